@@ -1,0 +1,1 @@
+"""What the agent's runtime asks of the outside: drivers, transports, clocks."""

@@ -1,0 +1,66 @@
+"""What a driver does for one device. This page is the implementer's manual."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Protocol
+
+from device_agent.protocol.messages import Pose, Twin
+
+
+class DriverError(Exception):
+    """The hardware or simulation cannot do what was asked. Its text is fit for an operator."""
+
+
+@dataclass(frozen=True, slots=True)
+class Observation:
+    """All joints of a device at one moment, in the order of the robot type's ``joints``.
+
+    Attributes:
+        position_rad: Measured, shape (n,) [rad].
+        velocity_rad_s: Measured, shape (n,) [rad/s].
+        effort_nm: Torque at the joint, shape (n,) [N m].
+        frames: Pose of each of the type's ``frames`` in the robot's base frame.
+    """
+
+    position_rad: tuple[float, ...]
+    velocity_rad_s: tuple[float, ...]
+    effort_nm: tuple[float, ...]
+    frames: tuple[Pose, ...]
+
+
+class Driver(Protocol):
+    """Makes one kind of robot do what the agent asks.
+
+    One thread calls it, the device's control loop, once per ``period_ms``: ``observe`` then ``send``. Neither blocks
+    longer than a fraction of the period. The constructor touches neither disk, network nor hardware.
+    """
+
+    def connect(self) -> None:
+        """Open the hardware or build the simulation; afterwards the device holds still where it is.
+
+        Raises:
+            DriverError: It is not there, or does not answer; the text says what to check.
+        """
+
+    def twin(self) -> Twin | None:
+        """The drawing for live views, or ``None`` where the driver knows none. Called once, after ``connect``."""
+
+    def observe(self) -> Observation:
+        """The newest measurement.
+
+        Raises:
+            DriverError: The device no longer answers. The agent then holds and raises a fault.
+        """
+
+    def send(self, position_rad: Sequence[float]) -> tuple[float, ...]:
+        """Command joint positions for the next period, shape (n,) [rad], already limited by the agent.
+
+        Returns:
+            What was really applied, after the driver's own clamping, shape (n,) [rad].
+
+        Raises:
+            DriverError: As for ``observe``.
+        """
+
+    def close(self) -> None:
+        """Let go. May be called twice, and without ``connect``."""

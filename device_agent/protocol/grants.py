@@ -1,0 +1,130 @@
+"""What one broker connection may do: a short-lived EdDSA token with exact topics, default deny.
+
+The functions issue it, the client gives it as its MQTT password (user name = principal, client id = ``client_id``),
+and the embedded broker checks it with the public key alone. Brokers that cannot read it (mosquitto's dynamic security)
+get the same topics written into them by the ``BrokerAccess`` adapter.
+"""
+
+import time
+from collections.abc import Mapping
+from typing import Any
+
+import jwt
+import msgspec
+from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey, Ed25519PublicKey
+from msgspec import Struct
+
+from device_agent.protocol import signing, topics
+from device_agent.protocol.errors import ProtocolError, SignatureError
+
+ALGORITHM = "EdDSA"
+AUDIENCE = "telescope/mqtt"
+
+
+class Grant(Struct, frozen=True, kw_only=True):
+    """Topics of one connection.
+
+    Attributes:
+        principal: Who it is: ``account:…``, ``agent:…`` or ``service:…``.
+        client_id: The MQTT client id it is bound to.
+        publish: Topic filters that cover what it may publish, and the topic of its will.
+        subscribe: Topic filters; a subscription is allowed when one of them covers it whole.
+        token_id: Unique id, for revocation.
+        expires_at: End of the connection's right [s since 1970].
+    """
+
+    principal: str
+    client_id: str
+    publish: tuple[str, ...]
+    subscribe: tuple[str, ...]
+    token_id: str
+    expires_at: int
+
+    def may_publish(self, topic: str) -> bool:
+        """Whether ``topic`` (no wildcards) may be published."""
+        if "+" in topic or "#" in topic:
+            return False
+        return any(topics.matches(pattern, topic) for pattern in self.publish)
+
+    def may_subscribe(self, pattern: str) -> bool:
+        """Whether the whole of ``pattern`` lies inside what may be read."""
+        return any(topics.matches(granted, pattern) for granted in self.subscribe)
+
+
+def issue(grant: Grant, key: Ed25519PrivateKey) -> str:
+    """The token of a grant."""
+    claims = {
+        "aud": AUDIENCE,
+        "sub": grant.principal,
+        "cid": grant.client_id,
+        "pub": list(grant.publish),
+        "sbs": list(grant.subscribe),
+        "jti": grant.token_id,
+        "exp": grant.expires_at,
+    }
+    return jwt.encode(claims, key, ALGORITHM, headers={"kid": signing.key_id(key.public_key())})
+
+
+def read(token: str, keys: Mapping[str, Ed25519PublicKey], *, leeway_s: float = 0) -> Grant:
+    """The grant in a token.
+
+    Raises:
+        SignatureError: Expired, of another purpose, or not signed by one of ``keys``.
+    """
+    try:
+        kid = jwt.get_unverified_header(token).get("kid", "")
+        claims: dict[str, Any] = jwt.decode(
+            token,
+            keys[kid],
+            algorithms=[ALGORITHM],
+            audience=AUDIENCE,
+            leeway=leeway_s,
+            options={"require": ["exp", "aud", "sub", "jti"]},
+        )
+        return msgspec.convert(
+            {
+                "principal": claims["sub"],
+                "client_id": claims["cid"],
+                "publish": claims["pub"],
+                "subscribe": claims["sbs"],
+                "token_id": claims["jti"],
+                "expires_at": claims["exp"],
+            },
+            Grant,
+        )
+    except (jwt.PyJWTError, KeyError, msgspec.ValidationError) as error:
+        raise SignatureError(f"broker token refused: {error}") from error
+
+
+def agent_grant(space: str, agent: str, *, token_id: str, lifetime_s: float) -> Grant:
+    """What an agent may do: speak for its own devices, hear what is addressed to them."""
+    own = f"{topics.ROOT}/{space}/{agent}"
+    spoken = (topics.DESC, topics.STATE, topics.EVENT, topics.ACK)
+    return Grant(
+        principal=f"agent:{agent}",
+        client_id=agent,
+        publish=(
+            topics.conn(space, agent),
+            *(f"{own}/+/{kind}" for kind in spoken),
+            f"{own}/+/{topics.DESC}/+",
+            f"{own}/+/{topics.TELE}/+",
+            f"{own}/+/{topics.CAM}/+",
+        ),
+        subscribe=(f"{own}/+/{topics.CMD}", f"{own}/+/{topics.CTL}/+", f"{own}/+/{topics.STOP}"),
+        token_id=token_id,
+        expires_at=int(time.time() + lifetime_s),
+    )
+
+
+def check(grant: Grant) -> None:
+    """Refuse a grant that could not be written into every broker.
+
+    Raises:
+        ProtocolError: A client id or topic filter outside the contract.
+    """
+    if not topics.is_id(grant.client_id):
+        raise ProtocolError(f"client id '{grant.client_id[:80]}' is not {topics.ID_PATTERN}")
+    for pattern in (*grant.publish, *grant.subscribe):
+        levels = pattern.split("/")
+        if any("#" in level and level != "#" for level in levels) or "#" in levels[:-1]:
+            raise ProtocolError(f"'{pattern}' is not a topic filter")

@@ -1,0 +1,1 @@
+"""What the services ask of the outside, as Protocols. Each page is its implementer's manual."""
