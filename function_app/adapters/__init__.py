@@ -1,0 +1,1 @@
+"""Implementations of the ports: the same file names in each family of stores and brokers."""

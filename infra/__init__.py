@@ -1,0 +1,1 @@
+"""What runs around the code: brokers, and the start of one machine. Each is a program of its own."""
