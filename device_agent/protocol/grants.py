@@ -14,11 +14,22 @@ import msgspec
 from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey, Ed25519PublicKey
 from msgspec import Struct
 
-from device_agent.protocol import signing, topics
+from device_agent.protocol import control, signing, topics
 from device_agent.protocol.errors import ProtocolError, SignatureError
 
 ALGORITHM = "EdDSA"
 AUDIENCE = "telescope/mqtt"
+
+_EVERY_DEVICE = f"{topics.ROOT}/+/+/+"
+SERVICE_PUBLISH = (f"{_EVERY_DEVICE}/{topics.CMD}", f"{_EVERY_DEVICE}/{topics.STOP}", control.TOPIC)
+"""What the functions say."""
+SERVICE_SUBSCRIBE = (
+    topics.conn(topics.ANY, topics.ANY),
+    *(f"{_EVERY_DEVICE}/{kind}" for kind in (topics.DESC, topics.STATE, topics.EVENT, topics.ACK)),
+    f"{_EVERY_DEVICE}/{topics.DESC}/+",
+    f"{_EVERY_DEVICE}/{topics.TELE}/+",
+)
+"""What the functions hear."""
 
 
 class Grant(Struct, frozen=True, kw_only=True):
@@ -60,6 +71,7 @@ def issue(grant: Grant, key: Ed25519PrivateKey) -> str:
         "pub": list(grant.publish),
         "sbs": list(grant.subscribe),
         "jti": grant.token_id,
+        "iat": time.time(),
         "exp": grant.expires_at,
     }
     return jwt.encode(claims, key, ALGORITHM, headers={"kid": signing.key_id(key.public_key())})
@@ -96,6 +108,13 @@ def read(token: str, keys: Mapping[str, Ed25519PublicKey], *, leeway_s: float = 
         raise SignatureError(f"broker token refused: {error}") from error
 
 
+def issued_at(token: str) -> float:
+    """When a token that ``read`` has accepted was made [s since 1970]; 0 where it does not say."""
+    claims: dict[str, Any] = jwt.decode(token, options={"verify_signature": False})
+    moment = claims.get("iat", 0)
+    return float(moment) if isinstance(moment, int | float) else 0.0
+
+
 def agent_grant(space: str, agent: str, *, token_id: str, lifetime_s: float) -> Grant:
     """What an agent may do: speak for its own devices, hear what is addressed to them."""
     own = f"{topics.ROOT}/{space}/{agent}"
@@ -111,6 +130,18 @@ def agent_grant(space: str, agent: str, *, token_id: str, lifetime_s: float) -> 
             f"{own}/+/{topics.CAM}/+",
         ),
         subscribe=(f"{own}/+/{topics.CMD}", f"{own}/+/{topics.CTL}/+", f"{own}/+/{topics.STOP}"),
+        token_id=token_id,
+        expires_at=int(time.time() + lifetime_s),
+    )
+
+
+def service_grant(*, client_id: str, token_id: str, lifetime_s: float) -> Grant:
+    """What a connection of the functions may do: tell every device and the broker, hear every agent's facts."""
+    return Grant(
+        principal="service:functions",
+        client_id=client_id,
+        publish=SERVICE_PUBLISH,
+        subscribe=SERVICE_SUBSCRIBE,
         token_id=token_id,
         expires_at=int(time.time() + lifetime_s),
     )
