@@ -35,6 +35,10 @@ class Driver(Protocol):
     longer than a fraction of the period. The constructor touches neither disk, network nor hardware.
     """
 
+    @property
+    def simulated(self) -> bool:
+        """Whether no real metal moves. Known before ``connect``."""
+
     def connect(self) -> None:
         """Open the hardware or build the simulation; afterwards the device holds still where it is.
 

@@ -27,8 +27,23 @@ class Transport(Protocol):
             TransportError: Its configuration is unusable.
         """
 
-    def publish(self, topic: str, payload: bytes, *, qos: int, retain: bool = False) -> bool:
+    def publish(
+        self,
+        topic: str,
+        payload: bytes,
+        *,
+        qos: int,
+        retain: bool = False,
+        delivered: Callable[[], None] | None = None,
+    ) -> bool:
         """Send; thread-safe; never blocks.
+
+        Args:
+            topic: One of ``protocol.topics``.
+            payload: The message, encoded.
+            qos: 0 or 1.
+            retain: Whether the broker keeps it for later subscribers.
+            delivered: With ``qos`` 1, called once the other side has confirmed the message; never if that is unknown.
 
         Returns:
             False when the link is down or its queue full and the message was dropped: measurements are then lost on

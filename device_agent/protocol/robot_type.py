@@ -28,6 +28,7 @@ class RobotType(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
         frames: Names of sites or bodies of the model whose pose telemetry carries.
         home_rad: Joint name → position [rad] at start.
         braking_rad_s2: Deceleration for a hold or a Stop [rad/s²], every joint; above ``max_acceleration_rad_s2``.
+        streaming_speed: Share of each joint's velocity limit that streamed setpoints may use, 0…1.
     """
 
     type: Id
@@ -43,6 +44,7 @@ class RobotType(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     frames: tuple[Label, ...]
     home_rad: dict[str, float]
     braking_rad_s2: float
+    streaming_speed: float = 0.35
     capabilities: tuple[Label, ...] = ()
     streams: tuple[Stream, ...] = ()
 

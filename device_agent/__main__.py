@@ -1,0 +1,184 @@
+"""``python -m device_agent enroll|run|devices``: the agent's command line."""
+
+import argparse
+import logging
+import os
+import signal
+import sys
+import threading
+import time
+from collections.abc import Sequence
+from pathlib import Path
+
+from device_agent import bootstrap, drivers
+from device_agent.ports.clock import CloudClock
+from device_agent.ports.driver import DriverError
+from device_agent.ports.transport import TransportError
+from device_agent.protocol import robot_type
+from device_agent.protocol.topics import ID_PATTERN, is_id
+from device_agent.runtime.home import Configuration, DeviceEntry, Home, HomeError, Pairing
+from device_agent.runtime.journal import JournalError
+from device_agent.transports.http.api import Claim, CloudApi, CloudError
+
+_POLL_S = 20.0
+_EXIT_FAILED = 1
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run one command; returns the exit code."""
+    options = _parser().parse_args(arguments)
+    logging.basicConfig(level=logging.INFO, format="%(asctime)s %(levelname)s %(message)s", stream=sys.stderr)
+    try:
+        code: int = options.command(options)
+    except (HomeError, JournalError, DriverError, TransportError, CloudError, OSError) as error:
+        print(f"telescope agent: {error}", file=sys.stderr)
+        return _EXIT_FAILED
+    except KeyboardInterrupt:
+        return 130
+    return code
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(prog="python -m device_agent", description="The Telescope agent of a robot.")
+    commands = parser.add_subparsers(required=True, metavar="COMMAND")
+    default = Path(os.environ.get("TELESCOPE_AGENT_HOME", Path.home() / ".telescope-agent"))
+
+    enroll = commands.add_parser("enroll", help="make this agent known and print a claim code")
+    enroll.add_argument("--server", help="address of the Telescope server, http://host:port")
+    enroll.add_argument("--name", help="name of this agent, for people (default: the folder's name)")
+    enroll.add_argument(
+        "--device",
+        action="append",
+        metavar="NAME=TYPE[:DRIVER]",
+        default=[],
+        help="a device behind this agent, for example arm=ur5; may be given several times",
+    )
+    enroll.add_argument(
+        "--no-wait", action="store_true", help="print the code and leave; `run` then waits for the claim"
+    )
+    enroll.set_defaults(command=_enroll)
+
+    run = commands.add_parser("run", help="run the agent until it is told to end (Ctrl-C, SIGTERM)")
+    run.add_argument("--trace", type=Path, metavar="FOLDER", help="simulated devices write what really happened here")
+    run.set_defaults(command=_run)
+
+    devices = commands.add_parser("devices", help="list this agent's devices, and known robot types and drivers")
+    devices.set_defaults(command=_devices)
+
+    for command in (enroll, run, devices):
+        command.add_argument("--home", type=Path, default=default, help="the agent's folder (default: %(default)s)")
+    return parser
+
+
+# ------------------------------------------------------------ enroll
+
+
+def _enroll(options: argparse.Namespace) -> int:
+    home = Home(options.home)
+    configuration = _configuration(options, home)
+    home.save_configuration(configuration)
+    api = bootstrap.api_of(home, configuration, CloudClock(), create=True)
+    claim = _announce(api, configuration)
+    if options.no_wait and claim.code is not None:
+        return 0
+    _await_claim(home, api, configuration, claim)
+    return 0
+
+
+def _configuration(options: argparse.Namespace, home: Home) -> Configuration:
+    try:
+        before = home.configuration()
+    except HomeError:
+        before = None
+    if before is not None and not options.device:
+        return Configuration(
+            server=options.server or before.server, name=options.name or before.name, devices=before.devices
+        )
+    if not options.device:
+        raise HomeError("say which devices it has, for example `--device arm=ur5`")
+    server = options.server or (before.server if before else "")
+    if not server.startswith(("http://", "https://")):
+        raise HomeError("say where the server is, for example `--server http://127.0.0.1:8080`")
+    devices = tuple(_entry(text) for text in options.device)
+    return Configuration(server=server, name=options.name or home.folder.resolve().name, devices=devices)
+
+
+def _entry(text: str) -> DeviceEntry:
+    name, equals, rest = text.partition("=")
+    kind, _, driver = rest.partition(":")
+    if not equals or not is_id(name):
+        raise HomeError(f"'{text}' is not NAME=TYPE; a name is {ID_PATTERN}")
+    label = bootstrap.load_type(kind).label
+    if driver:
+        drivers.load(driver)
+    return DeviceEntry(name=name, type=kind, driver=driver, label=label)
+
+
+def _announce(api: CloudApi, configuration: Configuration) -> Claim:
+    claim = api.enroll(
+        name=configuration.name, software=bootstrap.SOFTWARE, devices=bootstrap.enrolled_devices(configuration)
+    )
+    if claim.code is not None:
+        print(f"claim code {claim.code}  (valid for {claim.expires_in_s:.0f} s)", flush=True)
+    return claim
+
+
+def _await_claim(home: Home, api: CloudApi, configuration: Configuration, claim: Claim) -> Pairing:
+    """Wait until somebody redeems the code; a code that runs out is replaced."""
+    expires_s = time.monotonic() + claim.expires_in_s
+    while True:
+        found = api.enrollment(wait_s=_POLL_S if claim.code is not None else 0.0)
+        if found.get("state") == "claimed":
+            keys = {str(key["id"]): str(key["public"]) for key in found["keys"]}
+            pairing = Pairing(agent=found["agent"], space=found["space"], account=found["account"]["name"], keys=keys)
+            home.save_pairing(pairing)
+            print(f"paired with {pairing.account}", flush=True)
+            return pairing
+        if time.monotonic() > expires_s:
+            claim = _announce(api, configuration)
+            expires_s = time.monotonic() + claim.expires_in_s
+
+
+# ------------------------------------------------------------ run
+
+
+def _run(options: argparse.Namespace) -> int:
+    home = Home(options.home)
+    if home.pairing() is None:
+        configuration = home.configuration()
+        api = bootstrap.api_of(home, configuration, CloudClock())
+        _await_claim(home, api, configuration, _announce(api, configuration))
+    ending = threading.Event()
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, lambda *_: ending.set())
+    if options.trace is not None:
+        options.trace.mkdir(parents=True, exist_ok=True)
+    cell = bootstrap.build(home, trace=options.trace)
+    try:
+        cell.start()
+        print("running", flush=True)
+        ending.wait()
+    finally:
+        cell.stop()
+    return 0
+
+
+# ------------------------------------------------------------ devices
+
+
+def _devices(options: argparse.Namespace) -> int:
+    home = Home(options.home)
+    try:
+        for device in home.configuration().devices:
+            print(f"device  {device.name}: {device.type}, {device.driver or bootstrap.load_type(device.type).driver}")
+    except HomeError as error:
+        print(error)
+    for path in sorted(bootstrap.ROBOTS.glob(f"*/{robot_type.MANIFEST}")):
+        print(f"type    {path.parent.name}: {bootstrap.load_type(path.parent.name).label}")
+    for name in drivers.names():
+        print(f"driver  {name}")
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

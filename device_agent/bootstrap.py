@@ -1,0 +1,164 @@
+"""Puts an agent together: the one place that picks drivers and transports."""
+
+from pathlib import Path
+
+from device_agent import drivers
+from device_agent.ports.clock import CloudClock, tick_ms, wall_ms
+from device_agent.protocol import robot_type, topics
+from device_agent.protocol.errors import ProtocolError
+from device_agent.runtime.agent import Agent
+from device_agent.runtime.device import Device
+from device_agent.runtime.home import Configuration, DeviceEntry, Home, HomeError, Pairing
+from device_agent.runtime.journal import Journal
+from device_agent.transports.http.api import CloudApi, CloudError
+from device_agent.transports.mqtt import BrokerAccess, MqttTransport
+
+SOFTWARE = "telescope-agent 0.1.0"
+ROBOTS = Path(__file__).resolve().parent.parent / "robots"
+
+
+class Cell:
+    """A running agent and what must be closed with it."""
+
+    def __init__(self, agent: Agent, journal: Journal) -> None:
+        self._agent = agent
+        self._journal = journal
+
+    def start(self) -> None:
+        """Start devices and link.
+
+        Raises:
+            DriverError: A device is not there.
+            TransportError: The transport's configuration is unusable.
+        """
+        self._agent.start()
+
+    def stop(self) -> None:
+        """Hold, say goodbye, close. May be called twice."""
+        self._agent.stop()
+        self._journal.close()
+
+
+def load_type(name: str) -> robot_type.RobotType:
+    """A robot type of this installation.
+
+    Raises:
+        HomeError: Unknown, or its manifest is wrong; the text lists the known ones.
+    """
+    folder = ROBOTS / name
+    if not (folder / robot_type.MANIFEST).is_file():
+        known = sorted(path.parent.name for path in ROBOTS.glob(f"*/{robot_type.MANIFEST}"))
+        raise HomeError(f"no robot type '{name}'; there are: {', '.join(known)}")
+    try:
+        return robot_type.load(folder)
+    except ProtocolError as error:
+        raise HomeError(str(error)) from error
+
+
+def api_of(home: Home, configuration: Configuration, clock: CloudClock, *, create: bool = False) -> CloudApi:
+    """The agent's view of the HTTP API.
+
+    Raises:
+        HomeError: There is no identity.
+    """
+    return CloudApi(configuration.server, home.identity(create=create), clock)
+
+
+def enrolled_devices(configuration: Configuration) -> list[dict[str, str]]:
+    """The devices as the cloud is told of them."""
+    entries = []
+    for device in configuration.devices:
+        kind = load_type(device.type)
+        entries.append(
+            {"name": device.name, "kind": kind.kind, "robot_type": kind.type, "label": device.label or kind.label}
+        )
+    return entries
+
+
+def build(home: Home, *, trace: Path | None = None) -> Cell:
+    """An agent from its folder, ready to start.
+
+    Args:
+        home: Enrolled and claimed.
+        trace: A folder into which simulated devices write what really happened, ``{device}.ndjson`` each.
+
+    Raises:
+        HomeError: Not enrolled, not claimed, or a file is wrong.
+        JournalError: The journal cannot be used.
+        DriverError: An unknown driver or option.
+    """
+    configuration = home.configuration()
+    pairing = home.pairing()
+    if pairing is None:
+        raise HomeError(f"{home.folder} is not paired; run `python -m device_agent enroll` and redeem its claim code")
+    clock = CloudClock()
+    api = api_of(home, configuration, clock)
+    journal = Journal(home.journal)
+    journal.open(now_ms=wall_ms())
+    journal.end_open(now_ms=wall_ms(), tick_ms=tick_ms())
+    link = _Link(api, pairing)
+    transport = MqttTransport(
+        access=link.access,
+        presence_topic=topics.conn(pairing.space, pairing.agent),
+        next_session=journal.next_session,
+        software=SOFTWARE,
+        quiet=lambda: agent.quiet,
+    )
+    devices = {
+        entry.name: _device(entry, pairing, journal=journal, clock=clock, transport=transport, trace=trace)
+        for entry in configuration.devices
+    }
+    agent = Agent(devices, transport)
+    return Cell(agent, journal)
+
+
+class _Link:
+    """Broker credentials, asked of the cloud at each connection."""
+
+    def __init__(self, api: CloudApi, pairing: Pairing) -> None:
+        self._api = api
+        self._pairing = pairing
+
+    def access(self) -> BrokerAccess:
+        given = self._api.credentials()
+        try:
+            return BrokerAccess(
+                host=str(given["tcp"]["host"]),
+                port=int(given["tcp"]["port"]),
+                client_id=str(given["client_id"]),
+                username=str(given["username"]),
+                password=str(given["password"]),
+                subscribe=tuple(str(pattern) for pattern in given["subscribe"]),
+                lifetime_s=float(given["lifetime_s"]),
+            )
+        except (KeyError, TypeError) as error:
+            raise CloudError(f"the cloud's broker credentials lack {error}") from error
+
+
+def _device(
+    entry: DeviceEntry,
+    pairing: Pairing,
+    *,
+    journal: Journal,
+    clock: CloudClock,
+    transport: MqttTransport,
+    trace: Path | None,
+) -> Device:
+    kind = load_type(entry.type)
+    options: dict[str, object] = dict(entry.options)
+    name = entry.driver or kind.driver
+    if trace is not None and name == "mujoco":
+        options["trace"] = str(trace / f"{entry.name}.ndjson")
+    driver = drivers.load(name)(kind, ROBOTS / kind.type, options, entry.name)
+    return Device(
+        name=entry.name,
+        label=entry.label or kind.label,
+        space=pairing.space,
+        agent=pairing.agent,
+        robot_type=kind,
+        driver=driver,
+        journal=journal,
+        cloud_clock=clock,
+        keys=pairing.public_keys(),
+        publish=transport.publish,
+    )

@@ -1,0 +1,61 @@
+"""One agent: one link, any number of devices. Routes what arrives, and tells every device when the link changes."""
+
+import logging
+from collections.abc import Mapping
+
+from device_agent.ports.transport import Transport
+from device_agent.protocol import topics
+from device_agent.protocol.errors import ProtocolError
+from device_agent.runtime.device import Device
+
+_log = logging.getLogger(__name__)
+
+
+class Agent:
+    """Puts devices on a transport.
+
+    Args:
+        devices: By name.
+        transport: Not yet started.
+    """
+
+    def __init__(self, devices: Mapping[str, Device], transport: Transport) -> None:
+        self._devices = devices
+        self._transport = transport
+
+    def start(self) -> None:
+        """Start every device, then the link: a device holds before anybody can speak to it.
+
+        Raises:
+            DriverError: A device is not there.
+            TransportError: The transport's configuration is unusable.
+        """
+        for device in self._devices.values():
+            device.start()
+        self._transport.start(self._receive, self._link_changed)
+
+    def stop(self) -> None:
+        """Hold and close every device, then say goodbye. May be called twice."""
+        for device in self._devices.values():
+            device.stop()
+        self._transport.stop()
+
+    @property
+    def quiet(self) -> bool:
+        """Whether a short break of the link would disturb nothing."""
+        return all(device.quiet for device in self._devices.values())
+
+    def _receive(self, topic: str, payload: bytes) -> None:
+        try:
+            parsed = topics.parse(topic)
+        except ProtocolError as error:
+            _log.warning("message refused: %s", error)
+            return
+        device = self._devices.get(parsed.device)
+        if device is not None:
+            device.receive(parsed, payload)
+
+    def _link_changed(self, up: bool) -> None:
+        _log.info("link %s", "up" if up else "lost")
+        for device in self._devices.values():
+            device.link_changed(up)

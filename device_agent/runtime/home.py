@@ -1,0 +1,163 @@
+"""The agent's own folder: identity, configuration, pairing, journal. Survives restarts and updates.
+
+```
+identity.pem     the private key, mode 0600; never leaves the machine
+agent.toml       server and devices; written by ``enroll``, edited by people
+pairing.json     space, account and pinned keys, once claimed
+journal.db       what must not be forgotten
+```
+"""
+
+import json
+import os
+import tempfile
+import tomllib
+from pathlib import Path
+from typing import Any
+
+import msgspec
+from cryptography.hazmat.primitives import serialization
+from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey, Ed25519PublicKey
+from msgspec import Struct
+
+from device_agent.protocol import signing
+from device_agent.protocol.errors import ProtocolError
+from device_agent.protocol.messages import Id, Label
+
+
+class HomeError(Exception):
+    """The folder is not usable; the text says which file and what to do."""
+
+
+class DeviceEntry(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """One ``[[devices]]`` of ``agent.toml``. ``driver`` is empty for the one that the robot type names."""
+
+    name: Id
+    type: Id
+    driver: str = ""
+    label: Label = ""
+    options: dict[str, Any] = {}
+
+
+class Configuration(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """``agent.toml``."""
+
+    server: str
+    name: Label
+    devices: tuple[DeviceEntry, ...]
+
+
+class Pairing(Struct, frozen=True, kw_only=True):
+    """``pairing.json``: what the agent learned when it was claimed. ``keys`` are pinned: key id → public key."""
+
+    agent: Id
+    space: Id
+    account: str
+    keys: dict[str, str]
+
+    def public_keys(self) -> dict[str, Ed25519PublicKey]:
+        """The pinned keys, ready to verify with."""
+        return {name: signing.public_key(text) for name, text in self.keys.items()}
+
+
+class Home:
+    """Reads and writes the folder. The constructor touches nothing.
+
+    Args:
+        folder: Where; made when something is first written.
+    """
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
+        self.journal = folder / "journal.db"
+
+    def identity(self, *, create: bool = False) -> Ed25519PrivateKey:
+        """The agent's private key.
+
+        Raises:
+            HomeError: Not there (and not to be made), or unreadable.
+        """
+        path = self.folder / "identity.pem"
+        if create and not path.exists():
+            key = signing.generate()
+            pem = key.private_bytes(
+                serialization.Encoding.PEM, serialization.PrivateFormat.PKCS8, serialization.NoEncryption()
+            )
+            self._write(path, pem)
+            return key
+        try:
+            key = serialization.load_pem_private_key(path.read_bytes(), None)  # type: ignore[assignment]
+        except FileNotFoundError as error:
+            raise HomeError(f"{self.folder} holds no agent; run `python -m device_agent enroll` first") from error
+        except (OSError, ValueError) as error:
+            raise HomeError(f"{path} cannot be read as a private key: {error}") from error
+        if not isinstance(key, Ed25519PrivateKey):
+            raise HomeError(f"{path} is not an Ed25519 key")
+        return key
+
+    def configuration(self) -> Configuration:
+        """``agent.toml``.
+
+        Raises:
+            HomeError: Missing or wrong; the text names the field.
+        """
+        path = self.folder / "agent.toml"
+        try:
+            raw = tomllib.loads(path.read_text(encoding="utf-8"))
+            found = msgspec.convert(raw, Configuration)
+        except FileNotFoundError as error:
+            raise HomeError(f"{path} is missing; run `python -m device_agent enroll` first") from error
+        except (OSError, tomllib.TOMLDecodeError, msgspec.ValidationError, UnicodeDecodeError) as error:
+            raise HomeError(f"{path}: {error}") from error
+        names = [device.name for device in found.devices]
+        if not names or len(set(names)) != len(names):
+            raise HomeError(f"{path}: needs at least one device, each with a name of its own")
+        return found
+
+    def save_configuration(self, configuration: Configuration) -> None:
+        """Write ``agent.toml``."""
+        lines = [f"server = {json.dumps(configuration.server)}", f"name = {json.dumps(configuration.name)}"]
+        for device in configuration.devices:
+            lines += ["", "[[devices]]"]
+            lines += [f"{key} = {json.dumps(getattr(device, key))}" for key in ("name", "type", "driver", "label")]
+            if device.options:
+                lines.append("[devices.options]")
+                lines += [f"{key} = {json.dumps(value)}" for key, value in device.options.items()]
+        self._write(self.folder / "agent.toml", ("\n".join(lines) + "\n").encode())
+
+    def pairing(self) -> Pairing | None:
+        """What was learned when the agent was claimed, or ``None`` before.
+
+        Raises:
+            HomeError: Damaged.
+        """
+        path = self.folder / "pairing.json"
+        try:
+            found = msgspec.json.decode(path.read_bytes(), type=Pairing)
+            found.public_keys()
+        except FileNotFoundError:
+            return None
+        except (OSError, msgspec.DecodeError, ProtocolError) as error:
+            raise HomeError(f"{path}: {error}; delete it and enroll again") from error
+        return found
+
+    def save_pairing(self, pairing: Pairing | None) -> None:
+        """Write ``pairing.json``, or remove it."""
+        path = self.folder / "pairing.json"
+        if pairing is None:
+            path.unlink(missing_ok=True)
+        else:
+            self._write(path, msgspec.json.encode(pairing))
+
+    def _write(self, path: Path, content: bytes) -> None:
+        """Whole or not at all, readable by the owner alone."""
+        try:
+            self.folder.mkdir(parents=True, exist_ok=True, mode=0o700)
+            handle, temporary = tempfile.mkstemp(dir=self.folder)
+            with os.fdopen(handle, "wb") as file:
+                file.write(content)
+                file.flush()
+                os.fsync(file.fileno())
+            Path(temporary).replace(path)
+        except OSError as error:
+            raise HomeError(f"{path} cannot be written: {error.strerror}") from error

@@ -1,0 +1,185 @@
+"""What an agent must not forget: commands it has seen, each device's epoch and Stop latch, its session number.
+
+SQLite, committed to disk before anything that follows from it happens. One file per agent, one connection per thread.
+"""
+
+import sqlite3
+import threading
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from device_agent.protocol import codec
+from device_agent.protocol.messages import Ack, AckStatus, Reason, StopLatch
+
+_SCHEMA = """
+CREATE TABLE IF NOT EXISTS commands (
+    id TEXT PRIMARY KEY, device TEXT NOT NULL, last_ack BLOB NOT NULL,
+    terminal INTEGER NOT NULL, delivered INTEGER NOT NULL, at_ms INTEGER NOT NULL);
+CREATE INDEX IF NOT EXISTS undelivered ON commands (device) WHERE delivered = 0;
+CREATE TABLE IF NOT EXISTS devices (
+    device TEXT PRIMARY KEY, epoch INTEGER NOT NULL DEFAULT 0, burned INTEGER NOT NULL DEFAULT 0, latch BLOB);
+CREATE TABLE IF NOT EXISTS counters (name TEXT PRIMARY KEY, value INTEGER NOT NULL);
+"""
+_KEEP_MS = 7 * 24 * 3600 * 1000
+"""Commands are remembered a week: longer than any ``ttl_ms`` (a day at most), so that none can run twice."""
+
+
+class JournalError(Exception):
+    """The journal cannot be read or written; the text says what to do. The agent must not run without it."""
+
+
+@dataclass(frozen=True, slots=True)
+class DeviceRecord:
+    """What one device remembers across restarts: highest epoch seen, highest epoch no longer obeyed, Stop latch."""
+
+    epoch: int = 0
+    burned: int = 0
+    latch: StopLatch | None = None
+
+
+class Journal:
+    """The agent's memory. Thread-safe.
+
+    Args:
+        path: The database file; its folder must exist.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self._path = path
+        self._lock = threading.Lock()
+        self._database: sqlite3.Connection | None = None
+
+    def open(self, *, now_ms: int) -> None:
+        """Open or create the file, and forget commands older than a week.
+
+        Raises:
+            JournalError: Unreadable, or not a journal.
+        """
+        try:
+            self._database = sqlite3.connect(self._path, check_same_thread=False, isolation_level=None)
+            self._database.execute("PRAGMA journal_mode=WAL")
+            self._database.execute("PRAGMA synchronous=FULL")
+            self._database.executescript(_SCHEMA)
+            self._database.execute("DELETE FROM commands WHERE terminal = 1 AND at_ms < ?", (now_ms - _KEEP_MS,))
+        except sqlite3.Error as error:
+            raise JournalError(
+                f"the journal {self._path} cannot be used ({error}). Move it away to start with an empty one; the "
+                "agent then needs a new lease for each device and will not know which commands it has already run."
+            ) from error
+
+    def close(self) -> None:
+        """Close the file. May be called twice."""
+        with self._lock:
+            if self._database is not None:
+                self._database.close()
+                self._database = None
+
+    def begin(self, device: str, ack: Ack) -> Ack | None:
+        """Remember a command before anything is done about it.
+
+        Args:
+            device: Name of the device.
+            ack: The first answer to it, ``received`` or already a refusal.
+
+        Returns:
+            ``None`` for a new command; for one seen before, the last answer given to it, and nothing may be done again.
+        """
+        with self._lock:
+            rows = self._execute(
+                "INSERT INTO commands VALUES (?, ?, ?, ?, 0, ?) ON CONFLICT (id) DO NOTHING RETURNING id",
+                (ack.id, device, codec.encode(ack), ack.status.terminal, ack.at_ms),
+            )
+            if rows:
+                return None
+            return codec.decode(self._execute("SELECT last_ack FROM commands WHERE id = ?", (ack.id,))[0][0], Ack)
+
+    def record(self, ack: Ack) -> None:
+        """Remember the newest answer to a command begun before."""
+        with self._lock:
+            self._execute(
+                "UPDATE commands SET last_ack = ?, terminal = ?, delivered = 0, at_ms = ? "
+                "WHERE id = ? AND terminal = 0",
+                (codec.encode(ack), ack.status.terminal, ack.at_ms, ack.id),
+            )
+
+    def delivered(self, ack: Ack) -> None:
+        """Note that the cloud has this answer, unless a newer one has been recorded since."""
+        with self._lock:
+            if self._database is not None:
+                self._execute(
+                    "UPDATE commands SET delivered = 1 WHERE id = ? AND last_ack = ?", (ack.id, codec.encode(ack))
+                )
+
+    def undelivered(self, device: str) -> tuple[Ack, ...]:
+        """The last answers to this device's commands that the cloud may not have."""
+        with self._lock:
+            rows = self._execute("SELECT last_ack FROM commands WHERE device = ? AND delivered = 0", (device,))
+        return tuple(codec.decode(row[0], Ack) for row in rows)
+
+    def end_open(self, *, now_ms: int, tick_ms: int) -> int:
+        """At start: give every command that a former run left without an end one, ``failed``.
+
+        Returns:
+            How many there were. None of them will be run again: the device may have moved already.
+        """
+        reason = Reason(code="agent_restarted", message="the agent restarted while this ran; it was not run again")
+        with self._lock:
+            rows = self._execute("SELECT last_ack FROM commands WHERE terminal = 0")
+        for row in rows:
+            last = codec.decode(row[0], Ack)
+            self.record(
+                Ack(
+                    id=last.id,
+                    status=AckStatus.FAILED,
+                    sequence=last.sequence + 1,
+                    at_ms=now_ms,
+                    tick_ms=tick_ms,
+                    reason=reason,
+                )
+            )
+        return len(rows)
+
+    def device(self, device: str) -> DeviceRecord:
+        """What is remembered of a device; all zero for a new one."""
+        with self._lock:
+            rows = self._execute("SELECT epoch, burned, latch FROM devices WHERE device = ?", (device,))
+        if not rows:
+            return DeviceRecord()
+        epoch, burned, latch = rows[0]
+        return DeviceRecord(epoch, burned, codec.decode(latch, StopLatch) if latch else None)
+
+    def save_epoch(self, device: str, *, epoch: int, burned: int) -> None:
+        """Remember a device's epochs; neither ever falls."""
+        with self._lock:
+            self._execute(
+                "INSERT INTO devices (device, epoch, burned) VALUES (?, ?, ?) ON CONFLICT (device) DO UPDATE SET "
+                "epoch = max(epoch, excluded.epoch), burned = max(burned, excluded.burned)",
+                (device, epoch, burned),
+            )
+
+    def save_latch(self, device: str, latch: StopLatch | None) -> None:
+        """Remember a device's Stop latch."""
+        with self._lock:
+            self._execute(
+                "INSERT INTO devices (device, latch) VALUES (?, ?) "
+                "ON CONFLICT (device) DO UPDATE SET latch = excluded.latch",
+                (device, codec.encode(latch) if latch else None),
+            )
+
+    def next_session(self) -> int:
+        """The next session number of this agent's link, rising for ever."""
+        with self._lock:
+            rows = self._execute(
+                "INSERT INTO counters VALUES ('session', 1) ON CONFLICT (name) DO UPDATE SET value = value + 1 "
+                "RETURNING value"
+            )
+        return int(rows[0][0])
+
+    def _execute(self, sql: str, values: tuple[object, ...] = ()) -> list[Any]:
+        if self._database is None:
+            raise JournalError("the journal is closed")
+        try:
+            return self._database.execute(sql, values).fetchall()
+        except sqlite3.Error as error:
+            raise JournalError(f"the journal {self._path} cannot be written ({error}): is the disk full?") from error

@@ -1,0 +1,1 @@
+"""The cloud's HTTP API as the agent uses it."""

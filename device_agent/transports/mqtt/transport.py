@@ -1,0 +1,247 @@
+"""The MQTT transport: one connection at a time, each made afresh with new credentials, session number and will."""
+
+import contextlib
+import logging
+import random
+import socket
+import threading
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import paho.mqtt.client as mqtt
+from paho.mqtt.enums import CallbackAPIVersion, MQTTProtocolVersion
+from paho.mqtt.properties import Properties
+from paho.mqtt.reasoncodes import ReasonCode
+
+from device_agent.ports.clock import wall_ms
+from device_agent.ports.transport import LinkChanged, Receive
+from device_agent.protocol import codec
+from device_agent.protocol.messages import Presence
+
+KEEP_ALIVE_S = 5
+"""A dead peer is noticed after one and a half of these; at rest it costs one ping."""
+_CONNECT_TIMEOUT_S = 5.0
+_FIRST_BACK_OFF_S = 0.2
+_LONGEST_BACK_OFF_S = 15.0
+_REFRESH_AT = 0.8
+"""Credentials are renewed after this share of their life, at a quiet moment; at the last moment in any case."""
+_REFRESH_LATEST = 0.97
+_MOST_QUEUED = 2000
+_log = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True, slots=True)
+class BrokerAccess:
+    """Where and as whom to connect. ``subscribe`` are the filters to ask for; ``lifetime_s`` from now [s]."""
+
+    host: str
+    port: int
+    client_id: str
+    username: str
+    password: str
+    subscribe: tuple[str, ...]
+    lifetime_s: float
+
+
+class MqttTransport:
+    """``ports.transport.Transport`` over MQTT.
+
+    Args:
+        access: Asks the cloud for credentials; raises ``OSError`` or ``ValueError`` when it has none now.
+        presence_topic: Where presence and will go.
+        next_session: The next session number, rising across restarts.
+        software: Name and version, for presence.
+        quiet: Whether a short break would disturb nothing.
+    """
+
+    def __init__(
+        self,
+        *,
+        access: Callable[[], BrokerAccess],
+        presence_topic: str,
+        next_session: Callable[[], int],
+        software: str,
+        quiet: Callable[[], bool] = lambda: True,
+    ) -> None:
+        self._access = access
+        self._presence_topic = presence_topic
+        self._next_session = next_session
+        self._software = software
+        self._quiet = quiet
+        self._version = MQTTProtocolVersion.MQTTv5
+        self._client: mqtt.Client | None = None
+        self._up = False
+        self._stopping = threading.Event()
+        self._thread: threading.Thread | None = None
+        self._delivery_lock = threading.Lock()
+        self._delivered: dict[int, Callable[[], None]] = {}
+        self._session = 0
+        self._gone = threading.Event()
+
+    def start(self, receive: Receive, link_changed: LinkChanged) -> None:
+        """See ``Transport.start``."""
+        self._receive = receive
+        self._link_changed = link_changed
+        self._thread = threading.Thread(target=self._run, name="mqtt", daemon=True)
+        self._thread.start()
+
+    def publish(
+        self,
+        topic: str,
+        payload: bytes,
+        *,
+        qos: int,
+        retain: bool = False,
+        delivered: Callable[[], None] | None = None,
+    ) -> bool:
+        """See ``Transport.publish``."""
+        client = self._client
+        if client is None or not self._up:
+            return False
+        if delivered is None:
+            return client.publish(topic, payload, qos=qos, retain=retain).rc == mqtt.MQTT_ERR_SUCCESS
+        with self._delivery_lock:  # held until the id is known, so that a fast PUBACK finds it
+            sent = client.publish(topic, payload, qos=qos, retain=retain)
+            if sent.rc == mqtt.MQTT_ERR_SUCCESS:
+                self._delivered[sent.mid] = delivered
+        return sent.rc == mqtt.MQTT_ERR_SUCCESS
+
+    def stop(self) -> None:
+        """See ``Transport.stop``."""
+        self._stopping.set()
+        if self._thread is not None and self._thread is not threading.current_thread():
+            self._thread.join(timeout=3)
+
+    # ------------------------------------------------------------ one connection after another
+
+    def _run(self) -> None:
+        back_off_s = _FIRST_BACK_OFF_S
+        while not self._stopping.is_set():
+            began_s = time.monotonic()
+            try:
+                self._connect_once()
+            except (OSError, ValueError) as error:
+                _log.warning("no link: %s", error)
+            if time.monotonic() - began_s > _LONGEST_BACK_OFF_S:
+                back_off_s = _FIRST_BACK_OFF_S
+            # Full jitter: agents that lost one broker together do not come back together.
+            if self._stopping.wait(random.uniform(_FIRST_BACK_OFF_S / 2, back_off_s)):  # noqa: S311 (not a secret)
+                return
+            back_off_s = min(2 * back_off_s, _LONGEST_BACK_OFF_S)
+
+    def _connect_once(self) -> None:
+        access = self._access()
+        self._session = self._next_session()
+        client = self._client = self._new_client(access)
+        self._gone.clear()
+        client.connect(access.host, access.port, keepalive=KEEP_ALIVE_S)
+        began_s = time.monotonic()
+        # A thread of paho's own does all writing: two threads that write one socket can tear a packet.
+        client.loop_start()
+        try:
+            while not self._gone.wait(0.25) and not self._stopping.is_set():
+                age_s = time.monotonic() - began_s
+                if not self._up and age_s > _CONNECT_TIMEOUT_S:
+                    self._fall_back()
+                    raise OSError(f"{access.host}:{access.port} does not answer as an MQTT broker")
+                share = age_s / access.lifetime_s
+                if self._up and (share > _REFRESH_LATEST or (share > _REFRESH_AT and self._quiet())):
+                    return
+        finally:
+            was_up, self._up = self._up, False
+            if self._stopping.is_set() and was_up:
+                with contextlib.suppress(ValueError, RuntimeError):
+                    farewell = client.publish(self._presence_topic, self._presence(online=False), qos=1, retain=True)
+                    farewell.wait_for_publish(0.5)
+            client.disconnect()
+            client.loop_stop()
+            self._client = None
+            with self._delivery_lock:
+                self._delivered.clear()
+            if was_up:
+                self._link_changed(False)
+
+    def _new_client(self, access: BrokerAccess) -> mqtt.Client:
+        options: dict[str, Any] = {} if self._version is MQTTProtocolVersion.MQTTv5 else {"clean_session": True}
+        client = mqtt.Client(
+            CallbackAPIVersion.VERSION2,
+            access.client_id,
+            protocol=self._version,
+            reconnect_on_failure=False,
+            **options,
+        )
+        client.username_pw_set(access.username, access.password)
+        client.will_set(self._presence_topic, self._presence(online=False), qos=1, retain=True)
+        client.max_queued_messages_set(_MOST_QUEUED)
+        client.max_inflight_messages_set(100)
+        client.connect_timeout = _CONNECT_TIMEOUT_S
+        client.on_socket_open = _no_delay
+        client.on_connect = self._on_connect
+        client.on_disconnect = self._on_disconnect
+        client.on_subscribe = self._on_subscribe
+        client.on_publish = self._on_publish
+        client.on_message = self._on_message
+        client.user_data_set(access)
+        return client
+
+    # ------------------------------------------------------------ paho's callbacks, on our thread
+
+    def _on_connect(
+        self,
+        client: mqtt.Client,
+        access: BrokerAccess,
+        _flags: object,
+        code: ReasonCode,
+        _properties: Properties | None,
+    ) -> None:
+        if code.is_failure:
+            if "protocol" in str(code).lower():
+                self._fall_back()
+            _log.warning("the broker refused the connection: %s", code)
+            client.disconnect()
+            return
+        client.subscribe([(pattern, 1) for pattern in access.subscribe])
+
+    def _on_subscribe(
+        self, client: mqtt.Client, _access: object, _mid: int, codes: list[ReasonCode], _properties: Properties | None
+    ) -> None:
+        if any(code.is_failure for code in codes):
+            _log.error("the broker refused a subscription; check the agent's rights")
+            client.disconnect()
+            return
+        self._up = True
+        client.publish(self._presence_topic, self._presence(online=True), qos=1, retain=True)
+        self._link_changed(True)
+
+    def _on_disconnect(
+        self, _client: mqtt.Client, _access: object, _flags: object, _code: ReasonCode, _properties: Properties | None
+    ) -> None:
+        self._gone.set()
+
+    def _on_publish(
+        self, _client: mqtt.Client, _access: object, mid: int, code: ReasonCode, _properties: Properties | None
+    ) -> None:
+        with self._delivery_lock:
+            delivered = self._delivered.pop(mid, None)
+        if delivered is not None and not code.is_failure:
+            delivered()
+
+    def _on_message(self, _client: mqtt.Client, _access: object, message: mqtt.MQTTMessage) -> None:
+        if not message.retain:  # an order that a broker kept is not an order of now
+            self._receive(message.topic, bytes(message.payload))
+
+    def _fall_back(self) -> None:
+        if self._version is MQTTProtocolVersion.MQTTv5:
+            _log.info("the broker does not speak MQTT 5; using 3.1.1")
+            self._version = MQTTProtocolVersion.MQTTv311
+
+    def _presence(self, *, online: bool) -> bytes:
+        return codec.encode(Presence(online=online, session=self._session, at_ms=wall_ms(), software=self._software))
+
+
+def _no_delay(_client: mqtt.Client, _userdata: object, sock: Any) -> None:
+    """Without this a small message can wait 40 ms for the peer's delayed acknowledgement."""
+    with contextlib.suppress(OSError, AttributeError):
+        sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)

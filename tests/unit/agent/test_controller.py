@@ -1,0 +1,317 @@
+"""The controller, tick by tick: what moves, what holds, who is obeyed."""
+
+import pytest
+
+from device_agent.protocol.messages import Joint, JointTarget, Mode, Setpoint, StopLatch
+from device_agent.protocol.robot_type import RobotType
+from device_agent.runtime.controller import Controller, Outcome, Tenure
+from device_agent.runtime.lease import LeaseGate, Refused
+
+PERIOD_S = 0.008
+NAMES = ("shoulder", "elbow")
+
+
+def robot_type() -> RobotType:
+    joints = tuple(
+        Joint(
+            name=name,
+            label=name,
+            lower_rad=-3.0,
+            upper_rad=3.0,
+            max_velocity_rad_s=3.0,
+            max_acceleration_rad_s2=8.0,
+            max_jerk_rad_s3=80.0,
+            max_effort_nm=100.0,
+        )
+        for name in NAMES
+    )
+    return RobotType(
+        type="toy",
+        label="Toy",
+        kind="robot",
+        version=1,
+        description="",
+        model="",
+        scene="",
+        driver="none",
+        period_ms=8,
+        joints=joints,
+        frames=(),
+        home_rad=dict.fromkeys(NAMES, 0.0),
+        braking_rad_s2=20.0,
+    )
+
+
+class Rig:
+    """A controller with a clock of its own and an operator who answers the newest telemetry."""
+
+    def __init__(self, **gate: int) -> None:
+        self.controller = Controller(robot_type(), LeaseGate(**gate))
+        self.controller.start_at([0.0, 0.0])
+        self.now_s = 100.0
+        self.sequence = 0
+        self.velocities: list[float] = []
+
+    @property
+    def tick_ms(self) -> int:
+        return round(self.now_s * 1000)
+
+    def take(self, epoch: int, lease_s: float = 30.0) -> None:
+        self.controller.grant(epoch=epoch, holder="ann", lease_s=lease_s, now_s=self.now_s)
+        self.sequence = 0
+
+    def offer(self, epoch: int, elbow: float = 2.0, *, age_ms: int = 20, sequence: int | None = None) -> None:
+        self.sequence += 1
+        setpoint = Setpoint(
+            epoch=epoch,
+            sequence=self.sequence if sequence is None else sequence,
+            echo_tick_ms=self.tick_ms - age_ms,
+            sent_ms=1.0,
+            target=JointTarget(position_rad={"elbow": elbow}),
+        )
+        self.controller.offer(setpoint, now_s=self.now_s, tick_ms=self.tick_ms)
+
+    def run(self, seconds: float) -> Mode:
+        before = self.elbow
+        for _ in range(round(seconds / PERIOD_S)):
+            self.now_s += PERIOD_S
+            tick = self.controller.step(self.now_s)
+            self.elbow = tick.position_rad[1]
+            self.velocities.append((self.elbow - before) / PERIOD_S)
+            before = self.elbow
+        return self.controller.mode
+
+    elbow = 0.0
+
+    def stream(self, epoch: int, seconds: float, elbow: float = 2.0) -> Mode:
+        mode = self.controller.mode
+        for _ in range(round(seconds / 0.024)):
+            self.offer(epoch, elbow)
+            mode = self.run(0.024)
+        return mode
+
+    def at_rest_after(self, limit_s: float) -> float:
+        start = self.now_s
+        while self.now_s - start < limit_s:
+            self.run(PERIOD_S)
+            if not self.controller.moving:
+                return self.now_s - start
+        pytest.fail(f"still moving after {limit_s} s")
+
+
+def lost(_: Refused) -> None:
+    pass
+
+
+def test_streamed_setpoints_move_the_device_and_end_at_the_target() -> None:
+    rig = Rig()
+    rig.take(1)
+    assert rig.stream(1, 3.5) is Mode.STREAMING
+    assert rig.elbow == pytest.approx(2.0, abs=1e-4)
+
+
+def test_velocity_stays_under_the_streaming_share_of_the_limit() -> None:
+    rig = Rig()
+    rig.take(1)
+    rig.stream(1, 3.5)
+    assert 1.0 < max(rig.velocities) <= 0.35 * 3.0 + 1e-6
+
+
+def test_motion_is_at_rest_within_350_ms_of_the_last_setpoint() -> None:
+    rig = Rig()
+    rig.take(1)
+    rig.stream(1, 1.0)
+    assert rig.controller.moving
+    assert rig.at_rest_after(1.0) <= 0.35
+    assert rig.controller.mode is Mode.HOLDING
+
+
+def test_after_the_watchdog_nothing_moves_until_control_is_taken_again() -> None:
+    rig = Rig()
+    rig.take(1)
+    rig.stream(1, 1.0)
+    rig.run(0.5)
+    with pytest.raises(Refused) as refused:
+        rig.offer(1)
+    assert refused.value.code == "no_lease"
+    with pytest.raises(Refused):
+        rig.take(1)
+    rest = rig.elbow
+    rig.run(1.0)
+    assert rig.elbow == rest
+    rig.take(2)
+    rig.stream(2, 0.5)
+    assert rig.elbow > rest
+
+
+def test_setpoints_that_end_at_the_target_keep_the_lease() -> None:
+    rig = Rig()
+    rig.take(1)
+    rig.stream(1, 3.5)
+    assert rig.run(1.0) is Mode.IDLE
+    lease = rig.controller.lease(rig.now_s)
+    assert lease is not None
+    assert lease.epoch == 1
+
+
+@pytest.mark.parametrize("age_ms", [201, 5_000, -1])
+def test_a_setpoint_that_answers_old_or_invented_telemetry_is_refused(age_ms: int) -> None:
+    rig = Rig()
+    rig.take(1)
+    with pytest.raises(Refused) as refused:
+        rig.offer(1, age_ms=age_ms)
+    assert refused.value.code == "too_old"
+    rig.run(0.2)
+    assert rig.elbow == 0.0
+
+
+def test_an_older_setpoint_that_arrives_late_is_dropped() -> None:
+    rig = Rig()
+    rig.take(1)
+    rig.offer(1, sequence=7)
+    with pytest.raises(Refused) as refused:
+        rig.offer(1, sequence=7)
+    assert refused.value.code == "out_of_order"
+
+
+def test_a_setpoint_beyond_the_range_is_clamped_and_says_so() -> None:
+    rig = Rig()
+    rig.take(1)
+    rig.offer(1, elbow=9.0)
+    assert rig.controller.step(rig.now_s + PERIOD_S).limited == ("elbow: range",)
+    rig.stream(1, 6.0, elbow=9.0)
+    assert rig.elbow == pytest.approx(3.0, abs=1e-3)
+
+
+def test_a_newer_lease_fences_the_older() -> None:
+    rig = Rig()
+    rig.take(1)
+    rig.stream(1, 0.5)
+    rig.take(2)
+    with pytest.raises(Refused):
+        rig.offer(1)
+    with pytest.raises(Refused) as refused:
+        rig.take(1)
+    assert refused.value.code == "stale_epoch"
+    assert rig.at_rest_after(0.5) < 0.2
+    lease = rig.controller.lease(rig.now_s)
+    assert lease is not None
+    assert lease.epoch == 2
+
+
+def test_a_lease_that_runs_out_in_mid_motion_is_a_hold() -> None:
+    rig = Rig()
+    rig.take(1, lease_s=0.5)
+    rig.stream(1, 0.48)
+    rig.run(0.3)
+    assert not rig.controller.moving
+    assert rig.controller.mode is Mode.HOLDING
+    with pytest.raises(Refused):
+        rig.offer(1)
+
+
+def test_stop_latches_and_reset_resumes_nothing() -> None:
+    rig = Rig()
+    rig.take(1)
+    rig.stream(1, 1.0)
+    rig.controller.stop(StopLatch(by="bob", reason="", at_ms=1))
+    assert rig.at_rest_after(0.5) < 0.2
+    assert rig.controller.mode is Mode.STOPPED
+    rig.take(2)
+    with pytest.raises(Refused) as refused:
+        rig.offer(2)
+    assert refused.value.code == "stopped"
+    rest = rig.elbow
+    rig.controller.reset_stop()
+    rig.run(0.5)
+    assert rig.elbow == pytest.approx(rest, abs=1e-9)
+    rig.stream(2, 0.5)
+    assert rig.elbow != rest
+
+
+def test_the_first_stop_stays_the_one_shown() -> None:
+    rig = Rig()
+    rig.controller.stop(StopLatch(by="bob", reason="", at_ms=1))
+    rig.controller.stop(StopLatch(by="eve", reason="", at_ms=2))
+    assert rig.controller.latch is not None
+    assert rig.controller.latch.by == "bob"
+
+
+def test_a_move_reaches_its_target_and_says_so() -> None:
+    rig = Rig()
+    tenure = rig.controller.begin_action(epoch=1, on_lost=lost)
+    move = rig.controller.move(tenure, {"elbow": 1.0}, speed=1.0)
+    rig.run(2.0)
+    assert move.outcome is Outcome.REACHED
+    assert rig.elbow == pytest.approx(1.0, abs=1e-4)
+    rig.controller.end_action(tenure)
+    assert rig.run(0.1) is Mode.IDLE
+
+
+@pytest.mark.parametrize(
+    ("position_rad", "code"), [({"elbow": 3.1}, "out_of_range"), ({"knee": 0.0}, "unknown_joint")]
+)
+def test_a_move_that_cannot_be_is_refused_whole(position_rad: dict[str, float], code: str) -> None:
+    rig = Rig()
+    tenure = rig.controller.begin_action(epoch=1, on_lost=lost)
+    with pytest.raises(Refused) as refused:
+        rig.controller.move(tenure, {"shoulder": 1.0} | position_rad, speed=1.0)
+    assert refused.value.code == code
+    rig.run(0.5)
+    assert not rig.controller.moving
+
+
+def interruptions() -> dict[str, object]:
+    return {
+        "stop": lambda rig: rig.controller.stop(StopLatch(by="bob", reason="", at_ms=1)),
+        "link": lambda rig: rig.controller.lost(Refused("link_lost", "the link is gone")),
+        "takeover": lambda rig: rig.take(2),
+        "release": lambda rig: rig.controller.release(epoch=1),
+        "expiry": lambda rig: rig.run(6.0),
+        "fault": lambda rig: rig.controller.fail("no answer"),
+    }
+
+
+@pytest.mark.parametrize("cause", interruptions())
+def test_an_action_that_loses_the_device_moves_it_no_more(cause: str) -> None:
+    rig = Rig()
+    why: list[Refused] = []
+    rig.take(1, lease_s=5.0)
+    tenure: Tenure = rig.controller.begin_action(epoch=1, on_lost=why.append)
+    move = rig.controller.move(tenure, {"elbow": 2.9}, speed=0.1)
+    rig.run(0.5)
+    interruptions()[cause](rig)  # type: ignore[operator]
+    rig.run(0.3)
+    assert move.outcome is Outcome.INTERRUPTED
+    assert len(why) == 1
+    assert not rig.controller.moving
+    with pytest.raises(Refused):
+        rig.controller.move(tenure, {"elbow": -1.0}, speed=1.0)
+
+
+def test_setpoints_are_refused_while_an_action_runs() -> None:
+    rig = Rig()
+    rig.take(1)
+    tenure = rig.controller.begin_action(epoch=1, on_lost=lost)
+    with pytest.raises(Refused) as refused:
+        rig.offer(1)
+    assert refused.value.code == "busy"
+    with pytest.raises(Refused):
+        rig.controller.begin_action(epoch=1, on_lost=lost)
+    rig.controller.end_action(tenure)
+    rig.offer(1)
+
+
+def test_epochs_burned_before_a_restart_stay_burned() -> None:
+    rig = Rig(epoch=4, burned=4)
+    with pytest.raises(Refused):
+        rig.take(4)
+    rig.take(5)
+    rig.offer(5)
+
+
+def test_losing_the_link_at_rest_keeps_the_lease() -> None:
+    rig = Rig()
+    rig.take(1)
+    rig.controller.lost(Refused("link_lost", ""))
+    assert rig.controller.lease(rig.now_s) is not None
