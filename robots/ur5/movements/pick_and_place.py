@@ -1,0 +1,33 @@
+"""Carry between the two trays, as with a gripper: over, down, up, across. There is no gripper yet; it shows the path.
+
+Parameters: times (1 to 20, default 2), speed (share of the velocity limits, default 0.5).
+"""
+
+# Taught over the trays of scene.xml, flange down, 200 mm and 60 mm above the table [rad].
+OVER = {
+    "orange": [0.267, -1.274, 1.849, -2.146, -1.571, 0.267],
+    "green": [-0.660, -1.274, 1.849, -2.146, -1.571, -0.660],
+}
+DOWN = {
+    "orange": [0.267, -1.036, 1.958, -2.493, -1.571, 0.267],
+    "green": [-0.660, -1.036, 1.958, -2.493, -1.571, -0.660],
+}
+
+times = min(20, max(1, int(parameters.get("times", 2))))
+speed = float(parameters.get("speed", 0.5))
+
+
+def visit(tray):
+    """Go down to a tray and up again, slowly near it."""
+    robot.move_joints(OVER[tray], speed=speed)
+    robot.move_joints(DOWN[tray], speed=speed / 2)
+    wait(0.3)
+    robot.move_joints(OVER[tray], speed=speed / 2)
+
+
+robot.home(speed=speed)
+for count in range(times):
+    visit("orange")
+    visit("green")
+    print("carried", count + 1, "of", times)
+robot.home(speed=speed)

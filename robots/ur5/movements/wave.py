@@ -1,0 +1,15 @@
+"""Raise the arm, wave with the wrist, and go home.
+
+Parameters: times (how often to wave, 1 to 20, default 3), speed (share of the velocity limits, default 0.6).
+"""
+
+times = min(20, max(1, int(parameters.get("times", 3))))
+speed = float(parameters.get("speed", 0.6))
+
+robot.home(speed=speed)
+robot.move_joints({"shoulder_lift": -1.75, "elbow": 0.75, "wrist_1": -0.55, "wrist_2": -1.57}, speed=speed)
+for count in range(times):
+    robot.move_joints({"elbow": 0.35, "wrist_1": -0.95}, speed=speed)
+    robot.move_joints({"elbow": 1.15, "wrist_1": -0.15}, speed=speed)
+    print("wave", count + 1, "of", times)
+robot.home(speed=speed)

@@ -1,0 +1,50 @@
+"""Every robot folder of the project, so that a new one is tested without a new line of code."""
+
+from pathlib import Path
+from typing import Any
+
+import mujoco
+import numpy as np
+import numpy.typing as npt
+
+from device_agent.protocol import robot_type
+
+ROBOTS = Path(__file__).parents[3] / "robots"
+FOLDERS = sorted(path.parent for path in ROBOTS.glob("*/robot.toml"))
+MOVEMENTS = sorted(path for folder in FOLDERS for path in (folder / robot_type.MOVEMENTS).glob("*.py"))
+
+
+class Bench:
+    """One robot type's scene on the bench, stepped by hand, without the driver under test elsewhere."""
+
+    def __init__(self, folder: Path) -> None:
+        self.type = robot_type.load(folder)
+        self.model: Any = mujoco.MjModel.from_xml_path(str(folder / self.type.scene))
+        self.data: Any = mujoco.MjData(self.model)
+        self.names = [joint.name for joint in self.type.joints]
+        joints = [self.model.joint(name) for name in self.names]
+        self.qpos = np.array([joint.qposadr[0] for joint in joints])
+        self.dof = np.array([joint.dofadr[0] for joint in joints])
+        self.ctrl = np.array([self.model.actuator(name).id for name in self.names])
+        self.lower = np.array([joint.lower_rad for joint in self.type.joints])
+        self.upper = np.array([joint.upper_rad for joint in self.type.joints])
+        self.speed = np.array([joint.max_velocity_rad_s for joint in self.type.joints])
+        self.acceleration = np.array([joint.max_acceleration_rad_s2 for joint in self.type.joints])
+        self.home = np.array([self.type.home_rad[name] for name in self.names])
+        self.place(self.home)
+
+    def place(self, position: npt.NDArray[Any], velocity: npt.NDArray[Any] | float = 0.0) -> None:
+        """Put every joint somewhere, with its servo at the same place, and forget the past."""
+        mujoco.mj_resetData(self.model, self.data)
+        self.data.qpos[self.qpos] = position
+        self.data.qvel[self.dof] = velocity
+        self.data.ctrl[self.ctrl] = position
+        mujoco.mj_forward(self.model, self.data)
+
+    def touching(self) -> set[tuple[str, str]]:
+        """Pairs of bodies in contact."""
+        names = [
+            sorted(self.model.body(self.model.geom_bodyid[geom]).name for geom in (contact.geom1, contact.geom2))
+            for contact in self.data.contact[: self.data.ncon]
+        ]
+        return {(first, second) for first, second in names}

@@ -1,0 +1,119 @@
+"""Every movement, played in its robot's own scene."""
+
+import math
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import mujoco
+import numpy as np
+import pytest
+
+from tests.unit.robots.folders import MOVEMENTS, ROBOTS, Bench
+
+STEPS = 4  # of 2 ms: one control period
+
+
+class PlayedRobot:
+    """The script's ``robot``: follows minimum-jerk lines between joint positions and watches what happens."""
+
+    def __init__(self, bench: Bench) -> None:
+        self.bench = bench
+        self.allowed = bench.touching()
+        self.target = bench.home.copy()
+        self.moves = 0
+        self.touched: set[tuple[str, str]] = set()
+        self.fastest = 0.0  # share of the velocity limits
+
+    def move_joints(self, position_rad: Mapping[str, float] | Sequence[float], speed: float = 0.5) -> None:
+        assert 0 < speed <= 1
+        bench, start, goal = self.bench, self.target.copy(), self.target.copy()
+        if isinstance(position_rad, Mapping):
+            for name, value in position_rad.items():
+                goal[bench.names.index(name)] = value
+        else:
+            assert len(position_rad) == len(goal)
+            goal[:] = position_rad
+        assert np.all(bench.lower <= goal), "below a joint's range"
+        assert np.all(goal <= bench.upper), "above a joint's range"
+        way = np.abs(goal - start)
+        # Peaks of a minimum-jerk line: velocity 1.875 d/T, acceleration 5.774 d/T².
+        duration = max((1.875 * way / (bench.speed * speed)).max(), math.sqrt((5.774 * way / bench.acceleration).max()))
+        periods = max(1, math.ceil(duration / 0.008))
+        for period in range(1, periods + 1):
+            s = period / periods
+            self._hold(start + (goal - start) * (10 * s**3 - 15 * s**4 + 6 * s**5), 1)
+        self._hold(goal, 40)
+        self.target = goal
+        self.moves += 1
+        assert np.abs(bench.data.qpos[bench.qpos] - goal).max() < 0.005, "did not arrive"
+
+    def home(self, speed: float = 0.5) -> None:
+        self.move_joints(self.bench.home.tolist(), speed=speed)
+
+    def state(self) -> dict[str, Any]:
+        bench = self.bench
+        return {"position_rad": dict(zip(bench.names, bench.data.qpos[bench.qpos].tolist(), strict=True))}
+
+    def wait(self, seconds: float) -> None:
+        assert seconds >= 0
+        self._hold(self.target, math.ceil(seconds / 0.008))
+
+    def _hold(self, target: Any, periods: int) -> None:
+        bench = self.bench
+        for _ in range(periods):
+            bench.data.ctrl[bench.ctrl] = target
+            mujoco.mj_step(bench.model, bench.data, nstep=STEPS)
+            self.touched |= bench.touching() - self.allowed
+            self.fastest = max(self.fastest, float((np.abs(bench.data.qvel[bench.dof]) / bench.speed).max()))
+
+
+def play(path: Path, parameters: dict[str, Any]) -> PlayedRobot:
+    robot = PlayedRobot(Bench(path.parent.parent))
+    given = {
+        "robot": robot,
+        "wait": robot.wait,
+        "parameters": parameters,
+        "print": lambda *_: None,
+        "__name__": "movement",
+    }
+    exec(compile(path.read_text(encoding="utf-8"), str(path), "exec"), given)  # noqa: S102 - our own scripts
+    return robot
+
+
+def check(robot: PlayedRobot) -> None:
+    assert robot.moves > 0
+    assert robot.touched == set()
+    assert robot.fastest <= 1.02
+    assert not robot.bench.data.warning.number.any()
+
+
+@pytest.mark.parametrize("path", MOVEMENTS, ids=lambda path: f"{path.parent.parent.name}-{path.stem}")
+def test_movement_plays_without_contact_inside_the_limits(path: Path):
+    check(play(path, {}))
+
+
+@pytest.mark.parametrize(
+    ("name", "parameters"),
+    [
+        ("slow_square", {"side_m": 9, "height_m": 0}),
+        ("slow_square", {"side_m": 9, "height_m": 9}),
+        ("inspect_table", {"stops": 9, "pause_s": 0, "speed": 1.0}),
+        ("wave", {"times": 1, "speed": 1.0}),
+        ("pick_and_place", {"times": 1, "speed": 1.0}),
+    ],
+)
+def test_ur5_movement_stays_free_with_extreme_parameters(name: str, parameters: dict[str, Any]):
+    check(play(ROBOTS / "ur5" / "movements" / f"{name}.py", parameters))
+
+
+def test_a_movement_into_the_table_is_noticed(tmp_path: Path):
+    (tmp_path / "movements").mkdir()
+    for source in (ROBOTS / "ur5").glob("*.*"):
+        (tmp_path / source.name).write_bytes(source.read_bytes())
+    manifest = (tmp_path / "robot.toml").read_text()
+    (tmp_path / "robot.toml").write_text(manifest.replace('type = "ur5"', f'type = "{tmp_path.name}"'))
+    script = tmp_path / "movements" / "dive.py"
+    script.write_text('robot.move_joints({"shoulder_lift": -0.2, "elbow": 1.2}, speed=0.3)\n')
+    with pytest.raises(AssertionError, match="did not arrive"):
+        play(script, {})
