@@ -104,10 +104,9 @@ def build(home: Home, *, trace: Path | None = None) -> Cell:
         software=SOFTWARE,
         quiet=lambda: agent.quiet,
     )
-    devices = {
-        entry.name: _device(entry, pairing, journal=journal, clock=clock, transport=transport, trace=trace)
-        for entry in configuration.devices
-    }
+    devices = {}
+    for entry in configuration.devices:
+        devices[entry.name] = _device(entry, pairing, journal=journal, clock=clock, transport=transport, trace=trace)
     agent = Agent(devices, transport)
     return Cell(agent, journal)
 

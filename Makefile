@@ -1,0 +1,85 @@
+# Two commands: `make up` runs the product on this machine, `make test` passes its tests. Each sets itself up.
+# Ports, folder and broker: TELESCOPE_PORT, TELESCOPE_HOME, TELESCOPE_BROKER (see README).
+
+PYTHON ?= python3
+BIN := .venv/bin
+# Node.js of the machine when it is new enough, else the one that comes as a Python wheel.
+NODE_READY = command -v npm >/dev/null && node -e 'process.exit(parseInt(process.versions.node) >= 20 ? 0 : 1)'
+NPM = PATH="$(if $(wildcard $(BIN)/npm),$(CURDIR)/$(BIN):)$$PATH" npm --prefix web
+
+.PHONY: help up env console test test-long check contract requirements clean
+.DELETE_ON_ERROR:
+
+help:
+	@echo "make up            run Telescope on this machine"
+	@echo "make test          check and test everything (about ten minutes on two cores)"
+	@echo "make test-long     the same with every suite at full size"
+	@echo "make check         linters, types, import contracts, generated files"
+	@echo "make contract      regenerate docs/asyncapi.json and web/src/core/protocol.ts"
+	@echo "make requirements  regenerate requirements.txt and requirements/*.txt"
+
+up: env console
+	@exec $(BIN)/python -m infra.local
+
+env: .venv/.local
+
+.venv/.python:
+	@$(PYTHON) -c 'import sys; sys.exit("Telescope needs Python 3.11 or newer; set PYTHON=...") if sys.version_info < (3, 11) else None'
+	@$(PYTHON) -m venv .venv || { echo "telescope: python3-venv is missing; install it (Debian: apt-get install python3-venv)" >&2; exit 1; }
+	@touch $@
+
+.venv/.local: requirements/local.txt | .venv/.python
+	@echo "telescope: installing Python packages" >&2
+	@$(BIN)/python -m pip install --quiet --disable-pip-version-check -r requirements/local.txt
+	@touch $@
+
+.venv/.dev: requirements/dev.txt | .venv/.python
+	@echo "telescope: installing Python packages for development" >&2
+	@$(BIN)/python -m pip install --quiet --disable-pip-version-check -r requirements/dev.txt
+	@touch $@ .venv/.local
+
+.venv/.node: requirements/node.txt | .venv/.python
+	@{ $(NODE_READY); } 2>/dev/null || { echo "telescope: installing Node.js" >&2; \
+		$(BIN)/python -m pip install --quiet --disable-pip-version-check -r requirements/node.txt; }
+	@touch $@
+
+web/node_modules/.installed: web/package-lock.json | .venv/.node
+	@echo "telescope: installing console packages" >&2
+	@$(NPM) ci --silent --no-fund --no-audit
+	@touch $@
+
+console: web/dist/index.html
+
+web/dist/index.html: web/node_modules/.installed web/index.html web/package.json $(wildcard web/*.ts web/public/*) $(shell find web/src -type f 2>/dev/null)
+	@echo "telescope: building the console" >&2
+	@$(NPM) run --silent build
+	@touch $@
+
+test: .venv/.dev console check
+	@tests/system-packages
+	@$(NPM) test --silent
+	@$(BIN)/python -m pytest -m "not long"
+
+test-long: .venv/.dev console check
+	@tests/system-packages
+	@$(NPM) test --silent
+	@$(BIN)/python -m pytest
+
+check: .venv/.dev web/node_modules/.installed
+	@$(BIN)/ruff check .
+	@$(BIN)/ruff format --check .
+	@$(BIN)/mypy
+	@$(BIN)/lint-imports
+	@$(BIN)/python requirements/export.py --check
+	@$(BIN)/python -m device_agent.protocol.document | cmp - docs/asyncapi.json || { echo "docs/asyncapi.json is stale; run \`make contract\`" >&2; exit 1; }
+	@$(NPM) run --silent check
+
+contract: .venv/.dev web/node_modules/.installed
+	@$(BIN)/python -m device_agent.protocol.document > docs/asyncapi.json
+	@$(NPM) run --silent contract
+
+requirements: .venv/.dev
+	@$(BIN)/python requirements/export.py
+
+clean:
+	rm -rf .venv web/node_modules web/dist .mypy_cache .ruff_cache .pytest_cache .hypothesis
