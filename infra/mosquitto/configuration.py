@@ -1,0 +1,167 @@
+"""What mosquitto reads: its own configuration, and the first dynamic security file with the functions' own client.
+
+Formats: mosquitto.conf(5), and the dynamic security plugin's JSON as mosquitto 2.0 writes it.
+"""
+
+import base64
+import hashlib
+import json
+import os
+import pwd
+import secrets
+import shutil
+from pathlib import Path
+from typing import Any
+
+from device_agent.protocol import codec, control, grants
+
+SERVICE = "service"
+"""User name of the functions' own client, and of its role."""
+CONFIGURATION_FILE = "mosquitto.conf"
+SECURITY_FILE = "dynamic-security.json"
+PASSWORD_FILE = "service.password"  # noqa: S105 (the name of a file)
+PACKAGE = "mosquitto"
+"""Debian's package with both the broker and the plugin."""
+
+_PLUGIN = "mosquitto_dynamic_security.so"
+_PLUGIN_FOLDERS = (
+    "usr/lib/*-linux-*",
+    "usr/lib",
+    "usr/lib64",
+    "usr/local/lib",
+    "usr/local/lib/*-linux-*",
+    "opt/homebrew/lib",
+)
+_PATH_BESIDE = "/usr/local/sbin:/usr/sbin:/sbin:/opt/homebrew/sbin"
+_SALT_BYTES = 12
+_HASH_BYTES = 64
+_ITERATIONS = 101
+"""The plugin's own. Stretching protects guessable passwords; these have 256 random bits."""
+_HEADER_BYTES = 600
+"""Fixed header, packet id and the longest topic in a PUBLISH [bytes]."""
+_MAX_INFLIGHT = 100
+_MAX_QUEUED = 10_000
+
+
+class NotInstalledError(Exception):
+    """The broker or its plugin is not on this machine; the text names the package."""
+
+
+def binary() -> str:
+    """Path of the broker, also where the user's PATH leaves out the folders of servers.
+
+    Raises:
+        NotInstalledError: There is none.
+    """
+    found = shutil.which("mosquitto") or shutil.which("mosquitto", path=_PATH_BESIDE)
+    if found is None:
+        raise NotInstalledError(f"mosquitto is not installed; on Debian: apt-get install {PACKAGE}")
+    return found
+
+
+def plugin() -> str:
+    """Path of the dynamic security plugin.
+
+    Raises:
+        NotInstalledError: There is none.
+    """
+    for folder in _PLUGIN_FOLDERS:
+        for path in sorted(Path("/").glob(f"{folder}/{_PLUGIN}")):
+            return str(path)
+    raise NotInstalledError(f"mosquitto's {_PLUGIN} is not installed; on Debian: apt-get install {PACKAGE}")
+
+
+def write(home: Path, *, host: str, tcp_port: int, websocket_port: int, plugin_path: str) -> None:
+    """Write what is not there yet; the listeners of the configuration follow the arguments each time.
+
+    Raises:
+        OSError: ``home`` cannot be written.
+    """
+    home.mkdir(parents=True, exist_ok=True, mode=0o700)
+    security = home / SECURITY_FILE
+    if not security.exists():
+        password = secrets.token_urlsafe(32)
+        _write_secret(home / PASSWORD_FILE, f"{password}\n")
+        _write_secret(security, json.dumps(first_security(password), indent=1))
+    text = configuration(home, host=host, tcp_port=tcp_port, websocket_port=websocket_port, plugin_path=plugin_path)
+    path = home / CONFIGURATION_FILE
+    if not path.exists() or path.read_text() != text:
+        path.write_text(text)
+
+
+def configuration(home: Path, *, host: str, tcp_port: int, websocket_port: int, plugin_path: str) -> str:
+    """The text of ``mosquitto.conf``."""
+    lines = [
+        "# Written by `python -m infra.mosquitto` at each start: change it there.",
+        "per_listener_settings false",
+        "allow_anonymous false",
+        f"plugin {plugin_path}",
+        f"plugin_opt_config_file {home.absolute() / SECURITY_FILE}",
+        # Nagle's algorithm costs 44 ms for each message at QoS 1.
+        "set_tcp_nodelay true",
+        # Agents say what is retained again on connecting, and nothing relies on a queue for somebody who is away.
+        "persistence false",
+        "persistent_client_expiration 1h",
+        # Ends the connection. `message_size_limit` would acknowledge the message and drop it.
+        f"max_packet_size {codec.MAX_BYTES + _HEADER_BYTES}",
+        f"max_inflight_messages {_MAX_INFLIGHT}",
+        f"max_queued_messages {_MAX_QUEUED}",
+        "sys_interval 0",
+        "log_dest stderr",
+        "log_type error",
+        "log_type warning",
+        "connection_messages false",
+        # Only heeded when started as root: it would otherwise become a user who cannot read this folder.
+        f"user {pwd.getpwuid(os.geteuid()).pw_name}",
+        f"listener {tcp_port} {host}",
+        "protocol mqtt",
+        f"listener {websocket_port} {host}",
+        "protocol websockets",
+    ]
+    return "\n".join(lines) + "\n"
+
+
+def first_security(password: str) -> dict[str, Any]:
+    """Nobody may do anything, but for one client: it says and hears what the functions do, and manages the others."""
+    salt = secrets.token_bytes(_SALT_BYTES)
+    digest = hashlib.pbkdf2_hmac("sha512", password.encode(), salt, _ITERATIONS, _HASH_BYTES)
+    return {
+        "defaultACLAccess": {
+            "publishClientSend": False,
+            "publishClientReceive": False,
+            "subscribe": False,
+            "unsubscribe": False,
+        },
+        "clients": [
+            {
+                "username": SERVICE,
+                "textname": "The functions' own connections",
+                "roles": [{"rolename": SERVICE}],
+                "password": base64.b64encode(digest).decode(),
+                "salt": base64.b64encode(salt).decode(),
+                "iterations": _ITERATIONS,
+            }
+        ],
+        "groups": [],
+        "roles": [{"rolename": SERVICE, "acls": _service_acls()}],
+    }
+
+
+def _service_acls() -> list[dict[str, Any]]:
+    mine = "$CONTROL/dynamic-security/#"
+    acls = [("publishClientSend", topic) for topic in (*grants.SERVICE_PUBLISH, mine) if topic != control.TOPIC]
+    for pattern in (*grants.SERVICE_SUBSCRIBE, mine):
+        acls += [(kind, pattern) for kind in ("subscribePattern", "unsubscribePattern", "publishClientReceive")]
+    return [{"acltype": kind, "topic": topic, "priority": 0, "allow": True} for kind, topic in acls]
+
+
+def _write_secret(path: Path, text: str) -> None:
+    """Write a file that nobody else can read at any moment, whole or not at all."""
+    new = path.with_name(f"{path.name}.new")
+    new.unlink(missing_ok=True)
+    descriptor = os.open(new, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600)
+    with os.fdopen(descriptor, "w") as file:
+        file.write(text)
+        file.flush()
+        os.fsync(file.fileno())
+    new.replace(path)
