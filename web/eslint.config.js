@@ -1,0 +1,43 @@
+import js from "@eslint/js";
+import tseslint from "typescript-eslint";
+
+const pageNames = ["document", "window", "navigator", "location", "history", "localStorage", "sessionStorage"];
+
+export default tseslint.config(
+  { ignores: ["dist", "node_modules"] },
+  js.configs.recommended,
+  {
+    files: ["**/*.{ts,tsx}"],
+    extends: [...tseslint.configs.strictTypeChecked, ...tseslint.configs.stylisticTypeChecked],
+    languageOptions: { parserOptions: { projectService: true } },
+    rules: {
+      "@typescript-eslint/restrict-template-expressions": ["error", { allowNumber: true }],
+      "@typescript-eslint/switch-exhaustiveness-check": "error",
+      // `onClick={() => signal.value = x}` reads well and returns nothing anyone looks at.
+      "@typescript-eslint/no-confusing-void-expression": ["error", { ignoreArrowShorthand: true }],
+      eqeqeq: "error",
+      "no-console": "error",
+    },
+  },
+  {
+    // The core is told of the page by its callers, so that it runs and is tested without one.
+    files: ["src/core/**"],
+    rules: {
+      "no-restricted-globals": ["error", ...pageNames],
+      "no-restricted-imports": ["error", { patterns: ["**/ui/*", "preact", "preact/*", "three", "three/*", "uplot"] }],
+    },
+  },
+  {
+    // Generated from the wire contract: an index signature there says what the contract says.
+    files: ["src/core/protocol.ts"],
+    rules: {
+      "@typescript-eslint/consistent-indexed-object-style": "off",
+      "@typescript-eslint/consistent-type-definitions": "off",
+      "@typescript-eslint/array-type": "off",
+    },
+  },
+  {
+    files: ["scripts/**", "*.config.js"],
+    languageOptions: { globals: { URL: "readonly", process: "readonly" } },
+  },
+);

@@ -1,0 +1,13 @@
+/** Degrees are for the page only; everything inside is in radians. */
+
+export function degrees(rad: number): number {
+  return (rad * 180) / Math.PI;
+}
+
+export function radians(deg: number): number {
+  return (deg * Math.PI) / 180;
+}
+
+export function clamp(value: number, lower: number, upper: number): number {
+  return Math.min(upper, Math.max(lower, value));
+}

@@ -1,0 +1,235 @@
+/** One device as the page knows it: only what it or the cloud has said, with the time at which it was heard. */
+import { computed, signal, type ReadonlySignal } from "@preact/signals-core";
+import { ApiError, type Api, type Device, type Lease } from "./api";
+import { clock, now, onThisClock } from "./clock";
+import { History } from "./history";
+import type { Link } from "./link";
+import {
+  MessageError,
+  readAck,
+  readDescription,
+  readEvent,
+  readPresence,
+  readState,
+  readTelemetry,
+  readTwin,
+  type KnownAck,
+  type KnownDescription,
+  type KnownEvent,
+  type KnownState,
+  type KnownTelemetry,
+  type KnownTwin,
+} from "./messages";
+import type { Presence } from "./protocol";
+import { deviceTopics, type DeviceTopics } from "./topics";
+
+/** `unknown`: this page has no connection of its own, so it cannot say. */
+export type Reach = "online" | "stale" | "offline" | "unknown";
+
+/** Watched closely, a device that has sent no telemetry for this long is stale [ms]. */
+export const STALE_MS = 1_000;
+/** In the list only `state` is heard, every 30 s: two of them missed, and a little [ms]. */
+export const LIST_STALE_MS = 65_000;
+const EVENTS_KEPT = 20;
+
+export interface Timed<T> {
+  message: T;
+  /** On the page's clock [ms]. */
+  receivedAt: number;
+}
+
+export class DeviceStore {
+  readonly id: string;
+  readonly topics: DeviceTopics;
+  readonly history = new History();
+  readonly #api: Api;
+  readonly #link: Link;
+  readonly #info;
+  readonly #presence = signal<Required<Presence> | null>(null);
+  readonly #description = signal<KnownDescription | null>(null);
+  readonly #twin = signal<KnownTwin | null>(null);
+  readonly #state = signal<KnownState | null>(null);
+  readonly #telemetry = signal<Timed<KnownTelemetry> | null>(null);
+  readonly #events = signal<readonly KnownEvent[]>([]);
+  readonly #lease;
+  readonly #heardAt = signal<number | null>(null);
+  readonly #trouble = signal<string | null>(null);
+  readonly #close = signal(false);
+  readonly #ackReceivers = new Set<(ack: KnownAck) => void>();
+  readonly #recentAcks = new Map<string, KnownAck[]>();
+
+  readonly info: ReadonlySignal<Device>;
+  readonly presence: ReadonlySignal<Required<Presence> | null> = this.#presence;
+  readonly description: ReadonlySignal<KnownDescription | null> = this.#description;
+  readonly twin: ReadonlySignal<KnownTwin | null> = this.#twin;
+  readonly state: ReadonlySignal<KnownState | null> = this.#state;
+  readonly telemetry: ReadonlySignal<Timed<KnownTelemetry> | null> = this.#telemetry;
+  readonly events: ReadonlySignal<readonly KnownEvent[]> = this.#events;
+  /** Who the cloud says has control. The device's own word is in `state`. */
+  readonly lease: ReadonlySignal<Lease | null>;
+  /** The last message that could not be read; `null` when the last one could. */
+  readonly trouble: ReadonlySignal<string | null> = this.#trouble;
+
+  /** When the device, or the cloud for it, last said anything, on the page's clock [ms]. */
+  readonly heardAt = computed(() => {
+    const at = this.#info.value.last_seen_at;
+    const told = at === null ? null : onThisClock(Date.parse(at));
+    const heard = this.#heardAt.value;
+    return told === null || (heard !== null && heard > told) ? heard : told;
+  });
+
+  /** Age of the newest telemetry [ms]; `null` before the first. */
+  readonly telemetryAgeMs = computed(() => {
+    const latest = this.#telemetry.value;
+    return latest === null ? null : Math.max(0, clock.value - latest.receivedAt);
+  });
+
+  readonly reach = computed<Reach>(() => {
+    if (!this.#link.up.value) return "unknown";
+    if (!(this.#presence.value?.online ?? this.#info.value.online)) return "offline";
+    if (this.#close.value && (this.#description.value?.joints.length ?? 0) > 0) {
+      const age = this.telemetryAgeMs.value;
+      return age === null || age > STALE_MS ? "stale" : "online";
+    }
+    const heardAt = this.heardAt.value;
+    return heardAt === null || clock.value - heardAt > LIST_STALE_MS ? "stale" : "online";
+  });
+
+  /** Whether what is shown of the device is what it is now. */
+  readonly live = computed(() => this.reach.value === "online");
+
+  /** Latched, by the newest word of the device. */
+  readonly stopped = computed(() => {
+    const latest = this.#telemetry.value?.message;
+    const state = this.#state.value;
+    const newest = latest !== undefined && (state === null || latest.tick_ms >= state.tick_ms) ? latest : state;
+    return newest?.mode === "stopped" || (state?.stop ?? null) !== null && newest === state;
+  });
+
+  constructor(info: Device, api: Api, link: Link) {
+    this.id = info.id;
+    this.topics = deviceTopics(info.topic);
+    this.#api = api;
+    this.#link = link;
+    this.#info = signal(info);
+    this.#lease = signal(info.lease);
+    this.info = this.#info;
+    this.lease = this.#lease;
+  }
+
+  /** The cloud's newest word, from the list of devices. */
+  update(info: Device): void {
+    this.#info.value = info;
+    this.#lease.value = info.lease;
+  }
+
+  setLease(lease: Lease | null): void {
+    this.#lease.value = lease;
+  }
+
+  async refreshLease(): Promise<void> {
+    try {
+      this.#lease.value = await this.#api.lease(this.id);
+    } catch (error) {
+      if (!(error instanceof ApiError)) throw error;
+    }
+  }
+
+  /** Hear presence and state: enough for a list. Returns what ends it. */
+  watch(): () => void {
+    return this.#subscribe({
+      [this.topics.conn]: (payload, _, retained) => this.#hearPresence(readPresence(payload), retained),
+      [this.topics.state]: (payload, _, retained) => {
+        const state = readState(payload);
+        this.#state.value = state;
+        this.#noteHeard(state.at_ms, retained);
+      },
+    });
+  }
+
+  /** Hear everything else too: what the device's own page shows. Returns what ends it. */
+  watchClosely(): () => void {
+    this.#close.value = true;
+    const end = this.#subscribe({
+      [this.topics.desc]: (payload) => (this.#description.value = readDescription(payload)),
+      [this.topics.twin]: (payload) => (this.#twin.value = readTwin(payload)),
+      [this.topics.tele]: (payload, topic) => {
+        if (topic === this.topics.joints) this.#hearTelemetry(readTelemetry(payload));
+      },
+      [this.topics.event]: (payload) => this.#hearEvent(readEvent(payload)),
+      [this.topics.ack]: (payload) => this.#hearAck(readAck(payload)),
+    });
+    return () => {
+      end();
+      this.#close.value = false;
+      this.#telemetry.value = null;
+    };
+  }
+
+  /** Hear the acks of one command, from the first that this page has seen. Returns what ends it. */
+  onAck(id: string, receiver: (ack: KnownAck) => void): () => void {
+    const mine = (ack: KnownAck): void => {
+      if (ack.id === id) receiver(ack);
+    };
+    this.#recentAcks.get(id)?.forEach(receiver);
+    this.#ackReceivers.add(mine);
+    return () => this.#ackReceivers.delete(mine);
+  }
+
+  #subscribe(readers: Record<string, (payload: Uint8Array, topic: string, retained: boolean) => void>): () => void {
+    const ends = Object.entries(readers).map(([filter, reader]) =>
+      this.#link.subscribe(filter, (topic, payload, retained) => {
+        try {
+          reader(payload, topic, retained);
+          this.#trouble.value = null;
+        } catch (error) {
+          if (!(error instanceof MessageError)) throw error;
+          this.#trouble.value = error.message;
+        }
+      }),
+    );
+    return () => {
+      for (const end of ends) end();
+    };
+  }
+
+  #hearPresence(presence: Required<Presence>, retained: boolean): void {
+    const known = this.#presence.value;
+    // The will of an older connection may come after the word of a newer one.
+    if (known !== null && presence.session < known.session) return;
+    this.#presence.value = presence;
+    this.#noteHeard(presence.at_ms, retained);
+  }
+
+  #hearTelemetry(message: KnownTelemetry): void {
+    const known = this.#telemetry.value?.message;
+    const wanted = this.#description.value?.joints.length;
+    if (wanted !== undefined && message.position_rad.length !== wanted) {
+      throw new MessageError(`telemetry has ${message.position_rad.length} joints, the description ${wanted}`);
+    }
+    // Older than what is shown, unless the agent has started again and its clock with it.
+    if (known !== undefined && message.tick_ms <= known.tick_ms && message.at_ms <= known.at_ms) return;
+    const at = now();
+    this.#telemetry.value = { message, receivedAt: at };
+    this.#heardAt.value = at;
+    this.history.add(message, at);
+  }
+
+  #hearEvent(event: KnownEvent): void {
+    if (this.#events.value.some((known) => known.id === event.id)) return;
+    this.#events.value = [event, ...this.#events.value].slice(0, EVENTS_KEPT);
+  }
+
+  #hearAck(ack: KnownAck): void {
+    const known = this.#recentAcks.get(ack.id) ?? [];
+    this.#recentAcks.set(ack.id, [...known, ack]);
+    for (const oldest of [...this.#recentAcks.keys()].slice(0, -EVENTS_KEPT)) this.#recentAcks.delete(oldest);
+    for (const receiver of this.#ackReceivers) receiver(ack);
+  }
+
+  /** A retained message was said some time ago: its own time counts, never a later one than now. */
+  #noteHeard(atMs: number, retained: boolean): void {
+    const at = retained ? Math.min(now(), onThisClock(atMs)) : now();
+    if (this.#heardAt.value === null || at > this.#heardAt.value) this.#heardAt.value = at;
+  }
+}

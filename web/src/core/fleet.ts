@@ -1,0 +1,80 @@
+/** All devices that this account may see. */
+import { signal, type ReadonlySignal } from "@preact/signals-core";
+import { sentence, type Api, type Device } from "./api";
+import { DeviceStore } from "./device";
+import { MqttLink, type Link } from "./link";
+
+const REFRESH_MS = 15_000;
+
+export class Fleet {
+  readonly #api: Api;
+  readonly link: Link;
+  readonly #devices = signal<ReadonlyMap<string, DeviceStore> | null>(null);
+  readonly #trouble = signal<string | null>(null);
+  readonly #ends = new Map<string, () => void>();
+  readonly #timer: ReturnType<typeof setInterval>;
+
+  /** By id, in the order of the list; `null` until the first answer. */
+  readonly devices: ReadonlySignal<ReadonlyMap<string, DeviceStore> | null> = this.#devices;
+  /** Why the list could not be read the last time; `null` when it could. */
+  readonly trouble: ReadonlySignal<string | null> = this.#trouble;
+
+  constructor(api: Api, link?: Link) {
+    this.#api = api;
+    this.link = link ?? new MqttLink(() => api.credentials({ purpose: "watch" }));
+    void this.refresh();
+    this.#timer = setInterval(() => void this.refresh(), REFRESH_MS);
+  }
+
+  async refresh(): Promise<void> {
+    try {
+      this.#take(await this.#api.devices());
+      this.#trouble.value = null;
+    } catch (error) {
+      this.#trouble.value = sentence(error);
+    }
+  }
+
+  /** Pair an agent with this account by the code it shows; its devices. Throws `ApiError`. */
+  async claim(code: string): Promise<Device[]> {
+    const devices = await this.#api.claim(code);
+    await this.refresh();
+    return devices;
+  }
+
+  dispose(): void {
+    clearInterval(this.#timer);
+    for (const end of this.#ends.values()) end();
+    this.#ends.clear();
+    this.link.close();
+  }
+
+  #take(list: readonly Device[]): void {
+    const known = this.#devices.value ?? new Map<string, DeviceStore>();
+    const next = new Map<string, DeviceStore>();
+    for (const info of list) {
+      const store = known.get(info.id);
+      if (store === undefined) {
+        const added = new DeviceStore(info, this.#api, this.link);
+        this.#ends.set(info.id, added.watch());
+        next.set(info.id, added);
+      } else {
+        store.update(info);
+        next.set(info.id, store);
+      }
+    }
+    const gone = [...known.keys()].filter((id) => !next.has(id));
+    for (const id of gone) {
+      this.#ends.get(id)?.();
+      this.#ends.delete(id);
+    }
+    const added = [...next.keys()].some((id) => !known.has(id));
+    // Only a changed list is a new list for what draws it.
+    if (added || gone.length > 0 || this.#devices.value === null) {
+      const first = this.#devices.value === null;
+      this.#devices.value = next;
+      // What the broker lets this connection hear was fixed when its credentials were made.
+      if (added && !first) this.link.renew();
+    }
+  }
+}

@@ -1,0 +1,299 @@
+/**
+ * Reads what arrives from the broker: JSON of the contract's types, every number finite, every list of the length it
+ * must have. Unknown fields pass, so that this page still reads a newer robot. Nothing unchecked is ever drawn.
+ */
+import type {
+  Ack,
+  AckStatus,
+  ActionState,
+  Body,
+  Description,
+  Event,
+  Fault,
+  Geometry,
+  Joint,
+  JointTelemetry,
+  LeaseState,
+  Mode,
+  Pose,
+  Presence,
+  Quaternion,
+  Reason,
+  State,
+  StopLatch,
+  Stream,
+  TwinJoint,
+  Vector3,
+} from "./protocol";
+
+/** A message that is not what the contract says; the text names the field. */
+export class MessageError extends Error {
+  override name = "MessageError";
+}
+
+/** Largest message of the contract [bytes]. */
+const MAX_BYTES = 128 * 1024;
+const MAX_JOINTS = 128;
+const MAX_BODIES = 512;
+
+/** Checks one value; `at` is where it stands, for the error's text. */
+export type Check<T> = (value: unknown, at: string) => T;
+
+function fail(at: string, wanted: string): never {
+  throw new MessageError(`${at} is not ${wanted}`);
+}
+
+const number: Check<number> = (value, at) =>
+  typeof value === "number" && Number.isFinite(value) ? value : fail(at, "a finite number");
+
+const count: Check<number> = (value, at) =>
+  Number.isSafeInteger(value) && (value as number) >= 0 ? (value as number) : fail(at, "a whole number from 0");
+
+const text: Check<string> = (value, at) => (typeof value === "string" ? value : fail(at, "text"));
+
+const flag: Check<boolean> = (value, at) => (typeof value === "boolean" ? value : fail(at, "true or false"));
+
+const anything: Check<Record<string, unknown>> = (value, at) =>
+  typeof value === "object" && value !== null && !Array.isArray(value)
+    ? (value as Record<string, unknown>)
+    : fail(at, "an object");
+
+function oneOf<const T extends string>(...names: T[]): Check<T> {
+  return (value, at) => {
+    const found = names.find((name) => name === value);
+    return found ?? fail(at, `one of ${names.join(", ")}`);
+  };
+}
+
+function list<T>(item: Check<T>, longest: number): Check<T[]> {
+  return (value, at) => {
+    if (!Array.isArray(value) || value.length > longest) fail(at, `a list of at most ${longest}`);
+    return value.map((entry, index) => item(entry, `${at}[${index}]`));
+  };
+}
+
+function numbers<T extends number[]>(length: T["length"]): Check<T> {
+  return (value, at) => {
+    if (!Array.isArray(value) || value.length !== length) fail(at, `${length} numbers`);
+    return value.map((entry, index) => number(entry, `${at}[${index}]`)) as T;
+  };
+}
+
+function optional<T>(check: Check<T>, otherwise: T): Check<T> {
+  return (value, at) => (value === undefined ? otherwise : check(value, at));
+}
+
+function nullable<T>(check: Check<T>): Check<T | null> {
+  return (value, at) => (value === undefined || value === null ? null : check(value, at));
+}
+
+type Fields<T> = { [K in keyof T]-?: Check<T[K]> };
+
+function object<T extends object>(fields: Fields<T>): Check<T> {
+  const entries = Object.entries<Check<unknown>>(fields as Record<string, Check<unknown>>);
+  return (value, at) => {
+    const given = anything(value, at);
+    return Object.fromEntries(entries.map(([name, check]) => [name, check(given[name], `${at}.${name}`)])) as T;
+  };
+}
+
+const vector3 = numbers<Vector3>(3);
+const quaternion = numbers<Quaternion>(4);
+const pose = numbers<Pose>(7);
+const mode = oneOf<Mode>("idle", "streaming", "action", "holding", "stopped", "fault");
+
+const presence = object<Required<Presence>>({
+  online: flag,
+  session: count,
+  at_ms: count,
+  software: optional(text, ""),
+});
+
+const joint = object<Joint>({
+  name: text,
+  label: text,
+  lower_rad: number,
+  upper_rad: number,
+  max_velocity_rad_s: number,
+  max_acceleration_rad_s2: number,
+  max_jerk_rad_s3: number,
+  max_effort_nm: number,
+});
+
+const description = object<Required<Description>>({
+  device: text,
+  kind: text,
+  robot_type: text,
+  label: text,
+  joints: optional(list(joint, MAX_JOINTS), []),
+  frames: optional(list(text, MAX_JOINTS), []),
+  capabilities: optional(list(text, MAX_JOINTS), []),
+  streams: optional(list(object<Stream>({ name: text, rate_hz: number }), MAX_JOINTS), []),
+  watchdog_ms: optional(count, 0),
+  max_loop_age_ms: optional(count, 0),
+  simulated: optional(flag, false),
+});
+
+const geometry = object<Geometry>({
+  shape: oneOf("box", "sphere", "capsule", "cylinder", "ellipsoid", "plane"),
+  size_m: vector3,
+  position_m: vector3,
+  quaternion,
+  rgba: quaternion,
+});
+
+const twinJoint = object<Required<TwinJoint>>({
+  name: text,
+  kind: oneOf("hinge", "slide"),
+  axis: vector3,
+  anchor_m: vector3,
+  reference_rad: optional(number, 0),
+});
+
+const body = object<Required<Body>>({
+  name: text,
+  parent: number,
+  position_m: vector3,
+  quaternion,
+  joint: nullable<TwinJoint>(twinJoint),
+  geometries: optional(list(geometry, MAX_BODIES), []),
+});
+
+const twin = object<{ device: string; bodies: Required<Body>[] }>({ device: text, bodies: list(body, MAX_BODIES) });
+
+const state = object<Required<State>>({
+  device: text,
+  at_ms: count,
+  tick_ms: count,
+  mode,
+  epoch: count,
+  stop: nullable(object<StopLatch>({ by: text, reason: text, at_ms: count })),
+  lease: nullable(object<LeaseState>({ holder: text, epoch: count, expires_in_ms: count })),
+  action: nullable<ActionState>(
+    object<Required<ActionState>>({
+      id: text,
+      kind: text,
+      name: optional(text, ""),
+      progress: optional(number, 0),
+    }),
+  ),
+  faults: optional(list(object<Fault>({ code: text, message: text, since_ms: count }), MAX_JOINTS), []),
+});
+
+const measured = list(number, MAX_JOINTS);
+
+const jointTelemetry = object<Required<JointTelemetry>>({
+  tick_ms: count,
+  at_ms: count,
+  sequence: count,
+  mode,
+  position_rad: measured,
+  velocity_rad_s: measured,
+  effort_nm: measured,
+  commanded_rad: measured,
+  frames: optional(list(pose, MAX_JOINTS), []),
+  epoch: optional(count, 0),
+  setpoint_sequence: optional(count, 0),
+  setpoint_sent_ms: optional(number, 0),
+  loop_age_ms: optional(number, 0),
+  limited: optional(list(text, MAX_JOINTS), []),
+});
+
+const event = object<Required<Event>>({
+  id: text,
+  device: text,
+  at_ms: count,
+  kind: text,
+  severity: oneOf("info", "warning", "error"),
+  message: text,
+  data: optional(anything, {}),
+});
+
+const ack = object<Required<Ack>>({
+  id: text,
+  status: oneOf<AckStatus>("received", "accepted", "started", "done", "failed", "expired", "cancelled"),
+  sequence: count,
+  at_ms: count,
+  tick_ms: count,
+  reason: nullable(object<Reason>({ code: text, message: text })),
+  progress: nullable(number),
+  output: optional(text, ""),
+  result: optional(anything, {}),
+});
+
+const decoder = new TextDecoder("utf-8", { fatal: true });
+
+function read<T>(payload: Uint8Array, check: Check<T>, name: string): T {
+  if (payload.byteLength > MAX_BYTES) throw new MessageError(`${name} is longer than ${MAX_BYTES} bytes`);
+  let value: unknown;
+  try {
+    value = JSON.parse(decoder.decode(payload));
+  } catch {
+    throw new MessageError(`${name} is not JSON`);
+  }
+  return check(value, name);
+}
+
+export type KnownDescription = Required<Description>;
+export type KnownBody = Required<Body>;
+export interface KnownTwin {
+  device: string;
+  bodies: KnownBody[];
+}
+export type KnownState = Required<State>;
+export type KnownTelemetry = Required<JointTelemetry>;
+export type KnownAck = Required<Ack>;
+export type KnownEvent = Required<Event>;
+
+/** `conn`. Throws `MessageError`. */
+export function readPresence(payload: Uint8Array): Required<Presence> {
+  return read(payload, presence, "conn");
+}
+
+/** `desc`. Joint ranges must be ranges, and names must differ. Throws `MessageError`. */
+export function readDescription(payload: Uint8Array): KnownDescription {
+  const found = read(payload, description, "desc");
+  for (const one of found.joints) {
+    if (one.lower_rad >= one.upper_rad) fail(`desc: range of ${one.name}`, "a range");
+  }
+  if (new Set(found.joints.map((one) => one.name)).size !== found.joints.length) fail("desc.joints", "of distinct names");
+  return found;
+}
+
+/** `desc/twin`. Parents stand before their children, so that one pass builds the tree. Throws `MessageError`. */
+export function readTwin(payload: Uint8Array): KnownTwin {
+  const found = read(payload, twin, "twin");
+  found.bodies.forEach((one, index) => {
+    if (!Number.isInteger(one.parent) || one.parent < -1 || one.parent >= index) {
+      fail(`twin.bodies[${index}].parent`, "the index of an earlier body");
+    }
+    if (Math.hypot(...one.quaternion) < 1e-6) fail(`twin.bodies[${index}].quaternion`, "a rotation");
+    if (one.joint !== null && Math.hypot(...one.joint.axis) < 1e-6) fail(`twin.bodies[${index}].joint.axis`, "an axis");
+  });
+  return found;
+}
+
+/** `state`. Throws `MessageError`. */
+export function readState(payload: Uint8Array): KnownState {
+  return read(payload, state, "state");
+}
+
+/** `tele/joints`. All four lists are of one length. Throws `MessageError`. */
+export function readTelemetry(payload: Uint8Array): KnownTelemetry {
+  const found = read(payload, jointTelemetry, "telemetry");
+  const length = found.position_rad.length;
+  for (const name of ["velocity_rad_s", "effort_nm", "commanded_rad"] as const) {
+    if (found[name].length !== length) fail(`telemetry.${name}`, `a list of ${length} numbers`);
+  }
+  return found;
+}
+
+/** `event`. Throws `MessageError`. */
+export function readEvent(payload: Uint8Array): KnownEvent {
+  return read(payload, event, "event");
+}
+
+/** `ack`. Throws `MessageError`. */
+export function readAck(payload: Uint8Array): KnownAck {
+  return read(payload, ack, "ack");
+}

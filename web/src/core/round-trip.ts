@@ -1,0 +1,54 @@
+/** The time from sending a setpoint to seeing the telemetry that answers it, on one clock: this page's. */
+import { signal, type ReadonlySignal } from "@preact/signals-core";
+
+export interface RoundTripFigures {
+  latestMs: number;
+  medianMs: number;
+  p95Ms: number;
+  samples: number;
+}
+
+/** Nearest-rank percentile of values in rising order, `share` in 0…1. */
+export function percentile(sorted: readonly number[], share: number): number {
+  const rank = Math.max(1, Math.ceil(share * sorted.length));
+  return sorted[rank - 1] ?? NaN;
+}
+
+/** Figures over the newest samples; `null` until there is one. */
+export class RoundTrip {
+  readonly #window: number;
+  readonly #samples: number[] = [];
+  readonly #figures = signal<RoundTripFigures | null>(null);
+  #lastSequence = 0;
+
+  constructor(window = 200) {
+    this.#window = window;
+  }
+
+  get figures(): ReadonlySignal<RoundTripFigures | null> {
+    return this.#figures;
+  }
+
+  /** Telemetry names a setpoint of ours. Counts once for each sequence, at its first telemetry. */
+  seen(sequence: number, sentMs: number, nowMs: number): void {
+    const tookMs = nowMs - sentMs;
+    if (sequence <= this.#lastSequence || tookMs < 0) return;
+    this.#lastSequence = sequence;
+    this.#samples.push(tookMs);
+    if (this.#samples.length > this.#window) this.#samples.shift();
+    const sorted = this.#samples.toSorted((a, b) => a - b);
+    this.#figures.value = {
+      latestMs: tookMs,
+      medianMs: percentile(sorted, 0.5),
+      p95Ms: percentile(sorted, 0.95),
+      samples: sorted.length,
+    };
+  }
+
+  /** A new lease: sequences start again. */
+  restart(): void {
+    this.#lastSequence = 0;
+    this.#samples.length = 0;
+    this.#figures.value = null;
+  }
+}

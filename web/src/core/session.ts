@@ -1,0 +1,56 @@
+/** Who is signed in. The token of a sign-in link is used once and kept nowhere. */
+import { signal, type ReadonlySignal } from "@preact/signals-core";
+import { ApiError, sentence, type Account, type Api } from "./api";
+
+export type SessionState =
+  | { kind: "checking" }
+  /** `why` says what went wrong with a link, or why the session ended; empty at a first visit. */
+  | { kind: "out"; why: string }
+  | { kind: "in"; account: Account };
+
+export class Session {
+  readonly #api: Api;
+  readonly #state = signal<SessionState>({ kind: "checking" });
+  readonly state: ReadonlySignal<SessionState> = this.#state;
+
+  constructor(api: Api) {
+    this.#api = api;
+  }
+
+  /** Use a link's token, or find the session that the browser already has. */
+  async start(link: string | null): Promise<void> {
+    this.#state.value = { kind: "checking" };
+    try {
+      if (link !== null) await this.#api.signIn(link);
+      // The cookie is what counts from here on: asking proves that the browser has it.
+      this.#state.value = { kind: "in", account: await this.#api.me() };
+    } catch (error) {
+      const firstVisit = link === null && error instanceof ApiError && error.status === 401;
+      this.#state.value = { kind: "out", why: firstVisit ? "" : sentence(error) };
+    }
+  }
+
+  async signOut(): Promise<void> {
+    try {
+      await this.#api.signOut();
+    } finally {
+      this.#state.value = { kind: "out", why: "" };
+    }
+  }
+
+  /** The server no longer knows this session. */
+  ended(why: string): void {
+    if (this.#state.value.kind === "in") this.#state.value = { kind: "out", why };
+  }
+}
+
+/** The token in an address's fragment, `#sign-in=<token>`, or `null`. */
+export function signInToken(hash: string): string | null {
+  const found = /^#sign-in=([^&]+)$/.exec(hash);
+  if (found?.[1] === undefined) return null;
+  try {
+    return decodeURIComponent(found[1]);
+  } catch {
+    return null;
+  }
+}

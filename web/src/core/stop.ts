@@ -1,0 +1,121 @@
+/** Stop: told to the robot by every way there is, again and again, until the robot itself says that it has stopped. */
+import { computed, effect, signal, type ReadonlySignal } from "@preact/signals-core";
+import { sentence, type Api } from "./api";
+import { now } from "./clock";
+import type { DeviceStore } from "./device";
+import type { Link } from "./link";
+import type { Stop } from "./protocol";
+
+export const REPEAT_MS = 200;
+/** No word from the robot for this long: the page must say so, loudly [ms]. */
+export const DOUBT_MS = 1_000;
+/** Publishing goes on this long at most; somebody must have gone to the robot by then [ms]. */
+export const GIVE_UP_MS = 60_000;
+
+export type StopState =
+  | { kind: "clear" }
+  /** Sent and not yet confirmed; `doubtful` once that takes longer than it should. */
+  | { kind: "sending"; doubtful: boolean }
+  | { kind: "latched" }
+  | { kind: "unconfirmed" };
+
+type Pressed = { kind: "sending"; at: number; doubtful: boolean } | { kind: "unconfirmed" };
+
+export class StopSwitch {
+  readonly #api: Api;
+  readonly #device: DeviceStore;
+  readonly #link: Link;
+  readonly #by: string;
+  readonly #pressed = signal<Pressed | null>(null);
+  readonly #resetting = signal(false);
+  readonly #problem = signal<string | null>(null);
+  readonly #watch: () => void;
+  #timer: ReturnType<typeof setInterval> | undefined;
+
+  readonly resetting: ReadonlySignal<boolean> = this.#resetting;
+  /** What went wrong with the last stop or reset; `null` otherwise. */
+  readonly problem: ReadonlySignal<string | null> = this.#problem;
+
+  readonly state = computed<StopState>(() => {
+    const pressed = this.#pressed.value;
+    if (pressed?.kind === "sending") return { kind: "sending", doubtful: pressed.doubtful };
+    if (this.#device.stopped.value) return { kind: "latched" };
+    return pressed === null ? { kind: "clear" } : { kind: "unconfirmed" };
+  });
+
+  constructor(api: Api, device: DeviceStore, link: Link, by: string) {
+    this.#api = api;
+    this.#device = device;
+    this.#link = link;
+    this.#by = by;
+    this.#watch = effect(() => {
+      const latest = device.telemetry.value;
+      const pressed = this.#pressed.value;
+      if (pressed?.kind !== "sending") return;
+      // Only what was said after the press confirms it. `state` comes without a time of arrival: any change of it is new.
+      const seen = latest !== null && latest.receivedAt >= pressed.at && latest.message.mode === "stopped";
+      const told = device.state.value !== this.#stateAtPress && device.state.value?.mode === "stopped";
+      if (seen || told) {
+        queueMicrotask(() => this.#finish(null));
+      }
+    });
+  }
+
+  #stateAtPress: unknown = null;
+
+  /** Latch Stop. May be pressed again at any time. */
+  press(reason = "Stop pressed on the console"): void {
+    this.#stateAtPress = this.#device.state.value;
+    const at = now();
+    this.#problem.value = null;
+    this.#pressed.value = { kind: "sending", at, doubtful: false };
+    const message: Stop = { id: crypto.randomUUID(), by: this.#by.slice(0, 200), reason };
+    clearInterval(this.#timer);
+    this.#timer = setInterval(() => {
+      const age = now() - at;
+      if (age > GIVE_UP_MS) {
+        this.#finish({ kind: "unconfirmed" });
+        return;
+      }
+      if (age > DOUBT_MS) this.#pressed.value = { kind: "sending", at, doubtful: true };
+      this.#publish(message);
+    }, REPEAT_MS);
+    this.#publish(message);
+    this.#api.stop(this.#device.id, reason).then(
+      ({ confirmed }) => {
+        if (confirmed && this.#pressed.value?.kind === "sending" && this.#pressed.value.at === at) this.#finish(null);
+      },
+      (error: unknown) => (this.#problem.value = sentence(error)),
+    );
+  }
+
+  /** Release the latch. Nothing resumes. */
+  async reset(): Promise<void> {
+    this.#resetting.value = true;
+    this.#problem.value = null;
+    try {
+      const { confirmed } = await this.#api.resetStop(this.#device.id);
+      if (!confirmed) this.#problem.value = "The robot has not confirmed the reset yet.";
+      this.#pressed.value = null;
+    } catch (error) {
+      this.#problem.value = sentence(error);
+    } finally {
+      this.#resetting.value = false;
+    }
+  }
+
+  dispose(): void {
+    clearInterval(this.#timer);
+    this.#watch();
+  }
+
+  #publish(message: Stop): void {
+    // Where the broker is out of reach the HTTP call is the other way; the banner says which one failed.
+    this.#link.publish(this.#device.topics.stop, message, 1).catch(() => undefined);
+  }
+
+  #finish(pressed: Pressed | null): void {
+    clearInterval(this.#timer);
+    this.#pressed.value = pressed;
+  }
+}

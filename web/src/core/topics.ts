@@ -1,0 +1,38 @@
+/** Topics, as device_agent/protocol/topics.py has them. `base` is a device's `ts/v1/{space}/{agent}/{device}`. */
+
+export interface DeviceTopics {
+  conn: string;
+  desc: string;
+  twin: string;
+  state: string;
+  /** The filter; the joints' stream is `tele/joints`. */
+  tele: string;
+  joints: string;
+  event: string;
+  ack: string;
+  stop: string;
+  ctl: (epoch: number) => string;
+}
+
+export function deviceTopics(base: string): DeviceTopics {
+  return {
+    conn: `${base.slice(0, base.lastIndexOf("/"))}/conn`,
+    desc: `${base}/desc`,
+    twin: `${base}/desc/twin`,
+    state: `${base}/state`,
+    tele: `${base}/tele/+`,
+    joints: `${base}/tele/joints`,
+    event: `${base}/event`,
+    ack: `${base}/ack`,
+    stop: `${base}/stop`,
+    ctl: (epoch) => `${base}/ctl/${epoch}`,
+  };
+}
+
+/** Whether an MQTT filter covers a topic. */
+export function matches(filter: string, topic: string): boolean {
+  const wanted = filter.split("/");
+  const given = topic.split("/");
+  if (wanted.at(-1) !== "#" && wanted.length !== given.length) return false;
+  return wanted.every((level, index) => level === "#" || (index < given.length && (level === "+" || level === given[index])));
+}

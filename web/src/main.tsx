@@ -1,0 +1,26 @@
+import { render } from "preact";
+import { Api } from "./core/api";
+import { startClock } from "./core/clock";
+import { Session, signInToken } from "./core/session";
+import { App } from "./ui/app";
+import "./style.css";
+
+const api = new Api();
+const session = new Session(api);
+
+/** Take a sign-in token out of the address before anything else can read, show or keep it. */
+function takeToken(): string | null {
+  const token = signInToken(location.hash);
+  if (token !== null) history.replaceState(null, "", `${location.pathname}${location.search}#/`);
+  return token;
+}
+
+startClock();
+void session.start(takeToken());
+addEventListener("hashchange", () => {
+  const token = takeToken();
+  if (token !== null) void session.start(token);
+});
+
+const root = document.getElementById("app");
+if (root !== null) render(<App api={api} session={session} />, root);

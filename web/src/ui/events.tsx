@@ -1,0 +1,32 @@
+import { clock, onThisClock } from "../core/clock";
+import type { DeviceStore } from "../core/device";
+import { texts } from "../texts";
+import { Card } from "./parts";
+
+/** What lasts (faults) and what happened (events), newest first. */
+export function Events({ device }: { device: DeviceStore }) {
+  const events = device.events.value;
+  const faults = device.state.value?.faults ?? [];
+  const age = (atMs: number): string => texts.age(Math.max(0, clock.value - onThisClock(atMs)));
+  return (
+    <Card title={texts.events.title} class="events">
+      {faults.length > 0 && (
+        <ul class="faults" aria-label={texts.events.faults}>
+          {faults.map((fault) => (
+            <li key={fault.code} class="notice bad">
+              <strong>{fault.code}</strong> {fault.message} <span class="quiet">{age(fault.since_ms)}</span>
+            </li>
+          ))}
+        </ul>
+      )}
+      {events.length === 0 && faults.length === 0 && <p class="quiet">{texts.events.none}</p>}
+      <ul class="event-list">
+        {events.map((event) => (
+          <li key={event.id} class={event.severity}>
+            {event.message} <span class="quiet">{age(event.at_ms)}</span>
+          </li>
+        ))}
+      </ul>
+    </Card>
+  );
+}

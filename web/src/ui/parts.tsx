@@ -1,0 +1,67 @@
+/** Small parts that several pages use. */
+import type { ComponentChildren } from "preact";
+import { useId } from "preact/hooks";
+import { clock } from "../core/clock";
+import type { DeviceStore } from "../core/device";
+import { texts } from "../texts";
+
+interface CardProps {
+  title: string;
+  class?: string;
+  /** Beside the title: a note, a choice. */
+  aside?: ComponentChildren;
+  children: ComponentChildren;
+}
+
+export function Card({ title, aside, children, ...rest }: CardProps) {
+  const id = useId();
+  return (
+    <section class={`card ${rest.class ?? ""}`} aria-labelledby={id}>
+      <header class="card-head">
+        <h2 id={id}>{title}</h2>
+        {aside}
+      </header>
+      {children}
+    </section>
+  );
+}
+
+/** Online, stale, offline or unknown, with the age of the device's last word. */
+export function ReachChip({ device, ...rest }: { device: DeviceStore; "data-testid"?: string }) {
+  const reach = device.reach.value;
+  return (
+    <span class={`chip reach-${reach}`} data-status={reach} title={texts.reachExplained[reach]} {...rest}>
+      <span class="dot" aria-hidden="true" />
+      {texts.reach[reach]}
+    </span>
+  );
+}
+
+/** The age of the device's last word; it grows by itself. */
+export function HeardAge({ device }: { device: DeviceStore }) {
+  const heardAt = device.heardAt.value;
+  return <>{heardAt === null ? texts.fleet.never : texts.age(Math.max(0, clock.value - heardAt))}</>;
+}
+
+interface ChoiceProps<T extends string> {
+  label: string;
+  value: T;
+  options: readonly (readonly [T, string])[];
+  onChange: (value: T) => void;
+}
+
+/** One of a few, shown side by side. */
+export function Choice<T extends string>({ label, value, options, onChange }: ChoiceProps<T>) {
+  const name = useId();
+  return (
+    <fieldset class="choice">
+      <legend class="visually-hidden">{label}</legend>
+      {options.map(([option, text]) => (
+        <label key={option} class={option === value ? "chosen" : ""}>
+          <input type="radio" name={name} checked={option === value} onChange={() => onChange(option)} />
+          {text}
+        </label>
+      ))}
+    </fieldset>
+  );
+}

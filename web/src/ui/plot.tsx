@@ -1,0 +1,103 @@
+import { useEffect, useRef, useState } from "preact/hooks";
+import { degrees } from "../core/angles";
+import { now } from "../core/clock";
+import type { DeviceStore } from "../core/device";
+import type { Quantity } from "../core/history";
+import { texts } from "../texts";
+import type { Chart } from "./chart";
+import { Card, Choice } from "./parts";
+import { onColourChange, seriesColour } from "./theme";
+
+const QUANTITIES: readonly Quantity[] = ["position_rad", "velocity_rad_s", "effort_nm"];
+/** Often enough to look alive, seldom enough to leave the sliders their time [ms]. */
+const DRAW_EVERY_MS = 66;
+
+export function Plot({ device }: { device: DeviceStore }) {
+  const joints = device.description.value?.joints ?? [];
+  const [quantity, setQuantity] = useState<Quantity>("position_rad");
+  const [hidden, setHidden] = useState<ReadonlySet<string>>(new Set());
+  const [failed, setFailed] = useState(false);
+  const [repaint, setRepaint] = useState(0);
+  const box = useRef<HTMLDivElement>(null);
+
+  const shown = joints.map((joint, index) => ({ joint, index })).filter(({ joint }) => !hidden.has(joint.name));
+  const wanted = shown.map(({ joint }) => joint.name).join(" ");
+
+  useEffect(() => onColourChange(() => setRepaint((count) => count + 1)), []);
+
+  useEffect(() => {
+    if (box.current === null || wanted === "") return;
+    const element = box.current;
+    let alive = true;
+    let chart: Chart | null = null;
+    let asked = 0;
+    let drawnAt = 0;
+    const indices = shown.map(({ index }) => index);
+    const draw = (at: number): void => {
+      asked = requestAnimationFrame(draw);
+      if (at - drawnAt < DRAW_EVERY_MS) return;
+      drawnAt = at;
+      const [times, ...values] = device.history.columns(quantity, indices, now());
+      const inUnit = quantity === "effort_nm" ? values : values.map((column) => column.map(toDegrees));
+      chart?.draw([times, ...inUnit]);
+    };
+    import("./chart").then(
+      ({ createChart }) => {
+        if (!alive) return;
+        const lines = shown.map(({ joint, index }) => ({ label: joint.label, colour: seriesColour(index) }));
+        chart = createChart(element, lines, texts.plot.unit[quantity]);
+        asked = requestAnimationFrame(draw);
+      },
+      () => setFailed(true),
+    );
+    return () => {
+      alive = false;
+      cancelAnimationFrame(asked);
+      chart?.dispose();
+    };
+    // `shown` is in `wanted`, by name: a new array with the same joints is no reason to build a new chart.
+  }, [device, quantity, wanted, repaint]);
+
+  const toggle = (name: string): void => {
+    const next = new Set(hidden);
+    if (!next.delete(name)) next.add(name);
+    setHidden(next);
+  };
+
+  return (
+    <Card
+      title={texts.plot.title}
+      class="plot"
+      aside={
+        <Choice
+          label={texts.plot.choose}
+          value={quantity}
+          onChange={setQuantity}
+          options={QUANTITIES.map((one) => [one, texts.plot.quantity[one]] as const)}
+        />
+      }
+    >
+      {failed && <p class="notice">{texts.plot.failed}</p>}
+      <div
+        ref={box}
+        class={`chart ${device.live.value ? "" : "old"}`}
+        data-testid="plot"
+        role="img"
+        aria-label={texts.plot.label(texts.plot.quantity[quantity])}
+      />
+      <fieldset class="legend">
+        <legend class="visually-hidden">{texts.plot.joints}</legend>
+        {joints.map((joint, index) => (
+          <label key={joint.name} class={`series-${(index % 8) + 1}`}>
+            <input type="checkbox" checked={!hidden.has(joint.name)} onChange={() => toggle(joint.name)} />
+            {joint.label}
+          </label>
+        ))}
+      </fieldset>
+    </Card>
+  );
+}
+
+function toDegrees(value: number | null): number | null {
+  return value === null ? null : degrees(value);
+}

@@ -1,0 +1,232 @@
+/** The robot in three dimensions. Loaded only where one is looked at; draws only when something has changed. */
+import {
+  BoxGeometry,
+  type BufferGeometry,
+  CapsuleGeometry,
+  Color,
+  CylinderGeometry,
+  DirectionalLight,
+  Group,
+  GridHelper,
+  HemisphereLight,
+  Mesh,
+  MeshBasicMaterial,
+  MeshStandardMaterial,
+  type Material,
+  Object3D,
+  PerspectiveCamera,
+  PlaneGeometry,
+  Scene,
+  SphereGeometry,
+  SRGBColorSpace,
+  Vector3,
+  WebGLRenderer,
+} from "three";
+import { OrbitControls } from "three/examples/jsm/controls/OrbitControls.js";
+import { forward, placed } from "../core/kinematics";
+import type { KnownTwin } from "../core/messages";
+import type { Geometry } from "../core/protocol";
+import type { Targets } from "../core/streamer";
+
+/** No WebGL in this browser. */
+export class NoWebglError extends Error {
+  override name = "NoWebglError";
+}
+
+export interface LiveScene {
+  /** Show the measured pose, and the target's where it differs (`null`: no target). */
+  show(measured: Targets, target: Targets | null): void;
+  /** The page's colours have changed. */
+  recolour(): void;
+  resetView(): void;
+  dispose(): void;
+}
+
+/** Closer to the measured pose than this the target would only hide it [rad]. */
+const GHOST_FROM = 0.005;
+const GHOST_COLOUR = 0x2f8fe0;
+const GHOST_OPACITY = 0.28;
+
+type Robot = Object3D[];
+
+/** Builds the view inside `canvas`. `onFrame` is told of every drawn frame. Throws `NoWebglError`. */
+export function createScene(canvas: HTMLCanvasElement, twin: KnownTwin, onFrame: () => void): LiveScene {
+  let renderer: WebGLRenderer;
+  try {
+    renderer = new WebGLRenderer({ canvas, antialias: true, alpha: true });
+  } catch {
+    throw new NoWebglError();
+  }
+  renderer.outputColorSpace = SRGBColorSpace;
+  const scene = new Scene();
+  const solid = build(scene, twin, solidMaterial);
+  const ghostRoot = new Group();
+  scene.add(ghostRoot);
+  const ghostMaterial = new MeshBasicMaterial({
+    color: GHOST_COLOUR,
+    transparent: true,
+    opacity: GHOST_OPACITY,
+    depthWrite: false,
+  });
+  const ghost = build(ghostRoot, twin, () => ghostMaterial);
+  ghostRoot.visible = false;
+
+  const camera = new PerspectiveCamera(38, 1, 0.01, 100);
+  camera.up.set(0, 0, 1);
+  const controls = new OrbitControls(camera, canvas);
+  controls.enableDamping = false;
+  const home = frame(twin);
+  light(scene, home.radius);
+  let grid = floor(scene, home.radius);
+
+  let asked = 0;
+  const draw = (): void => {
+    asked = 0;
+    renderer.render(scene, camera);
+    onFrame();
+  };
+  const drawSoon = (): void => {
+    if (asked === 0) asked = requestAnimationFrame(draw);
+  };
+  const resetView = (): void => {
+    controls.target.copy(home.centre);
+    camera.position.copy(home.centre).add(new Vector3(1.15, -1.5, 0.75).normalize().multiplyScalar(home.radius * 3.1));
+    controls.update();
+    drawSoon();
+  };
+  const resize = (): void => {
+    const { clientWidth: width, clientHeight: height } = canvas;
+    if (width === 0 || height === 0) return;
+    renderer.setPixelRatio(Math.min(devicePixelRatio, 2));
+    renderer.setSize(width, height, false);
+    camera.aspect = width / height;
+    camera.updateProjectionMatrix();
+    drawSoon();
+  };
+  const observer = new ResizeObserver(resize);
+  observer.observe(canvas);
+  controls.addEventListener("change", drawSoon);
+  resize();
+  resetView();
+
+  return {
+    show(measured, target) {
+      pose(solid, twin, measured);
+      const differs =
+        target !== null && Object.entries(target).some(([name, at]) => Math.abs(at - (measured[name] ?? at)) > GHOST_FROM);
+      ghostRoot.visible = differs;
+      if (differs) pose(ghost, twin, target);
+      drawSoon();
+    },
+    recolour() {
+      scene.remove(grid);
+      grid.dispose();
+      grid = floor(scene, home.radius);
+      drawSoon();
+    },
+    resetView,
+    dispose() {
+      cancelAnimationFrame(asked);
+      observer.disconnect();
+      controls.dispose();
+      scene.traverse((object) => {
+        if (!(object instanceof Mesh)) return;
+        const mesh = object as Mesh<BufferGeometry, Material>;
+        mesh.geometry.dispose();
+        mesh.material.dispose();
+      });
+      grid.dispose();
+      renderer.dispose();
+    },
+  };
+}
+
+function solidMaterial(geometry: Geometry): Material {
+  const [red, green, blue, alpha] = geometry.rgba;
+  return new MeshStandardMaterial({
+    color: new Color().setRGB(red, green, blue, SRGBColorSpace),
+    roughness: 0.55,
+    metalness: 0.1,
+    transparent: alpha < 1,
+    opacity: alpha,
+  });
+}
+
+/** One object for each body, in the twin's order, parents holding their children. */
+function build(root: Object3D, twin: KnownTwin, material: (geometry: Geometry) => Material): Robot {
+  const bodies: Robot = [];
+  for (const body of twin.bodies) {
+    const object = new Group();
+    for (const geometry of body.geometries) {
+      const mesh = new Mesh(shape(geometry), material(geometry));
+      mesh.position.set(...geometry.position_m);
+      const [w, x, y, z] = geometry.quaternion;
+      mesh.quaternion.set(x, y, z, w).normalize();
+      if (geometry.shape === "ellipsoid") mesh.scale.set(...geometry.size_m);
+      object.add(mesh);
+    }
+    (bodies[body.parent] ?? root).add(object);
+    bodies.push(object);
+  }
+  pose(bodies, twin, {});
+  return bodies;
+}
+
+/** MuJoCo's sizes are half sizes, and its capsules and cylinders lie along z; those of three.js along y. */
+function shape({ shape: kind, size_m: [a, b, c] }: Geometry): BufferGeometry {
+  switch (kind) {
+    case "box":
+      return new BoxGeometry(2 * a, 2 * b, 2 * c);
+    case "sphere":
+      return new SphereGeometry(a, 32, 20);
+    case "ellipsoid":
+      return new SphereGeometry(1, 32, 20);
+    case "capsule":
+      return new CapsuleGeometry(a, 2 * b, 10, 28).rotateX(Math.PI / 2);
+    case "cylinder":
+      return new CylinderGeometry(a, a, 2 * b, 36).rotateX(Math.PI / 2);
+    case "plane":
+      return new PlaneGeometry(2 * a || 4, 2 * b || 4);
+  }
+}
+
+function pose(robot: Robot, twin: KnownTwin, positions: Targets): void {
+  twin.bodies.forEach((body, index) => {
+    const { joint } = body;
+    const at = joint === null ? 0 : (positions[joint.name] ?? joint.reference_rad ?? 0);
+    const { position_m, quaternion } = placed(body, at);
+    const [w, x, y, z] = quaternion;
+    robot[index]?.position.set(...position_m);
+    robot[index]?.quaternion.set(x, y, z, w);
+  });
+}
+
+/** Where to look, so that the whole robot is in sight at its reference pose and when it reaches out. */
+function frame(twin: KnownTwin): { centre: Vector3; radius: number } {
+  const points = forward(twin, {}).map(({ position_m }) => new Vector3(...position_m));
+  const base = points[0] ?? new Vector3();
+  const reach = Math.max(0.2, ...points.map((point) => point.distanceTo(base)));
+  return { centre: base.clone().add(new Vector3(0, 0, reach * 0.35)), radius: reach * 0.85 };
+}
+
+function light(scene: Scene, radius: number): void {
+  scene.add(new HemisphereLight(0xffffff, 0x8a94a0, 1.7));
+  const sun = new DirectionalLight(0xffffff, 1.9);
+  sun.position.set(2, -3, 4).multiplyScalar(radius);
+  scene.add(sun);
+  const fill = new DirectionalLight(0xffffff, 0.5);
+  fill.position.set(-3, 2, 1).multiplyScalar(radius);
+  scene.add(fill);
+}
+
+function floor(scene: Scene, radius: number): GridHelper {
+  const style = getComputedStyle(document.documentElement);
+  const line = new Color(style.getPropertyValue("--line-strong").trim());
+  const size = Math.ceil(radius * 2) * 2;
+  const grid = new GridHelper(size, size * 4, line, line);
+  grid.material.transparent = true;
+  grid.material.opacity = 0.45;
+  grid.rotateX(Math.PI / 2);
+  scene.add(grid);
+  return grid;
+}
