@@ -40,6 +40,11 @@ class MujocoDriver:
         self._upper: Floats = np.zeros(0)
         self._frames: list[tuple[bool, int]] = []  # (is a site, index)
 
+    @property
+    def simulated(self) -> bool:
+        """Always: no metal moves."""
+        return True
+
     def connect(self) -> None:
         """Build the world, or join it; the robot stands at home, or where it was left.
 
