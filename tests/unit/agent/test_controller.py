@@ -248,9 +248,7 @@ def test_a_move_reaches_its_target_and_says_so() -> None:
     assert rig.run(0.1) is Mode.IDLE
 
 
-@pytest.mark.parametrize(
-    ("position_rad", "code"), [({"elbow": 3.1}, "out_of_range"), ({"knee": 0.0}, "unknown_joint")]
-)
+@pytest.mark.parametrize(("position_rad", "code"), [({"elbow": 3.1}, "out_of_range"), ({"knee": 0.0}, "unknown_joint")])
 def test_a_move_that_cannot_be_is_refused_whole(position_rad: dict[str, float], code: str) -> None:
     rig = Rig()
     tenure = rig.controller.begin_action(epoch=1, on_lost=lost)
