@@ -1,0 +1,383 @@
+"""A whole device with a toy driver and a broker that is a list: commands in, acks out."""
+
+import hashlib
+import threading
+import time
+import uuid
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from device_agent.ports.clock import CloudClock, tick_ms, wall_ms
+from device_agent.ports.driver import DriverError, Observation
+from device_agent.protocol import codec, signing, topics
+from device_agent.protocol.messages import (
+    Ack,
+    AckStatus,
+    CancelAction,
+    Command,
+    Description,
+    GrantLease,
+    JointTarget,
+    JointTelemetry,
+    Mode,
+    MoveJoints,
+    ReleaseLease,
+    ResetStop,
+    RunMovement,
+    Setpoint,
+    State,
+    Stop,
+    StopDevice,
+    Twin,
+)
+from device_agent.runtime.device import Device
+from device_agent.runtime.journal import Journal
+from tests.unit.agent.test_controller import robot_type
+
+WITHIN_S = 15.0
+
+
+class ToyDriver:
+    """Is where it was told to be."""
+
+    simulated = True
+
+    def __init__(self) -> None:
+        self.position: tuple[float, ...] = (0.0, 0.0)
+        self.broken = False
+
+    def connect(self) -> None:
+        if self.broken:
+            raise DriverError("no answer from the arm; is it switched on?")
+
+    def twin(self) -> Twin | None:
+        return None
+
+    def observe(self) -> Observation:
+        if self.broken:
+            raise DriverError("no answer from the arm; is it switched on?")
+        return Observation(self.position, (0.0, 0.0), (0.0, 0.0), ())
+
+    def send(self, position_rad: Sequence[float]) -> tuple[float, ...]:
+        self.position = tuple(position_rad)
+        return self.position
+
+    def close(self) -> None:
+        pass
+
+
+class Bench:
+    """A device, the cloud's key, and everything the device has said."""
+
+    def __init__(self, folder: Path) -> None:
+        self.key = signing.generate()
+        self.said: list[tuple[str, bytes]] = []
+        self.driver = ToyDriver()
+        self.journal = Journal(folder / "journal.db")
+        self.journal.open(now_ms=wall_ms())
+        self.journal.end_open(now_ms=wall_ms(), tick_ms=tick_ms())
+        self.clock = CloudClock()
+        self.clock.observe(server_ms=wall_ms(), sent_tick_ms=tick_ms(), received_tick_ms=tick_ms())
+        self.number = 0
+        self.device = Device(
+            name="arm",
+            label="Arm",
+            space="s",
+            agent="a",
+            robot_type=robot_type(),
+            driver=self.driver,
+            journal=self.journal,
+            cloud_clock=self.clock,
+            keys={signing.key_id(self.key.public_key()): self.key.public_key()},
+            publish=self.publish,
+        )
+
+    def publish(
+        self,
+        topic: str,
+        payload: bytes,
+        *,
+        qos: int,
+        retain: bool = False,
+        delivered: Callable[[], None] | None = None,
+    ) -> bool:
+        assert qos in {0, 1}
+        assert retain == (topics.parse(topic).kind in {topics.DESC, topics.STATE})
+        self.said.append((topic, payload))
+        if delivered is not None:
+            delivered()
+        return True
+
+    def command(self, request: Any, *, epoch: int = 0, command_id: str | None = None, **changes: Any) -> str:
+        self.number += 1
+        fields: dict[str, Any] = {
+            "id": command_id or f"c{self.number}-{uuid.uuid4().hex[:8]}",
+            "space": "s",
+            "agent": "a",
+            "device": "arm",
+            "issued_at_ms": wall_ms(),
+            "ttl_ms": 10_000,
+            "who": "ann",
+            "epoch": epoch,
+            "request": request,
+        }
+        command = Command(**(fields | changes))
+        self.receive(topics.CMD, signing.sign(codec.encode(command), self.key))
+        return command.id
+
+    def receive(self, kind: str, payload: bytes, name: str = "") -> None:
+        self.device.receive(topics.Topic("s", "a", "arm", kind, name), payload)
+
+    def setpoint(self, epoch: int, sequence: int, elbow: float = 2.0) -> None:
+        target = JointTarget(position_rad={"elbow": elbow})
+        setpoint = Setpoint(epoch=epoch, sequence=sequence, echo_tick_ms=tick_ms(), sent_ms=0.5, target=target)
+        self.receive(topics.CTL, codec.encode(setpoint), str(epoch))
+
+    def heard(self, kind: str, message: type[Any], name: str = "") -> list[Any]:
+        wanted = topics.device("s", "a", "arm", kind, name)
+        return [codec.decode(payload, message) for topic, payload in list(self.said) if topic == wanted]
+
+    def acks(self, command: str) -> list[Ack]:
+        return [ack for ack in self.heard(topics.ACK, Ack) if ack.id == command]
+
+    def end(self, command: str) -> Ack:
+        ended: Ack = eventually(lambda: next((ack for ack in self.acks(command) if ack.status.terminal), None))
+        return ended
+
+    def telemetry(self) -> JointTelemetry:
+        seen: JointTelemetry = eventually(lambda: self.heard(topics.TELE, JointTelemetry, "joints")[-1:])[0]
+        return seen
+
+
+def eventually(probe: Callable[[], Any]) -> Any:
+    deadline_s = time.monotonic() + WITHIN_S
+    while time.monotonic() < deadline_s:
+        if found := probe():
+            return found
+        time.sleep(0.01)
+    pytest.fail("it never happened")
+
+
+@pytest.fixture
+def bench(tmp_path: Path):
+    bench = Bench(tmp_path)
+    bench.device.start()
+    bench.device.link_changed(True)
+    yield bench
+    bench.device.stop()
+    bench.journal.close()
+
+
+def script(source: str) -> RunMovement:
+    digest = hashlib.sha256(source.encode()).hexdigest()
+    return RunMovement(robot_type="toy", name="dance", version=1, sha256=digest, source=source)
+
+
+def test_it_introduces_itself_when_the_link_comes_up(bench: Bench) -> None:
+    described: Description = eventually(lambda: bench.heard(topics.DESC, Description))[0]
+    assert [joint.name for joint in described.joints] == ["shoulder", "elbow"]
+    state: State = eventually(lambda: bench.heard(topics.STATE, State))[0]
+    assert state.mode is Mode.IDLE
+    assert bench.telemetry().position_rad == (0.0, 0.0)
+
+
+def test_an_action_is_accepted_started_and_done_in_this_order(bench: Bench) -> None:
+    ack = bench.end(bench.command(MoveJoints(position_rad={"elbow": 0.2}, speed=1.0), epoch=1))
+    assert ack.status is AckStatus.DONE
+    assert ack.result["position_rad"]["elbow"] == pytest.approx(0.2, abs=1e-3)
+    acks = bench.acks(ack.id)
+    assert [ack.status for ack in acks] == [AckStatus.ACCEPTED, AckStatus.STARTED, AckStatus.DONE]
+    assert [ack.sequence for ack in acks] == sorted({ack.sequence for ack in acks})
+    assert bench.driver.position[1] == pytest.approx(0.2, abs=1e-3)
+
+
+def test_a_command_runs_once_however_often_it_arrives(bench: Bench) -> None:
+    move = MoveJoints(position_rad={"elbow": 0.2}, speed=1.0)
+    first = bench.end(bench.command(move, epoch=1, command_id="same"))
+    bench.end(bench.command(MoveJoints(position_rad={"elbow": 0.0}, speed=1.0), epoch=1))
+    bench.command(move, epoch=1, command_id="same")
+    eventually(lambda: len(bench.acks("same")) == 4)
+    assert bench.acks("same")[-1] == first
+    assert bench.driver.position[1] == pytest.approx(0.0, abs=1e-3)
+
+
+@pytest.mark.parametrize(
+    ("changes", "code", "status"),
+    [
+        ({"issued_at_ms": wall_ms() - 3_600_000}, "expired", AckStatus.EXPIRED),
+        ({"issued_at_ms": wall_ms() + 3_600_000}, "from_the_future", AckStatus.FAILED),
+    ],
+)
+def test_a_command_out_of_its_time_does_not_run(
+    bench: Bench, changes: dict[str, Any], code: str, status: AckStatus
+) -> None:
+    ack = bench.end(bench.command(MoveJoints(position_rad={"elbow": 0.2}), epoch=1, **changes))
+    assert (ack.status, ack.reason and ack.reason.code) == (status, code)
+    assert bench.driver.position == (0.0, 0.0)
+
+
+def test_without_the_clouds_time_nothing_that_moves_is_obeyed(bench: Bench) -> None:
+    bench.clock.__init__()  # type: ignore[misc]
+    ack = bench.end(bench.command(MoveJoints(position_rad={"elbow": 0.2}), epoch=1))
+    assert ack.reason is not None
+    assert ack.reason.code == "no_clock"
+
+
+@pytest.mark.parametrize("changes", [{"space": "x"}, {"agent": "x"}, {"device": "x"}])
+def test_a_command_for_somebody_else_is_not_even_answered(bench: Bench, changes: dict[str, str]) -> None:
+    foreign = bench.command(MoveJoints(position_rad={"elbow": 0.2}), epoch=1, **changes)
+    bench.end(bench.command(GrantLease(holder="ann", lease_ms=5000), epoch=1))
+    assert bench.acks(foreign) == []
+    assert bench.device.refusals == {"wrong_address": 1}
+
+
+def test_what_the_cloud_did_not_sign_is_not_obeyed(bench: Bench) -> None:
+    bench.key = signing.generate()
+    bench.command(GrantLease(holder="eve", lease_ms=5000), epoch=9)
+    bench.receive(topics.CMD, b"{}")
+    eventually(lambda: bench.device.refusals == {"bad_signature": 1, "malformed": 1})
+    assert bench.heard(topics.ACK, Ack) == []
+
+
+def test_streaming_needs_the_lease_and_moves_the_device(bench: Bench) -> None:
+    bench.setpoint(1, 1)
+    assert bench.device.refusals == {"no_lease": 1}
+    bench.end(bench.command(GrantLease(holder="ann", lease_ms=60_000), epoch=1))
+    for sequence in range(1, 40):
+        bench.setpoint(1, sequence)
+        time.sleep(0.02)
+    assert bench.driver.position[1] > 0.1
+    assert bench.telemetry().epoch == 1
+    assert bench.telemetry().setpoint_sequence > 1
+    state: State = eventually(lambda: [s for s in bench.heard(topics.STATE, State) if s.lease])[-1]
+    assert state.lease is not None
+    assert state.lease.holder == "ann"
+
+
+def test_an_epoch_in_the_topic_that_differs_from_the_message_is_refused(bench: Bench) -> None:
+    bench.end(bench.command(GrantLease(holder="ann", lease_ms=60_000), epoch=2))
+    setpoint = Setpoint(
+        epoch=2, sequence=1, echo_tick_ms=tick_ms(), sent_ms=0, target=JointTarget(position_rad={"elbow": 1})
+    )
+    bench.receive(topics.CTL, codec.encode(setpoint), "1")
+    assert bench.device.refusals == {"no_lease": 1}
+
+
+def test_stop_needs_no_lease_and_survives_a_restart(bench: Bench, tmp_path: Path) -> None:
+    running = bench.command(script("wait(600)"), epoch=1)
+    eventually(lambda: [ack for ack in bench.acks(running) if ack.status is AckStatus.STARTED])
+    bench.receive(topics.STOP, codec.encode(Stop(id="s1", by="bob", reason="smoke")))
+    ack = bench.end(running)
+    assert ack.status is AckStatus.FAILED
+    assert ack.reason is not None
+    assert ack.reason.code == "stopped"
+    state: State = eventually(lambda: [s for s in bench.heard(topics.STATE, State) if s.stop])[-1]
+    assert state.stop is not None
+    assert state.stop.by == "bob"
+    assert state.mode is Mode.STOPPED
+    refused = bench.end(bench.command(MoveJoints(position_rad={"elbow": 0.2}), epoch=2))
+    assert refused.reason is not None
+    assert refused.reason.code == "stopped"
+    again = Bench(tmp_path)
+    again.device.start()
+    eventually(lambda: again.telemetry().mode is Mode.STOPPED)
+    again.end(again.command(ResetStop()))
+    assert again.end(again.command(MoveJoints(position_rad={"elbow": 0.1}), epoch=3)).status is AckStatus.DONE
+    again.device.stop()
+    again.journal.close()
+
+
+def test_a_signed_stop_is_obeyed_however_late(bench: Bench) -> None:
+    ack = bench.end(bench.command(StopDevice(reason="late"), issued_at_ms=1))
+    assert ack.status is AckStatus.DONE
+    eventually(lambda: bench.telemetry().mode is Mode.STOPPED)
+
+
+def test_a_second_action_is_refused_while_one_runs_and_the_first_can_be_cancelled(bench: Bench) -> None:
+    first = bench.command(script("print('hello')\nwait(600)"), epoch=1)
+    eventually(lambda: [ack for ack in bench.acks(first) if ack.status is AckStatus.STARTED])
+    second = bench.end(bench.command(MoveJoints(position_rad={"elbow": 0.2}), epoch=1))
+    assert second.reason is not None
+    assert second.reason.code == "busy"
+    eventually(lambda: [ack for ack in bench.acks(first) if "hello" in ack.output])
+    assert bench.end(bench.command(CancelAction(action="nobody"))).status is AckStatus.FAILED
+    assert bench.end(bench.command(CancelAction(action=first))).status is AckStatus.DONE
+    cancelled = bench.end(first)
+    assert cancelled.status is AckStatus.CANCELLED
+    assert cancelled.output == "hello\n"
+    assert bench.end(bench.command(MoveJoints(position_rad={"elbow": 0.1}), epoch=1)).status is AckStatus.DONE
+
+
+def test_a_script_with_another_hash_or_of_another_robot_does_not_run(bench: Bench) -> None:
+    good = script("print(1)")
+    forged = RunMovement(robot_type="toy", name="dance", version=1, sha256=good.sha256, source="print(2)")
+    other = RunMovement(robot_type="nao", name="dance", version=1, sha256=good.sha256, source=good.source)
+    codes = []
+    for order in (forged, other):
+        reason = bench.end(bench.command(order, epoch=1)).reason
+        codes.append(reason and reason.code)
+    assert codes == ["wrong_hash", "wrong_type"]
+
+
+def test_the_release_of_a_lease_ends_its_action(bench: Bench) -> None:
+    bench.end(bench.command(GrantLease(holder="ann", lease_ms=60_000), epoch=1))
+    running = bench.command(script("wait(600)"), epoch=1)
+    eventually(lambda: [ack for ack in bench.acks(running) if ack.status is AckStatus.STARTED])
+    bench.end(bench.command(ReleaseLease(), epoch=1))
+    reason = bench.end(running).reason
+    assert reason is not None
+    assert reason.code == "lease_lost"
+
+
+def test_a_lost_link_ends_what_runs_and_the_answer_is_sent_when_it_is_back(bench: Bench) -> None:
+    running = bench.command(script("wait(600)"), epoch=1)
+    eventually(lambda: [ack for ack in bench.acks(running) if ack.status is AckStatus.STARTED])
+    gone = threading.Event()
+
+    def deaf(*_args: Any, **_options: Any) -> bool:
+        gone.set()
+        return False
+
+    bench.device._publish = deaf
+    bench.device.link_changed(False)
+    assert gone.wait(WITHIN_S)
+    bench.device._publish = bench.publish
+    bench.device.link_changed(True)
+    reason = bench.end(running).reason
+    assert reason is not None
+    assert reason.code == "link_lost"
+
+
+def test_a_driver_that_stops_answering_is_a_fault_that_ends_when_it_answers(bench: Bench) -> None:
+    bench.driver.broken = True
+    state: State = eventually(lambda: [s for s in bench.heard(topics.STATE, State) if s.faults])[-1]
+    assert "switched on" in state.faults[0].message
+    refused = bench.end(bench.command(MoveJoints(position_rad={"elbow": 0.2}), epoch=1)).reason
+    assert refused is not None
+    assert refused.code == "fault"
+    bench.driver.broken = False
+    eventually(lambda: (s := bench.heard(topics.STATE, State)) and not s[-1].faults)
+    assert bench.end(bench.command(MoveJoints(position_rad={"elbow": 0.1}), epoch=1)).status is AckStatus.DONE
+
+
+def test_a_lease_from_before_a_restart_is_not_obeyed(bench: Bench, tmp_path: Path) -> None:
+    bench.end(bench.command(GrantLease(holder="ann", lease_ms=60_000), epoch=4))
+    again = Bench(tmp_path)
+    again.device.start()
+    ack = again.end(again.command(GrantLease(holder="ann", lease_ms=60_000), epoch=4))
+    assert ack.reason is not None
+    assert ack.reason.code == "lease_ended"
+    assert again.end(again.command(GrantLease(holder="ann", lease_ms=60_000), epoch=5)).status is AckStatus.DONE
+    again.device.stop()
+    again.journal.close()
+
+
+def test_garbage_is_counted_and_harms_nothing(bench: Bench) -> None:
+    for kind in (topics.CTL, topics.STOP, topics.CMD):
+        for payload in (b"", b"\x00" * 10, b'{"id":1}', b"NaN"):
+            bench.receive(kind, payload, "1")
+    eventually(lambda: bench.device.refusals == {"malformed": 12})
+    assert bench.telemetry().mode is Mode.IDLE
