@@ -28,15 +28,6 @@ export default tseslint.config(
     },
   },
   {
-    // Generated from the wire contract: an index signature there says what the contract says.
-    files: ["src/core/protocol.ts"],
-    rules: {
-      "@typescript-eslint/consistent-indexed-object-style": "off",
-      "@typescript-eslint/consistent-type-definitions": "off",
-      "@typescript-eslint/array-type": "off",
-    },
-  },
-  {
     files: ["scripts/**", "*.config.js"],
     languageOptions: { globals: { URL: "readonly", process: "readonly" } },
   },

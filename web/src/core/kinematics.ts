@@ -1,10 +1,14 @@
 /** Forward kinematics of a twin, as MuJoCo does it: where each body is when its joint stands at a position. */
 import type { KnownBody, KnownTwin } from "./messages";
-import type { Quaternion, Vector3 } from "./protocol";
+
+export type Vector3 = [number, number, number];
+/** w, x, y, z */
+export type Quaternion = [number, number, number, number];
+/** position x, y, z [m] and quaternion w, x, y, z of a frame in the robot's base */
+export type Pose = [number, number, number, number, number, number, number];
 
 export interface Placement {
   position_m: Vector3;
-  /** w, x, y, z */
   quaternion: Quaternion;
 }
 

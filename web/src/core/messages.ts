@@ -2,6 +2,7 @@
  * Reads what arrives from the broker: JSON of the contract's types, every number finite, every list of the length it
  * must have. Unknown fields pass, so that this page still reads a newer robot. Nothing unchecked is ever drawn.
  */
+import type { Pose, Quaternion, Vector3 } from "./kinematics";
 import type {
   Ack,
   AckStatus,
@@ -15,15 +16,12 @@ import type {
   JointTelemetry,
   LeaseState,
   Mode,
-  Pose,
   Presence,
-  Quaternion,
   Reason,
   State,
   StopLatch,
   Stream,
   TwinJoint,
-  Vector3,
 } from "./protocol";
 
 /** A message that is not what the contract says; the text names the field. */

@@ -1,12 +1,11 @@
-// Types of the wire contract, as device_agent/protocol/messages.py has them. Only types: what arrives is checked
-// against them in messages.ts before anything else sees it. SI units and radians; the unit is in the field's name.
+// Generated from docs/asyncapi.json by `make contract`; do not edit.
+// Only types: what arrives is checked in messages.ts before anything else sees it. SI units and radians.
 
-export type Vector3 = [number, number, number];
-/** w, x, y, z (a colour: red, green, blue, alpha) */
-export type Quaternion = [number, number, number, number];
-/** position x, y, z [m] and quaternion w, x, y, z of a frame in the robot's base */
-export type Pose = [number, number, number, number, number, number, number];
-
+/**
+ * `conn`: the agent's link to the broker. Retained, and the will.
+ *
+ * `session` rises at each connection; an `online=False` with a lower session than one already seen is old news.
+ */
 export interface Presence {
   online: boolean;
   session: number;
@@ -14,25 +13,12 @@ export interface Presence {
   software?: string;
 }
 
-export interface Joint {
-  name: string;
-  label: string;
-  lower_rad: number;
-  upper_rad: number;
-  max_velocity_rad_s: number;
-  max_acceleration_rad_s2: number;
-  max_jerk_rad_s3: number;
-  max_effort_nm: number;
-}
-
-export interface Stream {
-  name: string;
-  rate_hz: number;
-}
-
+/** `desc`: what the device is and can do. Retained. */
 export interface Description {
+  /** letters, digits, _ and -, 1 to 64 of them */
   device: string;
   kind: string;
+  /** letters, digits, _ and -, 1 to 64 of them */
   robot_type: string;
   label: string;
   joints?: Joint[];
@@ -44,64 +30,68 @@ export interface Description {
   simulated?: boolean;
 }
 
-export interface Geometry {
-  shape: "box" | "sphere" | "capsule" | "cylinder" | "ellipsoid" | "plane";
-  size_m: Vector3;
-  position_m: Vector3;
-  quaternion: Quaternion;
-  rgba: Quaternion;
-}
-
-export interface TwinJoint {
+/** One joint and the limits that the agent enforces. */
+export interface Joint {
   name: string;
-  kind: "hinge" | "slide";
-  axis: Vector3;
-  anchor_m: Vector3;
-  reference_rad?: number;
+  label: string;
+  lower_rad: number;
+  upper_rad: number;
+  max_velocity_rad_s: number;
+  max_acceleration_rad_s2: number;
+  max_jerk_rad_s3: number;
+  max_effort_nm: number;
 }
 
-export interface Body {
+/** One measurement stream, published at `tele/{name}`. */
+export interface Stream {
+  /** letters, digits, _ and -, 1 to 64 of them */
   name: string;
-  parent: number;
-  position_m: Vector3;
-  quaternion: Quaternion;
-  joint?: TwinJoint | null;
-  geometries?: Geometry[];
+  rate_hz: number;
 }
 
+/** `desc/twin`: the drawing from which a page builds its live view. Retained. */
 export interface Twin {
+  /** letters, digits, _ and -, 1 to 64 of them */
   device: string;
   bodies: Body[];
 }
 
-export type Mode = "idle" | "streaming" | "action" | "holding" | "stopped" | "fault";
-
-export interface StopLatch {
-  by: string;
-  reason: string;
-  at_ms: number;
+/** One body of the tree; `parent` is its index in `Twin.bodies`, -1 for a root. */
+export interface Body {
+  name: string;
+  parent: number;
+  position_m: [number, number, number];
+  quaternion: [number, number, number, number];
+  joint?: TwinJoint | null;
+  geometries?: Geometry[];
 }
 
-export interface LeaseState {
-  holder: string;
-  epoch: number;
-  expires_in_ms: number;
+/** The joint by which a body turns or slides: axis and anchor in the body's own frame. */
+export interface TwinJoint {
+  name: string;
+  kind: "hinge" | "slide";
+  axis: [number, number, number];
+  anchor_m: [number, number, number];
+  reference_rad?: number;
 }
 
-export interface ActionState {
-  id: string;
-  kind: string;
-  name?: string;
-  progress?: number;
+/**
+ * One primitive shape of a body.
+ *
+ * `size_m` is as MuJoCo gives it: box half extents; sphere radius; capsule and
+ * cylinder radius, half length along z; ellipsoid radii; plane half extents.
+ */
+export interface Geometry {
+  shape: "box" | "capsule" | "cylinder" | "ellipsoid" | "plane" | "sphere";
+  size_m: [number, number, number];
+  position_m: [number, number, number];
+  quaternion: [number, number, number, number];
+  rgba: [number, number, number, number];
 }
 
-export interface Fault {
-  code: string;
-  message: string;
-  since_ms: number;
-}
-
+/** `state`: the current condition. Retained; on change and every 30 s, at most once a second. */
 export interface State {
+  /** letters, digits, _ and -, 1 to 64 of them */
   device: string;
   at_ms: number;
   tick_ms: number;
@@ -113,6 +103,46 @@ export interface State {
   faults?: Fault[];
 }
 
+/** What the device is doing at this moment. */
+export type Mode = "action" | "fault" | "holding" | "idle" | "stopped" | "streaming";
+
+/** Who stopped the device, and when. There until somebody who may resets it. */
+export interface StopLatch {
+  by: string;
+  reason: string;
+  at_ms: number;
+}
+
+/** The lease that the device obeys now. */
+export interface LeaseState {
+  holder: string;
+  epoch: number;
+  expires_in_ms: number;
+}
+
+/** The action that the device runs now. */
+export interface ActionState {
+  /** letters, digits, _ and -, 1 to 64 of them */
+  id: string;
+  kind: string;
+  name?: string;
+  progress?: number;
+}
+
+/** Something wrong that lasts. */
+export interface Fault {
+  code: string;
+  message: string;
+  since_ms: number;
+}
+
+/**
+ * `tele/joints`: all joints of one device at one tick, in the order of `Description.joints`.
+ *
+ * `setpoint_sequence` is the newest setpoint the control loop has taken (0: none in this lease), and
+ * `setpoint_sent_ms` the operator's own clock in it, so that the page measures its round trip on one clock.
+ * `limited` names what changed a setpoint on its way to the motors.
+ */
 export interface JointTelemetry {
   tick_ms: number;
   at_ms: number;
@@ -122,7 +152,7 @@ export interface JointTelemetry {
   velocity_rad_s: number[];
   effort_nm: number[];
   commanded_rad: number[];
-  frames?: Pose[];
+  frames?: [number, number, number, number, number, number, number][];
   epoch?: number;
   setpoint_sequence?: number;
   setpoint_sent_ms?: number;
@@ -130,24 +160,22 @@ export interface JointTelemetry {
   limited?: string[];
 }
 
+/** `event`: a fact that happened, in the past tense. Stored. */
 export interface Event {
+  /** letters, digits, _ and -, 1 to 64 of them */
   id: string;
+  /** letters, digits, _ and -, 1 to 64 of them */
   device: string;
   at_ms: number;
   kind: string;
-  severity: "info" | "warning" | "error";
+  severity: "error" | "info" | "warning";
   message: string;
-  data?: { [key: string]: unknown };
+  data?: Record<string, unknown>;
 }
 
-export type AckStatus = "received" | "accepted" | "started" | "done" | "failed" | "expired" | "cancelled";
-
-export interface Reason {
-  code: string;
-  message: string;
-}
-
+/** `ack`: the device's answer to one command. `sequence` orders the acks of one command. */
 export interface Ack {
+  /** letters, digits, _ and -, 1 to 64 of them */
   id: string;
   status: AckStatus;
   sequence: number;
@@ -156,14 +184,99 @@ export interface Ack {
   reason?: Reason | null;
   progress?: number | null;
   output?: string;
-  result?: { [key: string]: unknown };
+  result?: Record<string, unknown>;
 }
 
-export interface JointTarget {
-  kind: "joints";
-  position_rad: { [joint: string]: number };
+/** How far a command has come. The last four are terminal. */
+export type AckStatus = "accepted" | "cancelled" | "done" | "expired" | "failed" | "received" | "started";
+
+/** Why a command ended as it did: a code for programs, a sentence for people that says what to do. */
+export interface Reason {
+  code: string;
+  message: string;
 }
 
+/**
+ * `cmd`: a request to a device; travels inside `signing.Signed`.
+ *
+ * `space`, `agent` and `device` bind it to one device, `epoch` to one lease; it runs at most once per
+ * `id` and never later than `issued_at_ms + ttl_ms` on the cloud's clock, which the agent reads as an offset to
+ * its own monotonic clock.
+ */
+export interface Command {
+  /** letters, digits, _ and -, 1 to 64 of them */
+  id: string;
+  /** letters, digits, _ and -, 1 to 64 of them */
+  space: string;
+  /** letters, digits, _ and -, 1 to 64 of them */
+  agent: string;
+  /** letters, digits, _ and -, 1 to 64 of them */
+  device: string;
+  issued_at_ms: number;
+  ttl_ms: number;
+  who: string;
+  epoch: number;
+  request: GrantLease | ReleaseLease | RunMovement | MoveJoints | CancelAction | StopDevice | ResetStop;
+}
+
+/** Control of the device now belongs to `holder`, for `lease_ms` from the moment of arrival. Also renews. */
+export interface GrantLease {
+  kind: "grant_lease";
+  holder: string;
+  lease_ms: number;
+}
+
+/** Nobody controls the device any more; what moves is brought to a hold. */
+export interface ReleaseLease {
+  kind: "release_lease";
+}
+
+/** Run one movement script. The source must hash to `sha256` (hex). */
+export interface RunMovement {
+  kind: "run_movement";
+  /** letters, digits, _ and -, 1 to 64 of them */
+  robot_type: string;
+  /** letters, digits, _ and -, 1 to 64 of them */
+  name: string;
+  version: number;
+  sha256: string;
+  source: string;
+  parameters?: Record<string, unknown>;
+}
+
+/** Move to joint positions and end there. */
+export interface MoveJoints {
+  kind: "move_joints";
+  /** joint name → position [rad]; joints not named keep their target */
+  position_rad: Record<string, number>;
+  /** share of each joint's velocity limit */
+  speed?: number;
+}
+
+/** End the named action; the device holds where it is. */
+export interface CancelAction {
+  kind: "cancel_action";
+  /** letters, digits, _ and -, 1 to 64 of them */
+  action: string;
+}
+
+/** Latch Stop. */
+export interface StopDevice {
+  kind: "stop_device";
+  reason?: string;
+}
+
+/** Release the Stop latch. Nothing resumes. */
+export interface ResetStop {
+  kind: "reset_stop";
+}
+
+/**
+ * `ctl/{epoch}`: one streamed setpoint. The newest wins; `sequence` starts at 1 in each lease.
+ *
+ * `echo_tick_ms` is `tick_ms` of the last telemetry the operator saw: its age on the robot's own clock is the
+ * loop age. `sent_ms` is any clock of the operator's [ms]; telemetry echoes it.
+ */
 export interface Setpoint {
   epoch: number;
   sequence: number;
@@ -172,8 +285,26 @@ export interface Setpoint {
   target: JointTarget;
 }
 
+/** Go to these joint positions, as fast as limits allow. */
+export interface JointTarget {
+  kind: "joints";
+  /** joint name → position [rad]; joints not named keep their target */
+  position_rad: Record<string, number>;
+}
+
+/** `stop`: latch Stop now. Needs no lease and no signature: the broker lets only those publish it who may. */
 export interface Stop {
+  /** letters, digits, _ and -, 1 to 64 of them */
   id: string;
   by: string;
   reason?: string;
+}
+
+/** Ed25519 over `telescope/v1/command` + line feed + the exact bytes of `body`. */
+export interface Signed {
+  /** Id of the signing key. */
+  key: string;
+  /** base64url, without padding. */
+  signature: string;
+  body: Command;
 }

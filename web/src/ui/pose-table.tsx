@@ -1,8 +1,7 @@
 import { useState } from "preact/hooks";
 import { degrees } from "../core/angles";
 import type { DeviceStore } from "../core/device";
-import { rollPitchYaw, unit } from "../core/kinematics";
-import type { Pose } from "../core/protocol";
+import { rollPitchYaw, unit, type Pose } from "../core/kinematics";
 import { texts } from "../texts";
 import { Card, Choice } from "./parts";
 
