@@ -4,8 +4,9 @@ from collections.abc import Mapping
 from pathlib import Path
 
 from device_agent.drivers.mujoco.driver import MujocoDriver
+from device_agent.drivers.mujoco.snapshot import Snapshot
 from device_agent.drivers.mujoco.twin import draw
-from device_agent.drivers.mujoco.world import Placement, Snapshot, World
+from device_agent.drivers.mujoco.world import Placement, World
 from device_agent.ports.driver import DriverError
 from device_agent.protocol.robot_type import RobotType
 
@@ -18,7 +19,7 @@ def create(robot_type: RobotType, folder: Path, options: Mapping[str, object], d
     """The driver of one robot in a world of its own: the factory that ``drivers.load("mujoco")`` gives.
 
     Options (text): ``scene``, an MJCF file instead of the manifest's, relative to the robot's folder; ``trace``, a file
-    to which the world appends its true state at 100 Hz (see ``World``).
+    to which the world appends its true state at 100 Hz (see ``trace.Trace``).
 
     Raises:
         DriverError: An option is unknown or not text.

@@ -9,7 +9,8 @@ import mujoco
 import numpy as np
 
 from device_agent.drivers.mujoco import twin
-from device_agent.drivers.mujoco.world import SCALAR_JOINTS, STALE_S, Floats, Ints, Snapshot, World
+from device_agent.drivers.mujoco.snapshot import Floats, Ints, Snapshot
+from device_agent.drivers.mujoco.world import SCALAR_JOINTS, STALE_S, World
 from device_agent.ports.driver import DriverError, Observation
 from device_agent.protocol.messages import Pose, Twin
 from device_agent.protocol.robot_type import RobotType
@@ -48,10 +49,13 @@ class MujocoDriver:
     def connect(self) -> None:
         """Build the world, or join it; the robot stands at home, or where it was left.
 
+        Connecting again after the simulation became unstable begins it anew, with every robot of the world at home.
+
         Raises:
             DriverError: The model cannot be built, or lacks a joint, actuator or frame of the manifest.
         """
         if self._connected:
+            self._world.recover()
             return
         self._world.open()
         try:

@@ -4,21 +4,19 @@ No lock is held while stepping. A driver hands in its newest command by swapping
 ``Snapshot`` that the thread puts in place after each group of steps.
 """
 
-import json
 import logging
 import threading
 import time
 from collections.abc import Mapping, Sequence
-from contextlib import suppress
-from dataclasses import dataclass, field
-from io import TextIOWrapper
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import mujoco
 import numpy as np
-import numpy.typing as npt
 
+from device_agent.drivers.mujoco.snapshot import Floats, Ints, Snapshot
+from device_agent.drivers.mujoco.trace import Trace
 from device_agent.ports.driver import DriverError
 
 log = logging.getLogger(__name__)
@@ -30,15 +28,11 @@ MAX_CATCH_UP_S = 0.04
 """Furthest that simulated time may fall behind before it slips."""
 STALE_S = 2.0
 """Age at which a snapshot of a running world means that its thread hangs."""
-TRACE_S = 0.01
 WARN_EVERY_S = 10.0
 _STOP_TIMEOUT_S = 5.0
 SCALAR_JOINTS = frozenset({int(mujoco.mjtJoint.mjJNT_HINGE), int(mujoco.mjtJoint.mjJNT_SLIDE)})
 """Joint types with one position. As ``int``: MuJoCo's enumerations do not equal the numbers in its arrays."""
 _DIVERGED = ("mjWARN_BADQPOS", "mjWARN_BADQVEL", "mjWARN_BADQACC", "mjWARN_BADCTRL")
-
-Floats = npt.NDArray[np.float64]
-Ints = npt.NDArray[np.intp]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -56,45 +50,6 @@ class Placement:
     model: Path
     position_m: tuple[float, float, float] = (0.0, 0.0, 0.0)
     quaternion: tuple[float, float, float, float] = (1.0, 0.0, 0.0, 0.0)
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Snapshot:
-    """The world after a group of steps, all of one moment. The arrays are read-only copies.
-
-    Attributes:
-        time_s: Simulated time [s].
-        taken_s: ``time.monotonic()`` when it was taken [s].
-        qpos: Generalised positions, shape (nq,).
-        qvel: Generalised velocities, shape (nv,).
-        effort: Torque or force of the motors at each degree of freedom with what holds it against gravity, (nv,).
-        ctrl: What the actuators follow, shape (nu,).
-        body_position_m: Of each body in the world, shape (nbody, 3) [m].
-        body_quaternion: Of each body in the world, shape (nbody, 4).
-        site_position_m: Of each site in the world, shape (nsite, 3) [m].
-        site_matrix: Rotation of each site in the world, row-major, shape (nsite, 9).
-        lag_ms: Simulated time lost so far because the machine could not keep up [ms].
-        fault: Why the world stands still, empty while it is well.
-    """
-
-    time_s: float
-    taken_s: float
-    qpos: Floats
-    qvel: Floats
-    effort: Floats
-    ctrl: Floats
-    body_position_m: Floats
-    body_quaternion: Floats
-    site_position_m: Floats
-    site_matrix: Floats
-    lag_ms: float
-    fault: str
-    _addresses: Mapping[str, int] = field(repr=False)
-
-    @property
-    def position_rad(self) -> dict[str, float]:
-        """True position of every hinge [rad] and slide [m] by the joint's full name."""
-        return {name: float(self.qpos[address]) for name, address in self._addresses.items()}
 
 
 @dataclass(frozen=True, slots=True)
@@ -118,11 +73,6 @@ class World:
     ``open`` and ``close`` count users: the first ``open`` compiles the model and starts real time, the last ``close``
     stops it, and a later ``open`` goes on where it stopped. For tests, ``build`` then ``step`` drive it by hand; the
     same commands then give the same numbers.
-
-    ``trace`` is the ground truth for tests that cannot reach into the process: at each start a line that names the
-    columns (``joints``, ``actuators``), then at 100 Hz of simulated time one JSON object a line with ``tick_ms``
-    (monotonic clock), ``at_ms`` (wall clock), ``time_s``, ``lag_ms``, ``qpos``, ``qvel`` (by joint), ``target`` (the
-    newest command) and ``ctrl`` (what the actuators follow). Writing is part of stepping; a slow disk shows as lag.
     """
 
     def __init__(
@@ -139,7 +89,7 @@ class World:
             scene: MJCF file. It may hold a robot already.
             robots: Robots to put into it.
             home: Full joint name → position [rad or m] at the start; others start at the model's reference.
-            trace: File to append to.
+            trace: File to append the truth to, see ``Trace``.
         """
         self._scene = scene
         self._robots = tuple(robots)
@@ -170,24 +120,15 @@ class World:
         with self._life:
             self.build()
             if self._thread is None:
-                trace = self._open_trace()
-                self._stopping.clear()
-                self._publish()
-                self._thread = threading.Thread(target=self._run, args=(trace,), name="mujoco-world", daemon=True)
-                self._thread.start()
+                self._begin()
             self._users += 1
 
     def close(self) -> None:
         """Leave; the last to do so stops real time. One call for each ``open``."""
         with self._life:
             self._users = max(0, self._users - 1)
-            if self._users or self._thread is None:
-                return
-            self._stopping.set()
-            self._thread.join(timeout=_STOP_TIMEOUT_S)
-            if self._thread.is_alive():
-                raise DriverError(f"the simulation did not stop within {_STOP_TIMEOUT_S:.0f} s")
-            self._thread = None
+            if not self._users:
+                self._end()
 
     def build(self) -> None:
         """Compile the model and put every robot at home. Does nothing when that has been done.
@@ -198,28 +139,37 @@ class World:
         if self._model is not None:
             return
         model = self._compile()
-        data = mujoco.MjData(model)
-        for name, position in self._home.items():
-            joint = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_JOINT, name)
-            if joint < 0:
-                known = ", ".join(model.joint(index).name for index in range(model.njnt))
-                raise DriverError(f"{self._scene}: no joint '{name}'; the model has: {known}")
-            data.qpos[model.jnt_qposadr[joint]] = position
+        data = self._at_home(model)
         self._addresses = {
             model.joint(index).name: int(model.jnt_qposadr[index])
             for index in range(model.njnt)
             if model.jnt_type[index] in SCALAR_JOINTS
         }
-        for actuator in range(model.nu):  # every position servo holds where its joint starts
-            joint = model.actuator_trnid[actuator, 0]
-            by_joint = model.actuator_trntype[actuator] == int(mujoco.mjtTrn.mjTRN_JOINT)
-            if by_joint and model.actuator_biasprm[actuator, 1] < 0 and model.jnt_type[joint] in SCALAR_JOINTS:
-                data.ctrl[actuator] = data.qpos[model.jnt_qposadr[joint]]
         # Gravity compensation that the model does not already count as the motors' work.
         self._passive_gravity = np.where(model.jnt_actgravcomp[model.dof_jntid], 0.0, 1.0)
-        mujoco.mj_forward(model, data)
         self._model, self._data = model, data
         self._publish()
+
+    def recover(self) -> None:
+        """Begin again after a fault, with every robot at home. Does nothing in a world that is well.
+
+        Raises:
+            DriverError: As for ``open``.
+        """
+        with self._life:
+            if not self._fault:
+                return
+            running = self._thread is not None
+            self._end()
+            time_s = self.snapshot().time_s
+            self._commands.clear()
+            self._ramps.clear()
+            self._data = self._at_home(self._model)
+            self._data.time = time_s  # time only ever rises
+            self._fault = ""
+            self._publish()
+            if running:
+                self._begin()
 
     # ------------------------------------------------------------ for drivers and tests
 
@@ -278,6 +228,22 @@ class World:
 
     # ------------------------------------------------------------ stepping
 
+    def _begin(self) -> None:
+        trace = None if self._trace_path is None else Trace(self._trace_path, self._model, list(self._addresses))
+        self._stopping.clear()
+        self._publish()
+        self._thread = threading.Thread(target=self._run, args=(trace,), name="mujoco-world", daemon=True)
+        self._thread.start()
+
+    def _end(self) -> None:
+        if self._thread is None:
+            return
+        self._stopping.set()
+        self._thread.join(timeout=_STOP_TIMEOUT_S)
+        if self._thread.is_alive():
+            raise DriverError(f"the simulation did not stop within {_STOP_TIMEOUT_S:.0f} s")
+        self._thread = None
+
     def _compile(self) -> Any:
         try:
             spec = mujoco.MjSpec.from_file(str(self._scene))
@@ -292,6 +258,23 @@ class World:
             return spec.compile()
         except (ValueError, OSError, mujoco.FatalError) as error:
             raise DriverError(f"{self._scene}: MuJoCo cannot build this world: {error}") from error
+
+    def _at_home(self, model: Any) -> Any:
+        """A fresh state: joints at home, every position servo holding where its joint starts."""
+        data = mujoco.MjData(model)
+        for name, position in self._home.items():
+            joint = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_JOINT, name)
+            if joint < 0:
+                known = ", ".join(model.joint(index).name for index in range(model.njnt))
+                raise DriverError(f"{self._scene}: no joint '{name}'; the model has: {known}")
+            data.qpos[model.jnt_qposadr[joint]] = position
+        for actuator in range(model.nu):
+            joint = model.actuator_trnid[actuator, 0]
+            by_joint = model.actuator_trntype[actuator] == int(mujoco.mjtTrn.mjTRN_JOINT)
+            if by_joint and model.actuator_biasprm[actuator, 1] < 0 and model.jnt_type[joint] in SCALAR_JOINTS:
+                data.ctrl[actuator] = data.qpos[model.jnt_qposadr[joint]]
+        mujoco.mj_forward(model, data)
+        return data
 
     def _advance(self, count: int) -> None:
         model, data = self._model, self._data
@@ -341,10 +324,17 @@ class World:
             site_matrix=site_xmat,
             lag_ms=self._lag_s * 1000,
             fault=self._fault,
-            _addresses=self._addresses,
+            addresses=self._addresses,
         )
 
-    def _run(self, trace: TextIOWrapper | None) -> None:
+    def _targets(self) -> Floats:
+        """The newest command of each actuator, shape (nu,)."""
+        target: Floats = self._data.ctrl.copy()
+        for command in list(self._commands.values()):
+            target[command.actuators] = command.target
+        return target
+
+    def _run(self, trace: Trace | None) -> None:
         try:
             self._keep_time(trace)
         except Exception as error:  # nothing may end this thread unseen: drivers read the fault
@@ -353,23 +343,20 @@ class World:
             self._publish()
         finally:
             if trace is not None:
-                with suppress(OSError):
-                    trace.close()
+                trace.close()
 
-    def _keep_time(self, trace: TextIOWrapper | None) -> None:
+    def _keep_time(self, trace: Trace | None) -> None:
         group_s = GROUP_STEPS * TIMESTEP_S
         due = time.monotonic()
-        warned, traced = -WARN_EVERY_S, -TRACE_S
+        warned = -WARN_EVERY_S
         while not self._stopping.is_set():
             self._advance(GROUP_STEPS)
             self._publish()
             if self._fault:
                 log.error(self._fault)
                 return
-            snapshot = self.snapshot()
-            if trace is not None and snapshot.time_s - traced >= TRACE_S - TIMESTEP_S / 2:
-                self._write_trace(trace, snapshot)
-                traced = snapshot.time_s
+            if trace is not None:
+                trace.write(self.snapshot(), self._targets())
             due += group_s
             now = time.monotonic()
             if now - due > MAX_CATCH_UP_S:
@@ -379,40 +366,6 @@ class World:
                     warned = now
                     log.warning("the simulation cannot keep up: %.0f ms lost so far", self._lag_s * 1000)
             self._stopping.wait(max(0.0, due - now))
-
-    # ------------------------------------------------------------ trace
-
-    def _open_trace(self) -> TextIOWrapper | None:
-        if self._trace_path is None:
-            return None
-        model = self._model
-        header = {
-            "joints": list(self._addresses),
-            "actuators": [model.actuator(index).name for index in range(model.nu)],
-        }
-        try:
-            trace = self._trace_path.open("a", encoding="utf-8", buffering=1)
-            trace.write(json.dumps(header) + "\n")
-        except OSError as error:
-            raise DriverError(f"cannot write the trace file: {error}") from error
-        return trace
-
-    def _write_trace(self, trace: TextIOWrapper, snapshot: Snapshot) -> None:
-        target = snapshot.ctrl.copy()
-        for command in list(self._commands.values()):
-            target[command.actuators] = command.target
-        velocities = [self._model.jnt_dofadr[self._model.joint(name).id] for name in self._addresses]
-        row = {
-            "tick_ms": round(snapshot.taken_s * 1000, 3),
-            "at_ms": round(time.time() * 1000, 3),
-            "time_s": round(snapshot.time_s, 6),
-            "lag_ms": round(snapshot.lag_ms, 3),
-            "qpos": [round(value, 9) for value in snapshot.position_rad.values()],
-            "qvel": np.round(snapshot.qvel[velocities], 9).tolist(),
-            "target": np.round(target, 9).tolist(),
-            "ctrl": np.round(snapshot.ctrl, 9).tolist(),
-        }
-        trace.write(json.dumps(row) + "\n")
 
 
 def _follow(ramp: _Ramp, ctrl: Floats) -> None:

@@ -29,5 +29,6 @@ robot.home(speed=speed)
 for count in range(times):
     visit("orange")
     visit("green")
+    progress((count + 1) / times)
     print("carried", count + 1, "of", times)
 robot.home(speed=speed)

@@ -11,5 +11,5 @@ robot.move_joints({"shoulder_lift": -1.75, "elbow": 0.75, "wrist_1": -0.55, "wri
 for count in range(times):
     robot.move_joints({"elbow": 0.35, "wrist_1": -0.95}, speed=speed)
     robot.move_joints({"elbow": 1.15, "wrist_1": -0.15}, speed=speed)
-    print("wave", count + 1, "of", times)
+    progress((count + 1) / times)
 robot.home(speed=speed)

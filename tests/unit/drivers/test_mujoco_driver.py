@@ -124,6 +124,24 @@ def test_a_fault_of_the_world_reaches_observe_and_send(arm: MujocoDriver):
         arm.send([0.0] * 6)
 
 
+def test_connecting_after_a_fault_begins_anew_at_home(arm: MujocoDriver):
+    home = arm.observe().position_rad
+    arm.send([0.3, *home[1:]])
+    time.sleep(0.05)
+    arm._world._data.qvel[:] = np.nan
+    end = time.monotonic() + 20
+    while not arm._world.snapshot().fault:
+        assert time.monotonic() < end
+        time.sleep(0.002)
+    stopped = arm._world.snapshot().time_s
+    arm.connect()
+    assert arm.observe().position_rad == pytest.approx(home, abs=1e-3)
+    while arm._world.snapshot().time_s <= stopped + 0.02:
+        assert time.monotonic() < end
+        time.sleep(0.002)
+    assert arm.observe().position_rad == pytest.approx(home, abs=1e-3)
+
+
 def test_a_simulation_that_hangs_is_noticed(arm: MujocoDriver, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr(driver_module, "STALE_S", -1.0)
     with pytest.raises(DriverError, match="has not moved for"):

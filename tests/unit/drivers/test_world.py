@@ -2,6 +2,7 @@
 
 import json
 import logging
+import os
 import threading
 import time
 from collections.abc import Callable
@@ -11,8 +12,9 @@ import mujoco
 import numpy as np
 import pytest
 
+from device_agent.drivers.mujoco import Placement, Snapshot, World
 from device_agent.drivers.mujoco import world as world_module
-from device_agent.drivers.mujoco.world import MAX_CATCH_UP_S, Placement, Snapshot, World
+from device_agent.drivers.mujoco.world import MAX_CATCH_UP_S
 from device_agent.ports.driver import DriverError
 from device_agent.protocol import robot_type
 
@@ -247,6 +249,29 @@ def test_trace_tells_the_truth_at_100_hz(tmp_path: Path):
     assert rows[-1]["target"] == pytest.approx([0.2, -1.5, 1.5, -1.5, -1.5, 0.1])
     assert 0 < rows[-1]["ctrl"][0] < 0.2
     assert 0 < rows[-1]["qpos"][0] < 0.2
+
+
+def test_a_full_disk_at_the_start_is_one_clear_error():
+    world = ur5_world(Path("/dev/full"))
+    with pytest.raises(DriverError, match="cannot write the trace"):
+        world.open()
+
+
+def test_a_trace_that_fails_later_ends_and_the_simulation_goes_on(tmp_path: Path, caplog: pytest.LogCaptureFixture):
+    pipe = tmp_path / "pipe"
+    os.mkfifo(pipe)
+    reader = os.open(pipe, os.O_RDONLY | os.O_NONBLOCK)
+    world = ur5_world(pipe)
+    with caplog.at_level(logging.WARNING):
+        world.open()
+        try:
+            os.close(reader)
+            until(lambda: "the trace ends here" in caplog.text)
+            then = world.snapshot().time_s
+            until(lambda: world.snapshot().time_s > then)
+            assert world.snapshot().fault == ""
+        finally:
+            world.close()
 
 
 def test_trace_is_appended_to(tmp_path: Path):

@@ -21,6 +21,7 @@ class PlayedRobot:
         self.bench = bench
         self.allowed = bench.touching()
         self.target = bench.home.copy()
+        self.joints = tuple(bench.names)
         self.moves = 0
         self.touched: set[tuple[str, str]] = set()
         self.fastest = 0.0  # share of the velocity limits
@@ -59,6 +60,9 @@ class PlayedRobot:
         assert seconds >= 0
         self._hold(self.target, math.ceil(seconds / 0.008))
 
+    def progress(self, share: float) -> None:
+        assert 0 <= share <= 1
+
     def _hold(self, target: Any, periods: int) -> None:
         bench = self.bench
         for _ in range(periods):
@@ -74,8 +78,10 @@ def play(path: Path, parameters: dict[str, Any]) -> PlayedRobot:
         "robot": robot,
         "wait": robot.wait,
         "parameters": parameters,
+        "progress": robot.progress,
+        "RobotError": AssertionError,
         "print": lambda *_: None,
-        "__name__": "movement",
+        "__name__": "__movement__",
     }
     exec(compile(path.read_text(encoding="utf-8"), str(path), "exec"), given)  # noqa: S102 - our own scripts
     return robot

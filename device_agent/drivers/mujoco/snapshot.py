@@ -1,0 +1,49 @@
+"""What a world looked like at one moment."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+
+import numpy as np
+import numpy.typing as npt
+
+Floats = npt.NDArray[np.float64]
+Ints = npt.NDArray[np.intp]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Snapshot:
+    """The world after a group of steps, all of one moment. The arrays are read-only copies.
+
+    Attributes:
+        time_s: Simulated time [s].
+        taken_s: ``time.monotonic()`` when it was taken [s].
+        qpos: Generalised positions, shape (nq,).
+        qvel: Generalised velocities, shape (nv,).
+        effort: Torque or force of the motors at each degree of freedom with what holds it against gravity, (nv,).
+        ctrl: What the actuators follow, shape (nu,).
+        body_position_m: Of each body in the world, shape (nbody, 3) [m].
+        body_quaternion: Of each body in the world, shape (nbody, 4).
+        site_position_m: Of each site in the world, shape (nsite, 3) [m].
+        site_matrix: Rotation of each site in the world, row-major, shape (nsite, 9).
+        lag_ms: Simulated time lost so far because the machine could not keep up [ms].
+        fault: Why the world stands still, empty while it is well.
+    """
+
+    time_s: float
+    taken_s: float
+    qpos: Floats
+    qvel: Floats
+    effort: Floats
+    ctrl: Floats
+    body_position_m: Floats
+    body_quaternion: Floats
+    site_position_m: Floats
+    site_matrix: Floats
+    lag_ms: float
+    fault: str
+    addresses: Mapping[str, int] = field(repr=False)
+
+    @property
+    def position_rad(self) -> dict[str, float]:
+        """True position of every hinge [rad] and slide [m] by the joint's full name."""
+        return {name: float(self.qpos[address]) for name, address in self.addresses.items()}
