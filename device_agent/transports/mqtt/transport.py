@@ -124,6 +124,8 @@ class MqttTransport:
                 self._connect_once()
             except (OSError, ValueError) as error:
                 _log.warning("no link: %s", error)
+            except Exception:  # noqa: BLE001 (whatever it was: a robot that has lost its link must keep trying)
+                _log.exception("no link")
             if time.monotonic() - began_s > _LONGEST_BACK_OFF_S:
                 back_off_s = _FIRST_BACK_OFF_S
             # Full jitter: agents that lost one broker together do not come back together.
