@@ -102,8 +102,9 @@ def configuration(home: Path, *, host: str, tcp_port: int, websocket_port: int, 
         # Agents say what is retained again on connecting, and nothing relies on a queue for somebody who is away.
         "persistence false",
         "persistent_client_expiration 1h",
-        # Ends the connection. `message_size_limit` would acknowledge the message and drop it.
+        # The first ends the connection, on TCP. The second drops the message, and is all that WebSocket heeds.
         f"max_packet_size {codec.MAX_BYTES + _HEADER_BYTES}",
+        f"message_size_limit {codec.MAX_BYTES}",
         f"max_inflight_messages {_MAX_INFLIGHT}",
         f"max_queued_messages {_MAX_QUEUED}",
         "sys_interval 0",

@@ -122,7 +122,7 @@ def test_an_agent_cannot_publish_for_another(broker: RunningBroker, space: str) 
             )
             with broker.connect("evil", credentials) as evil:
                 evil.publish(topic, b"lie", retain=True)
-                wait_until(lambda: evil.disconnected.is_set() or broker.kind == "mosquitto", "the end")  # noqa: B023
+                wait_until(lambda: evil.disconnected.is_set() or broker.kind == "mosquitto", "the end")
         assert heard_before_mark(ear, marker, space) == []
 
 

@@ -1,0 +1,212 @@
+"""What is granted arrives: at its QoS, in order, once, without delay, and retained only where it was asked for."""
+
+import statistics
+import time
+
+import paho.mqtt.client as paho
+import pytest
+
+from device_agent.protocol import codec
+from tests.support import wire
+from tests.support.brokers import SILENCE_S, Message, RunningBroker, Transport, wait_until
+from tests.support.wire import Wire
+
+
+@pytest.mark.parametrize(("said", "heard"), [(0, 0), (0, 1), (1, 0), (1, 1)])
+def test_a_message_arrives_at_the_lower_of_its_qos_and_the_subscriptions(
+    broker: RunningBroker, space: str, transport: Transport, said: int, heard: int
+) -> None:
+    topic = f"ts/v1/{space}/arm/ur5/tele/joints"
+    with (
+        broker.client(f"{space}-arm", publish=(topic,), transport=transport) as arm,
+        broker.client(f"{space}-page", subscribe=(topic,), transport=transport) as page,
+    ):
+        assert page.subscribe(topic, qos=heard) == [heard]
+        arm.publish(topic, b"x", qos=said)
+        assert page.receive() == Message(topic, b"x", min(said, heard), retain=False)
+
+
+@pytest.mark.parametrize("qos", [0, 1])
+def test_the_order_on_a_topic_is_kept(broker: RunningBroker, space: str, transport: Transport, qos: int) -> None:
+    topic = f"ts/v1/{space}/arm/ur5/tele/joints"
+    with (
+        broker.client(f"{space}-arm", publish=(topic,), transport=transport) as arm,
+        broker.client(f"{space}-page", subscribe=(topic,), transport=transport) as page,
+    ):
+        page.subscribe(topic, qos=qos)
+        for number in range(400):
+            arm.publish(topic, b"%d" % number, qos=qos)
+        assert [int(page.receive().payload) for _ in range(400)] == list(range(400))
+
+
+def test_a_message_arrives_once_though_two_filters_cover_it(broker: RunningBroker, space: str) -> None:
+    topic = f"ts/v1/{space}/arm/ur5/state"
+    with (
+        broker.client(f"{space}-arm", publish=(topic,)) as arm,
+        broker.client(f"{space}-page", subscribe=(f"ts/v1/{space}/#",)) as page,
+    ):
+        page.subscribe(topic, f"ts/v1/{space}/arm/+/state", f"ts/v1/{space}/#")
+        arm.publish_acknowledged(topic, b"1")
+        arm.publish_acknowledged(topic, b"2")
+        assert [page.receive().payload, page.receive().payload] == [b"1", b"2"]
+
+
+def test_eight_filters_fit_into_one_subscribe(broker: RunningBroker, space: str) -> None:
+    topics = [f"ts/v1/{space}/arm/ur5/{each}" for each in ("desc", "state", "event", "ack", "cmd", "stop")]
+    topics += [f"ts/v1/{space}/arm/conn", f"ts/v1/{space}/arm/ur5/desc/twin"]
+    with broker.client(space, publish=tuple(topics), subscribe=tuple(topics)) as client:
+        assert client.subscribe(*topics) == [1] * 8
+        for topic in topics:
+            client.publish_acknowledged(topic, b"x")
+        assert [client.receive().topic for _ in topics] == topics
+
+
+def test_after_an_unsubscribe_nothing_comes(broker: RunningBroker, space: str) -> None:
+    topic, other = f"ts/v1/{space}/arm/conn", f"ts/v1/{space}/other/conn"
+    with broker.client(space, publish=(topic, other), subscribe=(topic, other)) as client:
+        client.subscribe(topic, other)
+        client.paho.unsubscribe(topic)
+        client.publish_acknowledged(topic, b"x")
+        client.publish_acknowledged(other, b"end")
+        assert [m.topic for m in (client.receive(), *client.heard())] == [other]
+
+
+def test_a_new_subscriber_gets_what_is_retained_and_a_present_one_what_is_live(
+    broker: RunningBroker, space: str, transport: Transport
+) -> None:
+    topic = f"ts/v1/{space}/arm/ur5/state"
+    with (
+        broker.client(f"{space}-arm", publish=(topic,)) as arm,
+        broker.client(f"{space}-present", subscribe=(topic,), transport=transport) as present,
+        broker.client(f"{space}-late", subscribe=(topic,), transport=transport) as late,
+    ):
+        present.subscribe(topic)
+        arm.publish_acknowledged(topic, b"old", retain=True)
+        arm.publish_acknowledged(topic, b"new", retain=True)
+        assert [present.receive(), present.receive()] == [
+            Message(topic, b"old", 1, retain=False),
+            Message(topic, b"new", 1, retain=False),
+        ]
+        late.subscribe(topic)
+        assert late.receive() == Message(topic, b"new", 1, retain=True)
+        assert late.heard() == []
+
+
+def test_an_empty_message_clears_what_is_retained(broker: RunningBroker, space: str) -> None:
+    topic = f"ts/v1/{space}/arm/ur5/state"
+    with (
+        broker.client(f"{space}-arm", publish=(topic,)) as arm,
+        broker.client(f"{space}-late", subscribe=(topic,)) as late,
+    ):
+        arm.publish_acknowledged(topic, b"x", retain=True)
+        arm.publish_acknowledged(topic, b"", retain=True)
+        late.subscribe(topic)
+        with pytest.raises(AssertionError, match="heard nothing"):
+            late.receive(SILENCE_S)
+
+
+def test_retained_messages_come_only_for_the_new_filter_and_only_to_who_subscribed(
+    broker: RunningBroker, space: str
+) -> None:
+    """The leak: a new client got what is retained for every filter that anybody held."""
+    mine, others = f"ts/v1/{space}/mine/conn", f"ts/v1/{space}/others/conn"
+    with (
+        broker.client(f"{space}-agents", publish=(mine, others)) as agents,
+        broker.client(f"{space}-all", subscribe=(f"ts/v1/{space}/+/conn",)) as everything,
+    ):
+        agents.publish_acknowledged(mine, b"mine", retain=True)
+        agents.publish_acknowledged(others, b"others", retain=True)
+        everything.subscribe(f"ts/v1/{space}/+/conn")
+        assert {everything.receive().topic, everything.receive().topic} == {mine, others}
+        with broker.client(f"{space}-new", subscribe=(mine,)) as new:
+            new.subscribe(mine)
+            assert new.receive().topic == mine
+            agents.publish_acknowledged(mine, b"end")
+            assert [m.payload for m in (new.receive(), *new.heard())] == [b"end"]
+            assert [m.payload for m in (everything.receive(), *everything.heard())] == [b"end"]
+
+
+def test_a_denied_publish_is_not_told_to_have_succeeded(broker: RunningBroker, space: str) -> None:
+    """In the newest protocol that the broker speaks; mosquitto acknowledges whatever 3.1.1 publishes."""
+    protocol = paho.MQTTv311 if broker.kind == "amqtt" else paho.MQTTv5
+    allowed = f"ts/v1/{space}/arm/conn"
+    with broker.client(space, publish=(allowed,), protocol=protocol) as client:
+        refused = client.publish(f"ts/v1/{space}/other/conn", b"x")
+        if broker.kind == "amqtt":
+            wait_until(client.disconnected.is_set, "the end of the connection")
+        else:
+            client.publish_acknowledged(allowed, b"end")
+        assert not client.acknowledged(refused)
+
+
+def test_the_largest_message_of_the_contract_passes(broker: RunningBroker, space: str, transport: Transport) -> None:
+    topic = f"ts/v1/{space}/arm/ur5/cam/wrist"
+    with (
+        broker.client(f"{space}-arm", publish=(topic,), transport=transport) as arm,
+        broker.client(f"{space}-page", subscribe=(topic,), transport=transport) as page,
+    ):
+        page.subscribe(topic, qos=0)
+        picture = bytes(range(256)) * (codec.MAX_BYTES // 256)
+        arm.publish(topic, picture, qos=0)
+        assert page.receive().payload == picture
+
+
+@pytest.mark.parametrize("qos", [0, 1])
+def test_a_message_over_the_limit_is_refused_and_harms_nobody(
+    broker: RunningBroker, space: str, transport: Transport, qos: int
+) -> None:
+    topic = f"ts/v1/{space}/arm/ur5/cam/wrist"
+    with (
+        broker.client(f"{space}-arm", publish=(topic,)) as arm,
+        broker.client(f"{space}-page", subscribe=(topic,)) as page,
+    ):
+        page.subscribe(topic)
+        with broker.client(f"{space}-huge", publish=(topic,), transport=transport) as huge:
+            huge.publish(topic, b"x" * (codec.MAX_BYTES + 1_024), qos=qos)
+            after = huge.publish(topic, b"after")
+            wait_until(lambda: huge.disconnected.is_set() or huge.acknowledged(after), "the broker's answer")
+            # Over WebSocket mosquitto 2.0 drops the message and goes on.
+            assert huge.disconnected.is_set() or (broker.kind, transport) == ("mosquitto", "websockets")
+        arm.publish_acknowledged(topic, b"small")
+        heard = [page.receive().payload]
+        while heard[-1] != b"small":
+            heard.append(page.receive().payload)
+        assert set(heard) <= {b"after", b"small"}
+
+
+def test_small_messages_are_sent_at_once(broker: RunningBroker, space: str, transport: Transport) -> None:
+    """TCP_NODELAY on the broker's side: with Nagle's algorithm the second of two messages waits 40 ms.
+
+    The listener behaves as a client that has just said something, whose kernel then delays its acknowledgements. A busy
+    machine can slow one round down; without TCP_NODELAY no round could ever be quick.
+    """
+    topic = f"ts/v1/{space}/arm/ur5/tele/joints"
+    credentials = broker.issue(broker.grant(space, subscribe=(topic,)))
+    with (
+        broker.client(f"{space}-arm", publish=(topic,)) as arm,
+        Wire(broker.port(transport), transport) as listener,
+    ):
+        listener.send(wire.connect_packet(space, credentials))
+        assert listener.read() == (wire.CONNACK, 0, b"\0\0")
+        listener.send(wire.subscribe_packet(topic))
+        assert listener.read() == (wire.SUBACK, 0, b"\0\1\0")
+        medians = []
+        for _ in range(5):
+            gaps = []
+            for _ in range(9):
+                listener.send(wire.PINGREQ)
+                assert listener.read() == (wire.PINGRESP, 0, b"")
+                arm.publish(topic, b"first", qos=0)
+                assert listener.read() == (wire.PUBLISH, 0, wire.text(topic) + b"first")
+                began = time.perf_counter()
+                arm.publish(topic, b"second", qos=0)
+                assert listener.read() == (wire.PUBLISH, 0, wire.text(topic) + b"second")
+                gaps.append(time.perf_counter() - began)
+            medians.append(statistics.median(gaps))
+            if medians[-1] < NAGLE_S / 2:
+                return
+        raise AssertionError(f"medians of {medians} s between two messages")
+
+
+NAGLE_S = 0.040
+"""Linux's least delay of an acknowledgement [s]."""

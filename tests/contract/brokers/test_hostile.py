@@ -1,0 +1,127 @@
+"""Whatever one connection sends, or does not, the broker lives and the others notice nothing.
+
+That it lives and prints no traceback is looked at after every test, by the fixture.
+"""
+
+import socket
+
+import pytest
+
+from tests.support import wire
+from tests.support.brokers import HOST, PATIENCE_S, RunningBroker, Transport
+from tests.support.wire import Wire
+
+GARBAGE = {
+    "nothing": b"",
+    "zeros": bytes(4_096),
+    "ones": b"\xff" * 4_096,
+    "text": b"GET /../../etc/passwd HTTP/1.1\r\nHost: x\r\n\r\n" * 20,
+    "websocket handshake cut short": b"GET /mqtt HTTP/1.1\r\nUpgrade: websocket\r\nSec-WebSocket-Version: 13\r\n\r\n",
+    "tls": bytes.fromhex("16030100") + b"\x2f\x01\x00" * 40,
+    "endless length": b"\x10\xff\xff\xff\xff\xff\x7f",
+    "huge length": b"\x10\xff\xff\xff\x7f" + b"MQTT" * 1_000,
+    "connect of nothing": b"\x10\x00",
+    "connect with lying lengths": b"\x10\x10" + wire.text("MQTT") + b"\x04\xc2\x00\x3c\xff\xff\xff\xff\xff\xff",
+    "connect with broken text": b"\x10\x12" + wire.text("MQTT") + b"\x04\x02\x00\x3c" + wire.text(b"\xc3\x28\xff\xfe"),
+    "connect of another protocol": wire.packet(1, wire.text("HTTP") + b"\x04\x02\x00\x3c" + wire.text("x")),
+    "publish first": wire.publish_packet("ts/v1/a/b/conn", b"x"),
+    "subscribe first": wire.subscribe_packet("#"),
+}
+NOT_MQTT = {
+    "publish that ends in its topic": wire.packet(3, b"\xff\xffts/v1"),
+    "publish without packet id": wire.packet(3, wire.text("ts/v1/a/b/conn"), flags=2),
+    "publish at qos 3": wire.packet(3, wire.text("ts/v1/a/b/conn") + b"\0\1x", flags=6),
+    "publish to nothing": wire.publish_packet("", b"x"),
+    "publish to broken text": wire.publish_packet(b"ts/\xff\xfe/\xc3\x28", b"x"),
+    "subscribe without filters": wire.packet(8, b"\0\1", flags=2),
+    "subscribe with wrong flags": wire.packet(8, b"\0\1" + wire.text("a") + b"\0", flags=0),
+    "subscribe that ends in its filter": wire.packet(8, b"\0\1\0\x40abc", flags=2),
+    "subscribe at qos 3": wire.packet(8, b"\0\1" + wire.text("a") + b"\3", flags=2),
+    "unsubscribe that ends in its filter": wire.packet(10, b"\0\1\0\x40abc", flags=2),
+    "connect again": wire.connect_packet("again"),
+    "packet of the broker": wire.packet(2, b"\0\0"),
+    "reserved packet": wire.packet(15, b""),
+    "garbage": b"\xff\xfe\xfd" * 100,
+}
+
+
+@pytest.mark.parametrize("garbage", GARBAGE.values(), ids=GARBAGE.keys())
+def test_garbage_before_a_connect_harms_nobody(
+    broker: RunningBroker, space: str, transport: Transport, garbage: bytes
+) -> None:
+    """Raw, on both listeners: the one for WebSocket gets what is not even HTTP."""
+    with broker.client(space, publish=("ts/v1/+/+/conn",), subscribe=("ts/v1/+/+/conn",)) as client:
+        topic = f"ts/v1/{space}/arm/conn"
+        client.subscribe(topic)
+        with socket.create_connection((HOST, broker.port(transport)), PATIENCE_S) as raw:
+            raw.sendall(garbage)
+            client.publish_acknowledged(topic, b"during")
+        client.publish_acknowledged(topic, b"after")
+        assert [client.receive().payload, client.receive().payload] == [b"during", b"after"]
+
+
+@pytest.mark.parametrize("garbage", GARBAGE.values(), ids=GARBAGE.keys())
+def test_garbage_in_websocket_frames_harms_nobody(broker: RunningBroker, space: str, garbage: bytes) -> None:
+    with broker.client(space) as client:
+        with Wire(broker.websocket_port, "websockets") as raw:
+            raw.send(garbage)
+        with Wire(broker.websocket_port, "websockets") as raw:
+            raw.send(garbage + garbage)
+        assert client.subscribe("x") != []
+
+
+@pytest.mark.parametrize("sent", NOT_MQTT.values(), ids=NOT_MQTT.keys())
+def test_what_is_not_mqtt_ends_the_connection_that_sent_it(
+    broker: RunningBroker, space: str, transport: Transport, sent: bytes
+) -> None:
+    credentials = broker.issue(broker.grant(space, publish=("ts/v1/#",), subscribe=("ts/v1/#",)))
+    with broker.client(f"{space}-other") as other:
+        with Wire(broker.port(transport), transport) as raw:
+            raw.send(wire.connect_packet(space, credentials))
+            assert raw.read() == (wire.CONNACK, 0, b"\0\0")
+            raw.send(sent)
+            assert raw.closed()
+        assert not other.disconnected.is_set()
+        assert other.subscribe("x") != []
+
+
+def test_a_connect_in_single_bytes_is_understood(broker: RunningBroker, space: str, transport: Transport) -> None:
+    with Wire(broker.port(transport), transport) as raw:
+        for byte in wire.connect_packet(space, broker.issue(broker.grant(space))):
+            raw.send(bytes([byte]))
+        assert raw.read() == (wire.CONNACK, 0, b"\0\0")
+
+
+def test_packets_that_come_together_are_all_answered(broker: RunningBroker, space: str, transport: Transport) -> None:
+    topic = f"ts/v1/{space}/arm/conn"
+    credentials = broker.issue(broker.grant(space, publish=(topic,), subscribe=(topic,)))
+    with Wire(broker.port(transport), transport) as raw:
+        raw.send(
+            wire.connect_packet(space, credentials)
+            + wire.subscribe_packet(topic)
+            + wire.publish_packet(topic, b"x", qos=1, packet_id=7)
+            + wire.PINGREQ
+        )
+        answers = [raw.read() for _ in range(5)]
+        assert answers[0] == (wire.CONNACK, 0, b"\0\0")
+        assert answers[1] == (wire.SUBACK, 0, b"\0\1\0")
+        assert (wire.PUBLISH, 0, wire.text(topic) + b"x") in answers
+        assert (wire.PUBACK, 0, b"\0\7") in answers
+        assert answers[-1] == (wire.PINGRESP, 0, b"")
+
+
+def test_a_subscriber_that_never_reads_holds_nobody_up(broker: RunningBroker, space: str, transport: Transport) -> None:
+    topic = f"ts/v1/{space}/arm/ur5/cam/wrist"
+    credentials = broker.issue(broker.grant(f"{space}-stuck", subscribe=(topic,)))
+    with (
+        broker.client(f"{space}-arm", publish=(topic,)) as arm,
+        broker.client(f"{space}-page", subscribe=(topic,)) as page,
+        Wire(broker.port(transport), transport) as stuck,
+    ):
+        stuck.send(wire.connect_packet(f"{space}-stuck", credentials))
+        assert stuck.read() == (wire.CONNACK, 0, b"\0\0")
+        stuck.send(wire.subscribe_packet(topic))
+        page.subscribe(topic)
+        for _ in range(200):
+            arm.publish_acknowledged(topic, bytes(100_000))
+        assert all(len(page.receive().payload) == 100_000 for _ in range(200))

@@ -1,0 +1,231 @@
+"""From CONNECT to the end: takeover, will, keep-alive, expiry, revocation."""
+
+import time
+from itertools import pairwise
+
+import paho.mqtt.client as paho
+import pytest
+
+from tests.support import wire
+from tests.support.brokers import SILENCE_S, Message, RunningBroker, Transport, wait_until
+from tests.support.wire import Wire
+
+
+def test_a_wrong_password_with_the_victims_client_id_leaves_the_victim_in_peace(
+    broker: RunningBroker, space: str
+) -> None:
+    topic = f"ts/v1/{space}/arm/conn"
+    with (
+        broker.client(f"{space}-victim", publish=(topic,), subscribe=(topic,)) as victim,
+    ):
+        victim.subscribe(topic)
+        others = broker.issue(broker.grant(f"{space}-other"))
+        for credentials in (None, others, others._replace(password="wrong")):
+            with broker.connect(f"{space}-victim", credentials) as thief:
+                assert not thief.connected.is_set()
+        victim.publish_acknowledged(topic, b"still here")
+        assert victim.receive().payload == b"still here"
+        assert not victim.disconnected.is_set()
+
+
+def test_a_takeover_closes_the_old_socket(broker: RunningBroker, space: str, transport: Transport) -> None:
+    credentials = broker.issue(broker.grant(space))
+    with Wire(broker.port(transport), transport) as old:
+        old.send(wire.connect_packet(space, credentials))
+        assert old.read() == (wire.CONNACK, 0, b"\0\0")
+        with broker.connect(space, credentials) as new:
+            assert new.connected.is_set()
+            assert old.closed()
+            assert not new.disconnected.is_set()
+
+
+def test_after_a_takeover_only_the_new_connection_hears(broker: RunningBroker, space: str) -> None:
+    topic = f"ts/v1/{space}/arm/conn"
+    credentials = broker.issue(broker.grant(space, publish=(topic,), subscribe=(topic,)))
+    with broker.connect(space, credentials) as old:
+        old.subscribe(topic)
+        with broker.connect(space, credentials) as new:
+            wait_until(old.disconnected.is_set, "the end of the old connection")
+            new.subscribe(topic)
+            for number in range(5):
+                new.publish_acknowledged(topic, b"%d" % number)
+            assert [new.receive().payload for _ in range(5)] == [b"0", b"1", b"2", b"3", b"4"]
+            assert old.heard() == []
+
+
+def test_a_lost_connection_lets_the_will_be_said_and_kept(
+    broker: RunningBroker, space: str, transport: Transport
+) -> None:
+    topic = f"ts/v1/{space}/arm/conn"
+    will = Message(topic, b"offline", 1, retain=True)
+    with broker.client(f"{space}-page", subscribe=(topic,)) as page:
+        page.subscribe(topic)
+        with broker.client(space, publish=(topic,), will=will, transport=transport) as agent:
+            agent.publish_acknowledged(topic, b"online", retain=True)
+            assert page.receive().payload == b"online"
+            agent.vanish()
+            assert page.receive().payload == b"offline"
+        with broker.client(f"{space}-late", subscribe=(topic,)) as late:
+            late.subscribe(topic)
+            assert late.receive() == Message(topic, b"offline", 1, retain=True)
+
+
+def test_a_lost_keep_alive_lets_the_will_be_said(broker: RunningBroker, space: str, transport: Transport) -> None:
+    topic = f"ts/v1/{space}/arm/conn"
+    credentials = broker.issue(broker.grant(space, publish=(topic,)))
+    with broker.client(f"{space}-page", subscribe=(topic,)) as page, Wire(broker.port(transport), transport) as silent:
+        page.subscribe(topic)
+        silent.send(wire.connect_with_will(space, credentials, topic, b"offline", keep_alive_s=1))
+        assert silent.read() == (wire.CONNACK, 0, b"\0\0")
+        began = time.monotonic()
+        assert page.receive().payload == b"offline"
+        assert time.monotonic() - began > 1.0, "a client may be silent for its keep-alive and half of it again"
+        assert silent.closed()
+
+
+def test_pings_keep_a_silent_client_alive(broker: RunningBroker, space: str) -> None:
+    with Wire(broker.tcp_port) as silent:
+        silent.send(wire.connect_packet(space, broker.issue(broker.grant(space)), keep_alive_s=1))
+        assert silent.read() == (wire.CONNACK, 0, b"\0\0")
+        for _ in range(6):
+            time.sleep(0.5)
+            silent.send(wire.PINGREQ)
+            assert silent.read() == (wire.PINGRESP, 0, b"")
+
+
+def test_a_disconnect_takes_the_will_back(broker: RunningBroker, space: str) -> None:
+    topic = f"ts/v1/{space}/arm/conn"
+    with broker.client(f"{space}-page", subscribe=(topic,)) as page:
+        page.subscribe(topic)
+        with broker.client(space, publish=(topic,), will=Message(topic, b"offline", 1, retain=True)) as agent:
+            agent.publish_acknowledged(topic, b"online")
+        assert page.receive().payload == b"online"
+        with pytest.raises(AssertionError, match="heard nothing"):
+            page.receive(SILENCE_S)
+
+
+def test_credentials_that_have_run_out_are_refused(broker: RunningBroker, space: str) -> None:
+    credentials = broker.issue(broker.grant(space, lifetime_s=-1))
+    broker.expire()
+    with broker.connect(space, credentials) as late:
+        assert not late.connected.is_set()
+
+
+def test_expiry_ends_the_live_session(broker: RunningBroker, space: str) -> None:
+    grant = broker.grant(space, lifetime_s=3)
+    longer = broker.grant(f"{space}-longer")
+    with (
+        broker.connect(space, broker.issue(grant)) as short,
+        broker.connect(f"{space}-longer", broker.issue(longer)) as other,
+    ):
+        assert short.connected.is_set()
+
+        def ended() -> bool:
+            broker.expire()
+            return short.disconnected.is_set()
+
+        wait_until(ended, "the end of a session whose credentials ran out")
+        assert time.time() >= grant.expires_at
+        assert not other.disconnected.is_set()
+
+
+def test_revoking_a_client_id_cuts_its_session_and_refuses_its_credentials(
+    broker: RunningBroker, space: str, transport: Transport
+) -> None:
+    credentials, spare = (broker.issue(broker.grant(space)) for _ in range(2))
+    with (
+        broker.connect(space, credentials, transport=transport) as client,
+        broker.client(f"{space}-bystander") as bystander,
+    ):
+        broker.revoke(client_id=space)
+        wait_until(client.disconnected.is_set, "the end of a revoked session")
+        for revoked in (credentials, spare):  # the spare one was never used
+            with broker.connect(space, revoked) as again:
+                assert not again.connected.is_set()
+        with broker.connect(space, broker.issue(broker.grant(space))) as renewed:
+            assert renewed.connected.is_set()
+            assert not bystander.disconnected.is_set()
+
+
+def test_revoking_a_principal_cuts_all_its_sessions_and_no_others(broker: RunningBroker, space: str) -> None:
+    person = f"account:{space}"
+    ids = [f"{space}-watch", f"{space}-control"]
+    credentials = [broker.issue(broker.grant(each, principal=person)) for each in ids]
+    with broker.client(f"{space}-other") as other:
+        clients = [broker.connect(each, given) for each, given in zip(ids, credentials, strict=True)]
+        broker.revoke(principal=person)
+        for client in clients:
+            wait_until(client.disconnected.is_set, "the end of a revoked session")
+            client.close()
+        for each, given in zip(ids, credentials, strict=True):
+            with broker.connect(each, given) as again:
+                assert not again.connected.is_set()
+        with broker.connect(ids[0], broker.issue(broker.grant(ids[0], principal=person))) as renewed:
+            assert renewed.connected.is_set()
+        assert not other.disconnected.is_set()
+
+
+def test_renewing_credentials_leaves_the_connection_alone(broker: RunningBroker, space: str) -> None:
+    with broker.client(space) as client:
+        broker.issue(broker.grant(space))
+        assert not client.disconnected.wait(SILENCE_S)
+
+
+def test_what_was_said_to_somebody_away_is_not_passed_off_as_retained(broker: RunningBroker, space: str) -> None:
+    topic = f"ts/v1/{space}/arm/ur5/event"
+    credentials = broker.issue(broker.grant(space, subscribe=(topic,)))
+    with broker.client(f"{space}-agent", publish=(topic,)) as agent:
+        with Wire(broker.tcp_port) as away:
+            away.send(wire.connect_packet(space, credentials, clean=False))
+            assert away.read() == (wire.CONNACK, 0, b"\0\0")
+            away.send(wire.subscribe_packet(topic, qos=1))
+            assert away.read() == (wire.SUBACK, 0, b"\0\1\1")
+        for number in range(20):
+            agent.publish_acknowledged(topic, b"%d" % number)
+        with Wire(broker.tcp_port) as back:
+            back.send(wire.connect_packet(space, credentials, clean=False))
+            answer = back.read()
+            assert answer is not None
+            assert answer[0] == wire.CONNACK
+            agent.publish_acknowledged(topic, b"end")
+            numbers = []
+            if not answer[2][0]:  # no session was kept, so nothing may be queued either
+                back.send(wire.subscribe_packet(topic, qos=1))
+                assert back.read() == (wire.SUBACK, 0, b"\0\1\1")
+                agent.publish_acknowledged(topic, b"end")
+            while (packet := back.read()) and not packet[2].endswith(b"end"):
+                assert packet[0] == wire.PUBLISH
+                assert not packet[1] & 1, "nothing was retained"
+                numbers.append(int(packet[2][len(wire.text(topic)) + 2 :]))
+                back.send(wire.packet(wire.PUBACK, packet[2][len(wire.text(topic)) :][:2]))
+            assert all(first < second for first, second in pairwise(numbers))
+            assert answer[2][0] or numbers == []
+
+
+def test_a_client_that_starts_with_mqtt_5_ends_up_connected(broker: RunningBroker, space: str) -> None:
+    topic = f"ts/v1/{space}/arm/conn"
+    credentials = broker.issue(broker.grant(space, publish=(topic,), subscribe=(topic,)))
+    began = time.monotonic()
+    client = broker.connect(space, credentials, protocol=paho.MQTTv5)
+    if not client.connected.is_set():
+        assert client.answer == "Unsupported protocol version"
+        assert time.monotonic() - began < PAHO_GIVES_UP_S, "paho was left waiting for its CONNACK"
+        client.close()
+        client = broker.connect(space, credentials)
+    with client:
+        client.subscribe(topic)
+        client.publish_acknowledged(topic, b"here")
+        assert client.receive().payload == b"here"
+
+
+PAHO_GIVES_UP_S = 5.0
+
+
+@pytest.mark.parametrize("level", [3, 5, 6, 255])
+def test_another_protocol_version_is_answered_at_once(broker: RunningBroker, space: str, level: int) -> None:
+    with Wire(broker.tcp_port) as raw:
+        raw.send(wire.connect_packet(space, broker.issue(broker.grant(space)), level=level))
+        answer = raw.read()
+        if broker.kind == "amqtt":
+            assert answer == (wire.CONNACK, 0, b"\0\1")
+        assert answer is None or answer[0] == wire.CONNACK

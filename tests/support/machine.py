@@ -1,0 +1,213 @@
+"""The whole product as ``make up`` starts it, for tests that look at it from outside."""
+
+import contextlib
+import json
+import os
+import re
+import signal
+import socket
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Self
+
+import httpx
+
+from tests.support.brokers import ROOT, wait_until
+
+START_WITHIN_S = 90.0
+
+
+def free_ports() -> int:
+    """The first of three free ports in a row."""
+    for _ in range(100):
+        with contextlib.ExitStack() as stack:
+            first = stack.enter_context(socket.socket())
+            first.bind(("127.0.0.1", 0))
+            port: int = first.getsockname()[1]
+            try:
+                for offset in (1, 2):
+                    stack.enter_context(socket.socket()).bind(("127.0.0.1", port + offset))
+            except (OSError, OverflowError):
+                continue
+            return port
+    raise AssertionError("no three free ports in a row")
+
+
+@dataclass
+class Machine:
+    """A started product."""
+
+    process: "subprocess.Popen[str]"
+    home: Path
+    port: int
+    lines: list[str]
+
+    @property
+    def url(self) -> str:
+        return f"http://127.0.0.1:{self.port}"
+
+    @property
+    def ready(self) -> str:
+        return next(line for line in self.lines if line.startswith("ready"))
+
+    def sign_in_link(self) -> str:
+        """A new one-time link, as an administrator makes one."""
+        done = subprocess.run(
+            [sys.executable, "-m", "function_app", "sign-in-link", "--account", "demo"],
+            cwd=ROOT,
+            env=os.environ | {"TELESCOPE_HOME": str(self.home), "TELESCOPE_PORT": str(self.port)},
+            capture_output=True,
+            text=True,
+            check=True,
+        )
+        return done.stdout.strip().splitlines()[-1]
+
+    def api(self) -> "Api":
+        """The HTTP API, signed in."""
+        return Api(self)
+
+    def trace(self, device: str = "ur5") -> "Trace":
+        """What the simulation of a device has written down."""
+        return Trace(self.home / "trace" / f"{device}.ndjson")
+
+    def pid(self, words: str) -> int:
+        """The process of ours whose command line has these words."""
+        listed = subprocess.run(["ps", "-eo", "pid,ppid,args"], capture_output=True, text=True, check=True).stdout
+        found = [line for line in listed.splitlines() if words in line and int(line.split()[1]) == self.process.pid]
+        assert len(found) == 1, f"{words}: {found}"
+        return int(found[0].split()[0])
+
+    def kill(self, words: str) -> None:
+        os.kill(self.pid(words), signal.SIGKILL)
+
+    def interrupt(self) -> int:
+        """Ctrl-C; the exit code."""
+        self.process.send_signal(signal.SIGINT)
+        return self.process.wait(60)
+
+    def log(self, name: str) -> str:
+        return (self.home / "logs" / f"{name}.log").read_text()
+
+
+class Api:
+    """One sign-in's view of the HTTP API. ``with`` closes it."""
+
+    def __init__(self, machine: Machine) -> None:
+        self.http = httpx.Client(base_url=f"{machine.url}/api/v1", timeout=30)
+        signed_in = self.http.post("/auth/sign-in", json={"link": machine.sign_in_link().partition("#sign-in=")[2]})
+        assert signed_in.status_code == httpx.codes.OK, signed_in.text
+        self.http.cookies.clear()
+        self.http.headers["Authorization"] = f"Bearer {signed_in.json()['access_token']}"
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.http.close()
+
+    def get(self, path: str, **query: Any) -> Any:
+        return self._ok(self.http.get(path, params=query))
+
+    def post(self, path: str, body: Any = None) -> Any:
+        return self._ok(self.http.post(path, json={} if body is None else body))
+
+    def device(self, name: str = "ur5") -> dict[str, Any]:
+        """The device with this name at its agent, once it is online."""
+        found: list[dict[str, Any]] = []
+
+        def online() -> bool:
+            found[:] = [each for each in self.get("/devices")["items"] if each["name"] == name and each["online"]]
+            return bool(found)
+
+        wait_until(online, f"{name} to be online", 30)
+        return found[0]
+
+    @staticmethod
+    def _ok(answer: httpx.Response) -> Any:
+        assert answer.is_success, f"{answer.request.method} {answer.request.url}: {answer.status_code} {answer.text}"
+        return answer.json() if answer.content else None
+
+
+class Trace:
+    """The simulation's own record, line by line: what really moved."""
+
+    def __init__(self, path: Path) -> None:
+        self._path = path
+
+    def rows(self) -> list[dict[str, Any]]:
+        rows = []
+        for line in self._path.read_text().splitlines():
+            with contextlib.suppress(ValueError):  # the last line may be half written
+                row = json.loads(line)
+                if "qpos" in row:
+                    rows.append(row)
+        return rows
+
+    def header(self) -> dict[str, Any]:
+        with self._path.open() as file:
+            header: dict[str, Any] = json.loads(file.readline())
+        return header
+
+    def now(self) -> dict[str, Any]:
+        return self.rows()[-1]
+
+
+@contextlib.contextmanager
+def start_machine(home: Path, *, port: int = 0, **settings: str) -> Iterator[Machine]:
+    """``make up``'s program, until the end of the ``with``; ``settings`` are environment variables.
+
+    Waits for the ready line, or for the end of the process.
+    """
+    port = port or free_ports()
+    environment = os.environ | {
+        "TELESCOPE_HOME": str(home),
+        "TELESCOPE_PORT": str(port),
+        "TELESCOPE_TRACE": str(home / "trace"),
+        **settings,
+    }
+    process = subprocess.Popen(
+        [sys.executable, "-m", "infra.local"],
+        cwd=ROOT,
+        env=environment,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.STDOUT,
+        text=True,
+    )
+    lines: list[str] = []
+    assert process.stdout is not None
+    output = process.stdout
+
+    def read() -> None:
+        for line in output:
+            lines.append(line)  # noqa: PERF402 (as they come)
+
+    reader = threading.Thread(target=read)
+    reader.start()
+    try:
+        deadline_s = time.monotonic() + START_WITHIN_S
+        while process.poll() is None and not any(line.startswith("ready") for line in lines):
+            assert time.monotonic() < deadline_s, "".join(lines)
+            time.sleep(0.05)
+        yield Machine(process, home, port, lines)
+    finally:
+        if process.poll() is None:
+            process.send_signal(signal.SIGINT)
+            try:
+                process.wait(40)
+            except subprocess.TimeoutExpired:
+                process.kill()
+        reader.join(10)
+        process.wait()
+        output.close()
+
+
+def ready_link(line: str) -> str:
+    """The sign-in link in a ready line."""
+    found = re.search(r"http\S+#sign-in=\S+", line)
+    assert found, line
+    return found[0]
