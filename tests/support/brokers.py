@@ -48,7 +48,7 @@ def wait_until(condition: Callable[[], object], what: str, timeout_s: float = PA
     deadline = time.monotonic() + timeout_s
     while not condition():
         assert time.monotonic() < deadline, f"waited {timeout_s} s for {what}"
-        time.sleep(0.01)
+        time.sleep(0.002)
 
 
 @dataclass

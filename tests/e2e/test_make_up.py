@@ -1,0 +1,204 @@
+"""``make up`` as a person meets it: the ready line, the data that stays, and every way in which it cannot start."""
+
+import os
+import signal
+import socket
+import sqlite3
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import httpx
+import pytest
+
+from tests.support.brokers import BROKERS, ROOT, wait_until
+from tests.support.machine import Machine, free_ports, ready_link, start_machine
+
+
+def clear_line(machine: Machine) -> str:
+    """The one line with which it ended; anything like a traceback fails."""
+    assert machine.process.wait(30) != 0
+    text = "".join(machine.lines)
+    assert "Traceback" not in text
+    lines = [line for line in machine.lines if line.strip() and line != "telescope: starting\n"]
+    assert len(lines) == 1, text
+    return lines[0]
+
+
+def listeners(machine: Machine) -> list[str]:
+    """Addresses on which the product's three ports listen."""
+    found = []
+    for family in ("tcp", "tcp6"):
+        for line in Path(f"/proc/net/{family}").read_text().splitlines()[1:]:
+            address, state = line.split()[1], line.split()[3]
+            host, _, port = address.rpartition(":")
+            if state == "0A" and 0 <= int(port, 16) - machine.port < 3:
+                found.append(host)
+    return found
+
+
+@pytest.mark.parametrize("broker", BROKERS)
+def test_it_gets_ready_ends_cleanly_and_keeps_its_data(tmp_path: Path, broker: str) -> None:
+    with start_machine(tmp_path, TELESCOPE_BROKER=broker) as first:
+        assert first.ready.count("\n") == 1
+        assert f"{first.url}/ " in first.ready
+        link = ready_link(first.ready)
+        token = link.partition("#sign-in=")[2]
+        assert httpx.post(f"{first.url}/api/v1/auth/sign-in", json={"link": token}).status_code == 200
+        assert httpx.post(f"{first.url}/api/v1/auth/sign-in", json={"link": token}).status_code == 401
+        with first.api() as api:
+            device = api.device()
+            api.http.put("/robot-types/ur5/movements/mine", json={"source": "robot.home()\n"}).raise_for_status()
+        assert set(listeners(first)) == {"0100007F"}, "something listens beyond loopback"
+        children = [first.pid(words) for words in ("infra." + broker, "serve", "work", "device_agent")]
+        assert first.interrupt() == 0
+        for pid in children:
+            assert not Path(f"/proc/{pid}").exists()
+        assert "Traceback" not in "".join(first.lines)
+    with start_machine(tmp_path, port=first.port, TELESCOPE_BROKER=broker) as second, second.api() as api:
+        assert api.device()["id"] == device["id"]
+        assert "mine" in [each["name"] for each in api.get("/robot-types/ur5/movements")["items"]]
+
+
+def test_every_part_that_is_killed_comes_back(tmp_path: Path) -> None:
+    with start_machine(tmp_path) as machine, machine.api() as api:
+        device = api.device()
+        for words in ("infra.amqtt", "serve", "work", "device_agent"):
+            machine.kill(words)
+            wait_until(lambda words=words: _runs(machine, words), f"{words} to be started again", 30)
+        wait_until(lambda: _moves(api, device["id"]), "the robot to move again", 60)
+
+
+def _runs(machine: Machine, words: str) -> bool:
+    try:
+        machine.pid(words)
+    except AssertionError:
+        return False
+    return True
+
+
+def _moves(api, device: str) -> bool:
+    try:
+        body = {
+            "request": {"kind": "move_joints", "position_rad": {"wrist_3": 0.2}},
+            "wait_ms": 20_000,
+            "wait_for": "done",
+        }
+        return api.http.post(f"/devices/{device}/actions", json=body).json().get("status") == "done"
+    except httpx.HTTPError:
+        return False
+
+
+def test_when_the_supervisor_is_killed_nothing_is_left_behind(tmp_path: Path) -> None:
+    with start_machine(tmp_path) as machine:
+        children = [machine.pid(words) for words in ("infra.amqtt", "serve", "work", "device_agent")]
+        machine.process.send_signal(signal.SIGKILL)
+        wait_until(lambda: not any(Path(f"/proc/{pid}").exists() for pid in children), "the others to end", 30)
+
+
+@pytest.mark.parametrize("offset", [0, 1, 2])
+def test_a_taken_port_is_named(tmp_path: Path, offset: int) -> None:
+    port = free_ports()
+    with socket.create_server(("127.0.0.1", port + offset)), start_machine(tmp_path, port=port) as machine:
+        line = clear_line(machine)
+        assert f"port {port + offset}" in line
+        assert "TELESCOPE_PORT" in line
+
+
+@pytest.mark.parametrize(
+    ("settings", "says"),
+    [
+        ({"TELESCOPE_PORT": "eighty"}, "TELESCOPE_PORT"),
+        ({"TELESCOPE_PORT": "70000"}, "TELESCOPE_PORT"),
+        ({"TELESCOPE_BROKER": "carrier-pigeon"}, "amqtt or mosquitto"),
+        ({"TELESCOPE_HOME": "/proc/nothing"}, "TELESCOPE_HOME"),
+    ],
+)
+def test_a_wrong_setting_is_named(tmp_path: Path, settings: dict[str, str], says: str) -> None:
+    with start_machine(tmp_path, **settings) as machine:
+        assert says in clear_line(machine)
+
+
+@pytest.mark.parametrize("package", ["ruckig", "fastapi", "amqtt", "mujoco"])
+def test_a_missing_package_is_named(tmp_path: Path, package: str) -> None:
+    hide = tmp_path / "hide"
+    hide.mkdir()
+    (hide / "sitecustomize.py").write_text(
+        "import sys\n"
+        "class Hide:\n"
+        "    def find_spec(self, name, path=None, target=None):\n"
+        f"        if name.partition('.')[0] == {package!r}:\n"
+        "            raise ModuleNotFoundError(name, name=name)\n"
+        "sys.meta_path.insert(0, Hide())\n"
+    )
+    with start_machine(tmp_path / "home", PYTHONPATH=str(hide)) as machine:
+        line = clear_line(machine)
+        assert f"'{package}'" in line
+        assert "make env" in line
+
+
+def test_a_corrupt_database_is_named_and_kept(tmp_path: Path) -> None:
+    with start_machine(tmp_path) as machine:
+        machine.interrupt()
+    (database,) = tmp_path.glob("*.db")
+    for leftover in (*tmp_path.glob("*.db-wal"), *tmp_path.glob("*.db-shm")):
+        leftover.unlink()
+    before = b"not a database at all" + database.read_bytes()[21:]
+    database.write_bytes(before)
+    with start_machine(tmp_path, port=machine.port) as again:
+        assert str(database) in clear_line(again)
+    assert database.read_bytes() == before
+
+
+def test_a_damaged_page_of_the_database_is_named_and_kept(tmp_path: Path) -> None:
+    with start_machine(tmp_path) as machine:
+        machine.interrupt()
+    (database,) = tmp_path.glob("*.db")
+    with sqlite3.connect(database) as connection:
+        connection.execute("PRAGMA wal_checkpoint(TRUNCATE)")
+    connection.close()
+    whole = bytearray(database.read_bytes())
+    whole[4096 : len(whole)] = os.urandom(len(whole) - 4096)
+    database.write_bytes(whole)
+    with start_machine(tmp_path, port=machine.port) as again:
+        assert str(database) in clear_line(again)
+    assert database.read_bytes() == bytes(whole)
+
+
+def test_help_is_there_for_every_program() -> None:
+    for program in (["device_agent"], ["device_agent", "enroll"], ["device_agent", "run"], ["function_app"]):
+        done = subprocess.run(
+            [sys.executable, "-m", *program, "--help"], cwd=ROOT, capture_output=True, text=True, check=True
+        )
+        assert done.stdout.startswith("usage:")
+
+
+def test_the_agent_says_in_one_line_what_it_lacks(tmp_path: Path) -> None:
+    cases = {
+        ("run",): "enroll",
+        ("enroll", "--server", "http://127.0.0.1:1"): "--device",
+        ("enroll", "--device", "arm=ur5"): "--server",
+        ("enroll", "--server", "http://127.0.0.1:1", "--device", "arm=ur99"): "ur5",
+        ("enroll", "--server", "http://127.0.0.1:1", "--device", "arm"): "NAME=TYPE",
+        ("enroll", "--server", "http://127.0.0.1:1", "--device", "arm=ur5:warp"): "mujoco",
+        ("enroll", "--server", "http://127.0.0.1:1", "--device", "arm=ur5"): "cannot be reached",
+    }
+    for number, (arguments, says) in enumerate(cases.items()):
+        done = subprocess.run(
+            [sys.executable, "-m", "device_agent", *arguments, "--home", str(tmp_path / str(number))],
+            cwd=ROOT,
+            capture_output=True,
+            text=True,
+            check=False,
+        )
+        assert done.returncode != 0
+        assert says in done.stderr, arguments
+        assert len(done.stderr.splitlines()) == 1, done.stderr
+
+
+def test_a_start_is_quick_enough_to_wait_for(tmp_path: Path) -> None:
+    began_s = time.monotonic()
+    with start_machine(tmp_path) as machine:
+        print(f"ready after {time.monotonic() - began_s:.1f} s")
+        assert machine.ready

@@ -1,0 +1,288 @@
+"""An operator in a real Chromium, a robot in real physics, and what the physics itself says moved."""
+
+import contextlib
+import json
+import math
+import subprocess
+import threading
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+from playwright.sync_api import Browser, BrowserContext, Page, expect, sync_playwright
+
+from tests.support.brokers import wait_until
+from tests.support.machine import Machine, Trace
+
+PATIENCE_MS = 30_000
+STOP_WITHIN_MS = 350
+_FLAGS = [
+    "--no-sandbox",
+    "--disable-gpu",
+    "--enable-unsafe-swiftshader",
+    "--disable-quic",
+    "--no-first-run",
+    "--disable-background-networking",
+    "--disable-component-update",
+    "--disable-sync",
+]
+
+
+@pytest.fixture(scope="module")
+def browser() -> Iterator[Browser]:
+    with sync_playwright() as playwright:
+        browser = playwright.chromium.launch(executable_path="/usr/bin/chromium", args=_FLAGS)
+        yield browser
+        browser.close()
+
+
+@contextlib.contextmanager
+def operator(browser: Browser, machine: Machine) -> Iterator[Page]:
+    """A person with a browser of their own, signed in, looking at the robot. Fails on any script error."""
+    context: BrowserContext = browser.new_context(viewport={"width": 1440, "height": 900})
+    page = context.new_page()
+    page.set_default_timeout(PATIENCE_MS)
+    errors: list[str] = []
+    page.on("pageerror", lambda error: errors.append(str(error)))
+    page.on("console", lambda message: errors.append(message.text) if "Content Security" in message.text else None)
+    page.goto(machine.sign_in_link())
+    expect(page.get_by_test_id("signed-in")).to_be_visible(timeout=PATIENCE_MS)
+    assert "sign-in=" not in page.url
+    page.get_by_test_id("device-row").filter(has_text="UR5").get_by_role("link").first.click()
+    expect(page.get_by_test_id("control-state")).to_be_visible(timeout=PATIENCE_MS)
+    yield page
+    assert errors == []
+    context.close()
+
+
+def elbow(trace: Trace) -> float:
+    """Measured by the simulation [rad]."""
+    return float(trace.now()["qpos"]["elbow"])
+
+
+def shown(page: Page, joint: str = "elbow") -> float:
+    """Measured, as the page shows it [deg]."""
+    return float(page.get_by_test_id(f"measured-{joint}").get_attribute("data-value") or "nan")
+
+
+def take(page: Page) -> None:
+    page.get_by_test_id("take-control").click()
+    expect(page.get_by_test_id("control-state")).to_have_attribute("data-state", "mine", timeout=PATIENCE_MS)
+    expect(page.get_by_test_id("slider-elbow")).to_be_enabled()
+
+
+def drag(page: Page, share: float, joint: str = "elbow", *, let_go: bool = True) -> None:
+    """Drag the slider with the mouse to a share of its width."""
+    slider = page.get_by_test_id(f"slider-{joint}")
+    slider.scroll_into_view_if_needed()
+    box = slider.bounding_box()
+    value, low, high = (
+        float(slider.evaluate(f"e => e.{name}") if name == "valueAsNumber" else slider.get_attribute(name) or "nan")
+        for name in ("valueAsNumber", "min", "max")
+    )
+    assert box is not None
+    y = box["y"] + box["height"] / 2
+    page.mouse.move(box["x"] + box["width"] * (value - low) / (high - low), y)
+    page.mouse.down()
+    page.mouse.move(box["x"] + box["width"] * share, y, steps=5)
+    if let_go:
+        page.mouse.up()
+
+
+def reset(page: Page) -> None:
+    page.get_by_test_id("reset-stop").click()
+    page.get_by_test_id("confirm-reset").click()
+    expect(page.get_by_test_id("stop-banner")).to_be_hidden(timeout=PATIENCE_MS)
+
+
+def test_the_elbow_slider_moves_the_simulation_and_nobody_elses_does(browser: Browser, machine: Machine) -> None:
+    trace = machine.trace()
+    with operator(browser, machine) as ann, operator(browser, machine) as bob:
+        expect(ann.get_by_test_id("online")).to_contain_text("online", ignore_case=True)
+        take(ann)
+        before = elbow(trace)
+        drag(ann, 0.6)
+        wait_until(lambda: abs(elbow(trace) - before) > 0.2, "the simulated elbow to follow", 30)
+        target = float(ann.get_by_test_id("slider-elbow").input_value())
+        wait_until(lambda: abs(math.degrees(elbow(trace)) - target) < 1.5, "the elbow to arrive", 60)
+        wait_until(lambda: abs(shown(ann) - math.degrees(elbow(trace))) < 0.5, "the page to show it", 30)
+        round_trip = ann.get_by_test_id("round-trip")
+        assert float(round_trip.get_attribute("data-value") or "nan") > 0
+
+        # The other browser sees it all and can move nothing.
+        wait_until(lambda: abs(shown(bob) - math.degrees(elbow(trace))) < 0.5, "the other page to show it", 30)
+        expect(bob.get_by_test_id("slider-elbow")).to_be_disabled()
+        bob.get_by_test_id("take-control").click()
+        rest = elbow(trace)
+        expect(bob.get_by_test_id("control-state")).not_to_have_attribute("data-state", "mine")
+        assert_not_moved_by_force(bob, machine)
+        assert abs(elbow(trace) - rest) < 0.005
+        ann.get_by_test_id("release-control").click()
+        expect(ann.get_by_test_id("control-state")).not_to_have_attribute("data-state", "mine", timeout=PATIENCE_MS)
+
+
+def assert_not_moved_by_force(page: Page, machine: Machine) -> None:
+    """What a page without the lease gets when it asks past its own buttons: no credentials, and no action."""
+    device = page.evaluate("() => fetch('/api/v1/devices').then(r => r.json())")["items"][0]
+    ask = """([path, body]) => fetch('/api/v1' + path, {method: 'POST', body: JSON.stringify(body),
+        headers: {'Content-Type': 'application/json', 'X-Telescope-Client': 'test'}}).then(r => r.status)"""
+    epoch = device["lease"]["epoch"]
+    credentials = {"purpose": "control", "device": device["id"], "epoch": epoch}
+    assert page.evaluate(ask, ["/mqtt/credentials", credentials]) in {403, 409}
+    move = {"kind": "move_joints", "position_rad": {"elbow": 0.0}}
+    for body in ({"request": move}, {"request": move, "epoch": epoch}):
+        assert page.evaluate(ask, [f"/devices/{device['id']}/actions", body]) == 409
+
+
+def test_stop_latches_until_it_is_reset(browser: Browser, machine: Machine) -> None:
+    trace = machine.trace()
+    with operator(browser, machine) as page:
+        take(page)
+        drag(page, 0.45)
+        wait_until(lambda: commanded_speed(trace) > 0.1, "motion", 30)
+        page.keyboard.press("Escape")
+        expect(page.get_by_test_id("stop-banner")).to_be_visible()
+        wait_until(lambda: commanded_speed(trace) == 0, "rest", 10)
+        wait_until(lambda: page.get_by_test_id("slider-elbow").is_disabled(), "the sliders to be locked")
+        rest = elbow(trace)
+        page.wait_for_timeout(1000)
+        assert abs(elbow(trace) - rest) < 0.005
+        reset(page)
+        page.wait_for_timeout(500)
+        assert abs(elbow(trace) - rest) < 0.005, "resetting Stop must resume nothing"
+        take(page)
+        drag(page, 0.5)
+        wait_until(lambda: abs(elbow(trace) - rest) > 0.05, "motion after control was taken again", 30)
+        page.get_by_test_id("release-control").click()
+
+
+def test_closing_the_browser_in_mid_motion_stops_the_arm(browser: Browser, machine: Machine) -> None:
+    trace = machine.trace()
+    with operator(browser, machine) as page:
+        take(page)
+        drag(page, 0.75 if elbow(trace) < 0.5 else 0.25, let_go=False)
+        wait_until(lambda: commanded_speed(trace) > 0.2, "motion", 30)
+        page.close()
+        closed_ms = time.time() * 1000
+    wait_until(lambda: commanded_speed(trace) == 0, "rest", 10)
+    moving = [row["at_ms"] for row in speeds(trace) if row["speed"] > 1e-3]
+    assert max(moving) - closed_ms < STOP_WITHIN_MS
+    rest = elbow(trace)
+    time.sleep(1)
+    assert abs(elbow(trace) - rest) < 0.005
+
+
+def speeds(trace: Trace) -> list[dict[str, float]]:
+    """Commanded speed of the fastest joint between rows of the trace [rad/s]."""
+    rows = trace.rows()[-800:]
+    found = []
+    for before, after in zip(rows, rows[1:], strict=False):
+        step_s = after["time_s"] - before["time_s"]
+        fastest = max(abs(after["target"][name] - before["target"][name]) for name in after["target"])
+        found.append({"at_ms": after["at_ms"], "speed": fastest / step_s if step_s else 0.0})
+    return found
+
+
+def commanded_speed(trace: Trace) -> float:
+    return max(row["speed"] for row in speeds(trace)[-3:])
+
+
+def test_the_view_the_plot_and_the_pose_table_are_alive(browser: Browser, machine: Machine) -> None:
+    with operator(browser, machine) as page:
+        view = page.get_by_test_id("view-3d")
+        view.scroll_into_view_if_needed()
+        wait_until(lambda: int(view.get_attribute("data-frames") or 0) > 0, "the 3D view to be drawn", 60)
+        expect(page.get_by_test_id("plot").locator("canvas").first).to_be_visible()
+        rows = page.get_by_test_id("poses").locator("tbody tr")
+        assert rows.count() >= 6
+
+
+def test_a_movement_runs_from_the_list(browser: Browser, machine: Machine) -> None:
+    trace = machine.trace()
+    with operator(browser, machine) as page:
+        page.get_by_test_id("movement-home").click()
+        status = page.get_by_test_id("action-status")
+        expect(status).to_have_attribute("data-status", "done", timeout=60_000)
+        page.get_by_test_id("movement-wave").click()
+        expect(status).to_have_attribute("data-status", "started", timeout=PATIENCE_MS)
+        wait_until(lambda: commanded_speed(trace) > 0.1, "the simulation to wave", 30)
+        page.get_by_test_id("cancel-action").click()
+        expect(status).to_have_attribute("data-status", "cancelled", timeout=PATIENCE_MS)
+        wait_until(lambda: commanded_speed(trace) == 0, "rest", 10)
+
+
+def test_a_robot_that_goes_offline_is_shown_as_such(browser: Browser, machine: Machine) -> None:
+    with operator(browser, machine) as page:
+        online = page.get_by_test_id("online")
+        expect(online).to_contain_text("online", ignore_case=True)
+        # Killed and at once started again by the supervisor: the page must have noticed, and come back.
+        seen: list[str] = []
+        ending = threading.Event()
+        machine.kill("device_agent")
+        deadline_s = time.monotonic() + 30
+        while time.monotonic() < deadline_s and not ending.is_set():
+            text = (online.text_content() or "").lower()
+            if text not in seen[-1:]:
+                seen.append(text)
+            if len(seen) > 1 and "online" in seen[-1]:
+                ending.set()
+            page.wait_for_timeout(20)
+        assert any("offline" in text or "stale" in text for text in seen), seen
+        assert "online" in seen[-1], seen
+
+
+def test_a_phone_shows_all_of_it_without_sideways_scrolling(browser: Browser, machine: Machine) -> None:
+    with operator(browser, machine) as page:
+        page.set_viewport_size({"width": 390, "height": 844})
+        page.wait_for_timeout(300)
+        assert page.evaluate("() => document.documentElement.scrollWidth <= window.innerWidth")
+        expect(page.get_by_test_id("stop")).to_be_in_viewport()
+
+
+def credentials_of(machine: Machine) -> tuple[dict[str, Any], dict[str, Any]]:
+    with machine.api() as api:
+        return api.device(), api.post("/mqtt/credentials", {"purpose": "watch"})
+
+
+def mosquitto_sub(machine: Machine, topic: str, *more: str) -> "subprocess.CompletedProcess[str]":
+    return subprocess.run(
+        ["mosquitto_sub", "-h", "127.0.0.1", "-p", str(machine.port + 1), "-V", "311", "-t", topic, "-W", "10", *more],
+        capture_output=True,
+        text=True,
+        timeout=60,
+        check=False,
+    )
+
+
+def test_mosquitto_sub_prints_the_telemetry_with_credentials_of_the_api_and_only_then(machine: Machine) -> None:
+    device, given = credentials_of(machine)
+    who = ("-i", given["client_id"], "-u", given["username"], "-P", given["password"])
+    topic = f"{device['topic']}/tele/joints"
+    allowed = mosquitto_sub(machine, topic, *who, "-C", "3")
+    assert allowed.returncode == 0, allowed.stderr
+    rows = [json.loads(line) for line in allowed.stdout.splitlines()]
+    assert len(rows) == 3
+    assert all(len(row["position_rad"]) == 6 and len(row["frames"]) >= 6 for row in rows)
+    for refused in (
+        mosquitto_sub(machine, topic),
+        mosquitto_sub(machine, topic, *who[:4], "-P", "wrong"),
+        mosquitto_sub(machine, "#", *who, "-C", "1"),
+        mosquitto_sub(machine, f"{device['topic']}/cmd", *who, "-C", "1"),
+    ):
+        assert refused.stdout == ""
+        assert refused.returncode != 0
+
+
+def test_pictures_for_the_documentation(browser: Browser, machine: Machine, tmp_path: Path) -> None:
+    with operator(browser, machine) as page:
+        take(page)
+        drag(page, 0.6)
+        page.wait_for_timeout(2500)
+        for width, height in ((1440, 1100), (390, 844)):
+            page.set_viewport_size({"width": width, "height": height})
+            page.wait_for_timeout(500)
+            page.screenshot(path=tmp_path / f"operate-{width}.png")
+            assert (tmp_path / f"operate-{width}.png").stat().st_size > 20_000
+        page.get_by_test_id("release-control").click()
