@@ -1,6 +1,7 @@
 """An operator in a real Chromium, a robot in real physics, and what the physics itself says moved."""
 
 import contextlib
+import itertools
 import json
 import math
 import subprocess
@@ -117,13 +118,13 @@ def test_the_elbow_slider_moves_the_simulation_and_nobody_elses_does(browser: Br
         bob.get_by_test_id("take-control").click()
         rest = elbow(trace)
         expect(bob.get_by_test_id("control-state")).not_to_have_attribute("data-state", "mine")
-        assert_not_moved_by_force(bob, machine)
+        assert_not_moved_by_force(bob)
         assert abs(elbow(trace) - rest) < 0.005
         ann.get_by_test_id("release-control").click()
         expect(ann.get_by_test_id("control-state")).not_to_have_attribute("data-state", "mine", timeout=PATIENCE_MS)
 
 
-def assert_not_moved_by_force(page: Page, machine: Machine) -> None:
+def assert_not_moved_by_force(page: Page) -> None:
     """What a page without the lease gets when it asks past its own buttons: no credentials, and no action."""
     device = page.evaluate("() => fetch('/api/v1/devices').then(r => r.json())")["items"][0]
     ask = """([path, body]) => fetch('/api/v1' + path, {method: 'POST', body: JSON.stringify(body),
@@ -178,7 +179,7 @@ def speeds(trace: Trace) -> list[dict[str, float]]:
     """Commanded speed of the fastest joint between rows of the trace [rad/s]."""
     rows = trace.rows()[-800:]
     found = []
-    for before, after in zip(rows, rows[1:], strict=False):
+    for before, after in itertools.pairwise(rows):
         step_s = after["time_s"] - before["time_s"]
         fastest = max(abs(after["target"][name] - before["target"][name]) for name in after["target"])
         found.append({"at_ms": after["at_ms"], "speed": fastest / step_s if step_s else 0.0})
