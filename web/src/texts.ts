@@ -15,6 +15,7 @@ export const texts = {
   number: {
     oneDigit: (value: number): string => oneDigit.format(Object.is(Math.round(value * 10), -0) ? 0 : value),
     degrees: (value: number): string => `${texts.number.oneDigit(value)}°`,
+    wholeDegrees: (value: number): string => `${Math.round(value)}°`,
     milliseconds: (value: number): string => (value < 10 ? `${texts.number.oneDigit(value)} ms` : `${Math.round(value)} ms`),
     unknown: "–",
   },

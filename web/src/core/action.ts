@@ -121,18 +121,32 @@ export class ActionRunner {
     });
   }
 
-  /** Steps may be skipped, never taken back; the first end stays. */
+  /** The status never goes back and the first end stays; a step that is told late still finds its place. */
   #advance(status: RunStatus, rest: Partial<Run>): void {
     const run = this.#run.value;
     if (run === null) return;
     const forward = RANK[status] > RANK[run.status];
-    const steps = forward ? [...run.steps, { status, afterMs: performance.now() - this.#clickedAt }] : run.steps;
-    this.#run.value = { ...run, ...rest, status: forward ? status : run.status, steps };
+    this.#run.value = {
+      ...run,
+      ...rest,
+      status: forward ? status : run.status,
+      steps: withStep(run.steps, status, performance.now() - this.#clickedAt),
+    };
   }
 
   #update(rest: Partial<Run>): void {
     if (this.#run.value !== null) this.#run.value = { ...this.#run.value, ...rest };
   }
+}
+
+function withStep(steps: Run["steps"], status: RunStatus, afterMs: number): Run["steps"] {
+  const after = steps.findIndex((step) => RANK[step.status] >= RANK[status]);
+  if (after < 0) return [...steps, { status, afterMs }];
+  const next = steps[after];
+  // Known already, or another end than the first.
+  if (next === undefined || RANK[next.status] === RANK[status]) return steps;
+  // The answer overtook the ack: it cannot have been later than what followed it.
+  return steps.toSpliced(after, 0, { status, afterMs: Math.min(afterMs, next.afterMs) });
 }
 
 /** Output only grows; the cloud and the device may tell it at different lengths. */

@@ -80,8 +80,10 @@ export class DeviceStore {
 
   /** Age of the newest telemetry [ms]; `null` before the first. */
   readonly telemetryAgeMs = computed(() => {
-    const latest = this.#telemetry.value;
-    return latest === null ? null : Math.max(0, clock.value - latest.receivedAt);
+    // Sampled with the clock: asked at every message it would always be nought.
+    const at = clock.value;
+    const latest = this.#telemetry.peek();
+    return latest === null ? null : Math.max(0, at - latest.receivedAt);
   });
 
   readonly reach = computed<Reach>(() => {

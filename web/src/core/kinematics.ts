@@ -85,9 +85,16 @@ export function forward(twin: KnownTwin, positions: Readonly<Record<string, numb
   return world;
 }
 
+/** Nearer than this to a pitch of a quarter turn, roll and yaw turn about the same axis: all of it is called roll. */
+const LOCKED = 1 - 1e-9;
+
 /** Roll, pitch and yaw [rad] of a unit quaternion: turns about x, then y, then z of the fixed base. */
 export function rollPitchYaw([w, x, y, z]: Quaternion): Vector3 {
-  const sinPitch = Math.min(1, Math.max(-1, 2 * (w * y - z * x)));
+  const sinPitch = 2 * (w * y - z * x);
+  if (Math.abs(sinPitch) > LOCKED) {
+    const roll = 2 * Math.atan2(x, w);
+    return [Math.atan2(Math.sin(roll), Math.cos(roll)), (Math.sign(sinPitch) * Math.PI) / 2, 0];
+  }
   return [
     Math.atan2(2 * (w * x + y * z), 1 - 2 * (x * x + y * y)),
     Math.asin(sinPitch),

@@ -103,13 +103,17 @@ function Operate({ api, fleet, device, account }: OperateProps) {
         <Heading device={device} />
         <StopBanner device={device} stop={stop} />
         <div class="desk">
-          <View3D device={device} control={control} />
-          <JointSliders device={device} control={control} />
-          <Plot device={device} />
-          <Movements api={api} device={device} control={control} actions={actions} />
-          <PoseTable device={device} />
-          <Latency device={device} control={control} />
-          <Events device={device} />
+          <div class="column">
+            <View3D device={device} control={control} />
+            <Plot device={device} />
+            <PoseTable device={device} />
+          </div>
+          <div class="column">
+            <JointSliders device={device} control={control} />
+            <Movements api={api} device={device} control={control} actions={actions} />
+            <Latency device={device} control={control} />
+            <Events device={device} />
+          </div>
         </div>
       </main>
     </>

@@ -117,6 +117,10 @@ function JointRow({ joint, index, device, streamer }: JointRowProps) {
         {measured === undefined ? texts.number.unknown : texts.number.degrees(measured)}
       </span>
       <div class="track">
+        <span class="limit quiet" aria-hidden="true">
+          {texts.number.wholeDegrees(lower)}
+        </span>
+        <span class="rail">
         <input
           type="range"
           data-testid={`slider-${joint.name}`}
@@ -138,9 +142,9 @@ function JointRow({ joint, index, device, streamer }: JointRowProps) {
         {measured !== undefined && (
           <span class="marker" aria-hidden="true" style={{ "--at": String((measured - lower) / (upper - lower)) }} />
         )}
-        <span class="limits quiet" aria-hidden="true">
-          <span>{texts.number.degrees(lower)}</span>
-          <span>{texts.number.degrees(upper)}</span>
+        </span>
+        <span class="limit quiet" aria-hidden="true">
+          {texts.number.wholeDegrees(upper)}
         </span>
       </div>
     </div>

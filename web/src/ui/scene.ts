@@ -23,6 +23,7 @@ import {
   WebGLRenderer,
 } from "three";
 import { OrbitControls } from "three/examples/jsm/controls/OrbitControls.js";
+import { now } from "../core/clock";
 import { forward, placed } from "../core/kinematics";
 import type { KnownTwin } from "../core/messages";
 import type { Geometry } from "../core/protocol";
@@ -42,6 +43,11 @@ export interface LiveScene {
   dispose(): void;
 }
 
+/** Drawing takes at most one part in this many of the page's time: sliders and setpoints go first. */
+const TIME_SHARE = 4;
+const LONGEST_WAIT_MS = 400;
+/** Nobody feels a frame that costs less [ms]. */
+const FREE_MS = 6;
 /** Closer to the measured pose than this the target would only hide it [rad]. */
 const GHOST_FROM = 0.005;
 const GHOST_COLOUR = 0x2f8fe0;
@@ -68,7 +74,7 @@ export function createScene(canvas: HTMLCanvasElement, twin: KnownTwin, onFrame:
     opacity: GHOST_OPACITY,
     depthWrite: false,
   });
-  const ghost = build(ghostRoot, twin, () => ghostMaterial);
+  const ghost = build(ghostRoot, twin, () => ghostMaterial, moving(twin));
   ghostRoot.visible = false;
 
   const camera = new PerspectiveCamera(38, 1, 0.01, 100);
@@ -77,20 +83,36 @@ export function createScene(canvas: HTMLCanvasElement, twin: KnownTwin, onFrame:
   controls.enableDamping = false;
   const home = frame(twin);
   light(scene, home.radius);
-  let grid = floor(scene, home.radius);
+  let grid = floor(scene, home);
 
   let asked = 0;
+  let waiting: ReturnType<typeof setTimeout> | undefined;
+  let again = false;
   const draw = (): void => {
     asked = 0;
+    const startedAt = now();
     renderer.render(scene, camera);
     onFrame();
+    // Without a graphics card a frame can cost the page more than its share; then the next one waits.
+    waiting = setTimeout(() => {
+      const tookMs = now() - startedAt;
+      waiting = setTimeout(
+        () => {
+          waiting = undefined;
+          if (again) drawSoon();
+        },
+        Math.min((TIME_SHARE - 1) * Math.max(0, tookMs - FREE_MS), LONGEST_WAIT_MS),
+      );
+    }, 0);
+    again = false;
   };
   const drawSoon = (): void => {
-    if (asked === 0) asked = requestAnimationFrame(draw);
+    again = true;
+    if (asked === 0 && waiting === undefined) asked = requestAnimationFrame(draw);
   };
   const resetView = (): void => {
     controls.target.copy(home.centre);
-    camera.position.copy(home.centre).add(new Vector3(1.15, -1.5, 0.75).normalize().multiplyScalar(home.radius * 3.1));
+    camera.position.copy(home.centre).add(new Vector3(1.15, -1.5, 0.75).normalize().multiplyScalar(home.radius * 3.2));
     controls.update();
     drawSoon();
   };
@@ -121,12 +143,13 @@ export function createScene(canvas: HTMLCanvasElement, twin: KnownTwin, onFrame:
     recolour() {
       scene.remove(grid);
       grid.dispose();
-      grid = floor(scene, home.radius);
+      grid = floor(scene, home);
       drawSoon();
     },
     resetView,
     dispose() {
       cancelAnimationFrame(asked);
+      clearTimeout(waiting);
       observer.disconnect();
       controls.dispose();
       scene.traverse((object) => {
@@ -153,11 +176,17 @@ function solidMaterial(geometry: Geometry): Material {
 }
 
 /** One object for each body, in the twin's order, parents holding their children. */
-function build(root: Object3D, twin: KnownTwin, material: (geometry: Geometry) => Material): Robot {
+function build(
+  root: Object3D,
+  twin: KnownTwin,
+  material: (geometry: Geometry) => Material,
+  only?: ReadonlySet<number>,
+): Robot {
   const bodies: Robot = [];
-  for (const body of twin.bodies) {
+  for (const [index, body] of twin.bodies.entries()) {
     const object = new Group();
-    for (const geometry of body.geometries) {
+    for (const geometry of only?.has(index) === false ? [] : body.geometries) {
+      if (geometry.shape === "plane") continue; // The grid is the floor.
       const mesh = new Mesh(shape(geometry), material(geometry));
       mesh.position.set(...geometry.position_m);
       const [w, x, y, z] = geometry.quaternion;
@@ -186,7 +215,7 @@ function shape({ shape: kind, size_m: [a, b, c] }: Geometry): BufferGeometry {
     case "cylinder":
       return new CylinderGeometry(a, a, 2 * b, 36).rotateX(Math.PI / 2);
     case "plane":
-      return new PlaneGeometry(2 * a || 4, 2 * b || 4);
+      return new PlaneGeometry(2 * a, 2 * b);
   }
 }
 
@@ -201,12 +230,35 @@ function pose(robot: Robot, twin: KnownTwin, positions: Targets): void {
   });
 }
 
-/** Where to look, so that the whole robot is in sight at its reference pose and when it reaches out. */
-function frame(twin: KnownTwin): { centre: Vector3; radius: number } {
-  const points = forward(twin, {}).map(({ position_m }) => new Vector3(...position_m));
+/** Indices of the bodies that some joint moves. */
+function moving(twin: KnownTwin): Set<number> {
+  const found = new Set<number>();
+  twin.bodies.forEach((body, index) => {
+    if (body.joint !== null || found.has(body.parent)) found.add(index);
+  });
+  return found;
+}
+
+interface Frame {
+  centre: Vector3;
+  radius: number;
+  floor: number;
+}
+
+/** Where to look, so that the whole robot is in sight, also when it reaches out. */
+function frame(twin: KnownTwin): Frame {
+  const parts = moving(twin);
+  const points = forward(twin, {})
+    .filter((_, index) => parts.has(index))
+    .map(({ position_m }) => new Vector3(...position_m));
   const base = points[0] ?? new Vector3();
   const reach = Math.max(0.2, ...points.map((point) => point.distanceTo(base)));
-  return { centre: base.clone().add(new Vector3(0, 0, reach * 0.35)), radius: reach * 0.85 };
+  const planes = twin.bodies.flatMap((body) => body.geometries.filter(({ shape: kind }) => kind === "plane"));
+  return {
+    centre: base.clone().add(new Vector3(0, 0, reach * 0.32)),
+    radius: reach * 0.95,
+    floor: planes[0]?.position_m[2] ?? 0,
+  };
 }
 
 function light(scene: Scene, radius: number): void {
@@ -219,7 +271,7 @@ function light(scene: Scene, radius: number): void {
   scene.add(fill);
 }
 
-function floor(scene: Scene, radius: number): GridHelper {
+function floor(scene: Scene, { radius, floor: height }: Frame): GridHelper {
   const style = getComputedStyle(document.documentElement);
   const line = new Color(style.getPropertyValue("--line-strong").trim());
   const size = Math.ceil(radius * 2) * 2;
@@ -227,6 +279,7 @@ function floor(scene: Scene, radius: number): GridHelper {
   grid.material.transparent = true;
   grid.material.opacity = 0.45;
   grid.rotateX(Math.PI / 2);
+  grid.position.z = height;
   scene.add(grid);
   return grid;
 }

@@ -13,7 +13,7 @@ export function StopBanner({ device, stop }: StopBannerProps) {
   const state = stop.state.value;
   const problem = stop.problem.value;
   return (
-    <div role="alert">
+    <div role="alert" class="alert-slot">
       {state.kind !== "clear" && (
         <div class="banner stopped" data-testid="stop-banner" data-state={state.kind}>
           {state.kind === "sending" && <strong>{state.doubtful ? texts.stop.doubtful : texts.stop.sending}</strong>}

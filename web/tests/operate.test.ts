@@ -1,0 +1,262 @@
+/** The core as a whole, against a broker over a real WebSocket and a small robot. */
+import { afterEach, beforeEach, describe, expect, it } from "vitest";
+import { ActionRunner } from "../src/core/action";
+import { Api, ApiError } from "../src/core/api";
+import { startClock } from "../src/core/clock";
+import { Control } from "../src/core/control";
+import type { DeviceStore } from "../src/core/device";
+import { Fleet } from "../src/core/fleet";
+import { Session } from "../src/core/session";
+import { StopSwitch } from "../src/core/stop";
+import { Cloud, DEVICE, problem } from "./support/cloud";
+import { until } from "./support/until";
+
+const TOPIC = "ts/v1/lab/agent00001/arm";
+
+let cloud: Cloud;
+let api: Api;
+let fleet: Fleet;
+let device: DeviceStore;
+let ends: (() => void)[];
+
+beforeEach(async () => {
+  cloud = new Cloud();
+  await cloud.start();
+  api = new Api(`${cloud.address}/api/v1`);
+  fleet = new Fleet(api);
+  ends = [startClock(), () => fleet.dispose()];
+  await until(() => fleet.devices.value?.has(DEVICE) === true, "the list");
+  const found = fleet.devices.value?.get(DEVICE);
+  if (found === undefined) throw new Error("no device");
+  device = found;
+  ends.push(device.watchClosely());
+  await until(() => device.reach.value === "online" && device.description.value !== null, "the device");
+});
+
+afterEach(async () => {
+  for (const end of ends.reverse()) end();
+  await cloud.stop();
+});
+
+function arm(): NonNullable<Cloud["arm"]> {
+  if (cloud.arm === null) throw new Error("no arm");
+  return cloud.arm;
+}
+
+function stopSwitch(): StopSwitch {
+  const stop = new StopSwitch(api, device, fleet.link, "Demo");
+  ends.push(() => stop.dispose());
+  return stop;
+}
+
+async function takeControl(): Promise<Control> {
+  const control = new Control(api, device);
+  ends.push(() => control.dispose());
+  await control.take();
+  expect(control.state.value.kind).toBe("held");
+  await until(() => control.linkStatus.value?.state === "up", "the connection for setpoints");
+  return control;
+}
+
+describe("a session", () => {
+  it("begins with a link and ends at sign-out", async () => {
+    const session = new Session(api);
+    await session.start("good");
+    expect(session.state.value).toMatchObject({ kind: "in", account: { name: "Demo" } });
+    await session.signOut();
+    expect(session.state.value).toEqual({ kind: "out", why: "" });
+  });
+
+  it("says why a link did not work, and nothing at a first visit", async () => {
+    const session = new Session(api);
+    await session.start("used");
+    expect(session.state.value).toMatchObject({ kind: "out", why: expect.stringContaining("used before") as string });
+    cloud.instead.set("GET /accounts/me", () => problem(401, "signed-out", "You are not signed in."));
+    await session.start(null);
+    expect(session.state.value).toEqual({ kind: "out", why: "" });
+  });
+
+  it("marks what it changes as coming from the console", () => {
+    const [call] = cloud.callsTo("POST", "/mqtt/credentials");
+    expect(call?.headers["x-telescope-client"]).toBe("console");
+    expect(cloud.callsTo("GET", "/devices")[0]?.headers["x-telescope-client"]).toBeUndefined();
+  });
+
+  it("tells a server that is away from one that refuses", async () => {
+    const away = new Api("http://127.0.0.1:9/api/v1");
+    await expect(away.me()).rejects.toMatchObject({ status: 0, code: "unreachable" });
+    await expect(api.claim("BCDF-GHJK")).rejects.toMatchObject({ status: 404, code: "claim-code-unknown" });
+    await expect(api.claim("BCDF-GHJK")).rejects.toBeInstanceOf(ApiError);
+  });
+});
+
+describe("what is known of a device", () => {
+  it("turns stale when it falls silent, and live again when it speaks", async () => {
+    arm().mute = true;
+    await until(() => device.reach.value === "stale", "stale");
+    arm().mute = false;
+    await until(() => device.reach.value === "online", "online");
+  });
+
+  it("is offline at the agent's word, unless that is older news", async () => {
+    const conn = "ts/v1/lab/agent00001/conn";
+    cloud.tell(conn, { online: false, session: 1, at_ms: Date.now() }, { qos: 1, retain: true });
+    cloud.tell(conn, { online: true, session: 9, at_ms: Date.now() }, { qos: 1, retain: true });
+    await until(() => device.presence.value?.session === 9, "the new session");
+    expect(device.reach.value).toBe("online");
+    cloud.tell(conn, { online: false, session: 9, at_ms: Date.now() }, { qos: 1, retain: true });
+    await until(() => device.reach.value === "offline", "offline");
+  });
+
+  it("is unknown while this page has no connection", async () => {
+    cloud.brokerDown = true;
+    cloud.cutAll();
+    await until(() => device.reach.value === "unknown", "unknown");
+    cloud.brokerDown = false;
+    await until(() => device.reach.value === "online", "online");
+  });
+
+  it("does not change by a message that cannot be read", async () => {
+    const before = device.state.value;
+    cloud.tell(`${TOPIC}/state`, "{\"mode\":", { qos: 1, retain: false });
+    await until(() => device.trouble.value !== null, "the complaint");
+    expect(device.state.value).toBe(before);
+    await until(() => device.trouble.value === null, "the next good message");
+  });
+
+  it("refuses telemetry for another number of joints", async () => {
+    const telemetry = { tick_ms: 9e9, at_ms: 9e14, sequence: 1, mode: "idle" };
+    const lists = { position_rad: [7], velocity_rad_s: [0], effort_nm: [0], commanded_rad: [7] };
+    cloud.tell(`${TOPIC}/tele/joints`, { ...telemetry, ...lists }, { qos: 0, retain: false });
+    await until(() => device.trouble.value?.includes("1 joints") === true, "the complaint");
+    expect(device.telemetry.value?.message.position_rad).toHaveLength(6);
+  });
+});
+
+describe("an operator", () => {
+  it("moves the arm: it goes where the target is, and only that joint", async () => {
+    const control = await takeControl();
+    const before = { ...arm().positions };
+    control.streamer.value?.setTarget("elbow", 1.2);
+    await until(() => control.streamer.value?.ended.value === "reached", "the target");
+    expect(arm().positions["elbow"]).toBeCloseTo(1.2, 3);
+    expect(arm().positions["wrist_1"]).toBeCloseTo(before["wrist_1"] ?? NaN, 3);
+    expect(arm().setpoints[0]?.sequence).toBe(1);
+    expect(control.roundTrip.figures.value?.samples).toBeGreaterThan(0);
+  });
+
+  it("cannot take what another holds", async () => {
+    cloud.lease = { holder: "Ann", epoch: 4, expires_at: "2030-01-01T00:00:00.000Z", mine: false, session: "s2" };
+    const control = new Control(api, device);
+    await control.take();
+    expect(control.state.value).toEqual({ kind: "refused", why: "Ann has control." });
+    await until(() => device.lease.value?.holder === "Ann", "the holder");
+  });
+
+  it("gives control back, and the connection for setpoints closes with it", async () => {
+    const control = await takeControl();
+    expect(cloud.connections).toBe(2);
+    await control.release();
+    expect(cloud.lease).toBeNull();
+    await until(() => cloud.connections === 1, "the end of the connection");
+  });
+
+  it("keeps control while the connection for setpoints is cut, and comes back", async () => {
+    const control = await takeControl();
+    cloud.cutAll();
+    await until(() => control.linkStatus.value?.state === "down", "the loss");
+    await until(() => control.linkStatus.value?.state === "up" && device.reach.value === "online", "the connections");
+    control.streamer.value?.setTarget("elbow", 1.4);
+    await until(() => control.streamer.value?.ended.value === "reached", "the target");
+  });
+});
+
+describe("stop", () => {
+  it("goes out by both ways and is confirmed by the robot", async () => {
+    const stop = stopSwitch();
+    stop.press("test");
+    expect(stop.state.value.kind).toBe("sending");
+    await until(() => stop.state.value.kind === "latched", "the latch");
+    expect(arm().stop).toMatchObject({ by: "Demo", reason: "test" });
+    await until(() => cloud.callsTo("POST", `/devices/${DEVICE}/stop`).length === 1, "the call");
+  });
+
+  it("is repeated until the robot says that it has stopped, and the page says so meanwhile", async () => {
+    arm().deaf = true;
+    const stop = stopSwitch();
+    stop.press();
+    await until(() => arm().stops >= 4, "repetitions");
+    await until(() => stop.state.value.kind === "sending" && stop.state.value.doubtful, "the warning");
+    arm().deaf = false;
+    await until(() => stop.state.value.kind === "latched", "the latch");
+    const count = arm().stops;
+    await new Promise((resolve) => setTimeout(resolve, 500));
+    expect(arm().stops).toBe(count);
+  });
+
+  it("reaches the cloud while the broker is away", async () => {
+    cloud.brokerDown = true;
+    cloud.cutAll();
+    await until(() => !fleet.link.up.value, "the loss");
+    cloud.instead.set(`POST /devices/${DEVICE}/stop`, () => ({ status: 200, body: { confirmed: true } }));
+    const stop = stopSwitch();
+    stop.press();
+    await until(() => stop.state.value.kind !== "sending", "the confirmation by the cloud");
+  });
+
+  it("stays latched until it is reset, and then nothing resumes", async () => {
+    const control = await takeControl();
+    const stop = stopSwitch();
+    control.streamer.value?.setTarget("shoulder_pan", 3);
+    await until(() => (arm().positions["shoulder_pan"] ?? 0) > 0.05, "motion");
+    control.stopped();
+    stop.press();
+    await until(() => stop.state.value.kind === "latched", "the latch");
+    const count = arm().setpoints.length;
+    await stop.reset();
+    await until(() => stop.state.value.kind === "clear", "the reset");
+    const position = arm().positions["shoulder_pan"];
+    await new Promise((resolve) => setTimeout(resolve, 300));
+    expect(arm().setpoints).toHaveLength(count);
+    expect(arm().positions["shoulder_pan"]).toBe(position);
+  });
+});
+
+describe("a movement", () => {
+  it("is followed from the click to its end, with what it printed", async () => {
+    const actions = new ActionRunner(api, device);
+    ends.push(() => actions.dispose());
+    await actions.start("wave", null);
+    expect(actions.run.value?.status).toBe("started");
+    await until(() => actions.run.value?.status === "done", "the end");
+    // The cloud's answer may overtake the robot's acks: each step is there in the end, in its place.
+    await until(() => actions.run.value?.steps.length === 4, "every step");
+    expect(actions.run.value?.steps.map((step) => step.status)).toEqual(["sent", "accepted", "started", "done"]);
+    expect(actions.run.value?.output).toBe("wave: finished\n");
+  });
+
+  it("can be cancelled", async () => {
+    const actions = new ActionRunner(api, device);
+    ends.push(() => actions.dispose());
+    await actions.start("wave", null);
+    await actions.cancel(null);
+    await until(() => actions.run.value?.status === "cancelled", "the end");
+  });
+
+  it("says why it was refused", async () => {
+    cloud.instead.set(`POST /devices/${DEVICE}/actions`, () => problem(409, "device-busy", "The arm is running home."));
+    const actions = new ActionRunner(api, device);
+    await actions.start("wave", null);
+    expect(actions.run.value).toMatchObject({ status: "refused", why: "The arm is running home." });
+  });
+
+  it("runs under the lease that the page holds, and once for one click", async () => {
+    const control = await takeControl();
+    const actions = new ActionRunner(api, device);
+    ends.push(() => actions.dispose());
+    await actions.start("home", control.epoch);
+    const [call] = cloud.callsTo("POST", `/devices/${DEVICE}/actions`);
+    expect(call?.body["epoch"]).toBe(control.epoch);
+    expect(call?.headers["idempotency-key"]).toMatch(/^[\w-]{36}$/);
+  });
+});
