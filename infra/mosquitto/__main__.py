@@ -25,8 +25,9 @@ _PR_SET_PDEATHSIG = 1
 def main() -> int:
     """Run; the exit code."""
     arguments = _arguments()
-    host, home = arguments.host, arguments.home
+    home = arguments.home
     try:
+        host = _address(arguments.host)
         binary, plugin = configuration.binary(), configuration.plugin()
         tcp_port, websocket_port = _free_ports(host, arguments.tcp_port, arguments.websocket_port)
         configuration.write(home, host=host, tcp_port=tcp_port, websocket_port=websocket_port, plugin_path=plugin)
@@ -36,6 +37,9 @@ def main() -> int:
     except _PortTakenError as error:
         print(f"broker: {error}; choose another port", file=sys.stderr)
         return CANNOT_START
+    except socket.gaierror:
+        print(f"broker: '{arguments.host}' has no IPv4 address, which is what it listens on", file=sys.stderr)
+        return BAD_INPUT
     except OSError as error:
         print(f"broker: cannot use {error.filename or home}: {error.strerror}", file=sys.stderr)
         return BAD_INPUT
@@ -49,10 +53,19 @@ class _PortTakenError(Exception):
 def _arguments() -> argparse.Namespace:
     parser = argparse.ArgumentParser(prog="python -m infra.mosquitto", description="The site's MQTT broker.")
     parser.add_argument("--home", type=Path, required=True, help="folder for its files; made when it is not there")
-    parser.add_argument("--host", default="127.0.0.1", help="address to listen on (default: loopback only)")
+    parser.add_argument("--host", default="127.0.0.1", help="IPv4 address or name to listen on (default: loopback)")
     parser.add_argument("--tcp-port", type=int, required=True, help="MQTT; 0 takes a free one")
     parser.add_argument("--websocket-port", type=int, required=True, help="MQTT over WebSocket; 0 takes a free one")
     return parser.parse_args()
+
+
+def _address(host: str) -> str:
+    """The IPv4 address of a host: on IPv6 mosquitto's listener for WebSocket cannot be kept to one address.
+
+    Raises:
+        socket.gaierror: It has none.
+    """
+    return str(socket.getaddrinfo(host, None, socket.AF_INET, socket.SOCK_STREAM)[0][4][0])
 
 
 def _free_ports(host: str, *ports: int) -> list[int]:
@@ -65,10 +78,9 @@ def _free_ports(host: str, *ports: int) -> list[int]:
     try:
         for port in ports:
             try:
-                family, kind, protocol, _, address = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM)[0]
-                held.append(socket.socket(family, kind, protocol))
+                held.append(socket.socket())
                 held[-1].setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-                held[-1].bind(address)
+                held[-1].bind((host, port))
                 held[-1].listen()
             except (OSError, OverflowError) as error:
                 why = getattr(error, "strerror", None) or error

@@ -4,6 +4,7 @@ Formats: mosquitto.conf(5), and the dynamic security plugin's JSON as mosquitto 
 """
 
 import base64
+import errno
 import hashlib
 import json
 import os
@@ -83,6 +84,12 @@ def write(home: Path, *, host: str, tcp_port: int, websocket_port: int, plugin_p
         password = secrets.token_urlsafe(32)
         _write_secret(home / PASSWORD_FILE, f"{password}\n")
         _write_secret(security, json.dumps(first_security(password), indent=1))
+    elif not (home / PASSWORD_FILE).exists():
+        raise FileNotFoundError(
+            errno.ENOENT,
+            f"not there, so the functions cannot manage rights; put it back, or delete {SECURITY_FILE} to begin anew",
+            str(home / PASSWORD_FILE),
+        )
     text = configuration(home, host=host, tcp_port=tcp_port, websocket_port=websocket_port, plugin_path=plugin_path)
     path = home / CONFIGURATION_FILE
     if not path.exists() or path.read_text() != text:
@@ -90,7 +97,7 @@ def write(home: Path, *, host: str, tcp_port: int, websocket_port: int, plugin_p
 
 
 def configuration(home: Path, *, host: str, tcp_port: int, websocket_port: int, plugin_path: str) -> str:
-    """The text of ``mosquitto.conf``."""
+    """The text of ``mosquitto.conf``; ``host`` is an IPv4 address."""
     lines = [
         "# Written by `python -m infra.mosquitto` at each start: change it there.",
         "per_listener_settings false",
@@ -118,6 +125,8 @@ def configuration(home: Path, *, host: str, tcp_port: int, websocket_port: int, 
         "protocol mqtt",
         f"listener {websocket_port} {host}",
         "protocol websockets",
+        # Without this the listener for WebSocket ignores its address, and is open to the whole network on IPv6.
+        "socket_domain ipv4",
     ]
     return "\n".join(lines) + "\n"
 

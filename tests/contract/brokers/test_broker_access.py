@@ -10,8 +10,8 @@ import pytest
 from device_agent.protocol import signing
 from device_agent.protocol.errors import ProtocolError
 from function_app.adapters.local.broker_access import MosquittoBrokerAccess, TokenBrokerAccess
-from function_app.ports.broker_access import BrokerAccess, BrokerAccessError
-from tests.support.brokers import HOST, BrokerKind, Credentials, RunningBroker, start_broker
+from function_app.ports.broker_access import BrokerAccess, BrokerAccessError, Credentials
+from tests.support.brokers import HOST, PATIENCE_S, BrokerKind, RunningBroker, start_broker
 
 
 def another_instance(broker: RunningBroker) -> BrokerAccess:
@@ -39,9 +39,9 @@ def test_a_client_id_outside_the_contract_is_refused(broker: RunningBroker, clie
 
 @pytest.mark.parametrize("pattern", ["a/#/b", "a#"])
 def test_a_filter_that_is_none_is_refused(broker: RunningBroker, space: str, pattern: str) -> None:
-    for rights in ({"publish": (pattern,)}, {"subscribe": (pattern,)}):
+    for grant in (broker.grant(space, publish=(pattern,)), broker.grant(space, subscribe=(pattern,))):
         with pytest.raises(ProtocolError, match="filter"):
-            broker.issue(broker.grant(space, **rights))
+            broker.issue(grant)
 
 
 def test_revoke_wants_exactly_one_name(broker: RunningBroker) -> None:
@@ -72,7 +72,7 @@ def test_any_instance_revokes_what_another_has_issued(broker: RunningBroker, spa
     other = another_instance(broker)
     with broker.client(space) as client:
         broker.run(other.revoke(client_id=space))
-        assert client.disconnected.wait(20)
+        assert client.disconnected.wait(PATIENCE_S)
     broker.run(other.close())
     broker.run(other.close())
 

@@ -1,0 +1,99 @@
+import contextlib
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from infra.amqtt import packets
+from infra.amqtt.limits import Limits
+from infra.amqtt.packets import Frame, Framer, MalformedPacket, UnacceptableProtocol
+from tests.support import wire
+
+LIMITS = Limits()
+READERS = (
+    lambda frame: packets.read_connect(frame.body),
+    packets.read_publish,
+    packets.read_subscribe,
+    packets.read_unsubscribe,
+    packets.read_puback,
+)
+TOPICS = st.text(st.characters(codec="utf-8"), min_size=1, max_size=100)
+
+
+def framer() -> Framer:
+    accepted = Framer(LIMITS)
+    accepted.open_up()
+    return accepted
+
+
+@given(st.binary(max_size=200), st.integers(0, 15), st.integers(0, 15))
+def test_whatever_a_packet_holds_reading_it_only_ever_says_that_it_is_malformed(
+    body: bytes, kind: int, flags: int
+) -> None:
+    for read in READERS:
+        with contextlib.suppress(MalformedPacket, UnacceptableProtocol):
+            read(Frame(kind, flags, body))
+
+
+@given(st.binary(max_size=300))
+def test_whatever_comes_cutting_it_only_ever_says_that_it_is_malformed(data: bytes) -> None:
+    for cut in (Framer(LIMITS), framer()):
+        with contextlib.suppress(MalformedPacket):
+            list(cut.feed(data))
+
+
+@given(TOPICS, st.binary(max_size=400), st.integers(0, 1), st.booleans(), st.integers(1, 0xFFFF))
+def test_a_publish_is_read_as_it_was_written(
+    topic: str, payload: bytes, qos: int, retain: bool, packet_id: int
+) -> None:
+    packet_id *= qos
+    (frame,) = framer().feed(packets.publish(topic, payload, packet_id=packet_id, retain=retain))
+    assert packets.read_publish(frame) == packets.Publish(topic, payload, qos, retain, packet_id)
+
+
+@given(st.lists(st.binary(max_size=300), max_size=5), st.integers(1, 50))
+def test_packets_are_the_same_however_the_stream_is_cut_up(payloads: list[bytes], size: int) -> None:
+    stream = b"".join(packets.publish("t", payload) for payload in payloads)
+    cut, found = framer(), []
+    for start in range(0, len(stream), size):
+        found += [packets.read_publish(frame).payload for frame in cut.feed(stream[start : start + size])]
+    assert found == payloads
+
+
+def test_a_packet_over_its_limit_is_refused_by_its_first_bytes() -> None:
+    with pytest.raises(MalformedPacket, match="the most"):
+        list(framer().feed(b"\x30\xff\xff\x7f"))
+    with pytest.raises(MalformedPacket, match="the most"):
+        list(Framer(LIMITS).feed(b"\x10\xff\xff\x7f"))
+
+
+def test_the_largest_publish_passes() -> None:
+    topic, payload = "t" * LIMITS.topic_bytes, bytes(LIMITS.payload_bytes)
+    assert len(list(framer().feed(packets.publish(topic, payload, packet_id=1)))) == 1
+
+
+def test_before_it_is_opened_up_nothing_but_a_connect_passes() -> None:
+    with pytest.raises(MalformedPacket, match="no place"):
+        list(Framer(LIMITS).feed(wire.PINGREQ))
+    with pytest.raises(MalformedPacket, match="no place"):
+        list(framer().feed(wire.connect_packet("x")))
+
+
+def test_a_length_inside_a_packet_cannot_reach_into_the_next() -> None:
+    lying = wire.packet(3, b"\x00\x10ts")
+    frames = framer().feed(lying + wire.publish_packet("secret/topic", b"x"))
+    with pytest.raises(MalformedPacket, match="ends inside"):
+        packets.read_publish(next(frames))
+
+
+@pytest.mark.parametrize("flags", [0b1, 0b1000, 0b10000, 0b11100, 0b11110100, 0b01000000])
+def test_a_connect_whose_flags_do_not_fit_is_malformed(flags: int) -> None:
+    body = wire.text("MQTT") + bytes([4, flags]) + b"\0\0" + wire.text("id")
+    with pytest.raises(MalformedPacket):
+        packets.read_connect(body)
+
+
+def test_a_connect_with_more_behind_it_is_malformed() -> None:
+    (frame,) = Framer(LIMITS).feed(wire.packet(1, wire.connect_packet("x")[2:] + b"more"))
+    with pytest.raises(MalformedPacket, match="add up"):
+        packets.read_connect(frame.body)
