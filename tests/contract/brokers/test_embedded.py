@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from device_agent.protocol import control, grants, signing
+from device_agent.protocol import codec, control, grants, signing
 from function_app.ports.broker_access import Credentials
 from tests.support import wire
 from tests.support.brokers import SILENCE_S, Message, RunningBroker, start_broker, wait_until
@@ -140,10 +140,17 @@ def test_a_session_is_never_kept(broker: RunningBroker, space: str) -> None:
             assert raw.read() == (wire.SUBACK, 0, b"\0\1\1")
 
 
+def test_one_byte_over_the_limit_is_too_much(broker: RunningBroker, space: str) -> None:
+    with broker.client(space, publish=("t",)) as client:
+        client.publish_acknowledged("t", bytes(codec.MAX_BYTES))
+        client.publish("t", bytes(codec.MAX_BYTES + 1))
+        wait_until(client.disconnected.is_set, "the end of the connection")
+
+
 def test_a_retained_message_over_its_limit_is_refused(broker: RunningBroker, space: str) -> None:
     topic = f"ts/v1/{space}/arm/ur5/desc/twin"
     with broker.client(space, publish=(topic,)) as client:
-        client.publish(topic, bytes(64 * 1024 + 1), retain=True)
+        client.publish(topic, bytes(codec.MAX_RETAINED_BYTES + 1), retain=True)
         wait_until(client.disconnected.is_set, "the end of the connection")
 
 

@@ -1,0 +1,60 @@
+import json
+from pathlib import Path
+
+import pytest
+
+from infra.mosquitto import configuration
+
+
+def write(home: Path, tcp_port: int = 1) -> None:
+    configuration.write(home, host="127.0.0.1", tcp_port=tcp_port, websocket_port=2, plugin_path="/x.so")
+
+
+def test_whatever_was_not_granted_is_denied() -> None:
+    """Each of these alone would keep a message from a stranger: all are off, so that one mistake is not enough."""
+    assert set(configuration.first_security("x")["defaultACLAccess"].items()) == {
+        ("publishClientSend", False),
+        ("publishClientReceive", False),
+        ("subscribe", False),
+        ("unsubscribe", False),
+    }
+
+
+def test_nobody_is_let_in_without_credentials_and_nothing_listens_without_an_address(tmp_path: Path) -> None:
+    write(tmp_path)
+    lines = (tmp_path / configuration.CONFIGURATION_FILE).read_text().splitlines()
+    assert "allow_anonymous false" in lines
+    assert [line for line in lines if line.startswith("listener")] == ["listener 1 127.0.0.1", "listener 2 127.0.0.1"]
+
+
+def test_a_second_start_keeps_rights_and_password_and_takes_the_new_ports(tmp_path: Path) -> None:
+    write(tmp_path)
+    kept = (configuration.SECURITY_FILE, configuration.PASSWORD_FILE)
+    before = [(tmp_path / name).read_text() for name in kept]
+    write(tmp_path, tcp_port=3)
+    assert [(tmp_path / name).read_text() for name in kept] == before
+    assert "listener 3 127.0.0.1" in (tmp_path / configuration.CONFIGURATION_FILE).read_text()
+
+
+def test_the_password_is_in_its_own_file_only(tmp_path: Path) -> None:
+    write(tmp_path)
+    password = (tmp_path / configuration.PASSWORD_FILE).read_text().strip()
+    assert len(password) >= 40
+    assert password not in (tmp_path / configuration.SECURITY_FILE).read_text()
+    assert password not in (tmp_path / configuration.CONFIGURATION_FILE).read_text()
+    assert json.loads((tmp_path / configuration.SECURITY_FILE).read_text())["clients"][0]["username"] == "service"
+
+
+def test_a_machine_without_mosquitto_is_told_which_package_to_install(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("PATH", str(tmp_path))
+    monkeypatch.setattr(configuration, "_PATH_BESIDE", str(tmp_path))
+    with pytest.raises(configuration.NotInstalledError, match="apt-get install mosquitto"):
+        configuration.binary()
+
+
+def test_a_machine_without_the_plugin_is_told_which_package_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(configuration, "_PLUGIN_FOLDERS", ("no/such/folder",))
+    with pytest.raises(configuration.NotInstalledError, match="apt-get install mosquitto"):
+        configuration.plugin()
