@@ -19,5 +19,6 @@ export default defineConfig({
     include: ["tests/**/*.test.ts"],
     environment: "node",
     testTimeout: 20_000,
+    maxWorkers: 2,
   },
 });

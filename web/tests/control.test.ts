@@ -138,16 +138,21 @@ describe("control of a device", () => {
 
   it("is lost at once when the server says so, and streams nothing more", async () => {
     await control.take();
+    // A robot on its way, so that the stream has every reason to go on.
+    const talk = setInterval(() => watch.tell("tele/joints", telemetry({ velocity_rad_s: [0, 0, 1, 0, 0, 0] })), 50);
+    await vi.advanceTimersByTimeAsync(LEASE_MS / 3 - 500);
     control.streamer.value?.setTarget("elbow", 1);
+    await vi.advanceTimersByTimeAsync(400);
+    expect(wire.published.length).toBeGreaterThan(10);
     desk.renewal = () => Promise.reject(new ApiError(409, "lease-lost", "Ann has control."));
-    await vi.advanceTimersByTimeAsync(LEASE_MS / 3 + 10);
+    await vi.advanceTimersByTimeAsync(110);
     expect(control.state.value).toEqual({ kind: "lost", why: "Ann has control." });
     expect(control.streamer.value).toBeNull();
     expect(wire.closed).toBe(true);
     const sent = wire.published.length;
-    watch.tell("tele/joints", telemetry());
     await vi.advanceTimersByTimeAsync(1_000);
     expect(wire.published).toHaveLength(sent);
+    clearInterval(talk);
   });
 
   it("survives a server that is away for a moment", async () => {

@@ -100,9 +100,11 @@ describe("what is known of a device", () => {
 
   it("is offline at the agent's word, unless that is older news", async () => {
     const conn = "ts/v1/lab/agent00001/conn";
-    cloud.tell(conn, { online: false, session: 1, at_ms: Date.now() }, { qos: 1, retain: true });
     cloud.tell(conn, { online: true, session: 9, at_ms: Date.now() }, { qos: 1, retain: true });
-    await until(() => device.presence.value?.session === 9, "the new session");
+    cloud.tell(conn, { online: false, session: 8, at_ms: Date.now() }, { qos: 1, retain: true });
+    arm().grant(2, null);
+    await until(() => device.state.value?.epoch === 2, "what was said after the old will");
+    expect(device.presence.value).toMatchObject({ online: true, session: 9 });
     expect(device.reach.value).toBe("online");
     cloud.tell(conn, { online: false, session: 9, at_ms: Date.now() }, { qos: 1, retain: true });
     await until(() => device.reach.value === "offline", "offline");
@@ -121,7 +123,9 @@ describe("what is known of a device", () => {
     cloud.tell(`${TOPIC}/state`, "{\"mode\":", { qos: 1, retain: false });
     await until(() => device.trouble.value !== null, "the complaint");
     expect(device.state.value).toBe(before);
+    arm().grant(3, "Ann");
     await until(() => device.trouble.value === null, "the next good message");
+    expect(device.state.value?.epoch).toBe(3);
   });
 
   it("refuses telemetry for another number of joints", async () => {

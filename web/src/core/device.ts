@@ -53,7 +53,7 @@ export class DeviceStore {
   readonly #events = signal<readonly KnownEvent[]>([]);
   readonly #lease;
   readonly #heardAt = signal<number | null>(null);
-  readonly #trouble = signal<string | null>(null);
+  readonly #troubles = signal<ReadonlyMap<string, string>>(new Map());
   readonly #close = signal(false);
   readonly #ackReceivers = new Set<(ack: KnownAck) => void>();
   readonly #recentAcks = new Map<string, KnownAck[]>();
@@ -67,8 +67,8 @@ export class DeviceStore {
   readonly events: ReadonlySignal<readonly KnownEvent[]> = this.#events;
   /** Who the cloud says has control. The device's own word is in `state`. */
   readonly lease: ReadonlySignal<Lease | null>;
-  /** The last message that could not be read; `null` when the last one could. */
-  readonly trouble: ReadonlySignal<string | null> = this.#trouble;
+  /** Why the newest message of some topic could not be read; `null` when all could. */
+  readonly trouble = computed<string | null>(() => [...this.#troubles.value.values()].at(-1) ?? null);
 
   /** When the device, or the cloud for it, last said anything, on the page's clock [ms]. */
   readonly heardAt = computed(() => {
@@ -183,16 +183,25 @@ export class DeviceStore {
       this.#link.subscribe(filter, (topic, payload, retained) => {
         try {
           reader(payload, topic, retained);
-          this.#trouble.value = null;
+          this.#noteTrouble(topic, null);
         } catch (error) {
           if (!(error instanceof MessageError)) throw error;
-          this.#trouble.value = error.message;
+          this.#noteTrouble(topic, error.message);
         }
       }),
     );
     return () => {
       for (const end of ends) end();
     };
+  }
+
+  #noteTrouble(topic: string, what: string | null): void {
+    const known = this.#troubles.value;
+    if ((known.get(topic) ?? null) === what) return;
+    const next = new Map(known);
+    if (what === null) next.delete(topic);
+    else next.set(topic, what);
+    this.#troubles.value = next;
   }
 
   #hearPresence(presence: Required<Presence>, retained: boolean): void {

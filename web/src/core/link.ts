@@ -61,7 +61,7 @@ export class MqttLink implements Link {
   #timer: ReturnType<typeof setTimeout> | undefined;
   readonly #watch: ReturnType<typeof setInterval>;
   readonly #fresh = new Set<string>();
-  #closed = false;
+  readonly #closing = new AbortController();
 
   readonly status: ReadonlySignal<LinkStatus> = this.#status;
   readonly up = computed(() => this.#status.value.state === "up");
@@ -105,7 +105,7 @@ export class MqttLink implements Link {
   }
 
   close(): void {
-    this.#closed = true;
+    this.#closing.abort();
     clearTimeout(this.#timer);
     clearInterval(this.#watch);
     this.#receivers.clear();
@@ -127,9 +127,8 @@ export class MqttLink implements Link {
     try {
       const obtainedAt = now();
       const credentials = await this.#obtain();
-      const client = await connect(credentials);
-      if (this.#isClosed()) client.end(true);
-      else await this.#adopt({ client, credentials, obtainedAt, heardAt: now(), retired: false });
+      const client = await connect(credentials, this.#closing.signal);
+      await this.#adopt({ client, credentials, obtainedAt, heardAt: now(), retired: false });
     } catch (error) {
       this.#failed(error);
     } finally {
@@ -141,9 +140,8 @@ export class MqttLink implements Link {
     }
   }
 
-  // A method, because the answer may have changed while something was awaited.
-  #isClosed(): boolean {
-    return this.#closed;
+  get #closed(): boolean {
+    return this.#closing.signal.aborted;
   }
 
   async #adopt(next: Connection): Promise<void> {
@@ -250,8 +248,9 @@ function retire(connection: Connection): void {
   connection.client.end(true);
 }
 
-async function connect(credentials: Credentials): Promise<MqttClient> {
+async function connect(credentials: Credentials, closing: AbortSignal): Promise<MqttClient> {
   const { default: mqtt } = await import("mqtt");
+  closing.throwIfAborted();
   return new Promise((resolve, reject) => {
     const client = mqtt.connect(credentials.websocket_url, {
       protocolVersion: 4,
@@ -268,20 +267,27 @@ async function connect(credentials: Credentials): Promise<MqttClient> {
       // Its other timers are a worker made from a blob, which the page's policy forbids.
       timerVariant: "native",
     });
+    const settle = (): void => {
+      client.off("error", failed);
+      client.off("close", unreachable);
+      closing.removeEventListener("abort", unreachable);
+    };
     const failed = (error: Error): void => {
+      settle();
+      client.on("error", () => undefined); // What it says after its end is of no use.
       client.end(true);
       reject(error);
     };
-    client.once("connect", () => {
-      client.off("error", failed);
-      client.off("close", closed);
-      resolve(client);
-    });
-    const closed = (): void => {
+    const unreachable = (): void => {
       failed(new Error("The broker cannot be reached."));
     };
-    client.once("error", failed);
-    client.once("close", closed);
+    client.once("connect", () => {
+      settle();
+      resolve(client);
+    });
+    client.on("error", failed);
+    client.on("close", unreachable);
+    closing.addEventListener("abort", unreachable);
   });
 }
 
@@ -290,10 +296,19 @@ async function subscribeAll(client: MqttClient, filters: readonly string[]): Pro
     const batch = filters.slice(start, start + FILTERS_AT_ONCE);
     // Telemetry is published at QoS 0 and stays so; asking for 1 keeps what matters at 1.
     await new Promise<void>((resolve, reject) => {
-      client.subscribe(batch, { qos: 1 }, (error) => {
+      const failed = (): void => {
+        clearTimeout(timer);
+        client.off("close", failed);
+        reject(new Error("The broker did not answer."));
+      };
+      const timer = setTimeout(failed, CONNECT_TIMEOUT_MS);
+      client.once("close", failed);
+      client.subscribe(batch, { qos: 1 }, () => {
         // A refused filter is no reason to give up the others: what it would bring stays unknown, and is shown so.
-        if (error && !client.connected) reject(error);
-        else resolve();
+        clearTimeout(timer);
+        client.off("close", failed);
+        if (client.connected) resolve();
+        else failed();
       });
     });
   }

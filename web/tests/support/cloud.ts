@@ -43,7 +43,8 @@ interface Options {
   /** A folder to serve at `/`. */
   page?: string;
   port?: number;
-  policy?: boolean;
+  /** More topics that may be heard. */
+  audible?: string[];
 }
 
 const TYPES: Readonly<Record<string, string>> = {
@@ -94,6 +95,7 @@ export class Cloud {
       },
     });
     this.#broker.on("publish", (packet) => this.#hear(packet));
+    this.#broker.on("subscribe", (subscriptions) => this.subscribes.push(subscriptions.length));
     this.#broker.on("client", (client) => this.#clients.add(client));
     this.#broker.on("clientDisconnect", (client) => this.#clients.delete(client));
     this.#server.on("upgrade", (request, socket, head) => {
@@ -102,7 +104,6 @@ export class Cloud {
         return;
       }
       this.#sockets.handleUpgrade(request, socket, head, (webSocket) => {
-        webSocket.on("message", (data: Buffer) => this.#count(data));
         const stream = createWebSocketStream(webSocket);
         stream.on("error", () => undefined);
         this.#broker?.handle(stream, request);
@@ -122,6 +123,7 @@ export class Cloud {
       if (this.#broker === null) resolve();
       else this.#broker.close(() => resolve());
     });
+    for (const socket of this.#sockets.clients) socket.terminate();
     this.#server.closeAllConnections();
     await new Promise((resolve) => this.#server.close(resolve));
   }
@@ -155,20 +157,6 @@ export class Cloud {
 
   callsTo(method: string, path: string): Call[] {
     return this.calls.filter((call) => call.method === method && call.path === path);
-  }
-
-  /** Counts filters in SUBSCRIBE packets, which a WebSocket client sends one a frame. */
-  #count(data: Buffer): void {
-    if ((data[0] ?? 0) >> 4 !== 8) return;
-    let at = 1;
-    while ((data[at] ?? 0) >= 128) at += 1;
-    at += 3; // The last length byte, and the packet's id.
-    let filters = 0;
-    while (at < data.length) {
-      at += 2 + data.readUInt16BE(at) + 1;
-      filters += 1;
-    }
-    this.subscribes.push(filters);
   }
 
   #hear(packet: AedesPublishPacket): void {
@@ -294,7 +282,7 @@ export class Cloud {
       publish: control ? [`${TOPIC}/ctl/${String(body["epoch"])}`] : [`${TOPIC}/stop`],
       subscribe: control
         ? []
-        : [CONN, ...["desc", "desc/twin", "state", "tele/+", "cam/+", "event", "ack"].map((kind) => `${TOPIC}/${kind}`)],
+        : [CONN, ...["desc", "desc/twin", "state", "tele/+", "cam/+", "event", "ack"].map((kind) => `${TOPIC}/${kind}`), ...(this.#options.audible ?? [])],
     };
     this.#rights.set(client, rights);
     return {
