@@ -1,0 +1,11 @@
+"""The machine's wall clock."""
+
+import time
+
+
+class SystemClock:
+    """``Clock`` of the operating system."""
+
+    def now_ms(self) -> int:
+        """See ``Clock``."""
+        return time.time_ns() // 1_000_000

@@ -1,0 +1,81 @@
+"""Commands and acks over one warm MQTT connection."""
+
+import asyncio
+import contextlib
+from collections.abc import AsyncGenerator, AsyncIterator, Callable
+
+from paho.mqtt.client import MQTTMessage
+
+from device_agent.protocol import codec, topics
+from device_agent.protocol.errors import ProtocolError
+from device_agent.protocol.messages import Ack
+from function_app.adapters.local.mqtt_link import MqttLink
+from function_app.ports.broker_access import ServiceCredentials
+
+_READY_S = 2.0
+
+
+class MqttCommandBus:
+    """``CommandBus`` over MQTT. Every instance hears all acks and hands on those that somebody here waits for."""
+
+    def __init__(self, *, host: str, port: int, credentials: Callable[[], ServiceCredentials]) -> None:
+        self._link = MqttLink(
+            host=host,
+            port=port,
+            credentials=credentials,
+            subscriptions=(topics.device(topics.ANY, topics.ANY, topics.ANY, topics.ACK),),
+            receive=self._dispatch,
+        )
+        self._waiting: dict[str, dict[str, asyncio.Queue[Ack]]] = {}
+
+    async def start(self) -> None:
+        """See ``CommandBus``."""
+        await self._link.ready(_READY_S)
+
+    async def publish(self, topic: str, payload: bytes, *, qos: int = 1) -> None:
+        """See ``CommandBus``."""
+        await self._link.publish(topic, payload, qos)
+
+    @contextlib.asynccontextmanager
+    async def acks(self, device_topic: str, command: str) -> AsyncGenerator[AsyncIterator[Ack] | None]:
+        """See ``CommandBus``."""
+        if not await self._link.ready(_READY_S):
+            yield None
+            return
+        topic = f"{device_topic}/{topics.ACK}"
+        queue: asyncio.Queue[Ack] = asyncio.Queue()
+        self._waiting.setdefault(topic, {})[command] = queue
+        try:
+            yield _drain(queue)
+        finally:
+            waiting = self._waiting[topic]
+            del waiting[command]
+            if not waiting:
+                del self._waiting[topic]
+
+    async def status(self) -> str:
+        """See ``CommandBus``."""
+        await self._link.ready(_READY_S)
+        return self._link.trouble or "ok"
+
+    async def close(self) -> None:
+        """See ``CommandBus``."""
+        await self._link.close()
+
+    def _dispatch(self, message: MQTTMessage) -> None:
+        # By topic and id: an agent can only answer for its own devices, whatever id it writes into its ack.
+        waiting = self._waiting.get(message.topic)
+        if waiting is None:
+            return
+        try:
+            ack = codec.decode(message.payload, Ack)
+        except ProtocolError:
+            return  # the ingest worker says so in the log
+        queue = waiting.get(ack.id)
+        if queue is not None:
+            queue.put_nowait(ack)
+
+
+async def _drain(queue: asyncio.Queue[Ack]) -> AsyncGenerator[Ack]:
+    while True:
+        yield await queue.get()

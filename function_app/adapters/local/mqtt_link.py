@@ -1,0 +1,311 @@
+"""One warm MQTT connection inside an event loop: paho without a thread of its own.
+
+A message goes out, and comes in, on the loop's own thread: no hand-over between threads lies in a command's way. A
+connection lives as long as its credentials; then, or when it breaks, a new client with new ones takes over.
+"""
+
+import asyncio
+import contextlib
+import logging
+import random
+import socket
+import time
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import paho.mqtt.client as mqtt
+from paho.mqtt.enums import CallbackAPIVersion, MQTTErrorCode, MQTTProtocolVersion
+from paho.mqtt.reasoncodes import ReasonCode
+
+from function_app.ports.broker_access import BrokerAccessError, ServiceCredentials
+from function_app.ports.command_bus import BusUnavailable
+
+KEEP_ALIVE_S = 30
+CONNECT_TIMEOUT_S = 5.0
+CONFIRM_TIMEOUT_S = 5.0
+READY_TIMEOUT_S = 2.0
+"""A caller waits this long for a connection that is just being made."""
+FIRST_RETRY_S = 0.1
+LAST_RETRY_S = 5.0
+RENEW_BEFORE_S = 30.0
+MAX_FILTERS = 8
+"""Filters in one SUBSCRIBE (facts: AWS IoT Core takes eight)."""
+
+_log = logging.getLogger(__name__)
+_VERSIONS = (MQTTProtocolVersion.MQTTv5, MQTTProtocolVersion.MQTTv311)
+_UNSUPPORTED = "Unsupported protocol version"
+
+
+class MqttLink:
+    """Connects at ``start`` and stays connected until ``close``."""
+
+    def __init__(
+        self,
+        *,
+        host: str,
+        port: int,
+        credentials: Callable[[], ServiceCredentials],
+        subscriptions: Sequence[str] = (),
+        receive: Callable[[mqtt.MQTTMessage], None] | None = None,
+        manual_ack: bool = False,
+    ) -> None:
+        self._host = host
+        self._port = port
+        self._credentials = credentials
+        self._subscriptions = tuple(subscriptions)
+        self._receive = receive
+        self._manual_ack = manual_ack
+        self._version = 0
+        self._client: mqtt.Client | None = None
+        self._keeper: asyncio.Task[None] | None = None
+        self._ready = asyncio.Event()
+        self._lost = asyncio.Event()
+        self._waiting: dict[int, asyncio.Future[None]] = {}
+        self._subscribed: dict[int, asyncio.Future[None]] = {}
+        self._trouble = "not connected yet"
+        self.generation = 0
+        """Number of the present connection: a message can only be confirmed on the one it came by."""
+
+    @property
+    def trouble(self) -> str:
+        """Empty while connected, else a sentence."""
+        return "" if self._ready.is_set() else self._trouble
+
+    def start(self) -> None:
+        """Begin to connect; returns at once. Does nothing the second time."""
+        if self._keeper is None:
+            self._keeper = asyncio.get_running_loop().create_task(self._keep(), name="mqtt link")
+
+    async def ready(self, timeout_s: float) -> bool:
+        """Wait until connected and subscribed."""
+        self.start()
+        if self._ready.is_set():
+            return True
+        try:
+            async with asyncio.timeout(timeout_s):
+                await self._ready.wait()
+        except TimeoutError:
+            return False
+        return True
+
+    async def publish(self, topic: str, payload: bytes, qos: int) -> None:
+        """Send, and for QoS 1 wait for the broker's word.
+
+        Raises:
+            BusUnavailable: Not connected, or not confirmed in time.
+        """
+        if not self._ready.is_set() and not await self.ready(READY_TIMEOUT_S):
+            raise BusUnavailable(f"the broker at {self._host}:{self._port} cannot be reached: {self._trouble}")
+        client = self._client
+        if client is None:
+            raise BusUnavailable(f"the broker at {self._host}:{self._port} went away")
+        information = client.publish(topic, payload, qos)
+        self._flush(client)
+        if information.rc != MQTTErrorCode.MQTT_ERR_SUCCESS:
+            raise BusUnavailable(f"the broker at {self._host}:{self._port} went away: {information.rc.name}")
+        if qos == 0:
+            return
+        confirmed: asyncio.Future[None] = asyncio.get_running_loop().create_future()
+        self._waiting[information.mid] = confirmed
+        try:
+            async with asyncio.timeout(CONFIRM_TIMEOUT_S):
+                await confirmed
+        except TimeoutError as error:
+            detail = f"the broker at {self._host}:{self._port} did not confirm a message in {CONFIRM_TIMEOUT_S:.0f} s"
+            raise BusUnavailable(detail) from error
+        finally:
+            self._waiting.pop(information.mid, None)
+
+    def acknowledge(self, message: mqtt.MQTTMessage, generation: int) -> None:
+        """Confirm a message that came with ``manual_ack``; nothing happens when its connection is gone."""
+        if self._client is not None and generation == self.generation:
+            self._client.ack(message.mid, message.qos)
+            self._flush(self._client)
+
+    async def close(self) -> None:
+        """Disconnect. May be called twice."""
+        if self._keeper is not None:
+            self._keeper.cancel()
+            with contextlib.suppress(asyncio.CancelledError):
+                await self._keeper
+            self._keeper = None
+
+    async def _keep(self) -> None:
+        """Connect, stay, and connect again, for ever."""
+        pause_s = FIRST_RETRY_S
+        while True:
+            client: mqtt.Client | None = None
+            try:
+                credentials = self._credentials()
+                client = await self._connect(credentials)
+                pause_s = FIRST_RETRY_S
+                await self._stay(client, credentials.expires_at)
+                continue
+            except (BrokerAccessError, BusUnavailable, OSError, ValueError) as error:
+                if str(error) != self._trouble:
+                    _log.warning("broker: %s", error)
+                self._trouble = str(error)
+            finally:
+                self._let_go(client)
+            await asyncio.sleep(pause_s * random.uniform(0.5, 1.0))  # noqa: S311 (spreads reconnects, hides nothing)
+            pause_s = min(2 * pause_s, LAST_RETRY_S)
+
+    async def _connect(self, credentials: ServiceCredentials) -> mqtt.Client:
+        """A connected and subscribed client; speaks MQTT 5, or 3.1.1 where the broker does not."""
+        while True:
+            loop = asyncio.get_running_loop()
+            answered: asyncio.Future[ReasonCode] = loop.create_future()
+            client = self._make(credentials, answered)
+            try:
+                await asyncio.to_thread(client.connect, self._host, self._port, KEEP_ALIVE_S)
+                sock = client.socket()
+                if sock is None:
+                    raise BusUnavailable("the broker closed the connection")
+                loop.add_reader(sock, self._read, client)
+                async with asyncio.timeout(CONNECT_TIMEOUT_S):
+                    reason = await answered
+                if not reason.is_failure:
+                    self._client = client
+                    self.generation += 1
+                    await self._subscribe(client)
+                    self._ready.set()
+                    return client
+            except TimeoutError as error:
+                self._drop(client)
+                if not self._next_version():
+                    raise BusUnavailable(f"no answer from the broker at {self._host}:{self._port}") from error
+                continue
+            except BaseException:
+                self._drop(client)
+                raise
+            self._drop(client)
+            if reason.getName() != _UNSUPPORTED or not self._next_version():
+                raise BusUnavailable(f"the broker at {self._host}:{self._port} refused us: {reason.getName()}")
+
+    def _next_version(self) -> bool:
+        """Step down to an older MQTT; ``False`` when there is none left (the next try begins at the newest again)."""
+        self._version = (self._version + 1) % len(_VERSIONS)
+        return self._version != 0
+
+    def _make(self, credentials: ServiceCredentials, answered: asyncio.Future[ReasonCode]) -> mqtt.Client:
+        version = _VERSIONS[self._version]
+        client = mqtt.Client(
+            CallbackAPIVersion.VERSION2,
+            client_id=credentials.client_id,
+            protocol=version,
+            manual_ack=self._manual_ack,
+            clean_session=None if version is MQTTProtocolVersion.MQTTv5 else True,
+        )
+        client.username_pw_set(credentials.username, credentials.password)
+        client.connect_timeout = CONNECT_TIMEOUT_S
+        client.max_inflight_messages_set(1000)
+
+        def opened(_client: mqtt.Client, _data: Any, sock: Any) -> None:
+            sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+
+        def connected(_client: mqtt.Client, _data: Any, _flags: Any, reason: ReasonCode, _properties: Any) -> None:
+            if not answered.done():
+                answered.set_result(reason)
+
+        def disconnected(_client: mqtt.Client, _data: Any, _flags: Any, reason: ReasonCode, _properties: Any) -> None:
+            if not answered.done():
+                answered.set_exception(BusUnavailable(f"the broker closed the connection: {reason.getName()}"))
+            if _client is self._client:
+                self._trouble = f"the connection was lost: {reason.getName()}"
+                self._lost.set()
+
+        def published(_client: mqtt.Client, _data: Any, mid: int, _reason: Any, _properties: Any) -> None:
+            waiting = self._waiting.get(mid)
+            if waiting is not None and not waiting.done():
+                waiting.set_result(None)
+
+        def subscribed(_client: mqtt.Client, _data: Any, mid: int, reasons: list[ReasonCode], _properties: Any) -> None:
+            waiting = self._subscribed.pop(mid, None)
+            if waiting is None or waiting.done():
+                return
+            refused = [reason.getName() for reason in reasons if reason.is_failure]
+            if refused:
+                waiting.set_exception(BusUnavailable(f"the broker refused a subscription: {refused[0]}"))
+            else:
+                waiting.set_result(None)
+
+        client.on_socket_open = opened
+        client.on_connect = connected
+        client.on_disconnect = disconnected
+        client.on_publish = published
+        client.on_subscribe = subscribed
+        if self._receive is not None:
+            receive = self._receive
+            client.on_message = lambda _client, _data, message: receive(message)
+        return client
+
+    async def _subscribe(self, client: mqtt.Client) -> None:
+        for start in range(0, len(self._subscriptions), MAX_FILTERS):
+            filters = [(pattern, 1) for pattern in self._subscriptions[start : start + MAX_FILTERS]]
+            result, mid = client.subscribe(filters)
+            if result != MQTTErrorCode.MQTT_ERR_SUCCESS or mid is None:
+                raise BusUnavailable("the broker went away")
+            done: asyncio.Future[None] = asyncio.get_running_loop().create_future()
+            self._subscribed[mid] = done
+            self._flush(client)
+            async with asyncio.timeout(CONNECT_TIMEOUT_S):
+                await done
+
+    async def _stay(self, client: mqtt.Client, expires_at: float) -> None:
+        """Keep the connection alive until it breaks or its credentials are about to end."""
+        while not self._lost.is_set():
+            client.loop_misc()
+            self._flush(client)
+            if time.time() > expires_at - RENEW_BEFORE_S:
+                return
+            with contextlib.suppress(TimeoutError):
+                async with asyncio.timeout(1.0):
+                    await self._lost.wait()
+        raise BusUnavailable(self._trouble)
+
+    def _let_go(self, client: mqtt.Client | None) -> None:
+        self._ready.clear()
+        self._lost.clear()
+        self._client = None
+        for waiting in (*self._waiting.values(), *self._subscribed.values()):
+            if not waiting.done():
+                waiting.set_exception(BusUnavailable(f"the broker at {self._host}:{self._port} went away"))
+                waiting.exception()  # asked for here: whoever waits gets it too, nobody waiting is no fault
+        self._waiting.clear()
+        self._subscribed.clear()
+        if client is not None:
+            self._drop(client)
+
+    def _drop(self, client: mqtt.Client) -> None:
+        sock = client.socket()
+        if sock is None:
+            return
+        loop = asyncio.get_running_loop()
+        loop.remove_reader(sock)
+        loop.remove_writer(sock)
+        client.disconnect()
+        client.loop_write()
+        # paho closes the socket only once the broker has; the connection is ours to close.
+        sock.close()
+
+    def _read(self, client: mqtt.Client) -> None:
+        sock = client.socket()
+        if sock is None:
+            return
+        client.loop_read()
+        if client.socket() is None:
+            asyncio.get_running_loop().remove_reader(sock)
+            asyncio.get_running_loop().remove_writer(sock)
+        else:
+            self._flush(client)
+
+    def _flush(self, client: mqtt.Client) -> None:
+        """What did not fit into the socket goes out as soon as it does."""
+        sock = client.socket()
+        if sock is not None and client.want_write():
+            asyncio.get_running_loop().add_writer(sock, self._write, client, sock)
+
+    def _write(self, client: mqtt.Client, sock: Any) -> None:
+        client.loop_write()
+        if client.socket() is None or not client.want_write():
+            asyncio.get_running_loop().remove_writer(sock)

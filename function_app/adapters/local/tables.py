@@ -1,0 +1,209 @@
+"""Tables in one SQLite file.
+
+Used straight from the event loop: a read or a write costs microseconds, a thread would cost more. Any number of
+processes share the file; SQLite's own lock makes each statement and each batch atomic.
+"""
+
+import base64
+import binascii
+import os
+import secrets
+import sqlite3
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import msgspec
+
+from function_app.ports.tables import (
+    MAX_BATCH,
+    MAX_DATA_BYTES,
+    MAX_KEY_LENGTH,
+    Conflict,
+    Page,
+    Row,
+    StoreError,
+    Write,
+)
+
+BUSY_TIMEOUT_MS = 5_000
+"""A writer waits this long for another process's write: they take well under a millisecond each."""
+MAX_PAGE = 1_000
+
+_SCHEMA = """
+CREATE TABLE IF NOT EXISTS rows (
+    tab TEXT NOT NULL, part TEXT NOT NULL, key TEXT NOT NULL, etag TEXT NOT NULL, data BLOB NOT NULL,
+    PRIMARY KEY (tab, part, key)
+) WITHOUT ROWID
+"""
+_GET = "SELECT etag, data FROM rows WHERE tab=? AND part=? AND key=?"
+_CREATE = "INSERT INTO rows (tab, part, key, etag, data) VALUES (?,?,?,?,?)"
+_REPLACE = "UPDATE rows SET etag=?, data=? WHERE tab=? AND part=? AND key=? AND etag=?"
+_DELETE = "DELETE FROM rows WHERE tab=? AND part=? AND key=? AND etag=?"
+_QUERY = "SELECT key, etag, data FROM rows WHERE tab=? AND part=? AND key>=? {last} ORDER BY key LIMIT ?"
+_QUERY_OPEN = _QUERY.format(last="")
+_QUERY_CLOSED = _QUERY.format(last="AND key<?")
+
+_encode = msgspec.json.Encoder().encode
+_decode = msgspec.json.Decoder(dict[str, Any]).decode
+
+
+class SqliteTables:
+    """``Tables`` in the file ``path``, which is made when it is not there. Opened at the first call."""
+
+    def __init__(self, path: Path) -> None:
+        self._path = path
+        self._db: sqlite3.Connection | None = None
+
+    async def get(self, table: str, partition: str, key: str) -> Row | None:
+        """See ``Tables``."""
+        found = self._run(_GET, (table, partition, key)).fetchone()
+        return None if found is None else Row(partition, key, _decode(found[1]), found[0])
+
+    async def create(self, table: str, row: Row) -> Row:
+        """See ``Tables``."""
+        return self._write(table, Write("create", row))
+
+    async def replace(self, table: str, row: Row) -> Row:
+        """See ``Tables``."""
+        return self._write(table, Write("replace", row))
+
+    async def delete(self, table: str, row: Row) -> None:
+        """See ``Tables``."""
+        self._write(table, Write("delete", row))
+
+    async def query(
+        self,
+        table: str,
+        partition: str,
+        *,
+        first: str = "",
+        last: str | None = None,
+        limit: int = 100,
+        cursor: str | None = None,
+    ) -> Page:
+        """See ``Tables``."""
+        if not 1 <= limit <= MAX_PAGE:
+            raise ValueError(f"limit must be 1 to {MAX_PAGE}, not {limit}")
+        start = first if cursor is None else max(first, _read_cursor(cursor))
+        if last is None:
+            found = self._run(_QUERY_OPEN, (table, partition, start, limit + 1)).fetchall()
+        else:
+            found = self._run(_QUERY_CLOSED, (table, partition, start, last, limit + 1)).fetchall()
+        rows = tuple(Row(partition, key, _decode(data), etag) for key, etag, data in found[:limit])
+        return Page(rows, _write_cursor(found[limit][0]) if len(found) > limit else None)
+
+    async def batch(self, table: str, writes: Sequence[Write]) -> tuple[Row, ...]:
+        """See ``Tables``."""
+        if not 1 <= len(writes) <= MAX_BATCH:
+            raise ValueError(f"a batch has 1 to {MAX_BATCH} writes, not {len(writes)}")
+        if len({write.row.partition for write in writes}) != 1:
+            raise ValueError("all writes of a batch are in one partition")
+        if len({write.row.key for write in writes}) != len(writes):
+            raise ValueError("a batch writes each key once")
+        for write in writes:
+            _check(write.row)
+        self._run("BEGIN IMMEDIATE")
+        try:
+            rows = tuple(self._write(table, write) for write in writes)
+            self._run("COMMIT")
+        except BaseException:
+            self._rollback()
+            raise
+        return rows
+
+    async def close(self) -> None:
+        """See ``Tables``."""
+        if self._db is not None:
+            self._db.close()
+            self._db = None
+
+    def _write(self, table: str, write: Write) -> Row:
+        row = write.row
+        _check(row)
+        if write.kind == "delete":
+            done = self._run(_DELETE, (table, row.partition, row.key, row.etag))
+            self._expect_one(done, table, row)
+            return row
+        data = _encode(row.data)
+        if len(data) > MAX_DATA_BYTES:
+            raise ValueError(f"a row holds at most {MAX_DATA_BYTES} bytes, not {len(data)}")
+        etag = secrets.token_hex(8)
+        if write.kind == "create":
+            try:
+                self._run(_CREATE, (table, row.partition, row.key, etag, data))
+            except sqlite3.IntegrityError as error:
+                raise Conflict(f"{table}: '{row.key}' exists") from error
+        else:
+            done = self._run(_REPLACE, (etag, data, table, row.partition, row.key, row.etag))
+            self._expect_one(done, table, row)
+        return Row(row.partition, row.key, row.data, etag)
+
+    @staticmethod
+    def _expect_one(done: sqlite3.Cursor, table: str, row: Row) -> None:
+        if done.rowcount != 1:
+            raise Conflict(f"{table}: '{row.key}' has changed or is gone")
+
+    def _rollback(self) -> None:
+        if self._db is not None and self._db.in_transaction:
+            self._db.rollback()
+
+    def _run(self, statement: str, values: tuple[Any, ...] = ()) -> sqlite3.Cursor:
+        db = self._db or self._open()
+        try:
+            return db.execute(statement, values)
+        except sqlite3.IntegrityError:
+            raise
+        except UnicodeEncodeError as error:
+            raise ValueError("partitions and keys are Unicode text without lone surrogates") from error
+        except sqlite3.Error as error:
+            raise self._unusable(error) from error
+
+    def _open(self) -> sqlite3.Connection:
+        try:
+            self._path.parent.mkdir(parents=True, exist_ok=True)
+            if not self._path.exists():
+                os.close(os.open(self._path, os.O_CREAT | os.O_WRONLY, 0o600))
+            db = sqlite3.connect(
+                self._path,
+                isolation_level=None,
+                timeout=BUSY_TIMEOUT_MS / 1000,
+                check_same_thread=False,
+                cached_statements=64,
+            )
+        except (OSError, sqlite3.Error) as error:
+            raise self._unusable(error) from error
+        try:
+            db.execute("PRAGMA journal_mode=WAL")
+            db.execute("PRAGMA synchronous=NORMAL")
+            db.execute(_SCHEMA)
+        except sqlite3.Error as error:
+            db.close()
+            raise self._unusable(error) from error
+        self._db = db
+        return db
+
+    def _unusable(self, error: Exception) -> StoreError:
+        if isinstance(error, sqlite3.OperationalError | OSError):
+            return StoreError(f"the tables in {self._path} cannot be used: {error}. Check disk space and permissions.")
+        return StoreError(
+            f"the tables in {self._path} are damaged ({error}). Put back a copy of the file, or move it away to start "
+            "empty; nothing was deleted."
+        )
+
+
+def _check(row: Row) -> None:
+    for text in (row.partition, row.key):
+        if not 1 <= len(text) <= MAX_KEY_LENGTH:
+            raise ValueError(f"partitions and keys have 1 to {MAX_KEY_LENGTH} characters, not {len(text)}")
+
+
+def _write_cursor(key: str) -> str:
+    return base64.urlsafe_b64encode(key.encode()).decode().rstrip("=")
+
+
+def _read_cursor(cursor: str) -> str:
+    try:
+        return base64.b64decode(cursor + "=" * (-len(cursor) % 4), altchars=b"-_", validate=True).decode()
+    except (ValueError, binascii.Error) as error:
+        raise ValueError("not a cursor of this list") from error

@@ -1,0 +1,166 @@
+"""Puts the functions together: the one place that picks adapters."""
+
+from dataclasses import dataclass
+
+from function_app.adapters.local.blobs import FileBlobs
+from function_app.adapters.local.broker_access import MosquittoBrokerAccess, TokenBrokerAccess
+from function_app.adapters.local.catalogue import FolderCatalogue
+from function_app.adapters.local.clock import SystemClock
+from function_app.adapters.local.command_bus import MqttCommandBus
+from function_app.adapters.local.feed import MqttFeed
+from function_app.adapters.local.keys import FileKeys
+from function_app.adapters.local.tables import SqliteTables
+from function_app.ports.blobs import Blobs
+from function_app.ports.broker_access import BrokerAccess
+from function_app.ports.clock import Clock
+from function_app.ports.command_bus import CommandBus
+from function_app.ports.feed import Feed
+from function_app.ports.keys import Keys
+from function_app.ports.tables import Tables
+from function_app.services.action_acks import ActionAcks
+from function_app.services.action_rows import ActionRows
+from function_app.services.actions import Actions
+from function_app.services.claim import Claim
+from function_app.services.commands import Commands
+from function_app.services.devices import Devices
+from function_app.services.enroll import Enroll
+from function_app.services.health import CheckHealth
+from function_app.services.identity import Identify
+from function_app.services.lease import Leases
+from function_app.services.movements import Movements
+from function_app.services.mqtt_credentials import MqttCredentials
+from function_app.services.pending import Pending
+from function_app.services.presence import PresenceIngest
+from function_app.services.sign_in import SignIn
+from function_app.services.start_action import StartAction
+from function_app.services.stop import StopDevices
+from function_app.services.sweep import Sweep
+from function_app.services.unpair import Unpair
+from function_app.settings import Settings
+
+TABLES_FILE = "tables.sqlite"
+MOSQUITTO_SERVICE = "service"
+
+
+@dataclass(frozen=True, slots=True)
+class Functions:
+    """Everything the entry points use."""
+
+    settings: Settings
+    tables: Tables
+    blobs: Blobs
+    bus: CommandBus
+    feed: Feed
+    access: BrokerAccess
+    keys: Keys
+    clock: Clock
+    identify: Identify
+    sign_in: SignIn
+    enroll: Enroll
+    claim: Claim
+    unpair: Unpair
+    devices: Devices
+    leases: Leases
+    movements: Movements
+    start_action: StartAction
+    actions: Actions
+    action_acks: ActionAcks
+    stop: StopDevices
+    mqtt_credentials: MqttCredentials
+    presence: PresenceIngest
+    sweep: Sweep
+    health: CheckHealth
+
+    async def close(self) -> None:
+        """Let go of all connections."""
+        await self.bus.close()
+        await self.access.close()
+        await self.tables.close()
+        await self.blobs.close()
+
+
+def build(settings: Settings, *, clock: Clock | None = None) -> Functions:
+    """The functions on one machine: SQLite, files, and a broker of our own. Reads the signing keys, opens no socket.
+
+    Raises:
+        StoreError: The signing keys cannot be used.
+    """
+    now = clock or SystemClock()
+    keys = FileKeys(settings.home / "keys")
+    private = keys.load()
+    tables = SqliteTables(settings.home / TABLES_FILE)
+    blobs = FileBlobs(settings.home / "blobs")
+    catalogue = FolderCatalogue(settings.robots)
+
+    async def publish(topic: str, payload: bytes) -> None:
+        await bus.publish(topic, payload)
+
+    access: TokenBrokerAccess | MosquittoBrokerAccess
+    if settings.broker == "amqtt":
+        access = TokenBrokerAccess(key=private, publish=publish)
+    else:
+        access = MosquittoBrokerAccess(
+            host=settings.mqtt_host,
+            port=settings.mqtt_port,
+            username=MOSQUITTO_SERVICE,
+            password_file=settings.home / "mosquitto" / "service.password",
+        )
+    bus = MqttCommandBus(
+        host=settings.mqtt_host, port=settings.mqtt_port, credentials=access.service_credentials
+    )
+    feed = MqttFeed(host=settings.mqtt_host, port=settings.mqtt_port, credentials=access.service_credentials)
+
+    identify = Identify(tables=tables, keys=keys, clock=now)
+    sign_in = SignIn(tables=tables, identify=identify, clock=now)
+    devices = Devices(tables=tables, clock=now)
+    commands = Commands(bus=bus, keys=keys, clock=now)
+    movements = Movements(tables=tables, blobs=blobs, catalogue=catalogue, clock=now)
+    rows = ActionRows(tables=tables)
+    acks = ActionAcks(rows=rows, clock=now)
+    pending = Pending(tables=tables)
+    return Functions(
+        settings=settings,
+        tables=tables,
+        blobs=blobs,
+        bus=bus,
+        feed=feed,
+        access=access,
+        keys=keys,
+        clock=now,
+        identify=identify,
+        sign_in=sign_in,
+        enroll=Enroll(tables=tables, clock=now),
+        claim=Claim(tables=tables, sign_in=sign_in, clock=now),
+        unpair=Unpair(tables=tables, commands=commands, access=access),
+        devices=devices,
+        leases=Leases(tables=tables, devices=devices, commands=commands, access=access, clock=now),
+        movements=movements,
+        start_action=StartAction(
+            tables=tables,
+            devices=devices,
+            movements=movements,
+            commands=commands,
+            rows=rows,
+            acks=acks,
+            pending=pending,
+            bus=bus,
+            clock=now,
+        ),
+        actions=Actions(
+            tables=tables, devices=devices, rows=rows, acks=acks, commands=commands, bus=bus, clock=now
+        ),
+        action_acks=acks,
+        stop=StopDevices(tables=tables, devices=devices, commands=commands, bus=bus),
+        mqtt_credentials=MqttCredentials(tables=tables, devices=devices, access=access, clock=now),
+        presence=PresenceIngest(tables=tables, clock=now),
+        sweep=Sweep(
+            tables=tables,
+            rows=rows,
+            pending=pending,
+            commands=commands,
+            movements=movements,
+            access=access,
+            clock=now,
+        ),
+        health=CheckHealth(tables=tables, bus=bus),
+    )

@@ -1,0 +1,47 @@
+"""People: accounts, who is asking, and what they may do to a device."""
+
+from dataclasses import dataclass
+from enum import StrEnum
+
+
+@dataclass(frozen=True, slots=True)
+class Account:
+    """A login, and the tenant that owns spaces, agents and movements."""
+
+    id: str
+    name: str
+
+
+@dataclass(frozen=True, slots=True)
+class Identity:
+    """Who is asking: an account in one sign-in session. Two browsers of one person are two identities."""
+
+    account: str
+    name: str
+    session: str
+
+
+@dataclass(frozen=True, slots=True)
+class Space:
+    """A room: a place for agents and devices. Belongs to one account."""
+
+    id: str
+    name: str
+
+
+class Role(StrEnum):
+    """What an account may do with a device."""
+
+    OWNER = "owner"
+    OPERATOR = "operator"
+    VIEWER = "viewer"
+
+    @property
+    def may_operate(self) -> bool:
+        """Take the lease, start actions, stop."""
+        return self is not Role.VIEWER
+
+    @property
+    def may_own(self) -> bool:
+        """Un-pair, share."""
+        return self is Role.OWNER

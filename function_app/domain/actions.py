@@ -1,0 +1,168 @@
+"""An action's life: ``created → published → received → accepted → started → done | failed | expired | cancelled``.
+
+Steps may be skipped, never taken back. The first terminal state stays, whoever reports another one later.
+"""
+
+from dataclasses import dataclass, field, replace
+from enum import StrEnum
+from typing import Any
+
+
+class Status(StrEnum):
+    """How far an action has come. The last four are terminal."""
+
+    CREATED = "created"
+    PUBLISHED = "published"
+    RECEIVED = "received"
+    ACCEPTED = "accepted"
+    STARTED = "started"
+    DONE = "done"
+    FAILED = "failed"
+    EXPIRED = "expired"
+    CANCELLED = "cancelled"
+
+    @property
+    def terminal(self) -> bool:
+        """Whether nothing follows."""
+        return self in TERMINAL
+
+    @property
+    def rank(self) -> int:
+        """Place in the order; all terminal states share the last."""
+        return _RANK[self]
+
+
+TERMINAL = frozenset({Status.DONE, Status.FAILED, Status.EXPIRED, Status.CANCELLED})
+REPEAT_MS = 1_000
+"""A command that nobody has answered is published again after this time."""
+GRACE_MS = 3_000
+"""An ack may be this late: until then a command whose time ran out is not called expired."""
+
+_RANK = {status: min(place, 5) for place, status in enumerate(Status)}
+
+
+@dataclass(frozen=True, slots=True)
+class Action:
+    """One run of something on one device.
+
+    Attributes:
+        request: What was asked, as it was asked.
+        pinned: For a movement: version and SHA-256 of the script, so that a re-published command is the same one.
+        pairing: The agent's pairing that it belongs to.
+        times: Status → when [ms since 1970]; ``published`` by the cloud's clock, the later ones by the agent's.
+        sequence: Of the newest ack seen.
+    """
+
+    id: str
+    device: str
+    account: str
+    who: str
+    pairing: str
+    request: dict[str, Any]
+    epoch: int
+    created_ms: int
+    ttl_ms: int
+    deadline_ms: int
+    status: Status = Status.CREATED
+    pinned: dict[str, Any] = field(default_factory=dict)
+    times: dict[str, int] = field(default_factory=dict)
+    reason: dict[str, str] | None = None
+    progress: float | None = None
+    output: str = ""
+    result: dict[str, Any] = field(default_factory=dict)
+    sequence: int = -1
+    cancel_id: str = ""
+
+    @property
+    def expires_ms(self) -> int:
+        """From here on the device must not begin it any more."""
+        return self.created_ms + self.ttl_ms
+
+
+@dataclass(frozen=True, slots=True)
+class Report:
+    """One ack about an action. ``output`` is all the script has printed so far, not what is new."""
+
+    status: Status
+    sequence: int
+    at_ms: int
+    reason: dict[str, str] | None = None
+    progress: float | None = None
+    output: str = ""
+    result: dict[str, Any] = field(default_factory=dict)
+
+
+def apply_report(action: Action, report: Report) -> Action:
+    """The action after a report: the same object when it brings nothing new.
+
+    Idempotent and monotone: doubled, late and disordered reports never take a step back.
+    """
+    if action.status.terminal:
+        return action
+    times = action.times if report.status.value in action.times else {**action.times, report.status.value: report.at_ms}
+    if report.sequence <= action.sequence and report.status.rank <= action.status.rank:
+        return action if times is action.times else replace(action, times=times)
+    changed = replace(action, times=times, sequence=max(action.sequence, report.sequence))
+    if report.status.rank >= action.status.rank:
+        changed = replace(changed, status=report.status)
+    if report.sequence > action.sequence or report.status.terminal:
+        changed = replace(
+            changed,
+            progress=action.progress if report.progress is None else report.progress,
+            output=report.output or action.output,
+            result=report.result or action.result,
+            reason=report.reason or action.reason,
+        )
+    return changed
+
+
+def mark_published(action: Action, now_ms: int) -> Action:
+    """The action, published; the same object when it already is."""
+    if action.status is not Status.CREATED:
+        return action
+    return replace(action, status=Status.PUBLISHED, times={**action.times, "published": now_ms})
+
+
+def end(action: Action, status: Status, code: str, message: str, now_ms: int) -> Action:
+    """The action, ended by the cloud; the same object when it already has an end."""
+    if action.status.terminal:
+        return action
+    return replace(
+        action,
+        status=status,
+        times={**action.times, status.value: now_ms},
+        reason={"code": code, "message": message},
+    )
+
+
+def reached(action: Action, wanted: Status) -> bool:
+    """Whether waiting for ``wanted`` is over."""
+    return action.status.terminal or action.status.rank >= wanted.rank
+
+
+def next_look_ms(action: Action, now_ms: int) -> int:
+    """When a timer has to look at an open action again [ms since 1970]."""
+    if action.status.rank < Status.RECEIVED.rank and now_ms < action.expires_ms + GRACE_MS:
+        return min(now_ms + REPEAT_MS, action.deadline_ms)
+    return action.deadline_ms
+
+
+class Verdict(StrEnum):
+    """What a timer has to do about an open action."""
+
+    WAIT = "wait"
+    PUBLISH = "publish"
+    EXPIRE = "expire"
+    LOSE = "lose"
+
+
+def judge(action: Action, now_ms: int) -> Verdict:
+    """What is due. An unanswered command is sent again until its time to live ends: the device drops doubles by id."""
+    if now_ms >= action.deadline_ms:
+        return Verdict.LOSE
+    if action.status.rank < Status.RECEIVED.rank:
+        if now_ms < action.expires_ms:
+            return Verdict.PUBLISH
+        if now_ms >= action.expires_ms + GRACE_MS:
+            return Verdict.EXPIRE
+    return Verdict.WAIT

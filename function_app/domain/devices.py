@@ -1,0 +1,125 @@
+"""Agents, their devices, and what is known of them at this moment."""
+
+from dataclasses import dataclass, replace
+from typing import Any
+
+from function_app.domain.accounts import Role
+
+SILENT_MS = 90_000
+"""An agent sends state every 30 s; after three missed ones a last word of "online" is no longer believed."""
+
+
+@dataclass(frozen=True, slots=True)
+class DeviceSpec:
+    """What an agent says about one of its devices when it enrolls."""
+
+    name: str
+    kind: str
+    robot_type: str
+    label: str
+
+
+@dataclass(frozen=True, slots=True)
+class Agent:
+    """One identity: a key pair that the agent made itself. Waiting until an account claims it.
+
+    Attributes:
+        pairing: Changes with each claim: what belongs to an earlier owner's pairing is no longer shown.
+        claim_code: The code that claims it now; empty when claimed.
+    """
+
+    id: str
+    name: str
+    public_key: str
+    software: str
+    devices: tuple[DeviceSpec, ...]
+    created_ms: int
+    account: str | None = None
+    space: str | None = None
+    pairing: str = ""
+    claimed_ms: int = 0
+    claim_code: str = ""
+    claim_expires_ms: int = 0
+
+    @property
+    def claimed(self) -> bool:
+        """Whether it belongs to somebody."""
+        return self.account is not None
+
+    def device(self, name: str) -> DeviceSpec | None:
+        """The device of this name."""
+        return next((spec for spec in self.devices if spec.name == name), None)
+
+
+@dataclass(frozen=True, slots=True)
+class Device:
+    """One device, as one account may see it. ``topic`` is the first levels of all its topics."""
+
+    id: str
+    name: str
+    label: str
+    kind: str
+    robot_type: str
+    agent: str
+    space: str
+    pairing: str
+    role: Role
+    topic: str
+
+
+def claim(agent: Agent, *, account: str, space: str, pairing: str, now_ms: int) -> Agent:
+    """The agent, now of ``account``; its code is used up."""
+    return replace(
+        agent,
+        account=account,
+        space=space,
+        pairing=pairing,
+        claimed_ms=now_ms,
+        claim_code="",
+        claim_expires_ms=0,
+    )
+
+
+def unpair(agent: Agent) -> Agent:
+    """The agent, of nobody."""
+    return replace(agent, account=None, space=None, pairing="", claimed_ms=0, claim_code="", claim_expires_ms=0)
+
+
+@dataclass(frozen=True, slots=True)
+class Link:
+    """The last word about an agent's broker connection.
+
+    Attributes:
+        session: Number of the agent's connection; it rises each time.
+        seen_ms: When the cloud took notice [ms since 1970, cloud's clock].
+    """
+
+    online: bool
+    session: int
+    seen_ms: int
+
+
+def newer_link(known: Link | None, incoming: Link) -> Link | None:
+    """What to store, or ``None`` when the news is old.
+
+    An old connection's will may arrive after the new connection's "online": the lower session number gives it away.
+    Within one session "offline" is final.
+    """
+    if known is None or incoming.session > known.session:
+        return incoming
+    if incoming.session < known.session or (incoming.online and not known.online):
+        return None
+    return incoming
+
+
+@dataclass(frozen=True, slots=True)
+class LastState:
+    """The newest ``state`` message of a device, as it came."""
+
+    state: dict[str, Any]
+    seen_ms: int
+
+
+def online(link: Link | None, last_seen_ms: int, now_ms: int) -> bool:
+    """Whether the agent may be believed to be there."""
+    return link is not None and link.online and now_ms - last_seen_ms <= SILENT_MS

@@ -1,0 +1,85 @@
+"""Ids: short, unguessable where it matters, and readable back into their parts. All match ``[A-Za-z0-9_-]{1,64}``."""
+
+import re
+import secrets
+
+ID = re.compile(r"\A[A-Za-z0-9_-]{1,64}\Z")
+DEVICE_NAME = re.compile(r"\A[A-Za-z0-9_-]{1,32}\Z")
+"""A device's name at its agent: short enough that an action's id, which holds it, stays within 64 characters."""
+AGENT_LENGTH = 10
+SUFFIX_LENGTH = 20
+CLAIM_ALPHABET = "BCDFGHJKLMNPQRSTVWXZ"
+"""Twenty consonants: nothing that reads as a word, nothing to mistake for a digit."""
+CLAIM_LENGTH = 8
+
+_BASE32 = "abcdefghijklmnopqrstuvwxyz234567"
+_SORTABLE32 = "0123456789abcdefghijklmnopqrstuv"
+_TIME_LENGTH = 9
+_TIME_END = 32**_TIME_LENGTH - 1
+
+
+def new_id(length: int = 16) -> str:
+    """A random id: 5 bits a character."""
+    return "".join(secrets.choice(_BASE32) for _ in range(length))
+
+
+def agent_id(key_id: str) -> str:
+    """The id of the agent that owns a key, from ``signing.key_id`` (hex): the first 50 bits of the key's hash.
+
+    One key is one agent, for ever: no second row is needed to find it again, and a replayed enrolment changes nothing.
+    The agent's row holds the whole key, so a second key with the same 50 bits is refused, not confused.
+    """
+    bits = int(key_id[:16], 16) >> 14
+    return "".join(_BASE32[(bits >> shift) & 31] for shift in range(45, -5, -5))
+
+
+def device_id(agent: str, name: str) -> str:
+    """The id of a device behind an agent."""
+    return f"{agent}-{name}"
+
+
+def split_device(device: str) -> tuple[str, str] | None:
+    """Agent and name in a device id, or ``None`` where the text cannot be one."""
+    agent, dash, name = device.partition("-")
+    if not dash or len(agent) != AGENT_LENGTH or not agent.isalnum() or not DEVICE_NAME.match(name):
+        return None
+    return (agent, name) if ID.match(agent) else None
+
+
+def new_suffix(now_ms: int) -> str:
+    """Last part of a command's id: counts down with time, so that newest sorts first; then 55 random bits."""
+    left = _TIME_END - now_ms
+    time = "".join(_SORTABLE32[(left >> shift) & 31] for shift in range(5 * (_TIME_LENGTH - 1), -5, -5))
+    return time + "".join(secrets.choice(_SORTABLE32) for _ in range(SUFFIX_LENGTH - _TIME_LENGTH))
+
+
+def command_id(device: str, now_ms: int) -> str:
+    """A new id of an action, or of another command to a device."""
+    return f"{device}-{new_suffix(now_ms)}"
+
+
+def split_command(command: str) -> tuple[str, str] | None:
+    """Device id and suffix in a command's id, or ``None`` where the text cannot be one."""
+    device, dash, suffix = command.rpartition("-")
+    if not dash or len(suffix) != SUFFIX_LENGTH or not suffix.isalnum() or split_device(device) is None:
+        return None
+    return device, suffix
+
+
+def new_claim_code() -> str:
+    """Eight characters of base 20: 2.56·10¹⁰ codes."""
+    return "".join(secrets.choice(CLAIM_ALPHABET) for _ in range(CLAIM_LENGTH))
+
+
+def show_claim_code(code: str) -> str:
+    """As people see it: ``XXXX-XXXX``."""
+    half = CLAIM_LENGTH // 2
+    return f"{code[:half]}-{code[half:]}"
+
+
+def read_claim_code(text: str) -> str | None:
+    """What a person typed, as it is stored; ``None`` when it cannot be a code."""
+    code = "".join(text.split()).replace("-", "").upper()
+    if len(code) != CLAIM_LENGTH or any(letter not in CLAIM_ALPHABET for letter in code):
+        return None
+    return code

@@ -1,0 +1,69 @@
+"""What can be refused, each with one code, one HTTP status and a sentence that says what to do (RFC 9457)."""
+
+from typing import Any
+
+
+class Problem(Exception):  # noqa: N818 (named as in RFC 9457)
+    """A request that is refused.
+
+    Attributes:
+        code: Stable name for programs; the last part of the problem's ``type``.
+        status: HTTP status.
+        title: What is wrong, the same for every occurrence.
+        detail: What is wrong this time and what to do.
+        extras: Further members of the answer.
+        retry_after_s: When it may be worth trying again [s].
+    """
+
+    def __init__(
+        self,
+        code: str,
+        status: int,
+        title: str,
+        detail: str,
+        *,
+        retry_after_s: int | None = None,
+        extras: dict[str, Any] | None = None,
+    ) -> None:
+        super().__init__(detail)
+        self.code = code
+        self.status = status
+        self.title = title
+        self.detail = detail
+        self.extras = extras or {}
+        self.retry_after_s = retry_after_s
+
+
+def unauthorized(detail: str) -> Problem:
+    """Nobody we know is asking."""
+    return Problem("unauthorized", 401, "Sign in first", detail)
+
+
+def forbidden(detail: str) -> Problem:
+    """Known, and not allowed."""
+    return Problem("forbidden", 403, "Not allowed", detail)
+
+
+def not_found(what: str, name: str) -> Problem:
+    """There is none, or none that this account may know of: the answer is the same."""
+    return Problem(f"{what}-unknown", 404, f"No such {what.replace('-', ' ')}", f"There is no {what} '{name[:80]}'.")
+
+
+def invalid(detail: str, *, code: str = "invalid", **extras: Any) -> Problem:
+    """The request cannot be understood."""
+    return Problem(code, 422, "The request is not valid", detail, extras=extras)
+
+
+def busy_store() -> Problem:
+    """Too many writers wanted the same row at the same moment."""
+    return Problem("busy", 503, "Busy", "Too many requests changed this at once. Try again.", retry_after_s=1)
+
+
+def broker_unavailable(detail: str) -> Problem:
+    """The message broker cannot be reached, so nothing reaches the device."""
+    return Problem("broker-unavailable", 503, "The broker cannot be reached", detail, retry_after_s=2)
+
+
+def store_unavailable(detail: str) -> Problem:
+    """The tables cannot be used."""
+    return Problem("store-unavailable", 503, "The store cannot be used", detail, retry_after_s=5)

@@ -1,0 +1,125 @@
+"""Routes with their documentation: what is written here is what the OpenAPI document says."""
+
+from collections.abc import Awaitable, Callable, Mapping, Sequence
+from typing import Any, Literal
+
+import msgspec
+from fastapi import APIRouter, Response
+
+from function_app.entrypoints.http import contract
+from function_app.entrypoints.http.answers import JSON, PROBLEM_JSON
+
+Handler = Callable[..., Awaitable[Response]]
+Caller = Literal["nobody", "account", "agent", "account or agent"]
+
+REF = "#/components/schemas/{name}"
+ACCOUNT_SCHEMES = ("accessToken", "sessionCookie")
+AGENT_SCHEME = "agentToken"
+_MEANINGS = {
+    200: "Done",
+    201: "Made",
+    202: "Under way",
+    204: "Done, nothing to say",
+    401: "Not signed in",
+    403: "Not allowed",
+    404: "There is none",
+    409: "Not in this state",
+    413: "The body is too large",
+    422: "The request is not valid",
+    429: "Too many tries; see Retry-After",
+    503: "The store or the broker cannot be used; see Retry-After",
+}
+_used: dict[str, Any] = {"Problem": contract.Problem}
+
+
+class Routes:
+    """A router for one resource. Handlers take ``request`` and path or query parameters and return a response."""
+
+    def __init__(self, tag: str) -> None:
+        self.router = APIRouter(tags=[tag])
+
+    def add(
+        self,
+        method: Literal["GET", "POST", "PUT", "DELETE"],
+        path: str,
+        *,
+        summary: str,
+        answers: Mapping[int, Any],
+        problems: Sequence[int] = (),
+        body: Any = None,
+        body_required: bool = True,
+        caller: Caller = "account",
+    ) -> Callable[[Handler], Handler]:
+        """Register a handler.
+
+        Args:
+            method: HTTP method.
+            path: Below the API's prefix.
+            summary: One line.
+            answers: Status → struct of the body (``None``: no body).
+            problems: Statuses of refusals beside 401, 413, 422 and 503, which follow from the rest.
+            body: Struct of the request's body.
+            body_required: Whether it may be left out.
+            caller: Who may ask.
+        """
+        refusals = {*problems, 503}
+        if caller != "nobody":
+            refusals.add(401)
+        if caller.startswith("account") and method != "GET":
+            refusals.add(403)
+        if body is not None:
+            refusals |= {413, 422}
+        responses: dict[int | str, dict[str, Any]] = {}
+        for status, kind in answers.items():
+            responses[status] = {"description": _MEANINGS[status]}
+            if kind is not None:
+                responses[status]["content"] = {JSON: {"schema": _reference(kind)}}
+        for status in sorted(refusals):
+            responses[status] = {
+                "description": _MEANINGS[status],
+                "content": {PROBLEM_JSON: {"schema": _reference(contract.Problem)}},
+            }
+        extra: dict[str, Any] = {"security": _security(caller)}
+        if body is not None:
+            extra["requestBody"] = {"required": body_required, "content": {JSON: {"schema": _reference(body)}}}
+
+        def register(handler: Handler) -> Handler:
+            self.router.add_api_route(
+                path,
+                handler,
+                methods=[method],
+                summary=summary,
+                description=(handler.__doc__ or "").strip() or None,
+                operation_id=handler.__name__,
+                status_code=min(answers),
+                response_class=Response,
+                response_model=None,
+                responses=responses,
+                openapi_extra=extra,
+            )
+            return handler
+
+        return register
+
+
+def schemas() -> dict[str, Any]:
+    """JSON Schemas of everything that routes have named."""
+    _, components = msgspec.json.schema_components(list(_used.values()), ref_template=REF)
+    return components
+
+
+def _reference(kind: Any) -> dict[str, Any]:
+    """The schema of a struct, or of a union of structs, by reference."""
+    (schema,), components = msgspec.json.schema_components([kind], ref_template=REF)
+    for name in components:
+        _used.setdefault(name, kind)
+    return schema
+
+
+def _security(caller: Caller) -> list[dict[str, list[str]]]:
+    names: list[str] = []
+    if "account" in caller:
+        names += ACCOUNT_SCHEMES
+    if "agent" in caller:
+        names.append(AGENT_SCHEME)
+    return [{name: []} for name in names]

@@ -1,0 +1,10 @@
+"""The time of day."""
+
+from typing import Protocol
+
+
+class Clock(Protocol):
+    """Wall clock."""
+
+    def now_ms(self) -> int:
+        """Milliseconds since 1970, UTC."""

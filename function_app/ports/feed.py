@@ -1,0 +1,17 @@
+"""What devices say, on its way into the tables, where a worker of ours subscribes to it (elsewhere the cloud calls)."""
+
+from collections.abc import Awaitable, Callable
+from typing import Protocol
+
+Handler = Callable[[str, bytes], Awaitable[None]]
+"""Given topic and payload. Returns once it is stored: only then is the message confirmed to the broker."""
+
+
+class Feed(Protocol):
+    """A subscription of the functions' own."""
+
+    async def run(self, handler: Handler) -> None:
+        """Deliver until cancelled; reconnects for ever. Messages of one topic arrive in order, one at a time.
+
+        A handler that raises leaves its message unconfirmed: brokers that can will send it again.
+        """

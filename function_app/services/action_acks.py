@@ -1,0 +1,111 @@
+"""What devices report about actions, written down by whoever hears it first: the waiting call or the ingest."""
+
+import asyncio
+import logging
+from collections.abc import AsyncIterator, Iterable
+
+import msgspec
+
+from device_agent.protocol import codec
+from device_agent.protocol.errors import ProtocolError
+from device_agent.protocol.messages import Ack
+from device_agent.protocol.topics import Topic
+from function_app.domain.actions import Action, Report, Status, apply_report, mark_published, reached
+from function_app.domain.ids import device_id, split_command
+from function_app.ports.clock import Clock
+from function_app.services.action_rows import ActionRows, Found
+
+_POLL_S = 0.02
+_SLOWEST_POLL_S = 0.2
+
+_log = logging.getLogger(__name__)
+
+
+class ActionAcks:
+    """Applies acks to actions, and waits for them."""
+
+    def __init__(self, *, rows: ActionRows, clock: Clock) -> None:
+        self._rows = rows
+        self._clock = clock
+
+    async def ingest(self, topic: Topic, payload: bytes) -> None:
+        """Apply one ack that came by ``topic``. Doubled, late and foreign ones change nothing.
+
+        Raises:
+            Problem: ``busy``: not stored, to be delivered again.
+        """
+        try:
+            ack = codec.decode(payload, Ack)
+        except ProtocolError as error:
+            _log.warning("ack of %s/%s dropped: %s", topic.agent, topic.device, error)
+            return
+        parts = split_command(ack.id)
+        if parts is None or parts[0] != device_id(topic.agent, topic.device):
+            return
+        await self._rows.change(ack.id, lambda action: apply_report(action, report(ack)))
+
+    async def follow(
+        self, found: Found, acks: AsyncIterator[Ack] | None, *, wanted: Status, wait_ms: int, published: bool = False
+    ) -> Action:
+        """Wait until the action has reached ``wanted``, has ended, or ``wait_ms`` are over.
+
+        Acks are collected and written once, before this returns: who asks next reads what this answered.
+
+        Args:
+            found: The action as it was read or written last.
+            acks: Its acks from before it was published, or ``None``: then the row is read again and again.
+            wanted: The status to wait for.
+            wait_ms: At most this long.
+            published: Whether to note that the command was published.
+        """
+        loop = asyncio.get_running_loop()
+        published_ms = self._clock.now_ms() if published else None
+        end = loop.time() + wait_ms / 1000
+        if acks is None:
+            if published:
+                found = await self._write(found, (), published_ms)
+            return await self._poll(found, wanted, end)
+        reports: list[Report] = []
+        action = found.action
+        try:
+            async with asyncio.timeout_at(end):
+                while not reached(action, wanted):
+                    heard = report(await anext(acks))
+                    reports.append(heard)
+                    action = apply_report(action, heard)
+        except TimeoutError:
+            # The ingest may have heard what this call has not.
+            found = await self._rows.get(found.action.id) or found
+        return (await self._write(found, reports, published_ms)).action
+
+    async def _write(self, found: Found, reports: Iterable[Report], published_ms: int | None) -> Found:
+        def changed(action: Action) -> Action:
+            if published_ms is not None:
+                action = mark_published(action, published_ms)
+            for heard in reports:
+                action = apply_report(action, heard)
+            return action
+
+        return await self._rows.change(found.action.id, changed, known=found) or found
+
+    async def _poll(self, found: Found, wanted: Status, end: float) -> Action:
+        loop = asyncio.get_running_loop()
+        pause_s = _POLL_S
+        while not reached(found.action, wanted) and (left_s := end - loop.time()) > 0:
+            await asyncio.sleep(min(pause_s, left_s))
+            pause_s = min(2 * pause_s, _SLOWEST_POLL_S)
+            found = await self._rows.get(found.action.id) or found
+        return found.action
+
+
+def report(ack: Ack) -> Report:
+    """An ack as the domain reads it."""
+    return Report(
+        status=Status(ack.status.value),
+        sequence=ack.sequence,
+        at_ms=ack.at_ms,
+        reason=None if ack.reason is None else msgspec.to_builtins(ack.reason),
+        progress=ack.progress,
+        output=ack.output,
+        result=ack.result,
+    )

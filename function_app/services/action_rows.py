@@ -1,0 +1,113 @@
+"""Actions in their rows: the one place that changes them, so that slot and lease end with them."""
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+from function_app.domain.actions import Action
+from function_app.domain.devices import Device
+from function_app.domain.ids import split_command
+from function_app.domain.lease import release
+from function_app.domain.problems import invalid
+from function_app.ports.tables import Row, Tables, Write
+from function_app.services import store
+from function_app.services.control import Control, read_control_rows
+
+_PREFIX = "action:"
+_END = "action;"
+
+
+@dataclass(frozen=True, slots=True)
+class Found:
+    """An action and the row it was read from."""
+
+    action: Action
+    row: Row
+
+
+def place(action: str) -> tuple[str, str] | None:
+    """Partition and key of an action, or ``None`` for what is no action's id."""
+    parts = split_command(action)
+    return None if parts is None else (parts[0], f"{_PREFIX}{parts[1]}")
+
+
+def new_row(action: Action) -> Row:
+    """The row of a new action."""
+    device, key = place(action.id) or (action.device, "")
+    return Row(device, key, store.fields(action))
+
+
+class ActionRows:
+    """Reads and changes actions."""
+
+    def __init__(self, *, tables: Tables) -> None:
+        self._tables = tables
+
+    async def get(self, action: str) -> Found | None:
+        """One action."""
+        where = place(action)
+        if where is None:
+            return None
+        row = await self._tables.get(store.CONTROL, *where)
+        return None if row is None else Found(store.read(row, Action), row)
+
+    async def list(self, device: Device, *, cursor: str | None, limit: int) -> tuple[list[Action], str | None]:
+        """Actions of a device since it was paired, newest first.
+
+        Raises:
+            Problem: ``cursor-invalid``.
+        """
+        try:
+            page = await self._tables.query(
+                store.CONTROL, device.id, first=_PREFIX, last=_END, limit=limit, cursor=cursor
+            )
+        except ValueError as error:
+            raise invalid("The cursor is not one of this list. Begin without one.", code="cursor-invalid") from error
+        actions = [action for row in page.rows if (action := store.read(row, Action)).pairing == device.pairing]
+        # Older than the pairing is all that follows a stranger's action: the list ends there.
+        return actions, page.cursor if len(actions) == len(page.rows) else None
+
+    async def change(
+        self, action: str, change: Callable[[Action], Action], *, known: Found | None = None
+    ) -> Found | None:
+        """Change an action by ETag; when that ends it, free its slot and its own lease in the same batch.
+
+        Args:
+            action: Its id.
+            change: Gives the same object when there is nothing to change; may be called several times.
+            known: What the caller read or wrote last: saves a read, and costs one more when it is stale.
+
+        Returns:
+            The action as it is now, or ``None`` when there is none.
+
+        Raises:
+            Problem: ``busy``.
+        """
+        stale = False
+
+        async def once() -> Found | None:
+            nonlocal stale
+            found = await self.get(action) if known is None or stale else known
+            stale = True
+            if found is None:
+                return None
+            changed = change(found.action)
+            if changed is found.action:
+                return found
+            writes = [Write("replace", replace(found.row, data=store.fields(changed)))]
+            if changed.status.terminal:
+                writes += _freed(changed, await read_control_rows(self._tables, changed.device))
+            rows = await self._tables.batch(store.CONTROL, writes)
+            return Found(changed, rows[0])
+
+        return await store.retry(once)
+
+
+def _freed(action: Action, control: Control) -> list[Write]:
+    """Give back what the action held: the slot, and the lease that was given for it alone."""
+    writes = []
+    if control.action == action.id:
+        writes.append(control.write_slot(action.device, "", action.pairing))
+    if control.lease is not None and control.lease.action == action.id:
+        nobody = replace(release(control.lease), pairing=control.lease.pairing)
+        writes.append(control.write_lease(action.device, nobody))
+    return writes

@@ -1,0 +1,96 @@
+"""An account claims an agent with the code that the agent shows; and gives it up again."""
+
+import contextlib
+from dataclasses import dataclass, replace
+
+from function_app.domain import devices
+from function_app.domain.accounts import Identity
+from function_app.domain.devices import Agent
+from function_app.domain.ids import new_id, read_claim_code
+from function_app.domain.problems import Problem, not_found
+from function_app.ports.clock import Clock
+from function_app.ports.tables import Conflict, Row, Tables
+from function_app.services import store
+from function_app.services.sign_in import SignIn
+
+WRONG_TRIES = 5
+WINDOW_MS = 300_000
+
+
+@dataclass(frozen=True, slots=True)
+class _Tries:
+    since_ms: int
+    count: int
+
+
+class Claim:
+    """Pairing by claim code. What decides is one ETag write on the agent's row."""
+
+    def __init__(self, *, tables: Tables, sign_in: SignIn, clock: Clock) -> None:
+        self._tables = tables
+        self._sign_in = sign_in
+        self._clock = clock
+
+    async def claim(self, who: Identity, text: str, space: str | None) -> Agent:
+        """Make the agent that shows this code an agent of ``who``.
+
+        Raises:
+            Problem: ``claim-code-unknown`` for a wrong, used or expired code alike; ``too-many-tries``;
+                ``space-unknown``.
+        """
+        spaces = await self._sign_in.spaces(who.account)
+        chosen = next((known.id for known in spaces if space in (None, known.id)), None)
+        if chosen is None:
+            raise not_found("space", space or "")
+        await self._count_try(who, 1)
+        agent = await self._redeem(who, read_claim_code(text), chosen)
+        if agent is None:
+            detail = "This code is wrong, used or expired. Codes live five minutes; the agent shows its newest."
+            raise Problem("claim-code-unknown", 404, "No such claim code", detail)
+        await self._count_try(who, -1)
+        return agent
+
+    async def _redeem(self, who: Identity, code: str | None, space: str) -> Agent | None:
+        if code is None:
+            return None
+        found = await self._tables.get(store.CLAIMS, code[0], code)
+        if found is None:
+            return None
+        row = await self._tables.get(store.AGENTS, found.data["agent"], "agent")
+        if row is None:
+            return None
+        agent = store.read(row, Agent)
+        now_ms = self._clock.now_ms()
+        if agent.claimed or agent.claim_code != code or now_ms >= agent.claim_expires_ms:
+            return None
+        claimed = devices.claim(agent, account=who.account, space=space, pairing=new_id(), now_ms=now_ms)
+        # The index first: without the agent's row behind it it shows nothing, so a stop in between leaves no harm.
+        index = Row(who.account, f"agent:{agent.id}", {})
+        with contextlib.suppress(Conflict):
+            await self._tables.create(store.MEMBERS, index)
+        try:
+            await self._tables.replace(store.AGENTS, Row(agent.id, "agent", store.fields(claimed), row.etag))
+        except Conflict:
+            return None
+        with contextlib.suppress(Conflict):
+            await self._tables.delete(store.CLAIMS, found)
+        return claimed
+
+    async def _count_try(self, who: Identity, change: int) -> None:
+        """Count before looking, so that parallel guesses are no way around; a right code is not counted.
+
+        Raises:
+            Problem: ``too-many-tries``.
+        """
+        now_ms = self._clock.now_ms()
+
+        def counted(tries: _Tries | None) -> _Tries:
+            if tries is None or now_ms - tries.since_ms >= WINDOW_MS:
+                tries = _Tries(now_ms, 0)
+            if change > 0 and tries.count >= WRONG_TRIES:
+                wait_s = -(-(tries.since_ms + WINDOW_MS - now_ms) // 1000)
+                detail = f"Too many wrong claim codes. Try again in {wait_s} s."
+                raise Problem("too-many-tries", 429, "Too many tries", detail, retry_after_s=wait_s)
+            return replace(tries, count=max(0, tries.count + change))
+
+        await store.upsert(self._tables, store.ATTEMPTS, who.account, "claim", counted, _Tries)

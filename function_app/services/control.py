@@ -1,0 +1,69 @@
+"""The rows that decide who controls a device: its lease and its slot, side by side in the device's partition."""
+
+from dataclasses import dataclass, field
+
+from function_app.domain.devices import Device
+from function_app.domain.lease import Lease, release
+from function_app.ports.tables import Row, Tables, Write
+from function_app.services import store
+
+LEASE = "now:lease"
+SLOT = "now:slot"
+
+
+@dataclass(frozen=True, slots=True)
+class Control:
+    """Lease and slot as they were read, with their rows (``None``: not written yet)."""
+
+    lease: Lease | None = None
+    action: str = ""
+    rows: dict[str, Row] = field(default_factory=dict)
+
+    def write_lease(self, device: str, lease: Lease) -> Write:
+        """The change that puts ``lease`` in place of what was read."""
+        return self._write(device, LEASE, store.fields(lease))
+
+    def write_slot(self, device: str, action: str, pairing: str) -> Write:
+        """The change that gives the slot to ``action`` (empty: to nobody)."""
+        return self._write(device, SLOT, {"action": action, "pairing": pairing})
+
+    def _write(self, device: str, key: str, data: dict[str, object]) -> Write:
+        row = self.rows.get(key)
+        return Write("replace" if row else "create", Row(device, key, data, row.etag if row else ""))
+
+
+async def read_control(tables: Tables, device: Device) -> Control:
+    """Lease and slot in one read.
+
+    What an earlier owner's pairing left behind is nobody's: an un-pairing that stopped half way blocks nobody.
+    """
+    rows = await _rows(tables, device.id)
+    lease = _lease(rows, device)
+    slot = rows.get(SLOT)
+    action = slot.data["action"] if slot and slot.data["pairing"] == device.pairing else ""
+    return Control(lease, action, rows)
+
+
+async def read_control_rows(tables: Tables, device: str) -> Control:
+    """Lease and slot, of whatever pairing."""
+    rows = await _rows(tables, device)
+    lease = store.read(rows[LEASE], Lease) if LEASE in rows else None
+    return Control(lease, rows[SLOT].data["action"] if SLOT in rows else "", rows)
+
+
+async def read_lease(tables: Tables, device: Device) -> Lease | None:
+    """The lease row alone, live or not."""
+    row = await tables.get(store.CONTROL, device.id, LEASE)
+    return _lease({LEASE: row} if row else {}, device)
+
+
+async def _rows(tables: Tables, device: str) -> dict[str, Row]:
+    page = await tables.query(store.CONTROL, device, first="now:", last="now;")
+    return {row.key: row for row in page.rows}
+
+
+def _lease(rows: dict[str, Row], device: Device) -> Lease | None:
+    if LEASE not in rows:
+        return None
+    lease = store.read(rows[LEASE], Lease)
+    return lease if lease.pairing in ("", device.pairing) else release(lease)

@@ -1,0 +1,88 @@
+"""An agent makes itself known with its own key, and waits to be claimed."""
+
+import asyncio
+from dataclasses import dataclass, replace
+
+from function_app.domain.devices import Agent, DeviceSpec
+from function_app.domain.ids import new_claim_code
+from function_app.domain.problems import Problem
+from function_app.ports.clock import Clock
+from function_app.ports.tables import Conflict, Row, Tables, Write
+from function_app.services import store
+
+CLAIM_MS = 300_000
+_LOOK_S = 0.2
+
+
+@dataclass(frozen=True, slots=True)
+class Enrollment:
+    """What an agent says about itself."""
+
+    name: str
+    public_key: str
+    software: str
+    devices: tuple[DeviceSpec, ...]
+
+
+class Enroll:
+    """Enrolment of agents."""
+
+    def __init__(self, *, tables: Tables, clock: Clock) -> None:
+        self._tables = tables
+        self._clock = clock
+
+    async def enroll(self, agent: str, told: Enrollment) -> Agent:
+        """Make or refresh the agent's row; while nobody owns it, with a new claim code.
+
+        The code's row is written first: a code without an agent's row behind it claims nothing.
+
+        Raises:
+            Problem: ``agent-id-taken``: another key has the same id (one in 2⁵⁰).
+        """
+
+        async def once() -> Agent:
+            row = await self._tables.get(store.AGENTS, agent, "agent")
+            now_ms = self._clock.now_ms()
+            if row is None:
+                record = Agent(agent, told.name, told.public_key, told.software, told.devices, now_ms)
+            else:
+                record = store.read(row, Agent)
+                if record.public_key != told.public_key:
+                    detail = "Another agent's key has the same id. Make a new key."
+                    raise Problem("agent-id-taken", 409, "The id is taken", detail)
+                record = replace(record, name=told.name, software=told.software, devices=told.devices)
+            if not record.claimed:
+                expires_ms = now_ms + CLAIM_MS
+                code = await self._new_code(agent, expires_ms)
+                record = replace(record, claim_code=code, claim_expires_ms=expires_ms)
+            new = Row(agent, "agent", store.fields(record), row.etag if row else "")
+            await self._tables.batch(store.AGENTS, [Write("replace" if row else "create", new)])
+            return record
+
+        return await store.retry(once)
+
+    async def wait(self, agent: Agent, wait_ms: int) -> Agent:
+        """The agent's row, as soon as somebody has claimed it, or as it is when the time is over."""
+        loop = asyncio.get_running_loop()
+        end = loop.time() + wait_ms / 1000
+        while not agent.claimed:
+            left_s = end - loop.time()
+            if left_s <= 0:
+                break
+            await asyncio.sleep(min(_LOOK_S, left_s))
+            row = await self._tables.get(store.AGENTS, agent.id, "agent")
+            if row is None:
+                break
+            agent = store.read(row, Agent)
+        return agent
+
+    async def _new_code(self, agent: str, expires_ms: int) -> str:
+        """A code that no live row has."""
+        while True:
+            code = new_claim_code()
+            try:
+                data = {"agent": agent, "expires_ms": expires_ms}
+                await self._tables.create(store.CLAIMS, Row(code[0], code, data))
+            except Conflict:
+                continue
+            return code

@@ -1,0 +1,76 @@
+"""What agents say of themselves and their devices, into the tables: presence, description, state, events."""
+
+import logging
+from typing import TypeVar
+
+import msgspec
+
+from device_agent.protocol import codec, topics
+from device_agent.protocol.errors import ProtocolError
+from device_agent.protocol.messages import Description, Event, Presence, State
+from device_agent.protocol.topics import Topic
+from function_app.domain.devices import Agent, LastState, Link, newer_link
+from function_app.domain.ids import device_id, new_suffix
+from function_app.ports.clock import Clock
+from function_app.ports.tables import Conflict, Row, Tables
+from function_app.services import store
+
+T = TypeVar("T")
+
+_log = logging.getLogger(__name__)
+
+
+class PresenceIngest:
+    """Writes down what arrives. Safe to repeat; what does not belong to a claimed agent is dropped."""
+
+    def __init__(self, *, tables: Tables, clock: Clock) -> None:
+        self._tables = tables
+        self._clock = clock
+
+    async def ingest(self, topic: Topic, payload: bytes) -> None:
+        """Take one message in.
+
+        Raises:
+            Problem: ``busy``: not stored, to be delivered again.
+        """
+        row = await self._tables.get(store.AGENTS, topic.agent, "agent")
+        if row is None:
+            return
+        agent = store.read(row, Agent)
+        if agent.space != topic.space or (topic.device and agent.device(topic.device) is None):
+            return
+        try:
+            await self._store(topic, payload)
+        except ProtocolError as error:
+            _log.warning("%s of %s/%s dropped: %s", topic.kind, topic.agent, topic.device, error)
+
+    async def _store(self, topic: Topic, payload: bytes) -> None:
+        now_ms = self._clock.now_ms()
+        if topic.kind == topics.CONN:
+            presence = codec.decode(payload, Presence)
+            link = Link(presence.online, presence.session, now_ms)
+            await store.upsert(
+                self._tables, store.AGENTS, topic.agent, "link", lambda known: newer_link(known, link), Link
+            )
+        elif topic.kind == topics.STATE:
+            state = LastState(msgspec.to_builtins(codec.decode(payload, State)), now_ms)
+            await store.upsert(
+                self._tables, store.AGENTS, topic.agent, f"state:{topic.device}", lambda _: state, LastState
+            )
+        elif topic.kind == topics.DESC and not topic.name:
+            description = codec.decode(payload, Description)
+            await store.upsert(
+                self._tables, store.DESCRIPTIONS, topic.agent, topic.device, lambda _: description, Description
+            )
+        elif topic.kind == topics.EVENT:
+            await self._event(topic, codec.decode(payload, Event), now_ms)
+
+    async def _event(self, topic: Topic, event: Event, now_ms: int) -> None:
+        """By its id, so that one that is delivered twice is stored once."""
+        device = device_id(topic.agent, topic.device)
+        data = {**msgspec.to_builtins(event), "seen_ms": now_ms}
+        when = new_suffix(event.at_ms)[:9]
+        try:
+            await self._tables.create(store.EVENTS, Row(device, f"{when}:{event.id}", data))
+        except Conflict:
+            return

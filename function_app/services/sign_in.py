@@ -1,0 +1,110 @@
+"""Signing in by a one-time link, and the accounts behind it."""
+
+import hashlib
+from dataclasses import dataclass
+
+from function_app.domain.accounts import Account, Identity, Space
+from function_app.domain.ids import new_id
+from function_app.domain.problems import unauthorized
+from function_app.ports.clock import Clock
+from function_app.ports.tables import Conflict, Row, Tables
+from function_app.services import store
+from function_app.services.identity import ACCESS_S, API, SESSION, SESSION_S, Identify, new_secret, new_session
+
+LINK_MS = 24 * 3600 * 1000
+FIRST_SPACE = "Home"
+
+
+@dataclass(frozen=True, slots=True)
+class SignedIn:
+    """A new sign-in session."""
+
+    account: Account
+    session: str
+    access_token: str
+    cookie: str
+    expires_in_s: int = ACCESS_S
+    cookie_s: int = SESSION_S
+
+
+class SignIn:
+    """Accounts and their one-time links."""
+
+    def __init__(self, *, tables: Tables, identify: Identify, clock: Clock) -> None:
+        self._tables = tables
+        self._identify = identify
+        self._clock = clock
+
+    async def account(self, name: str) -> Account:
+        """The account of this name, made with its first space when there is none.
+
+        Written so that a stop after any step leaves something the next call completes.
+        """
+        partition = f"name:{name}"
+        row = await self._tables.get(store.ACCOUNTS, partition, "account")
+        if row is None:
+            ids = {"account": new_id(12), "space": new_id(12)}
+            try:
+                row = await self._tables.create(store.ACCOUNTS, Row(partition, "account", ids))
+            except Conflict:
+                return await self.account(name)
+        account = Account(id=str(row.data["account"]), name=name)
+        spaces = await self.spaces(account.id)
+        if not spaces:
+            space = Space(id=str(row.data["space"]), name=FIRST_SPACE)
+            await self._create(Row(account.id, f"space:{space.id}", store.fields(space)))
+            await self._create(Row(account.id, "account", store.fields(account)))
+        return account
+
+    async def spaces(self, account: str) -> tuple[Space, ...]:
+        """The spaces of an account."""
+        page = await self._tables.query(store.ACCOUNTS, account, first="space:", last="space;")
+        return tuple(store.read(row, Space) for row in page.rows)
+
+    async def link(self, account: Account) -> str:
+        """A new one-time token that signs in to ``account``, good for a day. Only its hash is stored."""
+        token = new_secret()
+        hashed = _hash(token)
+        data = {"account": account.id, "name": account.name, "expires_ms": self._clock.now_ms() + LINK_MS}
+        await self._tables.create(store.SIGN_INS, Row(hashed[0], hashed, data))
+        return token
+
+    async def redeem(self, token: str) -> SignedIn:
+        """Sign in. Of several that bring the same token one wins: whoever deletes the row.
+
+        Raises:
+            Problem: ``unauthorized``: unknown, used or expired; the answer is the same.
+        """
+        hashed = _hash(token)
+        refused = unauthorized("This sign-in link is unknown, used or expired. Ask for a new one.")
+        row = await self._tables.get(store.SIGN_INS, hashed[0], hashed)
+        if row is None:
+            raise refused
+        try:
+            await self._tables.delete(store.SIGN_INS, row)
+        except Conflict as conflict:
+            raise refused from conflict
+        if self._clock.now_ms() >= row.data["expires_ms"]:
+            raise refused
+        account = Account(id=row.data["account"], name=row.data["name"])
+        session = new_session()
+        return SignedIn(
+            account=account,
+            session=session,
+            access_token=await self._identify.issue(account, session, API, ACCESS_S),
+            cookie=await self._identify.issue(account, session, SESSION, SESSION_S),
+        )
+
+    async def sign_out(self, who: Identity) -> None:
+        """End the session of ``who``."""
+        await self._identify.sign_out(who)
+
+    async def _create(self, row: Row) -> None:
+        try:
+            await self._tables.create(store.ACCOUNTS, row)
+        except Conflict:
+            return
+
+
+def _hash(token: str) -> str:
+    return hashlib.sha256(token.encode()).hexdigest()

@@ -1,0 +1,267 @@
+"""Starting an action: decide in one batch, publish, and wait as long as the caller likes."""
+
+import hashlib
+from dataclasses import dataclass, field
+from typing import Any, Literal
+
+import msgspec
+from msgspec import Struct
+
+from device_agent.protocol.messages import Id, JointPositions, MoveJoints, RunMovement
+from function_app.domain import lease as rules
+from function_app.domain.accounts import Identity
+from function_app.domain.actions import REPEAT_MS, Action, Status, reached
+from function_app.domain.devices import Device
+from function_app.domain.ids import command_id
+from function_app.domain.lease import Lease
+from function_app.domain.problems import Problem, busy_store
+from function_app.ports.clock import Clock
+from function_app.ports.command_bus import BusUnavailable, CommandBus
+from function_app.ports.tables import Row, Tables, Write
+from function_app.services import store
+from function_app.services.action_acks import ActionAcks
+from function_app.services.action_rows import ActionRows, Found, new_row
+from function_app.services.commands import Commands
+from function_app.services.control import Control, read_control
+from function_app.services.devices import Devices, require_online, require_operator
+from function_app.services.movements import Movements
+from function_app.services.pending import Pending
+
+ABANDON_MS = 30_000
+"""A start that has not been written after this time is given up: the timer may already have forgotten its note."""
+
+
+class AskMovement(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True, tag_field="kind", tag="run_movement"):
+    """Run a movement of the device's robot type, in its newest version."""
+
+    name: Id
+    parameters: dict[str, Any] = {}
+
+
+class AskJoints(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True, tag_field="kind", tag="move_joints"):
+    """Move to joint positions and end there."""
+
+    position_rad: JointPositions
+    speed: float = 0.5
+
+
+Asked = AskMovement | AskJoints
+
+
+@dataclass(frozen=True, slots=True)
+class Start:
+    """What to start.
+
+    Attributes:
+        epoch: Of the lease that the caller holds; ``None`` asks for one for the time of this action.
+        once: The caller's idempotency key, or empty.
+    """
+
+    asked: Asked
+    epoch: int | None = None
+    ttl_ms: int = 10_000
+    timeout_ms: int = 300_000
+    wait_ms: int = 0
+    wait_for: Literal["started", "done"] = "started"
+    once: str = ""
+
+    def fingerprint(self) -> str:
+        """The same for the same request."""
+        body = msgspec.json.encode(
+            [self.asked, self.epoch, self.ttl_ms, self.timeout_ms, self.wait_ms, self.wait_for], order="deterministic"
+        )
+        return hashlib.sha256(body).hexdigest()
+
+
+@dataclass(slots=True)
+class _Plan:
+    """An action on its way into the tables."""
+
+    device: Device
+    action: str
+    created_ms: int
+    request: dict[str, Any]
+    command: RunMovement | MoveJoints
+    pinned: dict[str, Any] = field(default_factory=dict)
+
+
+class StartAction:
+    """One run of something on one device."""
+
+    def __init__(
+        self,
+        *,
+        tables: Tables,
+        devices: Devices,
+        movements: Movements,
+        commands: Commands,
+        rows: ActionRows,
+        acks: ActionAcks,
+        pending: Pending,
+        bus: CommandBus,
+        clock: Clock,
+    ) -> None:
+        self._tables = tables
+        self._devices = devices
+        self._movements = movements
+        self._commands = commands
+        self._rows = rows
+        self._acks = acks
+        self._pending = pending
+        self._bus = bus
+        self._clock = clock
+
+    async def start(self, who: Identity, device_id: str, start: Start) -> tuple[Action, bool]:
+        """Start it; and whether the wanted status (or an end) was reached in time.
+
+        A stop of this process after any write leaves an action that the timer publishes or ends.
+
+        Raises:
+            Problem: ``device-unknown``, ``forbidden``, ``movement-unknown``, ``device-offline``, ``device-busy``,
+                ``lease-held``, ``lease-lost``, ``idempotency-key-reused``, ``busy``, ``invalid``.
+        """
+        device, link = await self._devices.with_link(who, device_id)
+        require_operator(device)
+        earlier = await self._earlier(who, device, start)
+        if earlier is not None:
+            return await self._again(earlier, device, start)
+        require_online(link)
+        plan = await self._plan(who, device, start.asked)
+        ttl_ms = min(start.ttl_ms, start.timeout_ms)
+        await self._pending.note(plan.action, plan.created_ms + REPEAT_MS)
+        found, fresh = await self._write(who, plan, start, ttl_ms)
+        if not fresh:
+            return await self._again(found, device, start)
+        payload = await self._payload(plan, found.action)
+        wanted = Status(start.wait_for)
+        async with self._bus.acks(device.topic, plan.action) as acks:
+            try:
+                await self._commands.publish(device, payload)
+            except BusUnavailable:
+                # It is written: the timer publishes it as soon as the broker is back, or ends it.
+                return found.action, False
+            action = await self._acks.follow(found, acks, wanted=wanted, wait_ms=start.wait_ms, published=True)
+        return action, reached(action, wanted)
+
+    async def _again(self, found: Found, device: Device, start: Start) -> tuple[Action, bool]:
+        """The answer to a repeated request: the action that the first one started."""
+        wanted = Status(start.wait_for)
+        async with self._bus.acks(device.topic, found.action.id) as acks:
+            found = await self._rows.get(found.action.id) or found
+            action = await self._acks.follow(found, acks, wanted=wanted, wait_ms=start.wait_ms)
+        return action, reached(action, wanted)
+
+    async def _plan(self, who: Identity, device: Device, asked: Asked) -> _Plan:
+        now_ms = self._clock.now_ms()
+        request: dict[str, Any] = msgspec.to_builtins(asked)
+        action = command_id(device.id, now_ms)
+        if isinstance(asked, AskJoints):
+            joints = MoveJoints(position_rad=asked.position_rad, speed=asked.speed)
+            plan = _Plan(device, action, now_ms, request, joints)
+        else:
+            movement, source = await self._movements.get(who, device.robot_type, asked.name)
+            command = RunMovement(
+                robot_type=device.robot_type,
+                name=movement.name,
+                version=movement.version,
+                sha256=movement.sha256,
+                source=source,
+                parameters=asked.parameters,
+            )
+            pinned = {"robot_type": device.robot_type, "version": movement.version, "sha256": movement.sha256}
+            plan = _Plan(device, action, now_ms, request, command, pinned)
+        # Built once before anything is written: what cannot be sent must not take the slot.
+        await self._commands.signed(
+            device, action, plan.command, who=who.name, epoch=0, issued_ms=now_ms, ttl_ms=1
+        )
+        return plan
+
+    async def _payload(self, plan: _Plan, action: Action) -> bytes:
+        return await self._commands.signed(
+            plan.device,
+            action.id,
+            plan.command,
+            who=action.who,
+            epoch=action.epoch,
+            issued_ms=action.created_ms,
+            ttl_ms=action.ttl_ms,
+        )
+
+    async def _write(self, who: Identity, plan: _Plan, start: Start, ttl_ms: int) -> tuple[Found, bool]:
+        """Action, slot, lease and idempotency row in one batch; not fresh: another request with the key was first."""
+
+        async def once() -> tuple[Found, bool]:
+            control = await read_control(self._tables, plan.device)
+            now_ms = self._clock.now_ms()
+            if now_ms - plan.created_ms > ABANDON_MS:
+                raise busy_store()
+            earlier = await self._earlier(who, plan.device, start)
+            if earlier is not None:
+                return earlier, False
+            lease = self._lease(who, control, plan, start, now_ms)
+            if control.action:
+                raise device_busy(control.action)
+            action = Action(
+                id=plan.action,
+                device=plan.device.id,
+                account=who.account,
+                who=who.name,
+                pairing=plan.device.pairing,
+                request=plan.request,
+                epoch=lease.epoch,
+                created_ms=plan.created_ms,
+                ttl_ms=ttl_ms,
+                deadline_ms=plan.created_ms + start.timeout_ms,
+                pinned=plan.pinned,
+            )
+            writes = [
+                Write("create", new_row(action)),
+                control.write_slot(plan.device.id, plan.action, plan.device.pairing),
+            ]
+            if lease is not control.lease:
+                writes.append(control.write_lease(plan.device.id, lease))
+            if start.once:
+                data = {"action": plan.action, "request": start.fingerprint()}
+                writes.append(Write("create", Row(plan.device.id, _once_key(who, start), data)))
+            rows = await self._tables.batch(store.CONTROL, writes)
+            return Found(action, rows[0]), True
+
+        return await store.retry(once)
+
+    @staticmethod
+    def _lease(who: Identity, control: Control, plan: _Plan, start: Start, now_ms: int) -> Lease:
+        """The lease that the action runs under: the caller's own, or one for the time of this action."""
+        if start.epoch is not None:
+            return rules.hold(control.lease, who, epoch=start.epoch, now_ms=now_ms)
+        if control.lease is not None and control.lease.live(now_ms) and control.lease.mine(who):
+            return control.lease
+        return rules.take(
+            control.lease,
+            who,
+            lease_ms=start.timeout_ms,
+            now_ms=now_ms,
+            pairing=plan.device.pairing,
+            action=plan.action,
+        )
+
+    async def _earlier(self, who: Identity, device: Device, start: Start) -> Found | None:
+        """The action that an earlier request with the same idempotency key started."""
+        if not start.once:
+            return None
+        row = await self._tables.get(store.CONTROL, device.id, _once_key(who, start))
+        if row is None:
+            return None
+        if row.data["request"] != start.fingerprint():
+            detail = "This Idempotency-Key was used with another request. Use a new key for a new request."
+            raise Problem("idempotency-key-reused", 422, "The key was used before", detail)
+        return await self._rows.get(row.data["action"])
+
+
+def device_busy(action: str) -> Problem:
+    """The refusal that names the running action."""
+    detail = f"The device is running action {action}. Wait for its end or cancel it."
+    return Problem("device-busy", 409, "The device is busy", detail, extras={"action": action})
+
+
+def _once_key(who: Identity, start: Start) -> str:
+    return "once:" + hashlib.sha256(f"{who.account}\n{start.once}".encode()).hexdigest()

@@ -1,0 +1,74 @@
+"""Stop, and its reset. Needs no lease: whoever may operate may stop."""
+
+import asyncio
+import contextlib
+import logging
+
+from device_agent.protocol import codec, topics
+from device_agent.protocol.messages import ResetStop, Stop, StopDevice
+from function_app.domain.accounts import Identity
+from function_app.domain.devices import Device
+from function_app.domain.ids import new_id
+from function_app.ports.command_bus import BusUnavailable, CommandBus
+from function_app.ports.tables import Tables
+from function_app.services.commands import Commands
+from function_app.services.control import read_lease
+from function_app.services.devices import Devices
+
+REPEAT_S = 0.2
+CONFIRM_MS = 1_000
+
+_log = logging.getLogger(__name__)
+
+
+class StopDevices:
+    """Latches and resets Stop."""
+
+    def __init__(self, *, tables: Tables, devices: Devices, commands: Commands, bus: CommandBus) -> None:
+        self._tables = tables
+        self._devices = devices
+        self._commands = commands
+        self._bus = bus
+
+    async def stop(self, who: Identity, device_id: str, reason: str) -> bool:
+        """Latch Stop; whether the device has confirmed it within a second.
+
+        Goes out twice: as the plain ``stop`` message, repeated until confirmed, and as a signed command.
+
+        Raises:
+            Problem: ``device-unknown``, ``forbidden``, ``broker-unavailable``: neither way was open.
+        """
+        device = await self._devices.to_operate(who, device_id)
+        epoch = await self._epoch(device)
+        plain = asyncio.create_task(self._repeat(device, Stop(id=new_id(), by=who.name, reason=reason)))
+        try:
+            request = StopDevice(reason=reason)
+            return await self._commands.confirmed(device, request, who=who.name, epoch=epoch, wait_ms=CONFIRM_MS)
+        finally:
+            plain.cancel()
+            with contextlib.suppress(asyncio.CancelledError, BusUnavailable):
+                await plain
+
+    async def reset(self, who: Identity, device_id: str) -> bool:
+        """Release the latch; whether the device has confirmed it within a second. Nothing resumes.
+
+        Raises:
+            Problem: ``device-unknown``, ``forbidden``, ``broker-unavailable``.
+        """
+        device = await self._devices.to_operate(who, device_id)
+        epoch = await self._epoch(device)
+        return await self._commands.confirmed(device, ResetStop(), who=who.name, epoch=epoch, wait_ms=CONFIRM_MS)
+
+    async def _repeat(self, device: Device, stop: Stop) -> None:
+        payload = codec.encode(stop)
+        while True:
+            try:
+                await self._bus.publish(f"{device.topic}/{topics.STOP}", payload)
+            except BusUnavailable as error:
+                _log.warning("stop of %s: %s", device.id, error)
+                raise
+            await asyncio.sleep(REPEAT_S)
+
+    async def _epoch(self, device: Device) -> int:
+        lease = await read_lease(self._tables, device)
+        return lease.epoch if lease else 0

@@ -1,0 +1,84 @@
+"""Records in rows: which table, which key, and the one way to write when others write too."""
+
+import asyncio
+import random
+from collections.abc import Awaitable, Callable
+from typing import Any, TypeVar
+
+import msgspec
+
+from function_app.domain.problems import busy_store
+from function_app.ports.tables import Conflict, Row, Tables
+
+ACCOUNTS = "Accounts"
+"""Partition: account id (or ``name:<name>``); keys ``account``, ``space:<id>``, ``signed-out:<session>``."""
+SIGN_INS = "SignIns"
+"""Partition: first letter of the token's hash; key: the hash."""
+AGENTS = "Agents"
+"""Partition: agent id; keys ``agent``, ``link``, ``state:<device name>``."""
+CLAIMS = "Claims"
+"""Partition: first letter of the code; key: the code."""
+ATTEMPTS = "Attempts"
+"""Partition: account id; key: what is being tried."""
+MEMBERS = "Members"
+"""Partition: account id; key ``agent:<agent id>``. Only an index: the agent's own row says whose it is."""
+CONTROL = "Control"
+"""Partition: device id; keys ``now:lease``, ``now:slot``, ``action:<suffix>``, ``once:<hash>``."""
+PENDING = "Pending"
+"""Partition: shard; key: ``<due ms>:<action id>``."""
+MOVEMENTS = "Movements"
+"""Partition: ``<account>/<robot type>``; key: name."""
+DESCRIPTIONS = "Descriptions"
+"""Partition: agent id; key: device name."""
+EVENTS = "Events"
+"""Partition: device id; key: counts down with time, newest first."""
+
+TRIES = 12
+_PAUSE_S = 0.002
+
+T = TypeVar("T")
+
+
+def read(row: Row, kind: type[T]) -> T:
+    """The record in a row. Fields that a newer version wrote are ignored."""
+    return msgspec.convert(row.data, kind, strict=False)
+
+
+def fields(record: Any) -> dict[str, Any]:
+    """A record as the data of a row."""
+    data: dict[str, Any] = msgspec.to_builtins(record)
+    return data
+
+
+async def retry(change: Callable[[], Awaitable[T]]) -> T:
+    """Do ``change`` (read, decide, write by ETag) again from its reading while others get in between.
+
+    Raises:
+        Problem: ``busy``, after a dozen tries.
+    """
+    for attempt in range(TRIES):
+        try:
+            return await change()
+        except Conflict:
+            if attempt:
+                await asyncio.sleep(random.uniform(0, _PAUSE_S * attempt))  # noqa: S311 (spreads writers)
+    raise busy_store()
+
+
+async def upsert(tables: Tables, table: str, partition: str, key: str, change: Callable[[T | None], T | None],
+                 kind: type[T]) -> T | None:
+    """Change one record that may not exist yet; ``change`` gives ``None`` to leave it as it is."""
+
+    async def once() -> T | None:
+        row = await tables.get(table, partition, key)
+        record = change(None if row is None else read(row, kind))
+        if record is None:
+            return None
+        data = fields(record)
+        if row is None:
+            await tables.create(table, Row(partition, key, data))
+        else:
+            await tables.replace(table, Row(partition, key, data, row.etag))
+        return record
+
+    return await retry(once)

@@ -1,0 +1,177 @@
+"""What time brings: commands that nobody answered, actions without an end, codes and links that ran out.
+
+Run every second by one or more timers; every step is safe to repeat and to be run by two at once.
+"""
+
+import logging
+
+from device_agent.protocol.messages import CancelAction, MoveJoints, RunMovement
+from function_app.domain.accounts import Identity
+from function_app.domain.actions import Action, Status, Verdict, end, judge, mark_published, next_look_ms
+from function_app.domain.devices import Agent, Device
+from function_app.domain.ids import CLAIM_ALPHABET, split_command, split_device
+from function_app.domain.problems import Problem
+from function_app.ports.broker_access import BrokerAccess, BrokerAccessError
+from function_app.ports.clock import Clock
+from function_app.ports.command_bus import BusUnavailable
+from function_app.ports.tables import Conflict, Row, Tables
+from function_app.services import store
+from function_app.services.action_rows import ActionRows, Found
+from function_app.services.commands import Commands
+from function_app.services.devices import devices_of
+from function_app.services.movements import Movements
+from function_app.services.pending import SHARDS, Pending
+from function_app.services.start_action import ABANDON_MS
+
+ORPHAN_MS = 2 * ABANDON_MS
+"""A note whose action was never written is kept this long: whoever writes it gives up before."""
+_HEX = "0123456789abcdef"
+
+_log = logging.getLogger(__name__)
+
+
+class Sweep:
+    """The timer's work."""
+
+    def __init__(
+        self,
+        *,
+        tables: Tables,
+        rows: ActionRows,
+        pending: Pending,
+        commands: Commands,
+        movements: Movements,
+        access: BrokerAccess,
+        clock: Clock,
+    ) -> None:
+        self._tables = tables
+        self._rows = rows
+        self._pending = pending
+        self._commands = commands
+        self._movements = movements
+        self._access = access
+        self._clock = clock
+        self._turn = 0
+
+    async def run(self) -> None:
+        """One round. What fails is logged and comes again in the next round.
+
+        Raises:
+            StoreError: The tables cannot be used.
+        """
+        for shard in range(SHARDS):
+            for action, note in await self._pending.due(shard, self._clock.now_ms()):
+                try:
+                    await self._look(action, note)
+                except (Problem, BusUnavailable) as error:
+                    _log.warning("action %s: %s", action, error)
+        await self._forget_expired()
+        try:
+            await self._access.expire(self._clock.now_ms() / 1000)
+        except BrokerAccessError as error:
+            _log.warning("broker access: %s", error)
+
+    async def _look(self, action_id: str, note: Row) -> None:
+        found = await self._rows.get(action_id)
+        now_ms = self._clock.now_ms()
+        if found is None:
+            if now_ms - int(note.key.partition(":")[0]) > ORPHAN_MS:
+                await self._pending.drop(note)
+            return
+        if found.action.status.terminal:
+            await self._pending.drop(note)
+            return
+        verdict = judge(found.action, now_ms)
+        if verdict is Verdict.EXPIRE:
+            message = "The device did not take the command in time. Check that it is online, then start it again."
+            await self._end(found, Status.EXPIRED, "no-answer", message, now_ms)
+        elif verdict is Verdict.LOSE:
+            await self._cancel(found.action)
+            message = "The device did not say how it ended before its time was over. Look at the device."
+            await self._end(found, Status.FAILED, "lost", message, now_ms)
+        else:
+            # The next note before this one goes: a stop in between leaves two, which is one too many, not too few.
+            await self._pending.note(action_id, next_look_ms(found.action, now_ms))
+            if verdict is Verdict.PUBLISH:
+                await self._publish(found, now_ms)
+        await self._pending.drop(note)
+
+    async def _end(self, found: Found, status: Status, code: str, message: str, now_ms: int) -> None:
+        await self._rows.change(
+            found.action.id, lambda action: end(action, status, code, message, now_ms), known=found
+        )
+
+    async def _publish(self, found: Found, now_ms: int) -> None:
+        """Send the very same command again: same id, same time of issue, so the device runs it at most once."""
+        action = found.action
+        device = await self._device(action)
+        if device is None:
+            message = "The device was un-paired before the command reached it."
+            await self._end(found, Status.FAILED, "unpaired", message, now_ms)
+            return
+        command = await self._command(action)
+        if command is None:
+            message = "The movement's script was changed before the command could be sent. Start it again."
+            await self._end(found, Status.FAILED, "movement-changed", message, now_ms)
+            return
+        payload = await self._commands.signed(
+            device,
+            action.id,
+            command,
+            who=action.who,
+            epoch=action.epoch,
+            issued_ms=action.created_ms,
+            ttl_ms=action.ttl_ms,
+        )
+        await self._commands.publish(device, payload)
+        await self._rows.change(action.id, lambda known: mark_published(known, now_ms), known=found)
+
+    async def _cancel(self, action: Action) -> None:
+        device = await self._device(action)
+        if device is None:
+            return
+        try:
+            await self._commands.send(device, CancelAction(action=action.id), who=action.who, epoch=action.epoch)
+        except BusUnavailable as error:
+            _log.warning("cancel of %s: %s", action.id, error)
+
+    async def _command(self, action: Action) -> MoveJoints | RunMovement | None:
+        if action.request["kind"] == "move_joints":
+            return MoveJoints(position_rad=action.request["position_rad"], speed=action.request["speed"])
+        owner = Identity(action.account, action.who, "")
+        robot_type, sha256 = action.pinned["robot_type"], action.pinned["sha256"]
+        source = await self._movements.pinned_source(owner, robot_type, action.request["name"], sha256)
+        if source is None:
+            return None
+        return RunMovement(
+            robot_type=robot_type,
+            name=action.request["name"],
+            version=action.pinned["version"],
+            sha256=sha256,
+            source=source,
+            parameters=action.request["parameters"],
+        )
+
+    async def _device(self, action: Action) -> Device | None:
+        """The device, as long as its agent is still of the pairing that the action belongs to."""
+        parts = split_device((split_command(action.id) or ("", ""))[0])
+        row = await self._tables.get(store.AGENTS, parts[0], "agent") if parts else None
+        if row is None:
+            return None
+        agent = store.read(row, Agent)
+        if agent.pairing != action.pairing:
+            return None
+        return next((device for device in devices_of(agent) if device.id == action.device), None)
+
+    async def _forget_expired(self) -> None:
+        """Claim codes and sign-in links whose time is over, a part of them each round."""
+        self._turn += 1
+        now_ms = self._clock.now_ms()
+        for table, shards in ((store.CLAIMS, CLAIM_ALPHABET), (store.SIGN_INS, _HEX)):
+            page = await self._tables.query(table, shards[self._turn % len(shards)], limit=1000)
+            for row in page.rows:
+                if now_ms >= row.data["expires_ms"]:
+                    try:
+                        await self._tables.delete(table, row)
+                    except Conflict:
+                        continue
