@@ -81,7 +81,6 @@ export const texts = {
     nobody: "nobody",
     you: "you",
     never: "never",
-    open: (label: string): string => `Operate ${label}`,
     faults: (count: number): string => (count === 1 ? "1 fault" : `${count} faults`),
   },
 
@@ -172,7 +171,7 @@ export const texts = {
     noWebgl: "This browser cannot draw in three dimensions (WebGL is off or missing). Everything else works.",
     failed: "The live view could not be loaded. Everything else works.",
     staleNote: "Last known pose",
-    ghost: "Solid: measured. Outline: target.",
+    ghost: "Solid: measured. Blue: target.",
     reset: "Reset view",
   },
 
@@ -193,6 +192,7 @@ export const texts = {
 
   poses: {
     title: "Joint frames",
+    table: "Table of joint frames",
     frame: "Frame",
     position: "Position (m)",
     rotation: "Rotation",

@@ -2,6 +2,7 @@
 import { signal, type ReadonlySignal } from "@preact/signals-core";
 import { ApiError, sentence, type Action, type ActionStatus, type Api } from "./api";
 import type { DeviceStore } from "./device";
+import { newId } from "./ids";
 import type { KnownAck } from "./messages";
 
 /** `sent`: asked for, and no answer yet. `refused`: the cloud said no. */
@@ -63,7 +64,7 @@ export class ActionRunner {
     const run: Run = { movement, id: null, status: "sent", steps: [], why: "", output: "", progress: null };
     this.#run.value = { ...run, steps: [{ status: "sent", afterMs: 0 }] };
     try {
-      const action = await this.#api.runMovement(this.#device.id, movement, epoch, crypto.randomUUID());
+      const action = await this.#api.runMovement(this.#device.id, movement, epoch, newId());
       if (this.#disposed) return;
       this.#update({ id: action.id });
       this.#endAcks = this.#device.onAck(action.id, (ack) => this.#hearAck(ack));

@@ -55,6 +55,7 @@ export class DeviceStore {
   readonly #heardAt = signal<number | null>(null);
   readonly #troubles = signal<ReadonlyMap<string, string>>(new Map());
   readonly #close = signal(false);
+  readonly #retained = new Map<string, Uint8Array>();
   readonly #ackReceivers = new Set<(ack: KnownAck) => void>();
   readonly #recentAcks = new Map<string, KnownAck[]>();
 
@@ -108,6 +109,20 @@ export class DeviceStore {
     return newest?.mode === "stopped" || (state?.stop ?? null) !== null && newest === state;
   });
 
+  /**
+   * Who has control; `null`: nobody. The device obeys the lease it knows, so its word counts before the cloud's, unless
+   * the cloud knows a newer one.
+   */
+  readonly holder = computed<{ name: string; mine: boolean } | null>(() => {
+    const lease = this.#lease.value;
+    const told = this.live.value ? this.#state.value : null;
+    const current = lease !== null && onThisClock(Date.parse(lease.expires_at)) > clock.value ? lease : null;
+    if (told !== null && (current === null || current.epoch < told.epoch)) {
+      return told.lease === null ? null : { name: told.lease.holder, mine: false };
+    }
+    return current === null ? null : { name: current.holder, mine: current.mine };
+  });
+
   constructor(info: Device, api: Api, link: Link) {
     this.id = info.id;
     this.topics = deviceTopics(info.topic);
@@ -153,8 +168,12 @@ export class DeviceStore {
   watchClosely(): () => void {
     this.#close.value = true;
     const end = this.#subscribe({
-      [this.topics.desc]: (payload) => (this.#description.value = readDescription(payload)),
-      [this.topics.twin]: (payload) => (this.#twin.value = readTwin(payload)),
+      [this.topics.desc]: (payload, topic) => {
+        if (this.#isNew(topic, payload)) this.#description.value = readDescription(payload);
+      },
+      [this.topics.twin]: (payload, topic) => {
+        if (this.#isNew(topic, payload)) this.#twin.value = readTwin(payload);
+      },
       [this.topics.tele]: (payload, topic) => {
         if (topic === this.topics.joints) this.#hearTelemetry(readTelemetry(payload));
       },
@@ -193,6 +212,14 @@ export class DeviceStore {
     return () => {
       for (const end of ends) end();
     };
+  }
+
+  /** Each new connection brings what is retained again: what is drawn from it must not be built again for that. */
+  #isNew(topic: string, payload: Uint8Array): boolean {
+    const known = this.#retained.get(topic);
+    if (known?.length === payload.length && known.every((byte, index) => byte === payload[index])) return false;
+    this.#retained.set(topic, payload);
+    return true;
   }
 
   #noteTrouble(topic: string, what: string | null): void {

@@ -3,7 +3,9 @@ import { computed, effect, signal, type ReadonlySignal } from "@preact/signals-c
 import { sentence, type Api } from "./api";
 import { now } from "./clock";
 import type { DeviceStore } from "./device";
+import { newId } from "./ids";
 import type { Link } from "./link";
+import type { KnownState } from "./messages";
 import type { Stop } from "./protocol";
 
 export const REPEAT_MS = 200;
@@ -19,7 +21,11 @@ export type StopState =
   | { kind: "latched" }
   | { kind: "unconfirmed" };
 
-type Pressed = { kind: "sending"; at: number; doubtful: boolean } | { kind: "unconfirmed" };
+type Pressed =
+  | { kind: "sending"; at: number; doubtful: boolean }
+  /** The cloud has it from the robot that it stopped; this page has not heard it yet. */
+  | { kind: "told"; at: number }
+  | { kind: "unconfirmed" };
 
 export class StopSwitch {
   readonly #api: Api;
@@ -31,6 +37,7 @@ export class StopSwitch {
   readonly #problem = signal<string | null>(null);
   readonly #watch: () => void;
   #timer: ReturnType<typeof setInterval> | undefined;
+  #stateAtPress: KnownState | null = null;
 
   readonly resetting: ReadonlySignal<boolean> = this.#resetting;
   /** What went wrong with the last stop or reset; `null` otherwise. */
@@ -39,7 +46,7 @@ export class StopSwitch {
   readonly state = computed<StopState>(() => {
     const pressed = this.#pressed.value;
     if (pressed?.kind === "sending") return { kind: "sending", doubtful: pressed.doubtful };
-    if (this.#device.stopped.value) return { kind: "latched" };
+    if (this.#device.stopped.value || pressed?.kind === "told") return { kind: "latched" };
     return pressed === null ? { kind: "clear" } : { kind: "unconfirmed" };
   });
 
@@ -51,6 +58,10 @@ export class StopSwitch {
     this.#watch = effect(() => {
       const latest = device.telemetry.value;
       const pressed = this.#pressed.value;
+      // What the robot itself says, a moment after the cloud, counts from then on.
+      if (pressed?.kind === "told" && latest !== null && latest.receivedAt > pressed.at + DOUBT_MS) {
+        queueMicrotask(() => this.#finish(null));
+      }
       if (pressed?.kind !== "sending") return;
       // Only what was said after the press confirms it. `state` comes without a time of arrival: any change of it is new.
       const seen = latest !== null && latest.receivedAt >= pressed.at && latest.message.mode === "stopped";
@@ -61,15 +72,13 @@ export class StopSwitch {
     });
   }
 
-  #stateAtPress: unknown = null;
-
   /** Latch Stop. May be pressed again at any time. */
   press(reason = "Stop pressed on the console"): void {
     this.#stateAtPress = this.#device.state.value;
     const at = now();
     this.#problem.value = null;
     this.#pressed.value = { kind: "sending", at, doubtful: false };
-    const message: Stop = { id: crypto.randomUUID(), by: this.#by.slice(0, 200), reason };
+    const message: Stop = { id: newId(), by: this.#by.slice(0, 200), reason };
     clearInterval(this.#timer);
     this.#timer = setInterval(() => {
       const age = now() - at;
@@ -83,7 +92,8 @@ export class StopSwitch {
     this.#publish(message);
     this.#api.stop(this.#device.id, reason).then(
       ({ confirmed }) => {
-        if (confirmed && this.#pressed.value?.kind === "sending" && this.#pressed.value.at === at) this.#finish(null);
+        const pressed = this.#pressed.value;
+        if (confirmed && pressed?.kind === "sending" && pressed.at === at) this.#finish({ kind: "told", at: now() });
       },
       (error: unknown) => (this.#problem.value = sentence(error)),
     );

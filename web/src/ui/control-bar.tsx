@@ -14,7 +14,7 @@ export function ControlBar({ device, control, stop }: ControlBarProps) {
   const state = control.state.value;
   const held = state.kind === "held";
   const describedYet = device.description.value !== null;
-  const resumable = device.lease.value?.mine === true && !held;
+  const resumable = device.holder.value?.mine === true && !held;
   return (
     <div class="control-bar" role="region" aria-label={texts.control.title}>
       <ControlState device={device} control={control} />
@@ -75,12 +75,9 @@ function describe(device: DeviceStore, control: Control): [Shown, string] {
     case "refused":
       return ["refused", texts.control.refused(state.why)];
     case "none": {
-      const lease = device.lease.value;
-      if (lease?.mine === true) return ["other", texts.control.elsewhere];
-      // The device obeys the lease it knows: its word counts before the list's, while it is fresh.
-      const told = device.live.value ? device.state.value?.lease : null;
-      const holder = told?.holder ?? lease?.holder;
-      return holder === undefined ? ["free", texts.control.free] : ["other", texts.control.other(holder)];
+      const holder = device.holder.value;
+      if (holder === null) return ["free", texts.control.free];
+      return ["other", holder.mine ? texts.control.elsewhere : texts.control.other(holder.name)];
     }
   }
 }

@@ -28,7 +28,7 @@ function DeviceRow({ device }: { device: DeviceStore }) {
   const info = device.info.value;
   return (
     <li class="card device-row" data-testid="device-row" data-device={device.id}>
-      <a class="device-name" href={deviceAddress(device.id)} aria-label={texts.fleet.open(info.label)}>
+      <a class="device-name" href={deviceAddress(device.id)}>
         {info.label}
         <span class="quiet">
           {info.robot_type} · {info.space}
@@ -81,8 +81,7 @@ function nameOf(action: { name?: string; kind: string }): string {
 }
 
 function Holder({ device }: { device: DeviceStore }) {
-  const lease = device.lease.value;
-  if (lease?.mine) return <>{texts.fleet.you}</>;
-  const told = device.live.value ? device.state.value?.lease : undefined;
-  return <>{told?.holder ?? lease?.holder ?? texts.fleet.nobody}</>;
+  const holder = device.holder.value;
+  if (holder === null) return <>{texts.fleet.nobody}</>;
+  return <>{holder.mine ? texts.fleet.you : holder.name}</>;
 }

@@ -31,7 +31,7 @@ export function PoseTable({ device }: { device: DeviceStore }) {
       {names.length === 0 ? (
         <p class="quiet">{texts.poses.none}</p>
       ) : (
-        <div class="scroll" tabIndex={0} role="region" aria-label={texts.poses.title}>
+        <div class="scroll" tabIndex={0} role="region" aria-label={texts.poses.table}>
           <table class={device.live.value ? "" : "old"} data-testid="poses">
             <thead>
               <tr>

@@ -74,7 +74,7 @@ export function View3D({ device, control }: View3DProps) {
         data-trouble={trouble ?? ""}
       >
         {/* Keyed: a canvas whose context is gone cannot be drawn on again. */}
-        <canvas key={twin === null ? "none" : "twin"} ref={canvas} aria-label={texts.view.label} role="img" />
+        <canvas key={twin} ref={canvas} aria-label={texts.view.label} role="img" />
         {twin === null && <p class="over quiet">{texts.view.waiting}</p>}
         {trouble !== null && <p class="over notice">{trouble === "no-webgl" ? texts.view.noWebgl : texts.view.failed}</p>}
         {trouble === null && scene !== null && !device.live.value && <p class="tag">{texts.view.staleNote}</p>}
