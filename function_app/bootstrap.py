@@ -105,9 +105,7 @@ def build(settings: Settings, *, clock: Clock | None = None) -> Functions:
             username=MOSQUITTO_SERVICE,
             password_file=settings.home / "mosquitto" / "service.password",
         )
-    bus = MqttCommandBus(
-        host=settings.mqtt_host, port=settings.mqtt_port, credentials=access.service_credentials
-    )
+    bus = MqttCommandBus(host=settings.mqtt_host, port=settings.mqtt_port, credentials=access.service_credentials)
     feed = MqttFeed(host=settings.mqtt_host, port=settings.mqtt_port, credentials=access.service_credentials)
 
     identify = Identify(tables=tables, keys=keys, clock=now)
@@ -146,9 +144,7 @@ def build(settings: Settings, *, clock: Clock | None = None) -> Functions:
             bus=bus,
             clock=now,
         ),
-        actions=Actions(
-            tables=tables, devices=devices, rows=rows, acks=acks, commands=commands, bus=bus, clock=now
-        ),
+        actions=Actions(tables=tables, devices=devices, rows=rows, acks=acks, commands=commands, bus=bus, clock=now),
         action_acks=acks,
         stop=StopDevices(tables=tables, devices=devices, commands=commands, bus=bus),
         mqtt_credentials=MqttCredentials(tables=tables, devices=devices, access=access, clock=now),

@@ -51,9 +51,7 @@ class Actions:
         """
         return await self._rows.list(await self._devices.get(who, device), cursor=cursor, limit=limit)
 
-    async def get(
-        self, who: Identity, action: str, *, wait_ms: int, wait_for: Literal["started", "done"]
-    ) -> Action:
+    async def get(self, who: Identity, action: str, *, wait_ms: int, wait_for: Literal["started", "done"]) -> Action:
         """One action, as soon as it has come as far as ``wait_for``, or as it is after ``wait_ms``.
 
         Raises:

@@ -93,10 +93,5 @@ class Commands:
             except TimeoutError:
                 return False
 
-    async def _short(
-        self, device: Device, command: str, request: Request, who: str, epoch: int, now_ms: int
-    ) -> bytes:
-        return await self.signed(
-            device, command, request, who=who, epoch=epoch, issued_ms=now_ms, ttl_ms=SHORT_TTL_MS
-        )
-
+    async def _short(self, device: Device, command: str, request: Request, who: str, epoch: int, now_ms: int) -> bytes:
+        return await self.signed(device, command, request, who=who, epoch=epoch, issued_ms=now_ms, ttl_ms=SHORT_TTL_MS)

@@ -85,7 +85,7 @@ class Devices:
         """
         parts = split_device(device)
         if parts is not None:
-            for view in await self._of_agent(who, parts[0], only=parts[1]):
+            for view in await self.of_agent(who, parts[0], only=parts[1]):
                 return view
         raise not_found("device", device)
 
@@ -96,7 +96,7 @@ class Devices:
             Problem: ``cursor-invalid``.
         """
         ids, following = await self._agent_ids(who, cursor, limit)
-        found = await asyncio.gather(*(self._of_agent(who, agent) for agent in ids))
+        found = await asyncio.gather(*(self.of_agent(who, agent) for agent in ids))
         return [view for views in found for view in views], following
 
     async def all(self, who: Identity) -> list[Device]:
@@ -129,7 +129,8 @@ class Devices:
             raise invalid("The cursor is not one of this list. Begin without one.", code="cursor-invalid") from error
         return [row.key.removeprefix("agent:") for row in page.rows], page.cursor
 
-    async def _of_agent(self, who: Identity, agent_id: str, only: str | None = None) -> list[DeviceView]:
+    async def of_agent(self, who: Identity, agent_id: str, only: str | None = None) -> list[DeviceView]:
+        """The devices of one agent, or the one called ``only``; none when the agent is not the account's."""
         page = await self._tables.query(store.AGENTS, agent_id, limit=1000)
         rows = {row.key: row for row in page.rows}
         agent = _agent(rows, who)

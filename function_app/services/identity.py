@@ -3,7 +3,7 @@
 import secrets
 from collections import OrderedDict
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Any, Final, Literal
 
 import jwt
 from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PublicKey
@@ -20,8 +20,8 @@ from function_app.ports.tables import Conflict, Row, Tables
 from function_app.services import store
 
 ALGORITHM = "EdDSA"
-API = "telescope/api"
-SESSION = "telescope/session"
+API: Final = "telescope/api"
+SESSION: Final = "telescope/session"
 ACCESS_S = 3600
 SESSION_S = 12 * 3600
 AGENT_TOKEN_S = 60

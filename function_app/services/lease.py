@@ -63,9 +63,7 @@ class Leases:
         lease = await self._change(device, changed)
         grant = GrantLease(holder=who.name, lease_ms=lease_ms)
         try:
-            confirmed = await self._commands.confirmed(
-                device, grant, who=who.name, epoch=lease.epoch, wait_ms=wait_ms
-            )
+            confirmed = await self._commands.confirmed(device, grant, who=who.name, epoch=lease.epoch, wait_ms=wait_ms)
         except Problem as problem:
             # The lease is theirs; that the device could not be told is what `confirmed` says.
             _log.warning("lease of %s: %s", device.id, problem.detail)

@@ -61,6 +61,11 @@ class SignIn:
         page = await self._tables.query(store.ACCOUNTS, account, first="space:", last="space;")
         return tuple(store.read(row, Space) for row in page.rows)
 
+    async def named(self, account: str) -> str:
+        """The name of an account; empty when it is gone."""
+        row = await self._tables.get(store.ACCOUNTS, account, "account")
+        return store.read(row, Account).name if row else ""
+
     async def link(self, account: Account) -> str:
         """A new one-time token that signs in to ``account``, good for a day. Only its hash is stored."""
         token = new_secret()

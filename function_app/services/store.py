@@ -65,8 +65,9 @@ async def retry(change: Callable[[], Awaitable[T]]) -> T:
     raise busy_store()
 
 
-async def upsert(tables: Tables, table: str, partition: str, key: str, change: Callable[[T | None], T | None],
-                 kind: type[T]) -> T | None:
+async def upsert(
+    tables: Tables, table: str, partition: str, key: str, change: Callable[[T | None], T | None], kind: type[T]
+) -> T | None:
     """Change one record that may not exist yet; ``change`` gives ``None`` to leave it as it is."""
 
     async def once() -> T | None:

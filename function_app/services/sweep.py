@@ -97,9 +97,7 @@ class Sweep:
         await self._pending.drop(note)
 
     async def _end(self, found: Found, status: Status, code: str, message: str, now_ms: int) -> None:
-        await self._rows.change(
-            found.action.id, lambda action: end(action, status, code, message, now_ms), known=found
-        )
+        await self._rows.change(found.action.id, lambda action: end(action, status, code, message, now_ms), known=found)
 
     async def _publish(self, found: Found, now_ms: int) -> None:
         """Send the very same command again: same id, same time of issue, so the device runs it at most once."""

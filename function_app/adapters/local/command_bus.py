@@ -68,7 +68,7 @@ class MqttCommandBus:
         if waiting is None:
             return
         try:
-            ack = codec.decode(message.payload, Ack)
+            ack = codec.decode(bytes(message.payload), Ack)
         except ProtocolError:
             return  # the ingest worker says so in the log
         queue = waiting.get(ack.id)

@@ -43,7 +43,7 @@ class MqttFeed:
             while True:
                 generation, message = await self._waiting.get()
                 try:
-                    await handler(message.topic, message.payload)
+                    await handler(message.topic, bytes(message.payload))
                 except Exception:  # one message must not end the worker; unconfirmed, it comes again where it can
                     _log.exception("ingest of %s failed", message.topic)
                 else:

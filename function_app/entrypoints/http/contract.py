@@ -29,7 +29,7 @@ class _Answer(Struct, frozen=True, kw_only=True):
 # ---------------------------------------------------------------- errors
 
 
-class Problem(_Answer):
+class Problem(_Answer, frozen=True, kw_only=True):
     """RFC 9457. ``type`` ends in a stable code; further members depend on it."""
 
     type: str
@@ -41,20 +41,20 @@ class Problem(_Answer):
 # ---------------------------------------------------------------- accounts
 
 
-class SignInRequest(_Request):
+class SignInRequest(_Request, frozen=True, kw_only=True):
     """The token of a one-time link."""
 
     link: Annotated[str, Meta(min_length=1, max_length=200)]
 
 
-class AccountRef(_Answer):
+class AccountRef(_Answer, frozen=True, kw_only=True):
     """An account, as others see it."""
 
     id: str
     name: str
 
 
-class SignedIn(_Answer):
+class SignedIn(_Answer, frozen=True, kw_only=True):
     """A new sign-in session."""
 
     access_token: str
@@ -64,7 +64,7 @@ class SignedIn(_Answer):
     session: str
 
 
-class Me(_Answer):
+class Me(_Answer, frozen=True, kw_only=True):
     """Who asks."""
 
     id: str
@@ -72,14 +72,14 @@ class Me(_Answer):
     session: str
 
 
-class SpaceOut(_Answer):
+class SpaceOut(_Answer, frozen=True, kw_only=True):
     """A space."""
 
     id: str
     name: str
 
 
-class SpaceList(_Answer):
+class SpaceList(_Answer, frozen=True, kw_only=True):
     """Spaces."""
 
     items: tuple[SpaceOut, ...]
@@ -89,7 +89,7 @@ class SpaceList(_Answer):
 # ---------------------------------------------------------------- agents
 
 
-class DeviceIn(_Request):
+class DeviceIn(_Request, frozen=True, kw_only=True):
     """One device behind an agent."""
 
     name: DeviceName
@@ -98,7 +98,7 @@ class DeviceIn(_Request):
     label: Label
 
 
-class EnrollRequest(_Request):
+class EnrollRequest(_Request, frozen=True, kw_only=True):
     """An agent introduces itself; the request's token is signed by the key that it names."""
 
     name: Name
@@ -107,7 +107,7 @@ class EnrollRequest(_Request):
     devices: Annotated[tuple[DeviceIn, ...], Meta(min_length=1, max_length=64)]
 
 
-class Enrolled(_Answer):
+class Enrolled(_Answer, frozen=True, kw_only=True):
     """``claim_code`` is null once the agent is claimed."""
 
     agent: str
@@ -116,14 +116,14 @@ class Enrolled(_Answer):
     expires_in_s: int
 
 
-class KeyOut(_Answer):
+class KeyOut(_Answer, frozen=True, kw_only=True):
     """A public key (Ed25519, base64url) and its id."""
 
     id: str
     public: str
 
 
-class EnrollmentState(_Answer):
+class EnrollmentState(_Answer, frozen=True, kw_only=True):
     """Whether an agent is claimed, and the keys whose commands it is to obey."""
 
     agent: str
@@ -133,14 +133,14 @@ class EnrollmentState(_Answer):
     keys: tuple[KeyOut, ...]
 
 
-class ClaimRequest(_Request):
+class ClaimRequest(_Request, frozen=True, kw_only=True):
     """The code that an agent shows, and the space it shall be in (default: the first)."""
 
     code: Annotated[str, Meta(min_length=1, max_length=40)]
     space: Id | None = None
 
 
-class AgentOut(_Answer):
+class AgentOut(_Answer, frozen=True, kw_only=True):
     """An agent of the account."""
 
     id: str
@@ -151,7 +151,7 @@ class AgentOut(_Answer):
     claimed_at: Moment
 
 
-class AgentList(_Answer):
+class AgentList(_Answer, frozen=True, kw_only=True):
     """Agents."""
 
     items: tuple[AgentOut, ...]
@@ -161,7 +161,7 @@ class AgentList(_Answer):
 # ---------------------------------------------------------------- devices
 
 
-class LeaseOut(_Answer):
+class LeaseOut(_Answer, frozen=True, kw_only=True):
     """Who controls a device."""
 
     holder: str
@@ -170,7 +170,7 @@ class LeaseOut(_Answer):
     mine: bool
 
 
-class DeviceOut(_Answer):
+class DeviceOut(_Answer, frozen=True, kw_only=True):
     """A device. ``state`` is the newest ``state`` message of the device."""
 
     id: str
@@ -188,14 +188,14 @@ class DeviceOut(_Answer):
     lease: LeaseOut | None
 
 
-class DeviceList(_Answer):
+class DeviceList(_Answer, frozen=True, kw_only=True):
     """Devices, agent by agent."""
 
     items: tuple[DeviceOut, ...]
     cursor: str | None
 
 
-class Claimed(_Answer):
+class Claimed(_Answer, frozen=True, kw_only=True):
     """What was claimed."""
 
     agent: str
@@ -203,7 +203,7 @@ class Claimed(_Answer):
     devices: tuple[DeviceOut, ...]
 
 
-class LeaseRequest(_Request):
+class LeaseRequest(_Request, frozen=True, kw_only=True):
     """Without ``epoch``: take. With it: renew that epoch."""
 
     lease_ms: LeaseMs = 30_000
@@ -211,7 +211,7 @@ class LeaseRequest(_Request):
     wait_ms: WaitMs = 1_000
 
 
-class LeaseGranted(_Answer):
+class LeaseGranted(_Answer, frozen=True, kw_only=True):
     """The caller's lease. ``confirmed``: the device has acknowledged it."""
 
     epoch: int
@@ -221,19 +221,19 @@ class LeaseGranted(_Answer):
     confirmed: bool
 
 
-class LeaseNow(_Answer):
+class LeaseNow(_Answer, frozen=True, kw_only=True):
     """The live lease of a device, if any."""
 
     lease: LeaseOut | None
 
 
-class StopRequest(_Request):
+class StopRequest(_Request, frozen=True, kw_only=True):
     """Why."""
 
     reason: Text = ""
 
 
-class Confirmed(_Answer):
+class Confirmed(_Answer, frozen=True, kw_only=True):
     """Whether the device has confirmed within a second."""
 
     confirmed: bool
@@ -242,7 +242,7 @@ class Confirmed(_Answer):
 # ---------------------------------------------------------------- actions
 
 
-class ActionRequest(_Request):
+class ActionRequest(_Request, frozen=True, kw_only=True):
     """What to run. Without ``epoch`` the action brings a lease for its own time."""
 
     request: Asked
@@ -253,22 +253,20 @@ class ActionRequest(_Request):
     wait_for: Literal["started", "done"] = "started"
 
 
-class ReasonOut(_Answer):
+class ReasonOut(_Answer, frozen=True, kw_only=True):
     """Why an action ended as it did."""
 
     code: str
     message: str
 
 
-class ActionOut(_Answer):
+class ActionOut(_Answer, frozen=True, kw_only=True):
     """An action. ``times``: ``<status>_ms`` → milliseconds since 1970."""
 
     id: str
     device: str
     request: dict[str, Any]
-    status: Literal[
-        "created", "published", "received", "accepted", "started", "done", "failed", "expired", "cancelled"
-    ]
+    status: Literal["created", "published", "received", "accepted", "started", "done", "failed", "expired", "cancelled"]
     epoch: int
     who: str
     created_at: Moment
@@ -280,7 +278,7 @@ class ActionOut(_Answer):
     result: dict[str, Any]
 
 
-class ActionList(_Answer):
+class ActionList(_Answer, frozen=True, kw_only=True):
     """Actions, newest first."""
 
     items: tuple[ActionOut, ...]
@@ -290,7 +288,7 @@ class ActionList(_Answer):
 # ---------------------------------------------------------------- robot types, movements
 
 
-class RobotTypeOut(_Answer):
+class RobotTypeOut(_Answer, frozen=True, kw_only=True):
     """What every robot of one type has in common."""
 
     type: str
@@ -302,14 +300,14 @@ class RobotTypeOut(_Answer):
     capabilities: tuple[str, ...]
 
 
-class RobotTypeList(_Answer):
+class RobotTypeList(_Answer, frozen=True, kw_only=True):
     """Robot types."""
 
     items: tuple[RobotTypeOut, ...]
     cursor: str | None
 
 
-class MovementOut(_Answer):
+class MovementOut(_Answer, frozen=True, kw_only=True):
     """A movement's newest version."""
 
     name: str
@@ -320,7 +318,7 @@ class MovementOut(_Answer):
     built_in: bool
 
 
-class MovementSource(_Answer):
+class MovementSource(_Answer, frozen=True, kw_only=True):
     """A movement's newest version, with its script."""
 
     name: str
@@ -332,14 +330,14 @@ class MovementSource(_Answer):
     source: str
 
 
-class MovementList(_Answer):
+class MovementList(_Answer, frozen=True, kw_only=True):
     """Movements by name."""
 
     items: tuple[MovementOut, ...]
     cursor: str | None
 
 
-class MovementRequest(_Request):
+class MovementRequest(_Request, frozen=True, kw_only=True):
     """A script. Without a description the first line of its docstring serves."""
 
     source: Annotated[str, Meta(min_length=1, max_length=64_000)]
@@ -349,32 +347,32 @@ class MovementRequest(_Request):
 # ---------------------------------------------------------------- broker
 
 
-class WatchRequest(_Request, tag_field="purpose", tag="watch"):
+class WatchRequest(_Request, frozen=True, kw_only=True, tag_field="purpose", tag="watch"):
     """To see every device and to stop those one may operate."""
 
 
-class ControlRequest(_Request, tag_field="purpose", tag="control"):
+class ControlRequest(_Request, frozen=True, kw_only=True, tag_field="purpose", tag="control"):
     """To send setpoints under a lease."""
 
     device: Id
     epoch: Epoch
 
 
-class AgentRequest(_Request, tag_field="purpose", tag="agent"):
+class AgentRequest(_Request, frozen=True, kw_only=True, tag_field="purpose", tag="agent"):
     """To speak for an agent's own devices."""
 
 
 MqttRequest = WatchRequest | ControlRequest | AgentRequest
 
 
-class TcpAddress(_Answer):
+class TcpAddress(_Answer, frozen=True, kw_only=True):
     """Where the broker takes MQTT."""
 
     host: str
     port: int
 
 
-class MqttCredentialsOut(_Answer):
+class MqttCredentialsOut(_Answer, frozen=True, kw_only=True):
     """What to connect with, and the topics it is good for."""
 
     client_id: str
@@ -389,7 +387,7 @@ class MqttCredentialsOut(_Answer):
     server_time_ms: int
 
 
-class HealthOut(_Answer):
+class HealthOut(_Answer, frozen=True, kw_only=True):
     """``ok``, or a sentence, for each thing the functions need."""
 
     status: Literal["ok", "degraded"]

@@ -1,16 +1,21 @@
 """Routes with their documentation: what is written here is what the OpenAPI document says."""
 
 from collections.abc import Awaitable, Callable, Mapping, Sequence
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
 import msgspec
-from fastapi import APIRouter, Response
+from fastapi import APIRouter, Query, Response
 
 from function_app.entrypoints.http import contract
 from function_app.entrypoints.http.answers import JSON, PROBLEM_JSON
 
 Handler = Callable[..., Awaitable[Response]]
 Caller = Literal["nobody", "account", "agent", "account or agent"]
+
+PREFIX = "/api/v1"
+VERSION = "0.1.0"
+Cursor = Annotated[str | None, Query(max_length=2000, description="Where the page before ended.")]
+Limit = Annotated[int, Query(ge=1, le=1000, description="At most so many in a page.")]
 
 REF = "#/components/schemas/{name}"
 ACCOUNT_SCHEMES = ("accessToken", "sessionCookie")

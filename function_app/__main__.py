@@ -1,0 +1,66 @@
+"""``python -m function_app serve|work|sign-in-link``: the functions on one machine."""
+
+import argparse
+import asyncio
+import logging
+import sys
+from collections.abc import Sequence
+
+from function_app import bootstrap, settings
+from function_app.bootstrap import Functions
+from function_app.entrypoints.serve import PortTaken, serve
+from function_app.entrypoints.worker import work
+from function_app.ports.tables import StoreError
+
+_EXIT_FAILED = 1
+_EXIT_TAKEN = 3
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run one command; returns the exit code."""
+    parser = argparse.ArgumentParser(prog="python -m function_app", description="The Telescope functions.")
+    commands = parser.add_subparsers(required=True, metavar="COMMAND", dest="command")
+    commands.add_parser("serve", help="API and console, under uvicorn")
+    commands.add_parser("work", help="ingest from the broker, and timers")
+    link = commands.add_parser("sign-in-link", help="print a one-time sign-in link; makes the account if it is new")
+    link.add_argument("--account", default="demo", help="name of the account (default: %(default)s)")
+    options = parser.parse_args(arguments)
+    logging.basicConfig(level=logging.INFO, format="%(asctime)s %(levelname)s %(message)s", stream=sys.stderr)
+    try:
+        functions = bootstrap.build(settings.read())
+        if options.command == "serve":
+            asyncio.run(_check(functions))
+            serve(functions)
+        elif options.command == "work":
+            asyncio.run(work(functions))
+        else:
+            asyncio.run(_link(functions, options.account))
+    except PortTaken as taken:
+        print(f"telescope functions: {taken}", file=sys.stderr)
+        return _EXIT_TAKEN
+    except (StoreError, settings.SettingsError) as error:
+        print(f"telescope functions: {error}", file=sys.stderr)
+        return _EXIT_FAILED
+    except KeyboardInterrupt:
+        return 130
+    return 0
+
+
+async def _check(functions: Functions) -> None:
+    """Say at once what is wrong with the tables, not at the first request.
+
+    Raises:
+        StoreError: They cannot be used.
+    """
+    await functions.tables.get("Accounts", "health", "health")
+    await functions.tables.close()
+
+
+async def _link(functions: Functions, account: str) -> None:
+    found = await functions.sign_in.account(account)
+    print(f"{functions.settings.public_url}/#sign-in={await functions.sign_in.link(found)}")
+    await functions.close()
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,40 @@
+"""Azure Functions: one catch-all HTTP route to the ASGI application, and the timer.
+
+A native route with the ASGI middleware inside, because the framework's own ASGI app breaks a route prefix; built at the
+first request, because a worker imports this file to index it.
+"""
+
+import functools
+
+import azure.functions as func
+
+from function_app import bootstrap, settings
+from function_app.bootstrap import Functions
+from function_app.entrypoints.http import create_app
+
+app = func.FunctionApp(http_auth_level=func.AuthLevel.ANONYMOUS)
+_METHODS = ("GET", "POST", "PUT", "PATCH", "DELETE", "HEAD", "OPTIONS")
+
+
+@functools.cache
+def _functions() -> Functions:
+    return bootstrap.build(settings.read())
+
+
+@functools.cache
+def _http() -> func.AsgiMiddleware:
+    return func.AsgiMiddleware(create_app(_functions()))
+
+
+@app.function_name("http")
+@app.route(route="{*path}", methods=list(_METHODS))
+async def http(req: func.HttpRequest, context: func.Context) -> func.HttpResponse:
+    """Every HTTP request. Our own tokens decide who may do what."""
+    return await _http().handle_async(req, context)
+
+
+@app.function_name("sweep")
+@app.timer_trigger(schedule="*/5 * * * * *", arg_name="timer", run_on_startup=False)
+async def sweep(timer: func.TimerRequest) -> None:  # noqa: ARG001 (the host passes it by name)
+    """What time brings: commands sent again, actions ended, rights expired."""
+    await _functions().sweep.run()

@@ -1,0 +1,80 @@
+"""``devices/{id}/actions`` and ``actions``."""
+
+from typing import Annotated, Literal
+
+from fastapi import APIRouter, Header, Query, Request, Response
+
+from function_app.bootstrap import Functions
+from function_app.entrypoints.http import contract, show
+from function_app.entrypoints.http.answers import answer, read
+from function_app.entrypoints.http.caller import Caller
+from function_app.entrypoints.http.routing import PREFIX, Cursor, Limit, Routes
+from function_app.services.start_action import Start
+
+Key = Annotated[
+    str | None,
+    Header(alias="Idempotency-Key", min_length=1, max_length=200, description="The same key starts one action only."),
+]
+Wait = Annotated[int, Query(ge=0, le=30_000, description="Wait at most this long [ms].")]
+WaitFor = Annotated[Literal["started", "done"], Query(description="What to wait for.")]
+
+
+def router(functions: Functions, caller: Caller) -> APIRouter:
+    """The routes."""
+    routes = Routes("actions")
+
+    @routes.add(
+        "POST",
+        "/devices/{device}/actions",
+        summary="Start an action",
+        body=contract.ActionRequest,
+        answers={200: contract.ActionOut, 202: contract.ActionOut},
+        problems=(404, 409),
+    )
+    async def start_action(request: Request, device: str, once: Key = None) -> Response:
+        """200: it has come as far as ``wait_for``, or has ended. 202: it is under way; ask at its address."""
+        who = await caller.account(request)
+        asked: contract.ActionRequest = await read(request, contract.ActionRequest)
+        start = Start(
+            asked=asked.request,
+            epoch=asked.epoch,
+            ttl_ms=asked.ttl_ms,
+            timeout_ms=asked.timeout_ms,
+            wait_ms=asked.wait_ms,
+            wait_for=asked.wait_for,
+            once=once or "",
+        )
+        found, there = await functions.start_action.start(who, device, start)
+        where = {"Location": f"{PREFIX}/actions/{found.id}"}
+        return answer(show.action(found), 200 if there else 202, where)
+
+    @routes.add(
+        "GET",
+        "/devices/{device}/actions",
+        summary="A device's actions, newest first",
+        answers={200: contract.ActionList},
+        problems=(404, 422),
+    )
+    async def list_actions(request: Request, device: str, cursor: Cursor = None, limit: Limit = 100) -> Response:
+        """Since it was paired."""
+        who = await caller.account(request)
+        found, following = await functions.actions.list(who, device, cursor=cursor, limit=limit)
+        return answer(contract.ActionList(items=tuple(show.action(each) for each in found), cursor=following))
+
+    @routes.add(
+        "GET", "/actions/{action}", summary="One action", answers={200: contract.ActionOut}, problems=(404, 422)
+    )
+    async def get_action(request: Request, action: str, wait_ms: Wait = 0, wait_for: WaitFor = "done") -> Response:
+        """As soon as it has come as far as ``wait_for``, or as it is after ``wait_ms``."""
+        who = await caller.account(request)
+        return answer(show.action(await functions.actions.get(who, action, wait_ms=wait_ms, wait_for=wait_for)))
+
+    @routes.add(
+        "POST", "/actions/{action}/cancel", summary="Cancel", answers={202: contract.ActionOut}, problems=(404,)
+    )
+    async def cancel_action(request: Request, action: str) -> Response:
+        """Asks the device to end it. It has ended when its status says so."""
+        who = await caller.account(request)
+        return answer(show.action(await functions.actions.cancel(who, action)), 202)
+
+    return routes.router

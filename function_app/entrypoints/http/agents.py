@@ -1,0 +1,123 @@
+"""``agents``: enrolment, claim, list, un-pairing."""
+
+from typing import Annotated
+
+import msgspec
+from fastapi import APIRouter, Query, Request, Response
+
+from device_agent.protocol import signing
+from function_app.bootstrap import Functions
+from function_app.domain.devices import Agent, DeviceSpec
+from function_app.domain.ids import show_claim_code
+from function_app.domain.problems import invalid
+from function_app.domain.times import rfc3339
+from function_app.entrypoints.http import contract, show
+from function_app.entrypoints.http.answers import answer, empty, read
+from function_app.entrypoints.http.caller import Caller
+from function_app.entrypoints.http.routing import Cursor, Limit, Routes
+from function_app.services.enroll import Enrollment
+
+Wait = Annotated[int, Query(ge=0, le=30_000, description="Wait at most this long for the claim [ms].")]
+
+
+def router(functions: Functions, caller: Caller) -> APIRouter:
+    """The routes."""
+    routes = Routes("agents")
+
+    @routes.add(
+        "POST",
+        "/agents/enroll",
+        summary="Make an agent known",
+        body=contract.EnrollRequest,
+        answers={200: contract.Enrolled, 201: contract.Enrolled},
+        problems=(409,),
+        caller="agent",
+    )
+    async def enroll_agent(request: Request) -> Response:
+        """Called by an agent, with a token signed by the key that the body names. Gives a claim code while unclaimed."""
+        asked: contract.EnrollRequest = await read(request, contract.EnrollRequest)
+        if len({device.name for device in asked.devices}) != len(asked.devices):
+            raise invalid("Two devices have the same name.")
+        agent = await caller.enrolling(request, asked.public_key)
+        specs = tuple(msgspec.convert(device, DeviceSpec, from_attributes=True) for device in asked.devices)
+        done = await functions.enroll.enroll(agent, Enrollment(asked.name, asked.public_key, asked.software, specs))
+        if done.claimed:
+            return answer(contract.Enrolled(agent=done.id, claim_code=None, expires_at=None, expires_in_s=0))
+        left_ms = max(0, done.claim_expires_ms - functions.clock.now_ms())
+        body = contract.Enrolled(
+            agent=done.id,
+            claim_code=show_claim_code(done.claim_code),
+            expires_at=rfc3339(done.claim_expires_ms),
+            expires_in_s=left_ms // 1000,
+        )
+        return answer(body, 201)
+
+    @routes.add(
+        "GET",
+        "/agents/enrollment",
+        summary="Whether this agent is claimed",
+        answers={200: contract.EnrollmentState},
+        problems=(422,),
+        caller="agent",
+    )
+    async def enrollment(request: Request, wait_ms: Wait = 0) -> Response:
+        """Called by an agent: its space, its owner, and the keys whose commands it is to obey."""
+        agent = await functions.enroll.wait(await caller.agent(request), wait_ms)
+        keys = await functions.keys.public()
+        body = contract.EnrollmentState(
+            agent=agent.id,
+            state="claimed" if agent.claimed else "waiting",
+            space=agent.space,
+            account=await _account(agent),
+            keys=tuple(contract.KeyOut(id=name, public=signing.public_text(key)) for name, key in keys.items()),
+        )
+        return answer(body)
+
+    async def _account(agent: Agent) -> contract.AccountRef | None:
+        if agent.account is None:
+            return None
+        found = await functions.sign_in.named(agent.account)
+        return contract.AccountRef(id=agent.account, name=found)
+
+    @routes.add(
+        "POST",
+        "/agents/claim",
+        summary="Claim an agent with the code it shows",
+        body=contract.ClaimRequest,
+        answers={200: contract.Claimed},
+        problems=(404, 429),
+    )
+    async def claim_agent(request: Request) -> Response:
+        """A wrong, used and expired code are answered alike."""
+        who = await caller.account(request)
+        asked: contract.ClaimRequest = await read(request, contract.ClaimRequest)
+        agent = await functions.claim.claim(who, asked.code, asked.space)
+        views = await functions.devices.of_agent(who, agent.id)
+        found = tuple(show.device(view, who) for view in views)
+        return answer(contract.Claimed(agent=agent.id, space=agent.space or "", devices=found))
+
+    @routes.add("GET", "/agents", summary="The account's agents", answers={200: contract.AgentList}, problems=(422,))
+    async def list_agents(request: Request, cursor: Cursor = None, limit: Limit = 100) -> Response:
+        """Agents that the account has claimed."""
+        who = await caller.account(request)
+        agents, following = await functions.devices.agents(who, cursor=cursor, limit=limit)
+        items = tuple(
+            contract.AgentOut(
+                id=agent.id,
+                name=agent.name,
+                software=agent.software,
+                space=agent.space or "",
+                devices=tuple(spec.name for spec in agent.devices),
+                claimed_at=rfc3339(agent.claimed_ms),
+            )
+            for agent in agents
+        )
+        return answer(contract.AgentList(items=items, cursor=following))
+
+    @routes.add("DELETE", "/agents/{agent}", summary="Un-pair an agent", answers={204: None}, problems=(404,))
+    async def unpair_agent(request: Request, agent: str) -> Response:
+        """Its devices disappear, its broker connection is cut, and it waits to be claimed again."""
+        await functions.unpair.unpair(await caller.account(request), agent)
+        return empty()
+
+    return routes.router

@@ -1,0 +1,164 @@
+"""The HTTP application: routes, problems, security headers, and the console beside them."""
+
+import logging
+from collections.abc import AsyncIterator
+from contextlib import asynccontextmanager
+from typing import Any
+
+from fastapi import FastAPI, Request, Response
+from fastapi.exceptions import RequestValidationError
+from starlette.exceptions import HTTPException
+from starlette.types import ASGIApp, Message, Receive, Scope, Send
+
+from function_app.bootstrap import Functions
+from function_app.domain.problems import Problem, invalid, store_unavailable
+from function_app.entrypoints.http import actions, agents, auth, broker, devices, health, library
+from function_app.entrypoints.http.answers import problem
+from function_app.entrypoints.http.caller import COOKIE, Caller
+from function_app.entrypoints.http.console import Console
+from function_app.entrypoints.http.reference import reference
+from function_app.entrypoints.http.routing import ACCOUNT_SCHEMES, AGENT_SCHEME, PREFIX, VERSION, schemas
+from function_app.ports.clock import Clock
+from function_app.ports.tables import StoreError
+
+_log = logging.getLogger(__name__)
+_TITLES = {404: "Nothing here", 405: "Not this method"}
+
+
+def create_app(functions: Functions) -> FastAPI:
+    """The application over one set of services."""
+
+    @asynccontextmanager
+    async def lifespan(_app: FastAPI) -> AsyncIterator[None]:
+        # A warm start where the host runs it; nothing depends on it, for some hosts never do.
+        await functions.bus.start()
+        yield
+        await functions.close()
+
+    app = FastAPI(
+        title="Telescope",
+        version=VERSION,
+        description="Operate robots, and the rooms they stand in, from anywhere.",
+        openapi_url=f"{PREFIX}/openapi.json",
+        docs_url=None,
+        redoc_url=None,
+        lifespan=lifespan,
+        redirect_slashes=False,
+    )
+    caller = Caller(functions.identify)
+    for router in (
+        auth.router(functions, caller),
+        agents.router(functions, caller),
+        devices.router(functions, caller),
+        actions.router(functions, caller),
+        library.router(functions, caller),
+        broker.router(functions, caller),
+        health.router(functions),
+    ):
+        app.include_router(router, prefix=PREFIX)
+    _document(app)
+    app.add_exception_handler(Problem, _on_problem)
+    app.add_exception_handler(StoreError, _on_store)
+    app.add_exception_handler(RequestValidationError, _on_validation)
+    app.add_exception_handler(HTTPException, _on_http)
+    app.mount("/", Console(functions.settings.console))
+    app.add_middleware(_Headers, clock=functions.clock, websocket_url=functions.settings.websocket_url)
+    return app
+
+
+def _document(app: FastAPI) -> None:
+    made = app.openapi
+
+    def openapi() -> dict[str, Any]:
+        if app.openapi_schema is None:
+            document = made()
+            components = document.setdefault("components", {})
+            # What the framework's own validation would say never leaves: refusals are problem details.
+            components["schemas"] = schemas()
+            components["securitySchemes"] = {
+                ACCOUNT_SCHEMES[0]: {"type": "http", "scheme": "bearer", "bearerFormat": "JWT"},
+                ACCOUNT_SCHEMES[1]: {"type": "apiKey", "in": "cookie", "name": COOKIE},
+                AGENT_SCHEME: {"type": "http", "scheme": "bearer", "description": "A JWT that the agent's key signed."},
+            }
+            app.openapi_schema = document
+        return app.openapi_schema
+
+    app.openapi = openapi  # type: ignore[method-assign]
+
+    @app.get("/api/docs", include_in_schema=False)
+    async def docs() -> Response:
+        return Response(reference(app.openapi()), media_type="text/html")
+
+
+async def _on_problem(_request: Request, error: Exception) -> Response:
+    assert isinstance(error, Problem)  # noqa: S101 (registered for nothing else)
+    return problem(error)
+
+
+async def _on_store(_request: Request, error: Exception) -> Response:
+    _log.error("%s", error)
+    return problem(
+        store_unavailable("The tables cannot be used now. The operator of this server finds why in its log.")
+    )
+
+
+async def _on_validation(_request: Request, error: Exception) -> Response:
+    assert isinstance(error, RequestValidationError)  # noqa: S101 (registered for nothing else)
+    first = error.errors()[0]
+    place = ".".join(str(part) for part in first["loc"])
+    return problem(invalid(f"{place}: {first['msg']}."))
+
+
+async def _on_http(request: Request, error: Exception) -> Response:
+    assert isinstance(error, HTTPException)  # noqa: S101 (registered for nothing else)
+    title = _TITLES.get(error.status_code, str(error.detail))
+    detail = f"{request.method} {request.url.path[:200]}: {str(error.detail).rstrip('.')}."
+    answer = problem(Problem("http", error.status_code, title, detail))
+    for name, value in (error.headers or {}).items():
+        answer.headers[name] = value
+    return answer
+
+
+class _Headers:
+    """The headers of every answer, and an answer for what nobody has foreseen. Plain ASGI: it costs microseconds."""
+
+    def __init__(self, app: ASGIApp, *, clock: Clock, websocket_url: str) -> None:
+        self._app = app
+        self._clock = clock
+        policy = (
+            "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self' data: blob:; font-src 'self'; "
+            f"connect-src 'self' {websocket_url.split('?', maxsplit=1)[0]}; base-uri 'none'; form-action 'none'; "
+            "frame-ancestors 'none'"
+        )
+        self._fixed = [
+            (b"content-security-policy", policy.encode()),
+            (b"x-content-type-options", b"nosniff"),
+            (b"referrer-policy", b"no-referrer"),
+            (b"x-frame-options", b"DENY"),
+            (b"cross-origin-opener-policy", b"same-origin"),
+            (b"cross-origin-resource-policy", b"same-origin"),
+            (b"permissions-policy", b"camera=(), microphone=(), geolocation=()"),
+        ]
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        if scope["type"] != "http":
+            await self._app(scope, receive, send)
+            return
+        begun = False
+
+        async def sending(message: Message) -> None:
+            nonlocal begun
+            if message["type"] == "http.response.start":
+                begun = True
+                now = str(self._clock.now_ms()).encode()
+                message["headers"] = [*message["headers"], *self._fixed, (b"x-telescope-time-ms", now)]
+            await send(message)
+
+        try:
+            await self._app(scope, receive, sending)
+        except Exception:
+            _log.exception("%s %s", scope["method"], scope["path"])
+            if begun:
+                raise
+            detail = "Something went wrong here, and was written to the log. Try again."
+            await problem(Problem("internal", 500, "Internal error", detail))(scope, receive, sending)

@@ -1,0 +1,28 @@
+"""The built console, as static files."""
+
+from pathlib import Path
+
+from starlette.exceptions import HTTPException
+from starlette.responses import Response
+from starlette.staticfiles import StaticFiles
+from starlette.types import Scope
+
+_FOR_EVER = "public, max-age=31536000, immutable"
+
+
+class Console(StaticFiles):
+    """Files of the console's folder. Assets carry a hash in their name and are kept for ever, the page is asked for."""
+
+    def __init__(self, folder: Path) -> None:
+        super().__init__(directory=folder, html=True, check_dir=False)
+        self._folder = folder
+
+    async def get_response(self, path: str, scope: Scope) -> Response:
+        """The file; 404 with a hint when the console was never built."""
+        if path.startswith("api"):
+            raise HTTPException(404, "There is no such resource; see /api/docs")
+        if not (self._folder / "index.html").is_file():
+            raise HTTPException(404, "The console is not built; run `make console`")
+        response = await super().get_response(path, scope)
+        response.headers["Cache-Control"] = _FOR_EVER if path.startswith("assets") else "no-cache"
+        return response

@@ -1,0 +1,27 @@
+"""``health``."""
+
+from fastapi import APIRouter, Request, Response
+
+from function_app.bootstrap import Functions
+from function_app.domain.problems import store_unavailable
+from function_app.entrypoints.http import contract
+from function_app.entrypoints.http.answers import answer
+from function_app.entrypoints.http.routing import VERSION, Routes
+
+
+def router(functions: Functions) -> APIRouter:
+    """The routes."""
+    routes = Routes("health")
+
+    @routes.add(
+        "GET", "/health", summary="Whether the functions can work", answers={200: contract.HealthOut}, caller="nobody"
+    )
+    async def health(_request: Request) -> Response:
+        """503 when the tables cannot be used; a broker that is away is said, and comes back by itself."""
+        found = await functions.health.check()
+        if found.tables != "ok":
+            raise store_unavailable(found.tables)
+        status = "ok" if found.broker == "ok" else "degraded"
+        return answer(contract.HealthOut(status=status, version=VERSION, tables=found.tables, broker=found.broker))
+
+    return routes.router

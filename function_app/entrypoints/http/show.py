@@ -1,0 +1,96 @@
+"""Records as the API shows them."""
+
+from typing import Any
+
+import msgspec
+
+from device_agent.protocol.messages import State
+from device_agent.protocol.robot_type import RobotType
+from function_app.domain.accounts import Identity
+from function_app.domain.actions import Action
+from function_app.domain.lease import Lease
+from function_app.domain.times import rfc3339
+from function_app.entrypoints.http import contract
+from function_app.services.devices import DeviceView
+from function_app.services.movements import Movement
+
+
+def device(view: DeviceView, who: Identity) -> contract.DeviceOut:
+    """A device and what is known of it now."""
+    known = view.device
+    return contract.DeviceOut(
+        id=known.id,
+        name=known.name,
+        label=known.label,
+        kind=known.kind,
+        robot_type=known.robot_type,
+        agent=known.agent,
+        space=known.space,
+        role=known.role.value,
+        topic=known.topic,
+        online=view.online,
+        last_seen_at=None if view.last_seen_ms is None else rfc3339(view.last_seen_ms),
+        state=None if view.state is None else msgspec.convert(view.state, State, strict=False),
+        lease=lease(view.lease, who),
+    )
+
+
+def lease(found: Lease | None, who: Identity) -> contract.LeaseOut | None:
+    """A live lease."""
+    if found is None:
+        return None
+    ends = rfc3339(found.expires_ms)
+    return contract.LeaseOut(holder=found.holder, epoch=found.epoch, expires_at=ends, mine=found.mine(who))
+
+
+def action(found: Action) -> contract.ActionOut:
+    """An action."""
+    return contract.ActionOut(
+        id=found.id,
+        device=found.device,
+        request=found.request,
+        status=found.status.value,
+        epoch=found.epoch,
+        who=found.who,
+        created_at=rfc3339(found.created_ms),
+        deadline_at=rfc3339(found.deadline_ms),
+        times={f"{status}_ms": at_ms for status, at_ms in found.times.items()},
+        reason=None if found.reason is None else contract.ReasonOut(**found.reason),
+        progress=found.progress,
+        output=found.output,
+        result=found.result,
+    )
+
+
+def robot_type(found: RobotType) -> contract.RobotTypeOut:
+    """A robot type."""
+    return contract.RobotTypeOut(
+        type=found.type,
+        label=found.label,
+        kind=found.kind,
+        version=found.version,
+        description=found.description,
+        joints=found.joints,
+        capabilities=found.capabilities,
+    )
+
+
+def movement(found: Movement) -> contract.MovementOut:
+    """A movement without its source."""
+    return contract.MovementOut(**_movement(found))
+
+
+def movement_source(found: Movement, source: str) -> contract.MovementSource:
+    """A movement with its source."""
+    return contract.MovementSource(**_movement(found), source=source)
+
+
+def _movement(found: Movement) -> dict[str, Any]:
+    return {
+        "name": found.name,
+        "description": found.description,
+        "version": found.version,
+        "sha256": found.sha256,
+        "updated_at": rfc3339(found.updated_ms),
+        "built_in": found.built_in,
+    }

@@ -1,0 +1,42 @@
+"""The functions under uvicorn, on one machine."""
+
+import socket
+
+import uvicorn
+
+from function_app.bootstrap import Functions
+from function_app.entrypoints.http import create_app
+
+KEEP_ALIVE_S = 75
+"""uvicorn's own 5 s would cost a waiting client a new connection each time."""
+
+
+class PortTaken(Exception):  # noqa: N818 (an answer for a terminal)
+    """Somebody listens there already."""
+
+
+def serve(functions: Functions) -> None:
+    """Run until SIGINT or SIGTERM.
+
+    Raises:
+        PortTaken: With a sentence that says what to do.
+    """
+    settings = functions.settings
+    listener = socket.socket(socket.AF_INET6 if ":" in settings.host else socket.AF_INET)
+    listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+    try:
+        listener.bind((settings.host, settings.port))
+    except OSError as error:
+        listener.close()
+        raise PortTaken(
+            f"{settings.host}:{settings.port} cannot be used ({error.strerror}); set TELESCOPE_PORT to a free port"
+        ) from error
+    config = uvicorn.Config(
+        create_app(functions),
+        timeout_keep_alive=KEEP_ALIVE_S,
+        access_log=False,
+        log_level="warning",
+        server_header=False,
+        timeout_graceful_shutdown=3,
+    )
+    uvicorn.Server(config).run(sockets=[listener])

@@ -1,0 +1,41 @@
+"""The local worker: ingest from the broker, and the timer. One process; any number may run."""
+
+import asyncio
+import logging
+import signal
+
+from function_app.bootstrap import Functions
+from function_app.entrypoints.ingest import ingest
+
+SWEEP_EVERY_S = 1.0
+_log = logging.getLogger(__name__)
+
+
+async def work(functions: Functions) -> None:
+    """Run until SIGINT or SIGTERM."""
+
+    async def handle(topic: str, payload: bytes) -> None:
+        await ingest(functions, topic, payload)
+
+    tasks = [asyncio.create_task(functions.feed.run(handle)), asyncio.create_task(_sweep(functions))]
+    ending = asyncio.Event()
+    loop = asyncio.get_running_loop()
+    for number in (signal.SIGINT, signal.SIGTERM):
+        loop.add_signal_handler(number, ending.set)
+    waiting = asyncio.create_task(ending.wait())
+    done, _ = await asyncio.wait([*tasks, waiting], return_when=asyncio.FIRST_COMPLETED)
+    for task in (*tasks, waiting):
+        task.cancel()
+    await asyncio.gather(*tasks, waiting, return_exceptions=True)
+    await functions.close()
+    for task in done - {waiting}:
+        task.result()
+
+
+async def _sweep(functions: Functions) -> None:
+    while True:
+        try:
+            await functions.sweep.run()
+        except Exception:  # noqa: BLE001 (one bad round must not end the timer)
+            _log.exception("timer")
+        await asyncio.sleep(SWEEP_EVERY_S)
