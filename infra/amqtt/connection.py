@@ -201,8 +201,10 @@ class Connection:
             self._take_connect(frame)
 
     def _take_connect(self, frame: Frame) -> None:
+        claimed = ""
         try:
             connect = packets.read_connect(frame.body)
+            claimed = connect.client_id[:64]
             admission = self._exchange.admit(connect)
             self._check_will(connect.will, admission.grant)
         except packets.UnacceptableProtocol:
@@ -212,7 +214,7 @@ class Connection:
             return
         except Refused as refusal:
             self._link.write(packets.connack(refusal.code))
-            self.end(f"CONNECT refused: {refusal}", flush=True)
+            self.end(f"CONNECT as {claimed!r} refused: {refusal}", flush=True)
             return
         self.admission = admission
         self._will = connect.will

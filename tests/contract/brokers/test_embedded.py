@@ -165,7 +165,8 @@ def test_the_log_names_who_was_refused_and_no_secret(broker: RunningBroker, spac
     credentials = broker.issue(broker.grant(space))
     with broker.connect(f"{space}-thief", credentials):
         pass
-    wait_until(lambda: "its token is for another client id" in broker.stderr(), "the refusal in the log")
+    said = f"CONNECT as '{space}-thief' refused: its token is for another client id"
+    wait_until(lambda: said in broker.stderr(), "the refusal in the log")
     assert credentials.password not in broker.stderr()
 
 
