@@ -138,6 +138,13 @@ describe("what is known of a device", () => {
   });
 });
 
+describe("the fleet", () => {
+  it("knows spaces by their names, and by their ids until it does", async () => {
+    await until(() => fleet.spaceName("lab") === "Laboratory", "the name");
+    expect(fleet.spaceName("elsewhere")).toBe("elsewhere");
+  });
+});
+
 describe("who has control", () => {
   const lease = (epoch: number, inMs: number): void =>
     device.setLease({ holder: "Cloud", epoch, expires_at: new Date(Date.now() + inMs).toISOString(), mine: false });

@@ -70,6 +70,11 @@ export interface Credentials {
 
 export type Purpose = { purpose: "watch" } | { purpose: "control"; device: string; epoch: number };
 
+export interface Space {
+  id: string;
+  name: string;
+}
+
 interface Page<T> {
   items: T[];
   cursor: string | null;
@@ -128,6 +133,10 @@ export class Api {
 
   devices(): Promise<Device[]> {
     return this.#all("/devices");
+  }
+
+  spaces(): Promise<Space[]> {
+    return this.#all("/spaces");
   }
 
   async claim(code: string): Promise<Device[]> {

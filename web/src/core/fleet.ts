@@ -11,6 +11,7 @@ export class Fleet {
   readonly link: Link;
   readonly #devices = signal<ReadonlyMap<string, DeviceStore> | null>(null);
   readonly #trouble = signal<string | null>(null);
+  readonly #spaces = signal<ReadonlyMap<string, string>>(new Map());
   readonly #ends = new Map<string, () => void>();
   readonly #timer: ReturnType<typeof setInterval>;
 
@@ -26,9 +27,15 @@ export class Fleet {
     this.#timer = setInterval(() => void this.refresh(), REFRESH_MS);
   }
 
+  /** The name of a space, or its id while that is all that is known. */
+  spaceName(id: string): string {
+    return this.#spaces.value.get(id) ?? id;
+  }
+
   async refresh(): Promise<void> {
     try {
       this.#take(await this.#api.devices());
+      if (this.#unnamed()) this.#spaces.value = new Map((await this.#api.spaces()).map(({ id, name }) => [id, name]));
       this.#trouble.value = null;
     } catch (error) {
       this.#trouble.value = sentence(error);
@@ -47,6 +54,10 @@ export class Fleet {
     for (const end of this.#ends.values()) end();
     this.#ends.clear();
     this.link.close();
+  }
+
+  #unnamed(): boolean {
+    return [...(this.#devices.value?.values() ?? [])].some(({ info }) => !this.#spaces.value.has(info.value.space));
   }
 
   #take(list: readonly Device[]): void {

@@ -100,7 +100,7 @@ function Operate({ api, fleet, device, account }: OperateProps) {
     <>
       <ControlBar device={device} control={control} stop={stop} />
       <main class="page operate" id="content">
-        <Heading device={device} />
+        <Heading device={device} fleet={fleet} />
         <StopBanner device={device} stop={stop} />
         <div class="desk">
           <div class="column">
@@ -120,7 +120,7 @@ function Operate({ api, fleet, device, account }: OperateProps) {
   );
 }
 
-function Heading({ device }: { device: DeviceStore }) {
+function Heading({ device, fleet }: { device: DeviceStore; fleet: Fleet }) {
   const info = device.info.value;
   const trouble = device.trouble.value;
   return (
@@ -128,7 +128,7 @@ function Heading({ device }: { device: DeviceStore }) {
       <a href={fleetAddress}>← {texts.device.back}</a>
       <h1>{info.label}</h1>
       <p class="quiet">
-        {info.robot_type} · {info.space}
+        {info.robot_type} · {fleet.spaceName(info.space)}
         {device.description.value?.simulated === true && ` · ${texts.device.simulated}`}
       </p>
       <p class="reach">

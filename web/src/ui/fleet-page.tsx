@@ -15,7 +15,7 @@ export function FleetPage({ fleet }: { fleet: Fleet }) {
       {devices !== null && devices.size > 0 && (
         <ul class="devices">
           {[...devices.values()].map((device) => (
-            <DeviceRow key={device.id} device={device} />
+            <DeviceRow key={device.id} device={device} fleet={fleet} />
           ))}
         </ul>
       )}
@@ -24,14 +24,14 @@ export function FleetPage({ fleet }: { fleet: Fleet }) {
   );
 }
 
-function DeviceRow({ device }: { device: DeviceStore }) {
+function DeviceRow({ device, fleet }: { device: DeviceStore; fleet: Fleet }) {
   const info = device.info.value;
   return (
     <li class="card device-row" data-testid="device-row" data-device={device.id}>
       <a class="device-name" href={deviceAddress(device.id)}>
         {info.label}
         <span class="quiet">
-          {info.robot_type} · {info.space}
+          {info.robot_type} · {fleet.spaceName(info.space)}
         </span>
       </a>
       <dl>

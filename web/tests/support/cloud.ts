@@ -219,6 +219,8 @@ export class Cloud {
         return ok({ id: "demo", name: "Demo", session: "s1" });
       case "GET /devices":
         return ok({ items: [this.device()], cursor: null });
+      case "GET /spaces":
+        return ok({ items: [{ id: "lab", name: "Laboratory" }], cursor: null });
       case "POST /agents/claim":
         return problem(404, "claim-code-unknown", "No agent waits with this code. Codes are valid for five minutes.");
       case "POST /mqtt/credentials":
