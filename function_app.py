@@ -1,1 +1,1 @@
-"""A Functions host looks for this file by name, then imports the package ``function_app`` beside it, where the app is."""
+"""A Functions host looks for this file, then imports the package ``function_app`` beside it, where the app is."""

@@ -23,14 +23,15 @@ def _functions() -> Functions:
 
 @functools.cache
 def _http() -> func.AsgiMiddleware:
-    return func.AsgiMiddleware(create_app(_functions()))
+    return func.AsgiMiddleware(create_app(_functions()))  # type: ignore[no-untyped-call]
 
 
 @app.function_name("http")
 @app.route(route="{*path}", methods=list(_METHODS))
 async def http(req: func.HttpRequest, context: func.Context) -> func.HttpResponse:
     """Every HTTP request. Our own tokens decide who may do what."""
-    return await _http().handle_async(req, context)
+    answer: func.HttpResponse = await _http().handle_async(req, context)
+    return answer
 
 
 @app.function_name("sweep")

@@ -1,4 +1,4 @@
-"""What devices say, into the tables: the handler behind every way in (worker here, Event Grid and IoT rules elsewhere)."""
+"""What devices say, into the tables: the one handler behind every way in."""
 
 import logging
 

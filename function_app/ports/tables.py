@@ -1,7 +1,7 @@
 """Rows in tables: partition and key, optimistic concurrency by ETag. Azure Tables, DynamoDB, SQLite.
 
 Partitions and keys are any non-empty Unicode text up to 512 characters; adapters encode them for their store such that
-keys of one partition still sort as their UTF-8 bytes do. ``data`` is a flat JSON object of at most 256 KB; values may be nested JSON.
+keys of one partition still sort as their UTF-8 bytes do. ``data`` is a JSON object of at most 256 KB.
 """
 
 from collections.abc import Mapping, Sequence

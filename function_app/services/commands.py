@@ -65,7 +65,7 @@ class Commands:
         """
         now_ms = self._clock.now_ms()
         command = command_id(device.id, now_ms)
-        await self.publish(device, await self._short(device, command, request, who, epoch, now_ms))
+        await self.publish(device, await self._short(device, command, request, who=who, epoch=epoch, now_ms=now_ms))
         return command
 
     async def confirmed(self, device: Device, request: Request, *, who: str, epoch: int, wait_ms: int) -> bool:
@@ -76,7 +76,7 @@ class Commands:
         """
         now_ms = self._clock.now_ms()
         command = command_id(device.id, now_ms)
-        payload = await self._short(device, command, request, who, epoch, now_ms)
+        payload = await self._short(device, command, request, who=who, epoch=epoch, now_ms=now_ms)
         async with self._bus.acks(device.topic, command) as acks:
             try:
                 await self.publish(device, payload)
@@ -93,5 +93,7 @@ class Commands:
             except TimeoutError:
                 return False
 
-    async def _short(self, device: Device, command: str, request: Request, who: str, epoch: int, now_ms: int) -> bytes:
+    async def _short(
+        self, device: Device, command: str, request: Request, *, who: str, epoch: int, now_ms: int
+    ) -> bytes:
         return await self.signed(device, command, request, who=who, epoch=epoch, issued_ms=now_ms, ttl_ms=SHORT_TTL_MS)

@@ -65,7 +65,7 @@ async def retry(change: Callable[[], Awaitable[T]]) -> T:
     raise busy_store()
 
 
-async def upsert(
+async def upsert(  # noqa: PLR0917 (a place, a change, a type: read best in this order)
     tables: Tables, table: str, partition: str, key: str, change: Callable[[T | None], T | None], kind: type[T]
 ) -> T | None:
     """Change one record that may not exist yet; ``change`` gives ``None`` to leave it as it is."""

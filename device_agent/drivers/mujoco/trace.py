@@ -23,7 +23,7 @@ class Trace:
 
     The first line has ``joints`` and ``actuators``. Each other has ``tick_ms`` (monotonic clock), ``at_ms`` (wall
     clock), ``time_s``, ``lag_ms``, ``qpos`` and ``qvel`` by joint, and by actuator ``target`` (the newest command) and
-    ``ctrl`` (what the actuator follows). Writing is part of stepping: a slow disk shows as lag, a full one ends the trace.
+    ``ctrl`` (what the actuator follows). Writing is part of stepping: slow disks show as lag, full ones end the trace.
     """
 
     def __init__(self, path: Path, model: Any, joints: Sequence[str]) -> None:

@@ -199,9 +199,10 @@ class MqttTransport:
         _properties: Properties | None,
     ) -> None:
         if code.is_failure:
-            if "protocol" in str(code).lower():
+            if "protocol" in str(code).lower() and self._version is MQTTProtocolVersion.MQTTv5:
                 self._fall_back()
-            _log.warning("the broker refused the connection: %s", code)
+            else:
+                _log.warning("the broker refused the connection: %s", code)
             client.disconnect()
             return
         client.subscribe([(pattern, 1) for pattern in access.subscribe])

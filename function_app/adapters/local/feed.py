@@ -44,7 +44,7 @@ class MqttFeed:
                 generation, message = await self._waiting.get()
                 try:
                     await handler(message.topic, bytes(message.payload))
-                except Exception:  # one message must not end the worker; unconfirmed, it comes again where it can
+                except Exception:  # noqa: BLE001 (unconfirmed, it comes again where the broker can)
                     _log.exception("ingest of %s failed", message.topic)
                 else:
                     self._link.acknowledge(message, generation)

@@ -48,7 +48,7 @@ class FileKeys:
                 self._make(path)
             private = serialization.load_pem_private_key(path.read_bytes(), password=None)
             if not isinstance(private, Ed25519PrivateKey):
-                raise TypeError("not an Ed25519 key")
+                raise TypeError("not an Ed25519 key")  # noqa: TRY301 (one answer for every unusable file)
             self._public = self._publish(private.public_key())
         except (OSError, ValueError, TypeError, AttributeError, ProtocolError) as error:
             raise StoreError(f"the signing keys in {self._folder} cannot be used: {error}. Put back a copy.") from error

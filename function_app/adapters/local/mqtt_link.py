@@ -160,7 +160,7 @@ class MqttLink:
                 await asyncio.to_thread(client.connect, self._host, self._port, KEEP_ALIVE_S)
                 sock = client.socket()
                 if sock is None:
-                    raise BusUnavailable("the broker closed the connection")
+                    raise BusUnavailable("the broker closed the connection")  # noqa: TRY301 (cleaned up below)
                 loop.add_reader(sock, self._read, client)
                 async with asyncio.timeout(CONNECT_TIMEOUT_S):
                     reason = await answered
@@ -187,7 +187,9 @@ class MqttLink:
         self._version = (self._version + 1) % len(_VERSIONS)
         return self._version != 0
 
-    def _make(self, credentials: ServiceCredentials, answered: asyncio.Future[ReasonCode]) -> mqtt.Client:
+    def _make(  # noqa: C901 (one short callback after another)
+        self, credentials: ServiceCredentials, answered: asyncio.Future[ReasonCode]
+    ) -> mqtt.Client:
         version = _VERSIONS[self._version]
         client = mqtt.Client(
             CallbackAPIVersion.VERSION2,
@@ -199,9 +201,15 @@ class MqttLink:
         client.username_pw_set(credentials.username, credentials.password)
         client.connect_timeout = CONNECT_TIMEOUT_S
         client.max_inflight_messages_set(1000)
+        loop = asyncio.get_running_loop()
 
         def opened(_client: mqtt.Client, _data: Any, sock: Any) -> None:
             sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+
+        def closing(_client: mqtt.Client, _data: Any, sock: Any) -> None:
+            # The last moment at which the event loop can still be told to forget it.
+            loop.remove_reader(sock)
+            loop.remove_writer(sock)
 
         def connected(_client: mqtt.Client, _data: Any, _flags: Any, reason: ReasonCode, _properties: Any) -> None:
             if not answered.done():
@@ -230,6 +238,7 @@ class MqttLink:
                 waiting.set_result(None)
 
         client.on_socket_open = opened
+        client.on_socket_close = closing
         client.on_connect = connected
         client.on_disconnect = disconnected
         client.on_publish = published
@@ -289,15 +298,8 @@ class MqttLink:
         sock.close()
 
     def _read(self, client: mqtt.Client) -> None:
-        sock = client.socket()
-        if sock is None:
-            return
         client.loop_read()
-        if client.socket() is None:
-            asyncio.get_running_loop().remove_reader(sock)
-            asyncio.get_running_loop().remove_writer(sock)
-        else:
-            self._flush(client)
+        self._flush(client)
 
     def _flush(self, client: mqtt.Client) -> None:
         """What did not fit into the socket goes out as soon as it does."""
@@ -307,5 +309,5 @@ class MqttLink:
 
     def _write(self, client: mqtt.Client, sock: Any) -> None:
         client.loop_write()
-        if client.socket() is None or not client.want_write():
+        if client.socket() is not None and not client.want_write():
             asyncio.get_running_loop().remove_writer(sock)

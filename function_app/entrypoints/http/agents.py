@@ -34,7 +34,7 @@ def router(functions: Functions, caller: Caller) -> APIRouter:
         caller="agent",
     )
     async def enroll_agent(request: Request) -> Response:
-        """Called by an agent, with a token signed by the key that the body names. Gives a claim code while unclaimed."""
+        """Called by an agent, with a token that the key in the body signed. Gives a claim code while unclaimed."""
         asked: contract.EnrollRequest = await read(request, contract.EnrollRequest)
         if len({device.name for device in asked.devices}) != len(asked.devices):
             raise invalid("Two devices have the same name.")

@@ -97,9 +97,7 @@ async def _on_problem(_request: Request, error: Exception) -> Response:
 
 async def _on_store(_request: Request, error: Exception) -> Response:
     _log.error("%s", error)
-    return problem(
-        store_unavailable("The tables cannot be used now. The operator of this server finds why in its log.")
-    )
+    return problem(store_unavailable("The tables cannot be used now; the log of this server says why."))
 
 
 async def _on_validation(_request: Request, error: Exception) -> Response:

@@ -21,7 +21,12 @@ def router(functions: Functions) -> APIRouter:
         found = await functions.health.check()
         if found.tables != "ok":
             raise store_unavailable(found.tables)
-        status = "ok" if found.broker == "ok" else "degraded"
-        return answer(contract.HealthOut(status=status, version=VERSION, tables=found.tables, broker=found.broker))
+        body = contract.HealthOut(
+            status="ok" if found.broker == "ok" else "degraded",
+            version=VERSION,
+            tables=found.tables,
+            broker=found.broker,
+        )
+        return answer(body)
 
     return routes.router
