@@ -186,8 +186,9 @@ class State(Struct, frozen=True, kw_only=True):
 class JointTelemetry(Struct, frozen=True, kw_only=True):
     """``tele/joints``: all joints of one device at one tick, in the order of ``Description.joints``.
 
-    ``setpoint_sequence`` is the newest setpoint the control loop has taken (0: none in this lease), and
-    ``setpoint_sent_ms`` the operator's own clock in it, so that the page measures its round trip on one clock.
+    ``epoch`` is that of the lease in force at the device, 0 when none is: whoever thinks to have control and reads 0
+    has it no longer. ``setpoint_sequence`` is the newest setpoint the control loop has taken (0: none in this lease),
+    and ``setpoint_sent_ms`` the operator's own clock in it, so that the page measures its round trip on one clock.
     ``limited`` names what changed a setpoint on its way to the motors.
     """
 

@@ -313,10 +313,11 @@ class Controller:
             if self._move is not None and self._motion.reached:
                 done, self._move = self._move, None
                 done.end(Outcome.REACHED)
+            lease = self._gate.current(now_s)
             return Tick(
                 position,
                 self._mode,
-                self._gate.epoch,
+                lease.epoch if lease else 0,
                 self._taken,
                 self._taken_sent_ms,
                 self._loop_age_ms,

@@ -96,8 +96,8 @@ class Script:
                 self._process.kill()
 
     def _serve(self, ours: socket.socket) -> None:
-        with ours.makefile("rwb") as lines:
-            try:
+        try:
+            with ours.makefile("rwb") as lines:
                 self._write(
                     lines,
                     source=self._order.source,
@@ -105,18 +105,23 @@ class Script:
                     parameters=self._order.parameters,
                     joints=self._robot.joints,
                 )
-                while True:
-                    line = lines.readline(_LONGEST_LINE)
-                    message = json.loads(line, parse_constant=_no_constant) if line.endswith(b"\n") else None
-                    if not isinstance(message, dict):
-                        raise ScriptFailed("the script's process ended before the script did")
-                    if "ended" in message:
-                        if message.get("error"):
-                            raise ScriptFailed(str(message["error"])[:MAX_OUTPUT])
-                        return
+                while (message := self._read(lines)) is not None:
                     self._answer(lines, message)
-            except (OSError, ValueError) as error:
-                raise ScriptFailed(f"the script's process ended before the script did ({error})") from error
+        except (OSError, ValueError) as error:
+            raise ScriptFailed(f"the script's process ended before the script did ({error})") from error
+
+    @staticmethod
+    def _read(lines: Any) -> dict[str, Any] | None:
+        """The next message, or ``None`` when the script has ended well."""
+        line = lines.readline(_LONGEST_LINE)
+        message = json.loads(line, parse_constant=_no_constant) if line.endswith(b"\n") else None
+        if not isinstance(message, dict):
+            raise ScriptFailed("the script's process ended before the script did")
+        if "ended" not in message:
+            return message
+        if message.get("error"):
+            raise ScriptFailed(str(message["error"])[:MAX_OUTPUT])
+        return None
 
     def _answer(self, lines: Any, message: dict[str, Any]) -> None:
         if "output" in message:

@@ -37,15 +37,16 @@ class Lease:
 def take(
     lease: Lease | None, who: Identity, *, lease_ms: int, now_ms: int, pairing: str = "", action: str = ""
 ) -> Lease:
-    """A lease for ``who``: the next epoch, or the same one renewed when ``who`` holds it already.
+    """A lease for ``who``, always with the next epoch.
+
+    Whoever holds it already gets a new one too: that is how control is taken again after the device has ended the
+    lease by itself (a hold, a Stop, a restart), which the cloud need not know.
 
     Raises:
         Problem: ``lease-held`` by somebody else (another sign-in session of the same account is somebody else).
     """
-    if lease is not None and lease.live(now_ms):
-        if not lease.mine(who):
-            raise held(lease)
-        return replace(lease, expires_ms=now_ms + lease_ms, lease_ms=lease_ms, action=action)
+    if lease is not None and lease.live(now_ms) and not lease.mine(who):
+        raise held(lease)
     return Lease(
         epoch=(lease.epoch if lease else 0) + 1,
         account=who.account,

@@ -18,7 +18,7 @@ from typing import Any
 from infra.local import settings
 from infra.local.processes import Child, StartError
 
-_NEEDS = ("fastapi", "uvicorn", "msgspec", "jwt", "paho.mqtt", "amqtt", "mujoco", "ruckig", "requests", "numpy")
+_NEEDS = ("fastapi", "uvicorn", "msgspec", "jwt", "paho", "amqtt", "mujoco", "ruckig", "requests", "numpy")
 _START_WITHIN_S = 60.0
 _ACCOUNT = "demo"
 _DEVICE = "ur5=ur5"
@@ -79,7 +79,7 @@ class Machine:
     # ------------------------------------------------------------ steps
 
     def _check(self) -> None:
-        missing = [name for name in _NEEDS if importlib.util.find_spec(name.split(".", maxsplit=1)[0]) is None]
+        missing = [name for name in _NEEDS if not installed(name)]
         if missing:
             raise StartError(f"Python package '{missing[0]}' is missing; run `make env`")
         chosen = self._chosen
@@ -193,6 +193,14 @@ class Machine:
         except urllib.error.HTTPError as error:
             raise ValueError(json.load(error).get("detail", error.reason)) from error
         return found
+
+
+def installed(package: str) -> bool:
+    """Whether a package can be found, without importing it."""
+    try:
+        return importlib.util.find_spec(package) is not None
+    except ImportError:
+        return False
 
 
 def taken(host: str, port: int) -> bool:

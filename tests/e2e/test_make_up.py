@@ -52,7 +52,10 @@ def test_it_gets_ready_ends_cleanly_and_keeps_its_data(tmp_path: Path, broker: s
             device = api.device()
             api.http.put("/robot-types/ur5/movements/mine", json={"source": "robot.home()\n"}).raise_for_status()
         assert set(listeners(first)) == {"0100007F"}, "something listens beyond loopback"
-        children = [first.pid(words) for words in ("infra." + broker, "serve", "work", "device_agent")]
+        children = [
+            first.pid(words)
+            for words in (f"infra.{broker}", "function_app serve", "function_app work", "-m device_agent")
+        ]
         assert first.interrupt() == 0
         for pid in children:
             assert not Path(f"/proc/{pid}").exists()
@@ -65,7 +68,7 @@ def test_it_gets_ready_ends_cleanly_and_keeps_its_data(tmp_path: Path, broker: s
 def test_every_part_that_is_killed_comes_back(tmp_path: Path) -> None:
     with start_machine(tmp_path) as machine, machine.api() as api:
         device = api.device()
-        for words in ("infra.amqtt", "serve", "work", "device_agent"):
+        for words in ("infra.amqtt", "function_app serve", "function_app work", "-m device_agent"):
             machine.kill(words)
             wait_until(functools.partial(_runs, machine, words), f"{words} to be started again", 30)
         wait_until(lambda: _moves(api, device["id"]), "the robot to move again", 60)
@@ -92,7 +95,10 @@ def _moves(api: Api, device: str) -> bool:
 
 def test_when_the_supervisor_is_killed_nothing_is_left_behind(tmp_path: Path) -> None:
     with start_machine(tmp_path) as machine:
-        children = [machine.pid(words) for words in ("infra.amqtt", "serve", "work", "device_agent")]
+        children = [
+            machine.pid(words)
+            for words in ("infra.amqtt", "function_app serve", "function_app work", "-m device_agent")
+        ]
         machine.process.send_signal(signal.SIGKILL)
         wait_until(lambda: not any(Path(f"/proc/{pid}").exists() for pid in children), "the others to end", 30)
 
@@ -141,8 +147,8 @@ def test_a_missing_package_is_named(tmp_path: Path, package: str) -> None:
 def test_a_corrupt_database_is_named_and_kept(tmp_path: Path) -> None:
     with start_machine(tmp_path) as machine:
         machine.interrupt()
-    (database,) = tmp_path.glob("*.db")
-    for leftover in (*tmp_path.glob("*.db-wal"), *tmp_path.glob("*.db-shm")):
+    (database,) = tmp_path.glob("*.sqlite")
+    for leftover in (*tmp_path.glob("*.sqlite-wal"), *tmp_path.glob("*.sqlite-shm")):
         leftover.unlink()
     before = b"not a database at all" + database.read_bytes()[21:]
     database.write_bytes(before)
@@ -154,7 +160,7 @@ def test_a_corrupt_database_is_named_and_kept(tmp_path: Path) -> None:
 def test_a_damaged_page_of_the_database_is_named_and_kept(tmp_path: Path) -> None:
     with start_machine(tmp_path) as machine:
         machine.interrupt()
-    (database,) = tmp_path.glob("*.db")
+    (database,) = tmp_path.glob("*.sqlite")
     with sqlite3.connect(database) as connection:
         connection.execute("PRAGMA wal_checkpoint(TRUNCATE)")
     connection.close()

@@ -53,9 +53,11 @@ def operator(browser: Browser, machine: Machine) -> Iterator[Page]:
     assert "sign-in=" not in page.url
     page.get_by_test_id("device-row").filter(has_text="UR5").get_by_role("link").first.click()
     expect(page.get_by_test_id("control-state")).to_be_visible(timeout=PATIENCE_MS)
-    yield page
+    try:
+        yield page
+    finally:
+        context.close()
     assert errors == []
-    context.close()
 
 
 def elbow(trace: Trace) -> float:
@@ -177,7 +179,7 @@ def test_closing_the_browser_in_mid_motion_stops_the_arm(browser: Browser, machi
 
 def speeds(trace: Trace) -> list[dict[str, float]]:
     """Commanded speed of the fastest joint between rows of the trace [rad/s]."""
-    rows = trace.rows()[-800:]
+    rows = trace.rows()
     found = []
     for before, after in itertools.pairwise(rows):
         step_s = after["time_s"] - before["time_s"]
@@ -273,7 +275,7 @@ def test_mosquitto_sub_prints_the_telemetry_with_credentials_of_the_api_and_only
         mosquitto_sub(machine, f"{device['topic']}/cmd", *who, "-C", "1"),
     ):
         assert refused.stdout == ""
-        assert refused.returncode != 0
+        assert refused.returncode != 0 or "denied" in refused.stderr
 
 
 def test_pictures_for_the_documentation(browser: Browser, machine: Machine, tmp_path: Path) -> None:

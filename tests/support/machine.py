@@ -20,6 +20,8 @@ import httpx
 from tests.support.brokers import ROOT, wait_until
 
 START_WITHIN_S = 90.0
+_ROW_BYTES = 500
+_COLUMNS = (("qpos", "joints"), ("qvel", "joints"), ("target", "actuators"), ("ctrl", "actuators"))
 
 
 def free_ports() -> int:
@@ -139,22 +141,21 @@ class Trace:
     def __init__(self, path: Path) -> None:
         self._path = path
 
-    def rows(self) -> list[dict[str, Any]]:
+    def rows(self, newest: int = 800) -> list[dict[str, Any]]:
+        """The newest rows; what the file has as lists is given by name."""
         rows = []
-        for line in self._path.read_text().splitlines():
-            with contextlib.suppress(ValueError):  # the last line may be half written
-                row = json.loads(line)
-                if "qpos" in row:
-                    rows.append(row)
+        with self._path.open("rb") as file:
+            names: dict[str, list[str]] = json.loads(file.readline())
+            file.seek(max(file.tell(), self._path.stat().st_size - newest * _ROW_BYTES))
+            for line in file.read().splitlines():
+                with contextlib.suppress(ValueError):  # the first and the last line may be torn
+                    row = json.loads(line)
+                    if "qpos" in row:
+                        rows.append(row | {key: dict(zip(names[of], row[key], strict=True)) for key, of in _COLUMNS})
         return rows
 
-    def header(self) -> dict[str, Any]:
-        with self._path.open() as file:
-            header: dict[str, Any] = json.loads(file.readline())
-        return header
-
     def now(self) -> dict[str, Any]:
-        return self.rows()[-1]
+        return self.rows(3)[-1]
 
 
 @contextlib.contextmanager

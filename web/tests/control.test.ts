@@ -183,6 +183,18 @@ describe("control of a device", () => {
     expect(control.state.value).toMatchObject({ kind: "lost" });
   });
 
+  it("is lost when the robot has ended it by itself, and is left to others", async () => {
+    await control.take();
+    watch.tell("tele/joints", telemetry({ epoch: 5 }));
+    await vi.advanceTimersByTimeAsync(1);
+    expect(control.epoch).toBe(5);
+    watch.tell("tele/joints", telemetry({ epoch: 0, mode: "holding" }));
+    await vi.advanceTimersByTimeAsync(1);
+    expect(control.state.value).toMatchObject({ kind: "lost" });
+    expect(wire.closed).toBe(true);
+    expect(desk.released).toEqual([5]);
+  });
+
   it("is not taken when somebody holds it, and the page says who", async () => {
     desk.taking = () => Promise.reject(new ApiError(409, "lease-held", "Ann has control."));
     await control.take();

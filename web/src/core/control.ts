@@ -32,6 +32,7 @@ export class Control {
   #timer: ReturnType<typeof setTimeout> | undefined;
   #expiry: ReturnType<typeof setTimeout> | undefined;
   #cleanups: (() => void)[] = [];
+  #obeyed = false;
 
   readonly state: ReadonlySignal<ControlState> = this.#state;
   /** There while the lease is held. */
@@ -95,6 +96,7 @@ export class Control {
 
   #hold(granted: Granted, askedAt: number): void {
     const { epoch } = granted;
+    this.#obeyed = false;
     this.#device.setLease({ holder: granted.holder, epoch, expires_at: granted.expires_at, mine: true });
     this.roundTrip.restart();
     const link = this.#openLink(this.#device.id, epoch);
@@ -120,7 +122,7 @@ export class Control {
     ];
   }
 
-  /** What the robot says of the lease: a higher epoch ends ours at once, whatever our clock says. */
+  /** What the robot says of the lease: a higher epoch, or none after ours, ends it at once, whatever our clock says. */
   #hear(epoch: number): void {
     const latest = this.#device.telemetry.value;
     const state = this.#device.state.value;
@@ -132,7 +134,15 @@ export class Control {
         this.#lose("Somebody else has control now.");
         return;
       }
-      if (heard === epoch && !current.confirmed) this.#state.value = { ...current, confirmed: true };
+      if (latest?.message.epoch === epoch) {
+        this.#obeyed = true;
+        if (!current.confirmed) this.#state.value = { ...current, confirmed: true };
+      } else if (this.#obeyed && latest?.message.epoch === 0) {
+        this.#lose("The robot has ended it: it was stopped, or had to hold. Take control again to go on.");
+        // Nobody can use this lease any more: let others have the next one.
+        void this.#api.releaseLease(this.#device.id, epoch, false).catch(() => undefined).then(() => this.#device.refreshLease());
+        return;
+      }
       this.#streamer.peek()?.follow();
       if (latest?.message.epoch === epoch && latest.message.setpoint_sequence > 0) {
         this.roundTrip.seen(latest.message.setpoint_sequence, latest.message.setpoint_sent_ms, latest.receivedAt);
