@@ -52,7 +52,7 @@ console: web/dist/index.html
 
 web/dist/index.html: web/node_modules/.installed web/index.html web/package.json $(wildcard web/*.ts web/public/*) $(shell find web/src -type f 2>/dev/null)
 	@echo "telescope: building the console" >&2
-	@$(NPM) run --silent build
+	@$(NPM) run --silent build -- --logLevel warn
 	@touch $@
 
 test: .venv/.dev console check

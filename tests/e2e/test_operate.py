@@ -4,15 +4,17 @@ import contextlib
 import itertools
 import json
 import math
+import os
+import signal
 import subprocess
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
 import pytest
-from playwright.sync_api import Browser, BrowserContext, Page, expect, sync_playwright
+from playwright.sync_api import Browser, BrowserContext, Error, Page, Playwright, expect, sync_playwright
 
 from tests.support.brokers import wait_until
 from tests.support.machine import Machine, Trace
@@ -32,11 +34,16 @@ _FLAGS = [
 
 
 @pytest.fixture(scope="module")
-def browser() -> Iterator[Browser]:
+def playwright() -> Iterator[Playwright]:
     with sync_playwright() as playwright:
-        browser = playwright.chromium.launch(executable_path="/usr/bin/chromium", args=_FLAGS)
-        yield browser
-        browser.close()
+        yield playwright
+
+
+@pytest.fixture(scope="module")
+def browser(playwright: Playwright) -> Iterator[Browser]:
+    browser = playwright.chromium.launch(executable_path="/usr/bin/chromium", args=_FLAGS)
+    yield browser
+    browser.close()
 
 
 @contextlib.contextmanager
@@ -161,20 +168,24 @@ def test_stop_latches_until_it_is_reset(browser: Browser, machine: Machine) -> N
         page.get_by_test_id("release-control").click()
 
 
-def test_closing_the_browser_in_mid_motion_stops_the_arm(browser: Browser, machine: Machine) -> None:
-    trace = machine.trace()
-    with operator(browser, machine) as page:
-        take(page)
-        drag(page, 0.75 if elbow(trace) < 0.5 else 0.25, let_go=False)
-        wait_until(lambda: commanded_speed(trace) > 0.2, "motion", 30)
-        page.close()
-        closed_ms = time.time() * 1000
+def end_in_mid_motion(page: Page, trace: Trace, end: Callable[[], None]) -> float:
+    """Take control, drag, end the page while the arm moves; how long the arm was commanded to move after that [ms]."""
+    take(page)
+    drag(page, 0.75 if elbow(trace) < 0.5 else 0.25, let_go=False)
+    wait_until(lambda: commanded_speed(trace) > 0.2, "motion", 30)
+    end()
+    ended_ms = time.time() * 1000
     wait_until(lambda: commanded_speed(trace) == 0, "rest", 10)
     moving = [row["at_ms"] for row in speeds(trace) if row["speed"] > 1e-3]
-    assert max(moving) - closed_ms < STOP_WITHIN_MS
     rest = elbow(trace)
     time.sleep(1)
     assert abs(elbow(trace) - rest) < 0.005
+    return max(moving) - ended_ms
+
+
+def test_closing_the_browser_in_mid_motion_stops_the_arm(browser: Browser, machine: Machine) -> None:
+    with operator(browser, machine) as page:
+        assert end_in_mid_motion(page, machine.trace(), page.close) < STOP_WITHIN_MS
 
 
 def speeds(trace: Trace) -> list[dict[str, float]]:
@@ -289,3 +300,21 @@ def test_pictures_for_the_documentation(browser: Browser, machine: Machine, tmp_
             page.screenshot(path=tmp_path / f"operate-{width}.png")
             assert (tmp_path / f"operate-{width}.png").stat().st_size > 20_000
         page.get_by_test_id("release-control").click()
+
+
+def test_a_browser_that_is_killed_in_mid_motion_stops_the_arm(playwright: Playwright, machine: Machine) -> None:
+    """Unlike a page that is closed, it says no goodbye: nothing but the watchdog at the robot can act."""
+    mark = "--named-by-a-test"
+
+    def kill() -> None:
+        listed = subprocess.run(["pgrep", "-f", "--", mark], capture_output=True, text=True, check=True).stdout
+        for pid in listed.split():
+            with contextlib.suppress(ProcessLookupError):
+                os.kill(int(pid), signal.SIGKILL)
+
+    browser = playwright.chromium.launch(executable_path="/usr/bin/chromium", args=[*_FLAGS, mark])
+    moved_on_ms: list[float] = []
+    with contextlib.suppress(Error), operator(browser, machine) as page:
+        moved_on_ms.append(end_in_mid_motion(page, machine.trace(), kill))
+    assert moved_on_ms
+    assert moved_on_ms[0] < STOP_WITHIN_MS

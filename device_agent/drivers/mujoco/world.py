@@ -138,6 +138,8 @@ class World:
         """
         if self._model is not None:
             return
+        # Else MuJoCo writes its warnings into a file in whatever folder the agent was started.
+        mujoco.set_mju_user_warning(_warn)
         model = self._compile()
         data = self._at_home(model)
         self._addresses = {
@@ -377,3 +379,7 @@ def _follow(ramp: _Ramp, ctrl: Floats) -> None:
     now = ctrl[command.actuators]
     ctrl[command.actuators] = command.target if share > 1 - 1e-9 else now + (command.target - now) * share
     ramp.remaining_s = 0.0 if share > 1 - 1e-9 else ramp.remaining_s - TIMESTEP_S
+
+
+def _warn(text: str) -> None:
+    log.warning("MuJoCo: %s", text)

@@ -135,6 +135,7 @@ def test_connecting_after_a_fault_begins_anew_at_home(arm: MujocoDriver):
         time.sleep(0.002)
     stopped = arm._world.snapshot().time_s
     arm.connect()
+    assert arm._world.snapshot().time_s >= stopped
     assert arm.observe().position_rad == pytest.approx(home, abs=1e-3)
     while arm._world.snapshot().time_s <= stopped + 0.02:
         assert time.monotonic() < end

@@ -116,8 +116,13 @@ def test_a_command_is_copied():
     assert world.step(1).ctrl[0] == pytest.approx(HOME["shoulder_pan"])
 
 
-def test_effort_counts_what_holds_the_arm_against_gravity():
-    world = ur5_world()
+@pytest.mark.parametrize("counted_by_the_model", [True, False])
+def test_effort_counts_what_holds_the_arm_against_gravity(tmp_path: Path, counted_by_the_model: bool):
+    model = (UR5 / "ur5.xml").read_text()
+    if not counted_by_the_model:
+        model = model.replace('actuatorgravcomp="true"', "")
+    (tmp_path / "arm.xml").write_text(model)
+    world = World(tmp_path / "arm.xml", home=HOME)
     world.build()
     assert abs(world.step(10).effort[1]) > 10  # the shoulder carries the arm
     assert abs(world.step(10).effort[0]) < 0.1  # the base turns about the vertical
@@ -179,19 +184,19 @@ def test_a_slow_machine_loses_time_and_says_so(monkeypatch: pytest.MonkeyPatch, 
         advance(count)
 
     monkeypatch.setattr(world, "_advance", slow)
+    before = time.monotonic()
     with caplog.at_level(logging.WARNING):
         world.open()
         try:
-            until(lambda: groups > 8)
+            until(lambda: world.snapshot().time_s > 0.3)
             snapshot = world.snapshot()
         finally:
             world.close()
-    lost_ms = snapshot.lag_ms
-    assert lost_ms >= MAX_CATCH_UP_S * 9 * 1000
+    lost_s = snapshot.lag_ms / 1000
+    assert lost_s >= MAX_CATCH_UP_S * 9
     assert "cannot keep up" in caplog.text
-    # It has not tried to make up for it: time_s is what was stepped, not what the clock says.
-    assert snapshot.time_s == pytest.approx(0.004 * round(snapshot.time_s / 0.004))
-    assert snapshot.time_s < MAX_CATCH_UP_S * 9
+    # What is lost stays lost: stepping it after all, in a burst, would be a jump.
+    assert snapshot.time_s + lost_s <= snapshot.taken_s - before + 0.005
 
 
 def test_a_diverged_world_stops_and_says_so():

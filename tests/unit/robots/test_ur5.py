@@ -86,6 +86,13 @@ def test_visual_shapes_weigh_and_touch_nothing(bench: Bench):
     assert not bench.model.geom_conaffinity[visual].any()
 
 
+def test_motors_do_the_work_of_holding_the_arm(bench: Bench):
+    mujoco.mj_step(bench.model, bench.data, nstep=10)
+    effort = bench.data.qfrc_actuator[bench.dof]
+    assert effort == pytest.approx(bench.data.qfrc_bias[bench.dof], abs=0.05)
+    assert abs(effort[1]) > 10
+
+
 def _demand(bench: Bench, acceleration: float, velocity: float, seed: int) -> npt.NDArray[np.float64]:
     """Torque that each joint needs if all six accelerate at once, each sign at its worst, shape (samples, 6) [N m]."""
     random = np.random.default_rng(seed)
