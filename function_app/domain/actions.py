@@ -117,10 +117,11 @@ def apply_report(action: Action, report: Report) -> Action:
 
 
 def mark_published(action: Action, now_ms: int) -> Action:
-    """The action, published; the same object when it already is."""
-    if action.status is not Status.CREATED:
+    """The action, published; the same object when that is known. A device's ack may be written down before this is."""
+    if Status.PUBLISHED.value in action.times:
         return action
-    return replace(action, status=Status.PUBLISHED, times={**action.times, "published": now_ms})
+    status = Status.PUBLISHED if action.status is Status.CREATED else action.status
+    return replace(action, status=status, times={**action.times, Status.PUBLISHED.value: now_ms})
 
 
 def end(action: Action, status: Status, code: str, message: str, now_ms: int) -> Action:
