@@ -26,7 +26,7 @@ class MqttCommandBus:
             subscriptions=(topics.device(topics.ANY, topics.ANY, topics.ANY, topics.ACK),),
             receive=self._dispatch,
         )
-        self._waiting: dict[str, dict[str, asyncio.Queue[Ack]]] = {}
+        self._waiting: dict[str, dict[str, set[asyncio.Queue[Ack]]]] = {}
 
     async def start(self) -> None:
         """See ``CommandBus``."""
@@ -44,13 +44,16 @@ class MqttCommandBus:
             return
         topic = f"{device_topic}/{topics.ACK}"
         queue: asyncio.Queue[Ack] = asyncio.Queue()
-        self._waiting.setdefault(topic, {})[command] = queue
+        commands = self._waiting.setdefault(topic, {})
+        queues = commands.setdefault(command, set())
+        queues.add(queue)
         try:
             yield _drain(queue)
         finally:
-            waiting = self._waiting[topic]
-            del waiting[command]
-            if not waiting:
+            queues.remove(queue)
+            if not queues:
+                del commands[command]
+            if not commands:
                 del self._waiting[topic]
 
     async def status(self) -> str:
@@ -71,8 +74,7 @@ class MqttCommandBus:
             ack = codec.decode(bytes(message.payload), Ack)
         except ProtocolError:
             return  # the ingest worker says so in the log
-        queue = waiting.get(ack.id)
-        if queue is not None:
+        for queue in waiting.get(ack.id, ()):
             queue.put_nowait(ack)
 
 
