@@ -2,10 +2,10 @@
 
 import hashlib
 from dataclasses import dataclass, field
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
 import msgspec
-from msgspec import Struct
+from msgspec import Meta, Struct
 
 from device_agent.protocol.messages import Id, JointPositions, MoveJoints, RunMovement
 from function_app.domain import lease as rules
@@ -42,7 +42,7 @@ class AskJoints(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True, t
     """Move to joint positions and end there."""
 
     position_rad: JointPositions
-    speed: float = 0.5
+    speed: Annotated[float, Meta(gt=0, le=1)] = 0.5
 
 
 Asked = AskMovement | AskJoints
