@@ -1,5 +1,6 @@
 import { describe, expect, it } from "vitest";
-import { forward, multiply, placed, rollPitchYaw, rotate, type Quaternion, type Vector3 } from "../src/core/kinematics";
+import { forward, multiply, placed, rollPitchYaw, rotate } from "../src/core/kinematics";
+import type { Quaternion, Vector3 } from "../src/core/vectors";
 import { readTwin, type KnownBody } from "../src/core/messages";
 import fixture from "./fixtures/ur5.json";
 import { twin as ur5 } from "./support/arm";

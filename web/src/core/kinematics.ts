@@ -1,11 +1,6 @@
 /** Forward kinematics of a twin, as MuJoCo does it: where each body is when its joint stands at a position. */
 import type { KnownBody, KnownTwin } from "./messages";
-
-export type Vector3 = [number, number, number];
-/** w, x, y, z */
-export type Quaternion = [number, number, number, number];
-/** position x, y, z [m] and quaternion w, x, y, z of a frame in the robot's base */
-export type Pose = [number, number, number, number, number, number, number];
+import type { Quaternion, Vector3 } from "./vectors";
 
 export interface Placement {
   position_m: Vector3;

@@ -2,7 +2,7 @@
  * Reads what arrives from the broker: JSON of the contract's types, every number finite, every list of the length it
  * must have. Unknown fields pass, so that this page still reads a newer robot. Nothing unchecked is ever drawn.
  */
-import type { Pose, Quaternion, Vector3 } from "./kinematics";
+import type { Pose, Quaternion, Vector3 } from "./vectors";
 import type {
   Ack,
   AckStatus,

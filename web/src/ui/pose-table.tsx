@@ -1,7 +1,8 @@
 import { useState } from "preact/hooks";
 import { degrees } from "../core/angles";
 import type { DeviceStore } from "../core/device";
-import { rollPitchYaw, unit, type Pose } from "../core/kinematics";
+import { rollPitchYaw, unit } from "../core/kinematics";
+import type { Pose } from "../core/vectors";
 import { texts } from "../texts";
 import { Card, Choice } from "./parts";
 
