@@ -12,6 +12,7 @@ from device_agent.protocol.messages import Ack
 from device_agent.protocol.topics import Topic
 from function_app.domain.actions import Action, Report, Status, apply_report, mark_published, reached
 from function_app.domain.ids import device_id, split_command
+from function_app.domain.nesting import too_deep
 from function_app.ports.clock import Clock
 from function_app.services.action_rows import ActionRows, Found
 
@@ -99,7 +100,7 @@ class ActionAcks:
 
 
 def report(ack: Ack) -> Report:
-    """An ack as the domain reads it."""
+    """An ack as the domain reads it. A result that could not be read again is left out; the end still counts."""
     return Report(
         status=Status(ack.status.value),
         sequence=ack.sequence,
@@ -107,5 +108,5 @@ def report(ack: Ack) -> Report:
         reason=None if ack.reason is None else msgspec.to_builtins(ack.reason),
         progress=ack.progress,
         output=ack.output,
-        result=ack.result,
+        result={} if too_deep(ack.result) else ack.result,
     )

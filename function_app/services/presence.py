@@ -11,6 +11,7 @@ from device_agent.protocol.messages import Description, Event, Presence, State
 from device_agent.protocol.topics import Topic
 from function_app.domain.devices import Agent, LastState, Link, newer_link
 from function_app.domain.ids import device_id, new_suffix
+from function_app.domain.nesting import MAX_LEVELS, too_deep
 from function_app.ports.clock import Clock
 from function_app.ports.tables import Conflict, Row, Tables
 from function_app.services import store
@@ -67,6 +68,8 @@ class PresenceIngest:
 
     async def _event(self, topic: Topic, event: Event, now_ms: int) -> None:
         """By its id, so that one that is delivered twice is stored once."""
+        if too_deep(event.data):
+            raise ProtocolError(f"the event's data are nested more than {MAX_LEVELS} levels deep")
         device = device_id(topic.agent, topic.device)
         data = {**msgspec.to_builtins(event), "seen_ms": now_ms}
         when = new_suffix(event.at_ms)[:9]

@@ -14,7 +14,8 @@ from function_app.domain.actions import REPEAT_MS, Action, Status, reached
 from function_app.domain.devices import Device
 from function_app.domain.ids import command_id
 from function_app.domain.lease import Lease
-from function_app.domain.problems import Problem, busy_store
+from function_app.domain.nesting import MAX_LEVELS, too_deep
+from function_app.domain.problems import Problem, busy_store, invalid
 from function_app.ports.clock import Clock
 from function_app.ports.command_bus import BusUnavailable, CommandBus
 from function_app.ports.tables import Row, Tables, Write
@@ -120,6 +121,8 @@ class StartAction:
             Problem: ``device-unknown``, ``forbidden``, ``movement-unknown``, ``device-offline``, ``device-busy``,
                 ``lease-held``, ``lease-lost``, ``idempotency-key-reused``, ``busy``, ``invalid``.
         """
+        if isinstance(start.asked, AskMovement) and too_deep(start.asked.parameters):
+            raise invalid(f"The parameters are nested more than {MAX_LEVELS} levels deep.")
         device, link = await self._devices.with_link(who, device_id)
         require_operator(device)
         earlier = await self._earlier(who, device, start)
