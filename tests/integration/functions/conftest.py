@@ -1,0 +1,78 @@
+import contextlib
+import shutil
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from function_app.adapters.local.keys import FileKeys
+from tests.support.brokers import BrokerKind, RunningBroker, start_broker
+from tests.support.cloud import Cloud, Person, Robot, paired, settings
+
+Open = Callable[..., Cloud]
+
+
+@pytest.fixture(scope="session")
+def keys(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Signing keys that the brokers of this session know."""
+    folder = tmp_path_factory.mktemp("functions") / "keys"
+    FileKeys(folder).load()
+    return folder
+
+
+@pytest.fixture(scope="session")
+def brokers(keys: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Callable[[BrokerKind], RunningBroker]]:
+    """One broker of a kind for all tests, started when the first one needs it."""
+    running: dict[BrokerKind, RunningBroker] = {}
+    with contextlib.ExitStack() as stack:
+
+        def start(kind: BrokerKind) -> RunningBroker:
+            if kind not in running:
+                folder = tmp_path_factory.mktemp(kind)
+                running[kind] = stack.enter_context(start_broker(kind, folder, keys=keys / "public.json"))
+            return running[kind]
+
+        yield start
+
+
+@pytest.fixture
+def broker(request: pytest.FixtureRequest, brokers: Callable[[BrokerKind], RunningBroker]) -> RunningBroker:
+    """The embedded one; a test that is parametrised with ``broker`` runs over others too."""
+    return brokers(getattr(request, "param", "amqtt"))
+
+
+@pytest.fixture
+def home(tmp_path: Path, keys: Path) -> Path:
+    folder = tmp_path / "home"
+    shutil.copytree(keys, folder / "keys")
+    return folder
+
+
+@pytest.fixture
+def open_cloud(home: Path, broker: RunningBroker) -> Iterator[Open]:
+    """Opens instances of the functions over one home."""
+    if broker.kind == "mosquitto":
+        (home / "mosquitto").mkdir()
+        shutil.copy(broker.home / "service.password", home / "mosquitto")
+    with contextlib.ExitStack() as stack:
+
+        def opened(*, at: RunningBroker | None = broker, **options: Any) -> Cloud:
+            return stack.enter_context(Cloud(settings(home, at), **options))
+
+        yield opened
+
+
+@pytest.fixture
+def cloud(open_cloud: Open) -> Cloud:
+    """The functions with their ingest."""
+    cloud = open_cloud()
+    cloud.start_ingest()
+    return cloud
+
+
+@pytest.fixture
+def pair(cloud: Cloud) -> Iterator[tuple[Person, Robot]]:
+    """Anna, and a robot of hers that is online."""
+    with paired(cloud) as found:
+        yield found
