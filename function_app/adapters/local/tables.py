@@ -9,6 +9,7 @@ import binascii
 import os
 import secrets
 import sqlite3
+import time
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -29,6 +30,7 @@ from function_app.ports.tables import (
 BUSY_TIMEOUT_MS = 5_000
 """A writer waits this long for another process's write: they take well under a millisecond each."""
 MAX_PAGE = 1_000
+_PAUSE_S = 0.002
 
 _SCHEMA = """
 CREATE TABLE IF NOT EXISTS rows (
@@ -174,9 +176,7 @@ class SqliteTables:
         except (OSError, sqlite3.Error) as error:
             raise self._unusable(error) from error
         try:
-            db.execute("PRAGMA journal_mode=WAL")
-            db.execute("PRAGMA synchronous=NORMAL")
-            db.execute(_SCHEMA)
+            _prepare(db)
         except sqlite3.Error as error:
             db.close()
             raise self._unusable(error) from error
@@ -190,6 +190,22 @@ class SqliteTables:
             f"the tables in {self._path} are damaged ({error}). Put back a copy of the file, or move it away to start "
             "empty; nothing was deleted."
         )
+
+
+def _prepare(db: sqlite3.Connection) -> None:
+    """Journal and schema. SQLite does not wait by itself while another process does the same to a new file."""
+    end = time.monotonic() + BUSY_TIMEOUT_MS / 1000
+    while True:
+        try:
+            db.execute("PRAGMA journal_mode=WAL")
+            db.execute("PRAGMA synchronous=NORMAL")
+            db.execute(_SCHEMA)
+        except sqlite3.OperationalError as error:
+            if error.sqlite_errorcode & 0xFF != sqlite3.SQLITE_BUSY or time.monotonic() > end:
+                raise
+            time.sleep(_PAUSE_S)
+        else:
+            return
 
 
 def _check(row: Row) -> None:
