@@ -1,6 +1,7 @@
-"""Blobs as files. Names are percent-encoded, so that none leaves the folder and every name is a file's name."""
+"""Blobs as files. Names are encoded, so that none leaves the folder and every name is a file's name."""
 
 import asyncio
+import base64
 import contextlib
 import os
 import secrets
@@ -12,6 +13,9 @@ from function_app.ports.tables import StoreError
 
 _PART = 120
 """An encoded name longer than this is cut into folders: file systems take 255 bytes a name."""
+_READABLE = 3 * MAX_NAME_LENGTH
+"""A path has at most 4,096 bytes: what percent signs would make longer than this is written in base64."""
+_COMPACT = "~"
 _TAIL = ".blob"
 _TEMPORARY = ".part"
 
@@ -50,9 +54,9 @@ class FileBlobs:
     def _path(self, name: str) -> Path:
         if not 1 <= len(name) <= MAX_NAME_LENGTH:
             raise ValueError(f"a blob's name has 1 to {MAX_NAME_LENGTH} characters, not {len(name)}")
-        encoded = quote(name, safe="").replace(".", "%2E") + _TAIL
+        encoded = _encode(name)
         parts = [encoded[start : start + _PART] for start in range(0, len(encoded), _PART)]
-        return self._folder.joinpath(*(f"{part}+" for part in parts[:-1]), parts[-1])
+        return self._folder.joinpath(*(f"{part}+" for part in parts[:-1]), parts[-1] + _TAIL)
 
     def _put(self, path: Path, content: bytes) -> None:
         temporary = self._folder / f"{secrets.token_hex(8)}{_TEMPORARY}"
@@ -101,11 +105,30 @@ class FileBlobs:
     def _list(self, prefix: str, limit: int) -> tuple[str, ...]:
         names = []
         for path in self._folder.rglob(f"*{_TAIL}"):
-            encoded = "".join(part.removesuffix("+") for part in path.relative_to(self._folder).parts)
-            name = unquote(encoded.removesuffix(_TAIL))
+            *folders, last = path.relative_to(self._folder).parts
+            name = _decode("".join(part.removesuffix("+") for part in folders) + last.removesuffix(_TAIL))
             if name.startswith(prefix):
                 names.append(name)
         return tuple(sorted(names)[:limit])
+
+
+def _encode(name: str) -> str:
+    """A name in characters that every file system takes: readable where it stays short enough."""
+    try:
+        text = name.encode()
+    except UnicodeEncodeError as error:
+        raise ValueError("a blob's name is Unicode text without lone surrogates") from error
+    readable = quote(text, safe="").replace(".", "%2E").replace(_COMPACT, "%7E")
+    if len(readable) <= _READABLE:
+        return readable
+    return _COMPACT + base64.urlsafe_b64encode(text).decode().rstrip("=")
+
+
+def _decode(encoded: str) -> str:
+    if not encoded.startswith(_COMPACT):
+        return unquote(encoded)
+    compact = encoded.removeprefix(_COMPACT)
+    return base64.urlsafe_b64decode(compact + "=" * (-len(compact) % 4)).decode()
 
 
 def _check(content: bytes) -> None:
