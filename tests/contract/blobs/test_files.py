@@ -1,0 +1,63 @@
+"""``FileBlobs`` keeps the port's promises and never leaves its folder."""
+
+from collections.abc import AsyncIterator, Awaitable, Callable
+from pathlib import Path
+
+import pytest
+
+from function_app.adapters.local.blobs import FileBlobs
+from function_app.ports.blobs import Blobs
+from function_app.ports.tables import StoreError
+from tests.contract.blobs.suite import NAMES, Again, BlobsSuite
+
+pytestmark = pytest.mark.anyio
+
+
+@pytest.fixture
+def anyio_backend() -> str:
+    return "asyncio"
+
+
+@pytest.fixture
+async def blobs(tmp_path: Path) -> AsyncIterator[Blobs]:
+    blobs = FileBlobs(tmp_path / "blobs")
+    yield blobs
+    await blobs.close()
+
+
+@pytest.fixture
+def again(tmp_path: Path) -> Again:
+    async def open_() -> Blobs:
+        return FileBlobs(tmp_path / "blobs")
+
+    return open_
+
+
+class TestFileBlobs(BlobsSuite):
+    pass
+
+
+async def test_no_name_leaves_the_folder_and_nothing_is_left_over(blobs: Blobs, tmp_path: Path) -> None:
+    for name in NAMES:
+        await blobs.put(name, b"x")
+    assert [path.name for path in tmp_path.iterdir()] == ["blobs"]
+    assert list(tmp_path.rglob("*.part")) == []
+    for name in NAMES:
+        await blobs.delete(name)
+    assert [path for path in tmp_path.rglob("*") if path.is_file()] == []
+
+
+async def test_a_folder_that_cannot_be_used_is_named(tmp_path: Path) -> None:
+    (tmp_path / "blobs").write_text("a file")
+    blobs = FileBlobs(tmp_path / "blobs")
+    calls: tuple[Callable[[], Awaitable[object]], ...] = (
+        lambda: blobs.put("a", b""),
+        lambda: blobs.append("a", b""),
+        lambda: blobs.get("a"),
+        lambda: blobs.delete("a"),
+    )
+    for call in calls:
+        with pytest.raises(StoreError, match="Check disk space and permissions") as caught:
+            await call()
+        assert str(tmp_path / "blobs") in str(caught.value)
+        assert "\n" not in str(caught.value)
