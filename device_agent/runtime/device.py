@@ -101,6 +101,7 @@ class Device:
         self._loop = ControlLoop(robot_type, driver, self._controller, name=name, tell=self._tell)
         self._executor = Executor(robot_type, self._controller, observe=lambda: self._loop.seen, report=self._report)
         self._commands: queue.Queue[bytes] = queue.Queue(maxsize=1000)
+        self._delivered: queue.SimpleQueue[Ack] = queue.SimpleQueue()
         self._sequences: dict[str, int] = {}
         self._told_lock = threading.Lock()
         self._twin: Twin | None = None
@@ -256,7 +257,9 @@ class Device:
         self._report(command.id, AckStatus.DONE)
 
     def _keep(self) -> None:
-        """Write down epochs and latch, when they have changed."""
+        """Write down epochs and latch when they have changed, and which answers have arrived."""
+        while not self._delivered.empty():
+            self._journal.delivered(self._delivered.get())
         if self._controller.changed.is_set():
             self._controller.changed.clear()
             epoch, burned = self._controller.epochs
@@ -280,7 +283,7 @@ class Device:
         self._send_ack(ack)
 
     def _send_ack(self, ack: Ack) -> None:
-        self._publish(self._topic(topics.ACK), codec.encode(ack), qos=1, delivered=lambda: self._journal.delivered(ack))
+        self._publish(self._topic(topics.ACK), codec.encode(ack), qos=1, delivered=lambda: self._delivered.put(ack))
 
     def _introduce(self) -> None:
         """After each connection: what the device is, how it is, and the answers that may not have arrived."""

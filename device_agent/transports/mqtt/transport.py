@@ -77,6 +77,7 @@ class MqttTransport:
         self._thread: threading.Thread | None = None
         self._delivery_lock = threading.Lock()
         self._delivered: dict[int, Callable[[], None]] = {}
+        self._early: set[int] = set()
         self._session = 0
         self._gone = threading.Event()
 
@@ -100,13 +101,13 @@ class MqttTransport:
         client = self._client
         if client is None or not self._up:
             return False
-        if delivered is None:
-            return client.publish(topic, payload, qos=qos, retain=retain).rc == mqtt.MQTT_ERR_SUCCESS
-        with self._delivery_lock:  # held until the id is known, so that a fast PUBACK finds it
-            sent = client.publish(topic, payload, qos=qos, retain=retain)
-            if sent.rc == mqtt.MQTT_ERR_SUCCESS:
-                self._delivered[sent.mid] = delivered
-        return sent.rc == mqtt.MQTT_ERR_SUCCESS
+        # No lock of ours is held here: paho holds its own while it calls ``_on_publish``, which takes ours.
+        sent = client.publish(topic, payload, qos=qos, retain=retain)
+        if sent.rc != mqtt.MQTT_ERR_SUCCESS:
+            return False
+        if qos and self._confirmed(sent.mid, delivered or _nothing) and delivered is not None:
+            delivered()
+        return True
 
     def stop(self) -> None:
         """See ``Transport.stop``."""
@@ -162,6 +163,7 @@ class MqttTransport:
             self._client = None
             with self._delivery_lock:
                 self._delivered.clear()
+                self._early.clear()
             if was_up:
                 self._link_changed(False)
 
@@ -226,10 +228,23 @@ class MqttTransport:
     def _on_publish(
         self, _client: mqtt.Client, _access: object, mid: int, code: ReasonCode, _properties: Properties | None
     ) -> None:
+        if code.is_failure:
+            return
         with self._delivery_lock:
             delivered = self._delivered.pop(mid, None)
-        if delivered is not None and not code.is_failure:
+            if delivered is None:
+                self._early.add(mid)
+        if delivered is not None:
             delivered()
+
+    def _confirmed(self, mid: int, delivered: Callable[[], None]) -> bool:
+        """Whether a message was confirmed before its sender knew its id; else ``delivered`` waits for it."""
+        with self._delivery_lock:
+            if mid in self._early:
+                self._early.discard(mid)
+                return True
+            self._delivered[mid] = delivered
+        return False
 
     def _on_message(self, _client: mqtt.Client, _access: object, message: mqtt.MQTTMessage) -> None:
         if not message.retain:  # an order that a broker kept is not an order of now
@@ -242,6 +257,10 @@ class MqttTransport:
 
     def _presence(self, *, online: bool) -> bytes:
         return codec.encode(Presence(online=online, session=self._session, at_ms=wall_ms(), software=self._software))
+
+
+def _nothing() -> None:
+    """Nobody waits to hear of this message."""
 
 
 def _no_delay(_client: mqtt.Client, _userdata: object, sock: Any) -> None:

@@ -61,7 +61,8 @@ def create_app(functions: Functions) -> FastAPI:
     app.add_exception_handler(StoreError, _on_store)
     app.add_exception_handler(RequestValidationError, _on_validation)
     app.add_exception_handler(HTTPException, _on_http)
-    app.mount("/", Console(functions.settings.console))
+    # What no route knows at all; a mount would also swallow a wrong method, which is a 405.
+    app.router.default = Console(functions.settings.console)
     app.add_middleware(_Headers, clock=functions.clock, websocket_url=functions.settings.websocket_url)
     return app
 

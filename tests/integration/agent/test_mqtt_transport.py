@@ -1,10 +1,12 @@
 """The agent's MQTT transport over real brokers: its link, its presence, its will, its way back."""
 
+import functools
 import os
 import signal
 import socket
 import subprocess
 import sys
+import threading
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -106,6 +108,29 @@ def test_a_message_is_reported_delivered(broker: RunningBroker) -> None:
         wait_until(lambda: any(message.topic == ACK for message in other.heard()), "the ack")
     link.transport.stop()
     assert not link.transport.publish(ACK, b"{}", qos=1)
+
+
+def test_many_threads_publish_and_none_ever_waits_for_another(broker: RunningBroker) -> None:
+    link = Link(broker)
+    link.up()
+    each, threads = 100, 4
+    delivered: list[int] = []
+
+    def note(number: int) -> None:
+        time.sleep(0.002)  # as long as writing to a disk takes: confirmations now come while others publish
+        delivered.append(number)
+
+    def speak() -> None:
+        for number in range(each):
+            while not link.transport.publish(ACK, b"{}", qos=1, delivered=functools.partial(note, number)):
+                time.sleep(0.01)
+            link.transport.publish(topics.device("lab", "arm1", "arm", topics.TELE, "joints"), b"{}", qos=0)
+
+    speakers = [threading.Thread(target=speak, daemon=True) for _ in range(threads)]
+    for speaker in speakers:
+        speaker.start()
+    wait_until(lambda: len(delivered) == each * threads, "all confirmations")
+    assert link.changes == [True]
 
 
 def test_a_clean_end_says_offline_in_the_same_session(broker: RunningBroker) -> None:
