@@ -13,5 +13,6 @@ class Feed(Protocol):
     async def run(self, handler: Handler) -> None:
         """Deliver until cancelled; reconnects for ever. Messages of one topic arrive in order, one at a time.
 
-        A handler that raises leaves its message unconfirmed: brokers that can will send it again.
+        A handler that raises ``StoreError`` or ``Problem`` is given its message again a few times; what still cannot be
+        stored then, or fails in another way, is logged and let go, so that the others go on.
         """

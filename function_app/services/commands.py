@@ -14,6 +14,8 @@ from function_app.ports.keys import Keys
 
 SHORT_TTL_MS = 5_000
 """Time to live of lease and stop commands: what arrives later is no longer meant."""
+_ENVELOPE_BYTES = 512
+"""More than signature, key, epoch and times add to a command that is checked before it has them."""
 _CONFIRMING = frozenset({AckStatus.ACCEPTED, AckStatus.STARTED, AckStatus.DONE})
 
 
@@ -25,6 +27,18 @@ class Commands:
         self._keys = keys
         self._clock = clock
 
+    def check(self, device: Device, command: str, request: Request, *, who: str, ttl_ms: int) -> None:
+        """Refuse what a device would drop unread, before anything is written about it.
+
+        Raises:
+            Problem: ``invalid``: a field is out of its range, a number is not finite, or it is too long for a message.
+        """
+        order = _order(device, command, request, who=who, epoch=0, issued_ms=0, ttl_ms=ttl_ms)
+        try:
+            codec.decode(codec.encode(order, limit=codec.MAX_BYTES - _ENVELOPE_BYTES), Command)
+        except ProtocolError as error:
+            raise invalid(f"{error}.") from error
+
     async def signed(
         self, device: Device, command: str, request: Request, *, who: str, epoch: int, issued_ms: int, ttl_ms: int
     ) -> bytes:
@@ -33,17 +47,7 @@ class Commands:
         Raises:
             Problem: ``invalid``: it holds a number that is not finite, or is too long for a message.
         """
-        order = Command(
-            id=command,
-            space=device.space,
-            agent=device.agent,
-            device=device.name,
-            issued_at_ms=issued_ms,
-            ttl_ms=ttl_ms,
-            who=who,
-            epoch=epoch,
-            request=request,
-        )
+        order = _order(device, command, request, who=who, epoch=epoch, issued_ms=issued_ms, ttl_ms=ttl_ms)
         try:
             return signing.sign(codec.encode(order), await self._keys.current())
         except ProtocolError as error:
@@ -97,3 +101,19 @@ class Commands:
         self, device: Device, command: str, request: Request, *, who: str, epoch: int, now_ms: int
     ) -> bytes:
         return await self.signed(device, command, request, who=who, epoch=epoch, issued_ms=now_ms, ttl_ms=SHORT_TTL_MS)
+
+
+def _order(
+    device: Device, command: str, request: Request, *, who: str, epoch: int, issued_ms: int, ttl_ms: int
+) -> Command:
+    return Command(
+        id=command,
+        space=device.space,
+        agent=device.agent,
+        device=device.name,
+        issued_at_ms=issued_ms,
+        ttl_ms=ttl_ms,
+        who=who,
+        epoch=epoch,
+        request=request,
+    )

@@ -173,8 +173,8 @@ class StartAction:
             )
             pinned = {"robot_type": device.robot_type, "version": movement.version, "sha256": movement.sha256}
             plan = _Plan(device, action, now_ms, request, command, pinned)
-        # Built once before anything is written: what cannot be sent must not take the slot.
-        await self._commands.signed(device, action, plan.command, who=who.name, epoch=0, issued_ms=now_ms, ttl_ms=1)
+        # Before anything is written: what cannot be sent must not take the slot.
+        self._commands.check(device, action, plan.command, who=who.name, ttl_ms=1)
         return plan
 
     async def _payload(self, plan: _Plan, action: Action) -> bytes:

@@ -3,17 +3,25 @@
 import asyncio
 import logging
 from collections.abc import Callable
+from typing import NamedTuple
 
 from paho.mqtt.client import MQTTMessage
 
 from device_agent.protocol import topics
 from device_agent.protocol.topics import ANY
 from function_app.adapters.local.mqtt_link import MqttLink
+from function_app.domain.problems import Problem
 from function_app.ports.broker_access import ServiceCredentials
 from function_app.ports.feed import Handler
+from function_app.ports.tables import StoreError
 
 MAX_WAITING = 10_000
-"""Messages read and not yet stored. More means that the store has stopped: then the oldest unconfirmed are let go."""
+"""Messages read and not yet stored. More means that the store has stopped: then the oldest are let go."""
+HOLD_ACK_S = 0.03
+"""A call that waits for an ack writes it down itself: after this time it has, and the ingest finds nothing to change
+instead of competing for the same rows in the middle of the call."""
+TRIES = 6
+FIRST_PAUSE_S = 0.1
 
 FILTERS = (
     topics.conn(ANY, ANY),
@@ -22,11 +30,19 @@ FILTERS = (
 _log = logging.getLogger(__name__)
 
 
+class _Arrived(NamedTuple):
+    """One message, by which connection it came, and when (the event loop's clock) [s]."""
+
+    message: MQTTMessage
+    generation: int
+    at_s: float
+
+
 class MqttFeed:
     """``Feed`` over MQTT: one connection, one message at a time, so that every topic keeps its order."""
 
     def __init__(self, *, host: str, port: int, credentials: Callable[[], ServiceCredentials]) -> None:
-        self._waiting: asyncio.Queue[tuple[int, MQTTMessage]] = asyncio.Queue(MAX_WAITING)
+        self._waiting: asyncio.Queue[_Arrived] = asyncio.Queue(MAX_WAITING)
         self._link = MqttLink(
             host=host,
             port=port,
@@ -39,20 +55,40 @@ class MqttFeed:
     async def run(self, handler: Handler) -> None:
         """See ``Feed``."""
         self._link.start()
+        loop = asyncio.get_running_loop()
         try:
             while True:
-                generation, message = await self._waiting.get()
-                try:
-                    await handler(message.topic, bytes(message.payload))
-                except Exception:  # noqa: BLE001 (unconfirmed, it comes again where the broker can)
-                    _log.exception("ingest of %s failed", message.topic)
-                else:
-                    self._link.acknowledge(message, generation)
+                arrived = await self._waiting.get()
+                if arrived.message.topic.endswith(f"/{topics.ACK}"):
+                    await asyncio.sleep(max(0.0, arrived.at_s + HOLD_ACK_S - loop.time()))
+                await self._store(arrived.message, handler)
+                self._link.acknowledge(arrived.message, arrived.generation)
         finally:
             await self._link.close()
 
+    async def _store(self, message: MQTTMessage, handler: Handler) -> None:
+        """Hand it on, again while the store is busy or away for a moment.
+
+        What cannot be stored in the end is logged and confirmed all the same: brokers stop sending after a number of
+        unconfirmed messages, and one that fails for ever must not end the stream of all others.
+        """
+        pause_s = FIRST_PAUSE_S
+        for attempt in range(TRIES):
+            try:
+                await handler(message.topic, bytes(message.payload))
+            except (StoreError, Problem) as error:
+                _log.warning("ingest of %s, try %d of %d: %s", message.topic, attempt + 1, TRIES, error)
+            except Exception:  # noqa: BLE001 (whatever it is: the others go on)
+                _log.exception("ingest of %s failed", message.topic)
+                return
+            else:
+                return
+            await asyncio.sleep(pause_s)
+            pause_s *= 2
+
     def _arrived(self, message: MQTTMessage) -> None:
         if self._waiting.full():
-            _, dropped = self._waiting.get_nowait()
-            _log.warning("ingest is behind: a message of %s was not stored", dropped.topic)
-        self._waiting.put_nowait((self._link.generation, message))
+            oldest = self._waiting.get_nowait()
+            self._link.acknowledge(oldest.message, oldest.generation)
+            _log.warning("ingest is behind: a message of %s was not stored", oldest.message.topic)
+        self._waiting.put_nowait(_Arrived(message, self._link.generation, asyncio.get_running_loop().time()))
