@@ -10,6 +10,7 @@ from function_app.domain.problems import Problem, invalid
 
 MAX_BODY = 1_000_000
 """Bytes of a request's body."""
+_LENGTH_DIGITS = 20
 JSON = "application/json"
 PROBLEM_JSON = "application/problem+json"
 
@@ -69,7 +70,7 @@ async def read_or(request: Request, kind: type[T], otherwise: T) -> T:
 
 async def _bytes(request: Request) -> bytes:
     declared = request.headers.get("content-length", "0")
-    if declared.isdecimal() and int(declared) > MAX_BODY:
+    if declared.isdecimal() and (len(declared) > _LENGTH_DIGITS or int(declared) > MAX_BODY):
         raise _too_large()
     kept: bytes | None = getattr(request.state, "body", None)
     if kept is not None:

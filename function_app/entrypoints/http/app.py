@@ -8,12 +8,13 @@ from typing import Any
 from fastapi import FastAPI, Request, Response
 from fastapi.exceptions import RequestValidationError
 from starlette.exceptions import HTTPException
+from starlette.requests import ClientDisconnect
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from function_app.bootstrap import Functions
 from function_app.domain.problems import Problem, invalid, store_unavailable
 from function_app.entrypoints.http import actions, agents, auth, broker, devices, health, library
-from function_app.entrypoints.http.answers import problem
+from function_app.entrypoints.http.answers import JSON, problem
 from function_app.entrypoints.http.caller import COOKIE, Caller
 from function_app.entrypoints.http.console import Console
 from function_app.entrypoints.http.reference import reference
@@ -76,6 +77,7 @@ def _document(app: FastAPI) -> None:
             components = document.setdefault("components", {})
             # What the framework's own validation would say never leaves: refusals are problem details.
             components["schemas"] = schemas()
+            _drop_validation_errors(document)
             components["securitySchemes"] = {
                 ACCOUNT_SCHEMES[0]: {"type": "http", "scheme": "bearer", "bearerFormat": "JWT"},
                 ACCOUNT_SCHEMES[1]: {"type": "apiKey", "in": "cookie", "name": COOKIE},
@@ -89,6 +91,14 @@ def _document(app: FastAPI) -> None:
     @app.get("/api/docs", include_in_schema=False)
     async def docs() -> Response:
         return Response(reference(app.openapi()), media_type="text/html")
+
+
+def _drop_validation_errors(document: dict[str, Any]) -> None:
+    """The framework adds its own 422 wherever a route has parameters: text in a path is never refused that way."""
+    for operations in document["paths"].values():
+        for operation in operations.values():
+            if JSON in operation["responses"].get("422", {}).get("content", {}):
+                del operation["responses"]["422"]
 
 
 async def _on_problem(_request: Request, error: Exception) -> Response:
@@ -155,6 +165,8 @@ class _Headers:
 
         try:
             await self._app(scope, receive, sending)
+        except ClientDisconnect:
+            return  # who left in the middle of a request waits for no answer
         except Exception:
             _log.exception("%s %s", scope["method"], scope["path"])
             if begun:

@@ -16,6 +16,7 @@ class Console(StaticFiles):
     def __init__(self, folder: Path) -> None:
         super().__init__(directory=folder, html=True, check_dir=False)
         self._folder = folder
+        self.config_checked = True  # a folder that is not there is an answer of ours, not a fault
 
     async def get_response(self, path: str, scope: Scope) -> Response:
         """The file; 404 with a hint when the console was never built."""
