@@ -58,7 +58,7 @@ class MqttCommandBus:
 
     async def status(self) -> str:
         """See ``CommandBus``."""
-        await self._link.ready(_READY_S)
+        await self._link.tried(_READY_S)
         return self._link.trouble or "ok"
 
     async def close(self) -> None:

@@ -59,6 +59,7 @@ class MqttLink:
         self._client: mqtt.Client | None = None
         self._keeper: asyncio.Task[None] | None = None
         self._ready = asyncio.Event()
+        self._tried = asyncio.Event()
         self._lost = asyncio.Event()
         self._waiting: dict[int, asyncio.Future[None]] = {}
         self._subscribed: dict[int, asyncio.Future[None]] = {}
@@ -87,6 +88,13 @@ class MqttLink:
         except TimeoutError:
             return False
         return True
+
+    async def tried(self, timeout_s: float) -> None:
+        """Wait until it is known whether the broker can be reached, but no longer than the first try takes."""
+        self.start()
+        with contextlib.suppress(TimeoutError):
+            async with asyncio.timeout(timeout_s):
+                await self._tried.wait()
 
     async def publish(self, topic: str, payload: bytes, qos: int) -> None:
         """Send, and for QoS 1 wait for the broker's word.
@@ -145,6 +153,7 @@ class MqttLink:
                 if str(error) != self._trouble:
                     _log.warning("broker: %s", error)
                 self._trouble = str(error)
+                self._tried.set()
             finally:
                 self._let_go(client)
             await asyncio.sleep(pause_s * random.uniform(0.5, 1.0))  # noqa: S311 (spreads reconnects, hides nothing)
@@ -169,6 +178,7 @@ class MqttLink:
                     self.generation += 1
                     await self._subscribe(client)
                     self._ready.set()
+                    self._tried.set()
                     return client
             except TimeoutError as error:
                 self._drop(client)
