@@ -156,7 +156,7 @@ def _as_nobody(path: Path) -> str:
     return said
 
 
-def _try(path: Path, there: "multiprocessing.connection.Connection") -> None:  # type: ignore[name-defined]
+def _try(path: Path, there: "multiprocessing.connection.Connection") -> None:
     if os.getuid() == 0:
         os.setgroups([])
         os.setgid(_NOBODY)

@@ -157,7 +157,8 @@ def test_what_cannot_be_run_is_refused_and_takes_no_slot(
 def test_parameters_however_deep_are_run_or_refused(pair: Pair, depth: int) -> None:
     anna, robot = pair
     deep = "[" * depth + "]" * depth
-    body = '{"wait_ms":10000,"request":{"kind":"run_movement","name":"wave","parameters":{"deep":%s}}}' % deep
+    asked = f'{{"kind":"run_movement","name":"wave","parameters":{{"deep":{deep}}}}}'
+    body = f'{{"wait_ms":10000,"request":{asked}}}'
     answer = anna.ask("POST", f"/devices/{robot.device}/actions", content=body)
     if answer.status_code == 200:
         assert anna.get(f"/actions/{answer.json()['id']}").json()["request"]["parameters"]["deep"] is not None

@@ -1,0 +1,18 @@
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from tests.support.cloud import Cloud, settings
+
+
+@pytest.fixture(scope="module")
+def cloud(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Cloud]:
+    """The functions with real tables and no broker anywhere."""
+    folder = tmp_path_factory.mktemp("home")
+    console = folder / "console"
+    (console / "assets").mkdir(parents=True)
+    (console / "index.html").write_text("<!doctype html><title>console</title>")
+    (console / "assets" / "app-0123abcd.js").write_text("export {};")
+    with Cloud(settings(Path(folder), console=console)) as cloud:
+        yield cloud
