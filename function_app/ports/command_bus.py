@@ -31,6 +31,8 @@ class CommandBus(Protocol):
     def acks(self, device_topic: str, command: str) -> AbstractAsyncContextManager[AsyncIterator[Ack] | None]:
         """Acks of one command from now on, in order of arrival.
 
+        A wait for the next one may be given up and begun again.
+
         Enter it before publishing the command. Gives ``None`` where the bus only publishes (or cannot connect): then
         the answer is to be read from the tables, where the ingest entry point writes it.
         """

@@ -18,6 +18,8 @@ from function_app.services.action_rows import ActionRows, Found
 
 _POLL_S = 0.02
 _SLOWEST_POLL_S = 0.2
+_FIRST_LOOK_S = 0.05
+_SLOWEST_LOOK_S = 0.5
 
 _log = logging.getLogger(__name__)
 
@@ -59,33 +61,39 @@ class ActionAcks:
             wait_ms: At most this long.
             published: Whether to note that the command was published.
         """
-        loop = asyncio.get_running_loop()
         published_ms = self._clock.now_ms() if published else None
-        end = loop.time() + wait_ms / 1000
+        end = asyncio.get_running_loop().time() + wait_ms / 1000
         if acks is None:
             if published:
                 found = await self._write(found, (), published_ms)
             return await self._poll(found, wanted, end)
+        found, reports = await self._hear(found, acks, wanted, end)
+        return (await self._write(found, reports, published_ms)).action
+
+    async def _hear(
+        self, found: Found, acks: AsyncIterator[Ack], wanted: Status, end: float
+    ) -> tuple[Found, list[Report]]:
+        """Collect acks, and look into the tables now and then: the ingest may have heard what came before this call."""
+        loop = asyncio.get_running_loop()
         reports: list[Report] = []
         action = found.action
-        try:
-            async with asyncio.timeout_at(end):
-                while not reached(action, wanted):
-                    heard = report(await anext(acks))
-                    reports.append(heard)
-                    action = apply_report(action, heard)
-        except TimeoutError:
-            # The ingest may have heard what this call has not.
-            found = await self._rows.get(found.action.id) or found
-        return (await self._write(found, reports, published_ms)).action
+        pause_s = _FIRST_LOOK_S
+        while not reached(action, wanted) and (left_s := end - loop.time()) > 0:
+            try:
+                async with asyncio.timeout(min(pause_s, left_s)):
+                    reports.append(report(await anext(acks)))
+                action = apply_report(action, reports[-1])
+            except TimeoutError:
+                pause_s = min(2 * pause_s, _SLOWEST_LOOK_S)
+                found = await self._rows.get(found.action.id) or found
+                action = _applied(found.action, reports)
+        return found, reports
 
     async def _write(self, found: Found, reports: Iterable[Report], published_ms: int | None) -> Found:
         def changed(action: Action) -> Action:
             if published_ms is not None:
                 action = mark_published(action, published_ms)
-            for heard in reports:
-                action = apply_report(action, heard)
-            return action
+            return _applied(action, reports)
 
         return await self._rows.change(found.action.id, changed, known=found) or found
 
@@ -97,6 +105,12 @@ class ActionAcks:
             pause_s = min(2 * pause_s, _SLOWEST_POLL_S)
             found = await self._rows.get(found.action.id) or found
         return found.action
+
+
+def _applied(action: Action, reports: Iterable[Report]) -> Action:
+    for heard in reports:
+        action = apply_report(action, heard)
+    return action
 
 
 def report(ack: Ack) -> Report:

@@ -48,7 +48,7 @@ class MqttCommandBus:
         queues = commands.setdefault(command, set())
         queues.add(queue)
         try:
-            yield _drain(queue)
+            yield _Acks(queue)
         finally:
             queues.remove(queue)
             if not queues:
@@ -78,6 +78,11 @@ class MqttCommandBus:
             queue.put_nowait(ack)
 
 
-async def _drain(queue: asyncio.Queue[Ack]) -> AsyncGenerator[Ack]:
-    while True:
-        yield await queue.get()
+class _Acks(AsyncIterator[Ack]):
+    """Acks as they come. Not a generator: that would end with the first wait that is given up."""
+
+    def __init__(self, queue: asyncio.Queue[Ack]) -> None:
+        self._queue = queue
+
+    async def __anext__(self) -> Ack:
+        return await self._queue.get()
