@@ -1,5 +1,6 @@
 """Who is asking: access tokens of people and apps, signed requests of agents."""
 
+import math
 import secrets
 from collections import OrderedDict
 from dataclasses import dataclass
@@ -136,7 +137,7 @@ class Identify:
             key = (await self._keys.public()).get(str(kid))
             if key is None:
                 raise unauthorized("The access token was not issued here. Sign in again.")
-            claims = _decode(token, key, audience, leeway_s=0)
+            claims = _decode(token, key, audience, now_s=self._now_s(), leeway_s=0)
             identity = Identity(account=str(claims["sub"]), name=str(claims["name"]), session=str(claims["sid"]))
         except (jwt.PyJWTError, KeyError) as error:
             raise unauthorized(f"The access token is refused: {error}. Sign in again.") from error
@@ -149,11 +150,14 @@ class Identify:
 
     def _check_agent(self, token: str, key: Ed25519PublicKey) -> None:
         try:
-            claims = _decode(token, key, API, leeway_s=CLOCK_SKEW_S)
+            claims = _decode(token, key, API, now_s=self._now_s(), leeway_s=CLOCK_SKEW_S)
         except jwt.PyJWTError as error:
             raise unauthorized(f"The agent's token is refused: {error}.") from error
         if claims.get("iss") != "agent" or claims["exp"] - claims["iat"] > AGENT_TOKEN_S:
             raise unauthorized(f"An agent's token has iss 'agent' and lives at most {AGENT_TOKEN_S} s.")
+
+    def _now_s(self) -> float:
+        return self._clock.now_ms() / 1000
 
 
 def new_session() -> str:
@@ -161,18 +165,39 @@ def new_session() -> str:
     return new_id()
 
 
+def principal(who: Identity) -> str:
+    """A sign-in session, as the broker knows it: signing out ends its connections and nobody else's."""
+    return f"account:{who.account}:{who.session}"
+
+
 def new_secret() -> str:
     """A one-time token: 256 random bits."""
     return secrets.token_urlsafe(32)
 
 
-def _decode(token: str, key: Ed25519PublicKey, audience: str, *, leeway_s: float) -> dict[str, Any]:
+def _decode(token: str, key: Ed25519PublicKey, audience: str, *, now_s: float, leeway_s: float) -> dict[str, Any]:
+    """The claims of a signed token. Its times are judged here, by our own clock, once they are seen to be numbers.
+
+    Raises:
+        jwt.PyJWTError: Forged, for another purpose, not yet good, or expired.
+    """
     claims: dict[str, Any] = jwt.decode(
         token,
         key,
         algorithms=[ALGORITHM],
         audience=audience,
-        leeway=leeway_s,
-        options={"require": ["exp", "iat", "aud", "jti"]},
+        options={
+            "require": ["exp", "iat", "aud", "jti"],
+            "verify_exp": False,
+            "verify_iat": False,
+            "verify_nbf": False,
+        },
     )
+    times = (claims["iat"], claims["exp"])
+    if not all(isinstance(moment, int | float) and math.isfinite(moment) for moment in times):
+        raise jwt.DecodeError("exp and iat must be seconds since 1970")
+    if claims["iat"] > now_s + leeway_s:
+        raise jwt.ImmatureSignatureError("the token is from the future; set this machine's clock")
+    if claims["exp"] <= now_s - leeway_s:
+        raise jwt.ExpiredSignatureError("the token has expired")
     return claims
