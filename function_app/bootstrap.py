@@ -109,7 +109,7 @@ def build(settings: Settings, *, clock: Clock | None = None) -> Functions:
     feed = MqttFeed(host=settings.mqtt_host, port=settings.mqtt_port, credentials=access.service_credentials)
 
     identify = Identify(tables=tables, keys=keys, clock=now)
-    sign_in = SignIn(tables=tables, identify=identify, clock=now)
+    sign_in = SignIn(tables=tables, identify=identify, access=access, clock=now)
     devices = Devices(tables=tables, clock=now)
     commands = Commands(bus=bus, keys=keys, clock=now)
     movements = Movements(tables=tables, blobs=blobs, catalogue=catalogue, clock=now)

@@ -14,6 +14,7 @@ from function_app.ports.clock import Clock
 from function_app.ports.tables import Tables
 from function_app.services.control import read_lease
 from function_app.services.devices import Devices
+from function_app.services.identity import principal
 from function_app.services.lease import control_client
 
 WATCH_S = 15 * 60
@@ -120,8 +121,3 @@ class MqttCredentials:
         except BrokerAccessError as error:
             raise broker_unavailable(f"{error}.") from error
         return Issued(grant.client_id, credentials, grant.expires_at * 1000, lifetime_s, publish, subscribe)
-
-
-def principal(who: Identity) -> str:
-    """A sign-in session, as the broker knows it: signing out ends its connections and nobody else's."""
-    return f"account:{who.account}:{who.session}"

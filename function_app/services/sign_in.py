@@ -1,18 +1,31 @@
 """Signing in by a one-time link, and the accounts behind it."""
 
 import hashlib
+import logging
 from dataclasses import dataclass
 
 from function_app.domain.accounts import Account, Identity, Space
 from function_app.domain.ids import new_id
 from function_app.domain.problems import unauthorized
+from function_app.ports.broker_access import BrokerAccess, BrokerAccessError
 from function_app.ports.clock import Clock
 from function_app.ports.tables import Conflict, Row, Tables
 from function_app.services import store
-from function_app.services.identity import ACCESS_S, API, SESSION, SESSION_S, Identify, new_secret, new_session
+from function_app.services.identity import (
+    ACCESS_S,
+    API,
+    SESSION,
+    SESSION_S,
+    Identify,
+    new_secret,
+    new_session,
+    principal,
+)
 
 LINK_MS = 24 * 3600 * 1000
 FIRST_SPACE = "Home"
+
+_log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True, slots=True)
@@ -30,8 +43,9 @@ class SignedIn:
 class SignIn:
     """Accounts and their one-time links."""
 
-    def __init__(self, *, tables: Tables, identify: Identify, clock: Clock) -> None:
+    def __init__(self, *, tables: Tables, identify: Identify, access: BrokerAccess, clock: Clock) -> None:
         self._tables = tables
+        self._access = access
         self._identify = identify
         self._clock = clock
 
@@ -101,8 +115,13 @@ class SignIn:
         )
 
     async def sign_out(self, who: Identity) -> None:
-        """End the session of ``who``."""
+        """End the session of ``who``, and its connections to the broker."""
         await self._identify.sign_out(who)
+        try:
+            await self._access.revoke(principal=principal(who))
+        except BrokerAccessError as error:
+            # Signed out it is; what the broker was told ends by itself, within a quarter of an hour.
+            _log.warning("sign-out: %s", error)
 
     async def _create(self, row: Row) -> None:
         try:

@@ -1,0 +1,36 @@
+"""Signing out, seen from the broker."""
+
+from collections.abc import Callable
+from typing import Any
+
+import pytest
+
+from function_app.ports.broker_access import Credentials
+from tests.support.brokers import BROKERS, Client, RunningBroker, wait_until
+from tests.support.cloud import Cloud, Person, Robot
+
+
+def watching(broker: RunningBroker, person: Person) -> Client:
+    issued: dict[str, Any] = person.post("/mqtt/credentials", {"purpose": "watch"}).json()
+    client = broker.connect(issued["client_id"], Credentials(issued["username"], issued["password"]))
+    assert client.connected.is_set(), client.answer
+    return client
+
+
+@pytest.mark.parametrize("broker", BROKERS, indirect=True)
+def test_signing_out_ends_the_sessions_own_connections_and_nobody_elses(
+    cloud: Cloud, broker: RunningBroker, pair: tuple[Person, Robot]
+) -> None:
+    anna, _ = pair
+    elsewhere = cloud.sign_in("anna")
+    with watching(broker, anna) as here, watching(broker, elsewhere) as there:
+        assert anna.post("/auth/sign-out").status_code == 204
+        wait_until(here.disconnected.is_set, "the end of the connection")
+        assert not there.disconnected.is_set()
+        assert there.subscribe(elsewhere.post("/mqtt/credentials", {"purpose": "watch"}).json()["subscribe"][0]) == [1]
+
+
+def test_signing_out_works_while_the_broker_is_away(open_cloud: Callable[..., Cloud]) -> None:
+    anna = open_cloud(at=None).sign_in("anna")
+    assert anna.post("/auth/sign-out").status_code == 204
+    assert anna.get("/accounts/me").status_code == 401
