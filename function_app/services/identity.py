@@ -170,11 +170,6 @@ def principal(who: Identity) -> str:
     return f"account:{who.account}:{who.session}"
 
 
-def principal(who: Identity) -> str:
-    """A sign-in session, as the broker knows it: signing out ends its connections and nobody else's."""
-    return f"account:{who.account}:{who.session}"
-
-
 def new_secret() -> str:
     """A one-time token: 256 random bits."""
     return secrets.token_urlsafe(32)
