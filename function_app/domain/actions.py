@@ -153,17 +153,21 @@ class Verdict(StrEnum):
 
     WAIT = "wait"
     PUBLISH = "publish"
+    CANCEL = "cancel"
     EXPIRE = "expire"
     LOSE = "lose"
 
 
 def judge(action: Action, now_ms: int) -> Verdict:
-    """What is due. An unanswered command is sent again until its time to live ends: the device drops doubles by id."""
+    """What is due. An unanswered command is sent again until its time to live ends: the device drops doubles by id.
+
+    Once somebody wants it cancelled, that is what is sent again: it must not begin because a message was lost.
+    """
     if now_ms >= action.deadline_ms:
         return Verdict.LOSE
     if action.status.rank < Status.RECEIVED.rank:
         if now_ms < action.expires_ms:
-            return Verdict.PUBLISH
+            return Verdict.CANCEL if action.cancel_id else Verdict.PUBLISH
         if now_ms >= action.expires_ms + GRACE_MS:
             return Verdict.EXPIRE
     return Verdict.WAIT

@@ -82,7 +82,9 @@ class Sweep:
             await self._pending.drop(note)
             return
         verdict = judge(found.action, now_ms)
-        if verdict is Verdict.EXPIRE:
+        if verdict is Verdict.EXPIRE and found.action.cancel_id:
+            await self._end(found, Status.CANCELLED, "cancelled", "Cancelled before the device took it.", now_ms)
+        elif verdict is Verdict.EXPIRE:
             message = "The device did not take the command in time. Check that it is online, then start it again."
             await self._end(found, Status.EXPIRED, "no-answer", message, now_ms)
         elif verdict is Verdict.LOSE:
@@ -94,6 +96,8 @@ class Sweep:
             await self._pending.note(action_id, next_look_ms(found.action, now_ms))
             if verdict is Verdict.PUBLISH:
                 await self._publish(found, now_ms)
+            elif verdict is Verdict.CANCEL:
+                await self._cancel(found.action)
         await self._pending.drop(note)
 
     async def _end(self, found: Found, status: Status, code: str, message: str, now_ms: int) -> None:

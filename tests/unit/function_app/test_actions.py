@@ -187,6 +187,12 @@ def test_a_timer_repeats_what_nobody_answered_then_ends_it(status: Status, after
     assert judge(replace(NEW, status=status), NEW.created_ms + after_ms) is verdict
 
 
+def test_what_was_cancelled_is_not_sent_again() -> None:
+    cancelled = replace(NEW, status=Status.PUBLISHED, cancel_id="x")
+    assert judge(cancelled, NEW.created_ms + 5_000) is Verdict.CANCEL
+    assert judge(cancelled, NEW.created_ms + 10_000 + GRACE_MS) is Verdict.EXPIRE
+
+
 @given(st.sampled_from(list(Status)[:5]), st.integers(min_value=0, max_value=59_999))
 def test_the_next_look_is_later_and_never_after_the_deadline(status: Status, after_ms: int) -> None:
     now_ms = NEW.created_ms + after_ms
