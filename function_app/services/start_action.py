@@ -223,7 +223,7 @@ class StartAction:
                 writes.append(control.write_lease(plan.device.id, lease))
             if start.once:
                 data = {"action": plan.action, "request": start.fingerprint()}
-                writes.append(Write("create", Row(plan.device.id, _once_key(who, start), data)))
+                writes.append(Write("create", Row(plan.device.id, _once_key(who, plan.device, start), data)))
             rows = await self._tables.batch(store.CONTROL, writes)
             return Found(action, rows[0]), True
 
@@ -249,7 +249,7 @@ class StartAction:
         """The action that an earlier request with the same idempotency key started."""
         if not start.once:
             return None
-        row = await self._tables.get(store.CONTROL, device.id, _once_key(who, start))
+        row = await self._tables.get(store.CONTROL, device.id, _once_key(who, device, start))
         if row is None:
             return None
         if row.data["request"] != start.fingerprint():
@@ -264,5 +264,6 @@ def device_busy(action: str) -> Problem:
     return Problem("device-busy", 409, "The device is busy", detail, extras={"action": action})
 
 
-def _once_key(who: Identity, start: Start) -> str:
-    return "once:" + hashlib.sha256(f"{who.account}\n{start.once}".encode()).hexdigest()
+def _once_key(who: Identity, device: Device, start: Start) -> str:
+    """Of one account and one pairing: the actions of an earlier pairing are nobody's any more."""
+    return "once:" + hashlib.sha256(f"{who.account}\n{device.pairing}\n{start.once}".encode()).hexdigest()
