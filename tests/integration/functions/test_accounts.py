@@ -1,0 +1,192 @@
+"""Signing in by a one-time link, cookies, sign-out."""
+
+from http.cookies import SimpleCookie
+from pathlib import Path
+from typing import Any
+
+import httpx
+import jwt
+import pytest
+from hypothesis import given
+from hypothesis import settings as quickly
+from hypothesis import strategies as st
+
+from device_agent.protocol import signing
+from tests.support.cloud import API, Cloud, MovingClock, problem, settings
+
+SIGN_IN = f"{API}/auth/sign-in"
+
+
+def sign_in(cloud: Cloud, link: str) -> httpx.Response:
+    return cloud.ask("POST", SIGN_IN, json={"link": link})
+
+
+def test_a_link_signs_in_once(cloud: Cloud) -> None:
+    link = cloud.link("anna")
+    answer = sign_in(cloud, link)
+    body = answer.json()
+    assert (body["token_type"], body["expires_in_s"], body["account"]["name"]) == ("Bearer", 3600, "anna")
+    assert answer.headers["cache-control"] == "no-store"
+    problem(sign_in(cloud, link), 401, "unauthorized")
+
+
+def test_ten_who_bring_one_link_at_once_are_one_session(cloud: Cloud) -> None:
+    link = cloud.link("anna")
+
+    async def all_at_once() -> list[httpx.Response]:
+        import asyncio
+
+        client = cloud.client()
+        return await asyncio.gather(*(client.post(SIGN_IN, json={"link": link}) for _ in range(10)))
+
+    statuses = sorted(answer.status_code for answer in cloud.run(all_at_once()))
+    assert statuses == [200] + [401] * 9
+
+
+@pytest.mark.parametrize("link", ["x", "", "A" * 43, "🤖", "x" * 201])
+def test_what_is_no_link_signs_nobody_in(cloud: Cloud, link: str) -> None:
+    assert sign_in(cloud, link).status_code in {401, 422}
+
+
+def test_a_link_is_good_for_a_day(home: Path) -> None:
+    clock = MovingClock()
+    with Cloud(settings(home), clock=clock) as cloud:
+        early, late = cloud.link("anna"), cloud.link("anna")
+        clock.advance(24 * 3600 - 60)
+        assert sign_in(cloud, early).status_code == 200
+        clock.advance(60)
+        problem(sign_in(cloud, late), 401, "unauthorized")
+
+
+def test_only_the_links_hash_is_stored(cloud: Cloud, home: Path) -> None:
+    link = cloud.link("anna")
+    stored = b"".join(path.read_bytes() for path in home.glob("tables.sqlite*"))
+    assert b"SignIns" in stored
+    assert link.encode() not in stored
+
+
+def test_the_same_name_is_the_same_account_with_one_space(cloud: Cloud) -> None:
+    one, two = cloud.sign_in("anna"), cloud.sign_in("anna")
+    assert one.account == two.account
+    assert one.session != two.session
+    assert one.get("/accounts/me").json() == {"id": one.account, "name": "anna", "session": one.session}
+    (space,) = one.get("/spaces").json()["items"]
+    assert set(space) == {"id", "name"}
+    assert two.get("/spaces").json()["items"] == [space]
+    (other,) = cloud.sign_in("bert").get("/spaces").json()["items"]
+    assert other["id"] != space["id"]
+
+
+class TestCookie:
+    @pytest.fixture
+    def page(self, cloud: Cloud) -> httpx.AsyncClient:
+        """A browser that has signed in."""
+        client = cloud.client()
+        answer = cloud.run(client.post(SIGN_IN, json={"link": cloud.link("anna")}))
+        cookie = SimpleCookie(answer.headers["set-cookie"])["telescope_session"]
+        assert (cookie["path"], cookie["samesite"], cookie["max-age"]) == ("/api", "Strict", "43200")
+        assert cookie["httponly"] is True
+        assert cookie["secure"] == ""
+        return client
+
+    def test_it_reads_and_changes_only_with_the_header(self, cloud: Cloud, page: httpx.AsyncClient) -> None:
+        assert cloud.run(page.get(f"{API}/accounts/me")).json()["name"] == "anna"
+        for method, path, body in (
+            ("POST", "/auth/sign-out", None),
+            ("POST", "/agents/claim", {"code": "BCDF-GHJK"}),
+            ("PUT", "/robot-types/ur5/movements/mine", {"source": "1"}),
+            ("DELETE", "/agents/abcdefgh23", None),
+            ("POST", "/mqtt/credentials", {"purpose": "watch"}),
+            ("POST", "/devices/abcdefgh23-arm/stop", None),
+        ):
+            problem(cloud.run(page.request(method, API + path, json=body)), 403, "forbidden")
+        headers = {"X-Telescope-Client": "console"}
+        answer = cloud.run(page.put(f"{API}/robot-types/ur5/movements/mine", json={"source": "1"}, headers=headers))
+        assert answer.status_code == 201
+
+    def test_sign_out_clears_it_and_ends_the_session(self, cloud: Cloud, page: httpx.AsyncClient) -> None:
+        stolen = dict(page.cookies)
+        answer = cloud.run(page.post(f"{API}/auth/sign-out", headers={"X-Telescope-Client": "console"}))
+        assert answer.status_code == 204
+        assert dict(page.cookies) == {}
+        problem(cloud.run(page.get(f"{API}/accounts/me")), 401, "unauthorized")
+        thief = cloud.client(cookies=stolen)
+        problem(cloud.run(thief.get(f"{API}/accounts/me")), 401, "unauthorized")
+
+    def test_it_is_no_access_token_and_an_access_token_is_no_cookie(
+        self, cloud: Cloud, page: httpx.AsyncClient
+    ) -> None:
+        token = page.cookies["telescope_session"]
+        answer = cloud.ask("GET", f"{API}/accounts/me", headers={"Authorization": f"Bearer {token}"})
+        problem(answer, 401, "unauthorized")
+        client = cloud.client(cookies={"telescope_session": cloud.sign_in("anna").token})
+        problem(cloud.run(client.get(f"{API}/accounts/me")), 401, "unauthorized")
+
+    def test_over_https_it_is_secure(self, home: Path) -> None:
+        from dataclasses import replace
+
+        with Cloud(replace(settings(home), public_url="https://telescope.example")) as cloud:
+            assert "; Secure" in sign_in(cloud, cloud.link("anna")).headers["set-cookie"]
+
+
+class TestAccessToken:
+    def test_it_ends_after_an_hour(self, home: Path) -> None:
+        clock = MovingClock()
+        with Cloud(settings(home), clock=clock) as cloud:
+            used, unused = cloud.sign_in("anna"), cloud.sign_in("anna")
+            assert used.get("/accounts/me").status_code == 200
+            clock.advance(3_590)
+            assert used.get("/accounts/me").status_code == 200
+            clock.advance(20)
+            for person in (used, unused):
+                problem(person.get("/accounts/me"), 401, "unauthorized")
+            assert cloud.sign_in("anna").get("/accounts/me").status_code == 200
+
+    def test_sign_out_ends_this_session_and_no_other_in_every_instance(self, home: Path) -> None:
+        clock = MovingClock()
+        with Cloud(settings(home), clock=clock) as here, Cloud(settings(home), clock=clock) as there:
+            gone, stays = here.sign_in("anna"), here.sign_in("anna")
+            headers = {"Authorization": f"Bearer {gone.token}"}
+            assert there.ask("GET", f"{API}/accounts/me", headers=headers).status_code == 200
+            assert gone.post("/auth/sign-out").status_code == 204
+            problem(gone.get("/accounts/me"), 401, "unauthorized")
+            clock.advance(5)
+            problem(there.ask("GET", f"{API}/accounts/me", headers=headers), 401, "unauthorized")
+            assert stays.get("/accounts/me").status_code == 200
+
+    def test_one_that_others_made_is_refused(self, cloud: Cloud) -> None:
+        anna = cloud.sign_in("anna")
+        claims = jwt.decode(anna.token, options={"verify_signature": False})
+        kid = jwt.get_unverified_header(anna.token)["kid"]
+        evil = signing.generate()
+        head, body, tail = anna.token.split(".")
+        for token in (
+            jwt.encode(claims, evil, "EdDSA", headers={"kid": kid}),
+            jwt.encode(claims, evil, "EdDSA", headers={"kid": signing.key_id(evil.public_key())}),
+            jwt.encode(claims, "x" * 32, "HS256", headers={"kid": kid}),
+            jwt.encode(claims, None, "none", headers={"kid": kid}),
+            f"{head}.{body}.",
+            f"{head}.{body}.{tail[:-4]}AAAA",
+            f"{head}.{body[:-4]}AAAA.{tail}",
+        ):
+            answer = cloud.ask("GET", f"{API}/accounts/me", headers={"Authorization": f"Bearer {token}"})
+            problem(answer, 401, "unauthorized")
+            assert answer.headers["www-authenticate"] == "Bearer"
+
+    @quickly(max_examples=80, deadline=None)
+    @given(st.text(alphabet=st.characters(min_codepoint=33, max_codepoint=255), max_size=60))
+    def test_any_text_is_refused(self, text: str) -> None:
+        shared = _SHARED[0]
+        for name in ("/accounts/me", "/agents/enrollment"):
+            header = f"Bearer {text}".encode("latin-1")
+            answer = shared.ask("GET", API + name, headers={b"Authorization": header})  # type: ignore[arg-type]
+            problem(answer, 401, "unauthorized")
+
+    @pytest.fixture(autouse=True)
+    def _shared(self, cloud: Cloud) -> Any:
+        _SHARED[:] = [cloud]
+        yield
+        _SHARED.clear()
+
+
+_SHARED: list[Cloud] = []
