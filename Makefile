@@ -7,11 +7,12 @@ BIN := .venv/bin
 NODE_READY = command -v npm >/dev/null && node -e 'process.exit(parseInt(process.versions.node) >= 20 ? 0 : 1)'
 NPM = PATH="$(if $(wildcard $(BIN)/npm),$(CURDIR)/$(BIN):)$$PATH" npm --prefix web
 
-.PHONY: help up env console test test-long check contract requirements clean
+.PHONY: help up link env console test test-long check contract requirements clean
 .DELETE_ON_ERROR:
 
 help:
 	@echo "make up            run Telescope on this machine"
+	@echo "make link          print another one-time sign-in link"
 	@echo "make test          check and test everything (about ten minutes on two cores)"
 	@echo "make test-long     the same with every suite at full size"
 	@echo "make check         linters, types, import contracts, generated files"
@@ -20,6 +21,9 @@ help:
 
 up: env console
 	@exec $(BIN)/python -m infra.local
+
+link: env
+	@$(BIN)/python -m function_app sign-in-link
 
 env: .venv/.local
 

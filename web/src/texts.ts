@@ -36,7 +36,7 @@ export const texts = {
     explain: "Open the sign-in link to come in. Each link works once.",
     where:
       "The program that runs this server prints one when it starts: look in its terminal for the line that begins with “ready”. For another one, run this there:",
-    command: "python -m function_app sign-in-link",
+    command: "make link",
     pasted: "Or paste the link here",
     use: "Sign in",
     notALink: "This is not a sign-in link: it has “#sign-in=” and a token in it.",
