@@ -1,0 +1,121 @@
+"""A tenant sees nothing of another: every route with the other's ids answers as if there were nothing."""
+
+import re
+from typing import Any
+
+import pytest
+
+from function_app.services import store
+from tests.support.cloud import Cloud, Person, Robot, paired, problem
+
+BODIES: dict[str, Any] = {
+    "take_lease": {},
+    "start_action": {"request": {"kind": "move_joints", "position_rad": {"elbow": 1.0}}},
+    "stop_device": {"reason": "x"},
+    "put_movement": {"source": "1"},
+}
+TABLES = [name for key, name in vars(store).items() if key.isupper() and isinstance(name, str)]
+
+
+def everything(cloud: Cloud) -> list[Any]:
+    """Every row there is, except who has tried how often."""
+    db: Any = cloud.functions.tables
+    return [row for row in db._run("SELECT tab, part, key, etag FROM rows ORDER BY 1, 2, 3") if row[0] != "Attempts"]
+
+
+@pytest.fixture
+def strangers(cloud: Cloud) -> Any:
+    """Anna with a robot, a lease and a running action; and Bert with a robot of his own."""
+    with paired(cloud, "anna") as (anna, robot), paired(cloud, "bert") as (bert, other):
+        epoch = anna.take(robot.device, lease_ms=600_000).json()["epoch"]
+        action = anna.start(robot.device, epoch=epoch, wait_ms=10_000).json()["id"]
+        anna.put("/robot-types/ur5/movements/secret", {"source": "'anna'"})
+        yield anna, robot, action, bert, other
+
+
+def test_every_route_with_the_others_ids_finds_nothing_and_changes_nothing(
+    cloud: Cloud, strangers: tuple[Person, Robot, str, Person, Robot]
+) -> None:
+    _, robot, action, bert, _ = strangers
+    ids = {
+        "device": robot.device,
+        "agent": robot.id,
+        "action": action,
+        "robot_type": "ur5",
+        "name": "secret",
+    }
+    told = len(robot.commands)
+    before = everything(cloud)
+    asked = set()
+    for path, operations in cloud.app.openapi()["paths"].items():
+        if not set(re.findall(r"{(\w+)}", path)) & {"device", "agent", "action", "name"}:
+            continue
+        for method, operation in operations.items():
+            name = operation["operationId"]
+            if name == "put_movement":
+                continue  # one's own of that name may be made
+            where = path.format(**ids).removeprefix("/api/v1") + ("?epoch=1" if name == "release_lease" else "")
+            answer = bert.ask(method.upper(), where, json=BODIES[name]) if name in BODIES else bert.ask(method, where)
+            assert answer.status_code == 404, f"{name}: {answer.status_code} {answer.text}"
+            detail = problem(answer, 404, answer.json()["type"].rpartition("/")[2])["detail"]
+            assert "anna" not in detail
+            asked.add(name)
+    assert {
+        "get_device",
+        "get_lease",
+        "take_lease",
+        "release_lease",
+        "start_action",
+        "list_actions",
+        "get_action",
+        "cancel_action",
+        "stop_device",
+        "reset_stop",
+        "unpair_agent",
+        "get_movement",
+        "delete_movement",
+    } <= asked
+    control = {"purpose": "control", "device": robot.device, "epoch": 1}
+    problem(bert.post("/mqtt/credentials", control), 404, "device-unknown")
+    assert everything(cloud) == before
+    assert len(robot.commands) == told
+    assert robot.stops == []
+
+
+def test_what_is_not_there_is_answered_as_what_is_anothers(
+    strangers: tuple[Person, Robot, str, Person, Robot],
+) -> None:
+    _, robot, action, bert, _ = strangers
+    nobodys = "zzzzzzzzzz"
+    for foreign, missing in (
+        (f"/devices/{robot.device}", f"/devices/{nobodys}-arm"),
+        (f"/actions/{action}", f"/actions/{nobodys}-arm-{action[-20:]}"),
+        (f"/devices/{robot.device}/actions", f"/devices/{nobodys}-arm/actions"),
+    ):
+        one, two = bert.get(foreign).json(), bert.get(missing).json()
+        assert one["detail"].replace(robot.id, nobodys) == two["detail"]
+        assert {**one, "detail": ""} == {**two, "detail": ""}
+
+
+def test_lists_hold_ones_own_only(strangers: tuple[Person, Robot, str, Person, Robot]) -> None:
+    _, robot, _, bert, other = strangers
+    for path in ("/devices", "/agents", "/spaces", "/robot-types/ur5/movements"):
+        text = bert.get(path).text
+        assert robot.id not in text
+        assert robot.space not in text
+        assert "secret" not in text
+    assert [item["id"] for item in bert.get("/devices").json()["items"]] == [other.device]
+    watch = bert.post("/mqtt/credentials", {"purpose": "watch"}).json()
+    assert not [topic for topic in (*watch["subscribe"], *watch["publish"]) if robot.space in topic]
+
+
+def test_a_cursor_of_anothers_list_shows_nothing_of_it(
+    cloud: Cloud, strangers: tuple[Person, Robot, str, Person, Robot]
+) -> None:
+    anna, robot, _, bert, other = strangers
+    with paired(cloud, "anna") as (again, _):
+        cursor = again.get("/devices", params={"limit": 1}).json()["cursor"]
+    assert cursor is not None
+    found = {item["id"] for item in bert.get("/devices", params={"cursor": cursor}).json()["items"]}
+    assert found <= {other.device}
+    assert anna.get(f"/devices/{robot.device}").status_code == 200
