@@ -66,8 +66,9 @@ class SignIn:
         spaces = await self.spaces(account.id)
         if not spaces:
             space = Space(id=str(row.data["space"]), name=FIRST_SPACE)
-            await self._create(Row(account.id, f"space:{space.id}", store.fields(space)))
+            # The space last: as long as it is not there, all of this is done again.
             await self._create(Row(account.id, "account", store.fields(account)))
+            await self._create(Row(account.id, f"space:{space.id}", store.fields(space)))
         return account
 
     async def spaces(self, account: str) -> tuple[Space, ...]:
