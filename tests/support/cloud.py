@@ -195,7 +195,9 @@ Answers = Iterable[AckStatus | Ack]
 
 
 class Robot:
-    """An agent as the protocol says: own key, broker credentials from the API, an ack for each signed command.
+    """An agent as the protocol says: own key, broker credentials from the API, acks for each signed command.
+
+    A command that comes a second time is answered with the last ack, and not obeyed.
 
     Attributes:
         reports: What it answers to a new action; a test may put another function here.
@@ -223,6 +225,7 @@ class Robot:
         self.link: Client | None = None
         self._keys: dict[str, Any] = {}
         self._sequences: dict[str, int] = {}
+        self._said: dict[str, bytes] = {}
 
     @property
     def device(self) -> str:
@@ -329,7 +332,10 @@ class Robot:
         command = codec.decode(signing.verify(message.payload, self._keys), Command)
         seen = self.payloads.setdefault(command.id, [])
         seen.append(message.payload)
+        topic_of_acks = topics.device(topic.space, topic.agent, topic.device, topics.ACK)
         if len(seen) > 1:
+            if command.id in self._said and not self.silent and self.link is not None:
+                self.link.publish(topic_of_acks, self._said[command.id])
             return
         self.commands.append(command)
         if self.silent or self.link is None:
@@ -337,7 +343,8 @@ class Robot:
         action = isinstance(command.request, MoveJoints | RunMovement)
         for each in self.reports(command) if action else (AckStatus.RECEIVED, AckStatus.DONE):
             ack = each if isinstance(each, Ack) else self.ack(command.id, each)
-            self.link.publish(topics.device(topic.space, topic.agent, topic.device, topics.ACK), codec.encode(ack))
+            self._said[command.id] = codec.encode(ack)
+            self.link.publish(topic_of_acks, self._said[command.id])
 
     def __enter__(self) -> Self:
         return self
