@@ -13,7 +13,7 @@ NPM = PATH="$(if $(wildcard $(BIN)/npm),$(CURDIR)/$(BIN):)$$PATH" npm --prefix w
 help:
 	@echo "make up            run Telescope on this machine"
 	@echo "make link          print another one-time sign-in link"
-	@echo "make test          check and test everything (about ten minutes on two cores)"
+	@echo "make test          check and test everything (about six minutes on two cores)"
 	@echo "make test-long     the same with every suite at full size"
 	@echo "make check         linters, types, import contracts, generated files"
 	@echo "make contract      regenerate docs/asyncapi.json and web/src/core/protocol.ts"
