@@ -164,7 +164,7 @@ class TestAccessToken:
             jwt.encode(claims, evil, "EdDSA", headers={"kid": kid}),
             jwt.encode(claims, evil, "EdDSA", headers={"kid": signing.key_id(evil.public_key())}),
             jwt.encode(claims, "x" * 32, "HS256", headers={"kid": kid}),
-            jwt.encode(claims, None, "none", headers={"kid": kid}),
+            jwt.encode(claims, "", "none", headers={"kid": kid}),
             f"{head}.{body}.",
             f"{head}.{body}.{tail[:-4]}AAAA",
             f"{head}.{body[:-4]}AAAA.{tail}",
@@ -179,7 +179,7 @@ class TestAccessToken:
         shared = _SHARED[0]
         for name in ("/accounts/me", "/agents/enrollment"):
             header = f"Bearer {text}".encode("latin-1")
-            answer = shared.ask("GET", API + name, headers={b"Authorization": header})  # type: ignore[arg-type]
+            answer = shared.ask("GET", API + name, headers={b"Authorization": header})
             problem(answer, 401, "unauthorized")
 
     @pytest.fixture(autouse=True)

@@ -6,7 +6,8 @@ from typing import Any
 import pytest
 
 from device_agent.protocol import signing
-from tests.support.brokers import BROKERS, Credentials, RunningBroker, wait_until
+from function_app.ports.broker_access import Credentials
+from tests.support.brokers import BROKERS, RunningBroker, wait_until
 from tests.support.cloud import API, Cloud, MovingClock, Person, Robot, paired, problem, settings
 
 Pair = tuple[Person, Robot]

@@ -3,7 +3,8 @@
 import pytest
 
 from device_agent.protocol import topics
-from tests.support.brokers import BROKERS, PATIENCE_S, SILENCE_S, Client, Credentials, RunningBroker, wait_until
+from function_app.ports.broker_access import Credentials
+from tests.support.brokers import BROKERS, PATIENCE_S, SILENCE_S, Client, RunningBroker, wait_until
 from tests.support.cloud import Cloud, Person, Robot, paired, problem
 
 Pair = tuple[Person, Robot]

@@ -3,7 +3,8 @@
 import pytest
 
 from device_agent.protocol.messages import AckStatus, GrantLease, ReleaseLease
-from tests.support.brokers import BROKERS, Credentials, RunningBroker, wait_until
+from function_app.ports.broker_access import Credentials
+from tests.support.brokers import BROKERS, RunningBroker, wait_until
 from tests.support.cloud import Cloud, Person, Robot, problem
 
 Pair = tuple[Person, Robot]

@@ -55,9 +55,10 @@ class TestWithoutAnswer:
         wait_until(lambda: robot.commands, "the command")
         cloud.sweep()
         assert len(robot.payloads[action]) == 1, "not before its time"
-        for count in (2, 3):
-            pass_time(cloud, 1.1)
-            wait_until(lambda count=count: len(robot.payloads[action]) == count, "the command again")
+        pass_time(cloud, 1.1)
+        wait_until(lambda: len(robot.payloads[action]) == 2, "the command again")
+        pass_time(cloud, 1.1)
+        wait_until(lambda: len(robot.payloads[action]) == 3, "the command a third time")
         assert len(set(robot.payloads[action])) == 1
         robot.report(action, AckStatus.RECEIVED)
         wait_until(lambda: anna.action(action)["status"] == "received", "the ack")
@@ -238,16 +239,19 @@ class CutTables:
         return await self._inner.query(*arguments, **options)
 
     async def create(self, table: str, row: Row) -> Row:
-        return await self._cut(self._inner.create, table, row)
+        created: Row = await self._cut(self._inner.create, table, row)
+        return created
 
     async def replace(self, table: str, row: Row) -> Row:
-        return await self._cut(self._inner.replace, table, row)
+        replaced: Row = await self._cut(self._inner.replace, table, row)
+        return replaced
 
     async def delete(self, table: str, row: Row) -> None:
         await self._cut(self._inner.delete, table, row)
 
     async def batch(self, table: str, writes: list[Write]) -> tuple[Row, ...]:
-        return await self._cut(self._inner.batch, table, writes)
+        written: tuple[Row, ...] = await self._cut(self._inner.batch, table, writes)
+        return written
 
     async def _cut(self, write: Callable[..., Any], *arguments: Any) -> Any:
         self._knife.check()
