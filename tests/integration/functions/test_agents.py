@@ -30,7 +30,8 @@ class TestEnroll:
         robot = alone.robot()
         answer = robot.enroll()
         body = answer.json()
-        assert (answer.status_code, body["agent"], body["expires_in_s"]) == (201, robot.id, 300)
+        assert (answer.status_code, body["agent"]) == (201, robot.id)
+        assert 280 <= body["expires_in_s"] <= 300
         assert len(body["claim_code"]) == 9
         assert robot.enrollment() | {"keys": []} == {
             "agent": robot.id,
