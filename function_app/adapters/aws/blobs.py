@@ -1,0 +1,199 @@
+"""Blobs in one S3 bucket.
+
+An object's key is the blob's name, but for what S3 or the way to it does not take (``encode``), and for names over 240
+characters (``names``), which are whole in the object's metadata.
+"""
+
+import asyncio
+import base64
+import random
+import re
+from typing import Any
+from weakref import WeakValueDictionary
+
+from function_app.adapters import rows
+from function_app.adapters.aws import names
+from function_app.adapters.aws.client import Client, Refused
+from function_app.ports.blobs import MAX_BYTES, MAX_NAME_LENGTH
+from function_app.ports.tables import StoreError
+
+TRIES = 30
+"""How often an append begins anew because another instance has written to the same blob meanwhile."""
+_PAUSE_S = 0.01
+_LONGEST_PAUSE_S = 0.2
+_PAGE = 1_000
+"""Most keys that S3 lists at once."""
+_FIRST = "us-east-1"
+"""Amazon's first region, which is not named when a bucket is made there."""
+_TAIL = "tail"
+_NO_NAME = "a blob's name is Unicode text without lone surrogates"
+_NOT_THERE = frozenset({"404", "NoSuchKey"})
+_WRITTEN_MEANWHILE = frozenset({"ConditionalRequestConflict", "PreconditionFailed", "NoSuchKey"})
+_HIDDEN = re.compile(r"[\x00-!]|(?:(?<=/)|^)\.", re.ASCII)
+_SHOWN = re.compile(r"!([0-9a-f]{2})|(?:(?<=/)|^)\._")
+
+
+class S3Blobs:
+    """``Blobs`` in ``bucket``. Connects at the first call."""
+
+    def __init__(self, *, bucket: str, region: str, endpoint: str | None = None) -> None:
+        """``endpoint`` is an emulator's address. Credentials come the SDK's own way: a role, or the environment."""
+        self._bucket = bucket
+        self._region = region
+        self._client = Client(
+            "s3", what=f"the S3 bucket '{bucket}'", how="private, without versions", region=region, endpoint=endpoint
+        )
+        self._appending: WeakValueDictionary[str, asyncio.Lock] = WeakValueDictionary()
+
+    async def prepare(self) -> None:
+        """Make the bucket where there is none. Safe to repeat, by many at once.
+
+        Raises:
+            StoreError: It cannot be made; its name may be another account's.
+        """
+        place = {"CreateBucketConfiguration": {"LocationConstraint": self._region}}
+        try:
+            await self._client.call("create_bucket", Bucket=self._bucket, **(place if self._region != _FIRST else {}))
+        except Refused as error:
+            if error.code != "BucketAlreadyOwnedByYou":
+                raise self._client.unusable(error) from error
+
+    async def put(self, name: str, content: bytes) -> None:
+        """See ``Blobs``."""
+        _check(content)
+        place = self._place(name)
+        await self._ask("put_object", **place, **_metadata(name), Body=content)
+
+    async def get(self, name: str) -> bytes | None:
+        """See ``Blobs``."""
+        found = await self._read(self._place(name))
+        return None if found is None else found[0]
+
+    async def append(self, name: str, content: bytes) -> None:
+        """See ``Blobs``."""
+        _check(content)
+        place = self._place(name)
+        # S3 only writes whole objects. One after the other here; other instances are told by the ETag.
+        async with self._appending.setdefault(name, asyncio.Lock()):
+            for attempt in range(TRIES):
+                if await self._append(place, _metadata(name), content):
+                    return
+                pause_s = min(_PAUSE_S * 2**attempt, _LONGEST_PAUSE_S)
+                await asyncio.sleep(random.uniform(0, pause_s))  # noqa: S311 (spreads writers)
+        raise StoreError(f"too many append to the blob '{name}' at once. Try again.")
+
+    async def delete(self, name: str) -> None:
+        """See ``Blobs``."""
+        await self._ask("delete_object", **self._place(name))
+
+    async def list(self, prefix: str, *, limit: int = 1000) -> tuple[str, ...]:
+        """See ``Blobs``."""
+        if not rows.is_text(prefix):
+            raise ValueError(_NO_NAME)
+        if limit < 1:
+            return ()
+        question = {
+            "Bucket": self._bucket,
+            "Prefix": encode(prefix[: names.HEAD]),
+            "MaxKeys": min(limit, _PAGE),
+        }
+        found: list[str] = []
+        while True:
+            answer = await self._ask("list_objects_v2", **question)
+            some = await asyncio.gather(*(self._name(each["Key"]) for each in answer.get("Contents", ())))
+            found += (name for name in some if name is not None and name.startswith(prefix))
+            if not answer["IsTruncated"] or _whole(found, limit):
+                break
+            question["ContinuationToken"] = answer["NextContinuationToken"]
+        return tuple(sorted(found)[:limit])
+
+    async def close(self) -> None:
+        """See ``Blobs``."""
+        await self._client.close()
+
+    async def _name(self, key: str) -> str | None:
+        """The name of an object; ``None`` when it has gone meanwhile."""
+        shown = decode(key)
+        if not names.is_long(shown):
+            return shown
+        try:
+            found = await self._client.call("head_object", Bucket=self._bucket, Key=key)
+        except Refused as error:
+            if error.code in _NOT_THERE:
+                return None
+            raise self._client.unusable(error) from error
+        return shown[: names.HEAD] + base64.b64decode(found["Metadata"][_TAIL]).decode()
+
+    def _place(self, name: str) -> dict[str, str]:
+        if not 1 <= len(name) <= MAX_NAME_LENGTH:
+            raise ValueError(f"a blob's name has 1 to {MAX_NAME_LENGTH} characters, not {len(name)}")
+        if not rows.is_text(name):
+            raise ValueError(_NO_NAME)
+        key = encode(name[: names.HEAD])
+        return {"Bucket": self._bucket, "Key": key if not names.is_long(name) else key + names.digest(name)}
+
+    async def _read(self, place: dict[str, str]) -> tuple[bytes, str] | None:
+        """Content and ETag."""
+        try:
+            found = await self._client.call("get_object", **place)
+        except Refused as error:
+            if error.code in _NOT_THERE:
+                return None
+            raise self._client.unusable(error) from error
+        return found["Body"], found["ETag"]
+
+    async def _append(self, place: dict[str, str], metadata: dict[str, Any], content: bytes) -> bool:
+        """Write the object anew with more at its end; ``False``: somebody else has written it since it was read."""
+        found = await self._read(place)
+        if found is not None and not content:
+            return True
+        old, condition = (b"", {"IfNoneMatch": "*"}) if found is None else (found[0], {"IfMatch": found[1]})
+        new = old + content
+        _check(new)
+        try:
+            await self._client.call("put_object", **place, **metadata, **condition, Body=new)
+        except Refused as error:
+            if error.code not in _WRITTEN_MEANWHILE:
+                raise self._client.unusable(error) from error
+            if not error.tried_again:
+                return False
+            # Its answer may have been lost, and what the SDK then sent again found our own writing.
+            now = await self._read(place)
+            return now is not None and now[0].startswith(new)
+        return True
+
+    async def _ask(self, operation: str, **parameters: Any) -> dict[str, Any]:
+        try:
+            return await self._client.call(operation, **parameters)
+        except Refused as error:
+            raise self._client.unusable(error) from error
+
+
+def encode(name: str) -> str:
+    """A name, or the beginning of one, as (the beginning of) a key; keys sort as names do.
+
+    ``!`` and what sorts before it, control characters and the space, are written ``!00`` to ``!21``. A dot that begins
+    a part of a path is written ``._``, so that no part is ``.`` or ``..``, on which URLs turn.
+    """
+    return _HIDDEN.sub(lambda found: "._" if found[0] == "." else f"!{ord(found[0]):02x}", name)
+
+
+def decode(key: str) -> str:
+    """The name that ``encode`` was given."""
+    return _SHOWN.sub(lambda found: chr(int(found[1], 16)) if found[1] else ".", key)
+
+
+def _whole(found: list[str], limit: int) -> bool:
+    """Whether the first ``limit`` names have been read, whatever the order among long ones will be."""
+    return len(found) >= limit and not names.same_head(found[limit - 1], found[-1])
+
+
+def _metadata(name: str) -> dict[str, Any]:
+    if not names.is_long(name):
+        return {}
+    return {"Metadata": {_TAIL: base64.b64encode(name[names.HEAD :].encode()).decode()}}
+
+
+def _check(content: bytes) -> None:
+    if len(content) > MAX_BYTES:
+        raise ValueError(f"a blob holds at most {MAX_BYTES} bytes, not {len(content)}")

@@ -1,0 +1,179 @@
+"""How the adapters talk to Amazon: one client each, made at the first call, in threads of its own.
+
+The SDK is imported at the first call too: it takes a third of a second, which the functions' start need not wait for.
+"""
+
+import asyncio
+import threading
+from concurrent.futures import ThreadPoolExecutor
+from typing import Any
+
+from function_app.ports.tables import StoreError
+
+THREADS = 16
+"""Calls under way at once; more wait for one of them."""
+ATTEMPTS = 3
+"""How often the SDK tries in all, with its own pauses between."""
+CONNECT_TIMEOUT_S = 3
+READ_TIMEOUT_S = 10
+
+_MISSING = frozenset({"ResourceNotFoundException", "NoSuchBucket"})
+_NO_RIGHTS = frozenset(
+    {
+        "403",
+        "AccessDenied",
+        "AccessDeniedException",
+        "ExpiredToken",
+        "ExpiredTokenException",
+        "IncompleteSignature",
+        "InvalidAccessKeyId",
+        "InvalidSignatureException",
+        "MissingAuthenticationTokenException",
+        "SignatureDoesNotMatch",
+        "UnrecognizedClientException",
+    }
+)
+_TOO_MUCH = frozenset(
+    {
+        "ProvisionedThroughputExceededException",
+        "RequestLimitExceeded",
+        "SlowDown",
+        "ThrottlingException",
+    }
+)
+
+
+class Refused(Exception):  # noqa: N818 (an outcome that callers look at)
+    """The service's answer is no.
+
+    Attributes:
+        code: The service's word for why.
+        reasons: Of a transaction, the word for each of its writes.
+        tried_again: The SDK sent the request more than once: an earlier one may have been obeyed.
+    """
+
+    def __init__(self, message: str, *, code: str, reasons: tuple[str, ...] = (), tried_again: bool = False) -> None:
+        super().__init__(message)
+        self.code = code
+        self.reasons = reasons
+        self.tried_again = tried_again
+
+
+class Client:
+    """One service as one adapter uses it. Any number of calls at once; opens nothing before the first."""
+
+    def __init__(self, service: str, *, what: str, how: str, region: str, endpoint: str | None) -> None:
+        """Remember the place.
+
+        Args:
+            service: The SDK's name of it.
+            what: What is used there, for errors: ``the S3 bucket 'telescope'``.
+            how: How it is to be created when it is not there, for errors.
+            region: Amazon's region.
+            endpoint: The address of an emulator; ``None`` for Amazon's own.
+        """
+        self._service = service
+        self._where = f"{what} in {region}" + ("" if endpoint is None else f" at {endpoint}")
+        self._how = how
+        self._region = region
+        self._endpoint = endpoint
+        self._lock = threading.Lock()
+        self._client: Any = None
+        self._threads: ThreadPoolExecutor | None = None
+
+    async def call(self, operation: str, **parameters: Any) -> dict[str, Any]:
+        """The answer to one of the SDK's operations. A body in it has been read.
+
+        Raises:
+            Refused: The answer is no; ``unusable`` words what the caller did not expect.
+            StoreError: There is no answer.
+        """
+        if self._threads is None:
+            self._threads = ThreadPoolExecutor(THREADS, thread_name_prefix=self._service)
+        return await asyncio.get_running_loop().run_in_executor(self._threads, self._call, operation, parameters)
+
+    async def close(self) -> None:
+        """Let go of connections and threads; a later call opens again."""
+        threads, self._threads = self._threads, None
+        if threads is not None:
+            await asyncio.to_thread(threads.shutdown)
+        client, self._client = self._client, None
+        if client is not None:
+            client.close()
+
+    def unusable(self, error: Refused) -> StoreError:
+        """What a refusal means and what to do, in one line."""
+        codes = {error.code, *error.reasons}
+        if codes & _MISSING:
+            return StoreError(
+                f"{self._where} does not exist. Check its name and the region, or create it: {self._how}."
+            )
+        if codes & _NO_RIGHTS:
+            return StoreError(
+                f"{self._where} may not be used: {_line(error)}. Check the credentials and the rights of their role."
+            )
+        if codes & _TOO_MUCH:
+            return StoreError(f"{self._where} has too much to do: {_line(error)}. Try again, or raise its limits.")
+        return StoreError(f"{self._where} cannot be used: {_line(error)}. Check its configuration.")
+
+    def _call(self, operation: str, parameters: dict[str, Any]) -> dict[str, Any]:
+        from botocore import exceptions as sdk  # noqa: PLC0415 (see this page's first lines)
+
+        try:
+            answer: dict[str, Any] = getattr(self._open(), operation)(**parameters)
+            if "Body" in answer:
+                answer["Body"] = answer["Body"].read()
+        except sdk.ClientError as error:
+            raise _refused(error.response, str(error)) from error
+        except (
+            sdk.CredentialRetrievalError,
+            sdk.NoCredentialsError,
+            sdk.PartialCredentialsError,
+            sdk.TokenRetrievalError,
+        ) as error:
+            raise StoreError(
+                f"{self._where} cannot be used: {_line(error)}. Give this program a role, or set AWS_ACCESS_KEY_ID and "
+                "AWS_SECRET_ACCESS_KEY."
+            ) from error
+        except (sdk.ConnectionError, sdk.HTTPClientError) as error:
+            raise StoreError(
+                f"{self._where} cannot be reached: {_line(error)}. Check region, endpoint and network."
+            ) from error
+        except sdk.BotoCoreError as error:
+            raise StoreError(f"{self._where} cannot be used: {_line(error)}. Check its configuration.") from error
+        return answer
+
+    def _open(self) -> Any:
+        from botocore.config import Config  # noqa: PLC0415
+        from botocore.session import Session  # noqa: PLC0415
+
+        with self._lock:
+            if self._client is None:
+                self._client = Session().create_client(
+                    self._service,
+                    region_name=self._region,
+                    endpoint_url=self._endpoint,
+                    config=Config(
+                        connect_timeout=CONNECT_TIMEOUT_S,
+                        read_timeout=READ_TIMEOUT_S,
+                        retries={"mode": "standard", "total_max_attempts": ATTEMPTS},
+                        max_pool_connections=THREADS,
+                        tcp_keepalive=True,
+                        # Emulators have no host name for each bucket.
+                        s3={"addressing_style": "auto" if self._endpoint is None else "path"},
+                    ),
+                )
+            return self._client
+
+
+def _refused(response: dict[str, Any], message: str) -> Refused:
+    return Refused(
+        message,
+        code=str(response.get("Error", {}).get("Code", "")),
+        reasons=tuple(str(each.get("Code")) for each in response.get("CancellationReasons", ())),
+        tried_again=bool(response.get("ResponseMetadata", {}).get("RetryAttempts")),
+    )
+
+
+def _line(error: Exception) -> str:
+    return " ".join(str(error).split()).rstrip(".")

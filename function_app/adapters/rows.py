@@ -1,0 +1,97 @@
+"""What every adapter of ``Tables`` checks and writes in the same way."""
+
+import base64
+import binascii
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import msgspec
+
+from function_app.ports.tables import MAX_BATCH, MAX_DATA_BYTES, MAX_KEY_LENGTH, Row, Write
+
+MAX_PAGE = 1_000
+
+_encode = msgspec.json.Encoder().encode
+_decode = msgspec.json.Decoder(dict[str, Any]).decode
+
+
+def check(row: Row) -> None:
+    """Refuse a row whose partition or key no store could take.
+
+    Raises:
+        ValueError: One is empty, too long, or no Unicode text.
+    """
+    for text in (row.partition, row.key):
+        if not 1 <= len(text) <= MAX_KEY_LENGTH:
+            raise ValueError(f"partitions and keys have 1 to {MAX_KEY_LENGTH} characters, not {len(text)}")
+        if not is_text(text):
+            raise ValueError("partitions and keys are Unicode text without lone surrogates")
+
+
+def check_batch(writes: Sequence[Write]) -> None:
+    """Refuse a batch that is not one.
+
+    Raises:
+        ValueError: Empty, too many writes, two partitions, a key twice, or a row that cannot be.
+    """
+    if not 1 <= len(writes) <= MAX_BATCH:
+        raise ValueError(f"a batch has 1 to {MAX_BATCH} writes, not {len(writes)}")
+    if len({write.row.partition for write in writes}) != 1:
+        raise ValueError("all writes of a batch are in one partition")
+    if len({write.row.key for write in writes}) != len(writes):
+        raise ValueError("a batch writes each key once")
+    for write in writes:
+        check(write.row)
+
+
+def check_limit(limit: int) -> None:
+    """Refuse a page of no rows or of too many.
+
+    Raises:
+        ValueError: It is so.
+    """
+    if not 1 <= limit <= MAX_PAGE:
+        raise ValueError(f"limit must be 1 to {MAX_PAGE}, not {limit}")
+
+
+def encode(data: Mapping[str, Any]) -> bytes:
+    """A row's data as JSON.
+
+    Raises:
+        ValueError: More than ``MAX_DATA_BYTES``.
+    """
+    text = _encode(data)
+    if len(text) > MAX_DATA_BYTES:
+        raise ValueError(f"a row holds at most {MAX_DATA_BYTES} bytes, not {len(text)}")
+    return text
+
+
+def decode(text: bytes | str) -> dict[str, Any]:
+    """A row's data from JSON."""
+    return _decode(text)
+
+
+def write_cursor(key: str) -> str:
+    """A cursor that goes on with ``key``."""
+    return base64.urlsafe_b64encode(key.encode()).decode().rstrip("=")
+
+
+def read_cursor(cursor: str) -> str:
+    """The key that a cursor goes on with.
+
+    Raises:
+        ValueError: It is no cursor.
+    """
+    try:
+        return base64.b64decode(cursor + "=" * (-len(cursor) % 4), altchars=b"-_", validate=True).decode()
+    except (ValueError, binascii.Error) as error:
+        raise ValueError("not a cursor of this list") from error
+
+
+def is_text(text: str) -> bool:
+    """Whether it can be written as UTF-8: Python's strings may hold lone surrogates."""
+    try:
+        text.encode()
+    except UnicodeEncodeError:
+        return False
+    return True

@@ -1,0 +1,201 @@
+"""An emulated Amazon for tests, and a wire to it that can be spoilt.
+
+with start_moto() as endpoint, start_wire(endpoint) as wire:
+    tables = DynamoTables(table="t", region=REGION, endpoint=wire.endpoint)
+    wire.spoil("lose answer")
+"""
+
+import contextlib
+import http.client
+import json
+import logging
+import threading
+from collections import deque
+from collections.abc import Iterator
+from dataclasses import dataclass
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from typing import Any, Literal
+from urllib.parse import urlsplit
+
+import pytest
+from moto.moto_server.werkzeug_app import DomainDispatcherApplication, MotoRequestHandler, create_backend_app
+from werkzeug.serving import make_server
+
+HOST = "127.0.0.1"
+REGION = "eu-west-1"
+
+
+@contextlib.contextmanager
+def start_moto() -> Iterator[str]:
+    """moto as an HTTP server on a free loopback port; gives its address."""
+    logging.getLogger("werkzeug").setLevel(logging.WARNING)
+    app = _OneAtATime(DomainDispatcherApplication(create_backend_app))
+    server = make_server(HOST, 0, app, threaded=True, request_handler=MotoRequestHandler)
+    thread = threading.Thread(target=server.serve_forever, args=(0.02,))
+    thread.start()
+    try:
+        yield f"http://{HOST}:{server.server_port}"
+    finally:
+        server.shutdown()
+        thread.join()
+        server.server_close()
+
+
+def reset(endpoint: str) -> None:
+    """Make moto forget everything."""
+    where = urlsplit(endpoint)
+    connection = http.client.HTTPConnection(where.hostname or HOST, where.port)
+    connection.request("POST", "/moto-api/reset")
+    assert connection.getresponse().status == 200
+    connection.close()
+
+
+class _OneAtATime:
+    """Answers one request after the other: moto's transactions undo what others write meanwhile. Amazon's do not."""
+
+    def __init__(self, app: Any) -> None:
+        self._app = app
+        self._lock = threading.Lock()
+
+    def __call__(self, environ: dict[str, Any], start_response: Any) -> list[bytes]:
+        with self._lock:
+            return list(self._app(environ, start_response))
+
+
+def use_credentials(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Credentials that moto takes, and nothing of this machine's own."""
+    for name, value in {
+        "AWS_ACCESS_KEY_ID": "testing",
+        "AWS_SECRET_ACCESS_KEY": "testing",
+        "AWS_CONFIG_FILE": "/dev/null",
+        "AWS_SHARED_CREDENTIALS_FILE": "/dev/null",
+        "AWS_EC2_METADATA_DISABLED": "true",
+    }.items():
+        monkeypatch.setenv(name, value)
+    for name in ("AWS_PROFILE", "AWS_SESSION_TOKEN", "AWS_ENDPOINT_URL"):
+        monkeypatch.delenv(name, raising=False)
+
+
+@dataclass(frozen=True)
+class Asked:
+    """One request as it came by."""
+
+    method: str
+    operation: str
+    """DynamoDB's; empty for S3."""
+    body: bytes
+
+    @property
+    def json(self) -> dict[str, Any]:
+        found: dict[str, Any] = json.loads(self.body)
+        return found
+
+
+@dataclass(frozen=True)
+class Refusal:
+    """An answer in the emulator's place."""
+
+    status: int
+    code: str
+    more: dict[str, Any]
+
+
+Fault = Literal["lose request", "lose answer", "cut answer", "pass"] | Refusal
+
+
+class Wire:
+    """Notes what an adapter asks, and spoils it in order; then everything passes."""
+
+    def __init__(self, endpoint: str) -> None:
+        self.asked: list[Asked] = []
+        self.endpoint = ""
+        self.behind = urlsplit(endpoint)
+        self.faults: deque[Fault] = deque()
+
+    def spoil(self, *faults: Fault) -> None:
+        self.asked.clear()
+        self.faults.extend(faults)
+
+    @property
+    def operations(self) -> list[str]:
+        return [asked.operation or asked.method for asked in self.asked]
+
+
+@contextlib.contextmanager
+def start_wire(endpoint: str) -> Iterator[Wire]:
+    """A wire to an emulator."""
+    wire = Wire(endpoint)
+
+    class Handler(_Handler):
+        between = wire
+
+    server = ThreadingHTTPServer((HOST, 0), Handler)
+    wire.endpoint = f"http://{HOST}:{server.server_port}"
+    thread = threading.Thread(target=server.serve_forever, args=(0.02,))
+    thread.start()
+    try:
+        yield wire
+    finally:
+        server.shutdown()
+        thread.join()
+        server.server_close()
+
+
+class _Handler(BaseHTTPRequestHandler):
+    protocol_version = "HTTP/1.1"
+    disable_nagle_algorithm = True
+    between: Wire
+
+    def handle_any(self) -> None:
+        body = self.rfile.read(int(self.headers.get("Content-Length", 0)))
+        operation = self.headers.get("X-Amz-Target", "").rpartition(".")[2]
+        self.between.asked.append(Asked(self.command, operation, body))
+        fault = self.between.faults.popleft() if self.between.faults else "pass"
+        if isinstance(fault, Refusal):
+            self._refuse(fault)
+            return
+        answer = None if fault == "lose request" else self._forward(body)
+        if answer is None or fault == "lose answer":
+            self.close_connection = True
+            return
+        if fault == "cut answer":
+            self.close_connection = True
+            status, headers, content = answer
+            self._answer(status, headers, content, sent=len(content) // 2)
+            return
+        self._answer(*answer)
+
+    do_GET = do_PUT = do_POST = do_DELETE = do_HEAD = handle_any  # noqa: N815 (the base class's names)
+
+    def _forward(self, body: bytes) -> tuple[int, list[tuple[str, str]], bytes]:
+        behind = http.client.HTTPConnection(self.between.behind.hostname or HOST, self.between.behind.port)
+        try:
+            behind.putrequest(self.command, self.path, skip_host=True, skip_accept_encoding=True)
+            for name, value in self.headers.items():
+                if name.lower() != "expect":
+                    behind.putheader(name, value)
+            behind.endheaders(body)
+            found = behind.getresponse()
+            return found.status, found.getheaders(), found.read()
+        finally:
+            behind.close()
+
+    def _refuse(self, fault: Refusal) -> None:
+        text = json.dumps({"__type": f"com.amazonaws.dynamodb.v20120810#{fault.code}", "message": "…", **fault.more})
+        if "X-Amz-Target" not in self.headers:
+            text = f"<Error><Code>{fault.code}</Code><Message>no</Message></Error>"
+        self._answer(fault.status, [("Content-Type", "application/x-amz-json-1.0")], text.encode())
+
+    def _answer(self, status: int, headers: list[tuple[str, str]], content: bytes, *, sent: int | None = None) -> None:
+        self.send_response_only(status)
+        for name, value in headers:
+            if name.lower() not in ("content-length", "transfer-encoding", "connection"):
+                self.send_header(name, value)
+        length = next((value for name, value in headers if name.lower() == "content-length"), str(len(content)))
+        self.send_header("Content-Length", length if self.command == "HEAD" else str(len(content)))
+        self.end_headers()
+        if self.command != "HEAD":
+            self.wfile.write(content[:sent])
+
+    def log_message(self, *_: object) -> None:
+        """Nothing: the tests read ``asked``."""
