@@ -101,6 +101,25 @@ def drag(page: Page, share: float, joint: str = "elbow", *, let_go: bool = True)
         page.mouse.up()
 
 
+def drive(page: Page, share: float, there: Callable[[], bool], what: str, *, let_go: bool = True) -> None:
+    """Take control and drag the elbow until ``there``.
+
+    On a machine so busy that setpoints come late, the robot holds and ends the control, as it must: take it again.
+    """
+    for _ in range(8):
+        if page.get_by_test_id("control-state").get_attribute("data-state") != "mine":
+            page.mouse.up()
+            take(page)
+        drag(page, share, let_go=let_go)
+        for _ in range(50):
+            if there():
+                return
+            if page.get_by_test_id("control-state").get_attribute("data-state") != "mine":
+                break
+            page.wait_for_timeout(100)
+    pytest.fail(f"{what} never happened")
+
+
 def reset(page: Page) -> None:
     page.get_by_test_id("reset-stop").click()
     page.get_by_test_id("confirm-reset").click()
@@ -111,12 +130,13 @@ def test_the_elbow_slider_moves_the_simulation_and_nobody_elses_does(browser: Br
     trace = machine.trace()
     with operator(browser, machine) as ann, operator(browser, machine) as bob:
         expect(ann.get_by_test_id("online")).to_contain_text("online", ignore_case=True)
-        take(ann)
         before = elbow(trace)
-        drag(ann, 0.6)
-        wait_until(lambda: abs(elbow(trace) - before) > 0.2, "the simulated elbow to follow", 30)
-        target = float(ann.get_by_test_id("slider-elbow").input_value())
-        wait_until(lambda: abs(math.degrees(elbow(trace)) - target) < 1.5, "the elbow to arrive", 60)
+        slider = ann.get_by_test_id("slider-elbow")
+
+        def arrived() -> bool:
+            return abs(math.degrees(elbow(trace)) - float(slider.input_value())) < 1.5
+
+        drive(ann, 0.6, lambda: abs(elbow(trace) - before) > 0.2 and arrived(), "the elbow following the slider")
         wait_until(lambda: abs(shown(ann) - math.degrees(elbow(trace))) < 0.5, "the page to show it", 30)
         round_trip = ann.get_by_test_id("round-trip")
         assert float(round_trip.get_attribute("data-value") or "nan") > 0
@@ -149,9 +169,7 @@ def assert_not_moved_by_force(page: Page) -> None:
 def test_stop_latches_until_it_is_reset(browser: Browser, machine: Machine) -> None:
     trace = machine.trace()
     with operator(browser, machine) as page:
-        take(page)
-        drag(page, 0.45)
-        wait_until(lambda: commanded_speed(trace) > 0.1, "motion", 30)
+        drive(page, 0.25, lambda: commanded_speed(trace) > 0.1, "motion")
         page.keyboard.press("Escape")
         expect(page.get_by_test_id("stop-banner")).to_be_visible()
         wait_until(lambda: commanded_speed(trace) == 0, "rest", 10)
@@ -162,17 +180,14 @@ def test_stop_latches_until_it_is_reset(browser: Browser, machine: Machine) -> N
         reset(page)
         page.wait_for_timeout(500)
         assert abs(elbow(trace) - rest) < 0.005, "resetting Stop must resume nothing"
-        take(page)
-        drag(page, 0.5)
-        wait_until(lambda: abs(elbow(trace) - rest) > 0.05, "motion after control was taken again", 30)
+        drive(page, 0.8, lambda: abs(elbow(trace) - rest) > 0.05, "motion after control was taken again")
         page.get_by_test_id("release-control").click()
 
 
 def end_in_mid_motion(page: Page, trace: Trace, end: Callable[[], None]) -> float:
     """Take control, drag, end the page while the arm moves; how long the arm was commanded to move after that [ms]."""
-    take(page)
-    drag(page, 0.75 if elbow(trace) < 0.5 else 0.25, let_go=False)
-    wait_until(lambda: commanded_speed(trace) > 0.2, "motion", 30)
+    share = 0.75 if elbow(trace) < 0.5 else 0.25
+    drive(page, share, lambda: commanded_speed(trace) > 0.2, "motion", let_go=False)
     end()
     ended_ms = time.time() * 1000
     wait_until(lambda: commanded_speed(trace) == 0, "rest", 10)
@@ -188,9 +203,9 @@ def test_closing_the_browser_in_mid_motion_stops_the_arm(browser: Browser, machi
         assert end_in_mid_motion(page, machine.trace(), page.close) < STOP_WITHIN_MS
 
 
-def speeds(trace: Trace) -> list[dict[str, float]]:
+def speeds(trace: Trace, newest: int = 800) -> list[dict[str, float]]:
     """Commanded speed of the fastest joint between rows of the trace [rad/s]."""
-    rows = trace.rows()
+    rows = trace.rows(newest)
     found = []
     for before, after in itertools.pairwise(rows):
         step_s = after["time_s"] - before["time_s"]
@@ -200,7 +215,7 @@ def speeds(trace: Trace) -> list[dict[str, float]]:
 
 
 def commanded_speed(trace: Trace) -> float:
-    return max(row["speed"] for row in speeds(trace)[-3:])
+    return max((row["speed"] for row in speeds(trace, 8)[-3:]), default=0.0)
 
 
 def test_the_view_the_plot_and_the_pose_table_are_alive(browser: Browser, machine: Machine) -> None:
