@@ -36,7 +36,7 @@ from function_app.services.start_action import StartAction
 from function_app.services.stop import StopDevices
 from function_app.services.sweep import Sweep
 from function_app.services.unpair import Unpair
-from function_app.settings import Settings
+from function_app.settings import AwsStore, AzureStore, Settings
 
 TABLES_FILE = "tables.sqlite"
 MOSQUITTO_SERVICE = "service"
@@ -80,7 +80,7 @@ class Functions:
 
 
 def build(settings: Settings, *, clock: Clock | None = None) -> Functions:
-    """The functions on one machine: SQLite, files, and a broker of our own. Reads the signing keys, opens no socket.
+    """The functions, with the stores that the settings choose. Reads the signing keys, opens no socket.
 
     Raises:
         StoreError: The signing keys cannot be used.
@@ -88,8 +88,7 @@ def build(settings: Settings, *, clock: Clock | None = None) -> Functions:
     now = clock or SystemClock()
     keys = FileKeys(settings.home / "keys")
     private = keys.load()
-    tables = SqliteTables(settings.home / TABLES_FILE)
-    blobs = FileBlobs(settings.home / "blobs")
+    tables, blobs = _stores(settings)
     catalogue = FolderCatalogue(settings.robots)
 
     async def publish(topic: str, payload: bytes) -> None:
@@ -160,3 +159,29 @@ def build(settings: Settings, *, clock: Clock | None = None) -> Functions:
         ),
         health=CheckHealth(tables=tables, bus=bus),
     )
+
+
+def _stores(settings: Settings) -> tuple[Tables, Blobs]:
+    """Tables and blobs. Of the clouds' adapters only the one in use is imported, and it its SDK only when needed."""
+    match settings.store:
+        case AzureStore() as azure:
+            from function_app.adapters.azure.blobs import AzureBlobs  # noqa: PLC0415
+            from function_app.adapters.azure.client import Place  # noqa: PLC0415
+            from function_app.adapters.azure.tables import AzureTables  # noqa: PLC0415
+
+            tables_place = Place(azure.connection, azure.tables_url, azure.identity)
+            blobs_place = Place(azure.connection, azure.blobs_url, azure.identity)
+            return (
+                AzureTables(place=tables_place, prefix=azure.prefix),
+                AzureBlobs(place=blobs_place, container=azure.container),
+            )
+        case AwsStore() as aws:
+            from function_app.adapters.aws.blobs import S3Blobs  # noqa: PLC0415
+            from function_app.adapters.aws.tables import DynamoTables  # noqa: PLC0415
+
+            return (
+                DynamoTables(table=aws.table, region=aws.region, endpoint=aws.endpoint),
+                S3Blobs(bucket=aws.bucket, region=aws.region, endpoint=aws.endpoint),
+            )
+        case None:
+            return SqliteTables(settings.home / TABLES_FILE), FileBlobs(settings.home / "blobs")

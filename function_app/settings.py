@@ -3,7 +3,7 @@
 import os
 import re
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Literal, cast
 from urllib.parse import urlsplit
@@ -13,6 +13,12 @@ Broker = Literal["amqtt", "mosquitto"]
 _LAST_PORT = 65_535
 _PORT = re.compile(r"\A[0-9]{1,5}\Z")
 _HOST = re.compile(r"\A[A-Za-z0-9._:%-]{1,255}\Z")
+_PREFIX = re.compile(r"\A[A-Za-z][A-Za-z0-9]{0,31}\Z")
+_CONTAINER = re.compile(r"\A(?=.{3,63}\Z)[a-z0-9]+(-[a-z0-9]+)*\Z")
+_TABLE = re.compile(r"\A[A-Za-z0-9_.-]{3,255}\Z")
+_BUCKET = re.compile(r"\A(?=.{3,63}\Z)[a-z0-9][a-z0-9.-]*[a-z0-9]\Z")
+_REGION = re.compile(r"\A[a-z]{2,}(-[a-z]+)+-[0-9]+\Z")
+_IDENTITY = re.compile(r"\A([0-9A-Fa-f]{8}(-[0-9A-Fa-f]{4}){3}-[0-9A-Fa-f]{12})?\Z")
 _SHOWN = 80
 """Characters of a wrong value that are shown."""
 
@@ -22,11 +28,50 @@ class SettingsError(Exception):
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
+class AzureStore:
+    """A storage account.
+
+    Attributes:
+        connection: Its connection string; or, where the functions show their managed identity instead,
+        tables_url: the address of its tables,
+        blobs_url: that of its blobs, and
+        identity: the client id of the identity, where they have not only the one that the host gives them.
+        prefix: What the names of its tables begin with.
+        container: The container of its blobs.
+    """
+
+    connection: str = field(default="", repr=False)
+    tables_url: str = ""
+    blobs_url: str = ""
+    identity: str = ""
+    prefix: str = "telescope"
+    container: str = "telescope"
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class AwsStore:
+    """A DynamoDB table and an S3 bucket. Credentials come the SDK's own way: a role, or its own variables.
+
+    Attributes:
+        region: Where both are.
+        table: The table's name.
+        bucket: The bucket's name.
+        endpoint: An emulator's address, ``None`` for Amazon's own.
+    """
+
+    region: str
+    bucket: str
+    table: str = "telescope"
+    endpoint: str | None = None
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Settings:
     """Where things are.
 
     Attributes:
         home: Folder of everything that lasts: tables, blobs, keys.
+        store: Where tables and blobs are, when not in ``home``.
         host: Address to listen on.
         port: Of the page and the API.
         public_url: The page's address as people open it; sign-in links begin with it.
@@ -37,6 +82,7 @@ class Settings:
     """
 
     home: Path
+    store: AzureStore | AwsStore | None = None
     host: str = "127.0.0.1"
     port: int = 8080
     public_url: str = "http://127.0.0.1:8080"
@@ -67,6 +113,7 @@ def read(environment: Mapping[str, str] | None = None) -> Settings:
     websocket_url = f"ws://{_in_url(mqtt_host)}:{websocket_port}/mqtt"
     return Settings(
         home=_folder(given, "TELESCOPE_HOME", Path(".telescope")),
+        store=_store(given),
         host=host,
         port=port,
         public_url=public_url,
@@ -78,6 +125,61 @@ def read(environment: Mapping[str, str] | None = None) -> Settings:
         robots=_folder(given, "TELESCOPE_ROBOTS", ROOT / "robots"),
         console=_folder(given, "TELESCOPE_CONSOLE", ROOT / "web" / "dist"),
     )
+
+
+def _store(given: Mapping[str, str]) -> AzureStore | AwsStore | None:
+    match given.get("TELESCOPE_STORE", "local"):
+        case "local":
+            return None
+        case "azure":
+            return _azure(given)
+        case "aws":
+            return _aws(given)
+        case other:
+            raise SettingsError(f"TELESCOPE_STORE is '{other[:_SHOWN]}'; it must be local, azure or aws")
+
+
+def _azure(given: Mapping[str, str]) -> AzureStore:
+    prefix = _matching(given, "TELESCOPE_STORAGE_PREFIX", "telescope", _PREFIX, "at most 32 letters and digits")
+    container = _matching(
+        given, "TELESCOPE_STORAGE_CONTAINER", "telescope", _CONTAINER, "3 to 63 lower-case letters, digits and hyphens"
+    )
+    connection = given.get("TELESCOPE_STORAGE_CONNECTION", "")
+    if connection:
+        # Never shown: there is a key in it.
+        if not all("=" in part for part in connection.strip("; ").split(";")):
+            raise SettingsError(
+                "TELESCOPE_STORAGE_CONNECTION is not a connection string; copy it from the storage account's "
+                "'Access keys'"
+            )
+        return AzureStore(connection=connection, prefix=prefix, container=container)
+    urls = ("TELESCOPE_STORAGE_TABLES_URL", "TELESCOPE_STORAGE_BLOBS_URL")
+    if not all(given.get(name) for name in urls):
+        raise SettingsError(
+            "TELESCOPE_STORE is azure; set TELESCOPE_STORAGE_CONNECTION to the storage account's connection string, or "
+            f"{' and '.join(urls)} to its addresses, to use the functions' managed identity"
+        )
+    tables_url, blobs_url = (_url(given, name, "", ("https",)) for name in urls)
+    identity = _matching(given, "TELESCOPE_STORAGE_IDENTITY", "", _IDENTITY, "the client id of a managed identity")
+    return AzureStore(tables_url=tables_url, blobs_url=blobs_url, identity=identity, prefix=prefix, container=container)
+
+
+def _aws(given: Mapping[str, str]) -> AwsStore:
+    region = given.get("AWS_REGION", "")  # Lambda sets it
+    endpoint = given.get("TELESCOPE_AWS_ENDPOINT")
+    return AwsStore(
+        region=_matching(given, "TELESCOPE_AWS_REGION", region, _REGION, "a region, such as eu-west-1"),
+        bucket=_matching(given, "TELESCOPE_AWS_BUCKET", "", _BUCKET, "the name of an S3 bucket"),
+        table=_matching(given, "TELESCOPE_AWS_TABLE", "telescope", _TABLE, "the name of a DynamoDB table"),
+        endpoint=endpoint and _url(given, "TELESCOPE_AWS_ENDPOINT", endpoint, ("http", "https")),
+    )
+
+
+def _matching(given: Mapping[str, str], name: str, otherwise: str, pattern: re.Pattern[str], what: str) -> str:
+    text = given.get(name, otherwise)
+    if not pattern.match(text):
+        raise SettingsError(f"{name} is '{text[:_SHOWN]}'; it must be {what}")
+    return text
 
 
 def _host(given: Mapping[str, str], name: str, otherwise: str) -> str:
