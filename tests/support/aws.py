@@ -11,7 +11,7 @@ import json
 import logging
 import threading
 from collections import deque
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from typing import Any, Literal
@@ -100,7 +100,8 @@ class Refusal:
     more: dict[str, Any]
 
 
-Fault = Literal["lose request", "lose answer", "cut answer", "pass"] | Refusal
+Fault = Literal["lose request", "lose answer", "cut answer", "pass"] | Refusal | Callable[[], object]
+"""A function is called before the request goes on: what happens meanwhile."""
 
 
 class Wire:
@@ -154,6 +155,8 @@ class _Handler(BaseHTTPRequestHandler):
         if isinstance(fault, Refusal):
             self._refuse(fault)
             return
+        if callable(fault):
+            fault()
         answer = None if fault == "lose request" else self._forward(body)
         if answer is None or fault == "lose answer":
             self.close_connection = True

@@ -2,7 +2,8 @@
 
 import asyncio
 import socket
-from collections.abc import AsyncIterator, Awaitable, Callable, Iterator
+from collections.abc import AsyncIterator, Awaitable, Callable, Coroutine, Iterator
+from typing import Any
 
 import pytest
 from hypothesis import given, settings
@@ -159,6 +160,30 @@ async def test_an_append_that_never_arrived_is_made_once(blobs: Blobs, through: 
         wire.spoil("pass", "lose request")
         await through.append("log", b"%d" % number)
     assert await blobs.get("log") == b"01"
+
+
+def meanwhile(writing: Coroutine[Any, Any, None]) -> Callable[[], None]:
+    """Somebody else's writing, before a request arrives."""
+    loop = asyncio.get_running_loop()
+    return lambda: asyncio.run_coroutine_threadsafe(writing, loop).result()
+
+
+async def test_an_append_loses_nothing_that_others_write_meanwhile(blobs: Blobs, through: Blobs, wire: Wire) -> None:
+    wire.spoil("pass", meanwhile(blobs.append("log", b"0")), "pass", meanwhile(blobs.append("log", b"1")))
+    await through.append("log", b"2")
+    assert await blobs.get("log") == b"012"
+    wire.spoil("pass", meanwhile(blobs.delete("log")))
+    await through.append("log", b"3")
+    assert await blobs.get("log") == b"3"
+
+
+async def test_an_append_that_was_lost_is_not_taken_for_what_others_write(
+    blobs: Blobs, through: Blobs, wire: Wire
+) -> None:
+    await blobs.append("log", b"0")
+    wire.spoil("pass", "lose request", meanwhile(blobs.append("log", b"1")))
+    await through.append("log", b"2")
+    assert await blobs.get("log") == b"012"
 
 
 async def test_an_append_begins_anew_when_another_was_quicker(blobs: Blobs, through: Blobs, wire: Wire) -> None:

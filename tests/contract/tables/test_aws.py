@@ -95,6 +95,7 @@ async def through(tables: Tables, opened: Open, wire: Wire) -> Tables:
 
 SHARED = "🤖" * (names.HEAD + 100)
 LONG = [SHARED + tail for tail in ("", "\x00", "0", "1", "20", "21", "ü", "\U0010ffff")]
+LONG += [SHARED[: names.HEAD] + tail for tail in ("\x00", "\x01", "z")]
 BETWEEN = [SHARED[: names.HEAD - 1], SHARED[: names.HEAD], SHARED[: names.HEAD - 1] + "🤗", "\U0010ffff", "a"]
 
 
@@ -104,7 +105,7 @@ async def test_long_keys_with_one_beginning_sort_as_all_others(tables: Tables) -
         await tables.create("T", Row("p", key, {"key": key}))
     for limit in (1, 4, 1000):
         assert await keys_of(tables, limit=limit) == keys
-    for first in (LONG[3], LONG[3] + "!", LONG[-1], BETWEEN[0], BETWEEN[1], SHARED[: names.HEAD + 1]):
+    for first in (LONG[-2], LONG[3], LONG[3] + "!", LONG[-1], BETWEEN[0], BETWEEN[1], SHARED[: names.HEAD + 1]):
         assert await keys_of(tables, limit=5, first=first) == [key for key in keys if key >= first]
         assert await keys_of(tables, limit=5, last=first) == [key for key in keys if key < first]
         bounds = {"first": first, "last": LONG[6]}
