@@ -5,7 +5,8 @@ PYTHON ?= python3
 BIN := .venv/bin
 # Node.js of the machine when it is new enough, else the one that comes as a Python wheel.
 NODE_READY = command -v npm >/dev/null && node -e 'process.exit(parseInt(process.versions.node) >= 20 ? 0 : 1)'
-NPM = PATH="$(if $(wildcard $(BIN)/npm),$(CURDIR)/$(BIN):)$$PATH" npm --prefix web
+NODE = PATH="$(if $(wildcard $(BIN)/npm),$(CURDIR)/$(BIN):)$$PATH" npm
+NPM = $(NODE) --prefix web
 
 .PHONY: help up link env console test test-long check contract requirements clean
 .DELETE_ON_ERROR:
@@ -52,6 +53,11 @@ web/node_modules/.installed: web/package-lock.json | .venv/.node
 	@$(NPM) ci --silent --no-fund --no-audit
 	@touch $@
 
+tests/azurite/node_modules/.installed: tests/azurite/package-lock.json | .venv/.node
+	@echo "telescope: installing Azurite" >&2
+	@$(NODE) --prefix tests/azurite ci --silent --no-fund --no-audit
+	@touch $@
+
 console: web/dist/index.html
 
 web/dist/index.html: web/node_modules/.installed web/index.html web/package.json $(wildcard web/*.ts web/public/*) $(shell find web/src -type f 2>/dev/null)
@@ -59,12 +65,12 @@ web/dist/index.html: web/node_modules/.installed web/index.html web/package.json
 	@$(NPM) run --silent build -- --logLevel warn
 	@touch $@
 
-test: .venv/.dev console check
+test: .venv/.dev console check tests/azurite/node_modules/.installed
 	@tests/system-packages
 	@$(NPM) test --silent
 	@$(BIN)/python -m pytest -m "not long"
 
-test-long: .venv/.dev console check
+test-long: .venv/.dev console check tests/azurite/node_modules/.installed
 	@tests/system-packages
 	@$(NPM) test --silent
 	@$(BIN)/python -m pytest
