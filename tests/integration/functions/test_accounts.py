@@ -12,6 +12,7 @@ from hypothesis import settings as quickly
 from hypothesis import strategies as st
 
 from device_agent.protocol import signing
+from tests.integration.functions.conftest import Open
 from tests.support.cloud import API, Cloud, MovingClock, problem, settings
 
 SIGN_IN = f"{API}/auth/sign-in"
@@ -142,17 +143,17 @@ class TestAccessToken:
                 problem(person.get("/accounts/me"), 401, "unauthorized")
             assert cloud.sign_in("anna").get("/accounts/me").status_code == 200
 
-    def test_sign_out_ends_this_session_and_no_other_in_every_instance(self, home: Path) -> None:
+    def test_sign_out_ends_this_session_and_no_other_in_every_instance(self, open_cloud: Open) -> None:
         clock = MovingClock()
-        with Cloud(settings(home), clock=clock) as here, Cloud(settings(home), clock=clock) as there:
-            gone, stays = here.sign_in("anna"), here.sign_in("anna")
-            headers = {"Authorization": f"Bearer {gone.token}"}
-            assert there.ask("GET", f"{API}/accounts/me", headers=headers).status_code == 200
-            assert gone.post("/auth/sign-out").status_code == 204
-            problem(gone.get("/accounts/me"), 401, "unauthorized")
-            clock.advance(5)
-            problem(there.ask("GET", f"{API}/accounts/me", headers=headers), 401, "unauthorized")
-            assert stays.get("/accounts/me").status_code == 200
+        here, there = open_cloud(clock=clock), open_cloud(clock=clock)
+        gone, stays = here.sign_in("anna"), here.sign_in("anna")
+        headers = {"Authorization": f"Bearer {gone.token}"}
+        assert there.ask("GET", f"{API}/accounts/me", headers=headers).status_code == 200
+        assert gone.post("/auth/sign-out").status_code == 204
+        problem(gone.get("/accounts/me"), 401, "unauthorized")
+        clock.advance(5)
+        problem(there.ask("GET", f"{API}/accounts/me", headers=headers), 401, "unauthorized")
+        assert stays.get("/accounts/me").status_code == 200
 
     def test_one_that_others_made_is_refused(self, cloud: Cloud) -> None:
         anna = cloud.sign_in("anna")

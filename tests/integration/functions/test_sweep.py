@@ -322,11 +322,11 @@ def test_a_start_killed_after_any_write_leaves_nothing_open(
         there = elsewhere(process, anna)
         assert there.get("/accounts/me").status_code == 200
         knife.left = after
-        answer = there.start(robot.device, wait_ms=300, wait_for="done", once=f"k{after}", **SHORT, **request_)
+        answer = there.start(robot.device, wait_ms=100, wait_for="done", once=f"k{after}", **SHORT, **request_)
         survived = knife.left > 0
         assert (answer.status_code < 500) is survived
         before = {key for key in rows(cloud, robot.device) if key.startswith("action:")}
-        again = anna.start(robot.device, once=f"k{after}", wait_ms=300, wait_for="done", **SHORT, **request_)
+        again = anna.start(robot.device, once=f"k{after}", wait_ms=100, wait_for="done", **SHORT, **request_)
         assert again.status_code in {200, 202}, again.text
         if knife.written > 1:
             new = {key for key in rows(cloud, robot.device) if key.startswith("action:")} - before
