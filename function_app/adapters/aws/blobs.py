@@ -41,7 +41,12 @@ class S3Blobs:
         self._bucket = bucket
         self._region = region
         self._client = Client(
-            "s3", what=f"the S3 bucket '{bucket}'", how="private, without versions", region=region, endpoint=endpoint
+            "s3",
+            what=f"the S3 bucket '{bucket}'",
+            setting="TELESCOPE_AWS_BUCKET",
+            how="private, without versions",
+            region=region,
+            endpoint=endpoint,
         )
         self._appending: WeakValueDictionary[str, asyncio.Lock] = WeakValueDictionary()
 

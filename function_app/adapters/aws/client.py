@@ -62,18 +62,20 @@ class Refused(Exception):  # noqa: N818 (an outcome that callers look at)
 class Client:
     """One service as one adapter uses it. Any number of calls at once; opens nothing before the first."""
 
-    def __init__(self, service: str, *, what: str, how: str, region: str, endpoint: str | None) -> None:
+    def __init__(self, service: str, *, what: str, setting: str, how: str, region: str, endpoint: str | None) -> None:
         """Remember the place.
 
         Args:
             service: The SDK's name of it.
             what: What is used there, for errors: ``the S3 bucket 'telescope'``.
+            setting: The setting that names it, for errors.
             how: How it is to be created when it is not there, for errors.
             region: Amazon's region.
             endpoint: The address of an emulator; ``None`` for Amazon's own.
         """
         self._service = service
         self._where = f"{what} in {region}" + ("" if endpoint is None else f" at {endpoint}")
+        self._setting = setting
         self._how = how
         self._region = region
         self._endpoint = endpoint
@@ -106,7 +108,8 @@ class Client:
         codes = {error.code, *error.reasons}
         if codes & _MISSING:
             return StoreError(
-                f"{self._where} does not exist. Check its name and the region, or create it: {self._how}."
+                f"{self._where} does not exist. Check {self._setting} and TELESCOPE_AWS_REGION, or create it: "
+                f"{self._how}."
             )
         if codes & _NO_RIGHTS:
             return StoreError(
@@ -136,8 +139,9 @@ class Client:
                 "AWS_SECRET_ACCESS_KEY."
             ) from error
         except (sdk.ConnectionError, sdk.HTTPClientError) as error:
+            setting = "TELESCOPE_AWS_REGION" if self._endpoint is None else "TELESCOPE_AWS_ENDPOINT"
             raise StoreError(
-                f"{self._where} cannot be reached: {_line(error)}. Check region, endpoint and network."
+                f"{self._where} cannot be reached: {_line(error)}. Check {setting} and the network."
             ) from error
         except sdk.BotoCoreError as error:
             raise StoreError(f"{self._where} cannot be used: {_line(error)}. Check its configuration.") from error

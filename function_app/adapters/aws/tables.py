@@ -46,7 +46,12 @@ class DynamoTables:
         """``endpoint`` is an emulator's address. Credentials come the SDK's own way: a role, or the environment."""
         self._table = table
         self._client = Client(
-            "dynamodb", what=f"the DynamoDB table '{table}'", how=_HOW, region=region, endpoint=endpoint
+            "dynamodb",
+            what=f"the DynamoDB table '{table}'",
+            setting="TELESCOPE_AWS_TABLE",
+            how=_HOW,
+            region=region,
+            endpoint=endpoint,
         )
 
     async def prepare(self) -> None:
