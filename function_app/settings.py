@@ -171,7 +171,7 @@ def _aws(given: Mapping[str, str]) -> AwsStore:
         region=_matching(given, "TELESCOPE_AWS_REGION", region, _REGION, "a region, such as eu-west-1"),
         bucket=_matching(given, "TELESCOPE_AWS_BUCKET", "", _BUCKET, "the name of an S3 bucket"),
         table=_matching(given, "TELESCOPE_AWS_TABLE", "telescope", _TABLE, "the name of a DynamoDB table"),
-        endpoint=endpoint and _url(given, "TELESCOPE_AWS_ENDPOINT", endpoint, ("http", "https")),
+        endpoint=None if endpoint is None else _url(given, "TELESCOPE_AWS_ENDPOINT", endpoint, ("http", "https")),
     )
 
 

@@ -98,6 +98,8 @@ class Refusal:
     status: int
     code: str
     more: dict[str, Any]
+    kind: str = ""
+    """Content type, when not the service's own."""
 
 
 Fault = Literal["lose request", "lose answer", "cut answer", "pass"] | Refusal | Callable[[], object]
@@ -184,10 +186,15 @@ class _Handler(BaseHTTPRequestHandler):
             behind.close()
 
     def _refuse(self, fault: Refusal) -> None:
-        text = json.dumps({"__type": f"com.amazonaws.dynamodb.v20120810#{fault.code}", "message": "…", **fault.more})
-        if "X-Amz-Target" not in self.headers:
+        if "X-Amz-Target" in self.headers:
+            kind = "application/x-amz-json-1.0"
+            text = json.dumps(
+                {"__type": f"com.amazonaws.dynamodb.v20120810#{fault.code}", "message": "…", **fault.more}
+            )
+        else:
+            kind = "application/xml"
             text = f"<Error><Code>{fault.code}</Code><Message>no</Message></Error>"
-        self._answer(fault.status, [("Content-Type", "application/x-amz-json-1.0")], text.encode())
+        self._answer(fault.status, [("Content-Type", fault.kind or kind)], text.encode())
 
     def _answer(self, status: int, headers: list[tuple[str, str]], content: bytes, *, sent: int | None = None) -> None:
         self.send_response_only(status)

@@ -12,6 +12,7 @@ import contextlib
 import itertools
 import random
 import secrets
+from http import HTTPStatus
 from typing import TYPE_CHECKING, Any, TypeVar
 from weakref import WeakValueDictionary
 
@@ -29,6 +30,8 @@ TRIES = 30
 """How often an append begins anew because another instance has written to the same blob meanwhile."""
 MANY_BLOCKS = 1_000
 """From so many appends on, the early ones become one block: Azure takes 50,000, and the list is sent each time."""
+RETRY_WITHIN_S = 1
+"""The SDK's pause before it tries again is up to this long."""
 KEPT_BLOCKS = 100
 """Appends that stay blocks then, to be known again should their answer have been lost."""
 _PAUSE_S = 0.01
@@ -143,13 +146,20 @@ def _open(place: Place, container: str, things: contextlib.ExitStack) -> "Contai
 
     options: dict[str, Any] = {
         "transport": transport(),
-        "retry_policy": LinearRetry(backoff=1, retry_total=ATTEMPTS - 1, random_jitter_range=1),
+        "retry_policy": LinearRetry(backoff=0, retry_total=ATTEMPTS - 1, random_jitter_range=RETRY_WITHIN_S),
+        "raw_response_hook": _read_refusal,
         "max_single_put_size": MAX_BYTES,
         "max_single_get_size": MAX_BYTES,
     }
     if place.url:
         return ContainerClient(place.url, container, credential=credential(place, things), **options)
     return ContainerClient.from_connection_string(place.connection, container, **options)
+
+
+def _read_refusal(response: Any) -> None:
+    """Read an answer whose body is an error's, so that its connection is free: of a download the SDK leaves it."""
+    if response.http_response.status_code >= HTTPStatus.BAD_REQUEST:
+        response.http_response.read()
 
 
 def _make(container: "ContainerClient") -> None:

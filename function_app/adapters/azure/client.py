@@ -20,8 +20,9 @@ ATTEMPTS = 3
 CONNECT_TIMEOUT_S = 3
 READ_TIMEOUT_S = 10
 
-_NOT_KNOWN = 401
-_NO_RIGHTS = frozenset({_NOT_KNOWN, 403})
+_CONNECTION = "TELESCOPE_STORAGE_CONNECTION"
+_NO_ANSWER = 0
+_NO_RIGHTS = frozenset({_NO_ANSWER, 401, 403})
 _TOO_MUCH = frozenset({429, 503})
 
 
@@ -68,10 +69,10 @@ class Client(Generic[Sdk]):
         """
         self._open = open_
         self._what = what + (f" at {place.url}" if place.url else "")
-        self._settings = "the addresses in TELESCOPE_STORAGE_*" if place.url else "TELESCOPE_STORAGE_CONNECTION"
-        self._right = (
-            f"Give the functions' identity the role '{role}'" if place.url else "Check TELESCOPE_STORAGE_CONNECTION"
+        self._settings = (
+            "the addresses in TELESCOPE_STORAGE_*, this machine's managed identity" if place.url else _CONNECTION
         )
+        self._right = f"Give the functions' identity the role '{role}'" if place.url else f"Check {_CONNECTION}"
         self._lock = threading.Lock()
         self._sdk: Sdk | None = None
         self._open_things = contextlib.ExitStack()
@@ -98,7 +99,9 @@ class Client(Generic[Sdk]):
 
     def unusable(self, error: Refused) -> StoreError:
         """What a refusal means and what to do, in one line."""
-        said = f"{_line(error)} ({error.status}{' ' if error.code else ''}{error.code})"
+        said = _line(error)
+        if error.status != _NO_ANSWER:
+            said += f" ({error.status}{' ' if error.code else ''}{error.code})"
         if error.status in _NO_RIGHTS:
             return StoreError(f"{self._what} may not be used: {said}. {self._right}.")
         if error.status in _TOO_MUCH:
@@ -113,13 +116,18 @@ class Client(Generic[Sdk]):
         except sdk.HttpResponseError as error:
             said = str(error.message).split("\nErrorCode:")[0].split("\nRequestId:")[0]
             # Without an answer, it is the credentials that the SDK itself finds wrong, or cannot get.
-            raise Refused(said, status=error.status_code or _NOT_KNOWN, code=code_of(error)) from error
+            raise Refused(said, status=error.status_code or _NO_ANSWER, code=code_of(error)) from error
         except (sdk.ServiceRequestError, sdk.ServiceResponseError) as error:
             raise StoreError(
-                f"{self._what} cannot be reached: {_line(error)}. Check {self._settings} and the network."
+                f"{self._what} cannot be reached: {_reason(error)}. Check {self._settings} and the network."
             ) from error
         except sdk.AzureError as error:
             raise StoreError(f"{self._what} cannot be used: {_line(error)}. Check the storage account.") from error
+        except AttributeError as error:
+            # How the SDK ends on an error whose answer it cannot read, as one from a proxy.
+            raise StoreError(
+                f"{self._what} gives answers that are not Azure's ({_line(error)}). Check {self._settings}."
+            ) from error
 
     def _opened(self) -> Sdk:
         with self._lock:
@@ -147,7 +155,9 @@ def credential(place: Place, things: contextlib.ExitStack) -> Any:
     """The functions' managed identity."""
     from azure.identity import ManagedIdentityCredential  # noqa: PLC0415 (see this page's first lines)
 
-    return things.enter_context(ManagedIdentityCredential(client_id=place.identity or None))
+    return things.enter_context(
+        ManagedIdentityCredential(client_id=place.identity or None, retry_total=ATTEMPTS - 1, retry_backoff_factor=0.1)
+    )
 
 
 def code_of(error: Exception) -> str:
@@ -156,5 +166,12 @@ def code_of(error: Exception) -> str:
     return str(getattr(code, "value", code))
 
 
-def _line(error: Exception) -> str:
+def _reason(error: Any) -> str:
+    """What is wrong with the connection, without what the libraries between wrap around it."""
+    inner = getattr(error, "inner_exception", None)
+    cause = inner.args[0] if inner is not None and inner.args else error
+    return _line(getattr(cause, "reason", None) or cause)
+
+
+def _line(error: object) -> str:
     return " ".join(str(error).split()).rstrip(".")[:300]
