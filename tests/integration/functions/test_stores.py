@@ -1,0 +1,125 @@
+"""Over each store the functions do the same: two instances of them, and what one writes the other knows."""
+
+import asyncio
+import contextlib
+import secrets
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from device_agent.protocol.messages import AckStatus, RunMovement
+from function_app import bootstrap
+from function_app.adapters.aws.blobs import S3Blobs
+from function_app.adapters.aws.tables import DynamoTables
+from function_app.settings import AwsStore, AzureStore, Settings
+from tests.support.aws import REGION, start_moto, use_credentials
+from tests.support.azure import start_azurite
+from tests.support.brokers import RunningBroker
+from tests.support.cloud import MOVE, Cloud, Person, paired, problem, settings
+
+MINE = "/robot-types/ur5/movements/mine"
+SOURCE = '"""Wave."""\nrobot.home()\n'
+STORES = ("local", "azure", "aws")
+
+
+@pytest.fixture(scope="module")
+def azurite() -> Iterator[str]:
+    with start_azurite() as connection:
+        yield connection
+
+
+@pytest.fixture(scope="module")
+def moto() -> Iterator[str]:
+    with start_moto() as endpoint:
+        yield endpoint
+
+
+@pytest.fixture(params=STORES)
+def store(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> AzureStore | AwsStore | None:
+    """An empty one."""
+    name = f"test{secrets.token_hex(8)}"
+    if request.param == "azure":
+        return AzureStore(connection=request.getfixturevalue("azurite"), prefix=name, container=name)
+    if request.param == "aws":
+        use_credentials(monkeypatch)
+        return AwsStore(region=REGION, bucket=name, table=name, endpoint=request.getfixturevalue("moto"))
+    return None
+
+
+@pytest.fixture
+def clouds(home: Path, broker: RunningBroker, store: AzureStore | AwsStore | None) -> Iterator[tuple[Cloud, Cloud]]:
+    """Two instances; the ingest runs in the second."""
+    chosen = replace(settings(home, broker), store=store)
+    if isinstance(store, AwsStore):
+        asyncio.run(_prepare(chosen))
+    with contextlib.ExitStack() as stack:
+        one, other = (stack.enter_context(Cloud(chosen)) for _ in range(2))
+        other.start_ingest()
+        yield one, other
+
+
+async def _prepare(chosen: Settings) -> None:
+    """Make Amazon's table and bucket, which a deployment does otherwise."""
+    functions = bootstrap.build(chosen)
+    assert isinstance(functions.tables, DynamoTables)
+    assert isinstance(functions.blobs, S3Blobs)
+    await functions.tables.prepare()
+    await functions.blobs.prepare()
+    await functions.close()
+
+
+def test_from_pairing_to_a_movement_that_was_run(clouds: tuple[Cloud, Cloud]) -> None:
+    one, other = clouds
+    with paired(one) as (anna, robot):
+        again = other.sign_in("anna")
+        assert [device["id"] for device in again.get("/devices").json()["items"]] == [robot.device]
+
+        assert anna.put(MINE, {"source": SOURCE}).status_code == 201
+        assert again.put(MINE, {"source": SOURCE + "#"}).json()["version"] == 2
+        assert anna.get(MINE).json()["source"] == SOURCE + "#"
+
+        epoch = anna.take(robot.device).json()["epoch"]
+        problem(again.take(robot.device), 409, "lease-held")
+        assert again.get(f"/devices/{robot.device}/lease").json()["lease"]["epoch"] == epoch
+
+        request = {"kind": "run_movement", "name": "mine", "parameters": {"note": "grüß 🤖"}}
+        asked: dict[str, Any] = {"request": request, "epoch": epoch, "wait_ms": 10_000, "once": "a/b#c?"}
+        action = anna.start(robot.device, **asked).json()
+        assert action["status"] == "started"
+        assert anna.start(robot.device, **asked).json()["id"] == action["id"]
+        problem(anna.start(robot.device, epoch=epoch), 409, "device-busy")
+        (command,) = robot.heard(RunMovement)
+        assert isinstance(command.request, RunMovement)
+        assert command.request.source == SOURCE + "#"
+
+        robot.report(action["id"], AckStatus.DONE, result={"reached": True})
+        final = again.action(action["id"], wait_ms=10_000, wait_for="done")
+        assert (final["status"], final["result"]) == ("done", {"reached": True})
+        for cloud in clouds:
+            cloud.sweep()
+
+        bert = other.sign_in("bert")
+        problem(bert.get(f"/actions/{action['id']}"), 404, "action-unknown")
+        problem(bert.get(f"/devices/{robot.device}"), 404, "device-unknown")
+        problem(bert.get(MINE), 404, "movement-unknown")
+
+
+def test_of_many_callers_of_two_instances_one_gets_the_slot(clouds: tuple[Cloud, Cloud]) -> None:
+    one, other = clouds
+    with paired(one) as (anna, robot):
+        epoch = anna.take(robot.device).json()["epoch"]
+        account = {"id": anna.account, "name": anna.name}
+        there = Person(other, {"access_token": anna.token, "session": anna.session, "account": account})
+        for _ in range(3):
+            calls = [
+                person.begin("POST", f"/devices/{robot.device}/actions", json={"request": MOVE, "epoch": epoch})
+                for person in (anna, there) * 4
+            ]
+            answers = [call() for call in calls]
+            (started,) = [answer.json() for answer in answers if answer.status_code == 202]
+            assert sorted(answer.status_code for answer in answers) == [202] + [409] * 7
+            robot.report(started["id"], AckStatus.DONE)
+            assert there.action(started["id"], wait_ms=10_000, wait_for="done")["status"] == "done"
