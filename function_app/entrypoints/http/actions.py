@@ -2,12 +2,13 @@
 
 from typing import Annotated, Literal
 
-from fastapi import APIRouter, Header, Query, Request, Response
+from fastapi import Header, Query, Request, Response
 
 from function_app.bootstrap import Functions
-from function_app.entrypoints.http import contract, show
+from function_app.entrypoints.http import show
 from function_app.entrypoints.http.answers import answer, read
 from function_app.entrypoints.http.caller import Caller
+from function_app.entrypoints.http.contract import actions as contract
 from function_app.entrypoints.http.routing import PREFIX, Cursor, Limit, Routes
 from function_app.services.start_action import Start
 
@@ -19,7 +20,7 @@ Wait = Annotated[int, Query(ge=0, le=30_000, description="Wait at most this long
 WaitFor = Annotated[Literal["started", "done"], Query(description="What to wait for.")]
 
 
-def router(functions: Functions, caller: Caller) -> APIRouter:
+def router(functions: Functions, caller: Caller) -> Routes:
     """The routes."""
     routes = Routes("actions")
 
@@ -77,4 +78,4 @@ def router(functions: Functions, caller: Caller) -> APIRouter:
         who = await caller.account(request)
         return answer(show.action(await functions.actions.cancel(who, action)), 202)
 
-    return routes.router
+    return routes

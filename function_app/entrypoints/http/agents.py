@@ -3,7 +3,7 @@
 from typing import Annotated
 
 import msgspec
-from fastapi import APIRouter, Query, Request, Response
+from fastapi import Query, Request, Response
 
 from device_agent.protocol import signing
 from function_app.bootstrap import Functions
@@ -11,16 +11,18 @@ from function_app.domain.devices import Agent, DeviceSpec
 from function_app.domain.ids import show_claim_code
 from function_app.domain.problems import invalid
 from function_app.domain.times import rfc3339
-from function_app.entrypoints.http import contract, show
+from function_app.entrypoints.http import show
 from function_app.entrypoints.http.answers import answer, empty, read
 from function_app.entrypoints.http.caller import Caller
+from function_app.entrypoints.http.contract import agents as contract
+from function_app.entrypoints.http.contract.auth import AccountRef
 from function_app.entrypoints.http.routing import Cursor, Limit, Routes
 from function_app.services.enroll import Enrollment
 
 Wait = Annotated[int, Query(ge=0, le=30_000, description="Wait at most this long for the claim [ms].")]
 
 
-def router(functions: Functions, caller: Caller) -> APIRouter:
+def router(functions: Functions, caller: Caller) -> Routes:
     """The routes."""
     routes = Routes("agents")
 
@@ -73,11 +75,11 @@ def router(functions: Functions, caller: Caller) -> APIRouter:
         )
         return answer(body)
 
-    async def _account(agent: Agent) -> contract.AccountRef | None:
+    async def _account(agent: Agent) -> AccountRef | None:
         if agent.account is None:
             return None
         found = await functions.sign_in.named(agent.account)
-        return contract.AccountRef(id=agent.account, name=found)
+        return AccountRef(id=agent.account, name=found)
 
     @routes.add(
         "POST",
@@ -120,4 +122,4 @@ def router(functions: Functions, caller: Caller) -> APIRouter:
         await functions.unpair.unpair(await caller.account(request), agent)
         return empty()
 
-    return routes.router
+    return routes

@@ -1,7 +1,7 @@
 """The HTTP application: routes, problems, security headers, and the console beside them."""
 
 import logging
-from collections.abc import AsyncIterator
+from collections.abc import AsyncIterator, Sequence
 from contextlib import asynccontextmanager
 from typing import Any
 
@@ -47,7 +47,7 @@ def create_app(functions: Functions) -> FastAPI:
         redirect_slashes=False,
     )
     caller = Caller(functions.identify)
-    for router in (
+    resources = (
         auth.router(functions, caller),
         agents.router(functions, caller),
         devices.router(functions, caller),
@@ -55,9 +55,10 @@ def create_app(functions: Functions) -> FastAPI:
         library.router(functions, caller),
         broker.router(functions, caller),
         health.router(functions),
-    ):
-        app.include_router(router, prefix=PREFIX)
-    _document(app)
+    )
+    for routes in resources:
+        app.include_router(routes.router, prefix=PREFIX)
+    _document(app, [kind for routes in resources for kind in routes.kinds])
     app.add_exception_handler(Problem, _on_problem)
     app.add_exception_handler(StoreError, _on_store)
     app.add_exception_handler(RequestValidationError, _on_validation)
@@ -68,7 +69,7 @@ def create_app(functions: Functions) -> FastAPI:
     return app
 
 
-def _document(app: FastAPI) -> None:
+def _document(app: FastAPI, kinds: Sequence[Any]) -> None:
     made = app.openapi
 
     def openapi() -> dict[str, Any]:
@@ -76,7 +77,7 @@ def _document(app: FastAPI) -> None:
             document = made()
             components = document.setdefault("components", {})
             # What the framework's own validation would say never leaves: refusals are problem details.
-            components["schemas"] = schemas()
+            components["schemas"] = schemas(kinds)
             _drop_validation_errors(document)
             components["securitySchemes"] = {
                 ACCOUNT_SCHEMES[0]: {"type": "http", "scheme": "bearer", "bearerFormat": "JWT"},

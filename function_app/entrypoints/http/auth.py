@@ -1,15 +1,15 @@
 """``auth``, ``accounts/me``, ``spaces``."""
 
-from fastapi import APIRouter, Request, Response
+from fastapi import Request, Response
 
 from function_app.bootstrap import Functions
-from function_app.entrypoints.http import contract
 from function_app.entrypoints.http.answers import answer, empty, read
 from function_app.entrypoints.http.caller import COOKIE, Caller
+from function_app.entrypoints.http.contract import auth as contract
 from function_app.entrypoints.http.routing import Routes
 
 
-def router(functions: Functions, caller: Caller) -> APIRouter:
+def router(functions: Functions, caller: Caller) -> Routes:
     """The routes."""
     routes = Routes("accounts")
     secure = "; Secure" if functions.settings.public_url.startswith("https:") else ""
@@ -57,4 +57,4 @@ def router(functions: Functions, caller: Caller) -> APIRouter:
         items = tuple(contract.SpaceOut(id=space.id, name=space.name) for space in spaces)
         return answer(contract.SpaceList(items=items, cursor=None))
 
-    return routes.router
+    return routes

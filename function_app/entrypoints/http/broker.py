@@ -2,18 +2,18 @@
 
 from typing import Any
 
-from fastapi import APIRouter, Request, Response
+from fastapi import Request, Response
 
 from function_app.bootstrap import Functions
 from function_app.domain.times import rfc3339
-from function_app.entrypoints.http import contract
 from function_app.entrypoints.http.answers import answer, read
 from function_app.entrypoints.http.caller import Caller
+from function_app.entrypoints.http.contract import broker as contract
 from function_app.entrypoints.http.routing import Routes
 from function_app.services.mqtt_credentials import Issued
 
 
-def router(functions: Functions, caller: Caller) -> APIRouter:
+def router(functions: Functions, caller: Caller) -> Routes:
     """The routes."""
     routes = Routes("broker")
 
@@ -53,4 +53,4 @@ def router(functions: Functions, caller: Caller) -> APIRouter:
             return await functions.mqtt_credentials.control(who, asked.device, asked.epoch)
         return await functions.mqtt_credentials.watch(who)
 
-    return routes.router
+    return routes

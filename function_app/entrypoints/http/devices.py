@@ -2,19 +2,20 @@
 
 from typing import Annotated
 
-from fastapi import APIRouter, Query, Request, Response
+from fastapi import Query, Request, Response
 
 from function_app.bootstrap import Functions
 from function_app.domain.times import rfc3339
-from function_app.entrypoints.http import contract, show
+from function_app.entrypoints.http import show
 from function_app.entrypoints.http.answers import answer, empty, read_or
 from function_app.entrypoints.http.caller import Caller
+from function_app.entrypoints.http.contract import devices as contract
 from function_app.entrypoints.http.routing import Cursor, Limit, Routes
 
 EpochQuery = Annotated[int, Query(ge=1, le=2**53, description="The epoch to give back.")]
 
 
-def router(functions: Functions, caller: Caller) -> APIRouter:
+def router(functions: Functions, caller: Caller) -> Routes:
     """The routes."""
     routes = Routes("devices")
 
@@ -104,4 +105,4 @@ def router(functions: Functions, caller: Caller) -> APIRouter:
         who = await caller.account(request)
         return answer(contract.Confirmed(confirmed=await functions.stop.reset(who, device)))
 
-    return routes.router
+    return routes

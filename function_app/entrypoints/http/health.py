@@ -1,15 +1,15 @@
 """``health``."""
 
-from fastapi import APIRouter, Request, Response
+from fastapi import Request, Response
 
 from function_app.bootstrap import Functions
 from function_app.domain.problems import store_unavailable
-from function_app.entrypoints.http import contract
 from function_app.entrypoints.http.answers import answer
+from function_app.entrypoints.http.contract import health as contract
 from function_app.entrypoints.http.routing import VERSION, Routes
 
 
-def router(functions: Functions) -> APIRouter:
+def router(functions: Functions) -> Routes:
     """The routes."""
     routes = Routes("health")
 
@@ -29,4 +29,4 @@ def router(functions: Functions) -> APIRouter:
         )
         return answer(body)
 
-    return routes.router
+    return routes

@@ -1,17 +1,18 @@
 """``robot-types`` and their movements."""
 
-from fastapi import APIRouter, Request, Response
+from fastapi import Request, Response
 
 from function_app.bootstrap import Functions
-from function_app.entrypoints.http import contract, show
+from function_app.entrypoints.http import show
 from function_app.entrypoints.http.answers import answer, empty, read
 from function_app.entrypoints.http.caller import Caller
+from function_app.entrypoints.http.contract import library as contract
 from function_app.entrypoints.http.routing import Routes
 
 _MOVEMENTS = "/robot-types/{robot_type}/movements"
 
 
-def router(functions: Functions, caller: Caller) -> APIRouter:
+def router(functions: Functions, caller: Caller) -> Routes:
     """The routes."""
     routes = Routes("robot types")
 
@@ -84,4 +85,4 @@ def router(functions: Functions, caller: Caller) -> APIRouter:
         await functions.movements.delete(await caller.account(request), robot_type, name)
         return empty()
 
-    return routes.router
+    return routes

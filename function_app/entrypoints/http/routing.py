@@ -1,13 +1,13 @@
 """Routes with their documentation: what is written here is what the OpenAPI document says."""
 
-from collections.abc import Awaitable, Callable, Mapping, Sequence
+from collections.abc import Awaitable, Callable, Iterable, Mapping, Sequence
 from typing import Annotated, Any, Literal
 
 import msgspec
 from fastapi import APIRouter, Query, Response
 
-from function_app.entrypoints.http import contract
 from function_app.entrypoints.http.answers import JSON, PROBLEM_JSON
+from function_app.entrypoints.http.contract import base as contract
 
 Handler = Callable[..., Awaitable[Response]]
 Caller = Literal["nobody", "account", "agent", "account or agent"]
@@ -34,7 +34,6 @@ _MEANINGS = {
     429: "Too many tries; see Retry-After",
     503: "The store or the broker cannot be used; see Retry-After",
 }
-_used: dict[str, Any] = {"Problem": contract.Problem}
 
 
 class Routes:
@@ -42,6 +41,8 @@ class Routes:
 
     def __init__(self, tag: str) -> None:
         self.router = APIRouter(tags=[tag])
+        self.kinds: list[Any] = [contract.Problem]
+        """Every struct that its routes have named."""
 
     def add(
         self,
@@ -78,7 +79,7 @@ class Routes:
         for status, kind in answers.items():
             responses[status] = {"description": _MEANINGS[status]}
             if kind is not None:
-                responses[status]["content"] = {JSON: {"schema": _reference(kind)}}
+                responses[status]["content"] = {JSON: {"schema": self._reference(kind)}}
         for status in sorted(refusals):
             responses[status] = {
                 "description": _MEANINGS[status],
@@ -86,7 +87,7 @@ class Routes:
             }
         extra: dict[str, Any] = {"security": _security(caller)}
         if body is not None:
-            extra["requestBody"] = {"required": body_required, "content": {JSON: {"schema": _reference(body)}}}
+            extra["requestBody"] = {"required": body_required, "content": {JSON: {"schema": self._reference(body)}}}
 
         def register(handler: Handler) -> Handler:
             self.router.add_api_route(
@@ -106,18 +107,20 @@ class Routes:
 
         return register
 
+    def _reference(self, kind: Any) -> dict[str, Any]:
+        self.kinds.append(kind)
+        return _reference(kind)
 
-def schemas() -> dict[str, Any]:
-    """JSON Schemas of everything that routes have named."""
-    _, components = msgspec.json.schema_components(list(_used.values()), ref_template=REF)
+
+def schemas(kinds: Iterable[Any]) -> dict[str, Any]:
+    """JSON Schemas of structs and of all that they hold."""
+    _, components = msgspec.json.schema_components(list(dict.fromkeys(kinds)), ref_template=REF)
     return components
 
 
 def _reference(kind: Any) -> dict[str, Any]:
     """The schema of a struct, or of a union of structs, by reference."""
-    (schema,), components = msgspec.json.schema_components([kind], ref_template=REF)
-    for name in components:
-        _used.setdefault(name, kind)
+    (schema,), _ = msgspec.json.schema_components([kind], ref_template=REF)
     return schema
 
 

@@ -10,15 +10,15 @@ from function_app.domain.accounts import Identity
 from function_app.domain.actions import Action
 from function_app.domain.lease import Lease
 from function_app.domain.times import rfc3339
-from function_app.entrypoints.http import contract
+from function_app.entrypoints.http.contract import actions, devices, library
 from function_app.services.devices import DeviceView
 from function_app.services.movements import Movement
 
 
-def device(view: DeviceView, who: Identity) -> contract.DeviceOut:
+def device(view: DeviceView, who: Identity) -> devices.DeviceOut:
     """A device and what is known of it now."""
     known = view.device
-    return contract.DeviceOut(
+    return devices.DeviceOut(
         id=known.id,
         name=known.name,
         label=known.label,
@@ -35,17 +35,17 @@ def device(view: DeviceView, who: Identity) -> contract.DeviceOut:
     )
 
 
-def lease(found: Lease | None, who: Identity) -> contract.LeaseOut | None:
+def lease(found: Lease | None, who: Identity) -> devices.LeaseOut | None:
     """A live lease."""
     if found is None:
         return None
     ends = rfc3339(found.expires_ms)
-    return contract.LeaseOut(holder=found.holder, epoch=found.epoch, expires_at=ends, mine=found.mine(who))
+    return devices.LeaseOut(holder=found.holder, epoch=found.epoch, expires_at=ends, mine=found.mine(who))
 
 
-def action(found: Action) -> contract.ActionOut:
+def action(found: Action) -> actions.ActionOut:
     """An action."""
-    return contract.ActionOut(
+    return actions.ActionOut(
         id=found.id,
         device=found.device,
         request=found.request,
@@ -55,16 +55,16 @@ def action(found: Action) -> contract.ActionOut:
         created_at=rfc3339(found.created_ms),
         deadline_at=rfc3339(found.deadline_ms),
         times={f"{status}_ms": at_ms for status, at_ms in found.times.items()},
-        reason=None if found.reason is None else contract.ReasonOut(**found.reason),
+        reason=None if found.reason is None else actions.ReasonOut(**found.reason),
         progress=found.progress,
         output=found.output,
         result=found.result,
     )
 
 
-def robot_type(found: RobotType) -> contract.RobotTypeOut:
+def robot_type(found: RobotType) -> library.RobotTypeOut:
     """A robot type."""
-    return contract.RobotTypeOut(
+    return library.RobotTypeOut(
         type=found.type,
         label=found.label,
         kind=found.kind,
@@ -75,14 +75,14 @@ def robot_type(found: RobotType) -> contract.RobotTypeOut:
     )
 
 
-def movement(found: Movement) -> contract.MovementOut:
+def movement(found: Movement) -> library.MovementOut:
     """A movement without its source."""
-    return contract.MovementOut(**_movement(found))
+    return library.MovementOut(**_movement(found))
 
 
-def movement_source(found: Movement, source: str) -> contract.MovementSource:
+def movement_source(found: Movement, source: str) -> library.MovementSource:
     """A movement with its source."""
-    return contract.MovementSource(**_movement(found), source=source)
+    return library.MovementSource(**_movement(found), source=source)
 
 
 def _movement(found: Movement) -> dict[str, Any]:

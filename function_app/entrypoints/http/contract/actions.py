@@ -1,0 +1,51 @@
+"""``actions``."""
+
+from typing import Annotated, Any, Literal
+
+from msgspec import Meta
+
+from function_app.entrypoints.http.contract.base import Answer, Epoch, Moment, Request, WaitMs
+from function_app.services.start_action import Asked
+
+
+class ActionRequest(Request, frozen=True, kw_only=True):
+    """What to run. Without ``epoch`` the action brings a lease for its own time."""
+
+    request: Asked
+    epoch: Epoch | None = None
+    ttl_ms: Annotated[int, Meta(ge=1, le=86_400_000)] = 10_000
+    timeout_ms: Annotated[int, Meta(ge=1_000, le=86_400_000)] = 300_000
+    wait_ms: WaitMs = 0
+    wait_for: Literal["started", "done"] = "started"
+
+
+class ReasonOut(Answer, frozen=True, kw_only=True):
+    """Why an action ended as it did."""
+
+    code: str
+    message: str
+
+
+class ActionOut(Answer, frozen=True, kw_only=True):
+    """An action. ``times``: ``<status>_ms`` → milliseconds since 1970."""
+
+    id: str
+    device: str
+    request: dict[str, Any]
+    status: Literal["created", "published", "received", "accepted", "started", "done", "failed", "expired", "cancelled"]
+    epoch: int
+    who: str
+    created_at: Moment
+    deadline_at: Moment
+    times: dict[str, int]
+    reason: ReasonOut | None
+    progress: float | None
+    output: str
+    result: dict[str, Any]
+
+
+class ActionList(Answer, frozen=True, kw_only=True):
+    """Actions, newest first."""
+
+    items: tuple[ActionOut, ...]
+    cursor: str | None

@@ -1,0 +1,87 @@
+"""``agents``."""
+
+from typing import Annotated, Literal
+
+from msgspec import Meta
+
+from device_agent.protocol.messages import Id, Label
+from function_app.entrypoints.http.contract.auth import AccountRef
+from function_app.entrypoints.http.contract.base import Answer, DeviceName, Moment, Name, Request
+from function_app.entrypoints.http.contract.devices import DeviceOut
+
+
+class DeviceIn(Request, frozen=True, kw_only=True):
+    """One device behind an agent."""
+
+    name: DeviceName
+    kind: Label
+    robot_type: Id
+    label: Label
+
+
+class EnrollRequest(Request, frozen=True, kw_only=True):
+    """An agent introduces itself; the request's token is signed by the key that it names."""
+
+    name: Name
+    public_key: Annotated[str, Meta(pattern="^[A-Za-z0-9_-]{43}$")]
+    software: Label
+    devices: Annotated[tuple[DeviceIn, ...], Meta(min_length=1, max_length=64)]
+
+
+class Enrolled(Answer, frozen=True, kw_only=True):
+    """``claim_code`` is null once the agent is claimed."""
+
+    agent: str
+    claim_code: str | None
+    expires_at: Moment | None
+    expires_in_s: int
+
+
+class KeyOut(Answer, frozen=True, kw_only=True):
+    """A public key (Ed25519, base64url) and its id."""
+
+    id: str
+    public: str
+
+
+class EnrollmentState(Answer, frozen=True, kw_only=True):
+    """Whether an agent is claimed, and the keys whose commands it is to obey."""
+
+    agent: str
+    state: Literal["waiting", "claimed"]
+    space: str | None
+    account: AccountRef | None
+    keys: tuple[KeyOut, ...]
+
+
+class ClaimRequest(Request, frozen=True, kw_only=True):
+    """The code that an agent shows, and the space it shall be in (default: the first)."""
+
+    code: Annotated[str, Meta(min_length=1, max_length=40)]
+    space: Id | None = None
+
+
+class AgentOut(Answer, frozen=True, kw_only=True):
+    """An agent of the account."""
+
+    id: str
+    name: str
+    software: str
+    space: str
+    devices: tuple[str, ...]
+    claimed_at: Moment
+
+
+class AgentList(Answer, frozen=True, kw_only=True):
+    """Agents."""
+
+    items: tuple[AgentOut, ...]
+    cursor: str | None
+
+
+class Claimed(Answer, frozen=True, kw_only=True):
+    """What was claimed."""
+
+    agent: str
+    space: str
+    devices: tuple[DeviceOut, ...]

@@ -1,0 +1,29 @@
+"""What all of them share."""
+
+from typing import Annotated
+
+from msgspec import Meta, Struct
+
+Moment = Annotated[str, Meta(description="RFC 3339, UTC, with milliseconds", examples=["2026-01-31T12:00:00.000Z"])]
+Epoch = Annotated[int, Meta(ge=1, le=2**53)]
+DeviceName = Annotated[str, Meta(pattern="^[A-Za-z0-9_-]{1,32}$")]
+Name = Annotated[str, Meta(min_length=1, max_length=200)]
+LeaseMs = Annotated[int, Meta(ge=1_000, le=600_000)]
+WaitMs = Annotated[int, Meta(ge=0, le=30_000)]
+
+
+class Request(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """Read strictly."""
+
+
+class Answer(Struct, frozen=True, kw_only=True):
+    """Written as it is."""
+
+
+class Problem(Answer, frozen=True, kw_only=True):
+    """RFC 9457. ``type`` ends in a stable code; further members depend on it."""
+
+    type: str
+    title: str
+    status: int
+    detail: str

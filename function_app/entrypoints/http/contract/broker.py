@@ -1,0 +1,44 @@
+"""``mqtt/credentials``."""
+
+from device_agent.protocol.messages import Id
+from function_app.entrypoints.http.contract.base import Answer, Epoch, Moment, Request
+
+
+class WatchRequest(Request, frozen=True, kw_only=True, tag_field="purpose", tag="watch"):
+    """To see every device and to stop those one may operate."""
+
+
+class ControlRequest(Request, frozen=True, kw_only=True, tag_field="purpose", tag="control"):
+    """To send setpoints under a lease."""
+
+    device: Id
+    epoch: Epoch
+
+
+class AgentRequest(Request, frozen=True, kw_only=True, tag_field="purpose", tag="agent"):
+    """To speak for an agent's own devices."""
+
+
+MqttRequest = WatchRequest | ControlRequest | AgentRequest
+
+
+class TcpAddress(Answer, frozen=True, kw_only=True):
+    """Where the broker takes MQTT."""
+
+    host: str
+    port: int
+
+
+class MqttCredentialsOut(Answer, frozen=True, kw_only=True):
+    """What to connect with, and the topics it is good for."""
+
+    client_id: str
+    username: str
+    password: str
+    expires_at: Moment
+    lifetime_s: int
+    publish: tuple[str, ...]
+    subscribe: tuple[str, ...]
+    tcp: TcpAddress
+    websocket_url: str
+    server_time_ms: int
