@@ -24,6 +24,7 @@ from function_app.services.claim import Claim
 from function_app.services.commands import Commands
 from function_app.services.devices import Devices
 from function_app.services.enroll import Enroll
+from function_app.services.forget import DAY_MS, Forget
 from function_app.services.health import CheckHealth
 from function_app.services.identity import Identify
 from function_app.services.lease import Leases
@@ -68,6 +69,7 @@ class Functions:
     stop: StopDevices
     mqtt_credentials: MqttCredentials
     presence: PresenceIngest
+    forget: Forget
     sweep: Sweep
     health: CheckHealth
 
@@ -107,7 +109,8 @@ def build(settings: Settings, *, clock: Clock | None = None) -> Functions:
     bus = MqttCommandBus(host=settings.mqtt_host, port=settings.mqtt_port, credentials=access.service_credentials)
     feed = MqttFeed(host=settings.mqtt_host, port=settings.mqtt_port, credentials=access.service_credentials)
 
-    identify = Identify(tables=tables, keys=keys, clock=now)
+    forget = Forget(tables=tables, blobs=blobs)
+    identify = Identify(tables=tables, keys=keys, forget=forget, clock=now)
     sign_in = SignIn(tables=tables, identify=identify, access=access, clock=now)
     devices = Devices(tables=tables, clock=now)
     commands = Commands(bus=bus, keys=keys, clock=now)
@@ -127,7 +130,7 @@ def build(settings: Settings, *, clock: Clock | None = None) -> Functions:
         identify=identify,
         sign_in=sign_in,
         enroll=Enroll(tables=tables, clock=now),
-        claim=Claim(tables=tables, sign_in=sign_in, clock=now),
+        claim=Claim(tables=tables, sign_in=sign_in, forget=forget, clock=now),
         unpair=Unpair(tables=tables, commands=commands, access=access),
         devices=devices,
         leases=Leases(tables=tables, devices=devices, commands=commands, access=access, clock=now),
@@ -147,7 +150,8 @@ def build(settings: Settings, *, clock: Clock | None = None) -> Functions:
         action_acks=acks,
         stop=StopDevices(tables=tables, devices=devices, commands=commands, bus=bus),
         mqtt_credentials=MqttCredentials(tables=tables, devices=devices, access=access, clock=now),
-        presence=PresenceIngest(tables=tables, clock=now),
+        presence=PresenceIngest(tables=tables, forget=forget, clock=now),
+        forget=forget,
         sweep=Sweep(
             tables=tables,
             rows=rows,
@@ -155,6 +159,8 @@ def build(settings: Settings, *, clock: Clock | None = None) -> Functions:
             commands=commands,
             movements=movements,
             access=access,
+            forget=forget,
+            keep_actions_ms=settings.keep_actions_days * DAY_MS,
             clock=now,
         ),
         health=CheckHealth(tables=tables, bus=bus),

@@ -11,7 +11,7 @@ from urllib.parse import urlsplit
 ROOT = Path(__file__).resolve().parents[1]
 Broker = Literal["amqtt", "mosquitto"]
 _LAST_PORT = 65_535
-_PORT = re.compile(r"\A[0-9]{1,5}\Z")
+_NUMBER = re.compile(r"\A[0-9]{1,9}\Z")
 _HOST = re.compile(r"\A[A-Za-z0-9._:%-]{1,255}\Z")
 _PREFIX = re.compile(r"\A[A-Za-z][A-Za-z0-9]{0,31}\Z")
 _CONTAINER = re.compile(r"\A(?=.{3,63}\Z)[a-z0-9]+(-[a-z0-9]+)*\Z")
@@ -79,6 +79,7 @@ class Settings:
         websocket_url: The broker's address for the page.
         robots: Folder of the robot types.
         console: Folder of the built console.
+        keep_actions_days: How long actions are kept after their end [d].
     """
 
     home: Path
@@ -93,6 +94,7 @@ class Settings:
     websocket_url: str = "ws://127.0.0.1:8082/mqtt"
     robots: Path = ROOT / "robots"
     console: Path = ROOT / "web" / "dist"
+    keep_actions_days: int = 30
 
 
 def read(environment: Mapping[str, str] | None = None) -> Settings:
@@ -124,6 +126,7 @@ def read(environment: Mapping[str, str] | None = None) -> Settings:
         websocket_url=_url(given, "TELESCOPE_WEBSOCKET_URL", websocket_url, ("ws", "wss")),
         robots=_folder(given, "TELESCOPE_ROBOTS", ROOT / "robots"),
         console=_folder(given, "TELESCOPE_CONSOLE", ROOT / "web" / "dist"),
+        keep_actions_days=_number(given, "TELESCOPE_KEEP_ACTIONS_DAYS", 30, 1, 3650),
     )
 
 
@@ -205,9 +208,13 @@ def _folder(given: Mapping[str, str], name: str, otherwise: Path) -> Path:
 
 
 def _port(given: Mapping[str, str], name: str, otherwise: int) -> int:
+    return _number(given, name, otherwise, 1, _LAST_PORT)
+
+
+def _number(given: Mapping[str, str], name: str, otherwise: int, least: int, most: int) -> int:
     text = given.get(name, str(otherwise))
-    if not _PORT.match(text) or not 1 <= int(text) <= _LAST_PORT:
-        raise SettingsError(f"{name} is '{text[:_SHOWN]}'; it must be a number from 1 to {_LAST_PORT}")
+    if not _NUMBER.match(text) or not least <= int(text) <= most:
+        raise SettingsError(f"{name} is '{text[:_SHOWN]}'; it must be a number from {least} to {most}")
     return int(text)
 
 

@@ -51,6 +51,8 @@ class Action:
         pairing: The agent's pairing that it belongs to.
         times: Status → when [ms since 1970]; ``published`` by the cloud's clock, the later ones by the agent's.
         sequence: Of the newest ack seen.
+        cancel_id: Of the command that shall end it, once somebody wants that.
+        once: Key of the row that holds the idempotency key it was started with, or empty.
     """
 
     id: str
@@ -72,6 +74,12 @@ class Action:
     result: dict[str, Any] = field(default_factory=dict)
     sequence: int = -1
     cancel_id: str = ""
+    once: str = ""
+
+    @property
+    def ended_ms(self) -> int:
+        """When it ended, as far as that can be believed [ms since 1970]: an agent's clock may be anywhere."""
+        return min(max(self.times.get(self.status.value, self.created_ms), self.created_ms), self.deadline_ms)
 
     @property
     def expires_ms(self) -> int:
@@ -156,6 +164,7 @@ class Verdict(StrEnum):
     CANCEL = "cancel"
     EXPIRE = "expire"
     LOSE = "lose"
+    ENDED = "ended"
 
 
 def judge(action: Action, now_ms: int) -> Verdict:
@@ -163,6 +172,8 @@ def judge(action: Action, now_ms: int) -> Verdict:
 
     Once somebody wants it cancelled, that is what is sent again: it must not begin because a message was lost.
     """
+    if action.status.terminal:
+        return Verdict.ENDED
     if now_ms >= action.deadline_ms:
         return Verdict.LOSE
     if action.status.rank < Status.RECEIVED.rank:

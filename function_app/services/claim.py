@@ -11,6 +11,7 @@ from function_app.domain.problems import Problem, not_found
 from function_app.ports.clock import Clock
 from function_app.ports.tables import Conflict, Row, Tables
 from function_app.services import store
+from function_app.services.forget import Forget
 from function_app.services.sign_in import SignIn
 
 WRONG_TRIES = 5
@@ -21,13 +22,15 @@ WINDOW_MS = 300_000
 class _Tries:
     since_ms: int
     count: int
+    expires_ms: int
 
 
 class Claim:
     """Pairing by claim code. What decides is one ETag write on the agent's row."""
 
-    def __init__(self, *, tables: Tables, sign_in: SignIn, clock: Clock) -> None:
+    def __init__(self, *, tables: Tables, sign_in: SignIn, forget: Forget, clock: Clock) -> None:
         self._tables = tables
+        self._forget = forget
         self._sign_in = sign_in
         self._clock = clock
 
@@ -86,11 +89,14 @@ class Claim:
 
         def counted(tries: _Tries | None) -> _Tries:
             if tries is None or now_ms - tries.since_ms >= WINDOW_MS:
-                tries = _Tries(now_ms, 0)
+                tries = _Tries(now_ms, 0, now_ms + WINDOW_MS)
             if change > 0 and tries.count >= WRONG_TRIES:
                 wait_s = -(-(tries.since_ms + WINDOW_MS - now_ms) // 1000)
                 detail = f"Too many wrong claim codes. Try again in {wait_s} s."
                 raise Problem("too-many-tries", 429, "Too many tries", detail, retry_after_s=wait_s)
             return replace(tries, count=max(0, tries.count + change))
 
+        # One note for all tries of a while, and written first: nothing stays that nobody forgets.
+        due_ms = (now_ms // WINDOW_MS + 2) * WINDOW_MS
+        await self._forget.row(store.ATTEMPTS, who.account, "claim", due_ms=due_ms)
         await store.upsert(self._tables, store.ATTEMPTS, who.account, "claim", counted, _Tries)

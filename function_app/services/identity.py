@@ -19,6 +19,7 @@ from function_app.ports.clock import Clock
 from function_app.ports.keys import Keys
 from function_app.ports.tables import Conflict, Row, Tables
 from function_app.services import store
+from function_app.services.forget import Forget
 
 ALGORITHM = "EdDSA"
 API: Final = "telescope/api"
@@ -45,8 +46,9 @@ class _Known:
 class Identify:
     """Issues and checks tokens. Verifying a signature costs 0.1 ms: what was verified is remembered until it ends."""
 
-    def __init__(self, *, tables: Tables, keys: Keys, clock: Clock) -> None:
+    def __init__(self, *, tables: Tables, keys: Keys, forget: Forget, clock: Clock) -> None:
         self._tables = tables
+        self._forget = forget
         self._keys = keys
         self._clock = clock
         self._known: OrderedDict[tuple[str, str], _Known] = OrderedDict()
@@ -92,6 +94,7 @@ class Identify:
         """End the session: its tokens are refused from now on, by other instances within ``RECHECK_MS``."""
         ends_ms = self._clock.now_ms() + SESSION_S * 1000
         row = Row(who.account, f"signed-out:{who.session}", {"expires_ms": ends_ms})
+        await self._forget.row(store.ACCOUNTS, row.partition, row.key, due_ms=ends_ms)
         try:
             await self._tables.create(store.ACCOUNTS, row)
         except Conflict:

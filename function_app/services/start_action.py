@@ -214,6 +214,7 @@ class StartAction:
                 ttl_ms=ttl_ms,
                 deadline_ms=plan.created_ms + start.timeout_ms,
                 pinned=plan.pinned,
+                once=_once_key(who, plan.device, start) if start.once else "",
             )
             writes = [
                 Write("create", new_row(action)),
@@ -223,7 +224,7 @@ class StartAction:
                 writes.append(control.write_lease(plan.device.id, lease))
             if start.once:
                 data = {"action": plan.action, "request": start.fingerprint()}
-                writes.append(Write("create", Row(plan.device.id, _once_key(who, plan.device, start), data)))
+                writes.append(Write("create", Row(plan.device.id, action.once, data)))
             rows = await self._tables.batch(store.CONTROL, writes)
             return Found(action, rows[0]), True
 

@@ -32,6 +32,8 @@ DESCRIPTIONS = "Descriptions"
 """Partition: agent id; key: device name."""
 EVENTS = "Events"
 """Partition: device id; key: counts down with time, newest first."""
+FORGET = "Forget"
+"""Partition: shard; key: ``<due ms>:<hash of what is to be deleted>``."""
 
 TRIES = 12
 _PAUSE_S = 0.002

@@ -16,15 +16,18 @@ from function_app.ports.clock import Clock
 from function_app.ports.command_bus import BusUnavailable
 from function_app.ports.tables import Conflict, Row, Tables
 from function_app.services import store
-from function_app.services.action_rows import ActionRows, Found
+from function_app.services.action_rows import ActionRows, Found, place
 from function_app.services.commands import Commands
 from function_app.services.devices import devices_of
+from function_app.services.forget import DAY_MS, Forget
 from function_app.services.movements import Movements
 from function_app.services.pending import SHARDS, Pending
 from function_app.services.start_action import ABANDON_MS
 
 ORPHAN_MS = 2 * ABANDON_MS
 """A note whose action was never written is kept this long: whoever writes it gives up before."""
+KEEP_ONCE_MS = DAY_MS
+"""An idempotency key is good for a day."""
 _HEX = "0123456789abcdef"
 
 _log = logging.getLogger(__name__)
@@ -42,6 +45,8 @@ class Sweep:
         commands: Commands,
         movements: Movements,
         access: BrokerAccess,
+        forget: Forget,
+        keep_actions_ms: int,
         clock: Clock,
     ) -> None:
         self._tables = tables
@@ -50,6 +55,8 @@ class Sweep:
         self._commands = commands
         self._movements = movements
         self._access = access
+        self._forget = forget
+        self._keep_actions_ms = keep_actions_ms
         self._clock = clock
         self._turn = 0
 
@@ -66,6 +73,7 @@ class Sweep:
                 except (Problem, BusUnavailable) as error:
                     _log.warning("action %s: %s", action, error)
         await self._forget_expired()
+        await self._forget.run(self._clock.now_ms())
         try:
             await self._access.expire(self._clock.now_ms() / 1000)
         except BrokerAccessError as error:
@@ -78,19 +86,21 @@ class Sweep:
             if now_ms - int(note.key.partition(":")[0]) > ORPHAN_MS:
                 await self._pending.drop(note)
             return
-        if found.action.status.terminal:
-            await self._pending.drop(note)
-            return
         verdict = judge(found.action, now_ms)
-        if verdict is Verdict.EXPIRE and found.action.cancel_id:
-            await self._end(found, Status.CANCELLED, "cancelled", "Cancelled before the device took it.", now_ms)
+        ended: Action | None = None
+        if verdict is Verdict.ENDED:
+            ended = found.action
+        elif verdict is Verdict.EXPIRE and found.action.cancel_id:
+            ended = await self._end(
+                found, Status.CANCELLED, "cancelled", "Cancelled before the device took it.", now_ms
+            )
         elif verdict is Verdict.EXPIRE:
             message = "The device did not take the command in time. Check that it is online, then start it again."
-            await self._end(found, Status.EXPIRED, "no-answer", message, now_ms)
+            ended = await self._end(found, Status.EXPIRED, "no-answer", message, now_ms)
         elif verdict is Verdict.LOSE:
             await self._cancel(found.action)
             message = "The device did not say how it ended before its time was over. Look at the device."
-            await self._end(found, Status.FAILED, "lost", message, now_ms)
+            ended = await self._end(found, Status.FAILED, "lost", message, now_ms)
         else:
             # The next note before this one goes: a stop in between leaves two, which is one too many, not too few.
             await self._pending.note(action_id, next_look_ms(found.action, now_ms))
@@ -98,10 +108,24 @@ class Sweep:
                 await self._publish(found, now_ms)
             elif verdict is Verdict.CANCEL:
                 await self._cancel(found.action)
+        if ended is not None:
+            await self._keep_for_a_while(ended)
         await self._pending.drop(note)
 
-    async def _end(self, found: Found, status: Status, code: str, message: str, now_ms: int) -> None:
-        await self._rows.change(found.action.id, lambda action: end(action, status, code, message, now_ms), known=found)
+    async def _end(self, found: Found, status: Status, code: str, message: str, now_ms: int) -> Action | None:
+        after = await self._rows.change(
+            found.action.id, lambda action: end(action, status, code, message, now_ms), known=found
+        )
+        return None if after is None else after.action
+
+    async def _keep_for_a_while(self, action: Action) -> None:
+        """See that an action that has ended, and the key it was started with, will be forgotten."""
+        where = place(action.id)
+        if where is None:
+            return
+        await self._forget.row(store.CONTROL, *where, due_ms=action.ended_ms + self._keep_actions_ms)
+        if action.once:
+            await self._forget.row(store.CONTROL, where[0], action.once, due_ms=action.created_ms + KEEP_ONCE_MS)
 
     async def _publish(self, found: Found, now_ms: int) -> None:
         """Send the very same command again: same id, same time of issue, so the device runs it at most once."""

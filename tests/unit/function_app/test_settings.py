@@ -111,3 +111,11 @@ def test_a_terminal_gets_that_line_and_no_traceback(tmp_path: Path, command: str
     assert done.returncode == 1
     assert done.stderr == "telescope functions: TELESCOPE_PORT is 'http'; it must be a number from 1 to 65535\n"
     assert done.stdout == ""
+
+
+def test_how_long_actions_are_kept() -> None:
+    assert settings.read({}).keep_actions_days == 30
+    assert settings.read({"TELESCOPE_KEEP_ACTIONS_DAYS": "7"}).keep_actions_days == 7
+    for wrong in ("0", "-1", "3651", "1e2", "", "99999999999"):
+        with pytest.raises(SettingsError, match="TELESCOPE_KEEP_ACTIONS_DAYS"):
+            settings.read({"TELESCOPE_KEEP_ACTIONS_DAYS": wrong})
