@@ -27,6 +27,7 @@ from function_app.services.enroll import Enroll
 from function_app.services.forget import DAY_MS, Forget
 from function_app.services.health import CheckHealth
 from function_app.services.identity import Identify
+from function_app.services.latency import Latencies
 from function_app.services.lease import Leases
 from function_app.services.movements import Movements
 from function_app.services.mqtt_credentials import MqttCredentials
@@ -70,6 +71,7 @@ class Functions:
     mqtt_credentials: MqttCredentials
     presence: PresenceIngest
     forget: Forget
+    latencies: Latencies
     sweep: Sweep
     health: CheckHealth
 
@@ -152,6 +154,7 @@ def build(settings: Settings, *, clock: Clock | None = None) -> Functions:
         mqtt_credentials=MqttCredentials(tables=tables, devices=devices, access=access, clock=now),
         presence=PresenceIngest(tables=tables, forget=forget, clock=now),
         forget=forget,
+        latencies=Latencies(tables=tables, forget=forget, clock=now),
         sweep=Sweep(
             tables=tables,
             rows=rows,

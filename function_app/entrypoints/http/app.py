@@ -13,7 +13,7 @@ from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from function_app.bootstrap import Functions
 from function_app.domain.problems import Problem, invalid, store_unavailable
-from function_app.entrypoints.http import actions, agents, auth, broker, devices, health, library
+from function_app.entrypoints.http import actions, agents, auth, broker, devices, health, latency, library
 from function_app.entrypoints.http.answers import JSON, problem
 from function_app.entrypoints.http.caller import COOKIE, Caller
 from function_app.entrypoints.http.console import Console
@@ -54,6 +54,7 @@ def create_app(functions: Functions) -> FastAPI:
         actions.router(functions, caller),
         library.router(functions, caller),
         broker.router(functions, caller),
+        latency.router(functions, caller),
         health.router(functions),
     )
     for routes in resources:
