@@ -21,8 +21,15 @@ ALGORITHM = "EdDSA"
 AUDIENCE = "telescope/mqtt"
 
 _EVERY_DEVICE = f"{topics.ROOT}/+/+/+"
-SERVICE_PUBLISH = (f"{_EVERY_DEVICE}/{topics.CMD}", f"{_EVERY_DEVICE}/{topics.STOP}", control.TOPIC)
-"""What the functions say."""
+SERVICE_PUBLISH = (
+    *(f"{_EVERY_DEVICE}/{kind}" for kind in (topics.CMD, topics.STOP)),
+    topics.conn(topics.ANY, topics.ANY),
+    *(f"{_EVERY_DEVICE}/{kind}" for kind in (topics.DESC, topics.STATE, topics.EVENT, topics.ACK)),
+    f"{_EVERY_DEVICE}/{topics.DESC}/+",
+    f"{_EVERY_DEVICE}/{topics.TELE}/+",
+    control.TOPIC,
+)
+"""What the functions say: orders; and for agents that speak HTTP, what those have told them."""
 SERVICE_SUBSCRIBE = (
     topics.conn(topics.ANY, topics.ANY),
     *(f"{_EVERY_DEVICE}/{kind}" for kind in (topics.DESC, topics.STATE, topics.EVENT, topics.ACK)),
@@ -136,7 +143,10 @@ def agent_grant(space: str, agent: str, *, token_id: str, lifetime_s: float) -> 
 
 
 def service_grant(*, client_id: str, token_id: str, lifetime_s: float) -> Grant:
-    """What a connection of the functions may do: tell every device and the broker, hear every agent's facts."""
+    """What a connection of the functions may do: tell every device and the broker, hear and pass on what agents say.
+
+    Never setpoints and pictures.
+    """
     return Grant(
         principal="service:functions",
         client_id=client_id,

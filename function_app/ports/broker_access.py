@@ -76,7 +76,8 @@ class BrokerAccess(Protocol):
     def service_credentials(self) -> ServiceCredentials:
         """Credentials for a new connection of the functions themselves, with a client id nobody else has.
 
-        They may publish commands and stops to every device, and hear every agent except camera pictures and setpoints.
+        They may publish commands and stops to every device, and hear every agent, and speak for one that has told them
+        over HTTP, except camera pictures and setpoints.
 
         Raises:
             BrokerAccessError: The key or password file is not there; the text says what to start first.

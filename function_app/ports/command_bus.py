@@ -21,8 +21,14 @@ class CommandBus(Protocol):
     async def start(self) -> None:
         """Connect now rather than at first use. Never raises: a broker that is away is tried again."""
 
-    async def publish(self, topic: str, payload: bytes, *, qos: int = 1) -> None:
+    async def publish(self, topic: str, payload: bytes, *, qos: int = 1, retain: bool = False) -> None:
         """Send; returns once the broker has confirmed (QoS 1) or the bytes are on their way (QoS 0).
+
+        Args:
+            topic: Where to.
+            payload: At most 128 KB, 64 KB where it is retained.
+            qos: 0 or 1.
+            retain: Keep it for whoever subscribes later, instead of what was kept there before.
 
         Raises:
             BusUnavailable: Not confirmed within a few seconds.

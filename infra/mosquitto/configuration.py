@@ -11,6 +11,7 @@ import os
 import pwd
 import secrets
 import shutil
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
@@ -90,6 +91,8 @@ def write(home: Path, *, host: str, tcp_port: int, websocket_port: int, plugin_p
             f"not there, so the functions cannot manage rights; put it back, or delete {SECURITY_FILE} to begin anew",
             str(home / PASSWORD_FILE),
         )
+    else:
+        _renew_service_rights(security)
     text = configuration(home, host=host, tcp_port=tcp_port, websocket_port=websocket_port, plugin_path=plugin_path)
     path = home / CONFIGURATION_FILE
     if not path.exists() or path.read_text() != text:
@@ -155,6 +158,23 @@ def first_security(password: str) -> dict[str, Any]:
         "groups": [],
         "roles": [{"rolename": SERVICE, "acls": _service_acls()}],
     }
+
+
+def _renew_service_rights(security: Path) -> None:
+    """What the functions may do is for this version to say, not for the one that wrote the file; the rest is kept."""
+    known = json.loads(security.read_bytes())
+    changed = False
+    for role in known.get("roles", ()):
+        if role["rolename"] == SERVICE and _by_topic(role.get("acls", ())) != _by_topic(_service_acls()):
+            role["acls"] = _service_acls()
+            changed = True
+    if changed:
+        _write_secret(security, json.dumps(known, indent=1))
+
+
+def _by_topic(acls: Iterable[dict[str, Any]]) -> set[tuple[str, str, bool]]:
+    """The broker writes the list in an order of its own."""
+    return {(acl["acltype"], acl["topic"], acl["allow"]) for acl in acls}
 
 
 def _service_acls() -> list[dict[str, Any]]:

@@ -32,9 +32,9 @@ class MqttCommandBus:
         """See ``CommandBus``."""
         await self._link.ready(_READY_S)
 
-    async def publish(self, topic: str, payload: bytes, *, qos: int = 1) -> None:
+    async def publish(self, topic: str, payload: bytes, *, qos: int = 1, retain: bool = False) -> None:
         """See ``CommandBus``."""
-        await self._link.publish(topic, payload, qos)
+        await self._link.publish(topic, payload, qos, retain=retain)
 
     @contextlib.asynccontextmanager
     async def acks(self, device_topic: str, command: str) -> AsyncGenerator[AsyncIterator[Ack] | None]:

@@ -96,7 +96,7 @@ class MqttLink:
             async with asyncio.timeout(timeout_s):
                 await self._tried.wait()
 
-    async def publish(self, topic: str, payload: bytes, qos: int) -> None:
+    async def publish(self, topic: str, payload: bytes, qos: int, *, retain: bool = False) -> None:
         """Send, and for QoS 1 wait for the broker's word.
 
         Raises:
@@ -107,7 +107,7 @@ class MqttLink:
         client = self._client
         if client is None:
             raise BusUnavailable(f"the broker at {self._host}:{self._port} went away")
-        information = client.publish(topic, payload, qos)
+        information = client.publish(topic, payload, qos, retain)
         self._flush(client)
         if information.rc != MQTTErrorCode.MQTT_ERR_SUCCESS:
             raise BusUnavailable(f"the broker at {self._host}:{self._port} went away: {information.rc.name}")

@@ -247,11 +247,31 @@ def test_the_functions_hear_every_agent_and_command_every_device(broker: Running
         assert [arm.receive().payload, arm.receive().payload] == [b"move", b"stop"]
 
 
-def test_the_functions_cannot_steer_or_speak_for_an_agent(broker: RunningBroker, space: str) -> None:
+def test_the_functions_pass_on_what_an_agent_told_them_over_http(broker: RunningBroker, space: str) -> None:
     own = f"ts/v1/{space}/arm"
-    ear, marker = echo(broker, space, f"{own}/ur5/ctl/+", f"{own}/conn", f"{own}/ur5/cam/+")
+    kept = [f"{own}/conn", *(f"{own}/ur5/{kind}" for kind in ("desc", "desc/twin", "state"))]
+    passed = [f"{own}/ur5/{kind}" for kind in ("event", "ack", "tele/joints")]
+    with (
+        broker.client(f"{space}-page", subscribe=(f"{own}/#",)) as page,
+        broker.service() as functions,
+    ):
+        page.subscribe(*kept, *passed)
+        for topic in kept:
+            functions.publish_acknowledged(topic, b"now", retain=True)
+        for topic in passed:
+            functions.publish_acknowledged(topic, b"now")
+        assert [page.receive().topic for _ in (*kept, *passed)] == [*kept, *passed]
+    with broker.client(f"{space}-late", subscribe=(f"{own}/#",)) as late:
+        late.subscribe(*kept)
+        found = {message.topic: message.retain for message in (late.receive() for _ in kept)}
+        assert found == dict.fromkeys(kept, True)
+
+
+def test_the_functions_cannot_steer_or_show_pictures(broker: RunningBroker, space: str) -> None:
+    own = f"ts/v1/{space}/arm"
+    ear, marker = echo(broker, space, f"{own}/ur5/ctl/+", f"{own}/ur5/cam/+")
     with ear, marker:
-        for topic in (f"{own}/ur5/ctl/1", f"{own}/conn"):
+        for topic in (f"{own}/ur5/ctl/1", f"{own}/ur5/cam/wrist"):
             with broker.service() as functions:
                 functions.subscribe(f"{own}/ur5/ctl/+", f"{own}/ur5/cam/+")
                 functions.publish(topic, b"x")

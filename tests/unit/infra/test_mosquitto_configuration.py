@@ -36,6 +36,22 @@ def test_a_second_start_keeps_rights_and_password_and_takes_the_new_ports(tmp_pa
     assert "listener 3 127.0.0.1" in (tmp_path / configuration.CONFIGURATION_FILE).read_text()
 
 
+def test_a_newer_version_gives_the_functions_their_rights_and_leaves_what_was_granted(tmp_path: Path) -> None:
+    write(tmp_path)
+    path = tmp_path / configuration.SECURITY_FILE
+    new = json.loads(path.read_text())
+    old = json.loads(path.read_text())
+    granted = {
+        "rolename": "arm",
+        "acls": [{"acltype": "publishClientSend", "topic": "t", "priority": 0, "allow": True}],
+    }
+    old["roles"][0]["acls"] = old["roles"][0]["acls"][:2]
+    old["roles"].append(granted)
+    path.write_text(json.dumps(old))
+    write(tmp_path)
+    assert json.loads(path.read_text())["roles"] == [*new["roles"], granted]
+
+
 def test_the_password_is_in_its_own_file_only(tmp_path: Path) -> None:
     write(tmp_path)
     password = (tmp_path / configuration.PASSWORD_FILE).read_text().strip()
