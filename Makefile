@@ -58,6 +58,13 @@ tests/azurite/node_modules/.installed: tests/azurite/package-lock.json | .venv/.
 	@$(NODE) --prefix tests/azurite ci --silent --no-fund --no-audit
 	@touch $@
 
+# The Functions worker runs on every Python that Telescope does, though it asks for 3.13.
+.venv/.azure-worker: requirements/azure-worker.txt | .venv/.dev
+	@rm -rf .venv/azure-worker
+	@$(BIN)/python -m pip install --quiet --disable-pip-version-check --no-deps --ignore-requires-python \
+		--target .venv/azure-worker -r requirements/azure-worker.txt
+	@touch $@
+
 console: web/dist/index.html
 
 web/dist/index.html: web/node_modules/.installed web/index.html web/package.json $(wildcard web/*.ts web/public/*) $(shell find web/src -type f 2>/dev/null)
@@ -65,12 +72,12 @@ web/dist/index.html: web/node_modules/.installed web/index.html web/package.json
 	@$(NPM) run --silent build -- --logLevel warn
 	@touch $@
 
-test: .venv/.dev console check tests/azurite/node_modules/.installed
+test: .venv/.dev console check tests/azurite/node_modules/.installed .venv/.azure-worker
 	@tests/system-packages
 	@$(NPM) test --silent
 	@$(BIN)/python -m pytest -m "not long"
 
-test-long: .venv/.dev console check tests/azurite/node_modules/.installed
+test-long: .venv/.dev console check tests/azurite/node_modules/.installed .venv/.azure-worker
 	@tests/system-packages
 	@$(NPM) test --silent
 	@$(BIN)/python -m pytest

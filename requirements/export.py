@@ -13,7 +13,10 @@ EXPORTS = {
     "requirements/local.txt": ("local",),
     "requirements/node.txt": ("node",),
     "requirements/dev.txt": ("dev",),
+    "requirements/azure-worker.txt": ("azure-worker",),
 }
+OPTIONS = {"requirements/azure-worker.txt": ("--no-deps", "--python-version", "3.13")}
+"""For what is not resolved like the others: it only runs beside packages that are there already."""
 HEADER = "# Exported from pyproject.toml by `make requirements`: groups {}.\n"
 
 
@@ -27,7 +30,7 @@ def resolved(name: str, groups: tuple[str, ...]) -> str:
         subprocess.run(  # noqa: S603 (the project's own tool)
             [
                 sys.executable, "-m", "uv", "pip", "compile", "--quiet", "--universal", "--no-header",
-                "--no-annotate", *chosen, "--output-file", str(output),
+                "--no-annotate", *OPTIONS.get(name, ()), *chosen, "--output-file", str(output),
             ],
             cwd=ROOT,
             check=True,

@@ -1,15 +1,17 @@
-"""Azure Functions: one catch-all HTTP route to the ASGI application, and the timer.
+"""Azure Functions: one catch-all HTTP route to the ASGI application, the timer, and what devices say.
 
 A native route with the ASGI middleware inside, because the framework's own ASGI app breaks a route prefix; built at the
 first request, because a worker imports this file to index it.
 """
 
 import functools
+import json
 
 import azure.functions as func
 
 from function_app import bootstrap, settings
 from function_app.bootstrap import Functions
+from function_app.entrypoints.events import from_event_grid
 from function_app.entrypoints.http import create_app
 
 app = func.FunctionApp(http_auth_level=func.AuthLevel.ANONYMOUS)
@@ -39,3 +41,11 @@ async def http(req: func.HttpRequest, context: func.Context) -> func.HttpRespons
 async def sweep(timer: func.TimerRequest) -> None:  # noqa: ARG001 (the host passes it by name)
     """What time brings: commands sent again, actions ended, rights expired."""
     await _functions().sweep.run()
+
+
+@app.function_name("ingest")
+@app.event_grid_trigger(arg_name="event")
+async def ingest(event: str) -> None:
+    """One MQTT message that the Event Grid namespace has routed. An error makes Event Grid deliver it again."""
+    # As text: the binding's own class for CloudEvents takes a payload in ``data_base64`` for an attribute.
+    await from_event_grid(_functions(), [json.loads(event)])

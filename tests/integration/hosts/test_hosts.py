@@ -1,0 +1,149 @@
+"""The same functions under each host: requests, the timer, and what devices say."""
+
+import asyncio
+import json
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import httpx
+import pytest
+
+from device_agent.protocol import codec, topics
+from device_agent.protocol.messages import Presence
+from function_app import bootstrap, settings
+from function_app.entrypoints.http.answers import MAX_BODY
+from function_app.entrypoints.http.caller import CLIENT_HEADER
+from tests.support.brokers import wait_until
+from tests.support.cloud import API, MOVE, MovingClock, Robot, problem
+from tests.support.hosts import HOSTS, Host, HostFailed, HostKind, start_host
+from tests.support.hosts.host import PATIENCE_S
+
+
+class Reached:
+    """A host, as the toy robot speaks to the functions."""
+
+    def __init__(self, host: Host, environment: dict[str, str]) -> None:
+        self.host = host
+        self.clock = MovingClock()
+        self._environment = environment
+
+    def ask(self, method: str, path: str, **options: Any) -> httpx.Response:
+        return httpx.request(method, self.host.url + path, timeout=PATIENCE_S, **options)
+
+    def link(self, name: str) -> str:
+        """A one-time sign-in token, made beside the host."""
+
+        async def made() -> str:
+            functions = bootstrap.build(settings.read(self._environment))
+            link = await functions.sign_in.link(await functions.sign_in.account(name))
+            await functions.close()
+            return link
+
+        return asyncio.run(made())
+
+    def sign_in(self, name: str) -> httpx.Client:
+        answer = self.ask("POST", f"{API}/auth/sign-in", json={"link": self.link(name)})
+        assert answer.status_code == 200, answer.text
+        token = {"Authorization": f"Bearer {answer.json()['access_token']}"}
+        return httpx.Client(base_url=self.host.url + API, headers=token, timeout=PATIENCE_S)
+
+
+@pytest.fixture(scope="module", params=HOSTS)
+def kind(request: pytest.FixtureRequest) -> HostKind:
+    found: HostKind = request.param
+    return found
+
+
+@pytest.fixture(scope="module")
+def there(kind: HostKind, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Reached]:
+    home = tmp_path_factory.mktemp(kind)
+    environment = {"TELESCOPE_HOME": str(home), "TELESCOPE_MQTT_PORT": "1"}
+    with start_host(kind, environment) as host:
+        yield Reached(host, environment)
+
+
+def test_a_person_signs_in_with_a_cookie_and_out_again(there: Reached) -> None:
+    with httpx.Client(base_url=there.host.url + API, timeout=PATIENCE_S) as anna:
+        answer = anna.post("/auth/sign-in", json={"link": there.link("anna")})
+        (cookie,) = answer.headers.get_list("set-cookie")
+        fields = {part.strip().lower().partition("=")[0] for part in cookie.split(";")}
+        assert fields >= {"path", "max-age", "httponly", "samesite"}
+        assert anna.get("/accounts/me").json()["name"] == "anna"
+        gone = anna.post("/auth/sign-out", headers={CLIENT_HEADER: "test"})
+        assert (gone.status_code, gone.content) == (204, b"")
+        assert list(anna.cookies.jar) == []
+        problem(anna.get("/accounts/me"), 401, "unauthorized")
+
+
+def test_bodies_come_and_go_whole(there: Reached) -> None:
+    document = there.ask("GET", f"{API}/openapi.json")
+    assert len(document.content) == int(document.headers["content-length"]) > 50_000
+    assert document.json()["openapi"].startswith("3.")
+    sign_in = f"{API}/auth/sign-in"
+    problem(there.ask("POST", sign_in, content=b" " * (MAX_BODY + 1)), 413, "too-large")
+    problem(there.ask("POST", sign_in, content=b" " * MAX_BODY), 422, "invalid")
+    problem(there.ask("POST", sign_in, content=b"\x00\xff\xfe"), 422, "invalid")
+    problem(there.ask("POST", sign_in, content='{"link": "grüß 🤖"}'.encode()), 401, "unauthorized")
+    assert there.ask("HEAD", f"{API}/health").content == b""
+
+
+@pytest.mark.parametrize(
+    "path",
+    ["/devices/%ff", "/devices/a%2Fb", "/devices/a+b%20c", "/devices/gr%C3%BC%C3%9F", "/devices/%25", "/devices/a;b=c"],
+)
+def test_an_odd_path_is_nobodys(there: Reached, path: str) -> None:
+    with there.sign_in("anna") as anna:
+        answer = anna.get(path)
+    assert answer.status_code in {404, 422}, answer.text
+    assert answer.headers["content-type"] == "application/problem+json"
+
+
+def test_a_query_comes_as_it_was_sent(there: Reached) -> None:
+    with there.sign_in("anna") as anna:
+        problem(anna.get("/devices?cursor=%F0%9F%A4%96%20%26%3D%2B"), 422, "cursor-invalid")
+        problem(anna.get("/devices?limit=5&limit=x"), 422, "invalid")
+        problem(anna.get("/devices?cursor=%ff"), 422, "cursor-invalid")
+        assert anna.get("/devices?limit=5&cursor=").status_code in {200, 422}
+        assert anna.get("/devices?limit=1&limit=2").status_code in {200, 422}
+
+
+def test_no_route_and_no_method_are_problems_too(there: Reached) -> None:
+    with there.sign_in("anna") as anna:
+        problem(anna.get("/nothing"), 404, "http")
+        problem(anna.post("/devices"), 405, "http")
+    assert int(there.ask("GET", f"{API}/health").headers["x-telescope-time-ms"]) > 0
+
+
+def test_what_a_device_says_is_taken_in_and_the_timer_ends_what_ran_out(there: Reached) -> None:
+    with there.sign_in("bert") as bert, Robot(there, ("arm",)) as robot:  # type: ignore[arg-type]
+        claimed = bert.post("/agents/claim", json={"code": robot.code()})
+        assert claimed.status_code == 200, claimed.text
+        robot.space = robot.enrollment()["space"]
+        assert bert.get(f"/devices/{robot.device}").json()["online"] is False
+        presence = Presence(online=True, session=1, at_ms=there.clock.now_ms())
+        there.host.deliver(topics.conn(robot.space, robot.id), codec.encode(presence))
+        assert bert.get(f"/devices/{robot.device}").json()["online"] is True
+        there.host.deliver(topics.conn(robot.space, robot.id), b"nonsense")
+        there.host.deliver("nonsense", b"")
+
+        begun = bert.post(f"/devices/{robot.device}/actions", json={"request": MOVE, "ttl_ms": 1_000})
+        action = f"/actions/{begun.json()['id']}"
+
+        def ended() -> bool:
+            there.host.tick()
+            return bool(bert.get(action).json()["status"] == "expired")
+
+        wait_until(ended, "the timer to end the action", PATIENCE_S)
+
+
+def test_an_error_reaches_the_host_so_that_it_delivers_again(kind: HostKind, tmp_path: Path) -> None:
+    with start_host(kind, {"TELESCOPE_HOME": str(tmp_path)}) as host:
+        for file in tmp_path.glob("tables.sqlite*"):
+            file.unlink()
+        (tmp_path / "tables.sqlite").write_bytes(b"no database " * 1000)
+        with pytest.raises(HostFailed, match="damaged"):
+            host.tick()
+        with pytest.raises(HostFailed, match="damaged"):
+            host.deliver("ts/v1/space/agent/conn", json.dumps({"online": True, "session": 1, "at_ms": 1}).encode())
+        problem(httpx.post(f"{host.url}{API}/auth/sign-in", json={"link": "x"}), 503, "store-unavailable")

@@ -1,0 +1,53 @@
+"""Azure Functions: Microsoft's own worker code in a process, behind a front as the Functions host is one."""
+
+import base64
+import contextlib
+import http.client
+import json
+import secrets
+from collections.abc import Iterator, Mapping
+from typing import Any
+from urllib.parse import urlsplit
+
+from tests.support.hosts.host import PATIENCE_S, Host, HostFailed, environment_of, start_program
+
+
+@contextlib.contextmanager
+def start_azure(environment: Mapping[str, str]) -> Iterator[Host]:
+    """The worker on a free port, with the functions indexed and loaded."""
+    with start_program(["-m", "tests.support.hosts.functions_host"], environment_of(environment)) as program:
+        yield _Azure(program.line())
+
+
+class _Azure:
+    """The non-HTTP functions are fired through the host's own addresses for that."""
+
+    def __init__(self, url: str) -> None:
+        self.url = url
+
+    def tick(self) -> None:
+        self._post("/admin/functions/sweep", {"input": ""}, {})
+
+    def deliver(self, topic: str, payload: bytes) -> None:
+        event = {
+            "specversion": "1.0",
+            "id": secrets.token_hex(8),
+            "source": "telescope-namespace",
+            "type": "MQTT.EventPublished",
+            "subject": topic,
+            "time": "2026-01-01T00:00:00Z",
+            "data_base64": base64.b64encode(payload).decode(),
+        }
+        self._post("/runtime/webhooks/eventgrid?functionName=ingest", [event], {"aeg-event-type": "Notification"})
+
+    def _post(self, path: str, body: Any, headers: dict[str, str]) -> None:
+        where = urlsplit(self.url)
+        connection = http.client.HTTPConnection(where.hostname or "", where.port, timeout=PATIENCE_S)
+        try:
+            connection.request("POST", path, json.dumps(body), {"content-type": "application/json", **headers})
+            answer = connection.getresponse()
+            said = answer.read().decode()
+            if answer.status != 202:
+                raise HostFailed(f"{answer.status} {said}")
+        finally:
+            connection.close()
