@@ -1,4 +1,4 @@
-"""What a Functions host sees: one app, two functions, and HTTP through the host's own types."""
+"""What a Functions host sees: one app, three functions, and HTTP through the host's own types."""
 
 import ast
 import asyncio
@@ -35,17 +35,19 @@ def azure(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Any]:
     azure._http.cache_clear()
 
 
-def test_a_host_finds_one_app_with_two_functions(functions: dict[str, Any]) -> None:
+def test_a_host_finds_one_app_with_three_functions(functions: dict[str, Any]) -> None:
     assert "app" in dir(function_app)
     apps = [name for name in dir(function_app) if isinstance(getattr(function_app, name), func.FunctionApp)]
     assert apps == ["app"]
-    assert set(functions) == {"http", "sweep"}
+    assert set(functions) == {"http", "ingest", "sweep"}
     http, sweep = (json.loads(str(functions[name])) for name in ("http", "sweep"))
     trigger = next(each for each in http["bindings"] if each["type"] == "httpTrigger")
     assert (trigger["route"], trigger["authLevel"]) == ("{*path}", "ANONYMOUS")
     assert {"GET", "POST", "PUT", "DELETE"} <= {str(method).rpartition(".")[2] for method in trigger["methods"]}
     (timer,) = [each for each in sweep["bindings"] if each["type"] == "timerTrigger"]
     assert timer["schedule"] == "*/5 * * * * *"
+    (event,) = json.loads(str(functions["ingest"]))["bindings"]
+    assert (event["type"], event["name"]) == ("eventGridTrigger", "event")
 
 
 def test_what_is_not_there_is_not_made_up() -> None:
