@@ -33,6 +33,14 @@ _CHANNELS = (
     _Channel(
         "joints", f"{_DEVICE}/tele/joints", "JointTelemetry", 0, False, "All joints, 20 Hz at rest, 50 Hz in motion."
     ),
+    _Channel(
+        "measurements",
+        f"{_DEVICE}/tele/{{stream}}",
+        "Measurements",
+        0,
+        False,
+        "Named values measured at one moment; every stream but `joints`.",
+    ),
     _Channel("event", f"{_DEVICE}/event", "Event", 1, False, "A fact that happened; stored."),
     _Channel("ack", f"{_DEVICE}/ack", "Ack", 1, False, "The answer to one command."),
     _Channel("command", f"{_DEVICE}/cmd", "Signed", 1, False, "A signed request; `body` is a Command.", to_agent=True),
@@ -59,6 +67,7 @@ _PARAMETERS = {
     "space": "Id of the space, the room and its people's data.",
     "agent": "Id of the agent; also its MQTT client id.",
     "device": "The device's name at its agent.",
+    "stream": "Name of the stream, any but `joints`.",
     "epoch": "Epoch of the lease under which the setpoints are sent.",
 }
 

@@ -20,6 +20,12 @@ Text = Annotated[str, Meta(max_length=2000)]
 Label = Annotated[str, Meta(max_length=200)]
 Count = Annotated[int, Meta(ge=0, le=2**53)]
 Milliseconds = Annotated[int, Meta(ge=0, le=2**53)]
+FIELD_PATTERN = r"[A-Za-z0-9_-][A-Za-z0-9_.-]{0,79}"
+Field = Annotated[
+    str, Meta(pattern=f"^{FIELD_PATTERN}$", description="letters, digits, _, - and dots, 1 to 80 of them")
+]
+MAX_VALUES = 128
+"""Values in one message of measurements."""
 Vector3 = tuple[float, float, float]
 Quaternion = tuple[float, float, float, float]
 Pose = Annotated[
@@ -61,7 +67,7 @@ class Joint(Struct, frozen=True, kw_only=True):
 
 
 class Stream(Struct, frozen=True, kw_only=True):
-    """One measurement stream, published at ``tele/{name}``."""
+    """One stream at ``tele/{name}``: ``joints`` carries ``JointTelemetry``, all others ``Measurements``."""
 
     name: Id
     rate_hz: float
@@ -206,6 +212,19 @@ class JointTelemetry(Struct, frozen=True, kw_only=True):
     setpoint_sent_ms: float = 0.0
     loop_age_ms: float = 0.0
     limited: tuple[Label, ...] = ()
+
+
+class Measurements(Struct, frozen=True, kw_only=True):
+    """``tele/{stream}``, every stream but ``joints``: named values, all measured at one moment.
+
+    A name is a quantity with its unit, then a dot and the part of the device where there are several:
+    ``temperature_c.elbow``. ``sequence`` counts up from one start of the agent to the next.
+    """
+
+    tick_ms: Milliseconds
+    at_ms: Milliseconds
+    sequence: Count
+    values: Annotated[dict[Field, float | bool], Meta(min_length=1, max_length=MAX_VALUES)]
 
 
 class Event(Struct, frozen=True, kw_only=True):
@@ -365,6 +384,6 @@ class Stop(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
 
 def schema_components() -> tuple[dict[str, Any], dict[str, Any]]:
     """JSON Schema of every message: ``(references by name, definitions)``, for the generated documents."""
-    kinds = (Presence, Description, Twin, State, JointTelemetry, Event, Ack, Command, Setpoint, Stop)
+    kinds = (Presence, Description, Twin, State, JointTelemetry, Measurements, Event, Ack, Command, Setpoint, Stop)
     references, definitions = msgspec.json.schema_components(kinds, ref_template="#/components/schemas/{name}")
     return dict(zip((kind.__name__ for kind in kinds), references, strict=True)), definitions

@@ -28,6 +28,8 @@ _NAME_REQUIRED = frozenset({TELE, CAM, CTL})
 _NAME_ALLOWED = _NAME_REQUIRED | {DESC}
 ANY = "+"
 
+JOINTS = "joints"
+"""Name under ``tele`` of the stream of all joints (``JointTelemetry``); all others carry ``Measurements``."""
 TWIN = "twin"
 """Name under ``desc`` of the retained drawing of the device (``Twin``)."""
 

@@ -13,6 +13,7 @@ const HEAD = `// Generated from docs/asyncapi.json by \`make contract\`; do not 
 const NO_TYPE = new Set([
   "title", "description", "default", "minimum", "maximum", "exclusiveMinimum", "exclusiveMaximum", "minLength",
   "maxLength", "pattern", "minItems", "maxItems", "minProperties", "maxProperties", "discriminator", "required",
+  "propertyNames",
 ]);
 
 const WORDS = { string: "string", number: "number", integer: "number", boolean: "boolean", null: "null" };

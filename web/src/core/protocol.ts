@@ -42,7 +42,7 @@ export interface Joint {
   max_effort_nm: number;
 }
 
-/** One measurement stream, published at `tele/{name}`. */
+/** One stream at `tele/{name}`: `joints` carries `JointTelemetry`, all others `Measurements`. */
 export interface Stream {
   /** letters, digits, _ and -, 1 to 64 of them */
   name: string;
@@ -159,6 +159,19 @@ export interface JointTelemetry {
   setpoint_sent_ms?: number;
   loop_age_ms?: number;
   limited?: string[];
+}
+
+/**
+ * `tele/{stream}`, every stream but `joints`: named values, all measured at one moment.
+ *
+ * A name is a quantity with its unit, then a dot and the part of the device where there are several:
+ * `temperature_c.elbow`. `sequence` counts up from one start of the agent to the next.
+ */
+export interface Measurements {
+  tick_ms: number;
+  at_ms: number;
+  sequence: number;
+  values: Record<string, number | boolean>;
 }
 
 /** `event`: a fact that happened, in the past tense. Stored. */
