@@ -7,14 +7,15 @@ from function_app.adapters.local.broker_access import MosquittoBrokerAccess, Tok
 from function_app.adapters.local.catalogue import FolderCatalogue
 from function_app.adapters.local.clock import SystemClock
 from function_app.adapters.local.command_bus import MqttCommandBus
-from function_app.adapters.local.feed import MqttFeed
+from function_app.adapters.local.feed import MqttFeed, MqttTelemetry
 from function_app.adapters.local.keys import FileKeys
 from function_app.adapters.local.tables import SqliteTables
+from function_app.domain.series import Keep
 from function_app.ports.blobs import Blobs
 from function_app.ports.broker_access import BrokerAccess
 from function_app.ports.clock import Clock
 from function_app.ports.command_bus import CommandBus
-from function_app.ports.feed import Feed
+from function_app.ports.feed import Feed, Telemetry
 from function_app.ports.keys import Keys
 from function_app.ports.tables import Tables
 from function_app.services.action_acks import ActionAcks
@@ -27,12 +28,15 @@ from function_app.services.enroll import Enroll
 from function_app.services.forget import DAY_MS, Forget
 from function_app.services.health import CheckHealth
 from function_app.services.identity import Identify
+from function_app.services.intake import Intake
 from function_app.services.latency import Latencies
 from function_app.services.lease import Leases
 from function_app.services.movements import Movements
 from function_app.services.mqtt_credentials import MqttCredentials
 from function_app.services.pending import Pending
 from function_app.services.presence import PresenceIngest
+from function_app.services.series import SeriesWriter
+from function_app.services.series_range import SeriesReader
 from function_app.services.sign_in import SignIn
 from function_app.services.start_action import StartAction
 from function_app.services.stop import StopDevices
@@ -53,6 +57,7 @@ class Functions:
     blobs: Blobs
     bus: CommandBus
     feed: Feed
+    telemetry: Telemetry
     access: BrokerAccess
     keys: Keys
     clock: Clock
@@ -72,6 +77,8 @@ class Functions:
     presence: PresenceIngest
     forget: Forget
     latencies: Latencies
+    intake: Intake
+    series: SeriesReader
     sweep: Sweep
     health: CheckHealth
 
@@ -110,11 +117,15 @@ def build(settings: Settings, *, clock: Clock | None = None) -> Functions:
         )
     bus = MqttCommandBus(host=settings.mqtt_host, port=settings.mqtt_port, credentials=access.service_credentials)
     feed = MqttFeed(host=settings.mqtt_host, port=settings.mqtt_port, credentials=access.service_credentials)
+    telemetry = MqttTelemetry(host=settings.mqtt_host, port=settings.mqtt_port, credentials=access.service_credentials)
 
     forget = Forget(tables=tables, blobs=blobs)
     identify = Identify(tables=tables, keys=keys, forget=forget, clock=now)
     sign_in = SignIn(tables=tables, identify=identify, access=access, clock=now)
     devices = Devices(tables=tables, clock=now)
+    keep = _keep(settings)
+    writer = SeriesWriter(tables=tables, forget=forget, keep=keep, clock=now)
+    intake = Intake(tables=tables, writer=writer, clock=now)
     commands = Commands(bus=bus, keys=keys, clock=now)
     movements = Movements(tables=tables, blobs=blobs, catalogue=catalogue, clock=now)
     rows = ActionRows(tables=tables)
@@ -126,6 +137,7 @@ def build(settings: Settings, *, clock: Clock | None = None) -> Functions:
         blobs=blobs,
         bus=bus,
         feed=feed,
+        telemetry=telemetry,
         access=access,
         keys=keys,
         clock=now,
@@ -155,6 +167,8 @@ def build(settings: Settings, *, clock: Clock | None = None) -> Functions:
         presence=PresenceIngest(tables=tables, forget=forget, clock=now),
         forget=forget,
         latencies=Latencies(tables=tables, forget=forget, clock=now),
+        intake=intake,
+        series=SeriesReader(tables=tables, devices=devices, keep=keep, clock=now),
         sweep=Sweep(
             tables=tables,
             rows=rows,
@@ -163,10 +177,22 @@ def build(settings: Settings, *, clock: Clock | None = None) -> Functions:
             movements=movements,
             access=access,
             forget=forget,
+            intake=intake,
             keep_actions_ms=settings.keep_actions_days * DAY_MS,
             clock=now,
         ),
         health=CheckHealth(tables=tables, bus=bus),
+    )
+
+
+def _keep(settings: Settings) -> Keep:
+    return Keep(
+        raw_ms=settings.keep_raw_hours * DAY_MS // 24,
+        levels_ms={
+            "10s": settings.keep_10s_days * DAY_MS,
+            "1min": settings.keep_1min_days * DAY_MS,
+            "10min": settings.keep_10min_days * DAY_MS,
+        },
     )
 
 

@@ -80,6 +80,9 @@ class Settings:
         robots: Folder of the robot types.
         console: Folder of the built console.
         keep_actions_days: How long actions are kept after their end [d].
+        keep_raw_hours: How long every sample is kept, and how late one may come [h].
+        keep_10s_days: How long what is left of each 10 s is kept [d]; of each minute, of each ten minutes. What is
+            left of hours and days is kept for ever.
     """
 
     home: Path
@@ -95,6 +98,10 @@ class Settings:
     robots: Path = ROOT / "robots"
     console: Path = ROOT / "web" / "dist"
     keep_actions_days: int = 30
+    keep_raw_hours: int = 24
+    keep_10s_days: int = 7
+    keep_1min_days: int = 90
+    keep_10min_days: int = 730
 
 
 def read(environment: Mapping[str, str] | None = None) -> Settings:
@@ -127,6 +134,10 @@ def read(environment: Mapping[str, str] | None = None) -> Settings:
         robots=_folder(given, "TELESCOPE_ROBOTS", ROOT / "robots"),
         console=_folder(given, "TELESCOPE_CONSOLE", ROOT / "web" / "dist"),
         keep_actions_days=_number(given, "TELESCOPE_KEEP_ACTIONS_DAYS", 30, 1, 3650),
+        keep_raw_hours=_number(given, "TELESCOPE_KEEP_RAW_HOURS", 24, 1, 9600),
+        keep_10s_days=_number(given, "TELESCOPE_KEEP_10S_DAYS", 7, 1, 36_500),
+        keep_1min_days=_number(given, "TELESCOPE_KEEP_1MIN_DAYS", 90, 1, 36_500),
+        keep_10min_days=_number(given, "TELESCOPE_KEEP_10MIN_DAYS", 730, 1, 36_500),
     )
 
 

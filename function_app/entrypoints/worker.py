@@ -3,9 +3,10 @@
 import asyncio
 import logging
 import signal
+from collections.abc import Sequence
 
 from function_app.bootstrap import Functions
-from function_app.entrypoints.ingest import ingest
+from function_app.entrypoints.ingest import ingest, ingest_telemetry
 
 SWEEP_EVERY_S = 1.0
 _log = logging.getLogger(__name__)
@@ -17,7 +18,14 @@ async def work(functions: Functions) -> None:
     async def handle(topic: str, payload: bytes) -> None:
         await ingest(functions, topic, payload)
 
-    tasks = [asyncio.create_task(functions.feed.run(handle)), asyncio.create_task(_sweep(functions))]
+    async def handle_telemetry(messages: Sequence[tuple[str, bytes]]) -> None:
+        await ingest_telemetry(functions, messages)
+
+    tasks = [
+        asyncio.create_task(functions.feed.run(handle)),
+        asyncio.create_task(functions.telemetry.run(handle_telemetry)),
+        asyncio.create_task(_sweep(functions)),
+    ]
     ending = asyncio.Event()
     loop = asyncio.get_running_loop()
     for number in (signal.SIGINT, signal.SIGTERM):

@@ -1,6 +1,6 @@
 """What devices say, on its way into the tables, where a worker of ours subscribes to it (elsewhere the cloud calls)."""
 
-from collections.abc import Awaitable, Callable
+from collections.abc import Awaitable, Callable, Sequence
 from typing import Protocol
 
 Handler = Callable[[str, bytes], Awaitable[None]]
@@ -16,3 +16,14 @@ class Feed(Protocol):
         A handler that raises ``StoreError`` or ``Problem`` is given its message again a few times; what still cannot be
         stored then, or fails in another way, is logged and let go, so that the others go on.
         """
+
+
+BatchHandler = Callable[[Sequence[tuple[str, bytes]]], Awaitable[None]]
+"""Given topics and payloads of what arrived in a short while."""
+
+
+class Telemetry(Protocol):
+    """A subscription to measurements: many, each of little worth, and never in the way of the others."""
+
+    async def run(self, handler: BatchHandler) -> None:
+        """Deliver until cancelled, about every two seconds; reconnects for ever. What cannot be kept is dropped."""

@@ -20,6 +20,7 @@ from function_app.services.action_rows import ActionRows, Found, place
 from function_app.services.commands import Commands
 from function_app.services.devices import devices_of
 from function_app.services.forget import DAY_MS, Forget
+from function_app.services.intake import Intake
 from function_app.services.movements import Movements
 from function_app.services.pending import SHARDS, Pending
 from function_app.services.start_action import ABANDON_MS
@@ -46,6 +47,7 @@ class Sweep:
         movements: Movements,
         access: BrokerAccess,
         forget: Forget,
+        intake: Intake,
         keep_actions_ms: int,
         clock: Clock,
     ) -> None:
@@ -56,6 +58,7 @@ class Sweep:
         self._movements = movements
         self._access = access
         self._forget = forget
+        self._intake = intake
         self._keep_actions_ms = keep_actions_ms
         self._clock = clock
         self._turn = 0
@@ -74,6 +77,7 @@ class Sweep:
                     _log.warning("action %s: %s", action, error)
         await self._forget_expired()
         await self._forget.run(self._clock.now_ms())
+        await self._intake.distribute_left()
         try:
             await self._access.expire(self._clock.now_ms() / 1000)
         except BrokerAccessError as error:

@@ -12,7 +12,7 @@ import contextlib
 import json
 import threading
 import time
-from collections.abc import Callable, Coroutine, Iterable, Iterator
+from collections.abc import Callable, Coroutine, Iterable, Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, Self, TypeVar
@@ -35,7 +35,7 @@ from device_agent.protocol.messages import (
 from function_app import bootstrap
 from function_app.domain.ids import agent_id
 from function_app.entrypoints.http import create_app
-from function_app.entrypoints.ingest import ingest
+from function_app.entrypoints.ingest import ingest, ingest_telemetry
 from function_app.ports.broker_access import Credentials
 from function_app.settings import Settings
 from tests.support.brokers import PATIENCE_S, Client, Message, RunningBroker, wait_until
@@ -72,6 +72,7 @@ class Cloud:
         self.functions = bootstrap.build(settings, clock=self.clock)
         self.app = create_app(self.functions)
         self._feed: asyncio.Future[None] | None = None
+        self._telemetry: asyncio.Future[None] | None = None
         self._clients: list[httpx.AsyncClient] = []
 
     def run(self, call: Coroutine[Any, Any, T]) -> T:
@@ -121,6 +122,19 @@ class Cloud:
 
         self.run(start())
 
+    def start_telemetry(self) -> None:
+        """Take in what robots measure, until the end; returns once it hears them."""
+
+        async def handle(messages: Sequence[tuple[str, bytes]]) -> None:
+            await ingest_telemetry(self.functions, messages)
+
+        async def start() -> None:
+            self._telemetry = asyncio.ensure_future(self.functions.telemetry.run(handle))
+            link: Any = self.functions.telemetry._link  # type: ignore[attr-defined]
+            assert await link.ready(PATIENCE_S), link.trouble
+
+        self.run(start())
+
     def sweep(self) -> None:
         """One round of the timer."""
         self.run(self.functions.sweep.run())
@@ -130,9 +144,10 @@ class Cloud:
 
     def __exit__(self, *_: object) -> None:
         async def end() -> None:
-            if self._feed is not None:
-                self._feed.cancel()
-                await asyncio.gather(self._feed, return_exceptions=True)
+            for feed in (self._feed, self._telemetry):
+                if feed is not None:
+                    feed.cancel()
+                    await asyncio.gather(feed, return_exceptions=True)
             for client in self._clients:
                 await client.aclose()
             await self.functions.close()

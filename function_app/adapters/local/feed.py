@@ -12,7 +12,7 @@ from device_agent.protocol.topics import ANY
 from function_app.adapters.local.mqtt_link import MqttLink
 from function_app.domain.problems import Problem
 from function_app.ports.broker_access import ServiceCredentials
-from function_app.ports.feed import Handler
+from function_app.ports.feed import BatchHandler, Handler
 from function_app.ports.tables import StoreError
 
 MAX_WAITING = 10_000
@@ -22,6 +22,12 @@ HOLD_ACK_S = 0.03
 instead of competing for the same rows in the middle of the call."""
 TRIES = 6
 FIRST_PAUSE_S = 0.1
+
+COLLECT_S = 2.0
+MAX_COLLECTED = 20_000
+"""Measurements that wait to be stored: a hundred robots at 20 Hz for ten seconds."""
+MAX_COLLECTED_BYTES = 32 * 1024 * 1024
+TELEMETRY_TRIES = 3
 
 FILTERS = (
     topics.conn(ANY, ANY),
@@ -92,3 +98,61 @@ class MqttFeed:
             self._link.acknowledge(oldest.message, oldest.generation)
             _log.warning("ingest is behind: a message of %s was not stored", oldest.message.topic)
         self._waiting.put_nowait(_Arrived(message, self._link.generation, asyncio.get_running_loop().time()))
+
+
+class MqttTelemetry:
+    """``Telemetry`` over MQTT, by a connection of its own: measurements that queue up hold up no ack."""
+
+    def __init__(self, *, host: str, port: int, credentials: Callable[[], ServiceCredentials]) -> None:
+        self._collected: list[tuple[str, bytes]] = []
+        self._bytes = 0
+        self._dropped = 0
+        self._some = asyncio.Event()
+        self._link = MqttLink(
+            host=host,
+            port=port,
+            credentials=credentials,
+            subscriptions=(topics.device(ANY, ANY, ANY, topics.TELE, ANY),),
+            receive=self._arrived,
+            qos=0,
+        )
+
+    async def run(self, handler: BatchHandler) -> None:
+        """See ``Telemetry``."""
+        self._link.start()
+        try:
+            while True:
+                await self._some.wait()
+                await asyncio.sleep(COLLECT_S)
+                batch, self._collected, self._bytes = self._collected, [], 0
+                self._some.clear()
+                if self._dropped:
+                    _log.warning("telemetry is behind: %d messages were dropped", self._dropped)
+                    self._dropped = 0
+                await self._store(batch, handler)
+        finally:
+            await self._link.close()
+
+    @staticmethod
+    async def _store(batch: list[tuple[str, bytes]], handler: BatchHandler) -> None:
+        for attempt in range(TELEMETRY_TRIES):
+            try:
+                await handler(batch)
+            except (StoreError, Problem) as error:
+                _log.warning("telemetry, try %d of %d: %s", attempt + 1, TELEMETRY_TRIES, error)
+                await asyncio.sleep(COLLECT_S)
+            except Exception:  # noqa: BLE001 (whatever it is: what comes next goes on)
+                _log.exception("%d messages of telemetry failed", len(batch))
+                return
+            else:
+                return
+        _log.warning("telemetry: %d messages were dropped", len(batch))
+
+    def _arrived(self, message: MQTTMessage) -> None:
+        payload = bytes(message.payload)
+        if len(self._collected) >= MAX_COLLECTED or self._bytes + len(payload) > MAX_COLLECTED_BYTES:
+            self._dropped += 1
+            return
+        self._collected.append((message.topic, payload))
+        self._bytes += len(payload)
+        self._some.set()

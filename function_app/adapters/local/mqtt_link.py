@@ -48,6 +48,7 @@ class MqttLink:
         subscriptions: Sequence[str] = (),
         receive: Callable[[mqtt.MQTTMessage], None] | None = None,
         manual_ack: bool = False,
+        qos: int = 1,
     ) -> None:
         self._host = host
         self._port = port
@@ -55,6 +56,7 @@ class MqttLink:
         self._subscriptions = tuple(subscriptions)
         self._receive = receive
         self._manual_ack = manual_ack
+        self._qos = qos
         self._version = 0
         self._client: mqtt.Client | None = None
         self._keeper: asyncio.Task[None] | None = None
@@ -260,7 +262,7 @@ class MqttLink:
 
     async def _subscribe(self, client: mqtt.Client) -> None:
         for start in range(0, len(self._subscriptions), MAX_FILTERS):
-            filters = [(pattern, 1) for pattern in self._subscriptions[start : start + MAX_FILTERS]]
+            filters = [(pattern, self._qos) for pattern in self._subscriptions[start : start + MAX_FILTERS]]
             result, mid = client.subscribe(filters)
             if result != MQTTErrorCode.MQTT_ERR_SUCCESS or mid is None:
                 raise BusUnavailable("the broker went away")
