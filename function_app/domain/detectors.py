@@ -12,7 +12,6 @@ from dataclasses import dataclass, field, replace
 
 from function_app.domain.estimators import (
     MEMORY,
-    SETTLED,
     VARIED,
     WARM_UP,
     Baseline,
@@ -85,9 +84,9 @@ SURE = 4.0
 """A slope, or the difference of two, of so many standard errors is one."""
 SLOWING = 0.9
 """A slope that is less than this share of the one before is on its way to rest, not to the limit."""
-PROVEN = 0.5
+PROVEN = 0.75
 """A slope that was this share of today's one ten minutes before is no beginning any more."""
-SOON = 1 / 3
+SOON = 1 / 4
 """Of a trend that has only begun, this share of the horizon counts: it may be a warming that comes to rest."""
 
 
@@ -185,6 +184,8 @@ FAR = 8.0
 """An outlier is so many standard deviations away;"""
 NEAR = 4.0
 """and is none any more so near."""
+PATIENCE = 60
+"""Windows for which a shift must last that is worth a word: ten minutes. A larger one is told sooner."""
 SHIFT = 6.0
 """Without limits a lasting shift is one of so many standard deviations."""
 
@@ -255,14 +256,14 @@ def _outlier(known: Watch, value: float, spread: float) -> Streak:
 
 
 def _changed(after: Watch, limits: Limits, value: float, spread: float) -> Watch:
-    """A shift that lasts about five minutes; over when the value is back, or has been the new normal for an hour."""
+    """A shift that lasts about ten minutes; over when the value is back, or has been the new normal for an hour."""
     room = limits.room(after.hinkley.mean)
     shift = limits.change or (None if room is None else room / 2)
     shift = SHIFT * spread if shift is None else max(shift, SHIFT * after.baseline.noise)
     if spread <= 0 or shift <= 0:
         hinkley, _ = page_hinkley(after.hinkley, value, delta=math.inf, threshold=math.inf)
         return replace(after, hinkley=hinkley)
-    hinkley, changed = page_hinkley(after.hinkley, value, delta=shift / 2, threshold=shift / 2 * SETTLED)
+    hinkley, changed = page_hinkley(after.hinkley, value, delta=shift / 2, threshold=shift / 2 * PATIENCE)
     if changed:
         return replace(after, hinkley=PageHinkley(), change=Streak(on=True), settled_at=after.hinkley.mean)
     if not after.change.on or after.settled_at is None:

@@ -18,7 +18,7 @@ MEMORY = 360
 DAY = 8_640
 """Values of ten seconds in a day."""
 SETTLED = 30
-"""Values before a change can be told, and how long the smallest one takes: five minutes."""
+"""Values before a change can be told: five minutes."""
 
 
 @dataclass(frozen=True, slots=True)
