@@ -10,18 +10,20 @@ import contextlib
 from collections.abc import Callable, Mapping
 from typing import Literal
 
+from tests.support.hosts.aws import start_lambda
 from tests.support.hosts.azure import start_azure
 from tests.support.hosts.host import Host, HostFailed
 from tests.support.hosts.uvicorn import start_uvicorn
 
-HostKind = Literal["uvicorn", "azure"]
-HOSTS: tuple[HostKind, ...] = ("uvicorn", "azure")
+HostKind = Literal["uvicorn", "azure", "lambda"]
+HOSTS: tuple[HostKind, ...] = ("uvicorn", "azure", "lambda")
 
 __all__ = ["HOSTS", "Host", "HostFailed", "HostKind", "start_host"]
 
 _START: dict[HostKind, Callable[[Mapping[str, str]], contextlib.AbstractContextManager[Host]]] = {
     "uvicorn": start_uvicorn,
     "azure": start_azure,
+    "lambda": start_lambda,
 }
 
 
