@@ -35,6 +35,7 @@ from function_app.services.movements import Movements
 from function_app.services.mqtt_credentials import MqttCredentials
 from function_app.services.pending import Pending
 from function_app.services.presence import PresenceIngest
+from function_app.services.robot_types import RobotTypes
 from function_app.services.series import SeriesWriter
 from function_app.services.series_range import SeriesReader
 from function_app.services.sign_in import SignIn
@@ -68,6 +69,7 @@ class Functions:
     unpair: Unpair
     devices: Devices
     leases: Leases
+    robot_types: RobotTypes
     movements: Movements
     start_action: StartAction
     actions: Actions
@@ -127,7 +129,16 @@ def build(settings: Settings, *, clock: Clock | None = None) -> Functions:
     writer = SeriesWriter(tables=tables, forget=forget, keep=keep, clock=now)
     intake = Intake(tables=tables, writer=writer, clock=now)
     commands = Commands(bus=bus, keys=keys, clock=now)
-    movements = Movements(tables=tables, blobs=blobs, catalogue=catalogue, clock=now)
+    robot_types = RobotTypes(catalogue=catalogue)
+    movements = Movements(
+        tables=tables,
+        blobs=blobs,
+        catalogue=catalogue,
+        robot_types=robot_types,
+        keys=keys,
+        forget=forget,
+        clock=now,
+    )
     rows = ActionRows(tables=tables)
     acks = ActionAcks(rows=rows, clock=now)
     pending = Pending(tables=tables)
@@ -148,6 +159,7 @@ def build(settings: Settings, *, clock: Clock | None = None) -> Functions:
         unpair=Unpair(tables=tables, commands=commands, access=access),
         devices=devices,
         leases=Leases(tables=tables, devices=devices, commands=commands, access=access, clock=now),
+        robot_types=robot_types,
         movements=movements,
         start_action=StartAction(
             tables=tables,

@@ -18,6 +18,7 @@ from device_agent.protocol import codec
 from device_agent.protocol.errors import ProtocolError, SignatureError
 
 COMMAND_CONTEXT = b"telescope/v1/command\n"
+MOVEMENT_CONTEXT = b"telescope/v1/movement\n"
 
 
 class Signed(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -79,6 +80,28 @@ def verify(payload: bytes, keys: Mapping[str, Ed25519PublicKey], *, context: byt
     except (InvalidSignature, ValueError, binascii.Error) as error:
         raise SignatureError("the signature does not match the message") from error
     return body
+
+
+def movement_text(robot_type: str, name: str, version: int, sha256: str) -> str:
+    """What the signature of a movement's version says: four lines, none of which can hold a line's end."""
+    return f"{robot_type}\n{name}\n{version}\n{sha256}"
+
+
+def sign_text(text: str, key: Ed25519PrivateKey, *, context: bytes) -> str:
+    """A signature that is kept beside ``text``, as base64url."""
+    return base64.urlsafe_b64encode(key.sign(context + text.encode())).rstrip(b"=").decode()
+
+
+def verify_text(text: str, signature: str, key: Ed25519PublicKey, *, context: bytes) -> None:
+    """Check what ``sign_text`` made.
+
+    Raises:
+        SignatureError: ``key`` did not sign this text for this purpose.
+    """
+    try:
+        key.verify(_unbase64(signature), context + text.encode())
+    except (InvalidSignature, ValueError, binascii.Error) as error:
+        raise SignatureError("the signature does not match the text") from error
 
 
 def _unbase64(text: str) -> bytes:

@@ -14,12 +14,11 @@ from function_app.domain.actions import REPEAT_MS, Action, Status, reached
 from function_app.domain.devices import Device
 from function_app.domain.ids import command_id
 from function_app.domain.lease import Lease
-from function_app.domain.nesting import MAX_LEVELS, too_deep
-from function_app.domain.problems import Problem, busy_store, invalid
+from function_app.domain.problems import Problem, busy_store
 from function_app.ports.clock import Clock
 from function_app.ports.command_bus import BusUnavailable, CommandBus
 from function_app.ports.tables import Row, Tables, Write
-from function_app.services import store
+from function_app.services import parameters, store
 from function_app.services.action_acks import ActionAcks
 from function_app.services.action_rows import ActionRows, Found, new_row
 from function_app.services.commands import Commands
@@ -119,10 +118,11 @@ class StartAction:
 
         Raises:
             Problem: ``device-unknown``, ``forbidden``, ``movement-unknown``, ``device-offline``, ``device-busy``,
-                ``lease-held``, ``lease-lost``, ``idempotency-key-reused``, ``busy``, ``invalid``.
+                ``lease-held``, ``lease-lost``, ``idempotency-key-reused``, ``busy``, ``parameters-invalid``,
+                ``invalid``.
         """
-        if isinstance(start.asked, AskMovement) and too_deep(start.asked.parameters):
-            raise invalid(f"The parameters are nested more than {MAX_LEVELS} levels deep.")
+        if isinstance(start.asked, AskMovement):
+            parameters.check(start.asked.parameters)
         device, link = await self._devices.with_link(who, device_id)
         require_operator(device)
         earlier = await self._earlier(who, device, start)
@@ -169,8 +169,10 @@ class StartAction:
                 version=movement.version,
                 sha256=movement.sha256,
                 source=source,
-                parameters=asked.parameters,
+                parameters=parameters.fit(movement.parameters_schema, asked.parameters),
             )
+            # With the defaults: a command that is sent again must be the same one.
+            request["parameters"] = command.parameters
             pinned = {"robot_type": device.robot_type, "version": movement.version, "sha256": movement.sha256}
             plan = _Plan(device, action, now_ms, request, command, pinned)
         # Before anything is written: what cannot be sent must not take the slot.

@@ -169,15 +169,14 @@ class Sweep:
         if action.request["kind"] == "move_joints":
             return MoveJoints(position_rad=action.request["position_rad"], speed=action.request["speed"])
         owner = Identity(action.account, action.who, "")
-        robot_type, sha256 = action.pinned["robot_type"], action.pinned["sha256"]
-        source = await self._movements.pinned_source(owner, robot_type, action.request["name"], sha256)
+        source = await self._movements.pinned_source(owner, action.request["name"], action.pinned)
         if source is None:
             return None
         return RunMovement(
-            robot_type=robot_type,
+            robot_type=action.pinned["robot_type"],
             name=action.request["name"],
             version=action.pinned["version"],
-            sha256=sha256,
+            sha256=action.pinned["sha256"],
             source=source,
             parameters=action.request["parameters"],
         )

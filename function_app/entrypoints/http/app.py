@@ -13,7 +13,17 @@ from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from function_app.bootstrap import Functions
 from function_app.domain.problems import Problem, invalid, store_unavailable
-from function_app.entrypoints.http import actions, agents, auth, broker, devices, health, latency, library
+from function_app.entrypoints.http import (
+    actions,
+    agents,
+    auth,
+    broker,
+    devices,
+    health,
+    latency,
+    movements,
+    robot_types,
+)
 from function_app.entrypoints.http.answers import JSON, problem
 from function_app.entrypoints.http.caller import COOKIE, Caller
 from function_app.entrypoints.http.console import Console
@@ -52,7 +62,8 @@ def create_app(functions: Functions) -> FastAPI:
         agents.router(functions, caller),
         devices.router(functions, caller),
         actions.router(functions, caller),
-        library.router(functions, caller),
+        robot_types.router(functions, caller),
+        movements.router(functions, caller),
         broker.router(functions, caller),
         latency.router(functions, caller),
         health.router(functions),

@@ -9,10 +9,12 @@ from device_agent.protocol.robot_type import RobotType
 from function_app.domain.accounts import Identity
 from function_app.domain.actions import Action
 from function_app.domain.lease import Lease
+from function_app.domain.movements import Movement
 from function_app.domain.times import rfc3339
-from function_app.entrypoints.http.contract import actions, devices, library
+from function_app.entrypoints.http.contract import actions, devices, movements, robot_types
 from function_app.services.devices import DeviceView
-from function_app.services.movements import Movement
+from function_app.services.parameters import ObjectSchema
+from function_app.services.script_store import signed_text
 
 
 def device(view: DeviceView, who: Identity) -> devices.DeviceOut:
@@ -62,9 +64,9 @@ def action(found: Action) -> actions.ActionOut:
     )
 
 
-def robot_type(found: RobotType) -> library.RobotTypeOut:
+def robot_type(found: RobotType) -> robot_types.RobotTypeOut:
     """A robot type."""
-    return library.RobotTypeOut(
+    return robot_types.RobotTypeOut(
         type=found.type,
         label=found.label,
         kind=found.kind,
@@ -75,17 +77,21 @@ def robot_type(found: RobotType) -> library.RobotTypeOut:
     )
 
 
-def movement(found: Movement) -> library.MovementOut:
+def movement(found: Movement) -> movements.MovementOut:
     """A movement without its source."""
-    return library.MovementOut(**_movement(found))
+    return movements.MovementOut(**_movement(found))
 
 
-def movement_source(found: Movement, source: str) -> library.MovementSource:
-    """A movement with its source."""
-    return library.MovementSource(**_movement(found), source=source)
+def movement_source(robot_type: str, found: Movement, source: str, public: str) -> movements.MovementSource:
+    """A movement with its source; ``public`` is the key that its signature names."""
+    signature = movements.SignatureOut(
+        key=found.key, public=public, signed=signed_text(robot_type, found), signature=found.signature
+    )
+    return movements.MovementSource(**_movement(found), source=source, signature=signature)
 
 
 def _movement(found: Movement) -> dict[str, Any]:
+    schema = found.parameters_schema
     return {
         "name": found.name,
         "description": found.description,
@@ -93,4 +99,5 @@ def _movement(found: Movement) -> dict[str, Any]:
         "sha256": found.sha256,
         "updated_at": rfc3339(found.updated_ms),
         "built_in": found.built_in,
+        "parameters_schema": None if schema is None else msgspec.convert(schema, ObjectSchema),
     }

@@ -1,7 +1,23 @@
-"""Look along the table from one side to the other, nod at each stop, and go home.
+"""Look along the table from one side to the other, nod at each stop, and go home."""
 
-Parameters: stops (2 to 9, default 3), pause_s (at each stop, 0 to 10, default 0.5), speed (default 0.4).
-"""
+PARAMETERS = {
+    "stops": {"type": "integer", "minimum": 2, "maximum": 9, "default": 3, "description": "Where it looks"},
+    "pause_s": {
+        "type": "number",
+        "minimum": 0,
+        "maximum": 10,
+        "default": 0.5,
+        "unit": "s",
+        "description": "At each stop",
+    },
+    "speed": {
+        "type": "number",
+        "minimum": 0.05,
+        "maximum": 1,
+        "default": 0.4,
+        "description": "Share of the joints' velocity limits",
+    },
+}
 
 SIDE_RAD = 0.9
 

@@ -1,7 +1,15 @@
-"""Carry between the two trays, as with a gripper: over, down, up, across. There is no gripper yet; it shows the path.
+"""Carry between the two trays, as with a gripper: over, down, up, across. It has no gripper yet."""
 
-Parameters: times (1 to 20, default 2), speed (share of the velocity limits, default 0.5).
-"""
+PARAMETERS = {
+    "times": {"type": "integer", "minimum": 1, "maximum": 20, "default": 2, "description": "How often, there and back"},
+    "speed": {
+        "type": "number",
+        "minimum": 0.05,
+        "maximum": 1,
+        "default": 0.5,
+        "description": "Share of the joints' velocity limits",
+    },
+}
 
 # Taught over the trays of scene.xml, flange down, 200 mm and 60 mm above the table [rad].
 OVER = {

@@ -1,11 +1,33 @@
-"""Draw a level square in the air with the flange pointing down, slowly, and go home.
-
-Parameters: side_m (0.05 to 0.25, default 0.2), height_m (of the flange over the table, 0.15 to 0.4, default 0.25),
-speed (share of the velocity limits, default 0.15).
-"""
+"""Draw a level square in the air with the flange pointing down, slowly, and go home."""
 
 import math
 from itertools import pairwise
+
+PARAMETERS = {
+    "side_m": {
+        "type": "number",
+        "minimum": 0.05,
+        "maximum": 0.25,
+        "default": 0.2,
+        "unit": "m",
+        "description": "Of the square",
+    },
+    "height_m": {
+        "type": "number",
+        "minimum": 0.15,
+        "maximum": 0.4,
+        "default": 0.25,
+        "unit": "m",
+        "description": "Of the flange over the table",
+    },
+    "speed": {
+        "type": "number",
+        "minimum": 0.05,
+        "maximum": 1,
+        "default": 0.15,
+        "description": "Share of the joints' velocity limits",
+    },
+}
 
 # The arm's measures [m]: robots/ur5/README.md.
 SHOULDER_HEIGHT, UPPER_ARM, FOREARM = 0.089159, 0.425, 0.39225

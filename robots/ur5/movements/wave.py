@@ -1,7 +1,15 @@
-"""Raise the arm, wave with the wrist, and go home.
+"""Raise the arm, wave with the wrist, and go home."""
 
-Parameters: times (how often to wave, 1 to 20, default 3), speed (share of the velocity limits, default 0.6).
-"""
+PARAMETERS = {
+    "times": {"type": "integer", "minimum": 1, "maximum": 20, "default": 3, "description": "How often to wave"},
+    "speed": {
+        "type": "number",
+        "minimum": 0.05,
+        "maximum": 1,
+        "default": 0.6,
+        "description": "Share of the joints' velocity limits",
+    },
+}
 
 times = min(20, max(1, int(parameters.get("times", 3))))
 speed = float(parameters.get("speed", 0.6))

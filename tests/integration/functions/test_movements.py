@@ -1,13 +1,21 @@
 """Movements: those that come with a robot type, and an account's own, which may shadow them."""
 
+import base64
 import hashlib
+from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 import pytest
+from cryptography.exceptions import InvalidSignature
 
+from device_agent.protocol import signing
 from device_agent.protocol.messages import AckStatus, RunMovement
-from function_app.services.movements import MAX_SOURCE
+from function_app.ports.tables import Row
+from function_app.services import store
+from function_app.services.movements import KEPT_MS
+from function_app.services.parameters import MAX_PARAMETERS_BYTES
+from function_app.services.scripts import MAX_SOURCE
 from tests.support.cloud import Cloud, Person, Robot, problem, settings
 
 UR5 = "/robot-types/ur5"
@@ -106,10 +114,29 @@ def test_a_script_that_is_too_much_is_refused_or_kept_and_never_a_fault(anna: Pe
     assert anna.get(f"{UR5}/movements").status_code == 200
 
 
-def test_a_script_may_have_64_000_characters_of_any_kind(anna: Person) -> None:
-    source = "# ".ljust(MAX_SOURCE, "ü")
-    assert anna.put(MINE, {"source": source}).status_code == 201
-    assert anna.get(MINE).json()["source"] == source
+def test_a_script_that_is_taken_can_be_sent_with_all_the_parameters_it_may_have(alone: Cloud, anna: Person) -> None:
+    sources = {
+        "letters": "# ".ljust(MAX_SOURCE),
+        "umlauts": "# ".ljust(48_000, "ü"),
+        "lines": "\n" * 48_000,
+        "quotes": '#"' * 24_000,
+    }
+    text = "x" * (MAX_PARAMETERS_BYTES - len('{"text":""}'))
+    starting = []
+    for name, source in sources.items():
+        saved = anna.put(f"{UR5}/movements/{name}", {"source": source})
+        assert saved.status_code == 201, saved.text
+        assert anna.get(f"{UR5}/movements/{name}").json()["source"] == source
+        device = alone.robot().pair(anna)
+        asked = {"kind": "run_movement", "name": name, "parameters": {"text": text}}
+        starting.append(anna.begin("POST", f"/devices/{device}/actions", json={"request": asked}))
+    assert [started().status_code for started in starting] == [202] * len(sources)
+
+
+@pytest.mark.parametrize("letter", ["🤖", "ü", "\x01", '"'])
+def test_a_script_that_a_message_cannot_carry_is_refused(anna: Person, letter: str) -> None:
+    refused = problem(anna.put(MINE, {"source": "#".ljust(MAX_SOURCE, letter)}), 422, "movement-invalid")
+    assert "bytes" in refused["detail"]
 
 
 @pytest.mark.parametrize("name", ["a b", "x" * 65, "ä", "a.py", "%2e%2e", "a%2Fb", "-;"])
@@ -143,3 +170,220 @@ def test_an_action_runs_the_newest_version_of_the_callers_own(pair: tuple[Person
     anna.start(robot.device, request=asked, wait_ms=10_000, wait_for="done")
     ran = [command.request for command in robot.heard(RunMovement)]
     assert [each.source for each in ran if isinstance(each, RunMovement)] == [*sources, anna.get(WAVE).json()["source"]]
+
+
+class TestVersions:
+    def test_every_version_is_listed_and_can_be_had(self, anna: Person) -> None:
+        sources = [f"robot.home()  # {number}" for number in range(5)]
+        for source in sources:
+            anna.put(WAVE, {"source": source})
+        pages = list(paged(anna, f"{WAVE}/versions", limit=2))
+        found = [item for page in pages for item in page]
+        assert max(map(len, pages)) <= 3
+        assert [item["version"] for item in found] == [6, 5, 4, 3, 2, 1]
+        assert [item["built_in"] for item in found] == [False] * 5 + [True]
+        for item, source in zip(found[:5], reversed(sources), strict=True):
+            one = anna.get(WAVE, params={"version": item["version"]}).json()
+            assert (one["source"], one["sha256"]) == (source, item["sha256"])
+        built_in = anna.get(WAVE, params={"version": 1}).json()
+        assert built_in["built_in"]
+        assert hashlib.sha256(built_in["source"].encode()).hexdigest() == built_in["sha256"]
+        for version in (7, 2**31):
+            problem(anna.get(WAVE, params={"version": version}), 404, "movement-version-unknown")
+        for wrong in ("0", "-1", "x", "1.5"):
+            problem(anna.get(WAVE, params={"version": wrong}), 422, "invalid")
+
+    def test_versions_of_a_built_in_one_are_that_one(self, anna: Person) -> None:
+        (only,) = anna.get(f"{WAVE}/versions").json()["items"]
+        assert (only["built_in"], only["version"]) == (True, 1)
+        assert anna.get(WAVE, params={"version": 1}).status_code == 200
+        problem(anna.get(WAVE, params={"version": 2}), 404, "movement-version-unknown")
+        problem(anna.get(f"{MINE}/versions"), 404, "movement-unknown")
+
+    def test_nobody_else_sees_them(self, alone: Cloud, anna: Person) -> None:
+        anna.put(MINE, {"source": SOURCE})
+        anna.put(WAVE, {"source": SOURCE})
+        bert = alone.sign_in("bert")
+        problem(bert.get(f"{MINE}/versions"), 404, "movement-unknown")
+        problem(bert.get(MINE, params={"version": 1}), 404, "movement-unknown")
+        problem(bert.get(WAVE, params={"version": 2}), 404, "movement-version-unknown")
+        assert len(bert.get(f"{WAVE}/versions").json()["items"]) == 1
+
+    def test_versions_of_before_a_deletion_are_gone_and_their_scripts_after_some_days(
+        self, home: Path, alone: Cloud, anna: Person
+    ) -> None:
+        for number in range(3):
+            anna.put(MINE, {"source": f"# {number}"})
+        anna.delete(MINE)
+        problem(anna.get(f"{MINE}/versions"), 404, "movement-unknown")
+        anna.put(MINE, {"source": "# 1"})
+        assert [item["version"] for item in anna.get(f"{MINE}/versions").json()["items"]] == [4]
+        problem(anna.get(MINE, params={"version": 2}), 404, "movement-version-unknown")
+        assert len(scripts(home)) == 4, "an action that was started with one may still be sent again"
+        alone.clock.advance((KEPT_MS + 1_000) / 1000)
+        alone.run(alone.functions.forget.run(alone.clock.now_ms()))
+        assert scripts(home) == ["# 1"]
+        again = alone.sign_in("anna")
+        assert again.get(MINE).json()["source"] == "# 1"
+        page = alone.run(alone.functions.tables.query(store.MOVEMENTS, f"{anna.account}/ur5"))
+        assert len(page.rows) == 2, "a name and a version"
+
+    def test_many_who_save_at_once_get_a_version_each_and_leave_no_other_script(self, home: Path, anna: Person) -> None:
+        waiting = [anna.begin("PUT", MINE, json={"source": f"# {number}"}) for number in range(8)]
+        saved = [answer().json()["version"] for answer in waiting]
+        assert sorted(saved) == list(range(1, 9))
+        found = anna.get(f"{MINE}/versions").json()["items"]
+        assert [item["version"] for item in found] == list(range(8, 0, -1))
+        assert sorted(scripts(home)) == sorted(
+            anna.get(MINE, params={"version": version}).json()["source"] for version in range(1, 9)
+        )
+
+    def test_lists_page_by_name_over_built_in_ones_and_ones_own(self, anna: Person) -> None:
+        for name in ("aaa", "home", "zzz", "wave-2", "gone"):
+            anna.put(f"{UR5}/movements/{name}", {"source": SOURCE})
+        anna.delete(f"{UR5}/movements/gone")
+        whole = anna.get(f"{UR5}/movements").json()
+        names = [item["name"] for item in whole["items"]]
+        assert whole["cursor"] is None
+        assert names == sorted(names)
+        assert {"aaa", "zzz", "wave", "wave-2"} <= set(names)
+        assert "gone" not in names
+        for limit in (1, 2, 3, 100):
+            pages = list(paged(anna, f"{UR5}/movements", limit=limit))
+            assert [item["name"] for page in pages for item in page] == names
+            assert all(len(page) <= limit for page in pages)
+        problem(anna.get(f"{UR5}/movements", params={"cursor": "~"}), 422, "cursor-invalid")
+
+
+class TestSignatures:
+    @pytest.mark.parametrize("own", [True, False])
+    def test_one_verifies_with_the_keys_that_agents_know(self, alone: Cloud, anna: Person, own: bool) -> None:
+        if own:
+            anna.put(WAVE, {"source": SOURCE})
+        robot = alone.robot()
+        robot.pair(anna)
+        keys = {key["id"]: key["public"] for key in robot.enrollment()["keys"]}
+        shown = anna.get(WAVE).json()
+        signature = shown["signature"]
+        assert keys[signature["key"]] == signature["public"]
+        text = "\n".join(["ur5", "wave", str(shown["version"]), shown["sha256"]])
+        assert signature["signed"] == text
+        raw = base64.urlsafe_b64decode(signature["signature"] + "==")
+        key = signing.public_key(keys[signature["key"]])
+        key.verify(raw, b"telescope/v1/movement\n" + text.encode())
+        with pytest.raises(InvalidSignature):
+            key.verify(raw, b"telescope/v1/command\n" + text.encode())
+
+    @pytest.mark.parametrize("change", ["sha256", "version", "signature", "key"])
+    def test_a_row_that_was_changed_in_the_store_is_not_run(self, alone: Cloud, anna: Person, change: str) -> None:
+        anna.put(MINE, {"source": SOURCE})
+        tables = alone.functions.tables
+        row = alone.run(tables.get(store.MOVEMENTS, f"{anna.account}/ur5", "mine"))
+        assert row is not None
+        evil = "evil()"
+        sha256 = hashlib.sha256(evil.encode()).hexdigest()
+        values = {"sha256": sha256, "version": 2, "signature": "A" * 86, "key": "0" * 16}
+        alone.run(
+            tables.replace(store.MOVEMENTS, Row(row.partition, row.key, {**row.data, change: values[change]}, row.etag))
+        )
+        version = 2 if change == "version" else 1
+        for digest in (sha256, row.data["sha256"]):
+            name = f"movements/{anna.account}/ur5/mine/{version}-{digest}.py"
+            alone.run(alone.functions.blobs.put(name, evil.encode() if digest == sha256 else SOURCE.encode()))
+        problem(anna.get(MINE), 409, "movement-damaged")
+        device = alone.robot().pair(anna)
+        problem(anna.start(device, request={"kind": "run_movement", "name": "mine"}), 409, "movement-damaged")
+
+
+class TestParameters:
+    SCHEMA: ClassVar = {
+        "type": "object",
+        "properties": {
+            "times": {"type": "integer", "minimum": 1, "default": 3},
+            "who": {"type": "string", "enum": ["anna", "bert"]},
+        },
+        "required": ["who"],
+        "additionalProperties": False,
+    }
+
+    def test_built_in_ones_say_what_they_take(self, anna: Person) -> None:
+        for item in anna.get(f"{UR5}/movements").json()["items"]:
+            properties = item["parameters_schema"]["properties"]
+            assert properties["speed"]["default"] > 0
+            assert all(value["description"] for value in properties.values())
+
+    def test_a_schema_is_the_callers_else_the_scripts_else_none(self, anna: Person) -> None:
+        literal = 'PARAMETERS = {"who": {"type": "string"}, "times": {"type": "integer", "default": 1}}'
+        read = anna.put(MINE, {"source": literal}).json()["parameters_schema"]
+        assert (sorted(read["properties"]), read["required"]) == (["times", "who"], ["who"])
+        said = anna.put(MINE, {"source": literal, "parameters_schema": self.SCHEMA}).json()["parameters_schema"]
+        assert said["properties"]["who"]["enum"] == ["anna", "bert"]
+        assert anna.get(MINE).json()["parameters_schema"] == said
+        assert anna.put(MINE, {"source": "1"}).json()["parameters_schema"] is None
+        assert anna.get(MINE, params={"version": 2}).json()["parameters_schema"] == said
+
+    @pytest.mark.parametrize(
+        "schema",
+        [
+            {"type": "object", "properties": {"a": {"$ref": "#"}}},
+            {"type": "object", "properties": {"a": {"type": "string", "pattern": "(a+)+$"}}},
+            {"type": "object", "patternProperties": {}},
+            {"type": "array", "items": {"type": "string"}},
+            {"type": "object", "properties": {"a": {"type": ["string", "null"]}}},
+        ],
+    )
+    def test_what_a_schema_may_not_say_is_refused(self, anna: Person, schema: dict[str, Any]) -> None:
+        problem(anna.put(MINE, {"source": "1", "parameters_schema": schema}), 422, "invalid")
+
+    def test_a_schema_that_contradicts_itself_is_refused(self, anna: Person) -> None:
+        schema = {"type": "object", "properties": {"a": {"type": "integer", "default": "x"}}}
+        refused = problem(anna.put(MINE, {"source": "1", "parameters_schema": schema}), 422, "schema-invalid")
+        assert "$.a" in refused["detail"]
+        problem(anna.put(MINE, {"source": 'PARAMETERS = {"a": 1}'}), 422, "schema-invalid")
+        problem(anna.put(MINE, {"source": "PARAMETERS = f()"}), 422, "movement-invalid")
+
+    def test_an_action_gets_the_defaults_and_keeps_them(self, pair: tuple[Person, Robot]) -> None:
+        anna, robot = pair
+        anna.put(MINE, {"source": "1", "parameters_schema": self.SCHEMA})
+        asked = {"kind": "run_movement", "name": "mine", "parameters": {"who": "bert"}}
+        started = anna.start(robot.device, request=asked, wait_ms=10_000, once="x").json()
+        (command,) = robot.heard(RunMovement)
+        assert isinstance(command.request, RunMovement)
+        assert command.request.parameters == {"who": "bert", "times": 3}
+        assert started["request"]["parameters"] == {"who": "bert", "times": 3}
+        assert anna.start(robot.device, request=asked, wait_ms=10_000, once="x").json()["id"] == started["id"]
+
+    @pytest.mark.parametrize(
+        ("given", "place"),
+        [
+            ({}, "$"),
+            ({"who": "carl"}, "$.who"),
+            ({"who": "anna", "times": 0}, "$.times"),
+            ({"who": "anna", "times": True}, "$.times"),
+            ({"who": "anna", "more": 1}, "$"),
+        ],
+    )
+    def test_what_does_not_fit_is_refused_with_its_place_and_takes_no_slot(
+        self, anna: Person, given: dict[str, Any], place: str
+    ) -> None:
+        device = anna.cloud.robot().pair(anna)
+        anna.put(MINE, {"source": "1", "parameters_schema": self.SCHEMA})
+        asked = {"kind": "run_movement", "name": "mine", "parameters": given}
+        refused = problem(anna.start(device, request=asked), 422, "parameters-invalid")
+        assert refused["place"] == place
+        assert anna.get(f"/devices/{device}/actions").json()["items"] == []
+
+
+def paged(person: Person, path: str, **query: Any) -> Iterator[list[dict[str, Any]]]:
+    cursor = None
+    while True:
+        body = person.get(path, params={**query, **({"cursor": cursor} if cursor else {})}).json()
+        yield body["items"]
+        cursor = body["cursor"]
+        if cursor is None:
+            return
+
+
+def scripts(home: Path) -> list[str]:
+    """Every script in the blob store."""
+    return sorted(path.read_text() for path in (home / "blobs").rglob("*.blob"))

@@ -21,7 +21,7 @@ from tests.support.cloud import Answers, Cloud, MovingClock, Person, Robot, prob
 Pair = tuple[Person, Robot]
 TTL_S, TIMEOUT_S = 2, 6
 SHORT = {"ttl_ms": TTL_S * 1000, "timeout_ms": TIMEOUT_S * 1000}
-WAVE = {"kind": "run_movement", "name": "wave", "parameters": {"a": [1, 2.5, 1e2, "ü"]}}
+WAVE = {"kind": "run_movement", "name": "slow_square", "parameters": {"side_m": 0.1}}
 
 
 def notes(cloud: Cloud) -> list[str]:

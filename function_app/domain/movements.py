@@ -1,0 +1,28 @@
+"""Movements as the tables hold them."""
+
+from dataclasses import dataclass
+from typing import Any
+
+
+@dataclass(frozen=True, slots=True)
+class Movement:
+    """One version of a movement; the row of the name holds the newest.
+
+    Attributes:
+        since: The first version since it was last made new. A version number is never used twice, so the row of a
+            ``deleted`` one stays.
+        key: Id of the key that signed robot type, name, version and hash.
+        parameters_schema: What an operator may set; ``None``: anything.
+    """
+
+    name: str
+    description: str
+    version: int
+    sha256: str
+    updated_ms: int
+    built_in: bool = False
+    deleted: bool = False
+    since: int = 1
+    key: str = ""
+    signature: str = ""
+    parameters_schema: dict[str, Any] | None = None
