@@ -35,7 +35,9 @@ from function_app.services.movements import Movements
 from function_app.services.mqtt_credentials import MqttCredentials
 from function_app.services.pending import Pending
 from function_app.services.presence import PresenceIngest
+from function_app.services.queue import Queues
 from function_app.services.robot_types import RobotTypes
+from function_app.services.send_action import SendAction
 from function_app.services.series import SeriesWriter
 from function_app.services.series_range import SeriesReader
 from function_app.services.sign_in import SignIn
@@ -73,6 +75,7 @@ class Functions:
     movements: Movements
     start_action: StartAction
     actions: Actions
+    queues: Queues
     action_acks: ActionAcks
     stop: StopDevices
     mqtt_credentials: MqttCredentials
@@ -140,8 +143,10 @@ def build(settings: Settings, *, clock: Clock | None = None) -> Functions:
         clock=now,
     )
     rows = ActionRows(tables=tables)
-    acks = ActionAcks(rows=rows, clock=now)
     pending = Pending(tables=tables)
+    sending = SendAction(tables=tables, rows=rows, commands=commands, movements=movements, clock=now)
+    queues = Queues(tables=tables, devices=devices, rows=rows, pending=pending, sending=sending, clock=now)
+    acks = ActionAcks(rows=rows, queues=queues, clock=now)
     return Functions(
         settings=settings,
         tables=tables,
@@ -169,12 +174,14 @@ def build(settings: Settings, *, clock: Clock | None = None) -> Functions:
             rows=rows,
             acks=acks,
             pending=pending,
+            queues=queues,
             bus=bus,
             clock=now,
         ),
         actions=Actions(tables=tables, devices=devices, rows=rows, acks=acks, commands=commands, bus=bus, clock=now),
+        queues=queues,
         action_acks=acks,
-        stop=StopDevices(tables=tables, devices=devices, commands=commands, bus=bus),
+        stop=StopDevices(tables=tables, devices=devices, commands=commands, queues=queues, bus=bus),
         mqtt_credentials=MqttCredentials(tables=tables, devices=devices, access=access, clock=now),
         presence=PresenceIngest(tables=tables, forget=forget, clock=now),
         forget=forget,
@@ -186,7 +193,8 @@ def build(settings: Settings, *, clock: Clock | None = None) -> Functions:
             rows=rows,
             pending=pending,
             commands=commands,
-            movements=movements,
+            sending=sending,
+            queues=queues,
             access=access,
             forget=forget,
             intake=intake,

@@ -1,6 +1,7 @@
 """An action's life: ``created → published → received → accepted → started → done | failed | expired | cancelled``.
 
-Steps may be skipped, never taken back. The first terminal state stays, whoever reports another one later.
+One that waits for its turn is ``queued`` before. Steps may be skipped, never taken back. The first terminal state
+stays, whoever reports another one later.
 """
 
 from dataclasses import dataclass, field, replace
@@ -11,6 +12,7 @@ from typing import Any
 class Status(StrEnum):
     """How far an action has come. The last four are terminal."""
 
+    QUEUED = "queued"
     CREATED = "created"
     PUBLISHED = "published"
     RECEIVED = "received"
@@ -38,7 +40,7 @@ REPEAT_MS = 1_000
 GRACE_MS = 3_000
 """An ack may be this late: until then a command whose time ran out is not called expired."""
 
-_RANK = {status: min(place, 5) for place, status in enumerate(Status)}
+_RANK = {status: min(place, 5) for place, status in enumerate(Status, start=-1)}
 
 
 @dataclass(frozen=True, slots=True)
@@ -49,6 +51,11 @@ class Action:
         request: What was asked, as it was asked.
         pinned: For a movement: version and SHA-256 of the script, so that a re-published command is the same one.
         pairing: The agent's pairing that it belongs to.
+        session: The sign-in session that started it: a lease for it will be that session's.
+        epoch: Of its lease; 0 while it waits for its turn and was started without one.
+        timeout_ms: From its turn to ``deadline_ms``.
+        queued_until_ms: As long as it may wait for its turn [ms since 1970]; 0 for one that never waited.
+        turn_ms: When its turn came, for one that has waited [ms since 1970].
         times: Status → when [ms since 1970]; ``published`` by the cloud's clock, the later ones by the agent's.
         sequence: Of the newest ack seen.
         cancel_id: Of the command that shall end it, once somebody wants that.
@@ -75,6 +82,15 @@ class Action:
     sequence: int = -1
     cancel_id: str = ""
     once: str = ""
+    session: str = ""
+    timeout_ms: int = 0
+    queued_until_ms: int = 0
+    turn_ms: int = 0
+
+    @property
+    def issued_ms(self) -> int:
+        """When its command was issued [ms since 1970]: a repeated one says the same."""
+        return self.turn_ms or self.created_ms
 
     @property
     def ended_ms(self) -> int:
@@ -84,7 +100,7 @@ class Action:
     @property
     def expires_ms(self) -> int:
         """From here on the device must not begin it any more."""
-        return self.created_ms + self.ttl_ms
+        return self.issued_ms + self.ttl_ms
 
 
 @dataclass(frozen=True, slots=True)
@@ -105,8 +121,8 @@ def apply_report(action: Action, report: Report) -> Action:
 
     Idempotent and monotone: doubled, late and disordered reports never take a step back.
     """
-    if action.status.terminal:
-        return action
+    if action.status.terminal or action.status is Status.QUEUED:
+        return action  # a queued one was never sent: whoever reports about it makes it up
     times = action.times if report.status.value in action.times else {**action.times, report.status.value: report.at_ms}
     if report.sequence <= action.sequence and report.status.rank <= action.status.rank:
         return action if times is action.times else replace(action, times=times)
@@ -132,6 +148,13 @@ def mark_published(action: Action, now_ms: int) -> Action:
     return replace(action, status=status, times={**action.times, Status.PUBLISHED.value: now_ms})
 
 
+def give_turn(action: Action, epoch: int, now_ms: int) -> Action:
+    """A queued action that is to be sent now: its time to live and its time limit begin."""
+    times = {**action.times, Status.CREATED.value: now_ms}
+    deadline_ms = now_ms + action.timeout_ms
+    return replace(action, status=Status.CREATED, epoch=epoch, turn_ms=now_ms, deadline_ms=deadline_ms, times=times)
+
+
 def end(action: Action, status: Status, code: str, message: str, now_ms: int) -> Action:
     """The action, ended by the cloud; the same object when it already has an end."""
     if action.status.terminal:
@@ -151,6 +174,8 @@ def reached(action: Action, wanted: Status) -> bool:
 
 def next_look_ms(action: Action, now_ms: int) -> int:
     """When a timer has to look at an open action again [ms since 1970]."""
+    if action.status is Status.QUEUED:
+        return action.queued_until_ms
     if action.status.rank < Status.RECEIVED.rank and now_ms < action.expires_ms + GRACE_MS:
         return min(now_ms + REPEAT_MS, action.deadline_ms)
     return action.deadline_ms
@@ -174,6 +199,8 @@ def judge(action: Action, now_ms: int) -> Verdict:
     """
     if action.status.terminal:
         return Verdict.ENDED
+    if action.status is Status.QUEUED:
+        return Verdict.EXPIRE if now_ms >= action.queued_until_ms else Verdict.WAIT
     if now_ms >= action.deadline_ms:
         return Verdict.LOSE
     if action.status.rank < Status.RECEIVED.rank:

@@ -15,6 +15,7 @@ from function_app.domain.ids import device_id, split_command
 from function_app.domain.nesting import too_deep
 from function_app.ports.clock import Clock
 from function_app.services.action_rows import ActionRows, Found
+from function_app.services.queue import Queues
 
 _POLL_S = 0.02
 _SLOWEST_POLL_S = 0.2
@@ -27,8 +28,9 @@ _log = logging.getLogger(__name__)
 class ActionAcks:
     """Applies acks to actions, and waits for them."""
 
-    def __init__(self, *, rows: ActionRows, clock: Clock) -> None:
+    def __init__(self, *, rows: ActionRows, queues: Queues, clock: Clock) -> None:
         self._rows = rows
+        self._queues = queues
         self._clock = clock
 
     async def ingest(self, topic: Topic, payload: bytes) -> None:
@@ -45,7 +47,7 @@ class ActionAcks:
         parts = split_command(ack.id)
         if parts is None or parts[0] != device_id(topic.agent, topic.device):
             return
-        await self._rows.change(ack.id, lambda action: apply_report(action, report(ack)))
+        await self._queues.change(ack.id, lambda action: apply_report(action, report(ack)))
 
     async def follow(
         self, found: Found, acks: AsyncIterator[Ack] | None, *, wanted: Status, wait_ms: int, published: bool = False
@@ -82,7 +84,11 @@ class ActionAcks:
             try:
                 async with asyncio.timeout(min(pause_s, left_s)):
                     reports.append(report(await anext(acks)))
-                action = apply_report(action, reports[-1])
+                if action.status is Status.QUEUED:  # not any more, or nobody would report about it
+                    found = await self._rows.get(action.id) or found
+                    action = _applied(found.action, reports)
+                else:
+                    action = apply_report(action, reports[-1])
             except TimeoutError:
                 pause_s = min(2 * pause_s, _SLOWEST_LOOK_S)
                 found = await self._rows.get(found.action.id) or found
@@ -95,7 +101,7 @@ class ActionAcks:
                 action = mark_published(action, published_ms)
             return _applied(action, reports)
 
-        return await self._rows.change(found.action.id, changed, known=found) or found
+        return await self._queues.change(found.action.id, changed, known=found) or found
 
     async def _poll(self, found: Found, wanted: Status, end: float) -> Action:
         loop = asyncio.get_running_loop()

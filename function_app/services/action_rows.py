@@ -1,13 +1,14 @@
-"""Actions in their rows: the one place that changes them, so that slot and lease end with them."""
+"""Actions in their rows: the one place that changes them, so that slot, lease and place in the queue end with them."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 
-from function_app.domain.actions import Action
+from function_app.domain.actions import Action, Status
 from function_app.domain.devices import Device
 from function_app.domain.ids import split_command
 from function_app.domain.lease import release
 from function_app.domain.problems import invalid
+from function_app.domain.queue import FAILED_BEFORE
 from function_app.ports.tables import Row, Tables, Write
 from function_app.services import store
 from function_app.services.control import Control, read_control_rows
@@ -18,10 +19,11 @@ _END = "action;"
 
 @dataclass(frozen=True, slots=True)
 class Found:
-    """An action and the row it was read from."""
+    """An action and the row it was read from; ``waited_for``: its end, just now, was what others wait for."""
 
     action: Action
     row: Row
+    waited_for: bool = False
 
 
 def place(action: str) -> tuple[str, str] | None:
@@ -69,7 +71,9 @@ class ActionRows:
     async def change(
         self, action: str, change: Callable[[Action], Action], *, known: Found | None = None
     ) -> Found | None:
-        """Change an action by ETag; when that ends it, free its slot and its own lease in the same batch.
+        """Change an action by ETag; when that ends it, free its slot, lease and place in the queue in the same batch.
+
+        Who ends one that others wait for must see to the queue then: ``Queues.change`` does both.
 
         Args:
             action: Its id.
@@ -94,19 +98,27 @@ class ActionRows:
             if changed is found.action:
                 return found
             writes = [Write("replace", replace(found.row, data=store.fields(changed)))]
+            waited_for = False
             if changed.status.terminal:
-                writes += _freed(changed, await read_control_rows(self._tables, changed.device))
+                control = await read_control_rows(self._tables, changed.device)
+                writes += _freed(changed, control)
+                waited_for = not control.queue.without(action).empty
             rows = await self._tables.batch(store.CONTROL, writes)
-            return Found(changed, rows[0])
+            return Found(changed, rows[0], waited_for)
 
         return await store.retry(once)
 
 
 def _freed(action: Action, control: Control) -> list[Write]:
-    """Give back what the action held: the slot, and the lease that was given for it alone."""
+    """Give back what the action held: the slot, its place in the queue, and the lease that was given for it alone."""
     writes = []
+    queue = control.queue.without(action.id)
     if control.action == action.id:
         writes.append(control.write_slot(action.device, "", action.pairing))
+        if action.status is Status.FAILED:
+            queue = queue.halted(FAILED_BEFORE)
+    if queue != control.queue:
+        writes.append(control.write_queue(action.device, queue))
     if control.lease is not None and control.lease.action == action.id:
         nobody = replace(release(control.lease), pairing=control.lease.pairing)
         writes.append(control.write_lease(action.device, nobody))

@@ -5,7 +5,7 @@ from typing import Literal
 
 from device_agent.protocol.messages import CancelAction
 from function_app.domain.accounts import Identity
-from function_app.domain.actions import Action, Status
+from function_app.domain.actions import Action, Status, end
 from function_app.domain.devices import Device
 from function_app.domain.ids import command_id, split_command
 from function_app.domain.problems import broker_unavailable, not_found
@@ -65,7 +65,7 @@ class Actions:
             return await self._acks.follow(found, acks, wanted=Status(wait_for), wait_ms=wait_ms)
 
     async def cancel(self, who: Identity, action: str) -> Action:
-        """Ask the device to end an action. It has ended when its status says so.
+        """Ask the device to end an action; one that waits for its turn ends at once. It has ended when it says so.
 
         Raises:
             Problem: ``action-unknown``, ``forbidden``, ``broker-unavailable``, ``busy``.
@@ -75,9 +75,12 @@ class Actions:
         if found.action.status.terminal:
             return found.action
         cancel_id = command_id(device.id, self._clock.now_ms())
-        marked = await self._rows.change(action, lambda known: _cancelling(known, cancel_id), known=found)
+        now_ms = self._clock.now_ms()
+        marked = await self._rows.change(action, lambda known: _cancelling(known, cancel_id, now_ms), known=found)
+        if marked is not None and marked.action.status.terminal:
+            return marked.action
         lease = await read_lease(self._tables, device)
-        epoch = max(found.action.epoch, lease.epoch if lease else 0)
+        epoch = max((marked or found).action.epoch, lease.epoch if lease else 0)
         try:
             await self._commands.send(device, CancelAction(action=action), who=who.name, epoch=epoch)
         except BusUnavailable as error:
@@ -101,7 +104,9 @@ class Actions:
         return visible
 
 
-def _cancelling(action: Action, cancel_id: str) -> Action:
+def _cancelling(action: Action, cancel_id: str, now_ms: int) -> Action:
+    if action.status is Status.QUEUED:
+        return end(action, Status.CANCELLED, "cancelled", "Cancelled before its turn came.", now_ms)
     if action.status.terminal or action.cancel_id:
         return action
     return replace(action, cancel_id=cancel_id)

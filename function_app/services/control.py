@@ -1,22 +1,25 @@
-"""The rows that decide who controls a device: its lease and its slot, side by side in the device's partition."""
+"""The rows that decide who controls a device: lease, slot and queue, side by side in the device's partition."""
 
 from dataclasses import dataclass, field
 
 from function_app.domain.devices import Device
 from function_app.domain.lease import Lease, release
+from function_app.domain.queue import Queue
 from function_app.ports.tables import Row, Tables, Write
 from function_app.services import store
 
 LEASE = "now:lease"
 SLOT = "now:slot"
+QUEUE = "now:queue"
 
 
 @dataclass(frozen=True, slots=True)
 class Control:
-    """Lease and slot as they were read, with their rows (``None``: not written yet)."""
+    """Lease, slot and queue as they were read, with their rows (none: not written yet)."""
 
     lease: Lease | None = None
     action: str = ""
+    queue: Queue = field(default_factory=lambda: Queue(""))
     rows: dict[str, Row] = field(default_factory=dict)
 
     def write_lease(self, device: str, lease: Lease) -> Write:
@@ -27,13 +30,17 @@ class Control:
         """The change that gives the slot to ``action`` (empty: to nobody)."""
         return self._write(device, SLOT, {"action": action, "pairing": pairing})
 
+    def write_queue(self, device: str, queue: Queue) -> Write:
+        """The change that puts ``queue`` in place of what was read."""
+        return self._write(device, QUEUE, store.fields(queue))
+
     def _write(self, device: str, key: str, data: dict[str, object]) -> Write:
         row = self.rows.get(key)
         return Write("replace" if row else "create", Row(device, key, data, row.etag if row else ""))
 
 
 async def read_control(tables: Tables, device: Device) -> Control:
-    """Lease and slot in one read.
+    """Lease, slot and queue in one read.
 
     What an earlier owner's pairing left behind is nobody's: an un-pairing that stopped half way blocks nobody.
     """
@@ -41,14 +48,15 @@ async def read_control(tables: Tables, device: Device) -> Control:
     lease = _lease(rows, device)
     slot = rows.get(SLOT)
     action = slot.data["action"] if slot and slot.data["pairing"] == device.pairing else ""
-    return Control(lease, action, rows)
+    queue = _queue(rows)
+    return Control(lease, action, queue if queue.pairing == device.pairing else Queue(device.pairing), rows)
 
 
 async def read_control_rows(tables: Tables, device: str) -> Control:
-    """Lease and slot, of whatever pairing."""
+    """Lease, slot and queue, of whatever pairing."""
     rows = await _rows(tables, device)
     lease = store.read(rows[LEASE], Lease) if LEASE in rows else None
-    return Control(lease, rows[SLOT].data["action"] if SLOT in rows else "", rows)
+    return Control(lease, rows[SLOT].data["action"] if SLOT in rows else "", _queue(rows), rows)
 
 
 async def read_lease(tables: Tables, device: Device) -> Lease | None:
@@ -60,6 +68,10 @@ async def read_lease(tables: Tables, device: Device) -> Lease | None:
 async def _rows(tables: Tables, device: str) -> dict[str, Row]:
     page = await tables.query(store.CONTROL, device, first="now:", last="now;")
     return {row.key: row for row in page.rows}
+
+
+def _queue(rows: dict[str, Row]) -> Queue:
+    return store.read(rows[QUEUE], Queue) if QUEUE in rows else Queue("")
 
 
 def _lease(rows: dict[str, Row], device: Device) -> Lease | None:

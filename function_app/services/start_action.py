@@ -26,6 +26,7 @@ from function_app.services.control import Control, read_control
 from function_app.services.devices import Devices, require_online, require_operator
 from function_app.services.movements import Movements
 from function_app.services.pending import Pending
+from function_app.services.queue import Queues, run_lease
 
 ABANDON_MS = 30_000
 """A start that has not been written after this time is given up: the timer may already have forgotten its note."""
@@ -54,11 +55,15 @@ class Start:
 
     Attributes:
         epoch: Of the lease that the caller holds; ``None`` asks for one for the time of this action.
+        policy: Whether it is refused while the device is busy, or waits for its turn,
+        queue_ms: at most so long. ``ttl_ms`` and ``timeout_ms`` count from its turn.
         once: The caller's idempotency key, or empty.
     """
 
     asked: Asked
     epoch: int | None = None
+    policy: Literal["reject", "queue"] = "reject"
+    queue_ms: int = 300_000
     ttl_ms: int = 10_000
     timeout_ms: int = 300_000
     wait_ms: int = 0
@@ -68,7 +73,16 @@ class Start:
     def fingerprint(self) -> str:
         """The same for the same request."""
         body = msgspec.json.encode(
-            [self.asked, self.epoch, self.ttl_ms, self.timeout_ms, self.wait_ms, self.wait_for], order="deterministic"
+            [
+                self.asked,
+                self.epoch,
+                self.ttl_ms,
+                self.timeout_ms,
+                self.wait_ms,
+                self.wait_for,
+                *((self.policy, self.queue_ms) if self.policy == "queue" else ()),
+            ],
+            order="deterministic",
         )
         return hashlib.sha256(body).hexdigest()
 
@@ -98,6 +112,7 @@ class StartAction:
         rows: ActionRows,
         acks: ActionAcks,
         pending: Pending,
+        queues: Queues,
         bus: CommandBus,
         clock: Clock,
     ) -> None:
@@ -108,6 +123,7 @@ class StartAction:
         self._rows = rows
         self._acks = acks
         self._pending = pending
+        self._queues = queues
         self._bus = bus
         self._clock = clock
 
@@ -118,8 +134,8 @@ class StartAction:
 
         Raises:
             Problem: ``device-unknown``, ``forbidden``, ``movement-unknown``, ``device-offline``, ``device-busy``,
-                ``lease-held``, ``lease-lost``, ``idempotency-key-reused``, ``busy``, ``parameters-invalid``,
-                ``invalid``.
+                ``queue-full``, ``lease-held``, ``lease-lost``, ``idempotency-key-reused``, ``busy``,
+                ``parameters-invalid``, ``invalid``.
         """
         if isinstance(start.asked, AskMovement):
             parameters.check(start.asked.parameters)
@@ -132,8 +148,12 @@ class StartAction:
         plan = await self._plan(who, device, start.asked)
         ttl_ms = min(start.ttl_ms, start.timeout_ms)
         await self._pending.note(plan.action, plan.created_ms + REPEAT_MS)
+        if start.policy == "queue":
+            await self._queues.watch(device.id)
         found, fresh = await self._write(who, plan, start, ttl_ms)
-        if not fresh:
+        if not fresh or found.action.status is Status.QUEUED:
+            if fresh:
+                await self._queues.advance(device.id)
             return await self._again(found, device, start)
         payload = await self._payload(plan, found.action)
         wanted = Status(start.wait_for)
@@ -147,7 +167,7 @@ class StartAction:
         return action, reached(action, wanted)
 
     async def _again(self, found: Found, device: Device, start: Start) -> tuple[Action, bool]:
-        """The answer to a repeated request: the action that the first one started."""
+        """The answer where nothing is to be sent: an earlier request started it, or it waits for its turn."""
         wanted = Status(start.wait_for)
         async with self._bus.acks(device.topic, found.action.id) as acks:
             found = await self._rows.get(found.action.id) or found
@@ -201,9 +221,9 @@ class StartAction:
             earlier = await self._earlier(who, plan.device, start)
             if earlier is not None:
                 return earlier, False
-            lease = self._lease(who, control, plan, start, now_ms)
-            if control.action:
-                raise device_busy(control.action)
+            before = control.action or next(iter((*control.queue.actions, *control.queue.dropped)), "")
+            lease = _lease(who, control, plan, start, before, now_ms)
+            waits = bool(before)
             action = Action(
                 id=plan.action,
                 device=plan.device.id,
@@ -211,18 +231,25 @@ class StartAction:
                 who=who.name,
                 pairing=plan.device.pairing,
                 request=plan.request,
-                epoch=lease.epoch,
+                epoch=lease.epoch if lease is not None else 0,
                 created_ms=plan.created_ms,
                 ttl_ms=ttl_ms,
-                deadline_ms=plan.created_ms + start.timeout_ms,
+                deadline_ms=plan.created_ms + start.timeout_ms + (start.queue_ms if waits else 0),
+                status=Status.QUEUED if waits else Status.CREATED,
                 pinned=plan.pinned,
                 once=_once_key(who, plan.device, start) if start.once else "",
+                session=who.session,
+                timeout_ms=start.timeout_ms,
+                queued_until_ms=plan.created_ms + start.queue_ms if waits else 0,
             )
             writes = [
                 Write("create", new_row(action)),
-                control.write_slot(plan.device.id, plan.action, plan.device.pairing),
+                # Also where it waits: whoever frees the slot now must see the queue, or this must see the slot free.
+                control.write_slot(plan.device.id, control.action if waits else plan.action, plan.device.pairing),
             ]
-            if lease is not control.lease:
+            if waits:
+                writes.append(control.write_queue(plan.device.id, control.queue.joined(plan.action)))
+            elif lease is not None and lease is not control.lease:
                 writes.append(control.write_lease(plan.device.id, lease))
             if start.once:
                 data = {"action": plan.action, "request": start.fingerprint()}
@@ -231,22 +258,6 @@ class StartAction:
             return Found(action, rows[0]), True
 
         return await store.retry(once)
-
-    @staticmethod
-    def _lease(who: Identity, control: Control, plan: _Plan, start: Start, now_ms: int) -> Lease:
-        """The lease that the action runs under: the caller's own, or one for the time of this action."""
-        if start.epoch is not None:
-            return rules.hold(control.lease, who, epoch=start.epoch, now_ms=now_ms)
-        if control.lease is not None and control.lease.live(now_ms) and control.lease.mine(who):
-            return control.lease
-        return rules.take(
-            control.lease,
-            who,
-            lease_ms=start.timeout_ms,
-            now_ms=now_ms,
-            pairing=plan.device.pairing,
-            action=plan.action,
-        )
 
     async def _earlier(self, who: Identity, device: Device, start: Start) -> Found | None:
         """The action that an earlier request with the same idempotency key started."""
@@ -265,6 +276,36 @@ def device_busy(action: str) -> Problem:
     """The refusal that names the running action."""
     detail = f"The device is running action {action}. Wait for its end or cancel it."
     return Problem("device-busy", 409, "The device is busy", detail, extras={"action": action})
+
+
+def _lease(  # noqa: PLR0917 (what decides)
+    who: Identity, control: Control, plan: _Plan, start: Start, before: str, now_ms: int
+) -> Lease | None:
+    """The lease it runs under; ``None`` where it waits behind ``before`` without one, and gets its own at its turn.
+
+    One that waits may wait for the end of an action that has the lease for its own time, not for a person who took it.
+
+    Raises:
+        Problem: ``device-busy``, ``lease-lost``, ``lease-held``.
+    """
+    waits = bool(before) and start.policy == "queue"
+    if waits and start.epoch is None:
+        held = control.lease
+        if held is not None and held.live(now_ms) and not held.mine(who) and not held.action:
+            raise rules.held(held)
+        return None
+    lease = run_lease(
+        control.lease,
+        who,
+        epoch=start.epoch,
+        action=plan.action,
+        lease_ms=start.timeout_ms,
+        now_ms=now_ms,
+        pairing=plan.device.pairing,
+    )
+    if before and not waits:
+        raise device_busy(before)
+    return lease
 
 
 def _once_key(who: Identity, device: Device, start: Start) -> str:

@@ -9,11 +9,14 @@ from device_agent.protocol.messages import ResetStop, Stop, StopDevice
 from function_app.domain.accounts import Identity
 from function_app.domain.devices import Device
 from function_app.domain.ids import new_id
+from function_app.domain.problems import Problem
+from function_app.domain.queue import STOPPED
 from function_app.ports.command_bus import BusUnavailable, CommandBus
 from function_app.ports.tables import Tables
 from function_app.services.commands import Commands
 from function_app.services.control import read_lease
 from function_app.services.devices import Devices
+from function_app.services.queue import Queues
 
 REPEAT_S = 0.2
 CONFIRM_MS = 1_000
@@ -24,22 +27,27 @@ _log = logging.getLogger(__name__)
 class StopDevices:
     """Latches and resets Stop."""
 
-    def __init__(self, *, tables: Tables, devices: Devices, commands: Commands, bus: CommandBus) -> None:
+    def __init__(
+        self, *, tables: Tables, devices: Devices, commands: Commands, queues: Queues, bus: CommandBus
+    ) -> None:
         self._tables = tables
         self._devices = devices
         self._commands = commands
+        self._queues = queues
         self._bus = bus
 
     async def stop(self, who: Identity, device_id: str, reason: str) -> bool:
         """Latch Stop; whether the device has confirmed it within a second.
 
-        Goes out twice: as the plain ``stop`` message, repeated until confirmed, and as a signed command.
+        Goes out twice: as the plain ``stop`` message, repeated until confirmed, and as a signed command. Actions that
+        wait for their turn end: nothing may start by itself after the reset.
 
         Raises:
             Problem: ``device-unknown``, ``forbidden``, ``broker-unavailable``: neither way was open.
         """
         device = await self._devices.to_operate(who, device_id)
         epoch = await self._epoch(device)
+        emptying = asyncio.create_task(self._empty(device))
         plain = asyncio.create_task(self._repeat(device, Stop(id=new_id(), by=who.name, reason=reason)))
         try:
             request = StopDevice(reason=reason)
@@ -48,6 +56,7 @@ class StopDevices:
             plain.cancel()
             with contextlib.suppress(asyncio.CancelledError, BusUnavailable):
                 await plain
+            await emptying
 
     async def reset(self, who: Identity, device_id: str) -> bool:
         """Release the latch; whether the device has confirmed it within a second. Nothing resumes.
@@ -68,6 +77,13 @@ class StopDevices:
                 _log.warning("stop of %s: %s", device.id, error)
                 raise
             await asyncio.sleep(REPEAT_S)
+
+    async def _empty(self, device: Device) -> None:
+        try:
+            await self._queues.halt(device.id, STOPPED)
+        except Problem as problem:
+            # The device is stopped, so those that wait fail at their turn.
+            _log.warning("queue of %s: %s", device.id, problem.detail)
 
     async def _epoch(self, device: Device) -> int:
         lease = await read_lease(self._tables, device)

@@ -5,11 +5,9 @@ Run every second by one or more timers; every step is safe to repeat and to be r
 
 import logging
 
-from device_agent.protocol.messages import CancelAction, MoveJoints, RunMovement
-from function_app.domain.accounts import Identity
-from function_app.domain.actions import Action, Status, Verdict, end, judge, mark_published, next_look_ms
-from function_app.domain.devices import Agent, Device
-from function_app.domain.ids import CLAIM_ALPHABET, split_command, split_device
+from device_agent.protocol.messages import CancelAction
+from function_app.domain.actions import Action, Status, Verdict, end, judge, next_look_ms
+from function_app.domain.ids import CLAIM_ALPHABET
 from function_app.domain.problems import Problem
 from function_app.ports.broker_access import BrokerAccess, BrokerAccessError
 from function_app.ports.clock import Clock
@@ -18,17 +16,18 @@ from function_app.ports.tables import Conflict, Row, Tables
 from function_app.services import store
 from function_app.services.action_rows import ActionRows, Found, place
 from function_app.services.commands import Commands
-from function_app.services.devices import devices_of
 from function_app.services.forget import DAY_MS, Forget
 from function_app.services.intake import Intake
-from function_app.services.movements import Movements
 from function_app.services.pending import SHARDS, Pending
+from function_app.services.queue import TIMEOUT, Queues, queue_of
+from function_app.services.send_action import MovementChanged, SendAction
 from function_app.services.start_action import ABANDON_MS
 
 ORPHAN_MS = 2 * ABANDON_MS
 """A note whose action was never written is kept this long: whoever writes it gives up before."""
 KEEP_ONCE_MS = DAY_MS
 """An idempotency key is good for a day."""
+_ENDING = frozenset({Verdict.ENDED, Verdict.LOSE, Verdict.EXPIRE})
 _HEX = "0123456789abcdef"
 
 _log = logging.getLogger(__name__)
@@ -44,7 +43,8 @@ class Sweep:
         rows: ActionRows,
         pending: Pending,
         commands: Commands,
-        movements: Movements,
+        sending: SendAction,
+        queues: Queues,
         access: BrokerAccess,
         forget: Forget,
         intake: Intake,
@@ -55,7 +55,8 @@ class Sweep:
         self._rows = rows
         self._pending = pending
         self._commands = commands
-        self._movements = movements
+        self._sending = sending
+        self._queues = queues
         self._access = access
         self._forget = forget
         self._intake = intake
@@ -83,7 +84,13 @@ class Sweep:
         except BrokerAccessError as error:
             _log.warning("broker access: %s", error)
 
-    async def _look(self, action_id: str, note: Row) -> None:
+    async def _look(self, what: str, note: Row) -> None:
+        if device := queue_of(what):
+            await self._look_at_queue(device, note)
+        else:
+            await self._look_at_action(what, note)
+
+    async def _look_at_action(self, action_id: str, note: Row) -> None:
         found = await self._rows.get(action_id)
         now_ms = self._clock.now_ms()
         if found is None:
@@ -91,20 +98,12 @@ class Sweep:
                 await self._pending.drop(note)
             return
         verdict = judge(found.action, now_ms)
-        ended: Action | None = None
-        if verdict is Verdict.ENDED:
-            ended = found.action
-        elif verdict is Verdict.EXPIRE and found.action.cancel_id:
-            ended = await self._end(
-                found, Status.CANCELLED, "cancelled", "Cancelled before the device took it.", now_ms
-            )
-        elif verdict is Verdict.EXPIRE:
-            message = "The device did not take the command in time. Check that it is online, then start it again."
-            ended = await self._end(found, Status.EXPIRED, "no-answer", message, now_ms)
-        elif verdict is Verdict.LOSE:
-            await self._cancel(found.action)
-            message = "The device did not say how it ended before its time was over. Look at the device."
-            ended = await self._end(found, Status.FAILED, "lost", message, now_ms)
+        if verdict in _ENDING:
+            after = await self._ended(found, verdict, now_ms)
+            if after is not None and after.status.terminal:
+                await self._keep_for_a_while(after)
+            elif after is not None:  # something was heard of it meanwhile
+                await self._pending.note(action_id, next_look_ms(after, now_ms))
         else:
             # The next note before this one goes: a stop in between leaves two, which is one too many, not too few.
             await self._pending.note(action_id, next_look_ms(found.action, now_ms))
@@ -112,14 +111,40 @@ class Sweep:
                 await self._publish(found, now_ms)
             elif verdict is Verdict.CANCEL:
                 await self._cancel(found.action)
-        if ended is not None:
-            await self._keep_for_a_while(ended)
+        await self._pending.drop(note)
+
+    async def _ended(self, found: Found, verdict: Verdict, now_ms: int) -> Action | None:
+        """The action with its end, known or given now, unless it has come to deserve another verdict."""
+        if verdict is Verdict.ENDED:
+            return found.action
+        if verdict is Verdict.LOSE:
+            await self._cancel(found.action)
+            message = "The device did not say how it ended before its time was over. Look at the device."
+            return await self._end(found, Status.FAILED, "lost", message, now_ms)
+        if found.action.status is Status.QUEUED:
+            return await self._end(found, Status.EXPIRED, "queue-timeout", TIMEOUT, now_ms)
+        if found.action.cancel_id:
+            message = "Cancelled before the device took it."
+            return await self._end(found, Status.CANCELLED, "cancelled", message, now_ms)
+        message = "The device did not take the command in time. Check that it is online, then start it again."
+        return await self._end(found, Status.EXPIRED, "no-answer", message, now_ms)
+
+    async def _look_at_queue(self, device: str, note: Row) -> None:
+        """Whoever freed the slot may have been killed before it gave the next one its turn."""
+        if await self._queues.look(device):
+            await self._queues.watch(device)
+        elif self._clock.now_ms() - int(note.key.partition(":")[0]) <= ORPHAN_MS:
+            return  # somebody may be about to put an action into it
         await self._pending.drop(note)
 
     async def _end(self, found: Found, status: Status, code: str, message: str, now_ms: int) -> Action | None:
-        after = await self._rows.change(
-            found.action.id, lambda action: end(action, status, code, message, now_ms), known=found
-        )
+        verdict = judge(found.action, now_ms)
+
+        def ended(action: Action) -> Action:
+            # An ack, or its turn, may have come since it was read.
+            return end(action, status, code, message, now_ms) if judge(action, now_ms) is verdict else action
+
+        after = await self._queues.change(found.action.id, ended, known=found)
         return None if after is None else after.action
 
     async def _keep_for_a_while(self, action: Action) -> None:
@@ -133,64 +158,25 @@ class Sweep:
 
     async def _publish(self, found: Found, now_ms: int) -> None:
         """Send the very same command again: same id, same time of issue, so the device runs it at most once."""
-        action = found.action
-        device = await self._device(action)
+        device = await self._sending.device(found.action)
         if device is None:
             message = "The device was un-paired before the command reached it."
             await self._end(found, Status.FAILED, "unpaired", message, now_ms)
             return
-        command = await self._command(action)
-        if command is None:
+        try:
+            await self._sending.send(found, device)
+        except MovementChanged:
             message = "The movement's script was changed before the command could be sent. Start it again."
             await self._end(found, Status.FAILED, "movement-changed", message, now_ms)
-            return
-        payload = await self._commands.signed(
-            device,
-            action.id,
-            command,
-            who=action.who,
-            epoch=action.epoch,
-            issued_ms=action.created_ms,
-            ttl_ms=action.ttl_ms,
-        )
-        await self._commands.publish(device, payload)
-        await self._rows.change(action.id, lambda known: mark_published(known, now_ms), known=found)
 
     async def _cancel(self, action: Action) -> None:
-        device = await self._device(action)
+        device = await self._sending.device(action)
         if device is None:
             return
         try:
             await self._commands.send(device, CancelAction(action=action.id), who=action.who, epoch=action.epoch)
         except BusUnavailable as error:
             _log.warning("cancel of %s: %s", action.id, error)
-
-    async def _command(self, action: Action) -> MoveJoints | RunMovement | None:
-        if action.request["kind"] == "move_joints":
-            return MoveJoints(position_rad=action.request["position_rad"], speed=action.request["speed"])
-        owner = Identity(action.account, action.who, "")
-        source = await self._movements.pinned_source(owner, action.request["name"], action.pinned)
-        if source is None:
-            return None
-        return RunMovement(
-            robot_type=action.pinned["robot_type"],
-            name=action.request["name"],
-            version=action.pinned["version"],
-            sha256=action.pinned["sha256"],
-            source=source,
-            parameters=action.request["parameters"],
-        )
-
-    async def _device(self, action: Action) -> Device | None:
-        """The device, as long as its agent is still of the pairing that the action belongs to."""
-        parts = split_device((split_command(action.id) or ("", ""))[0])
-        row = await self._tables.get(store.AGENTS, parts[0], "agent") if parts else None
-        if row is None:
-            return None
-        agent = store.read(row, Agent)
-        if agent.pairing != action.pairing:
-            return None
-        return next((device for device in devices_of(agent) if device.id == action.device), None)
 
     async def _forget_expired(self) -> None:
         """Claim codes and sign-in links whose time is over, a part of them each round."""

@@ -5,6 +5,7 @@ from typing import Annotated, Literal
 from fastapi import Header, Query, Request, Response
 
 from function_app.bootstrap import Functions
+from function_app.domain.actions import Action
 from function_app.entrypoints.http import show
 from function_app.entrypoints.http.answers import answer, read
 from function_app.entrypoints.http.caller import Caller
@@ -24,6 +25,9 @@ def router(functions: Functions, caller: Caller) -> Routes:
     """The routes."""
     routes = Routes("actions")
 
+    async def shown(found: Action) -> contract.ActionOut:
+        return show.action(found, (await functions.queues.positions([found])).get(found.id))
+
     @routes.add(
         "POST",
         "/devices/{device}/actions",
@@ -33,12 +37,14 @@ def router(functions: Functions, caller: Caller) -> Routes:
         problems=(404, 409),
     )
     async def start_action(request: Request, device: str, once: Key = None) -> Response:
-        """200: it has come as far as ``wait_for``, or has ended. 202: it is under way; ask at its address."""
+        """200: it has come as far as ``wait_for``, or has ended. 202: it waits or is under way; ask at its address."""
         who = await caller.account(request)
         asked: contract.ActionRequest = await read(request, contract.ActionRequest)
         start = Start(
             asked=asked.request,
             epoch=asked.epoch,
+            policy=asked.policy,
+            queue_ms=asked.queue_ms,
             ttl_ms=asked.ttl_ms,
             timeout_ms=asked.timeout_ms,
             wait_ms=asked.wait_ms,
@@ -47,7 +53,7 @@ def router(functions: Functions, caller: Caller) -> Routes:
         )
         found, there = await functions.start_action.start(who, device, start)
         where = {"Location": f"{PREFIX}/actions/{found.id}"}
-        return answer(show.action(found), 200 if there else 202, where)
+        return answer(await shown(found), 200 if there else 202, where)
 
     @routes.add(
         "GET",
@@ -60,7 +66,9 @@ def router(functions: Functions, caller: Caller) -> Routes:
         """Since it was paired."""
         who = await caller.account(request)
         found, following = await functions.actions.list(who, device, cursor=cursor, limit=limit)
-        return answer(contract.ActionList(items=tuple(show.action(each) for each in found), cursor=following))
+        positions = await functions.queues.positions(found)
+        items = tuple(show.action(each, positions.get(each.id)) for each in found)
+        return answer(contract.ActionList(items=items, cursor=following))
 
     @routes.add(
         "GET", "/actions/{action}", summary="One action", answers={200: contract.ActionOut}, problems=(404, 422)
@@ -68,14 +76,14 @@ def router(functions: Functions, caller: Caller) -> Routes:
     async def get_action(request: Request, action: str, wait_ms: Wait = 0, wait_for: WaitFor = "done") -> Response:
         """As soon as it has come as far as ``wait_for``, or as it is after ``wait_ms``."""
         who = await caller.account(request)
-        return answer(show.action(await functions.actions.get(who, action, wait_ms=wait_ms, wait_for=wait_for)))
+        return answer(await shown(await functions.actions.get(who, action, wait_ms=wait_ms, wait_for=wait_for)))
 
     @routes.add(
         "POST", "/actions/{action}/cancel", summary="Cancel", answers={202: contract.ActionOut}, problems=(404,)
     )
     async def cancel_action(request: Request, action: str) -> Response:
-        """Asks the device to end it. It has ended when its status says so."""
+        """Asks the device to end it; one that waits for its turn ends at once. It has ended when its status says so."""
         who = await caller.account(request)
-        return answer(show.action(await functions.actions.cancel(who, action)), 202)
+        return answer(await shown(await functions.actions.cancel(who, action)), 202)
 
     return routes

@@ -45,13 +45,14 @@ def lease(found: Lease | None, who: Identity) -> devices.LeaseOut | None:
     return devices.LeaseOut(holder=found.holder, epoch=found.epoch, expires_at=ends, mine=found.mine(who))
 
 
-def action(found: Action) -> actions.ActionOut:
-    """An action."""
+def action(found: Action, position: int | None = None) -> actions.ActionOut:
+    """An action, and its place in the queue."""
     return actions.ActionOut(
         id=found.id,
         device=found.device,
         request=found.request,
         status=found.status.value,
+        queue_position=position,
         epoch=found.epoch,
         who=found.who,
         created_at=rfc3339(found.created_ms),

@@ -6,11 +6,15 @@ from typing import Any
 
 import pytest
 
+from function_app import bootstrap
 from function_app.adapters.local.keys import FileKeys
+from function_app.adapters.local.tables import SqliteTables
 from tests.support.brokers import BrokerKind, RunningBroker, start_broker
-from tests.support.cloud import Cloud, Person, Robot, paired, settings
+from tests.support.cloud import Cloud, MovingClock, Person, Robot, paired, settings
+from tests.support.knife import CutTables, Knife
 
 Open = Callable[..., Cloud]
+Mortal = Callable[[MovingClock], tuple[Cloud, Knife]]
 
 
 @pytest.fixture(scope="session")
@@ -76,3 +80,16 @@ def pair(cloud: Cloud) -> Iterator[tuple[Person, Robot]]:
     """Anna, and a robot of hers that is online."""
     with paired(cloud) as found:
         yield found
+
+
+@pytest.fixture
+def mortal(open_cloud: Open, monkeypatch: pytest.MonkeyPatch) -> Callable[[MovingClock], tuple[Cloud, Knife]]:
+    """Opens another process over the same home, and the knife that ends it."""
+
+    def opened(clock: MovingClock) -> tuple[Cloud, Knife]:
+        knife = Knife()
+        with monkeypatch.context() as patch:
+            patch.setattr(bootstrap, "SqliteTables", lambda path: CutTables(SqliteTables(path), knife))
+            return open_cloud(clock=clock), knife
+
+    return opened

@@ -10,13 +10,13 @@ import pytest
 from device_agent.protocol.messages import AckStatus, CancelAction, Command, MoveJoints, RunMovement
 from function_app import bootstrap
 from function_app.adapters.local.tables import SqliteTables
-from function_app.ports.tables import Page, Row, Write
 from function_app.services import store
 from function_app.services.pending import SHARDS
 from function_app.services.sweep import ORPHAN_MS
-from tests.integration.functions.conftest import Open
+from tests.integration.functions.conftest import Mortal, Open
 from tests.support.brokers import start_broker, wait_until
-from tests.support.cloud import Answers, Cloud, MovingClock, Person, Robot, problem, settings
+from tests.support.cloud import Answers, Cloud, Person, Robot, problem, settings
+from tests.support.knife import CutTables, Killed, Knife, elsewhere
 
 Pair = tuple[Person, Robot]
 TTL_S, TIMEOUT_S = 2, 6
@@ -201,92 +201,10 @@ def test_while_the_broker_is_away_an_action_is_kept_and_sent_when_it_is_back(
 # ---------------------------------------------------------------- killed between two writes
 
 
-class Killed(Exception):  # noqa: N818 (an outcome that the test wants)
-    """The process is gone."""
-
-
-class Knife:
-    """Ends a process after its next so many writes."""
-
-    def __init__(self) -> None:
-        self.left: int | None = None
-        self.written = 0
-
-    def check(self) -> None:
-        if self.left is not None and self.left <= 0:
-            raise Killed
-
-    def wrote(self) -> None:
-        self.written += 1
-        if self.left is not None:
-            self.left -= 1
-        self.check()
-
-
-class CutTables:
-    """Real tables of a process that the knife ends: after that it neither reads nor writes."""
-
-    def __init__(self, inner: SqliteTables, knife: Knife) -> None:
-        self._inner = inner
-        self._knife = knife
-
-    async def get(self, table: str, partition: str, key: str) -> Row | None:
-        self._knife.check()
-        return await self._inner.get(table, partition, key)
-
-    async def query(self, *arguments: Any, **options: Any) -> Page:
-        self._knife.check()
-        return await self._inner.query(*arguments, **options)
-
-    async def create(self, table: str, row: Row) -> Row:
-        created: Row = await self._cut(self._inner.create, table, row)
-        return created
-
-    async def replace(self, table: str, row: Row) -> Row:
-        replaced: Row = await self._cut(self._inner.replace, table, row)
-        return replaced
-
-    async def delete(self, table: str, row: Row) -> None:
-        await self._cut(self._inner.delete, table, row)
-
-    async def batch(self, table: str, writes: list[Write]) -> tuple[Row, ...]:
-        written: tuple[Row, ...] = await self._cut(self._inner.batch, table, writes)
-        return written
-
-    async def _cut(self, write: Callable[..., Any], *arguments: Any) -> Any:
-        self._knife.check()
-        done = await write(*arguments)
-        self._knife.wrote()
-        return done
-
-    async def close(self) -> None:
-        await self._inner.close()
-
-
-@pytest.fixture
-def mortal(open_cloud: Open, monkeypatch: pytest.MonkeyPatch) -> Callable[[MovingClock], tuple[Cloud, Knife]]:
-    """Opens another process over the same home, and the knife that ends it."""
-
-    def opened(clock: MovingClock) -> tuple[Cloud, Knife]:
-        knife = Knife()
-        with monkeypatch.context() as patch:
-            patch.setattr(bootstrap, "SqliteTables", lambda path: CutTables(SqliteTables(path), knife))
-            return open_cloud(clock=clock), knife
-
-    return opened
-
-
-Mortal = Callable[[MovingClock], tuple[Cloud, Knife]]
 SILENT: Callable[[Command], Answers] = lambda _: ()  # noqa: E731
 STARTS: Callable[[Command], Answers] = lambda _: (AckStatus.RECEIVED, AckStatus.STARTED)  # noqa: E731
 ENDS: Callable[[Command], Answers] = lambda _: (AckStatus.RECEIVED, AckStatus.STARTED, AckStatus.DONE)  # noqa: E731
 MOST_WRITES = 12
-
-
-def elsewhere(cloud: Cloud, person: Person) -> Person:
-    """The same session, at another process."""
-    account = {"id": person.account, "name": person.name}
-    return Person(cloud, {"access_token": person.token, "account": account, "session": person.session})
 
 
 def settled(cloud: Cloud, anna: Person, robot: Robot) -> None:

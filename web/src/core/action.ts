@@ -33,7 +33,7 @@ const POLL_MS = 10_000;
 const RETRY_MS = 2_000;
 
 function rank(status: ActionStatus): RunStatus {
-  if (status === "created" || status === "published" || status === "received") return "sent";
+  if (status === "queued" || status === "created" || status === "published" || status === "received") return "sent";
   return status;
 }
 

@@ -45,7 +45,7 @@ export interface Movement {
   built_in: boolean;
 }
 
-export type ActionStatus = AckStatus | "created" | "published";
+export type ActionStatus = AckStatus | "queued" | "created" | "published";
 
 export interface Action {
   id: string;

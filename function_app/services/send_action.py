@@ -1,0 +1,79 @@
+"""From an action's row to its device: the same row always makes the same command, so the device drops doubles."""
+
+from device_agent.protocol.messages import MoveJoints, RunMovement
+from function_app.domain.accounts import Identity
+from function_app.domain.actions import Action, mark_published
+from function_app.domain.devices import Agent, Device
+from function_app.domain.ids import split_command, split_device
+from function_app.ports.clock import Clock
+from function_app.ports.tables import Tables
+from function_app.services import store
+from function_app.services.action_rows import ActionRows, Found
+from function_app.services.commands import Commands
+from function_app.services.devices import devices_of
+from function_app.services.movements import Movements
+
+
+class MovementChanged(Exception):  # noqa: N818 (an outcome that callers expect)
+    """The script that the action pinned is gone."""
+
+
+class SendAction:
+    """Publishes written actions: those whose turn has come, and those that nobody has answered."""
+
+    def __init__(
+        self, *, tables: Tables, rows: ActionRows, commands: Commands, movements: Movements, clock: Clock
+    ) -> None:
+        self._tables = tables
+        self._rows = rows
+        self._commands = commands
+        self._movements = movements
+        self._clock = clock
+
+    async def device(self, action: Action) -> Device | None:
+        """The action's device, as long as its agent is still of the pairing that the action belongs to."""
+        parts = split_device((split_command(action.id) or ("", ""))[0])
+        row = await self._tables.get(store.AGENTS, parts[0], "agent") if parts else None
+        if row is None:
+            return None
+        agent = store.read(row, Agent)
+        if agent.pairing != action.pairing:
+            return None
+        return next((device for device in devices_of(agent) if device.id == action.device), None)
+
+    async def send(self, found: Found, device: Device) -> None:
+        """Publish it and write that down.
+
+        Raises:
+            MovementChanged: There is nothing to send.
+            BusUnavailable: The broker did not confirm it.
+        """
+        action = found.action
+        payload = await self._commands.signed(
+            device,
+            action.id,
+            await self._command(action),
+            who=action.who,
+            epoch=action.epoch,
+            issued_ms=action.issued_ms,
+            ttl_ms=action.ttl_ms,
+        )
+        await self._commands.publish(device, payload)
+        now_ms = self._clock.now_ms()
+        await self._rows.change(action.id, lambda known: mark_published(known, now_ms), known=found)
+
+    async def _command(self, action: Action) -> MoveJoints | RunMovement:
+        if action.request["kind"] == "move_joints":
+            return MoveJoints(position_rad=action.request["position_rad"], speed=action.request["speed"])
+        owner = Identity(action.account, action.who, "")
+        source = await self._movements.pinned_source(owner, action.request["name"], action.pinned)
+        if source is None:
+            raise MovementChanged
+        return RunMovement(
+            robot_type=action.pinned["robot_type"],
+            name=action.request["name"],
+            version=action.pinned["version"],
+            sha256=action.pinned["sha256"],
+            source=source,
+            parameters=action.request["parameters"],
+        )
