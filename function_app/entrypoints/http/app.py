@@ -18,6 +18,7 @@ from function_app.entrypoints.http import (
     agents,
     auth,
     broker,
+    data,
     devices,
     health,
     latency,
@@ -66,6 +67,7 @@ def create_app(functions: Functions) -> FastAPI:
         movements.router(functions, caller),
         broker.router(functions, caller),
         latency.router(functions, caller),
+        data.router(functions, caller),
         health.router(functions),
     )
     for routes in resources:
