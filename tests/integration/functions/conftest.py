@@ -1,5 +1,6 @@
 import contextlib
 import shutil
+import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -9,9 +10,13 @@ import pytest
 from function_app import bootstrap
 from function_app.adapters.local.keys import FileKeys
 from function_app.adapters.local.tables import SqliteTables
+from tests.conftest import Emulators
+from tests.support.aws import use_credentials
 from tests.support.brokers import BrokerKind, RunningBroker, start_broker
 from tests.support.cloud import Cloud, MovingClock, Person, Robot, paired, settings
 from tests.support.knife import CutTables, Knife
+from tests.support.processes import Place
+from tests.support.stores import StoreKind, empty_store, make_places
 
 Open = Callable[..., Cloud]
 Mortal = Callable[[MovingClock], tuple[Cloud, Knife]]
@@ -93,3 +98,16 @@ def mortal(open_cloud: Open, monkeypatch: pytest.MonkeyPatch) -> Callable[[Movin
             return open_cloud(clock=clock), knife
 
     return opened
+
+
+@pytest.fixture
+def place(
+    request: pytest.FixtureRequest, tmp_path: Path, emulators: Emulators, monkeypatch: pytest.MonkeyPatch
+) -> Place:
+    """An empty store of the kind that the test is parametrised with."""
+    kind: StoreKind = request.param
+    if kind == "aws":
+        use_credentials(monkeypatch)
+    environment = {"TELESCOPE_HOME": str(tmp_path), **empty_store(kind, emulators(kind))}
+    make_places(tmp_path, environment)
+    return Place(environment, time.time_ns() // 1_000_000, tmp_path / "sent")
