@@ -23,6 +23,7 @@ from function_app.services.action_rows import ActionRows
 from function_app.services.actions import Actions
 from function_app.services.claim import Claim
 from function_app.services.commands import Commands
+from function_app.services.delivery import Delivery
 from function_app.services.devices import Devices
 from function_app.services.enroll import Enroll
 from function_app.services.forget import DAY_MS, Forget
@@ -31,11 +32,14 @@ from function_app.services.identity import Identify
 from function_app.services.intake import Intake
 from function_app.services.latency import Latencies
 from function_app.services.lease import Leases
+from function_app.services.mailbox import Mailbox
 from function_app.services.movements import Movements
 from function_app.services.mqtt_credentials import MqttCredentials
 from function_app.services.pending import Pending
+from function_app.services.polling import Polling
 from function_app.services.presence import PresenceIngest
 from function_app.services.queue import Queues
+from function_app.services.relay import Relay
 from function_app.services.robot_types import RobotTypes
 from function_app.services.send_action import SendAction
 from function_app.services.series import SeriesWriter
@@ -80,6 +84,8 @@ class Functions:
     stop: StopDevices
     mqtt_credentials: MqttCredentials
     presence: PresenceIngest
+    polling: Polling
+    relay: Relay
     forget: Forget
     latencies: Latencies
     intake: Intake
@@ -131,7 +137,9 @@ def build(settings: Settings, *, clock: Clock | None = None) -> Functions:
     keep = _keep(settings)
     writer = SeriesWriter(tables=tables, forget=forget, keep=keep, clock=now)
     intake = Intake(tables=tables, writer=writer, clock=now)
-    commands = Commands(bus=bus, keys=keys, clock=now)
+    mailbox = Mailbox(tables=tables, forget=forget, clock=now)
+    delivery = Delivery(bus=bus, mailbox=mailbox)
+    commands = Commands(delivery=delivery, keys=keys, clock=now)
     robot_types = RobotTypes(catalogue=catalogue)
     movements = Movements(
         tables=tables,
@@ -146,7 +154,7 @@ def build(settings: Settings, *, clock: Clock | None = None) -> Functions:
     pending = Pending(tables=tables)
     sending = SendAction(tables=tables, rows=rows, commands=commands, movements=movements, clock=now)
     queues = Queues(tables=tables, devices=devices, rows=rows, pending=pending, sending=sending, clock=now)
-    acks = ActionAcks(rows=rows, queues=queues, clock=now)
+    acks = ActionAcks(rows=rows, queues=queues, mailbox=mailbox, clock=now)
     return Functions(
         settings=settings,
         tables=tables,
@@ -175,15 +183,19 @@ def build(settings: Settings, *, clock: Clock | None = None) -> Functions:
             acks=acks,
             pending=pending,
             queues=queues,
-            bus=bus,
+            delivery=delivery,
             clock=now,
         ),
-        actions=Actions(tables=tables, devices=devices, rows=rows, acks=acks, commands=commands, bus=bus, clock=now),
+        actions=Actions(
+            tables=tables, devices=devices, rows=rows, acks=acks, commands=commands, delivery=delivery, clock=now
+        ),
         queues=queues,
         action_acks=acks,
-        stop=StopDevices(tables=tables, devices=devices, commands=commands, queues=queues, bus=bus),
+        stop=StopDevices(tables=tables, devices=devices, commands=commands, queues=queues, delivery=delivery),
         mqtt_credentials=MqttCredentials(tables=tables, devices=devices, access=access, clock=now),
         presence=PresenceIngest(tables=tables, forget=forget, clock=now),
+        polling=Polling(tables=tables, mailbox=mailbox, clock=now),
+        relay=Relay(bus=bus, clock=now),
         forget=forget,
         latencies=Latencies(tables=tables, forget=forget, clock=now),
         intake=intake,

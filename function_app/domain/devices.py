@@ -1,12 +1,19 @@
 """Agents, their devices, and what is known of them at this moment."""
 
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, Literal
 
 from function_app.domain.accounts import Role
 
 SILENT_MS = 90_000
 """An agent sends state every 30 s; after three missed ones a last word of "online" is no longer believed."""
+POLL_SILENT_MS = 45_000
+"""An agent that polls asks at least every 30 s."""
+POLL_MARK_MS = 15_000
+"""How often at most it is written down that an agent has polled."""
+
+Transport = Literal["mqtt", "http", "xmpp"]
+"""How an agent hears what is addressed to it. Not over MQTT: it, or who speaks XMPP for it, fetches it by HTTP."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -40,6 +47,7 @@ class Agent:
     claimed_ms: int = 0
     claim_code: str = ""
     claim_expires_ms: int = 0
+    transport: Transport = "mqtt"
 
     @property
     def claimed(self) -> bool:
@@ -65,6 +73,7 @@ class Device:
     pairing: str
     role: Role
     topic: str
+    transport: Transport = "mqtt"
 
 
 def claim(agent: Agent, *, account: str, space: str, pairing: str, now_ms: int) -> Agent:
@@ -87,16 +96,18 @@ def unpair(agent: Agent) -> Agent:
 
 @dataclass(frozen=True, slots=True)
 class Link:
-    """The last word about an agent's broker connection.
+    """The last word about an agent's connection.
 
     Attributes:
         session: Number of the agent's connection; it rises each time.
         seen_ms: When the cloud took notice [ms since 1970, cloud's clock].
+        polled: The agent has no connection but asks again and again; nobody says so when it stops.
     """
 
     online: bool
     session: int
     seen_ms: int
+    polled: bool = False
 
 
 def newer_link(known: Link | None, incoming: Link) -> Link | None:
@@ -122,4 +133,17 @@ class LastState:
 
 def online(link: Link | None, last_seen_ms: int, now_ms: int) -> bool:
     """Whether the agent may be believed to be there."""
-    return link is not None and link.online and now_ms - last_seen_ms <= SILENT_MS
+    if link is None or not link.online:
+        return False
+    return now_ms - last_seen_ms <= (POLL_SILENT_MS if link.polled else SILENT_MS)
+
+
+def polled(known: Link | None, now_ms: int) -> Link | None:
+    """What to store when an agent has polled, or ``None`` when that was noted a moment ago.
+
+    Asking is better evidence than any earlier word of "offline".
+    """
+    fresh = known is not None and now_ms - known.seen_ms < POLL_MARK_MS
+    if known is not None and known.online and known.polled and fresh:
+        return None
+    return Link(online=True, session=known.session if known else 0, seen_ms=now_ms, polled=True)

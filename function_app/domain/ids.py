@@ -14,6 +14,7 @@ CLAIM_LENGTH = 8
 
 _BASE32 = "abcdefghijklmnopqrstuvwxyz234567"
 _SORTABLE32 = "0123456789abcdefghijklmnopqrstuv"
+_REVERSED = str.maketrans(_SORTABLE32, _SORTABLE32[::-1])
 _TIME_LENGTH = 9
 _TIME_END = 32**_TIME_LENGTH - 1
 
@@ -51,6 +52,11 @@ def new_suffix(now_ms: int) -> str:
     left = _TIME_END - now_ms
     time = "".join(_SORTABLE32[(left >> shift) & 31] for shift in range(5 * (_TIME_LENGTH - 1), -5, -5))
     return time + "".join(secrets.choice(_SORTABLE32) for _ in range(SUFFIX_LENGTH - _TIME_LENGTH))
+
+
+def oldest_first(suffix: str) -> str:
+    """The last part of a command's id such that it sorts the other way round."""
+    return suffix.translate(_REVERSED)
 
 
 def command_id(device: str, now_ms: int) -> str:

@@ -5,29 +5,41 @@ from collections.abc import Sequence
 
 from device_agent.protocol import topics
 from device_agent.protocol.errors import ProtocolError
+from device_agent.protocol.topics import Topic
 from function_app.bootstrap import Functions
+from function_app.domain.devices import Transport
 from function_app.services.intake import Arrived
+
+_SHOWN = 200
 
 _log = logging.getLogger(__name__)
 
 
 async def ingest(functions: Functions, topic: str, payload: bytes) -> None:
-    """Store one message. Safe to repeat.
+    """Store one message that came over MQTT. Safe to repeat; what cannot be read is logged and let go.
 
     Raises:
         Problem, StoreError: Not stored; to be delivered again.
     """
     try:
-        parsed = topics.parse(topic)
+        await take_in(functions, topics.parse(topic), payload)
     except ProtocolError as error:
-        _log.warning("%s", error)
-        return
-    if parsed.kind == topics.ACK:
-        await functions.action_acks.ingest(parsed, payload)
-    elif parsed.kind == topics.TELE:
-        await functions.intake.take([Arrived(parsed, payload)])
-    elif parsed.kind in {topics.CONN, topics.DESC, topics.STATE, topics.EVENT}:
-        await functions.presence.ingest(parsed, payload)
+        _log.warning("a message of %s was dropped: %s", topic[:_SHOWN], error)
+
+
+async def take_in(functions: Functions, topic: Topic, payload: bytes, *, by: Transport = "mqtt") -> None:
+    """Store one message that came by whatever transport. Safe to repeat.
+
+    Raises:
+        ProtocolError: It is not what its topic says.
+        Problem, StoreError: Not stored; to be delivered again.
+    """
+    if topic.kind == topics.ACK:
+        await functions.action_acks.ingest(topic, payload, by=by)
+    elif topic.kind == topics.TELE:
+        await functions.intake.take([Arrived(topic, payload)])
+    elif topic.kind in {topics.CONN, topics.DESC, topics.STATE, topics.EVENT}:
+        await functions.presence.ingest(topic, payload, by=by)
 
 
 async def ingest_telemetry(functions: Functions, messages: Sequence[tuple[str, bytes]]) -> None:

@@ -1,7 +1,6 @@
 """What devices report about actions, written down by whoever hears it first: the waiting call or the ingest."""
 
 import asyncio
-import logging
 from collections.abc import AsyncIterator, Iterable
 
 import msgspec
@@ -11,10 +10,13 @@ from device_agent.protocol.errors import ProtocolError
 from device_agent.protocol.messages import Ack
 from device_agent.protocol.topics import Topic
 from function_app.domain.actions import Action, Report, Status, apply_report, mark_published, reached
+from function_app.domain.devices import Transport
 from function_app.domain.ids import device_id, split_command
 from function_app.domain.nesting import too_deep
 from function_app.ports.clock import Clock
 from function_app.services.action_rows import ActionRows, Found
+from function_app.services.delivery import CONFIRMING
+from function_app.services.mailbox import Mailbox
 from function_app.services.queue import Queues
 
 _POLL_S = 0.02
@@ -22,32 +24,37 @@ _SLOWEST_POLL_S = 0.2
 _FIRST_LOOK_S = 0.05
 _SLOWEST_LOOK_S = 0.5
 
-_log = logging.getLogger(__name__)
-
 
 class ActionAcks:
     """Applies acks to actions, and waits for them."""
 
-    def __init__(self, *, rows: ActionRows, queues: Queues, clock: Clock) -> None:
+    def __init__(self, *, rows: ActionRows, queues: Queues, mailbox: Mailbox, clock: Clock) -> None:
         self._rows = rows
         self._queues = queues
+        self._mailbox = mailbox
         self._clock = clock
 
-    async def ingest(self, topic: Topic, payload: bytes) -> None:
-        """Apply one ack that came by ``topic``. Doubled, late and foreign ones change nothing.
+    async def ingest(self, topic: Topic, payload: bytes, *, by: Transport = "mqtt") -> None:
+        """Apply one ack that came by ``topic``. Doubled and late ones change nothing.
 
         Raises:
+            ProtocolError: Not an ack, or to a command of another device.
             Problem: ``busy``: not stored, to be delivered again.
         """
-        try:
-            ack = codec.decode(payload, Ack)
-        except ProtocolError as error:
-            _log.warning("ack of %s/%s dropped: %s", topic.agent, topic.device, error)
-            return
+        ack = codec.decode(payload, Ack)
         parts = split_command(ack.id)
         if parts is None or parts[0] != device_id(topic.agent, topic.device):
-            return
-        await self._queues.change(ack.id, lambda action: apply_report(action, report(ack)))
+            raise ProtocolError(f"'{ack.id}' is no command to {topic.agent}/{topic.device}")
+        if await self._queues.change(ack.id, lambda action: apply_report(action, report(ack))) is None:
+            await self._answer(topic.agent, ack)
+        if by != "mqtt":
+            # Last: until then the agent is given the command again, and answers again.
+            await self._mailbox.withdraw(topic.agent, ack.id)
+
+    async def _answer(self, agent: str, ack: Ack) -> None:
+        """To a command that is no action: somebody may wait for it."""
+        if ack.status.terminal or ack.status in CONFIRMING:
+            await self._mailbox.answer(agent, ack)
 
     async def follow(
         self, found: Found, acks: AsyncIterator[Ack] | None, *, wanted: Status, wait_ms: int, published: bool = False

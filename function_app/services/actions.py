@@ -10,12 +10,13 @@ from function_app.domain.devices import Device
 from function_app.domain.ids import command_id, split_command
 from function_app.domain.problems import broker_unavailable, not_found
 from function_app.ports.clock import Clock
-from function_app.ports.command_bus import BusUnavailable, CommandBus
+from function_app.ports.command_bus import BusUnavailable
 from function_app.ports.tables import Tables
 from function_app.services.action_acks import ActionAcks
 from function_app.services.action_rows import ActionRows, Found
 from function_app.services.commands import Commands
 from function_app.services.control import read_lease
+from function_app.services.delivery import Delivery
 from function_app.services.devices import Devices, require_operator
 
 
@@ -30,7 +31,7 @@ class Actions:
         rows: ActionRows,
         acks: ActionAcks,
         commands: Commands,
-        bus: CommandBus,
+        delivery: Delivery,
         clock: Clock,
     ) -> None:
         self._tables = tables
@@ -38,7 +39,7 @@ class Actions:
         self._rows = rows
         self._acks = acks
         self._commands = commands
-        self._bus = bus
+        self._delivery = delivery
         self._clock = clock
 
     async def list(
@@ -60,7 +61,7 @@ class Actions:
         device, found = await self._find(who, action)
         if not wait_ms or found.action.status.terminal:
             return found.action
-        async with self._bus.acks(device.topic, action) as acks:
+        async with self._delivery.acks(device, action) as acks:
             found = await self._rows.get(action) or found
             return await self._acks.follow(found, acks, wanted=Status(wait_for), wait_ms=wait_ms)
 

@@ -1,29 +1,29 @@
 """Signed commands on their way to a device, and the device's first answer."""
 
-import asyncio
-
-from device_agent.protocol import codec, signing, topics
+from device_agent.protocol import codec, signing
 from device_agent.protocol.errors import ProtocolError
-from device_agent.protocol.messages import AckStatus, Command, Request
+from device_agent.protocol.messages import CancelAction, Command, Request, StopDevice
 from function_app.domain.devices import Device
 from function_app.domain.ids import command_id
 from function_app.domain.problems import broker_unavailable, invalid
 from function_app.ports.clock import Clock
-from function_app.ports.command_bus import BusUnavailable, CommandBus
+from function_app.ports.command_bus import BusUnavailable
 from function_app.ports.keys import Keys
+from function_app.services.delivery import Delivery, Signed
 
 SHORT_TTL_MS = 5_000
 """Time to live of lease and stop commands: what arrives later is no longer meant."""
+STOP_KEPT_MS = 60_000
+"""How long an agent that polls can still fetch a Stop: a late Stop is still a Stop."""
 _ENVELOPE_BYTES = 512
 """More than signature, key, epoch and times add to a command that is checked before it has them."""
-_CONFIRMING = frozenset({AckStatus.ACCEPTED, AckStatus.STARTED, AckStatus.DONE})
 
 
 class Commands:
-    """Builds, signs and publishes."""
+    """Builds, signs and sends."""
 
-    def __init__(self, *, bus: CommandBus, keys: Keys, clock: Clock) -> None:
-        self._bus = bus
+    def __init__(self, *, delivery: Delivery, keys: Keys, clock: Clock) -> None:
+        self._delivery = delivery
         self._keys = keys
         self._clock = clock
 
@@ -41,36 +41,39 @@ class Commands:
 
     async def signed(
         self, device: Device, command: str, request: Request, *, who: str, epoch: int, issued_ms: int, ttl_ms: int
-    ) -> bytes:
-        """The bytes of one command. The same arguments make the same command: the device drops the double.
+    ) -> Signed:
+        """One command, ready to be sent. The same arguments make the same bytes: the device drops the double.
 
         Raises:
             Problem: ``invalid``: it holds a number that is not finite, or is too long for a message.
         """
         order = _order(device, command, request, who=who, epoch=epoch, issued_ms=issued_ms, ttl_ms=ttl_ms)
         try:
-            return signing.sign(codec.encode(order), await self._keys.current())
+            payload = signing.sign(codec.encode(order), await self._keys.current())
         except ProtocolError as error:
             raise invalid(f"{error}.") from error
+        stop = isinstance(request, StopDevice)
+        return Signed(command, payload, issued_ms + (STOP_KEPT_MS if stop else ttl_ms), first=stop)
 
-    async def publish(self, device: Device, payload: bytes) -> None:
+    async def publish(self, device: Device, signed: Signed) -> None:
         """Send a signed command.
 
         Raises:
             BusUnavailable: The broker did not confirm it.
         """
-        await self._bus.publish(f"{device.topic}/{topics.CMD}", payload)
+        await self._delivery.send(device, signed)
 
     async def send(self, device: Device, request: Request, *, who: str, epoch: int) -> str:
-        """Sign and send a short-lived command; gives its id.
+        """Sign and send a short-lived command; gives its id. A cancel takes back an action nobody has fetched.
 
         Raises:
             BusUnavailable: The broker did not confirm it.
         """
-        now_ms = self._clock.now_ms()
-        command = command_id(device.id, now_ms)
-        await self.publish(device, await self._short(device, command, request, who=who, epoch=epoch, now_ms=now_ms))
-        return command
+        if isinstance(request, CancelAction):
+            await self._delivery.withdraw(device, request.action)
+        signed = await self._short(device, request, who=who, epoch=epoch)
+        await self._delivery.send(device, signed)
+        return signed.command
 
     async def confirmed(self, device: Device, request: Request, *, who: str, epoch: int, wait_ms: int) -> bool:
         """Sign and send a short-lived command; whether the device accepted it within ``wait_ms``.
@@ -78,28 +81,15 @@ class Commands:
         Raises:
             Problem: ``broker-unavailable``.
         """
+        signed = await self._short(device, request, who=who, epoch=epoch)
+        try:
+            return await self._delivery.confirmed(device, signed, wait_ms=wait_ms)
+        except BusUnavailable as error:
+            raise broker_unavailable(f"{error}.") from error
+
+    async def _short(self, device: Device, request: Request, *, who: str, epoch: int) -> Signed:
         now_ms = self._clock.now_ms()
         command = command_id(device.id, now_ms)
-        payload = await self._short(device, command, request, who=who, epoch=epoch, now_ms=now_ms)
-        async with self._bus.acks(device.topic, command) as acks:
-            try:
-                await self.publish(device, payload)
-            except BusUnavailable as error:
-                raise broker_unavailable(f"{error}.") from error
-            if acks is None:
-                return False
-            try:
-                async with asyncio.timeout(wait_ms / 1000):
-                    while True:
-                        status = (await anext(acks)).status
-                        if status in _CONFIRMING or status.terminal:
-                            return status in _CONFIRMING
-            except TimeoutError:
-                return False
-
-    async def _short(
-        self, device: Device, command: str, request: Request, *, who: str, epoch: int, now_ms: int
-    ) -> bytes:
         return await self.signed(device, command, request, who=who, epoch=epoch, issued_ms=now_ms, ttl_ms=SHORT_TTL_MS)
 
 

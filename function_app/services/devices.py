@@ -169,13 +169,25 @@ def require_operator(device: Device) -> Device:
     return device
 
 
-def require_online(link: Link | None) -> None:
+def require_claimed(agent: Agent) -> str:
+    """The space of an agent, once it is seen that somebody has claimed it.
+
+    Raises:
+        Problem: ``agent-unclaimed``.
+    """
+    if agent.space is None:
+        detail = "Nobody has claimed this agent yet. Wait for GET /agents/enrollment to say so."
+        raise Problem("agent-unclaimed", 409, "The agent is not claimed", detail)
+    return agent.space
+
+
+def require_online(link: Link | None, now_ms: int) -> None:
     """Refuse what cannot arrive.
 
     Raises:
-        Problem: ``device-offline``: the agent's last word was "offline".
+        Problem: ``device-offline``: the agent's last word was "offline", or it polls and has stopped to.
     """
-    if link is not None and not link.online:
+    if link is not None and not (devices.online(link, link.seen_ms, now_ms) if link.polled else link.online):
         detail = "The device's agent is offline. Check that it runs and has network."
         raise Problem("device-offline", 409, "The device is offline", detail)
 
@@ -205,4 +217,5 @@ def _device(agent: Agent, spec: DeviceSpec) -> Device:
         pairing=agent.pairing,
         role=Role.OWNER,
         topic=f"{topics.ROOT}/{space}/{agent.id}/{spec.name}",
+        transport=agent.transport,
     )

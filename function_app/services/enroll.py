@@ -3,7 +3,7 @@
 import asyncio
 from dataclasses import dataclass, replace
 
-from function_app.domain.devices import Agent, DeviceSpec
+from function_app.domain.devices import Agent, DeviceSpec, Transport
 from function_app.domain.ids import new_claim_code
 from function_app.domain.problems import Problem
 from function_app.ports.clock import Clock
@@ -22,6 +22,7 @@ class Enrollment:
     public_key: str
     software: str
     devices: tuple[DeviceSpec, ...]
+    transport: Transport = "mqtt"
 
 
 class Enroll:
@@ -51,6 +52,7 @@ class Enroll:
                     detail = "Another agent's key has the same id. Make a new key."
                     raise Problem("agent-id-taken", 409, "The id is taken", detail)
                 record = replace(record, name=told.name, software=told.software, devices=told.devices)
+            record = replace(record, transport=told.transport)
             if not record.claimed:
                 expires_ms = now_ms + CLAIM_MS
                 code = await self._new_code(agent, expires_ms)

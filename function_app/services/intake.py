@@ -82,13 +82,17 @@ class Intake:
         self._agents: dict[str, _Agent] = {}
         self._turn = 0
 
-    async def take(self, messages: Iterable[Arrived]) -> None:
+    async def take(self, messages: Iterable[Arrived]) -> dict[int, str]:
         """Take messages in: once this returns they are in their series.
+
+        Returns:
+            What cannot be read and is dropped: its place among ``messages``, and why.
 
         Raises:
             Problem: ``busy``: what is not in its series yet is in the queue, or is to be delivered again.
             StoreError: As above.
         """
+        dropped: dict[int, str] = {}
         parts: dict[tuple[str, str], list[tuple[int, Values]]] = defaultdict(list)
         devices: dict[str, Device] = {}
         for number, message in enumerate(messages):
@@ -102,12 +106,14 @@ class Intake:
                 sample = _sample(message, known.joints.get(message.topic.device, ()))
             except ProtocolError as error:
                 _log.warning("%s of %s dropped: %s", message.topic.name, device.id, error)
+                dropped[number] = str(error)
                 continue
             devices[device.id] = device
             parts[device.id, message.topic.name].append(sample)
         gathered = [_Part(devices[id_], stream, series.gather(rows)) for (id_, stream), rows in parts.items()]
         for batch in _batches(gathered):
             await self._distribute(await self._queue(batch), batch)
+        return dropped
 
     async def distribute_left(self) -> None:
         """Distribute what others have left behind: a part of the queue each time.

@@ -8,12 +8,12 @@ from function_app.domain import lease as rules
 from function_app.domain.accounts import Identity
 from function_app.domain.devices import Agent
 from function_app.domain.ids import new_id
-from function_app.domain.problems import Problem, broker_unavailable
+from function_app.domain.problems import broker_unavailable
 from function_app.ports.broker_access import BrokerAccess, BrokerAccessError, Credentials
 from function_app.ports.clock import Clock
 from function_app.ports.tables import Tables
 from function_app.services.control import read_lease
-from function_app.services.devices import Devices
+from function_app.services.devices import Devices, require_claimed
 from function_app.services.identity import principal
 from function_app.services.lease import control_client
 
@@ -107,10 +107,8 @@ class MqttCredentials:
         Raises:
             Problem: ``agent-unclaimed``, ``broker-unavailable``.
         """
-        if agent.space is None:
-            detail = "Nobody has claimed this agent yet. Wait for GET /agents/enrollment to say so."
-            raise Problem("agent-unclaimed", 409, "The agent is not claimed", detail)
-        grant = grants.agent_grant(agent.space, agent.id, token_id=new_id(), lifetime_s=AGENT_S)
+        space = require_claimed(agent)
+        grant = grants.agent_grant(space, agent.id, token_id=new_id(), lifetime_s=AGENT_S)
         return await self._issue(grant, AGENT_S, grant.publish, grant.subscribe)
 
     async def _issue(

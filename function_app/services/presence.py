@@ -1,6 +1,5 @@
 """What agents say of themselves and their devices, into the tables: presence, description, state, events."""
 
-import logging
 from typing import TypeVar
 
 import msgspec
@@ -9,7 +8,7 @@ from device_agent.protocol import codec, topics
 from device_agent.protocol.errors import ProtocolError
 from device_agent.protocol.messages import Description, Event, Presence, State
 from device_agent.protocol.topics import Topic
-from function_app.domain.devices import Agent, LastState, Link, newer_link
+from function_app.domain.devices import Agent, LastState, Link, Transport, newer_link
 from function_app.domain.ids import device_id, new_suffix
 from function_app.domain.nesting import MAX_LEVELS, too_deep
 from function_app.ports.clock import Clock
@@ -23,8 +22,6 @@ _NOTED = 4096
 
 T = TypeVar("T")
 
-_log = logging.getLogger(__name__)
-
 
 class PresenceIngest:
     """Writes down what arrives. Safe to repeat; what does not belong to a claimed agent is dropped."""
@@ -35,10 +32,14 @@ class PresenceIngest:
         self._clock = clock
         self._noted: dict[tuple[str, int, int], None] = {}
 
-    async def ingest(self, topic: Topic, payload: bytes) -> None:
+    async def ingest(self, topic: Topic, payload: bytes, *, by: Transport = "mqtt") -> None:
         """Take one message in.
 
+        What an agent has said over HTTP is told to the broker too and comes back from there, perhaps late: then it is
+        not taken a second time.
+
         Raises:
+            ProtocolError: It is not what its topic says.
             Problem: ``busy``: not stored, to be delivered again.
         """
         row = await self._tables.get(store.AGENTS, topic.agent, "agent")
@@ -47,16 +48,14 @@ class PresenceIngest:
         agent = store.read(row, Agent)
         if agent.space != topic.space or (topic.device and agent.device(topic.device) is None):
             return
-        try:
-            await self._store(topic, payload)
-        except ProtocolError as error:
-            _log.warning("%s of %s/%s dropped: %s", topic.kind, topic.agent, topic.device, error)
+        if agent.transport == "mqtt" or by != "mqtt":
+            await self._store(topic, payload, polled=agent.transport != "mqtt")
 
-    async def _store(self, topic: Topic, payload: bytes) -> None:
+    async def _store(self, topic: Topic, payload: bytes, *, polled: bool) -> None:
         now_ms = self._clock.now_ms()
         if topic.kind == topics.CONN:
             presence = codec.decode(payload, Presence)
-            link = Link(presence.online, presence.session, now_ms)
+            link = Link(presence.online, presence.session, now_ms, polled)
             await store.upsert(
                 self._tables, store.AGENTS, topic.agent, "link", lambda known: newer_link(known, link), Link
             )

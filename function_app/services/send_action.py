@@ -49,7 +49,7 @@ class SendAction:
             BusUnavailable: The broker did not confirm it.
         """
         action = found.action
-        payload = await self._commands.signed(
+        signed = await self._commands.signed(
             device,
             action.id,
             await self._command(action),
@@ -58,7 +58,7 @@ class SendAction:
             issued_ms=action.issued_ms,
             ttl_ms=action.ttl_ms,
         )
-        await self._commands.publish(device, payload)
+        await self._commands.publish(device, signed)
         now_ms = self._clock.now_ms()
         await self._rows.change(action.id, lambda known: mark_published(known, now_ms), known=found)
 

@@ -16,13 +16,14 @@ from function_app.domain.ids import command_id
 from function_app.domain.lease import Lease
 from function_app.domain.problems import Problem, busy_store
 from function_app.ports.clock import Clock
-from function_app.ports.command_bus import BusUnavailable, CommandBus
+from function_app.ports.command_bus import BusUnavailable
 from function_app.ports.tables import Row, Tables, Write
 from function_app.services import parameters, store
 from function_app.services.action_acks import ActionAcks
 from function_app.services.action_rows import ActionRows, Found, new_row
 from function_app.services.commands import Commands
 from function_app.services.control import Control, read_control
+from function_app.services.delivery import Delivery, Signed
 from function_app.services.devices import Devices, require_online, require_operator
 from function_app.services.movements import Movements
 from function_app.services.pending import Pending
@@ -113,7 +114,7 @@ class StartAction:
         acks: ActionAcks,
         pending: Pending,
         queues: Queues,
-        bus: CommandBus,
+        delivery: Delivery,
         clock: Clock,
     ) -> None:
         self._tables = tables
@@ -124,7 +125,7 @@ class StartAction:
         self._acks = acks
         self._pending = pending
         self._queues = queues
-        self._bus = bus
+        self._delivery = delivery
         self._clock = clock
 
     async def start(self, who: Identity, device_id: str, start: Start) -> tuple[Action, bool]:
@@ -144,7 +145,7 @@ class StartAction:
         earlier = await self._earlier(who, device, start)
         if earlier is not None:
             return await self._again(earlier, device, start)
-        require_online(link)
+        require_online(link, self._clock.now_ms())
         plan = await self._plan(who, device, start.asked)
         ttl_ms = min(start.ttl_ms, start.timeout_ms)
         await self._pending.note(plan.action, plan.created_ms + REPEAT_MS)
@@ -155,11 +156,11 @@ class StartAction:
             if fresh:
                 await self._queues.advance(device.id)
             return await self._again(found, device, start)
-        payload = await self._payload(plan, found.action)
+        signed = await self._signed(plan, found.action)
         wanted = Status(start.wait_for)
-        async with self._bus.acks(device.topic, plan.action) as acks:
+        async with self._delivery.acks(device, plan.action) as acks:
             try:
-                await self._commands.publish(device, payload)
+                await self._commands.publish(device, signed)
             except BusUnavailable:
                 # It is written: the timer publishes it as soon as the broker is back, or ends it.
                 return found.action, False
@@ -169,7 +170,7 @@ class StartAction:
     async def _again(self, found: Found, device: Device, start: Start) -> tuple[Action, bool]:
         """The answer where nothing is to be sent: an earlier request started it, or it waits for its turn."""
         wanted = Status(start.wait_for)
-        async with self._bus.acks(device.topic, found.action.id) as acks:
+        async with self._delivery.acks(device, found.action.id) as acks:
             found = await self._rows.get(found.action.id) or found
             action = await self._acks.follow(found, acks, wanted=wanted, wait_ms=start.wait_ms)
         return action, reached(action, wanted)
@@ -199,7 +200,7 @@ class StartAction:
         self._commands.check(device, action, plan.command, who=who.name, ttl_ms=1)
         return plan
 
-    async def _payload(self, plan: _Plan, action: Action) -> bytes:
+    async def _signed(self, plan: _Plan, action: Action) -> Signed:
         return await self._commands.signed(
             plan.device,
             action.id,

@@ -4,17 +4,18 @@ import asyncio
 import contextlib
 import logging
 
-from device_agent.protocol import codec, topics
+from device_agent.protocol import codec
 from device_agent.protocol.messages import ResetStop, Stop, StopDevice
 from function_app.domain.accounts import Identity
 from function_app.domain.devices import Device
 from function_app.domain.ids import new_id
 from function_app.domain.problems import Problem
 from function_app.domain.queue import STOPPED
-from function_app.ports.command_bus import BusUnavailable, CommandBus
+from function_app.ports.command_bus import BusUnavailable
 from function_app.ports.tables import Tables
 from function_app.services.commands import Commands
 from function_app.services.control import read_lease
+from function_app.services.delivery import Delivery
 from function_app.services.devices import Devices
 from function_app.services.queue import Queues
 
@@ -28,13 +29,13 @@ class StopDevices:
     """Latches and resets Stop."""
 
     def __init__(
-        self, *, tables: Tables, devices: Devices, commands: Commands, queues: Queues, bus: CommandBus
+        self, *, tables: Tables, devices: Devices, commands: Commands, queues: Queues, delivery: Delivery
     ) -> None:
         self._tables = tables
         self._devices = devices
         self._commands = commands
         self._queues = queues
-        self._bus = bus
+        self._delivery = delivery
 
     async def stop(self, who: Identity, device_id: str, reason: str) -> bool:
         """Latch Stop; whether the device has confirmed it within a second.
@@ -72,7 +73,7 @@ class StopDevices:
         payload = codec.encode(stop)
         while True:
             try:
-                await self._bus.publish(f"{device.topic}/{topics.STOP}", payload)
+                await self._delivery.stop(device, payload)
             except BusUnavailable as error:
                 _log.warning("stop of %s: %s", device.id, error)
                 raise

@@ -42,6 +42,8 @@ EVENTS = "Events"
 """Partition: device id; key: counts down with time, newest first."""
 FORGET = "Forget"
 """Partition: shard; key: ``<due ms>:<hash of what is to be deleted>``."""
+MAILBOX = "Mailbox"
+"""Partition: agent id; keys ``<0 for Stop, 1>:<oldest first>:<command id>``, ``ack:<command id>``."""
 
 TRIES = 12
 _PAUSE_S = 0.002

@@ -42,7 +42,8 @@ def router(functions: Functions, caller: Caller) -> Routes:
             raise invalid("Two devices have the same name.")
         agent = await caller.enrolling(request, asked.public_key)
         specs = tuple(msgspec.convert(device, DeviceSpec, from_attributes=True) for device in asked.devices)
-        done = await functions.enroll.enroll(agent, Enrollment(asked.name, asked.public_key, asked.software, specs))
+        told = Enrollment(asked.name, asked.public_key, asked.software, specs, asked.transport)
+        done = await functions.enroll.enroll(agent, told)
         if done.claimed:
             return answer(contract.Enrolled(agent=done.id, claim_code=None, expires_at=None, expires_in_s=0))
         left_ms = max(0, done.claim_expires_ms - functions.clock.now_ms())
@@ -110,6 +111,7 @@ def router(functions: Functions, caller: Caller) -> Routes:
                 software=agent.software,
                 space=agent.space or "",
                 devices=tuple(spec.name for spec in agent.devices),
+                transport=agent.transport,
                 claimed_at=rfc3339(agent.claimed_ms),
             )
             for agent in agents

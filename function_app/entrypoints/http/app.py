@@ -22,6 +22,7 @@ from function_app.entrypoints.http import (
     devices,
     health,
     latency,
+    messages,
     movements,
     robot_types,
 )
@@ -61,6 +62,7 @@ def create_app(functions: Functions) -> FastAPI:
     resources = (
         auth.router(functions, caller),
         agents.router(functions, caller),
+        messages.router(functions, caller),
         devices.router(functions, caller),
         actions.router(functions, caller),
         robot_types.router(functions, caller),

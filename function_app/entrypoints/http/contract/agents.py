@@ -26,6 +26,10 @@ class EnrollRequest(Request, frozen=True, kw_only=True):
     public_key: Annotated[str, Meta(pattern="^[A-Za-z0-9_-]{43}$")]
     software: Label
     devices: Annotated[tuple[DeviceIn, ...], Meta(min_length=1, max_length=64)]
+    transport: Annotated[
+        Literal["mqtt", "http", "xmpp"],
+        Meta(description="How it hears commands: by the broker, or by asking"),
+    ] = "mqtt"
 
 
 class Enrolled(Answer, frozen=True, kw_only=True):
@@ -69,6 +73,7 @@ class AgentOut(Answer, frozen=True, kw_only=True):
     software: str
     space: str
     devices: tuple[str, ...]
+    transport: Literal["mqtt", "http", "xmpp"]
     claimed_at: Moment
 
 
