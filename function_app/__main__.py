@@ -1,4 +1,4 @@
-"""``python -m function_app serve|work|sign-in-link``: the functions on one machine."""
+"""``python -m function_app serve|work|prepare|sign-in-link``: the functions on one machine."""
 
 import argparse
 import asyncio
@@ -22,17 +22,24 @@ def main(arguments: Sequence[str] | None = None) -> int:
     commands = parser.add_subparsers(required=True, metavar="COMMAND", dest="command")
     commands.add_parser("serve", help="API and console, under uvicorn")
     commands.add_parser("work", help="ingest from the broker, and timers")
+    commands.add_parser("prepare", help="make Amazon's table and bucket, where there are none")
     link = commands.add_parser("sign-in-link", help="print a one-time sign-in link; makes the account if it is new")
     link.add_argument("--account", default="demo", help="name of the account (default: %(default)s)")
     options = parser.parse_args(arguments)
     logging.basicConfig(level=logging.INFO, format="%(asctime)s %(levelname)s %(message)s", stream=sys.stderr)
+    for sdk in ("azure", "botocore"):  # they tell of every request
+        logging.getLogger(sdk).setLevel(logging.WARNING)
     try:
-        functions = bootstrap.build(settings.read())
+        known = settings.read()
+        if options.command == "prepare":
+            asyncio.run(bootstrap.prepare(known))
+            return 0
+        functions = bootstrap.build(known)
         if options.command == "serve":
             asyncio.run(_check(functions))
             serve(functions)
         elif options.command == "work":
-            asyncio.run(work(functions))
+            asyncio.run(_work(functions))
         else:
             asyncio.run(_link(functions, options.account))
     except PortTaken as taken:
@@ -54,6 +61,11 @@ async def _check(functions: Functions) -> None:
     """
     await functions.tables.get("Accounts", "health", "health")
     await functions.tables.close()
+
+
+async def _work(functions: Functions) -> None:
+    await _check(functions)
+    await work(functions)
 
 
 async def _link(functions: Functions, account: str) -> None:

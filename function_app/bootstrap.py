@@ -228,6 +228,26 @@ def _keep(settings: Settings) -> Keep:
     )
 
 
+async def prepare(settings: Settings) -> None:
+    """Make what the store must have before its first use. Safe to repeat.
+
+    Only Amazon's needs it: a file, and Azure's tables and container, are made when first written to.
+
+    Raises:
+        StoreError: It cannot be made.
+    """
+    if isinstance(settings.store, AwsStore):
+        from function_app.adapters.aws.blobs import S3Blobs  # noqa: PLC0415
+        from function_app.adapters.aws.tables import DynamoTables  # noqa: PLC0415
+
+        for store in _stores(settings):
+            assert isinstance(store, DynamoTables | S3Blobs)  # noqa: S101 (the settings say so)
+            try:
+                await store.prepare()
+            finally:
+                await store.close()
+
+
 def _stores(settings: Settings) -> tuple[Tables, Blobs]:
     """Tables and blobs. Of the clouds' adapters only the one in use is imported, and it its SDK only when needed."""
     match settings.store:

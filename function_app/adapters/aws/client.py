@@ -109,7 +109,7 @@ class Client:
         if codes & _MISSING:
             return StoreError(
                 f"{self._where} does not exist. Check {self._setting} and TELESCOPE_AWS_REGION, or create it: "
-                f"{self._how}."
+                f"{self._how}; `python -m function_app prepare` does."
             )
         if codes & _NO_RIGHTS:
             return StoreError(

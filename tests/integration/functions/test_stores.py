@@ -12,9 +12,7 @@ import pytest
 
 from device_agent.protocol.messages import AckStatus, RunMovement
 from function_app import bootstrap
-from function_app.adapters.aws.blobs import S3Blobs
-from function_app.adapters.aws.tables import DynamoTables
-from function_app.settings import AwsStore, AzureStore, Settings
+from function_app.settings import AwsStore, AzureStore
 from tests.support.aws import REGION, start_moto, use_credentials
 from tests.support.azure import start_azurite
 from tests.support.brokers import RunningBroker
@@ -53,22 +51,11 @@ def store(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> Az
 def clouds(home: Path, broker: RunningBroker, store: AzureStore | AwsStore | None) -> Iterator[tuple[Cloud, Cloud]]:
     """Two instances; the ingest runs in the second."""
     chosen = replace(settings(home, broker), store=store)
-    if isinstance(store, AwsStore):
-        asyncio.run(_prepare(chosen))
+    asyncio.run(bootstrap.prepare(chosen))
     with contextlib.ExitStack() as stack:
         one, other = (stack.enter_context(Cloud(chosen)) for _ in range(2))
         other.start_ingest()
         yield one, other
-
-
-async def _prepare(chosen: Settings) -> None:
-    """Make Amazon's table and bucket, which a deployment does otherwise."""
-    functions = bootstrap.build(chosen)
-    assert isinstance(functions.tables, DynamoTables)
-    assert isinstance(functions.blobs, S3Blobs)
-    await functions.tables.prepare()
-    await functions.blobs.prepare()
-    await functions.close()
 
 
 def test_from_pairing_to_a_movement_that_was_run(clouds: tuple[Cloud, Cloud]) -> None:

@@ -17,10 +17,20 @@ import time
 import uuid
 from collections.abc import Iterator, Mapping
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from pathlib import Path
 from typing import Any, ClassVar
 from urllib.parse import unquote_to_bytes
 
-from tests.support.hosts.host import LOOPBACK, PATIENCE_S, HostFailed, Program, environment_of, start_program
+from tests.support.hosts.host import (
+    LOOPBACK,
+    PATIENCE_S,
+    ROOT,
+    HostFailed,
+    Program,
+    environment_of,
+    only,
+    start_program,
+)
 
 MAX_INSTANCES = 8
 MAX_EVENT_BYTES = 6 * 1024 * 1024
@@ -32,11 +42,13 @@ _ARN = "arn:aws:lambda:eu-west-1:123456789012:function:telescope"
 
 
 @contextlib.contextmanager
-def start_lambda(environment: Mapping[str, str], *, freeze: bool = True) -> Iterator["Lambda"]:
-    """The functions behind a gateway on a free port."""
+def start_lambda(
+    environment: Mapping[str, str], *, freeze: bool = True, package: Path | None = None
+) -> Iterator["Lambda"]:
+    """The functions behind a gateway on a free port; with ``package``, the code and libraries in it alone."""
     with contextlib.ExitStack() as stack:
         instances = stack.enter_context(contextlib.ExitStack())
-        host = Lambda(environment, instances, freeze=freeze)
+        host = Lambda(environment, instances, freeze=freeze, package=package)
         host.url = stack.enter_context(_serve(_gateway(host)))
         stack.callback(host.thaw)
         yield host
@@ -45,12 +57,19 @@ def start_lambda(environment: Mapping[str, str], *, freeze: bool = True) -> Iter
 class Lambda:
     """The service: starts instances, gives each an event at a time."""
 
-    def __init__(self, environment: Mapping[str, str], stack: contextlib.ExitStack, *, freeze: bool) -> None:
+    def __init__(
+        self, environment: Mapping[str, str], stack: contextlib.ExitStack, *, freeze: bool, package: Path | None
+    ) -> None:
         self.url = ""
         self.instances: list[_Instance] = []
         self._environment = environment
         self._stack = stack
         self._freeze = freeze
+        self._folder, self._arguments = ROOT, ["-m", "awslambdaric", _HANDLER]
+        self._libraries: dict[str, str] = {}
+        if package is not None:
+            self._folder, self._arguments = package, ["-S", *self._arguments]
+            self._libraries = only(package, "awslambdaric", "runtime_client*", "simplejson", "snapshot_restore_py")
         self._lock = threading.Lock()
         self._idle: list[_Instance] = []
 
@@ -105,9 +124,10 @@ class Lambda:
                 "AWS_LAMBDA_FUNCTION_MEMORY_SIZE": "512",
                 "AWS_EXECUTION_ENV": "AWS_Lambda_python3.11",
                 "_HANDLER": _HANDLER,
+                **self._libraries,
             }
         )
-        instance.program = self._stack.enter_context(start_program(["-m", "awslambdaric", _HANDLER], given))
+        instance.program = self._stack.enter_context(start_program(self._arguments, given, folder=self._folder))
         self.instances.append(instance)
         return instance
 

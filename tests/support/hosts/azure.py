@@ -5,17 +5,26 @@ import contextlib
 import http.client
 import json
 import secrets
+import sys
 from collections.abc import Iterator, Mapping
+from pathlib import Path
 from typing import Any
 from urllib.parse import urlsplit
 
-from tests.support.hosts.host import PATIENCE_S, Host, HostFailed, environment_of, start_program
+from tests.support.hosts.host import PATIENCE_S, Host, HostFailed, environment_of, only, start_program
+
+WORKER = Path(sys.prefix) / "azure-worker"
+"""Where ``make`` installs the worker: not among the project's packages, because it asks for a newer Python."""
 
 
 @contextlib.contextmanager
-def start_azure(environment: Mapping[str, str]) -> Iterator[Host]:
-    """The worker on a free port, with the functions indexed and loaded."""
-    with start_program(["-m", "tests.support.hosts.functions_host"], environment_of(environment)) as program:
+def start_azure(environment: Mapping[str, str], *, package: Path | None = None) -> Iterator[Host]:
+    """The worker on a free port, with the functions indexed and loaded; with ``package``, on its libraries alone."""
+    assert any(WORKER.glob("azure_functions_runtime")), f"the Functions worker is not in {WORKER}; run `make test`"
+    arguments, more = ["-m", "tests.support.hosts.functions_host", str(WORKER)], {}
+    if package is not None:
+        arguments, more = ["-S", *arguments], only(package, "uvicorn", "h11", "click")
+    with start_program(arguments, environment_of({**environment, **more})) as program:
         yield _Azure(program.line())
 
 

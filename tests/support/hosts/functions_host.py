@@ -1,4 +1,4 @@
-"""``python -m tests.support.hosts.functions_host``: what stands around the functions at Azure.
+"""``python -m tests.support.hosts.functions_host WORKER``: what stands around the functions at Azure.
 
 The worker is Microsoft's (``azure-functions-runtime``): it indexes, loads and invokes the functions as in production.
 This is the host before it, which turns each HTTP request into an invocation and its answer back. The behaviour that the
@@ -8,9 +8,11 @@ path decoded where it is UTF-8 and encoded again, cookies as fields of their own
 
 import asyncio
 import http
+import importlib
 import json
 import os
 import re
+import socket
 import sys
 import threading
 import uuid
@@ -20,12 +22,9 @@ from urllib.parse import quote, unquote_to_bytes
 
 import uvicorn
 
-from function_app.entrypoints.serve import listen
 from tests.support.hosts import rpc
 from tests.support.hosts.host import LOOPBACK, ROOT
 
-WORKER = Path(sys.prefix) / "azure-worker"
-"""Where ``make`` installs the worker: not among the project's packages, because it asks for a newer Python."""
 _ADMIN = "/admin/functions/"
 _EVENTS = "/runtime/webhooks/eventgrid"
 _ACCEPTED = 202
@@ -34,14 +33,10 @@ _ACCEPTED = 202
 class FunctionsHost:
     """The functions of a folder."""
 
-    def __init__(self, folder: Path) -> None:
-        sys.path.append(str(WORKER))
-        try:
-            import azure_functions_runtime as runtime  # type: ignore[import-not-found,unused-ignore]
-        except ImportError as error:
-            raise SystemExit(f"the Functions worker is not in {WORKER}; `make test` installs it") from error
+    def __init__(self, folder: Path, worker: str) -> None:
+        sys.path.append(worker)
         self._folder = folder
-        self._worker = runtime
+        self._worker = importlib.import_module("azure_functions_runtime")
         self._functions: dict[str, Any] = {}
         settings = json.loads((folder / "host.json").read_text(encoding="utf-8"))
         self._prefix = settings["extensions"]["http"]["routePrefix"]
@@ -226,10 +221,9 @@ def _accepted(answer: Any) -> _Answer:
 
 async def main() -> None:
     """Serve until standard input ends."""
-    host = FunctionsHost(ROOT)
+    host = FunctionsHost(ROOT, sys.argv[1])
     await host.start()
-    listener = listen(LOOPBACK, 0)
-    listener.listen(128)
+    listener = socket.create_server((LOOPBACK, 0))
     print(f"http://{LOOPBACK}:{listener.getsockname()[1]}", flush=True)  # noqa: T201
     await uvicorn.Server(
         uvicorn.Config(host, lifespan="off", access_log=False, server_header=False, log_level="warning")

@@ -5,6 +5,7 @@ import os
 import select
 import subprocess
 import sys
+import sysconfig
 import tempfile
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
@@ -71,6 +72,19 @@ def start_program(
             yield program
         finally:
             program.end()
+
+
+def only(package: Path, *programs: str) -> dict[str, str]:
+    """What lets a program see the libraries in ``package`` alone, and beside them these of the tests'.
+
+    To be run with ``-S``, so that Python adds none of its own.
+    """
+    beside = Path(tempfile.mkdtemp(dir=package.parent))
+    site = Path(sysconfig.get_path("purelib"))
+    for program in programs:
+        for found in site.glob(program):
+            (beside / found.name).symlink_to(found)
+    return {"PYTHONPATH": f"{package}{os.pathsep}{beside}"}
 
 
 class Program:
