@@ -26,6 +26,7 @@ from function_app.services.commands import Commands
 from function_app.services.delivery import Delivery
 from function_app.services.devices import Devices
 from function_app.services.enroll import Enroll
+from function_app.services.fleet import StartOnMany
 from function_app.services.forget import DAY_MS, Forget
 from function_app.services.health import CheckHealth
 from function_app.services.identity import Identify
@@ -78,6 +79,7 @@ class Functions:
     robot_types: RobotTypes
     movements: Movements
     start_action: StartAction
+    fleet: StartOnMany
     actions: Actions
     queues: Queues
     action_acks: ActionAcks
@@ -155,6 +157,18 @@ def build(settings: Settings, *, clock: Clock | None = None) -> Functions:
     sending = SendAction(tables=tables, rows=rows, commands=commands, movements=movements, clock=now)
     queues = Queues(tables=tables, devices=devices, rows=rows, pending=pending, sending=sending, clock=now)
     acks = ActionAcks(rows=rows, queues=queues, mailbox=mailbox, clock=now)
+    start_action = StartAction(
+        tables=tables,
+        devices=devices,
+        movements=movements,
+        commands=commands,
+        rows=rows,
+        acks=acks,
+        pending=pending,
+        queues=queues,
+        delivery=delivery,
+        clock=now,
+    )
     return Functions(
         settings=settings,
         tables=tables,
@@ -174,18 +188,8 @@ def build(settings: Settings, *, clock: Clock | None = None) -> Functions:
         leases=Leases(tables=tables, devices=devices, commands=commands, access=access, clock=now),
         robot_types=robot_types,
         movements=movements,
-        start_action=StartAction(
-            tables=tables,
-            devices=devices,
-            movements=movements,
-            commands=commands,
-            rows=rows,
-            acks=acks,
-            pending=pending,
-            queues=queues,
-            delivery=delivery,
-            clock=now,
-        ),
+        start_action=start_action,
+        fleet=StartOnMany(start_action=start_action),
         actions=Actions(
             tables=tables, devices=devices, rows=rows, acks=acks, commands=commands, delivery=delivery, clock=now
         ),

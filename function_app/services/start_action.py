@@ -1,13 +1,15 @@
 """Starting an action: decide in one batch, publish, and wait as long as the caller likes."""
 
 import hashlib
+from collections.abc import AsyncIterator
+from contextlib import AbstractAsyncContextManager, AsyncExitStack, nullcontext
 from dataclasses import dataclass, field
 from typing import Annotated, Any, Literal
 
 import msgspec
 from msgspec import Meta, Struct
 
-from device_agent.protocol.messages import Id, JointPositions, MoveJoints, RunMovement
+from device_agent.protocol.messages import Ack, Id, JointPositions, MoveJoints, RunMovement
 from function_app.domain import lease as rules
 from function_app.domain.accounts import Identity
 from function_app.domain.actions import REPEAT_MS, Action, Status, reached
@@ -100,6 +102,16 @@ class _Plan:
     pinned: dict[str, Any] = field(default_factory=dict)
 
 
+@dataclass(frozen=True, slots=True)
+class _Begun:
+    """An action that is written, and its acks from before it was sent."""
+
+    found: Found
+    acks: AsyncIterator[Ack] | None
+    published: bool = False
+    undelivered: bool = False
+
+
 class StartAction:
     """One run of something on one device."""
 
@@ -128,23 +140,43 @@ class StartAction:
         self._delivery = delivery
         self._clock = clock
 
-    async def start(self, who: Identity, device_id: str, start: Start) -> tuple[Action, bool]:
+    async def start(
+        self, who: Identity, device_id: str, start: Start, *, gate: AbstractAsyncContextManager[object] | None = None
+    ) -> tuple[Action, bool]:
         """Start it; and whether the wanted status (or an end) was reached in time.
 
         A stop of this process after any write leaves an action that the timer publishes or ends.
+
+        Args:
+            who: Who asks.
+            device_id: On which device.
+            start: What to start.
+            gate: Held while it is written and sent, not while its start is waited for.
 
         Raises:
             Problem: ``device-unknown``, ``forbidden``, ``movement-unknown``, ``device-offline``, ``device-busy``,
                 ``queue-full``, ``lease-held``, ``lease-lost``, ``idempotency-key-reused``, ``busy``,
                 ``parameters-invalid``, ``invalid``.
         """
+        wanted = Status(start.wait_for)
+        async with AsyncExitStack() as listening:
+            async with gate or nullcontext():
+                begun = await self._begin(who, device_id, start, listening)
+            if begun.undelivered:
+                return begun.found.action, False
+            action = await self._acks.follow(
+                begun.found, begun.acks, wanted=wanted, wait_ms=start.wait_ms, published=begun.published
+            )
+        return action, reached(action, wanted)
+
+    async def _begin(self, who: Identity, device_id: str, start: Start, listening: AsyncExitStack) -> "_Begun":
         if isinstance(start.asked, AskMovement):
             parameters.check(start.asked.parameters)
         device, link = await self._devices.with_link(who, device_id)
         require_operator(device)
         earlier = await self._earlier(who, device, start)
         if earlier is not None:
-            return await self._again(earlier, device, start)
+            return await self._join(earlier, device, listening)
         require_online(link, self._clock.now_ms())
         plan = await self._plan(who, device, start.asked)
         ttl_ms = min(start.ttl_ms, start.timeout_ms)
@@ -152,28 +184,23 @@ class StartAction:
         if start.policy == "queue":
             await self._queues.watch(device.id)
         found, fresh = await self._write(who, plan, start, ttl_ms)
+        if fresh and found.action.status is Status.QUEUED:
+            await self._queues.advance(device.id)
         if not fresh or found.action.status is Status.QUEUED:
-            if fresh:
-                await self._queues.advance(device.id)
-            return await self._again(found, device, start)
+            return await self._join(found, device, listening)
         signed = await self._signed(plan, found.action)
-        wanted = Status(start.wait_for)
-        async with self._delivery.acks(device, plan.action) as acks:
-            try:
-                await self._commands.publish(device, signed)
-            except BusUnavailable:
-                # It is written: the timer publishes it as soon as the broker is back, or ends it.
-                return found.action, False
-            action = await self._acks.follow(found, acks, wanted=wanted, wait_ms=start.wait_ms, published=True)
-        return action, reached(action, wanted)
+        acks = await listening.enter_async_context(self._delivery.acks(device, plan.action))
+        try:
+            await self._commands.publish(device, signed)
+        except BusUnavailable:
+            # It is written: the timer publishes it as soon as the broker is back, or ends it.
+            return _Begun(found, acks, undelivered=True)
+        return _Begun(found, acks, published=True)
 
-    async def _again(self, found: Found, device: Device, start: Start) -> tuple[Action, bool]:
-        """The answer where nothing is to be sent: an earlier request started it, or it waits for its turn."""
-        wanted = Status(start.wait_for)
-        async with self._delivery.acks(device, found.action.id) as acks:
-            found = await self._rows.get(found.action.id) or found
-            action = await self._acks.follow(found, acks, wanted=wanted, wait_ms=start.wait_ms)
-        return action, reached(action, wanted)
+    async def _join(self, found: Found, device: Device, listening: AsyncExitStack) -> "_Begun":
+        """Where nothing is to be sent: an earlier request started it, or it waits for its turn."""
+        acks = await listening.enter_async_context(self._delivery.acks(device, found.action.id))
+        return _Begun(await self._rows.get(found.action.id) or found, acks)
 
     async def _plan(self, who: Identity, device: Device, asked: Asked) -> _Plan:
         now_ms = self._clock.now_ms()

@@ -1,5 +1,6 @@
 """``devices/{id}/actions`` and ``actions``."""
 
+from dataclasses import replace
 from typing import Annotated, Literal
 
 from fastapi import Header, Query, Request, Response
@@ -10,6 +11,7 @@ from function_app.entrypoints.http import show
 from function_app.entrypoints.http.answers import answer, read
 from function_app.entrypoints.http.caller import Caller
 from function_app.entrypoints.http.contract import actions as contract
+from function_app.entrypoints.http.contract.fleet import FleetRequest
 from function_app.entrypoints.http.routing import PREFIX, Cursor, Limit, Routes
 from function_app.services.start_action import Start
 
@@ -26,7 +28,7 @@ def router(functions: Functions, caller: Caller) -> Routes:
     routes = Routes("actions")
 
     async def shown(found: Action) -> contract.ActionOut:
-        return show.action(found, (await functions.queues.positions([found])).get(found.id))
+        return await show_action(functions, found)
 
     @routes.add(
         "POST",
@@ -40,17 +42,7 @@ def router(functions: Functions, caller: Caller) -> Routes:
         """200: it has come as far as ``wait_for``, or has ended. 202: it waits or is under way; ask at its address."""
         who = await caller.account(request)
         asked: contract.ActionRequest = await read(request, contract.ActionRequest)
-        start = Start(
-            asked=asked.request,
-            epoch=asked.epoch,
-            policy=asked.policy,
-            queue_ms=asked.queue_ms,
-            ttl_ms=asked.ttl_ms,
-            timeout_ms=asked.timeout_ms,
-            wait_ms=asked.wait_ms,
-            wait_for=asked.wait_for,
-            once=once or "",
-        )
+        start = replace(start_of(asked, once), epoch=asked.epoch)
         found, there = await functions.start_action.start(who, device, start)
         where = {"Location": f"{PREFIX}/actions/{found.id}"}
         return answer(await shown(found), 200 if there else 202, where)
@@ -87,3 +79,22 @@ def router(functions: Functions, caller: Caller) -> Routes:
         return answer(await shown(await functions.actions.cancel(who, action)), 202)
 
     return routes
+
+
+def start_of(asked: contract.ActionRequest | FleetRequest, once: str | None) -> Start:
+    """What is to be started, without the lease."""
+    return Start(
+        asked=asked.request,
+        policy=asked.policy,
+        queue_ms=asked.queue_ms,
+        ttl_ms=asked.ttl_ms,
+        timeout_ms=asked.timeout_ms,
+        wait_ms=asked.wait_ms,
+        wait_for=asked.wait_for,
+        once=once or "",
+    )
+
+
+async def show_action(functions: Functions, found: Action) -> contract.ActionOut:
+    """An action with its place in the queue, if it has one."""
+    return show.action(found, (await functions.queues.positions([found])).get(found.id))

@@ -32,7 +32,7 @@ def empty(headers: Mapping[str, str] | None = None) -> Response:
 def problem(error: Problem) -> Response:
     """A refusal."""
     body = {
-        "type": f"/problems/{error.code}",
+        "type": problem_type(error),
         "title": error.title,
         "status": error.status,
         "detail": error.detail,
@@ -42,6 +42,11 @@ def problem(error: Problem) -> Response:
     if error.status == 401:  # noqa: PLR2004
         headers["WWW-Authenticate"] = "Bearer"
     return Response(_encode(body), error.status, headers, media_type=PROBLEM_JSON)
+
+
+def problem_type(error: Problem) -> str:
+    """What names the refusal for programs."""
+    return f"/problems/{error.code}"
 
 
 async def read(request: Request, kind: Any) -> Any:
