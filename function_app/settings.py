@@ -79,6 +79,7 @@ class Settings:
         websocket_url: The broker's address for the page.
         robots: Folder of the robot types.
         console: Folder of the built console.
+        trusted_proxies: Proxies of one's own in front of the API; the last of ``X-Forwarded-For`` are theirs.
         keep_actions_days: How long actions are kept after their end [d].
         keep_raw_hours: How long every sample is kept, and how late one may come [h].
         keep_10s_days: How long what is left of each 10 s is kept [d]; of each minute, of each ten minutes. What is
@@ -97,6 +98,7 @@ class Settings:
     websocket_url: str = "ws://127.0.0.1:8082/mqtt"
     robots: Path = ROOT / "robots"
     console: Path = ROOT / "web" / "dist"
+    trusted_proxies: int = 0
     keep_actions_days: int = 30
     keep_raw_hours: int = 24
     keep_10s_days: int = 7
@@ -133,6 +135,7 @@ def read(environment: Mapping[str, str] | None = None) -> Settings:
         websocket_url=_url(given, "TELESCOPE_WEBSOCKET_URL", websocket_url, ("ws", "wss")),
         robots=_folder(given, "TELESCOPE_ROBOTS", ROOT / "robots"),
         console=_folder(given, "TELESCOPE_CONSOLE", ROOT / "web" / "dist"),
+        trusted_proxies=_number(given, "TELESCOPE_TRUSTED_PROXIES", 0, 0, 10),
         keep_actions_days=_number(given, "TELESCOPE_KEEP_ACTIONS_DAYS", 30, 1, 3650),
         keep_raw_hours=_number(given, "TELESCOPE_KEEP_RAW_HOURS", 24, 1, 9600),
         keep_10s_days=_number(given, "TELESCOPE_KEEP_10S_DAYS", 7, 1, 36_500),

@@ -28,6 +28,7 @@ def serve(functions: Functions) -> None:
         access_log=False,
         log_level="warning",
         server_header=False,
+        proxy_headers=False,  # whom to believe about addresses is a setting
         timeout_graceful_shutdown=3,
     )
     uvicorn.Server(config).run(sockets=[listener])

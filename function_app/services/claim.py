@@ -34,8 +34,11 @@ class Claim:
         self._sign_in = sign_in
         self._clock = clock
 
-    async def claim(self, who: Identity, text: str, space: str | None) -> Agent:
+    async def claim(self, who: Identity, text: str, space: str | None, *, address: str = "") -> Agent:
         """Make the agent that shows this code an agent of ``who``.
+
+        Wrong codes are counted by the account and, where it is known, by the address that the request comes from; a
+        right code is not.
 
         Raises:
             Problem: ``claim-code-unknown`` for a wrong, used or expired code alike; ``too-many-tries``;
@@ -45,12 +48,13 @@ class Claim:
         chosen = next((known.id for known in spaces if space in (None, known.id)), None)
         if chosen is None:
             raise not_found("space", space or "")
-        await self._count_try(who, 1)
+        counters = (who.account, f"address:{address}") if address else (who.account,)
+        await self._count(counters)
         agent = await self._redeem(who, read_claim_code(text), chosen)
         if agent is None:
             detail = "This code is wrong, used or expired. Codes live five minutes; the agent shows its newest."
             raise Problem("claim-code-unknown", 404, "No such claim code", detail)
-        await self._count_try(who, -1)
+        await self._uncount(counters)
         return agent
 
     async def _redeem(self, who: Identity, code: str | None, space: str) -> Agent | None:
@@ -79,12 +83,24 @@ class Claim:
             await self._tables.delete(store.CLAIMS, found)
         return claimed
 
-    async def _count_try(self, who: Identity, change: int) -> None:
-        """Count before looking, so that parallel guesses are no way around; a right code is not counted.
+    async def _count(self, counters: tuple[str, ...]) -> None:
+        """Count a try before looking, so that parallel guesses are no way around.
 
         Raises:
-            Problem: ``too-many-tries``.
+            Problem: ``too-many-tries``, by the account or from the address; such a try counts nowhere.
         """
+        for done, counter in enumerate(counters):
+            try:
+                await self._change(counter, 1)
+            except Problem:
+                await self._uncount(counters[:done])
+                raise
+
+    async def _uncount(self, counters: tuple[str, ...]) -> None:
+        for counter in counters:
+            await self._change(counter, -1)
+
+    async def _change(self, counter: str, change: int) -> None:
         now_ms = self._clock.now_ms()
 
         def counted(tries: _Tries | None) -> _Tries:
@@ -98,5 +114,5 @@ class Claim:
 
         # One note for all tries of a while, and written first: nothing stays that nobody forgets.
         due_ms = (now_ms // WINDOW_MS + 2) * WINDOW_MS
-        await self._forget.row(store.ATTEMPTS, who.account, "claim", due_ms=due_ms)
-        await store.upsert(self._tables, store.ATTEMPTS, who.account, "claim", counted, _Tries)
+        await self._forget.row(store.ATTEMPTS, counter, "claim", due_ms=due_ms)
+        await store.upsert(self._tables, store.ATTEMPTS, counter, "claim", counted, _Tries)

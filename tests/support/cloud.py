@@ -79,9 +79,9 @@ class Cloud:
         """Run something on the functions' own loop."""
         return asyncio.run_coroutine_threadsafe(call, self.loop).result(4 * PATIENCE_S)
 
-    def client(self, **options: Any) -> httpx.AsyncClient:
-        """A new HTTP client with a cookie jar of its own."""
-        transport = httpx.ASGITransport(self.app, raise_app_exceptions=False)
+    def client(self, *, address: str = "127.0.0.1", **options: Any) -> httpx.AsyncClient:
+        """A new HTTP client with a cookie jar of its own, that asks from ``address``."""
+        transport = httpx.ASGITransport(self.app, raise_app_exceptions=False, client=(address, 50_000))
         client = httpx.AsyncClient(transport=transport, base_url=BASE, timeout=PATIENCE_S, **options)
         self._clients.append(client)
         return client
@@ -99,11 +99,11 @@ class Cloud:
 
         return self.run(made())
 
-    def sign_in(self, name: str) -> "Person":
-        """Somebody in a new sign-in session."""
+    def sign_in(self, name: str, *, address: str = "127.0.0.1") -> "Person":
+        """Somebody in a new sign-in session, who asks from ``address``."""
         answer = self.ask("POST", f"{API}/auth/sign-in", json={"link": self.link(name)})
         assert answer.status_code == 200, answer.text
-        return Person(self, answer.json())
+        return Person(self, answer.json(), address=address)
 
     def robot(self, *names: str) -> "Robot":
         """An agent that nobody has claimed, with devices of these names (default: ``arm``)."""
@@ -162,13 +162,13 @@ class Cloud:
 class Person:
     """An account in one sign-in session, by access token."""
 
-    def __init__(self, cloud: Cloud, signed_in: dict[str, Any]) -> None:
+    def __init__(self, cloud: Cloud, signed_in: dict[str, Any], *, address: str = "127.0.0.1") -> None:
         self.cloud = cloud
         self.token: str = signed_in["access_token"]
         self.account: str = signed_in["account"]["id"]
         self.name: str = signed_in["account"]["name"]
         self.session: str = signed_in["session"]
-        self._client = cloud.client(headers={"Authorization": f"Bearer {self.token}"})
+        self._client = cloud.client(address=address, headers={"Authorization": f"Bearer {self.token}"})
 
     def ask(self, method: str, path: str, **options: Any) -> httpx.Response:
         return self.cloud.run(self._client.request(method, API + path, **options))

@@ -12,6 +12,7 @@ from function_app.domain.ids import show_claim_code
 from function_app.domain.problems import invalid
 from function_app.domain.times import rfc3339
 from function_app.entrypoints.http import show
+from function_app.entrypoints.http.address import client_address
 from function_app.entrypoints.http.answers import answer, empty, read
 from function_app.entrypoints.http.caller import Caller
 from function_app.entrypoints.http.contract import agents as contract
@@ -94,7 +95,12 @@ def router(functions: Functions, caller: Caller) -> Routes:
         """A wrong, used and expired code are answered alike."""
         who = await caller.account(request)
         asked: contract.ClaimRequest = await read(request, contract.ClaimRequest)
-        agent = await functions.claim.claim(who, asked.code, asked.space)
+        agent = await functions.claim.claim(
+            who,
+            asked.code,
+            asked.space,
+            address=client_address(request, functions.settings.trusted_proxies),
+        )
         views = await functions.devices.of_agent(who, agent.id)
         found = tuple(show.device(view, who) for view in views)
         return answer(contract.Claimed(agent=agent.id, space=agent.space or "", devices=found))

@@ -4,8 +4,10 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from fastapi import Request
 
 from device_agent.protocol import signing
+from function_app.entrypoints.http.address import client_address
 from function_app.ports.broker_access import Credentials
 from tests.support.brokers import BROKERS, RunningBroker, wait_until
 from tests.support.cloud import API, Cloud, MovingClock, Person, Robot, paired, problem, settings
@@ -160,17 +162,64 @@ class TestClaim:
         assert all(body == bodies[0] for body in bodies)
 
     def test_after_five_wrong_tries_even_the_right_code_waits(self, alone: Cloud, clock: MovingClock) -> None:
-        anna, bert = alone.sign_in("anna"), alone.sign_in("bert")
+        anna, bert = alone.sign_in("anna"), alone.sign_in("bert", address="10.0.0.2")
         robot = alone.robot()
         for _ in range(5):
             problem(anna.post("/agents/claim", {"code": "BCDF-GHJK"}), 404, "claim-code-unknown")
         answer = anna.post("/agents/claim", {"code": robot.code()})
         problem(answer, 429, "too-many-tries")
         assert 290 <= int(answer.headers["retry-after"]) <= 300
-        problem(alone.sign_in("anna").post("/agents/claim", {"code": robot.code()}), 429, "too-many-tries")
+        elsewhere = alone.sign_in("anna", address="10.0.0.3")
+        problem(elsewhere.post("/agents/claim", {"code": robot.code()}), 429, "too-many-tries")
         assert bert.post("/agents/claim", {"code": alone.robot().code()}).status_code == 200
         clock.advance(300)
         assert alone.sign_in("anna").post("/agents/claim", {"code": robot.code()}).status_code == 200
+
+    def test_an_address_has_five_wrong_tries_whoever_asks_from_there(self, alone: Cloud, clock: MovingClock) -> None:
+        for number in range(5):
+            guesser = alone.sign_in(f"guesser{number}", address="10.0.0.9")
+            problem(guesser.post("/agents/claim", {"code": "BCDF-GHJK"}), 404, "claim-code-unknown")
+        late = alone.sign_in("late", address="10.0.0.9")
+        for _ in range(8):
+            answer = late.post("/agents/claim", {"code": alone.robot().code()})
+            problem(answer, 429, "too-many-tries")
+        moved = alone.sign_in("late", address="10.0.0.10")
+        assert moved.post("/agents/claim", {"code": alone.robot().code()}).status_code == 200, "none of those counted"
+        clock.advance(300)
+        assert late.post("/agents/claim", {"code": alone.robot().code()}).status_code == 200
+
+    def test_parallel_guesses_from_one_address_are_no_way_around(self, alone: Cloud) -> None:
+        guessers = [alone.sign_in(f"guesser{number}", address="10.0.0.9") for number in range(10)]
+        answers = [
+            guesser.begin("POST", "/agents/claim", json={"code": "BCDF-GHJK"}) for guesser in guessers for _ in range(3)
+        ]
+        statuses = [answer().status_code for answer in answers]
+        assert 1 <= statuses.count(404) <= 5
+        assert set(statuses) <= {404, 429, 503}
+
+    @pytest.mark.parametrize(
+        ("client", "proxies", "forwarded", "found"),
+        [
+            ("10.0.0.1", 0, [], "10.0.0.1"),
+            ("10.0.0.1", 0, ["1.1.1.1"], "10.0.0.1"),
+            ("10.0.0.1", 1, ["1.1.1.1"], "1.1.1.1"),
+            ("10.0.0.1", 1, ["6.6.6.6, 1.1.1.1"], "1.1.1.1"),
+            ("10.0.0.1", 2, ["6.6.6.6, 1.1.1.1", "2.2.2.2"], "1.1.1.1"),
+            ("10.0.0.1", 1, [], "10.0.0.1"),
+            ("10.0.0.1", 1, ["1.1.1.1:4711"], "1.1.1.1"),
+            ("10.0.0.1", 1, ["[2001:db8::1]:4711"], "2001:db8::/64"),
+            ("10.0.0.1", 1, ["2001:db8:0:0:ffff::1"], "2001:db8::/64"),
+            ("10.0.0.1", 1, ["::ffff:1.1.1.1"], "1.1.1.1"),
+            ("10.0.0.1", 1, ["<script>"], ""),
+            ("fe80::1%eth0", 0, [], "fe80::/64"),
+            (None, 0, ["6.6.6.6, 1.1.1.1:4711"], "1.1.1.1"),
+            (None, 0, [], ""),
+        ],
+    )
+    def test_whose_address_it_is(self, client: str | None, proxies: int, forwarded: list[str], found: str) -> None:
+        headers = [(b"x-forwarded-for", line.encode()) for line in forwarded]
+        scope = {"type": "http", "client": client and (client, 1), "headers": headers}
+        assert client_address(Request(scope), proxies) == found
 
     def test_right_codes_are_not_counted(self, alone: Cloud) -> None:
         anna = alone.sign_in("anna")

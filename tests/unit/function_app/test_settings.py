@@ -119,3 +119,10 @@ def test_how_long_actions_are_kept() -> None:
     for wrong in ("0", "-1", "3651", "1e2", "", "99999999999"):
         with pytest.raises(SettingsError, match="TELESCOPE_KEEP_ACTIONS_DAYS"):
             settings.read({"TELESCOPE_KEEP_ACTIONS_DAYS": wrong})
+
+
+def test_how_many_proxies_are_believed() -> None:
+    assert settings.read({}).trusted_proxies == 0
+    assert settings.read({"TELESCOPE_TRUSTED_PROXIES": "2"}).trusted_proxies == 2
+    with pytest.raises(SettingsError, match="TELESCOPE_TRUSTED_PROXIES"):
+        settings.read({"TELESCOPE_TRUSTED_PROXIES": "11"})
