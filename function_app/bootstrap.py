@@ -23,9 +23,12 @@ from function_app.services.action_rows import ActionRows
 from function_app.services.actions import Actions
 from function_app.services.claim import Claim
 from function_app.services.commands import Commands
+from function_app.services.conditions import Conditions
 from function_app.services.delivery import Delivery
 from function_app.services.devices import Devices
 from function_app.services.enroll import Enroll
+from function_app.services.events import Events
+from function_app.services.faults import Faults
 from function_app.services.fleet import StartOnMany
 from function_app.services.forget import DAY_MS, Forget
 from function_app.services.health import CheckHealth
@@ -89,6 +92,9 @@ class Functions:
     polling: Polling
     relay: Relay
     forget: Forget
+    events: Events
+    faults: Faults
+    conditions: Conditions
     latencies: Latencies
     intake: Intake
     series: SeriesReader
@@ -133,6 +139,9 @@ def build(settings: Settings, *, clock: Clock | None = None) -> Functions:
     telemetry = MqttTelemetry(host=settings.mqtt_host, port=settings.mqtt_port, credentials=access.service_credentials)
 
     forget = Forget(tables=tables, blobs=blobs)
+    events = Events(tables=tables, forget=forget, clock=now)
+    faults = Faults(tables=tables, events=events, forget=forget, clock=now)
+    conditions = Conditions(tables=tables, faults=faults, clock=now)
     identify = Identify(tables=tables, keys=keys, forget=forget, clock=now)
     sign_in = SignIn(tables=tables, identify=identify, access=access, clock=now)
     devices = Devices(tables=tables, clock=now)
@@ -197,10 +206,13 @@ def build(settings: Settings, *, clock: Clock | None = None) -> Functions:
         action_acks=acks,
         stop=StopDevices(tables=tables, devices=devices, commands=commands, queues=queues, delivery=delivery),
         mqtt_credentials=MqttCredentials(tables=tables, devices=devices, access=access, clock=now),
-        presence=PresenceIngest(tables=tables, forget=forget, clock=now),
         polling=Polling(tables=tables, mailbox=mailbox, clock=now),
         relay=Relay(bus=bus, clock=now),
+        presence=PresenceIngest(tables=tables, events=events, conditions=conditions, clock=now),
         forget=forget,
+        events=events,
+        faults=faults,
+        conditions=conditions,
         latencies=Latencies(tables=tables, forget=forget, clock=now),
         intake=intake,
         series=SeriesReader(tables=tables, devices=devices, keep=keep, clock=now),
@@ -213,6 +225,7 @@ def build(settings: Settings, *, clock: Clock | None = None) -> Functions:
             queues=queues,
             access=access,
             forget=forget,
+            conditions=conditions,
             intake=intake,
             keep_actions_ms=settings.keep_actions_days * DAY_MS,
             clock=now,

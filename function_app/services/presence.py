@@ -9,16 +9,13 @@ from device_agent.protocol.errors import ProtocolError
 from device_agent.protocol.messages import Description, Event, Presence, State
 from device_agent.protocol.topics import Topic
 from function_app.domain.devices import Agent, LastState, Link, Transport, newer_link
-from function_app.domain.ids import device_id, new_suffix
+from function_app.domain.ids import device_id
 from function_app.domain.nesting import MAX_LEVELS, too_deep
 from function_app.ports.clock import Clock
-from function_app.ports.tables import Conflict, Row, Tables
+from function_app.ports.tables import Tables
 from function_app.services import store
-from function_app.services.forget import DAY_MS, Forget
-
-KEEP_EVENTS_MS = 90 * DAY_MS
-_NOTED = 4096
-"""Days of devices whose end a process knows to be noted."""
+from function_app.services.conditions import Conditions
+from function_app.services.events import Events
 
 T = TypeVar("T")
 
@@ -26,11 +23,11 @@ T = TypeVar("T")
 class PresenceIngest:
     """Writes down what arrives. Safe to repeat; what does not belong to a claimed agent is dropped."""
 
-    def __init__(self, *, tables: Tables, forget: Forget, clock: Clock) -> None:
+    def __init__(self, *, tables: Tables, events: Events, conditions: Conditions, clock: Clock) -> None:
         self._tables = tables
-        self._forget = forget
+        self._events = events
+        self._conditions = conditions
         self._clock = clock
-        self._noted: dict[tuple[str, int, int], None] = {}
 
     async def ingest(self, topic: Topic, payload: bytes, *, by: Transport = "mqtt") -> None:
         """Take one message in.
@@ -49,18 +46,22 @@ class PresenceIngest:
         if agent.space != topic.space or (topic.device and agent.device(topic.device) is None):
             return
         if agent.transport == "mqtt" or by != "mqtt":
-            await self._store(topic, payload, polled=agent.transport != "mqtt")
+            await self._store(agent, topic, payload)
 
-    async def _store(self, topic: Topic, payload: bytes, *, polled: bool) -> None:
+    async def _store(self, agent: Agent, topic: Topic, payload: bytes) -> None:
         now_ms = self._clock.now_ms()
         if topic.kind == topics.CONN:
             presence = codec.decode(payload, Presence)
-            link = Link(presence.online, presence.session, now_ms, polled)
+            link = Link(presence.online, presence.session, now_ms, agent.transport != "mqtt")
+            if link.online:
+                await self._conditions.connected(agent, link.session)
             await store.upsert(
                 self._tables, store.AGENTS, topic.agent, "link", lambda known: newer_link(known, link), Link
             )
         elif topic.kind == topics.STATE:
-            state = LastState(msgspec.to_builtins(codec.decode(payload, State)), now_ms)
+            said = codec.decode(payload, State)
+            await self._conditions.said(agent, topic.device, said)
+            state = LastState(msgspec.to_builtins(said), now_ms)
             await store.upsert(
                 self._tables, store.AGENTS, topic.agent, f"state:{topic.device}", lambda _: state, LastState
             )
@@ -70,30 +71,10 @@ class PresenceIngest:
                 self._tables, store.DESCRIPTIONS, topic.agent, topic.device, lambda _: description, Description
             )
         elif topic.kind == topics.EVENT:
-            await self._event(topic, codec.decode(payload, Event), now_ms)
+            await self._event(topic, codec.decode(payload, Event))
 
-    async def _event(self, topic: Topic, event: Event, now_ms: int) -> None:
+    async def _event(self, topic: Topic, event: Event) -> None:
         """By its id, so that one that is delivered twice is stored once."""
         if too_deep(event.data):
             raise ProtocolError(f"the event's data are nested more than {MAX_LEVELS} levels deep")
-        device = device_id(topic.agent, topic.device)
-        data = {**msgspec.to_builtins(event), "seen_ms": now_ms, "expires_ms": now_ms + KEEP_EVENTS_MS}
-        when = new_suffix(event.at_ms)[:9]
-        await self._note(device, event.at_ms // DAY_MS, now_ms // DAY_MS)
-        try:
-            await self._tables.create(store.EVENTS, Row(device, f"{when}:{event.id}", data))
-        except Conflict:
-            return
-
-    async def _note(self, device: str, day: int, seen_day: int) -> None:
-        """See that the events of one day that were seen on another will be forgotten: one note for all of them."""
-        known = (device, day, seen_day)
-        if known in self._noted:
-            return
-        # Keys count down with time: the day's last moment comes first.
-        first, last = (new_suffix((day + 1) * DAY_MS - 1)[:9], new_suffix(day * DAY_MS)[:9] + ";")
-        due_ms = (seen_day + 1) * DAY_MS + KEEP_EVENTS_MS
-        await self._forget.rows(store.EVENTS, device, first=first, last=last, due_ms=due_ms)
-        self._noted[known] = None
-        if len(self._noted) > _NOTED:
-            del self._noted[next(iter(self._noted))]
+        await self._events.add(device_id(topic.agent, topic.device), msgspec.to_builtins(event))

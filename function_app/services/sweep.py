@@ -16,6 +16,7 @@ from function_app.ports.tables import Conflict, Row, Tables
 from function_app.services import store
 from function_app.services.action_rows import ActionRows, Found, place
 from function_app.services.commands import Commands
+from function_app.services.conditions import Conditions
 from function_app.services.forget import DAY_MS, Forget
 from function_app.services.intake import Intake
 from function_app.services.pending import SHARDS, Pending
@@ -47,6 +48,7 @@ class Sweep:
         queues: Queues,
         access: BrokerAccess,
         forget: Forget,
+        conditions: Conditions,
         intake: Intake,
         keep_actions_ms: int,
         clock: Clock,
@@ -59,6 +61,7 @@ class Sweep:
         self._queues = queues
         self._access = access
         self._forget = forget
+        self._conditions = conditions
         self._intake = intake
         self._keep_actions_ms = keep_actions_ms
         self._clock = clock
@@ -78,6 +81,10 @@ class Sweep:
                     _log.warning("action %s: %s", action, error)
         await self._forget_expired()
         await self._forget.run(self._clock.now_ms())
+        try:
+            await self._conditions.run(self._clock.now_ms())
+        except Problem as problem:
+            _log.warning("silent devices: %s", problem.detail)
         await self._intake.distribute_left()
         try:
             await self._access.expire(self._clock.now_ms() / 1000)

@@ -20,6 +20,7 @@ from function_app.entrypoints.http import (
     broker,
     data,
     devices,
+    faults,
     fleet,
     health,
     latency,
@@ -71,6 +72,7 @@ def create_app(functions: Functions) -> FastAPI:
         movements.router(functions, caller),
         broker.router(functions, caller),
         latency.router(functions, caller),
+        faults.router(functions, caller),
         data.router(functions, caller),
         health.router(functions),
     )

@@ -13,7 +13,6 @@ from device_agent.protocol import codec
 from device_agent.protocol.messages import Mode, State
 from function_app.entrypoints import events
 from function_app.ports.tables import Row, StoreError
-from function_app.services.forget import Forget
 from function_app.services.presence import PresenceIngest
 from tests.support.cloud import Cloud, Person, Robot, settings
 
@@ -73,9 +72,8 @@ class BrokenTables:
 
 def without_store(cloud: Cloud) -> Any:
     tables: Any = BrokenTables()
-    presence = PresenceIngest(
-        tables=tables, forget=Forget(tables=tables, blobs=cloud.functions.blobs), clock=cloud.clock
-    )
+    own = cloud.functions
+    presence = PresenceIngest(tables=tables, events=own.events, conditions=own.conditions, clock=cloud.clock)
     return replace(cloud.functions, presence=presence)
 
 
