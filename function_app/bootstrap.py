@@ -53,7 +53,7 @@ from function_app.services.start_action import StartAction
 from function_app.services.stop import StopDevices
 from function_app.services.sweep import Sweep
 from function_app.services.unpair import Unpair
-from function_app.settings import AwsStore, AzureStore, Settings
+from function_app.settings import AwsStore, AzureStore, EventGridBus, IotBus, Settings
 
 TABLES_FILE = "tables.sqlite"
 MOSQUITTO_SERVICE = "service"
@@ -134,7 +134,7 @@ def build(settings: Settings, *, clock: Clock | None = None) -> Functions:
             username=MOSQUITTO_SERVICE,
             password_file=settings.home / "mosquitto" / "service.password",
         )
-    bus = MqttCommandBus(host=settings.mqtt_host, port=settings.mqtt_port, credentials=access.service_credentials)
+    bus = _bus(settings, access)
     feed = MqttFeed(host=settings.mqtt_host, port=settings.mqtt_port, credentials=access.service_credentials)
     telemetry = MqttTelemetry(host=settings.mqtt_host, port=settings.mqtt_port, credentials=access.service_credentials)
 
@@ -263,6 +263,23 @@ async def prepare(settings: Settings) -> None:
                 await store.prepare()
             finally:
                 await store.close()
+
+
+def _bus(settings: Settings, access: BrokerAccess) -> CommandBus:
+    """What publishes commands."""
+    match settings.bus:
+        case IotBus() as iot:
+            from function_app.adapters.aws.command_bus import IotCommandBus  # noqa: PLC0415 (only where it is in use)
+
+            return IotCommandBus(region=iot.region, endpoint=iot.endpoint)
+        case EventGridBus() as grid:
+            from function_app.adapters.azure.command_bus import EventGridCommandBus  # noqa: PLC0415
+
+            return EventGridCommandBus(endpoint=grid.endpoint, identity=grid.identity)
+        case None:
+            return MqttCommandBus(
+                host=settings.mqtt_host, port=settings.mqtt_port, credentials=access.service_credentials
+            )
 
 
 def _stores(settings: Settings) -> tuple[Tables, Blobs]:

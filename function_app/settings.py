@@ -66,12 +66,39 @@ class AwsStore:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
+class IotBus:
+    """AWS IoT Core, as the way to devices.
+
+    Attributes:
+        region: Where it is.
+        endpoint: The account's own address for data.
+    """
+
+    region: str
+    endpoint: str
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class EventGridBus:
+    """An Event Grid namespace, as the way to devices.
+
+    Attributes:
+        endpoint: The namespace's address.
+        identity: The client id of the functions' identity, where they have not only the one that the host gives them.
+    """
+
+    endpoint: str
+    identity: str = ""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Settings:
     """Where things are.
 
     Attributes:
         home: Folder of everything that lasts: tables, blobs, keys.
         store: Where tables and blobs are, when not in ``home``.
+        bus: What publishes commands, when not a connection to the broker.
         host: Address to listen on.
         port: Of the page and the API.
         public_url: The page's address as people open it; sign-in links begin with it.
@@ -88,6 +115,7 @@ class Settings:
 
     home: Path
     store: AzureStore | AwsStore | None = None
+    bus: IotBus | EventGridBus | None = None
     host: str = "127.0.0.1"
     port: int = 8080
     public_url: str = "http://127.0.0.1:8080"
@@ -125,6 +153,7 @@ def read(environment: Mapping[str, str] | None = None) -> Settings:
     return Settings(
         home=_folder(given, "TELESCOPE_HOME", Path(".telescope")),
         store=_store(given),
+        bus=_bus(given),
         host=host,
         port=port,
         public_url=public_url,
@@ -156,6 +185,31 @@ def _store(given: Mapping[str, str]) -> AzureStore | AwsStore | None:
             raise SettingsError(f"TELESCOPE_STORE is '{other[:_SHOWN]}'; it must be local, azure or aws")
 
 
+def _bus(given: Mapping[str, str]) -> IotBus | EventGridBus | None:
+    match given.get("TELESCOPE_BUS", "mqtt"):
+        case "mqtt":
+            return None
+        case "iot":
+            return IotBus(
+                region=_region(given),
+                endpoint=_url(given, "TELESCOPE_IOT_ENDPOINT", "", ("https", "http")),
+            )
+        case "eventgrid":
+            return EventGridBus(
+                endpoint=_url(given, "TELESCOPE_EVENTGRID_ENDPOINT", "", ("https",)),
+                identity=_matching(
+                    given, "TELESCOPE_EVENTGRID_IDENTITY", "", _IDENTITY, "the client id of a managed identity"
+                ),
+            )
+        case other:
+            raise SettingsError(f"TELESCOPE_BUS is '{other[:_SHOWN]}'; it must be mqtt, iot or eventgrid")
+
+
+def _region(given: Mapping[str, str]) -> str:
+    region = given.get("AWS_REGION", "")  # Lambda sets it
+    return _matching(given, "TELESCOPE_AWS_REGION", region, _REGION, "a region, such as eu-west-1")
+
+
 def _azure(given: Mapping[str, str]) -> AzureStore:
     prefix = _matching(given, "TELESCOPE_STORAGE_PREFIX", "telescope", _PREFIX, "at most 32 letters and digits")
     container = _matching(
@@ -182,10 +236,9 @@ def _azure(given: Mapping[str, str]) -> AzureStore:
 
 
 def _aws(given: Mapping[str, str]) -> AwsStore:
-    region = given.get("AWS_REGION", "")  # Lambda sets it
     endpoint = given.get("TELESCOPE_AWS_ENDPOINT")
     return AwsStore(
-        region=_matching(given, "TELESCOPE_AWS_REGION", region, _REGION, "a region, such as eu-west-1"),
+        region=_region(given),
         bucket=_matching(given, "TELESCOPE_AWS_BUCKET", "", _BUCKET, "the name of an S3 bucket"),
         table=_matching(given, "TELESCOPE_AWS_TABLE", "telescope", _TABLE, "the name of a DynamoDB table"),
         endpoint=None if endpoint is None else _url(given, "TELESCOPE_AWS_ENDPOINT", endpoint, ("http", "https")),

@@ -85,6 +85,7 @@ class Asked:
     operation: str
     """DynamoDB's; empty for S3."""
     body: bytes
+    path: str = ""
 
     @property
     def json(self) -> dict[str, Any]:
@@ -153,7 +154,7 @@ class _Handler(BaseHTTPRequestHandler):
     def handle_any(self) -> None:
         body = self.rfile.read(int(self.headers.get("Content-Length", 0)))
         operation = self.headers.get("X-Amz-Target", "").rpartition(".")[2]
-        self.between.asked.append(Asked(self.command, operation, body))
+        self.between.asked.append(Asked(self.command, operation, body, self.path))
         fault = self.between.faults.popleft() if self.between.faults else "pass"
         if isinstance(fault, Refusal):
             self._refuse(fault)
@@ -192,6 +193,9 @@ class _Handler(BaseHTTPRequestHandler):
             text = json.dumps(
                 {"__type": f"com.amazonaws.dynamodb.v20120810#{fault.code}", "message": "…", **fault.more}
             )
+        elif fault.kind == "application/json":
+            kind = fault.kind
+            text = json.dumps({"__type": fault.code, "message": "no"})
         else:
             kind = "application/xml"
             text = f"<Error><Code>{fault.code}</Code><Message>no</Message></Error>"

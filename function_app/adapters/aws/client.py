@@ -25,11 +25,13 @@ _NO_RIGHTS = frozenset(
         "AccessDeniedException",
         "ExpiredToken",
         "ExpiredTokenException",
+        "ForbiddenException",
         "IncompleteSignature",
         "InvalidAccessKeyId",
         "InvalidSignatureException",
         "MissingAuthenticationTokenException",
         "SignatureDoesNotMatch",
+        "UnauthorizedException",
         "UnrecognizedClientException",
     }
 )
@@ -62,7 +64,9 @@ class Refused(Exception):  # noqa: N818 (an outcome that callers look at)
 class Client:
     """One service as one adapter uses it. Any number of calls at once; opens nothing before the first."""
 
-    def __init__(self, service: str, *, what: str, setting: str, how: str, region: str, endpoint: str | None) -> None:
+    def __init__(
+        self, service: str, *, what: str, setting: str, how: str, region: str, endpoint: str | None, address: str = ""
+    ) -> None:
         """Remember the place.
 
         Args:
@@ -72,6 +76,7 @@ class Client:
             how: How it is to be created when it is not there, for errors.
             region: Amazon's region.
             endpoint: The address of an emulator; ``None`` for Amazon's own.
+            address: The setting that holds ``endpoint``, where that is not an emulator's.
         """
         self._service = service
         self._where = f"{what} in {region}" + ("" if endpoint is None else f" at {endpoint}")
@@ -79,6 +84,7 @@ class Client:
         self._how = how
         self._region = region
         self._endpoint = endpoint
+        self._address = address or ("TELESCOPE_AWS_REGION" if endpoint is None else "TELESCOPE_AWS_ENDPOINT")
         self._lock = threading.Lock()
         self._client: Any = None
         self._threads: ThreadPoolExecutor | None = None
@@ -139,9 +145,8 @@ class Client:
                 "AWS_SECRET_ACCESS_KEY."
             ) from error
         except (sdk.ConnectionError, sdk.HTTPClientError) as error:
-            setting = "TELESCOPE_AWS_REGION" if self._endpoint is None else "TELESCOPE_AWS_ENDPOINT"
             raise StoreError(
-                f"{self._where} cannot be reached: {_line(error)}. Check {setting} and the network."
+                f"{self._where} cannot be reached: {_line(error)}. Check {self._address} and the network."
             ) from error
         except sdk.BotoCoreError as error:
             raise StoreError(f"{self._where} cannot be used: {_line(error)}. Check its configuration.") from error

@@ -1,0 +1,95 @@
+"""What a Functions host gives its functions: an identity endpoint. And a certificate for services that want TLS."""
+
+import contextlib
+import datetime as dt
+import ipaddress
+import json
+import threading
+import time
+from collections.abc import Iterator
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from pathlib import Path
+from urllib.parse import parse_qs, urlsplit
+
+import jwt
+import pytest
+from cryptography import x509
+from cryptography.hazmat.primitives import hashes, serialization
+from cryptography.hazmat.primitives.asymmetric import ec
+from cryptography.x509.oid import NameOID
+
+HOST = "127.0.0.1"
+SECRET = "the host's own"
+
+
+def make_certificate(folder: Path) -> Path:
+    """Certificate of the loopback address in a file, and its key beside it in ``key.pem``."""
+    key = ec.generate_private_key(ec.SECP256R1())
+    name = x509.Name([x509.NameAttribute(NameOID.COMMON_NAME, HOST)])
+    now = dt.datetime.now(dt.UTC)
+    made = (
+        x509.CertificateBuilder()
+        .subject_name(name)
+        .issuer_name(name)
+        .public_key(key.public_key())
+        .serial_number(x509.random_serial_number())
+        .not_valid_before(now - dt.timedelta(days=1))
+        .not_valid_after(now + dt.timedelta(days=1))
+        .add_extension(x509.SubjectAlternativeName([x509.IPAddress(ipaddress.ip_address(HOST))]), critical=False)
+        .add_extension(x509.BasicConstraints(ca=True, path_length=None), critical=True)
+        .sign(key, hashes.SHA256())
+    )
+    (folder / "key.pem").write_bytes(
+        key.private_bytes(serialization.Encoding.PEM, serialization.PrivateFormat.PKCS8, serialization.NoEncryption())
+    )
+    path = folder / "certificate.pem"
+    path.write_bytes(made.public_bytes(serialization.Encoding.PEM))
+    return path
+
+
+class Host(ThreadingHTTPServer):
+    """A Functions host's identity endpoint."""
+
+    def __init__(self) -> None:
+        super().__init__((HOST, 0), _Answer)
+        self.asked: list[dict[str, list[str]]] = []
+        self.lifetime_s = 3600
+
+
+class _Answer(BaseHTTPRequestHandler):
+    server: Host
+
+    def do_GET(self) -> None:
+        assert self.headers["X-IDENTITY-HEADER"] == SECRET
+        asked = parse_qs(urlsplit(self.path).query)
+        self.server.asked.append(asked)
+        (audience,) = asked["resource"]
+        now = int(time.time())
+        times = {"iat": now - 60, "nbf": now - 60, "exp": now + self.server.lifetime_s}
+        claims = {"aud": audience, "iss": "https://sts.windows.net/telescope/", **times}
+        token = jwt.encode(claims, "nobody checks it here, all the same", "HS256")
+        answer = {"access_token": token, "expires_on": str(now + 3600), "resource": audience, "token_type": "Bearer"}
+        body = json.dumps(answer).encode()
+        self.send_response_only(200)
+        self.send_header("Content-Type", "application/json")
+        self.send_header("Content-Length", str(len(body)))
+        self.end_headers()
+        self.wfile.write(body)
+
+    def log_message(self, *_: object) -> None:
+        """Nothing."""
+
+
+@contextlib.contextmanager
+def start_host(monkeypatch: pytest.MonkeyPatch, certificate: Path) -> Iterator[Host]:
+    """A host in whose environment the functions run."""
+    host = Host()
+    thread = threading.Thread(target=host.serve_forever, args=(0.02,))
+    thread.start()
+    monkeypatch.setenv("IDENTITY_ENDPOINT", f"http://{HOST}:{host.server_port}/msi/token")
+    monkeypatch.setenv("IDENTITY_HEADER", SECRET)
+    monkeypatch.setenv("REQUESTS_CA_BUNDLE", str(certificate))
+    yield host
+    host.shutdown()
+    thread.join()
+    host.server_close()

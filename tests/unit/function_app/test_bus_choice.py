@@ -1,0 +1,85 @@
+"""What publishes commands is a setting; what is not chosen is not even imported."""
+
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from function_app import bootstrap, settings
+from function_app.settings import EventGridBus, IotBus, Settings, SettingsError
+
+ROOT = Path(__file__).resolve().parents[3]
+IOT = {
+    "TELESCOPE_BUS": "iot",
+    "TELESCOPE_AWS_REGION": "eu-west-1",
+    "TELESCOPE_IOT_ENDPOINT": "https://a1b2c3-ats.iot.eu-west-1.amazonaws.com",
+}
+GRID = {
+    "TELESCOPE_BUS": "eventgrid",
+    "TELESCOPE_EVENTGRID_ENDPOINT": "https://lab.westeurope-1.ts.eventgrid.azure.net",
+}
+CLIENT_ID = "11059fcc-5514-4800-b5f8-49808b9cfab6"
+
+
+def test_without_any_it_is_a_connection_to_the_broker() -> None:
+    assert settings.read({}).bus is None
+    assert settings.read({"TELESCOPE_BUS": "mqtt"}).bus is None
+
+
+def test_a_clouds_broker_by_its_address() -> None:
+    assert settings.read(IOT).bus == IotBus(region="eu-west-1", endpoint=IOT["TELESCOPE_IOT_ENDPOINT"])
+    endpoint = GRID["TELESCOPE_EVENTGRID_ENDPOINT"]
+    assert settings.read(GRID).bus == EventGridBus(endpoint=endpoint)
+    named = {**GRID, "TELESCOPE_EVENTGRID_IDENTITY": CLIENT_ID}
+    assert settings.read(named).bus == EventGridBus(endpoint=endpoint, identity=CLIENT_ID)
+
+
+@pytest.mark.parametrize(
+    ("given", "name", "value"),
+    [
+        ({}, "TELESCOPE_BUS", "kafka"),
+        ({}, "TELESCOPE_BUS", ""),
+        (IOT, "TELESCOPE_IOT_ENDPOINT", ""),
+        (IOT, "TELESCOPE_IOT_ENDPOINT", "a1b2c3-ats.iot.eu-west-1.amazonaws.com"),
+        (IOT, "TELESCOPE_AWS_REGION", "Ireland"),
+        (GRID, "TELESCOPE_EVENTGRID_ENDPOINT", ""),
+        (GRID, "TELESCOPE_EVENTGRID_ENDPOINT", "http://lab.westeurope-1.ts.eventgrid.azure.net"),
+        (GRID, "TELESCOPE_EVENTGRID_IDENTITY", "me"),
+    ],
+)
+def test_a_wrong_one_is_named(given: dict[str, str], name: str, value: str) -> None:
+    with pytest.raises(SettingsError, match=rf"{name} is '.*'; it must be ") as caught:
+        settings.read({**given, name: value})
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.anyio
+@pytest.mark.parametrize("anyio_backend", ["asyncio"])
+@pytest.mark.parametrize(
+    ("given", "kind"), [({}, "MqttCommandBus"), (IOT, "IotCommandBus"), (GRID, "EventGridCommandBus")]
+)
+async def test_the_chosen_one_is_built_and_opens_nothing(tmp_path: Path, given: dict[str, str], kind: str) -> None:
+    functions = bootstrap.build(Settings(home=tmp_path, bus=settings.read(given).bus))
+    assert type(functions.bus).__name__ == kind
+    await functions.close()
+
+
+_IMPORTED = """
+import sys
+from function_app import bootstrap, settings
+built = bootstrap.build(settings.read({given!r}))
+sdks = {{"azure", "boto3", "botocore", "requests"}}
+print(*sorted(name for name in sys.modules if name.split(".")[0] in sdks or ".adapters.a" in name))
+"""
+
+
+@pytest.mark.parametrize(("given", "adapters"), [(IOT, "aws"), (GRID, "azure")], ids=["iot", "eventgrid"])
+def test_no_sdk_is_imported_before_it_is_needed(tmp_path: Path, given: dict[str, str], adapters: str) -> None:
+    program = _IMPORTED.format(given={**given, "TELESCOPE_HOME": str(tmp_path)})
+    done = subprocess.run(
+        [sys.executable, "-c", program], cwd=ROOT, capture_output=True, text=True, timeout=60, check=True
+    )
+    found = done.stdout.split()
+    assert found
+    assert all(name.startswith(f"function_app.adapters.{adapters}") for name in found), found
