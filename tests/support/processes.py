@@ -192,13 +192,16 @@ def killed(process: Any) -> bool:
     return bool(process.exitcode)
 
 
-async def show_code(functions: Functions, names: Sequence[str] = ("arm",)) -> tuple[str, str]:
-    """A new agent with these devices makes itself known: its id, and the claim code that it shows."""
-    key = signing.generate().public_key()
-    agent = agent_id(signing.key_id(key))
+async def show_code(functions: Functions, names: Sequence[str] = ("arm",), *, public: str = "") -> tuple[str, str]:
+    """An agent with these devices (and this or a new public key) makes itself known: its id, and its claim code."""
+    public = public or new_public_key()
+    agent = agent_id(signing.key_id(signing.public_key(public)))
     specs = tuple(DeviceSpec(name, "arm", "ur5", name) for name in names)
-    told = Enrollment("lab", signing.public_text(key), "1", specs)
-    return agent, (await functions.enroll.enroll(agent, told)).claim_code
+    return agent, (await functions.enroll.enroll(agent, Enrollment("lab", public, "1", specs))).claim_code
+
+
+def new_public_key() -> str:
+    return signing.public_text(signing.generate().public_key())
 
 
 def commands_sent(place: Place) -> dict[str, set[bytes]]:

@@ -1,0 +1,387 @@
+"""Processes that are killed with SIGKILL between any two writes: the timer ends what they left, and nothing is lost."""
+
+import contextlib
+import random
+import secrets
+from collections.abc import Awaitable, Callable
+from dataclasses import dataclass
+from typing import Any, cast
+
+import pytest
+
+from device_agent.protocol import codec, topics
+from device_agent.protocol.messages import Ack, AckStatus
+from function_app.bootstrap import Functions
+from function_app.domain.accounts import Identity
+from function_app.domain.problems import Problem
+from function_app.services import store
+from function_app.services.pending import SHARDS
+from function_app.services.start_action import AskJoints, Start
+from function_app.services.sweep import ORPHAN_MS
+from tests.support.processes import (
+    Place,
+    SetClock,
+    Work,
+    begin,
+    commands_sent,
+    killed,
+    new_public_key,
+    run_here,
+    show_code,
+)
+
+TTL_S, TIMEOUT_S, QUEUE_S = 2, 6, 10
+MOVE = AskJoints(position_rad={"elbow": 1.0})
+TERMINAL = {"done", "failed", "expired", "cancelled"}
+MOST_STEPS = 30
+
+
+def asked(**more: Any) -> Start:
+    return Start(asked=MOVE, ttl_ms=1000 * TTL_S, timeout_ms=1000 * TIMEOUT_S, queue_ms=1000 * QUEUE_S, **more)
+
+
+@dataclass(frozen=True)
+class Scene:
+    """Somebody with a robot of one device."""
+
+    who: Identity
+    public: str
+    agent: str
+    action: str = ""
+    """One that runs on it."""
+    epoch: int = 0
+    """Of the lease that ``who`` holds."""
+    code: str = ""
+    """The claim code it shows, where nobody has claimed it."""
+
+    @property
+    def device(self) -> str:
+        return f"{self.agent}-arm"
+
+
+async def person(functions: Functions, name: str) -> Identity:
+    return Identity((await functions.sign_in.account(name)).id, name, f"session of {name}")
+
+
+async def paired(functions: Functions, who: Identity, **more: Any) -> Scene:
+    public = new_public_key()
+    agent, code = await show_code(functions, public=public)
+    await functions.claim.claim(who, code, None)
+    return Scene(who, public, agent, **more)
+
+
+# ---------------------------------------------------------------- what is killed
+
+
+async def idle(functions: Functions) -> Scene:
+    return await paired(functions, await person(functions, "anna"))
+
+
+async def running(functions: Functions) -> Scene:
+    scene = await idle(functions)
+    lease, _ = await functions.leases.take(scene.who, scene.device, epoch=None, lease_ms=600_000, wait_ms=0)
+    action, _ = await functions.start_action.start(scene.who, scene.device, asked(epoch=lease.epoch))
+    return Scene(scene.who, scene.public, scene.agent, action.id, lease.epoch)
+
+
+async def queued(functions: Functions) -> Scene:
+    scene = await running(functions)
+    for _ in range(2):
+        await functions.start_action.start(scene.who, scene.device, asked(epoch=scene.epoch, policy="queue"))
+    return scene
+
+
+async def unclaimed(functions: Functions) -> Scene:
+    public = new_public_key()
+    agent, code = await show_code(functions, public=public)
+    # Each robot another person: a claim that is killed counts as a try.
+    return Scene(await person(functions, f"owner of {agent}"), public, agent, code=code)
+
+
+async def start(functions: Functions, scene: Scene) -> None:
+    await functions.start_action.start(scene.who, scene.device, asked())
+
+
+async def start_refused(functions: Functions, scene: Scene) -> None:
+    with pytest.raises(Problem, match="is running"):
+        await start(functions, scene)
+
+
+async def start_once(functions: Functions, scene: Scene) -> None:
+    await functions.start_action.start(scene.who, scene.device, asked(once="key"))
+
+
+async def join_queue(functions: Functions, scene: Scene) -> None:
+    await functions.start_action.start(
+        scene.who, scene.device, asked(policy="queue", epoch=scene.epoch or None, once="key")
+    )
+
+
+async def cancel(functions: Functions, scene: Scene) -> None:
+    await functions.actions.cancel(scene.who, scene.action)
+
+
+async def report_done(functions: Functions, scene: Scene) -> None:
+    await report(functions, scene.action, AckStatus.DONE)
+
+
+async def take(functions: Functions, scene: Scene) -> None:
+    await functions.leases.take(scene.who, scene.device, epoch=None, lease_ms=5_000, wait_ms=0)
+
+
+async def release(functions: Functions, scene: Scene) -> None:
+    await functions.leases.release(scene.who, scene.device, epoch=scene.epoch)
+
+
+async def stop(functions: Functions, scene: Scene) -> None:
+    await functions.stop.stop(scene.who, scene.device, "enough")
+
+
+async def unpair(functions: Functions, scene: Scene) -> None:
+    await functions.unpair.unpair(scene.who, scene.agent)
+
+
+async def claim(functions: Functions, scene: Scene) -> None:
+    await functions.claim.claim(scene.who, scene.code, None)
+
+
+async def time_out(functions: Functions, _scene: Scene) -> None:
+    """The timer, when everything's time is over."""
+    cast("SetClock", functions.clock).advance(TIMEOUT_S + QUEUE_S)
+    await functions.sweep.run()
+
+
+async def report(functions: Functions, action: str, status: AckStatus) -> None:
+    device = action.rpartition("-")[0]
+    agent, _, name = device.partition("-")
+    at_ms = functions.clock.now_ms()
+    ack = Ack(id=action, status=status, sequence=1, at_ms=at_ms, tick_ms=at_ms)
+    topic = topics.parse(topics.device("space", agent, name, topics.ACK))
+    await functions.action_acks.ingest(topic, codec.encode(ack))
+
+
+CASES: dict[str, tuple[Callable[[Functions], Awaitable[Scene]], Work, int]] = {
+    "start": (idle, start, 4),
+    "start with a key": (idle, start_once, 4),
+    "start refused": (running, start_refused, 1),
+    "join the queue": (queued, join_queue, 3),
+    "queue while it is idle": (idle, join_queue, 4),
+    "cancel": (running, cancel, 2),
+    "the end, reported": (running, report_done, 1),
+    "the end before a queue": (queued, report_done, 4),
+    "take": (idle, take, 2),
+    "take again": (running, take, 2),
+    "release": (running, release, 2),
+    "stop before a queue": (queued, stop, 4),
+    "un-pair": (queued, unpair, 4),
+    "claim": (unclaimed, claim, 4),
+    "timer": (queued, time_out, 4),
+}
+"""What it starts from, what is done, and the steps that it has at least."""
+
+
+def kill_at_every_step(place: Place, case: str) -> list[Scene]:
+    """Do it once for each of its steps, killed there, until it comes through; then once more, as a person would."""
+    made, work, at_least = CASES[case]
+    scenes = []
+    for step in range(MOST_STEPS):
+        scene = run_here(place, made)
+        scenes.append(scene)
+        victim = begin(place, work, scene, dies_at=step)
+        survived = not killed(victim)
+        if case != "timer":
+            run_here(place, lambda functions, scene=scene: again(functions, work, scene))
+        if survived:
+            assert step >= at_least, f"only {step} steps"
+            return scenes
+    pytest.fail(f"{case} has more than {MOST_STEPS} steps")
+
+
+async def again(functions: Functions, work: Work, scene: Scene) -> None:
+    """Repeat it; that it is refused because it is done already is an answer too."""
+    with contextlib.suppress(Problem, pytest.fail.Exception):
+        await work(functions, scene)
+    if work in {start_once, join_queue}:
+        device = await functions.devices.get(scene.who, scene.device)
+        rows = await rows_of(functions, store.CONTROL, device.id)
+        keyed = [key for key, data in rows.items() if key.startswith("action:") and data["once"]]
+        assert len(keyed) == 1, "the same key is the same action, also after a kill"
+
+
+# ---------------------------------------------------------------- what must be true when time has passed
+
+
+async def rows_of(functions: Functions, table: str, partition: str) -> dict[str, dict[str, Any]]:
+    found: dict[str, dict[str, Any]] = {}
+    cursor = None
+    while True:
+        page = await functions.tables.query(table, partition, limit=1000, cursor=cursor)
+        found |= {row.key: dict(row.data) for row in page.rows}
+        cursor = page.cursor
+        if cursor is None:
+            return found
+
+
+async def settle(functions: Functions) -> None:
+    """Let time pass, with rounds of the timer, until every promise must have been kept."""
+    clock = cast("SetClock", functions.clock)
+    for step_s in (*([1.0] * (TIMEOUT_S + QUEUE_S + 4)), *([ORPHAN_MS / 2000 + 1] * 3)):
+        clock.advance(step_s)
+        await functions.sweep.run()
+    notes = [key for shard in range(SHARDS) for key in await rows_of(functions, store.PENDING, str(shard))]
+    assert notes == []
+
+
+async def look(functions: Functions, place: Place, scenes: list[Scene]) -> None:
+    """Nothing is left open, nothing ran that is not written, and every robot can be used."""
+    await settle(functions)
+    sent = commands_sent(place)
+    for command, payloads in sent.items():
+        assert len(payloads) == 1, f"{command} went out as different commands"
+    written = set()
+    for scene in scenes:
+        rows = await rows_of(functions, store.CONTROL, scene.device)
+        for key, data in rows.items():
+            if key.startswith("action:"):
+                assert data["status"] in TERMINAL, data
+                written.add(data["id"])
+        assert rows.get("now:slot", {"action": ""})["action"] == ""
+        assert not rows.get("now:queue", {"actions": ()})["actions"]
+    assert actions_sent(sent) <= written, "nothing goes out that is not written"
+    for scene in scenes:
+        public, agent = scene.public, scene.agent
+        _, code = await show_code(functions, public=public)
+        owner = scene.who
+        if code:
+            owner = await person(functions, f"next owner of {agent}")
+            await functions.claim.claim(owner, code, None)
+            assert (await functions.actions.list(owner, scene.device, cursor=None, limit=10))[0] == []
+        row = await functions.tables.get(store.AGENTS, agent, "agent")
+        assert row is not None
+        owner = Identity(row.data["account"], "whoever", owner.session)
+        action, _ = await functions.start_action.start(owner, scene.device, asked())
+        assert action.status.value == "published"
+        await report(functions, action.id, AckStatus.DONE)
+        lease, _ = await functions.leases.take(owner, scene.device, epoch=None, lease_ms=5_000, wait_ms=0)
+        assert lease.epoch > action.epoch >= max(1, scene.epoch)
+
+
+def actions_sent(sent: dict[str, set[bytes]]) -> set[str]:
+    """Ids of those commands that run something."""
+    runs = (b'"kind":"move_joints"', b'"kind":"run_movement"')
+    return {command for command, payloads in sent.items() if any(kind in one for kind in runs for one in payloads)}
+
+
+@pytest.mark.parametrize("place", ["local"], indirect=True)
+@pytest.mark.parametrize("case", CASES)
+def test_killed_at_any_step_it_leaves_nothing_without_an_end(place: Place, case: str) -> None:
+    scenes = kill_at_every_step(place, case)
+    run_here(place, lambda functions: look(functions, place, scenes))
+
+
+@pytest.mark.parametrize("place", ["azure", "aws"], indirect=True)
+def test_so_it_is_over_the_clouds_stores(place: Place) -> None:
+    scenes = [
+        scene for case in ("start with a key", "the end before a queue") for scene in kill_at_every_step(place, case)
+    ]
+    run_here(place, lambda functions: look(functions, place, scenes))
+
+
+@pytest.mark.long
+@pytest.mark.timeout(1_800)
+@pytest.mark.parametrize("place", ["azure", "aws"], indirect=True)
+@pytest.mark.parametrize("case", CASES)
+def test_so_it_is_over_the_clouds_stores_for_all_of_it(place: Place, case: str) -> None:
+    scenes = kill_at_every_step(place, case)
+    run_here(place, lambda functions: look(functions, place, scenes))
+
+
+# ---------------------------------------------------------------- eight at once, and any of them killed
+
+CROWD = 8
+PEOPLE = ("anna", "bert")
+Two = list[Identity]
+
+
+async def anything(functions: Functions, scenes: list[Scene], seed: int) -> None:
+    """Do one thing after the other, until this process is killed."""
+    chance = random.Random(seed)  # noqa: S311 (chance with a seed)
+    who = [await person(functions, name) for name in PEOPLE]
+    while True:
+        does = chance.choice(
+            (start_something, start_something, cancel_some, report_some, control, pass_time, hand_over)
+        )
+        with contextlib.suppress(Problem):
+            await does(functions, chance, chance.sample(who, 2), chance.choice(scenes))
+
+
+async def start_something(functions: Functions, chance: random.Random, who: Two, scene: Scene) -> None:
+    key = chance.choice(("", "", f"key {chance.randrange(50)}"))
+    policy = chance.choice(("reject", "queue"))
+    await functions.start_action.start(who[0], scene.device, asked(once=key, policy=policy))
+
+
+async def cancel_some(functions: Functions, chance: random.Random, who: Two, scene: Scene) -> None:
+    for action in (await functions.actions.list(who[0], scene.device, cursor=None, limit=chance.randrange(1, 4)))[0]:
+        await functions.actions.cancel(who[0], action.id)
+
+
+async def report_some(functions: Functions, chance: random.Random, who: Two, scene: Scene) -> None:
+    for action in (await functions.actions.list(who[0], scene.device, cursor=None, limit=4))[0]:
+        await report(functions, action.id, chance.choice(list(AckStatus)))
+
+
+async def control(functions: Functions, chance: random.Random, who: Two, scene: Scene) -> None:
+    lease, _ = await functions.leases.take(who[0], scene.device, epoch=None, lease_ms=3_000, wait_ms=0)
+    policy = chance.choice(("reject", "queue"))
+    await functions.start_action.start(who[0], scene.device, asked(epoch=lease.epoch, policy=policy))
+    await functions.leases.release(who[0], scene.device, epoch=lease.epoch)
+
+
+async def pass_time(functions: Functions, chance: random.Random, who: Two, scene: Scene) -> None:
+    cast("SetClock", functions.clock).advance(chance.uniform(0, 3))
+    await functions.sweep.run()
+    if not chance.randrange(4):
+        await functions.stop.stop(who[0], scene.device, "")
+
+
+async def hand_over(functions: Functions, chance: random.Random, who: Two, scene: Scene) -> None:
+    if chance.randrange(4):
+        return
+    with contextlib.suppress(Problem):
+        await functions.unpair.unpair(who[0], scene.agent)
+    _, code = await show_code(functions, public=scene.public)
+    if code:
+        await functions.claim.claim(who[1], code, None)
+
+
+def see_that_all_of_it_ends(place: Place, *, kills: int, seed: int, steps: int, devices: int = 3) -> None:
+    chance = random.Random(seed)  # noqa: S311 (chance with a seed)
+
+    async def prepare(functions: Functions) -> list[Scene]:
+        who = await person(functions, PEOPLE[0])
+        await person(functions, PEOPLE[1])
+        return [await paired(functions, who) for _ in range(devices)]
+
+    scenes = run_here(place, prepare)
+    crowd: list[Any] = []
+    for number in range(kills):
+        place = place.later(chance.uniform(0, 2))
+        crowd.append(begin(place, anything, scenes, seed + number, dies_at=chance.randrange(steps)))
+        if len(crowd) >= CROWD:
+            assert killed(crowd.pop(chance.randrange(CROWD)))
+    for process in crowd:
+        assert killed(process)
+    run_here(place.later(5), lambda functions: look(functions, place, scenes))
+
+
+@pytest.mark.parametrize("place", ["local"], indirect=True)
+def test_of_eight_at_once_any_may_be_killed_anywhere(place: Place) -> None:
+    see_that_all_of_it_ends(place, kills=60, seed=1, steps=80)
+
+
+@pytest.mark.long
+@pytest.mark.timeout(1_800)
+@pytest.mark.parametrize(("place", "kills"), [("local", 600), ("azure", 60), ("aws", 60)], indirect=["place"])
+def test_of_eight_at_once_any_may_be_killed_anywhere_very_often(place: Place, kills: int) -> None:
+    see_that_all_of_it_ends(place, kills=kills, seed=secrets.randbits(32), steps=200)
