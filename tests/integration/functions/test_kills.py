@@ -5,6 +5,7 @@ import random
 import secrets
 from collections.abc import Awaitable, Callable
 from dataclasses import dataclass
+from functools import partial
 from typing import Any, cast
 
 import pytest
@@ -190,7 +191,7 @@ def kill_at_every_step(place: Place, case: str) -> list[Scene]:
         victim = begin(place, work, scene, dies_at=step)
         survived = not killed(victim)
         if case != "timer":
-            run_here(place, lambda functions, scene=scene: again(functions, work, scene))
+            run_here(place, partial(again, work=work, scene=scene))
         if survived:
             assert step >= at_least, f"only {step} steps"
             return scenes
