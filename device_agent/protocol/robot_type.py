@@ -1,6 +1,5 @@
 """A robot type's manifest, ``robots/<type>/robot.toml``: read by agents (limits, model) and the cloud (catalogue)."""
 
-import tomllib
 from pathlib import Path
 from typing import Any
 
@@ -71,6 +70,8 @@ def parse(text: str) -> RobotType:
     Raises:
         ProtocolError: Not TOML, a field is wrong, or fields contradict each other.
     """
+    import tomllib  # noqa: PLC0415 (15 ms of regular expressions, for who reads a manifest only)
+
     try:
         raw: dict[str, Any] = tomllib.loads(text)
         robot_type = msgspec.convert(raw, RobotType, strict=False)
