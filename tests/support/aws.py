@@ -11,7 +11,7 @@ import json
 import logging
 import threading
 from collections import deque
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from typing import Any, Literal
@@ -116,6 +116,8 @@ class Wire:
         self.endpoint = ""
         self.behind = urlsplit(endpoint)
         self.faults: deque[Fault] = deque()
+        self.guard: Callable[[str, str, Mapping[str, str]], Refusal | None] | None = None
+        """Given method, path and headers: what the emulator itself does not check."""
 
     def spoil(self, *faults: Fault) -> None:
         self.asked.clear()
@@ -156,6 +158,8 @@ class _Handler(BaseHTTPRequestHandler):
         operation = self.headers.get("X-Amz-Target", "").rpartition(".")[2]
         self.between.asked.append(Asked(self.command, operation, body, self.path))
         fault = self.between.faults.popleft() if self.between.faults else "pass"
+        if fault == "pass" and self.between.guard is not None:
+            fault = self.between.guard(self.command, self.path, dict(self.headers)) or "pass"
         if isinstance(fault, Refusal):
             self._refuse(fault)
             return

@@ -14,7 +14,7 @@ from weakref import WeakValueDictionary
 from function_app.adapters import rows
 from function_app.adapters.aws import names
 from function_app.adapters.aws.client import Client, Refused
-from function_app.ports.blobs import MAX_BYTES, MAX_NAME_LENGTH
+from function_app.ports.blobs import MAX_BYTES, MAX_NAME_LENGTH, Upload, check_upload
 from function_app.ports.tables import StoreError
 
 TRIES = 30
@@ -111,6 +111,43 @@ class S3Blobs:
                 break
             question["ContinuationToken"] = answer["NextContinuationToken"]
         return tuple(sorted(found)[:limit])
+
+    async def size(self, name: str) -> int | None:
+        """See ``Blobs``."""
+        try:
+            found = await self._client.call("head_object", **self._place(name))
+        except Refused as error:
+            if error.code in _NOT_THERE:
+                return None
+            raise self._client.unusable(error) from error
+        return int(found["ContentLength"])
+
+    async def presign_upload(self, name: str, *, length: int, content_type: str, lifetime_s: int) -> Upload:
+        """See ``Blobs``. Length, type and that nothing is there yet are part of what is signed."""
+        check_upload(length)
+        url = await self._client.presign(
+            "put_object",
+            lifetime_s=lifetime_s,
+            **self._place(name),
+            **_metadata(name),
+            ContentLength=length,
+            ContentType=content_type,
+            IfNoneMatch="*",
+        )
+        headers = {"Content-Length": str(length), "Content-Type": content_type, "If-None-Match": "*"}
+        for key, value in _metadata(name).get("Metadata", {}).items():
+            headers[f"x-amz-meta-{key}"] = value
+        return Upload("PUT", url, headers)
+
+    async def presign_download(self, name: str, *, content_type: str, lifetime_s: int) -> str:
+        """See ``Blobs``."""
+        return await self._client.presign(
+            "get_object",
+            lifetime_s=lifetime_s,
+            **self._place(name),
+            ResponseContentType=content_type,
+            ResponseContentDisposition="attachment",
+        )
 
     async def close(self) -> None:
         """See ``Blobs``."""

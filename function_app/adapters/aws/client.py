@@ -5,8 +5,9 @@ The SDK is imported at the first call too: it takes a third of a second, which t
 
 import asyncio
 import threading
+from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
-from typing import Any
+from typing import Any, TypeVar
 
 from function_app.ports.tables import StoreError
 
@@ -43,6 +44,8 @@ _TOO_MUCH = frozenset(
         "ThrottlingException",
     }
 )
+
+T = TypeVar("T")
 
 
 class Refused(Exception):  # noqa: N818 (an outcome that callers look at)
@@ -96,9 +99,20 @@ class Client:
             Refused: The answer is no; ``unusable`` words what the caller did not expect.
             StoreError: There is no answer.
         """
-        if self._threads is None:
-            self._threads = ThreadPoolExecutor(THREADS, thread_name_prefix=self._service)
-        return await asyncio.get_running_loop().run_in_executor(self._threads, self._call, operation, parameters)
+        return await self._in_thread(lambda: self._call(operation, parameters))
+
+    async def presign(self, operation: str, *, lifetime_s: int, **parameters: Any) -> str:
+        """An address at which whoever has it may do one of the SDK's operations.
+
+        Raises:
+            StoreError: There are no credentials to sign it with.
+        """
+
+        def sign(client: Any) -> str:
+            url: str = client.generate_presigned_url(operation, Params=parameters, ExpiresIn=lifetime_s)
+            return url
+
+        return await self._in_thread(lambda: self._guarded(sign))
 
     async def close(self) -> None:
         """Let go of connections and threads; a later call opens again."""
@@ -125,13 +139,26 @@ class Client:
             return StoreError(f"{self._where} has too much to do: {_line(error)}. Try again, or raise its limits.")
         return StoreError(f"{self._where} cannot be used: {_line(error)}. Check its configuration.")
 
+    async def _in_thread(self, do: Callable[[], T]) -> T:
+        if self._threads is None:
+            self._threads = ThreadPoolExecutor(THREADS, thread_name_prefix=self._service)
+        return await asyncio.get_running_loop().run_in_executor(self._threads, do)
+
     def _call(self, operation: str, parameters: dict[str, Any]) -> dict[str, Any]:
+        def ask(client: Any) -> dict[str, Any]:
+            answer: dict[str, Any] = getattr(client, operation)(**parameters)
+            if "Body" in answer:
+                answer["Body"] = answer["Body"].read()
+            return answer
+
+        return self._guarded(ask)
+
+    def _guarded(self, do: Callable[[Any], T]) -> T:
+        """Do it with the SDK's client, and say what is wrong in our own words."""
         from botocore import exceptions as sdk  # noqa: PLC0415 (see this page's first lines)
 
         try:
-            answer: dict[str, Any] = getattr(self._open(), operation)(**parameters)
-            if "Body" in answer:
-                answer["Body"] = answer["Body"].read()
+            return do(self._open())
         except sdk.ClientError as error:
             raise _refused(error.response, str(error)) from error
         except (
@@ -150,7 +177,6 @@ class Client:
             ) from error
         except sdk.BotoCoreError as error:
             raise StoreError(f"{self._where} cannot be used: {_line(error)}. Check its configuration.") from error
-        return answer
 
     def _open(self) -> Any:
         from botocore.config import Config  # noqa: PLC0415
@@ -168,6 +194,8 @@ class Client:
                         retries={"mode": "standard", "total_max_attempts": ATTEMPTS},
                         max_pool_connections=THREADS,
                         tcp_keepalive=True,
+                        # What the SDK signs addresses with otherwise leaves out the length of what is uploaded.
+                        signature_version="s3v4" if self._service == "s3" else None,
                         # Emulators have no host name for each bucket.
                         s3={"addressing_style": "auto" if self._endpoint is None else "path"},
                     ),

@@ -12,13 +12,15 @@ import contextlib
 import itertools
 import random
 import secrets
+from datetime import UTC, datetime, timedelta
 from http import HTTPStatus
 from typing import TYPE_CHECKING, Any, TypeVar
 from weakref import WeakValueDictionary
 
 from function_app.adapters.azure import names
 from function_app.adapters.azure.client import ATTEMPTS, Client, Place, Refused, code_of, credential, transport
-from function_app.ports.blobs import MAX_BYTES, MAX_NAME_LENGTH
+from function_app.adapters.azure.signing_keys import SigningKeys
+from function_app.ports.blobs import MAX_BYTES, MAX_NAME_LENGTH, Upload, check_upload
 from function_app.ports.tables import StoreError
 
 if TYPE_CHECKING:
@@ -60,6 +62,7 @@ class AzureBlobs:
             role="Storage Blob Data Contributor",
         )
         self._appending: WeakValueDictionary[str, asyncio.Lock] = WeakValueDictionary()
+        self._keys = SigningKeys(place)
 
     async def put(self, name: str, content: bytes) -> None:
         """See ``Blobs``."""
@@ -121,6 +124,57 @@ class AzureBlobs:
         except Refused as error:
             if error.code == _NO_CONTAINER:
                 return ()
+            raise self._client.unusable(error) from error
+
+    async def size(self, name: str) -> int | None:
+        """See ``Blobs``."""
+        written = _written(name)
+        try:
+            found = await self._client.call(lambda container: container.get_blob_client(written).get_blob_properties())
+        except Refused as error:
+            if error.status == _GONE:
+                return None
+            raise self._client.unusable(error) from error
+        return int(found.size)
+
+    async def presign_upload(self, name: str, *, length: int, content_type: str, lifetime_s: int) -> Upload:
+        """See ``Blobs``. Signed is the right to create this blob; what its length may be, Azure cannot say."""
+        check_upload(length)
+        metadata = {f"x-ms-meta-{key}": value for key, value in _metadata(name).items()}
+        try:
+            await self._client.call(_make)  # nobody else would, before the upload
+        except Refused as error:
+            raise self._client.unusable(error) from error
+        url = await self._presign(name, lifetime_s, permission="c")
+        headers = {"Content-Length": str(length), "Content-Type": content_type, "x-ms-blob-type": "BlockBlob"}
+        return Upload("PUT", url, headers | metadata | {"If-None-Match": "*"})
+
+    async def presign_download(self, name: str, *, content_type: str, lifetime_s: int) -> str:
+        """See ``Blobs``."""
+        return await self._presign(
+            name, lifetime_s, permission="r", content_type=content_type, content_disposition="attachment"
+        )
+
+    async def _presign(self, name: str, lifetime_s: int, **rights: Any) -> str:
+        written = _written(name)
+
+        def sign(container: "ContainerClient") -> str:
+            from azure.storage.blob import generate_blob_sas  # noqa: PLC0415 (only when the SDK is in use)
+
+            blob = container.get_blob_client(written)
+            token = generate_blob_sas(
+                str(container.account_name),
+                container.container_name,
+                written,
+                **self._keys.of(container, lifetime_s),
+                expiry=datetime.now(UTC) + timedelta(seconds=lifetime_s),
+                **rights,
+            )
+            return f"{blob.url}?{token}"
+
+        try:
+            return await self._client.call(sign)
+        except Refused as error:
             raise self._client.unusable(error) from error
 
     async def close(self) -> None:

@@ -5,10 +5,22 @@ import base64
 import contextlib
 import os
 import secrets
+import time
+from collections.abc import AsyncIterator, Mapping
 from pathlib import Path
+from typing import Any, BinaryIO
 from urllib.parse import quote, unquote
 
-from function_app.ports.blobs import MAX_BYTES, MAX_NAME_LENGTH
+import jwt
+
+from function_app.ports.blobs import (
+    MAX_BYTES,
+    MAX_NAME_LENGTH,
+    Download,
+    TransferRefused,
+    Upload,
+    check_upload,
+)
 from function_app.ports.tables import StoreError
 
 _PART = 120
@@ -18,13 +30,21 @@ _READABLE = 3 * MAX_NAME_LENGTH
 _COMPACT = "~"
 _TAIL = ".blob"
 _TEMPORARY = ".part"
+_LEFT_S = 86_400
+_READ_BYTES = 1024 * 1024
+_ALGORITHM = "HS256"
+_UPLOAD = "telescope/blobs/upload"
+_DOWNLOAD = "telescope/blobs/download"
 
 
 class FileBlobs:
     """``Blobs`` in ``folder``. Files are read and written in a thread: a disk may be slow, and blobs are large."""
 
-    def __init__(self, folder: Path) -> None:
+    def __init__(self, folder: Path, *, key: bytes | None = None, url: str = "") -> None:
+        """``key`` signs addresses below ``url``, at which ``receive`` and ``send`` are to be reached."""
         self._folder = folder
+        self._key = key or secrets.token_bytes(32)
+        self._url = url
 
     async def put(self, name: str, content: bytes) -> None:
         """See ``Blobs``."""
@@ -47,6 +67,107 @@ class FileBlobs:
     async def list(self, prefix: str, *, limit: int = 1000) -> tuple[str, ...]:
         """See ``Blobs``."""
         return await asyncio.to_thread(self._list, prefix, limit)
+
+    async def size(self, name: str) -> int | None:
+        """See ``Blobs``."""
+        path = self._path(name)
+        try:
+            return (await asyncio.to_thread(path.stat)).st_size
+        except FileNotFoundError:
+            return None
+        except OSError as error:
+            raise _unusable(path, error) from error
+
+    async def presign_upload(self, name: str, *, length: int, content_type: str, lifetime_s: int) -> Upload:
+        """See ``Blobs``. The address is the functions' own."""
+        check_upload(length)
+        self._path(name)
+        claims = {"aud": _UPLOAD, "sub": name, "length": length, "type": content_type}
+        headers = {"Content-Length": str(length), "Content-Type": content_type}
+        return Upload("PUT", self._address(claims, lifetime_s), headers)
+
+    async def presign_download(self, name: str, *, content_type: str, lifetime_s: int) -> str:
+        """See ``Blobs``."""
+        self._path(name)
+        return self._address({"aud": _DOWNLOAD, "sub": name, "type": content_type}, lifetime_s)
+
+    async def receive(self, token: str, headers: Mapping[str, str], content: AsyncIterator[bytes]) -> None:
+        """See ``Transfers``."""
+        claims = self._claims(token, _UPLOAD)
+        length = claims["length"]
+        if headers.get("content-length", str(length)) != str(length):
+            raise TransferRefused(403, f"The address is for exactly {length} bytes.")
+        if headers.get("content-type") != claims["type"]:
+            raise TransferRefused(403, f"The address is for content of the type {claims['type']}.")
+        path = self._path(claims["sub"])
+        await asyncio.to_thread(self._refuse_second, path)
+        await asyncio.to_thread(self._clear)
+        temporary = self._folder / f"{secrets.token_hex(8)}{_TEMPORARY}"
+        try:
+            if await self._fill(temporary, content, length) != length:
+                raise TransferRefused(400, f"The body must have {length} bytes.")
+            await asyncio.to_thread(os.link, temporary, path)
+        except FileExistsError as error:
+            raise _there_already() from error
+        except OSError as error:
+            raise _unusable(path, error) from error
+        finally:
+            with contextlib.suppress(OSError):
+                await asyncio.to_thread(temporary.unlink)
+
+    async def send(self, token: str) -> Download:
+        """See ``Transfers``."""
+        claims = self._claims(token, _DOWNLOAD)
+        path = self._path(claims["sub"])
+        try:
+            file = await asyncio.to_thread(path.open, "rb")
+        except FileNotFoundError as error:
+            raise TransferRefused(404, "There is nothing at this address any more.") from error
+        except OSError as error:
+            raise _unusable(path, error) from error
+        return Download(_parts(file), os.fstat(file.fileno()).st_size, claims["type"])
+
+    def _address(self, claims: dict[str, Any], lifetime_s: int) -> str:
+        token = jwt.encode({**claims, "exp": time.time() + lifetime_s}, self._key, _ALGORITHM)
+        return f"{self._url}/{token}"
+
+    def _claims(self, token: str, audience: str) -> dict[str, Any]:
+        try:
+            claims: dict[str, Any] = jwt.decode(
+                token, self._key, [_ALGORITHM], audience=audience, options={"require": ["exp", "aud", "sub"]}
+            )
+        except (jwt.PyJWTError, ValueError) as error:
+            raise TransferRefused(403, "The address is not one of ours, or is over. Ask for a new one.") from error
+        return claims
+
+    @staticmethod
+    def _refuse_second(path: Path) -> None:
+        if path.exists():
+            raise _there_already()
+        path.parent.mkdir(parents=True, exist_ok=True)
+
+    def _clear(self) -> None:
+        """Delete what uploads have left that were cut off by the end of a process."""
+        for path in self._folder.glob(f"*{_TEMPORARY}"):
+            with contextlib.suppress(OSError):
+                if time.time() - path.stat().st_mtime > _LEFT_S:
+                    path.unlink()
+
+    @staticmethod
+    async def _fill(path: Path, content: AsyncIterator[bytes], most: int) -> int:
+        """Write what comes, but no more than ``most`` bytes of it; how many came."""
+        length = 0
+        file = await asyncio.to_thread(path.open, "xb")
+        try:
+            async for part in content:
+                length += len(part)
+                if length > most:
+                    break
+                await asyncio.to_thread(file.write, part)
+            await asyncio.to_thread(_flush, file)
+        finally:
+            await asyncio.to_thread(file.close)
+        return length
 
     async def close(self) -> None:
         """See ``Blobs``."""
@@ -110,6 +231,23 @@ class FileBlobs:
             if name.startswith(prefix):
                 names.append(name)
         return tuple(sorted(names)[:limit])
+
+
+async def _parts(file: BinaryIO) -> AsyncIterator[bytes]:
+    try:
+        while part := await asyncio.to_thread(file.read, _READ_BYTES):
+            yield part
+    finally:
+        await asyncio.to_thread(file.close)
+
+
+def _flush(file: BinaryIO) -> None:
+    file.flush()
+    os.fsync(file.fileno())
+
+
+def _there_already() -> TransferRefused:
+    return TransferRefused(409, "There is a blob at this address already; it is not written over.")
 
 
 def _encode(name: str) -> str:

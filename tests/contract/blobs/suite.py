@@ -1,17 +1,44 @@
 """What every adapter of ``Blobs`` promises. An adapter's test inherits the class and brings its fixtures.
 
 ``blobs``: an empty store. ``again``: opens another instance over the same store, as another process would.
+``direct``: the store as a client of its presigned addresses sees it.
 """
 
 import asyncio
 from collections.abc import Awaitable, Callable
+from dataclasses import dataclass, replace
 
+import httpx
 import pytest
 
-from function_app.ports.blobs import MAX_BYTES, MAX_NAME_LENGTH, Blobs
+from function_app.ports.blobs import MAX_BYTES, MAX_NAME_LENGTH, MAX_UPLOAD_BYTES, Blobs, Upload
 from tests.contract.tables.suite import HOSTILE, KEYS
 
 Again = Callable[[], Awaitable[Blobs]]
+
+UPLOADED = "uploads/a b/ü+%2F"
+PNG = "image/png"
+
+
+@dataclass(frozen=True)
+class Direct:
+    """A store and a plain HTTP client.
+
+    Attributes:
+        renamed: Puts another word of a name into an address, and nothing else.
+        binds_length: Whether the store itself refuses another length.
+    """
+
+    blobs: Blobs
+    http: httpx.AsyncClient
+    renamed: Callable[[str, str, str], str] = str.replace
+    binds_length: bool = True
+
+    async def send(self, upload: Upload, content: bytes) -> httpx.Response:
+        """Obey ``upload``, with headers as it says but for the length, which is the content's own."""
+        headers = {**upload.headers, "Content-Length": str(len(content))}
+        return await self.http.request(upload.method, upload.url, headers=headers, content=content)
+
 
 NAMES = (
     *KEYS,
@@ -141,6 +168,71 @@ class BlobsSuite:
         with pytest.raises(ValueError, match=str(MAX_BYTES)):
             await blobs.append("a", content)
         assert await blobs.list("") == ()
+
+    async def test_an_upload_goes_straight_to_the_store(self, direct: Direct) -> None:
+        content = bytes(range(256)) * 20_000
+        assert await direct.blobs.size(UPLOADED) is None
+        upload = await direct.blobs.presign_upload(UPLOADED, length=len(content), content_type=PNG, lifetime_s=60)
+        answer = await direct.send(upload, content)
+        assert answer.is_success, answer.text
+        assert await direct.blobs.size(UPLOADED) == len(content)
+        assert await direct.blobs.get(UPLOADED) == content
+        address = await direct.blobs.presign_download(UPLOADED, content_type=PNG, lifetime_s=60)
+        found = await direct.http.get(address)
+        assert (found.status_code, found.content) == (200, content)
+        assert found.headers["content-disposition"] == "attachment"
+        assert found.headers["content-type"] == PNG
+
+    async def test_an_upload_never_writes_over_anything(self, direct: Direct) -> None:
+        upload = await direct.blobs.presign_upload(UPLOADED, length=3, content_type=PNG, lifetime_s=60)
+        assert (await direct.send(upload, b"one")).is_success
+        assert not (await direct.send(upload, b"two")).is_success
+        other = await direct.blobs.presign_upload(UPLOADED, length=3, content_type=PNG, lifetime_s=60)
+        assert not (await direct.send(other, b"two")).is_success
+        assert await direct.blobs.get(UPLOADED) == b"one"
+
+    async def test_many_uploads_to_one_address_leave_one_of_them(self, direct: Direct) -> None:
+        upload = await direct.blobs.presign_upload(UPLOADED, length=100_000, content_type=PNG, lifetime_s=60)
+        contents = [bytes([number]) * 100_000 for number in range(6)]
+        answers = await asyncio.gather(*(direct.send(upload, content) for content in contents))
+        (winner,) = [content for answer, content in zip(answers, contents, strict=True) if answer.is_success]
+        assert await direct.blobs.get(UPLOADED) == winner
+
+    @pytest.mark.parametrize("content", [b"", b"12", b"1234", bytes(100_000)], ids=len)
+    async def test_another_length_is_refused_or_can_be_seen(self, direct: Direct, content: bytes) -> None:
+        upload = await direct.blobs.presign_upload(UPLOADED, length=3, content_type=PNG, lifetime_s=60)
+        answer = await direct.send(upload, content)
+        assert await direct.blobs.size(UPLOADED) == (len(content) if answer.is_success else None)
+        assert not answer.is_success or not direct.binds_length
+
+    async def test_an_address_is_good_for_nothing_else(self, direct: Direct) -> None:
+        upload = await direct.blobs.presign_upload("up/alpha", length=3, content_type=PNG, lifetime_s=60)
+        await direct.blobs.put("up/gamma", b"two")
+        changed = replace(upload, url=direct.renamed(upload.url, "alpha", "delta"))
+        assert changed != upload
+        assert not (await direct.send(changed, b"123")).is_success
+        assert await direct.blobs.list("") == ("up/gamma",)
+        download = await direct.blobs.presign_download("up/gamma", content_type=PNG, lifetime_s=60)
+        changed = replace(upload, url=download)
+        assert not (await direct.send(changed, b"123")).is_success
+        assert not (await direct.http.get(direct.renamed(download, "gamma", "alpha"))).is_success
+        assert not (await direct.http.get(upload.url)).is_success
+        assert not (await direct.http.delete(download)).is_success
+        assert await direct.blobs.get("up/gamma") == b"two"
+
+    async def test_an_address_ends(self, direct: Direct) -> None:
+        await direct.blobs.put("up/gamma", b"two")
+        upload = await direct.blobs.presign_upload("up/alpha", length=3, content_type=PNG, lifetime_s=1)
+        download = await direct.blobs.presign_download("up/gamma", content_type=PNG, lifetime_s=1)
+        await asyncio.sleep(2.1)
+        assert not (await direct.send(upload, b"123")).is_success
+        assert not (await direct.http.get(download)).is_success
+        assert await direct.blobs.size("up/alpha") is None
+
+    @pytest.mark.parametrize("length", [-1, MAX_UPLOAD_BYTES + 1])
+    async def test_a_length_that_cannot_be_is_refused(self, blobs: Blobs, length: int) -> None:
+        with pytest.raises(ValueError, match=str(length)):
+            await blobs.presign_upload("a", length=length, content_type=PNG, lifetime_s=60)
 
     async def test_another_instance_sees_every_write_at_once(self, blobs: Blobs, again: Again) -> None:
         other = await again()

@@ -1,10 +1,15 @@
 """``S3Blobs`` keeps the port's promises over moto, and says clearly what is wrong with the real thing."""
 
 import asyncio
+import hashlib
+import hmac
 import socket
-from collections.abc import AsyncIterator, Awaitable, Callable, Coroutine, Iterator
+from collections.abc import AsyncIterator, Awaitable, Callable, Coroutine, Iterator, Mapping
+from datetime import UTC, datetime, timedelta
 from typing import Any
+from urllib.parse import unquote
 
+import httpx
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -14,7 +19,7 @@ from function_app.adapters.aws import names
 from function_app.adapters.aws.blobs import TRIES, S3Blobs, decode, encode
 from function_app.ports.blobs import Blobs
 from function_app.ports.tables import StoreError
-from tests.contract.blobs.suite import Again, BlobsSuite
+from tests.contract.blobs.suite import Again, BlobsSuite, Direct
 from tests.support.aws import HOST, REGION, Refusal, Wire, reset, start_moto, start_wire, use_credentials
 
 Open = Callable[..., S3Blobs]
@@ -70,6 +75,39 @@ def again(opened: Open) -> Again:
         return opened()
 
     return open_
+
+
+@pytest.fixture
+async def direct(blobs: Blobs, opened: Open, wire: Wire) -> AsyncIterator[Direct]:
+    """By a wire that checks signatures as Amazon documents them, which moto does not."""
+    assert await blobs.list("") == ()
+    wire.guard = signed
+    async with httpx.AsyncClient() as client:
+        yield Direct(opened(at=wire.endpoint), client)
+
+
+def signed(method: str, path: str, headers: Mapping[str, str]) -> Refusal | None:
+    """Whether a presigned request is what was signed (Signature Version 4, query parameters)."""
+    given = {name.lower(): value.strip() for name, value in headers.items()}
+    address, _, text = path.partition("?")
+    query = dict(part.partition("=")[::2] for part in text.split("&") if part)
+    signature = query.pop("X-Amz-Signature", None)
+    if signature is None:
+        return None if "authorization" in given else Refusal(403, "AccessDenied", {})
+    made = datetime.strptime(query["X-Amz-Date"], "%Y%m%dT%H%M%SZ").replace(tzinfo=UTC)
+    if datetime.now(UTC) > made + timedelta(seconds=int(query["X-Amz-Expires"])):
+        return Refusal(403, "AccessDenied", {})
+    names = unquote(query["X-Amz-SignedHeaders"]).split(";")
+    lines = [f"{name}:{given.get(name, '')}" for name in names]
+    asked = [method, address, "&".join(f"{key}={query[key]}" for key in sorted(query)), *lines, "", ";".join(names)]
+    digest = hashlib.sha256("\n".join([*asked, "UNSIGNED-PAYLOAD"]).encode()).hexdigest()
+    _, *scope = unquote(query["X-Amz-Credential"]).split("/")
+    key = b"AWS4testing"
+    for word in scope:
+        key = hmac.digest(key, word.encode(), "sha256")
+    told = "\n".join(["AWS4-HMAC-SHA256", query["X-Amz-Date"], "/".join(scope), digest])
+    right = hmac.new(key, told.encode(), "sha256").hexdigest() == signature
+    return None if right else Refusal(403, "SignatureDoesNotMatch", {})
 
 
 class TestS3Blobs(BlobsSuite):

@@ -5,6 +5,7 @@ import secrets
 from collections.abc import AsyncIterator, Awaitable, Callable, Coroutine, Iterator
 from typing import Any
 
+import httpx
 import pytest
 
 from function_app.adapters.azure import blobs as adapter
@@ -12,7 +13,7 @@ from function_app.adapters.azure.blobs import AzureBlobs
 from function_app.adapters.azure.client import ATTEMPTS, Place
 from function_app.ports.blobs import MAX_BYTES, Blobs
 from function_app.ports.tables import StoreError
-from tests.contract.blobs.suite import Again, BlobsSuite
+from tests.contract.blobs.suite import Again, BlobsSuite, Direct
 from tests.support.aws import Fault, Refusal, Wire, start_wire
 from tests.support.azure import KEY, endpoint, start_azurite, through
 
@@ -52,6 +53,12 @@ async def again(connection: str, container: str) -> AsyncIterator[Again]:
     yield open_
     for each in opened:
         await each.close()
+
+
+@pytest.fixture
+async def direct(blobs: Blobs) -> AsyncIterator[Direct]:
+    async with httpx.AsyncClient() as client:
+        yield Direct(blobs, client, binds_length=False)
 
 
 class TestAzureBlobs(BlobsSuite):

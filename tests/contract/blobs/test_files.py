@@ -1,14 +1,19 @@
 """``FileBlobs`` keeps the port's promises and never leaves its folder."""
 
+import base64
 from collections.abc import AsyncIterator, Awaitable, Callable
 from pathlib import Path
 
+import httpx
 import pytest
+from fastapi import FastAPI, Response
 
 from function_app.adapters.local.blobs import FileBlobs
+from function_app.domain.problems import Problem
+from function_app.entrypoints.http import transfers
 from function_app.ports.blobs import Blobs
 from function_app.ports.tables import StoreError
-from tests.contract.blobs.suite import NAMES, Again, BlobsSuite
+from tests.contract.blobs.suite import NAMES, Again, BlobsSuite, Direct
 
 pytestmark = pytest.mark.anyio
 
@@ -31,6 +36,25 @@ def again(tmp_path: Path) -> Again:
         return FileBlobs(tmp_path / "blobs")
 
     return open_
+
+
+@pytest.fixture
+async def direct(tmp_path: Path) -> AsyncIterator[Direct]:
+    blobs = FileBlobs(tmp_path / "blobs", key=b"k" * 32, url="http://telescope.test/blobs")
+    app = FastAPI()
+    app.include_router(transfers.router(blobs))
+    app.add_exception_handler(Problem, lambda _, error: Response(str(error), error.status))
+
+    def renamed(url: str, name: str, other: str) -> str:
+        head, _, token = url.rpartition("/")
+        parts = token.split(".")
+        body = base64.urlsafe_b64decode(parts[1] + "==").replace(name.encode(), other.encode())
+        parts[1] = base64.urlsafe_b64encode(body).decode().rstrip("=")
+        return f"{head}/{'.'.join(parts)}"
+
+    async with httpx.AsyncClient(transport=httpx.ASGITransport(app)) as client:
+        yield Direct(blobs, client, renamed)
+    assert list(tmp_path.rglob("*.part")) == []
 
 
 class TestFileBlobs(BlobsSuite):
