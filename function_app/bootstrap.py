@@ -1,6 +1,9 @@
 """Puts the functions together: the one place that picks adapters."""
 
+import hashlib
 from dataclasses import dataclass
+
+from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
 
 from function_app.adapters.local.blobs import FileBlobs
 from function_app.adapters.local.broker_access import MosquittoBrokerAccess, TokenBrokerAccess
@@ -11,7 +14,7 @@ from function_app.adapters.local.feed import MqttFeed, MqttTelemetry
 from function_app.adapters.local.keys import FileKeys
 from function_app.adapters.local.tables import SqliteTables
 from function_app.domain.series import Keep
-from function_app.ports.blobs import Blobs
+from function_app.ports.blobs import Blobs, Transfers
 from function_app.ports.broker_access import BrokerAccess
 from function_app.ports.clock import Clock
 from function_app.ports.command_bus import CommandBus
@@ -53,9 +56,12 @@ from function_app.services.start_action import StartAction
 from function_app.services.stop import StopDevices
 from function_app.services.sweep import Sweep
 from function_app.services.unpair import Unpair
+from function_app.services.uploads import Uploads
 from function_app.settings import AwsStore, AzureStore, EventGridBus, IotBus, Settings
 
 TABLES_FILE = "tables.sqlite"
+BLOBS_PATH = "/api/v1/blobs"
+"""Where the addresses of blobs in files lead to."""
 MOSQUITTO_SERVICE = "service"
 
 
@@ -97,6 +103,8 @@ class Functions:
     conditions: Conditions
     latencies: Latencies
     intake: Intake
+    uploads: Uploads
+    transfers: Transfers | None
     series: SeriesReader
     sweep: Sweep
     health: CheckHealth
@@ -118,7 +126,7 @@ def build(settings: Settings, *, clock: Clock | None = None) -> Functions:
     now = clock or SystemClock()
     keys = FileKeys(settings.home / "keys")
     private = keys.load()
-    tables, blobs = _stores(settings)
+    tables, blobs = _stores(settings, private)
     catalogue = FolderCatalogue(settings.robots)
 
     async def publish(topic: str, payload: bytes) -> None:
@@ -147,6 +155,7 @@ def build(settings: Settings, *, clock: Clock | None = None) -> Functions:
     devices = Devices(tables=tables, clock=now)
     keep = _keep(settings)
     writer = SeriesWriter(tables=tables, forget=forget, keep=keep, clock=now)
+    uploads = Uploads(tables=tables, blobs=blobs, keep_ms=settings.keep_uploads_days * DAY_MS, clock=now)
     intake = Intake(tables=tables, writer=writer, clock=now)
     mailbox = Mailbox(tables=tables, forget=forget, clock=now)
     delivery = Delivery(bus=bus, mailbox=mailbox)
@@ -215,6 +224,8 @@ def build(settings: Settings, *, clock: Clock | None = None) -> Functions:
         conditions=conditions,
         latencies=Latencies(tables=tables, forget=forget, clock=now),
         intake=intake,
+        uploads=uploads,
+        transfers=blobs if isinstance(blobs, FileBlobs) else None,
         series=SeriesReader(tables=tables, devices=devices, keep=keep, clock=now),
         sweep=Sweep(
             tables=tables,
@@ -227,6 +238,7 @@ def build(settings: Settings, *, clock: Clock | None = None) -> Functions:
             forget=forget,
             conditions=conditions,
             intake=intake,
+            uploads=uploads,
             keep_actions_ms=settings.keep_actions_days * DAY_MS,
             clock=now,
         ),
@@ -282,7 +294,7 @@ def _bus(settings: Settings, access: BrokerAccess) -> CommandBus:
             )
 
 
-def _stores(settings: Settings) -> tuple[Tables, Blobs]:
+def _stores(settings: Settings, private: Ed25519PrivateKey | None = None) -> tuple[Tables, Blobs]:
     """Tables and blobs. Of the clouds' adapters only the one in use is imported, and it its SDK only when needed."""
     match settings.store:
         case AzureStore() as azure:
@@ -305,4 +317,10 @@ def _stores(settings: Settings) -> tuple[Tables, Blobs]:
                 S3Blobs(bucket=aws.bucket, region=aws.region, endpoint=aws.endpoint),
             )
         case None:
-            return SqliteTables(settings.home / TABLES_FILE), FileBlobs(settings.home / "blobs")
+            return SqliteTables(settings.home / TABLES_FILE), _files(settings, private)
+
+
+def _files(settings: Settings, private: Ed25519PrivateKey | None) -> FileBlobs:
+    """Blobs in files, whose addresses any instance with the same signing key makes and knows."""
+    key = None if private is None else hashlib.sha256(b"telescope/v1/blobs" + private.private_bytes_raw()).digest()
+    return FileBlobs(settings.home / "blobs", key=key, url=f"{settings.public_url}{BLOBS_PATH}")

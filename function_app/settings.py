@@ -108,6 +108,7 @@ class Settings:
         console: Folder of the built console.
         trusted_proxies: Proxies of one's own in front of the API; the last of ``X-Forwarded-For`` are theirs.
         keep_actions_days: How long actions are kept after their end [d].
+        keep_uploads_days: How long captures are kept after their upload [d].
         keep_raw_hours: How long every sample is kept, and how late one may come [h].
         keep_10s_days: How long what is left of each 10 s is kept [d]; of each minute, of each ten minutes. What is
             left of hours and days is kept for ever.
@@ -128,6 +129,7 @@ class Settings:
     console: Path = ROOT / "web" / "dist"
     trusted_proxies: int = 0
     keep_actions_days: int = 30
+    keep_uploads_days: int = 30
     keep_raw_hours: int = 24
     keep_10s_days: int = 7
     keep_1min_days: int = 90
@@ -166,6 +168,7 @@ def read(environment: Mapping[str, str] | None = None) -> Settings:
         console=_folder(given, "TELESCOPE_CONSOLE", ROOT / "web" / "dist"),
         trusted_proxies=_number(given, "TELESCOPE_TRUSTED_PROXIES", 0, 0, 10),
         keep_actions_days=_number(given, "TELESCOPE_KEEP_ACTIONS_DAYS", 30, 1, 3650),
+        keep_uploads_days=_number(given, "TELESCOPE_KEEP_UPLOADS_DAYS", 30, 1, 36_500),
         keep_raw_hours=_number(given, "TELESCOPE_KEEP_RAW_HOURS", 24, 1, 9600),
         keep_10s_days=_number(given, "TELESCOPE_KEEP_10S_DAYS", 7, 1, 36_500),
         keep_1min_days=_number(given, "TELESCOPE_KEEP_1MIN_DAYS", 90, 1, 36_500),

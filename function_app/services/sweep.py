@@ -23,6 +23,7 @@ from function_app.services.pending import SHARDS, Pending
 from function_app.services.queue import TIMEOUT, Queues, queue_of
 from function_app.services.send_action import MovementChanged, SendAction
 from function_app.services.start_action import ABANDON_MS
+from function_app.services.uploads import Uploads
 
 ORPHAN_MS = 2 * ABANDON_MS
 """A note whose action was never written is kept this long: whoever writes it gives up before."""
@@ -50,6 +51,7 @@ class Sweep:
         forget: Forget,
         conditions: Conditions,
         intake: Intake,
+        uploads: Uploads,
         keep_actions_ms: int,
         clock: Clock,
     ) -> None:
@@ -63,6 +65,7 @@ class Sweep:
         self._forget = forget
         self._conditions = conditions
         self._intake = intake
+        self._uploads = uploads
         self._keep_actions_ms = keep_actions_ms
         self._clock = clock
         self._turn = 0
@@ -86,6 +89,7 @@ class Sweep:
         except Problem as problem:
             _log.warning("silent devices: %s", problem.detail)
         await self._intake.distribute_left()
+        await self._uploads.forget_due()
         try:
             await self._access.expire(self._clock.now_ms() / 1000)
         except BrokerAccessError as error:

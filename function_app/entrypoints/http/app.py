@@ -27,6 +27,8 @@ from function_app.entrypoints.http import (
     messages,
     movements,
     robot_types,
+    transfers,
+    uploads,
 )
 from function_app.entrypoints.http.answers import JSON, problem
 from function_app.entrypoints.http.caller import COOKIE, Caller
@@ -74,10 +76,12 @@ def create_app(functions: Functions) -> FastAPI:
         latency.router(functions, caller),
         faults.router(functions, caller),
         data.router(functions, caller),
+        uploads.router(functions, caller),
         health.router(functions),
     )
     for routes in resources:
         app.include_router(routes.router, prefix=PREFIX)
+    app.include_router(transfers.router(functions.transfers), prefix=PREFIX)
     _document(app, [kind for routes in resources for kind in routes.kinds])
     app.add_exception_handler(Problem, _on_problem)
     app.add_exception_handler(StoreError, _on_store)
