@@ -201,7 +201,7 @@ def build(settings: Settings, *, clock: Clock | None = None) -> Functions:
         sign_in=sign_in,
         enroll=Enroll(tables=tables, clock=now),
         claim=Claim(tables=tables, sign_in=sign_in, forget=forget, clock=now),
-        unpair=Unpair(tables=tables, commands=commands, access=access),
+        unpair=Unpair(tables=tables, commands=commands, access=access, series=writer),
         devices=devices,
         leases=Leases(tables=tables, devices=devices, commands=commands, access=access, clock=now),
         robot_types=robot_types,

@@ -106,6 +106,16 @@ class SeriesWriter:
             new = series.merge(new, await self._add(place, windows))
         return new
 
+    async def forget(self, device: str, pairing: str) -> None:
+        """Forget all streams of a pairing that has ended, once those who do not know yet have stopped to write."""
+        due_ms = self._clock.now_ms() + MARGIN_MS
+        place = Place(device, pairing, "")
+        listed = await self._tables.query(store.SERIES, place.streams, limit=MAX_STREAMS)
+        for row in listed.rows:
+            partition = place._replace(stream=row.key).partition
+            await self._forget.rows(store.SERIES, partition, first="", last=None, due_ms=due_ms)
+        await self._forget.rows(store.SERIES, place.streams, first="", last=None, due_ms=due_ms)
+
     async def _add(self, place: Place, windows: _Windows) -> Samples:
         """A part that fits into one batch, or, where what is known already makes it too large, into several."""
 

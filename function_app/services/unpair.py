@@ -16,6 +16,7 @@ from function_app.services import store
 from function_app.services.commands import Commands
 from function_app.services.control import read_control
 from function_app.services.devices import devices_of
+from function_app.services.series import SeriesWriter
 
 _log = logging.getLogger(__name__)
 
@@ -23,10 +24,11 @@ _log = logging.getLogger(__name__)
 class Unpair:
     """Ends a pairing."""
 
-    def __init__(self, *, tables: Tables, commands: Commands, access: BrokerAccess) -> None:
+    def __init__(self, *, tables: Tables, commands: Commands, access: BrokerAccess, series: SeriesWriter) -> None:
         self._tables = tables
         self._commands = commands
         self._access = access
+        self._series = series
 
     async def unpair(self, who: Identity, agent_id: str) -> None:
         """End the pairing. The write on the agent's row decides; all that follows only tidies up.
@@ -50,6 +52,7 @@ class Unpair:
         agent = await store.retry(once)
         for device in devices_of(agent):
             await self._fence(device, who)
+            await self._series.forget(device.id, device.pairing)
         await self._forget(who, agent)
         try:
             await self._access.revoke(principal=f"agent:{agent.id}")

@@ -7,6 +7,8 @@ import pytest
 from device_agent.protocol import codec, topics
 from device_agent.protocol.messages import JointTelemetry, Measurements, Mode
 from function_app.adapters.local import feed
+from function_app.services import store
+from function_app.services.series import Place
 from tests.integration.functions.conftest import Open
 from tests.support.brokers import wait_until
 from tests.support.cloud import Cloud, Person, Robot, paired, problem
@@ -106,3 +108,27 @@ def test_what_cannot_be_kept_until_it_is_stored_is_dropped_and_said(
     wait_until(lambda: "health" in streams(anna, robot), "samples to be stored")
     assert streams(anna, robot)["health"]["samples"] <= 100
     assert "messages were dropped" in caplog.text
+
+
+def test_what_an_unpaired_robot_has_measured_is_forgotten(cloud: Cloud, pair: tuple[Person, Robot]) -> None:
+    cloud.start_telemetry()
+    anna, robot = pair
+    for stream in ("health", "power"):
+        measure(robot, stream, cloud.clock.now_ms(), a=1.0)
+    wait_until(lambda: len(streams(anna, robot)) == 2, "the samples to be stored")
+    row = cloud.run(cloud.functions.tables.get(store.AGENTS, robot.id, "agent"))
+    assert row is not None
+    place = Place(robot.device, row.data["pairing"], "health")
+    assert anna.delete(f"/agents/{robot.id}").status_code == 204
+
+    def left() -> int:
+        places = (place.streams, place.partition, place._replace(stream="power").partition)
+        pages = [cloud.run(cloud.functions.tables.query(store.SERIES, each)) for each in places]
+        return sum(len(page.rows) for page in pages)
+
+    assert left() == 2 + 2 * 8
+    cloud.sweep()
+    assert left() == 2 + 2 * 8
+    cloud.clock.advance(2 * 3600)
+    cloud.sweep()
+    assert left() == 0

@@ -121,6 +121,24 @@ def test_how_long_actions_are_kept() -> None:
             settings.read({"TELESCOPE_KEEP_ACTIONS_DAYS": wrong})
 
 
+@pytest.mark.parametrize(
+    ("name", "field", "usual", "most"),
+    [
+        ("UPLOADS_DAYS", "keep_uploads_days", 30, 36_500),
+        ("RAW_HOURS", "keep_raw_hours", 24, 9_600),
+        ("10S_DAYS", "keep_10s_days", 7, 36_500),
+        ("1MIN_DAYS", "keep_1min_days", 90, 36_500),
+        ("10MIN_DAYS", "keep_10min_days", 730, 36_500),
+    ],
+)
+def test_how_long_data_are_kept(name: str, field: str, usual: int, most: int) -> None:
+    assert getattr(settings.read({}), field) == usual
+    assert getattr(settings.read({f"TELESCOPE_KEEP_{name}": str(most)}), field) == most
+    for wrong in ("0", "-1", str(most + 1), "1e2", ""):
+        with pytest.raises(SettingsError, match=f"TELESCOPE_KEEP_{name}"):
+            settings.read({f"TELESCOPE_KEEP_{name}": wrong})
+
+
 def test_how_many_proxies_are_believed() -> None:
     assert settings.read({}).trusted_proxies == 0
     assert settings.read({"TELESCOPE_TRUSTED_PROXIES": "2"}).trusted_proxies == 2
