@@ -11,7 +11,8 @@ from typing import Any, Protocol, Self
 
 import httpx
 
-from device_agent.protocol import topics
+from device_agent.protocol import codec, topics
+from device_agent.protocol.messages import AckStatus
 from tests.support.brokers import PATIENCE_S, Message
 from tests.support.cloud import API, MovingClock, Robot
 
@@ -66,6 +67,29 @@ class PollingRobot(Robot):
     def poll(self, **query: Any) -> httpx.Response:
         """Ask once."""
         return self.ask("GET", f"/agents/{self.id}/commands", params=query)
+
+    def fetch(self, **query: Any) -> list[dict[str, Any]]:
+        """The commands that one asking gives."""
+        answer = self.poll(**query)
+        assert answer.status_code == 200, answer.text
+        found: list[dict[str, Any]] = answer.json()["items"]
+        return found
+
+    def read(self, items: list[dict[str, Any]]) -> list[Any]:
+        """What is asked in commands that came; nothing is told."""
+        self.silent = True
+        before = len(self.commands)
+        for item in items:
+            self.obey(Message(item["topic"], item["payload"].encode(), 1, retain=False))
+        return [command.request for command in self.commands[before:]]
+
+    def tell_ack(self, command: str, status: AckStatus, **more: Any) -> dict[str, Any]:
+        """Tell one ack; its result."""
+        answer = self.tell_raw((self.topic(topics.ACK), codec.encode(self.ack(command, status, **more))))
+        assert answer.status_code == 200, answer.text
+        (result,) = answer.json()["results"]
+        found: dict[str, Any] = result
+        return found
 
     def tell(self, *messages: tuple[str, Any]) -> httpx.Response:
         """Tell messages: topic and what JSON makes of the payload."""

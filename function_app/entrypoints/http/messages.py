@@ -78,6 +78,7 @@ def router(functions: Functions, caller: Caller) -> Routes:
         asking = await _asking(request, agent)
         space = require_claimed(asking)
         asked: contract.MessagesRequest = await read(request, contract.MessagesRequest)
+        await functions.polling.seen(asking)  # first: what it says of itself counts more
         taken: dict[int, Arrived] = {}
         refused: dict[int, str] = {}
         for place, told in enumerate(asked.messages):
@@ -92,7 +93,6 @@ def router(functions: Functions, caller: Caller) -> Routes:
         measured = [place for place, arrived in taken.items() if arrived.topic.kind == topics.TELE]
         dropped = await functions.intake.take([taken[place] for place in measured])
         refused |= {measured[number]: why for number, why in dropped.items()}
-        await functions.polling.seen(asking)
         passed = [(asked.messages[place].topic, *arrived) for place, arrived in taken.items() if place not in refused]
         await functions.relay.pass_on(passed)
         results = (
