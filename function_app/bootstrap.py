@@ -29,6 +29,7 @@ from function_app.services.commands import Commands
 from function_app.services.conditions import Conditions
 from function_app.services.delivery import Delivery
 from function_app.services.devices import Devices
+from function_app.services.diagnostics import Diagnostics
 from function_app.services.enroll import Enroll
 from function_app.services.events import Events
 from function_app.services.faults import Faults
@@ -101,6 +102,7 @@ class Functions:
     events: Events
     faults: Faults
     conditions: Conditions
+    diagnostics: Diagnostics
     latencies: Latencies
     intake: Intake
     uploads: Uploads
@@ -156,11 +158,14 @@ def build(settings: Settings, *, clock: Clock | None = None) -> Functions:
     keep = _keep(settings)
     writer = SeriesWriter(tables=tables, forget=forget, keep=keep, clock=now)
     uploads = Uploads(tables=tables, blobs=blobs, keep_ms=settings.keep_uploads_days * DAY_MS, clock=now)
-    intake = Intake(tables=tables, writer=writer, clock=now)
     mailbox = Mailbox(tables=tables, forget=forget, clock=now)
     delivery = Delivery(bus=bus, mailbox=mailbox)
     commands = Commands(delivery=delivery, keys=keys, clock=now)
     robot_types = RobotTypes(catalogue=catalogue)
+    diagnostics = Diagnostics(
+        tables=tables, devices=devices, faults=faults, robot_types=robot_types, sign_in=sign_in, clock=now
+    )
+    intake = Intake(tables=tables, writer=writer, clock=now, observers=(diagnostics.observe,))
     movements = Movements(
         tables=tables,
         blobs=blobs,
@@ -222,6 +227,7 @@ def build(settings: Settings, *, clock: Clock | None = None) -> Functions:
         events=events,
         faults=faults,
         conditions=conditions,
+        diagnostics=diagnostics,
         latencies=Latencies(tables=tables, forget=forget, clock=now),
         intake=intake,
         uploads=uploads,

@@ -1,16 +1,46 @@
 """A robot type's manifest, ``robots/<type>/robot.toml``: read by agents (limits, model) and the cloud (catalogue)."""
 
+import math
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any, Literal
 
 import msgspec
-from msgspec import Struct
+from msgspec import Meta, Struct
 
 from device_agent.protocol.errors import ProtocolError
 from device_agent.protocol.messages import Id, Joint, Label, Stream, Text
 
 MANIFEST = "robot.toml"
 MOVEMENTS = "movements"
+
+
+class Diagnostic(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """How some measurements of a robot type are to be judged. Values in the measurement's own unit.
+
+    Attributes:
+        stream: The stream that carries them.
+        fields: Their names; ``*`` stands for any text: ``temperature_c.*``.
+        label: What is measured, for people; ``unit``: of the values.
+        advice: What to do when something is wrong.
+        low: Below this something breaks; ``high``: above.
+        warning_low: Below this somebody should look; ``warning_high``: above.
+        change: A lasting shift that is worth a word; without it half of the room to the limits.
+        horizon_s: How long before a limit a trend towards it is told [s].
+        questions: What to look for.
+    """
+
+    stream: Id = "health"
+    fields: Annotated[str, Meta(min_length=1, max_length=200)]
+    label: Label
+    unit: Annotated[str, Meta(max_length=20)] = ""
+    advice: Annotated[str, Meta(max_length=500)] = ""
+    low: float | None = None
+    high: float | None = None
+    warning_low: float | None = None
+    warning_high: float | None = None
+    change: Annotated[float, Meta(gt=0)] | None = None
+    horizon_s: Annotated[float, Meta(ge=60, le=86_400)] = 2_700.0
+    questions: tuple[Literal["level", "trend", "change", "outlier"], ...] = ("level", "trend", "change", "outlier")
 
 
 class RobotType(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -27,6 +57,7 @@ class RobotType(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
         frames: Names of sites or bodies of the model whose pose telemetry carries.
         home_rad: Joint name → position [rad] at start.
         braking_rad_s2: Deceleration for a hold or a Stop [rad/s²], every joint; above ``max_acceleration_rad_s2``.
+        diagnostics: How its measurements are to be judged; the first that fits a field counts.
         streaming_speed: Share of each joint's velocity limit that streamed setpoints may use, 0…1.
     """
 
@@ -46,6 +77,7 @@ class RobotType(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     streaming_speed: float = 0.35
     capabilities: tuple[Label, ...] = ()
     streams: tuple[Stream, ...] = ()
+    diagnostics: Annotated[tuple[Diagnostic, ...], Meta(max_length=100)] = ()
 
 
 def load(folder: Path) -> RobotType:
@@ -85,4 +117,9 @@ def parse(text: str) -> RobotType:
     for joint in robot_type.joints:
         if not joint.lower_rad <= robot_type.home_rad[joint.name] <= joint.upper_rad:
             raise ProtocolError(f"home_rad of '{joint.name}' is outside its range")
+    for diagnostic in robot_type.diagnostics:
+        given = (diagnostic.low, diagnostic.warning_low, diagnostic.warning_high, diagnostic.high)
+        limits = [limit for limit in given if limit is not None]
+        if not all(math.isfinite(limit) for limit in limits) or limits != sorted(limits):
+            raise ProtocolError(f"diagnostics of '{diagnostic.fields}': low, warning_low, warning_high, high must rise")
     return robot_type
