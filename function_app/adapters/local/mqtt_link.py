@@ -2,6 +2,9 @@
 
 A message goes out, and comes in, on the loop's own thread: no hand-over between threads lies in a command's way. A
 connection lives as long as its credentials; then, or when it breaks, a new client with new ones takes over.
+
+Some hosts let the loop turn during a call only, and freeze the process between two. A connection from before the frost
+may be dead without a sign: it has to prove itself with the first message, which goes out again over a new one if not.
 """
 
 import asyncio
@@ -28,6 +31,12 @@ READY_TIMEOUT_S = 2.0
 FIRST_RETRY_S = 0.1
 LAST_RETRY_S = 5.0
 RENEW_BEFORE_S = 30.0
+FROST_S = 3.0
+"""So long without a turn of the loop, which has one each second at least, and the process was frozen."""
+DEAD_S = 1.5 * KEEP_ALIVE_S
+"""So long without a word from us, and the broker has let go of the connection (MQTT, 3.1.2.10)."""
+PROOF_TIMEOUT_S = 1.0
+"""A connection that was frozen has this long to confirm a message."""
 MAX_FILTERS = 8
 """Filters in one SUBSCRIBE (facts: AWS IoT Core takes eight)."""
 
@@ -66,6 +75,8 @@ class MqttLink:
         self._waiting: dict[int, asyncio.Future[None]] = {}
         self._subscribed: dict[int, asyncio.Future[None]] = {}
         self._trouble = "not connected yet"
+        self._turn_at = self._clocks()
+        self._unproven = False
         self.generation = 0
         """Number of the present connection: a message can only be confirmed on the one it came by."""
 
@@ -82,6 +93,7 @@ class MqttLink:
     async def ready(self, timeout_s: float) -> bool:
         """Wait until connected and subscribed."""
         self.start()
+        self._notice_frost()
         if self._ready.is_set():
             return True
         try:
@@ -94,16 +106,33 @@ class MqttLink:
     async def tried(self, timeout_s: float) -> None:
         """Wait until it is known whether the broker can be reached, but no longer than the first try takes."""
         self.start()
+        self._notice_frost()
         with contextlib.suppress(TimeoutError):
             async with asyncio.timeout(timeout_s):
                 await self._tried.wait()
 
     async def publish(self, topic: str, payload: bytes, qos: int, *, retain: bool = False) -> None:
-        """Send, and for QoS 1 wait for the broker's word.
+        """Send, and for QoS 1 wait for the broker's word. After a frost it may be sent twice.
 
         Raises:
             BusUnavailable: Not connected, or not confirmed in time.
         """
+        self._notice_frost()
+        generation = self.generation
+        if self._unproven:
+            if qos == 0:  # which nobody confirms
+                self._abandon(generation, "it was frozen")
+            else:
+                try:
+                    await self._publish(topic, payload, qos, retain=retain, timeout_s=PROOF_TIMEOUT_S)
+                except BusUnavailable as error:
+                    self._abandon(generation, str(error))
+                else:
+                    self._unproven = False
+                    return
+        await self._publish(topic, payload, qos, retain=retain, timeout_s=CONFIRM_TIMEOUT_S)
+
+    async def _publish(self, topic: str, payload: bytes, qos: int, *, retain: bool, timeout_s: float) -> None:
         if not self._ready.is_set() and not await self.ready(READY_TIMEOUT_S):
             raise BusUnavailable(f"the broker at {self._host}:{self._port} cannot be reached: {self._trouble}")
         client = self._client
@@ -118,10 +147,10 @@ class MqttLink:
         confirmed: asyncio.Future[None] = asyncio.get_running_loop().create_future()
         self._waiting[information.mid] = confirmed
         try:
-            async with asyncio.timeout(CONFIRM_TIMEOUT_S):
+            async with asyncio.timeout(timeout_s):
                 await confirmed
         except TimeoutError as error:
-            detail = f"the broker at {self._host}:{self._port} did not confirm a message in {CONFIRM_TIMEOUT_S:.0f} s"
+            detail = f"the broker at {self._host}:{self._port} did not confirm a message in {timeout_s:.0f} s"
             raise BusUnavailable(detail) from error
         finally:
             self._waiting.pop(information.mid, None)
@@ -179,6 +208,7 @@ class MqttLink:
                     self._client = client
                     self.generation += 1
                     await self._subscribe(client)
+                    self._turn_at, self._unproven = self._clocks(), False
                     self._ready.set()
                     self._tried.set()
                     return client
@@ -275,6 +305,7 @@ class MqttLink:
     async def _stay(self, client: mqtt.Client, expires_at: float) -> None:
         """Keep the connection alive until it breaks or its credentials are about to end."""
         while not self._lost.is_set():
+            self._notice_frost()
             client.loop_misc()
             self._flush(client)
             if time.time() > expires_at - RENEW_BEFORE_S:
@@ -283,6 +314,27 @@ class MqttLink:
                 async with asyncio.timeout(1.0):
                     await self._lost.wait()
         raise BusUnavailable(self._trouble)
+
+    def _notice_frost(self) -> None:
+        """Called whenever the loop turns. Both clocks, since some hosts stop the monotonic one too."""
+        now = self._clocks()
+        still_s = max(new - old for new, old in zip(now, self._turn_at, strict=True))
+        self._turn_at = now
+        if still_s > FROST_S and self._ready.is_set():
+            self._unproven = True
+            if still_s > DEAD_S:
+                self._abandon(self.generation, "the process was frozen too long")
+
+    def _abandon(self, generation: int, reason: str) -> None:
+        """Have another connection made, unless that has happened since this one."""
+        if generation == self.generation and self._ready.is_set():
+            self._trouble = f"the connection was given up: {reason}"
+            self._ready.clear()
+            self._lost.set()
+
+    @staticmethod
+    def _clocks() -> tuple[float, float]:
+        return time.monotonic(), time.time()
 
     def _let_go(self, client: mqtt.Client | None) -> None:
         self._ready.clear()

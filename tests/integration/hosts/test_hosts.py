@@ -1,52 +1,21 @@
 """The same functions under each host: requests, the timer, and what devices say."""
 
-import asyncio
 import json
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
 
 import httpx
 import pytest
 
 from device_agent.protocol import codec, topics
 from device_agent.protocol.messages import Presence
-from function_app import bootstrap, settings
 from function_app.entrypoints.http.answers import MAX_BODY
 from function_app.entrypoints.http.caller import CLIENT_HEADER
 from tests.support.brokers import wait_until
-from tests.support.cloud import API, MOVE, MovingClock, Robot, problem
-from tests.support.hosts import HOSTS, Host, HostFailed, HostKind, start_host
+from tests.support.cloud import API, MOVE, problem
+from tests.support.hosts import HOSTS, HostFailed, HostKind, start_host
 from tests.support.hosts.host import PATIENCE_S
-
-
-class Reached:
-    """A host, as the toy robot speaks to the functions."""
-
-    def __init__(self, host: Host, environment: dict[str, str]) -> None:
-        self.host = host
-        self.clock = MovingClock()
-        self._environment = environment
-
-    def ask(self, method: str, path: str, **options: Any) -> httpx.Response:
-        return httpx.request(method, self.host.url + path, timeout=PATIENCE_S, **options)
-
-    def link(self, name: str) -> str:
-        """A one-time sign-in token, made beside the host."""
-
-        async def made() -> str:
-            functions = bootstrap.build(settings.read(self._environment))
-            link = await functions.sign_in.link(await functions.sign_in.account(name))
-            await functions.close()
-            return link
-
-        return asyncio.run(made())
-
-    def sign_in(self, name: str) -> httpx.Client:
-        answer = self.ask("POST", f"{API}/auth/sign-in", json={"link": self.link(name)})
-        assert answer.status_code == 200, answer.text
-        token = {"Authorization": f"Bearer {answer.json()['access_token']}"}
-        return httpx.Client(base_url=self.host.url + API, headers=token, timeout=PATIENCE_S)
+from tests.support.hosts.reached import Reached
 
 
 @pytest.fixture(scope="module", params=HOSTS)
@@ -116,10 +85,8 @@ def test_no_route_and_no_method_are_problems_too(there: Reached) -> None:
 
 
 def test_what_a_device_says_is_taken_in_and_the_timer_ends_what_ran_out(there: Reached) -> None:
-    with there.sign_in("bert") as bert, Robot(there, ("arm",)) as robot:  # type: ignore[arg-type]
-        claimed = bert.post("/agents/claim", json={"code": robot.code()})
-        assert claimed.status_code == 200, claimed.text
-        robot.space = robot.enrollment()["space"]
+    with there.sign_in("bert") as bert, there.robot() as robot:
+        there.pair(bert, robot)
         assert bert.get(f"/devices/{robot.device}").json()["online"] is False
         presence = Presence(online=True, session=1, at_ms=there.clock.now_ms())
         there.host.deliver(topics.conn(robot.space, robot.id), codec.encode(presence))

@@ -1,0 +1,102 @@
+"""TCP between a client and a server, which a test can cut, loudly or without a sign.
+
+with start_proxy(broker.tcp_port) as proxy:
+    connect(proxy.port)
+    proxy.swallow()
+"""
+
+import contextlib
+import selectors
+import socket
+import threading
+from collections.abc import Iterator
+
+HOST = "127.0.0.1"
+
+
+class Proxy:
+    """Passes bytes both ways.
+
+    Attributes:
+        port: Where clients connect.
+        accepted: Number of connections so far.
+    """
+
+    def __init__(self, behind: int) -> None:
+        self.accepted = 0
+        self._behind = behind
+        self._listener = socket.create_server((HOST, 0))
+        self.port: int = self._listener.getsockname()[1]
+        self._selector = selectors.DefaultSelector()
+        self._selector.register(self._listener, selectors.EVENT_READ)
+        self._wake, self._woken = socket.socketpair()
+        self._selector.register(self._woken, selectors.EVENT_READ)
+        self._peers: dict[socket.socket, socket.socket] = {}
+        self._lock = threading.Lock()
+        self._ended = False
+        self._thread = threading.Thread(target=self._run)
+        self._thread.start()
+
+    def swallow(self) -> None:
+        """Nothing comes through on the connections of now, and nobody is told: as when a router forgets them."""
+        with self._lock:
+            for each in self._peers:
+                self._selector.unregister(each)
+            self._forgotten = list(self._peers)
+            self._peers.clear()
+
+    def cut(self) -> None:
+        """Close the connections of now."""
+        with self._lock:
+            for each in self._peers:
+                self._selector.unregister(each)
+                each.close()
+            self._peers.clear()
+
+    def end(self) -> None:
+        self._ended = True
+        self._wake.send(b"x")
+        self._thread.join()
+        self.cut()
+        for each in (*getattr(self, "_forgotten", ()), self._listener, self._wake, self._woken):
+            each.close()
+        self._selector.close()
+
+    def _run(self) -> None:
+        while not self._ended:
+            for key, _ in self._selector.select():
+                with self._lock:
+                    self._turn(key.fileobj)
+
+    def _turn(self, ready: object) -> None:
+        if ready is self._listener:
+            client, _ = self._listener.accept()
+            server = socket.create_connection((HOST, self._behind))
+            self.accepted += 1
+            for one, other in ((client, server), (server, client)):
+                one.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+                self._peers[one] = other
+                self._selector.register(one, selectors.EVENT_READ)
+        elif isinstance(ready, socket.socket) and ready in self._peers:
+            other = self._peers[ready]
+            content = b""
+            with contextlib.suppress(OSError):
+                content = ready.recv(65_536)
+            if content:
+                with contextlib.suppress(OSError):
+                    other.sendall(content)
+                return
+            for each in (ready, other):
+                self._selector.unregister(each)
+                del self._peers[each]
+                each.close()
+
+
+@contextlib.contextmanager
+def start_proxy(behind: int) -> Iterator[Proxy]:
+    """A proxy before a port of this machine."""
+    proxy = Proxy(behind)
+    try:
+        yield proxy
+    finally:
+        proxy.end()
