@@ -13,7 +13,7 @@ from typing import Any
 
 from function_app.bootstrap import Functions
 from function_app.domain.problems import Problem
-from function_app.entrypoints.ingest import ingest
+from function_app.entrypoints.ingest import ingest, ingest_telemetry, is_telemetry
 from function_app.ports.tables import StoreError
 
 RULE_SQL = "SELECT encode(*, 'base64') AS payload, topic() AS topic, timestamp() AS at_ms FROM 'ts/v1/#'"
@@ -34,6 +34,7 @@ async def from_event_grid(functions: Functions, events: Sequence[Mapping[str, An
         Problem, StoreError: At least one was not stored; all are to be delivered again.
     """
     failed: Problem | StoreError | None = None
+    measured: list[tuple[str, bytes]] = []
     for event in events:
         if event.get("type") != _MQTT:
             _log.warning("an event of type '%s' is no MQTT message", str(event.get("type"))[:_SHOWN])
@@ -42,10 +43,18 @@ async def from_event_grid(functions: Functions, events: Sequence[Mapping[str, An
         if payload is None:
             _log.warning("the event of '%s' has no payload that can be read", str(event.get("subject"))[:_SHOWN])
             continue
+        topic = str(event.get("subject"))
+        if is_telemetry(topic):
+            measured.append((topic, payload))
+            continue
         try:
-            await ingest(functions, str(event.get("subject")), payload)
+            await ingest(functions, topic, payload)
         except (Problem, StoreError) as error:
             failed = error
+    try:
+        await ingest_telemetry(functions, measured)
+    except (Problem, StoreError) as error:
+        failed = error
     if failed is not None:
         raise failed
 
@@ -56,11 +65,9 @@ async def from_iot_rule(functions: Functions, event: Mapping[str, Any]) -> None:
     Raises:
         Problem, StoreError: Not stored; to be delivered again.
     """
-    topic, payload = event.get("topic"), _base64(event.get("payload"))
-    if not isinstance(topic, str) or payload is None:
-        _log.warning("an event with the fields %s is not what the rule gives", str(sorted(event))[:_SHOWN])
-        return
-    await ingest(functions, topic, payload)
+    message = _rule_message(event)
+    if message is not None:
+        await ingest(functions, *message)
 
 
 async def from_queue(functions: Functions, event: Mapping[str, Any]) -> dict[str, list[dict[str, str]]]:
@@ -69,14 +76,34 @@ async def from_queue(functions: Functions, event: Mapping[str, Any]) -> dict[str
     Returns:
         The records that were not stored, in the form by which Lambda leaves only those in the queue.
     """
-    failures = []
+    failed: list[str] = []
+    measured: dict[str, tuple[str, bytes]] = {}
     for record in event.get("Records", ()):
+        message = _rule_message(_body(record))
+        if message is None:
+            continue
+        if is_telemetry(message[0]):
+            measured[str(record["messageId"])] = message
+            continue
         try:
-            await from_iot_rule(functions, _body(record))
+            await ingest(functions, *message)
         except (Problem, StoreError) as error:
             _log.warning("record %s was not stored: %s", record.get("messageId"), error)
-            failures.append({"itemIdentifier": str(record["messageId"])})
-    return {"batchItemFailures": failures}
+            failed.append(str(record["messageId"]))
+    try:
+        await ingest_telemetry(functions, list(measured.values()))
+    except (Problem, StoreError) as error:
+        _log.warning("%d records of telemetry were not stored: %s", len(measured), error)
+        failed += measured
+    return {"batchItemFailures": [{"itemIdentifier": record} for record in failed]}
+
+
+def _rule_message(event: Mapping[str, Any]) -> tuple[str, bytes] | None:
+    topic, payload = event.get("topic"), _base64(event.get("payload"))
+    if not isinstance(topic, str) or payload is None:
+        _log.warning("an event with the fields %s is not what the rule gives", str(sorted(event))[:_SHOWN])
+        return None
+    return topic, payload
 
 
 def _cloud_event_payload(event: Mapping[str, Any]) -> bytes | None:

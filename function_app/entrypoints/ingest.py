@@ -42,6 +42,11 @@ async def take_in(functions: Functions, topic: Topic, payload: bytes, *, by: Tra
         await functions.presence.ingest(topic, payload, by=by)
 
 
+def is_telemetry(topic: str) -> bool:
+    """Whether it looks like a measurement's: those are better taken in together."""
+    return f"/{topics.TELE}/" in topic
+
+
 async def ingest_telemetry(functions: Functions, messages: Sequence[tuple[str, bytes]]) -> None:
     """Store many measurements at once, which costs much less than one by one. Safe to repeat.
 
@@ -57,4 +62,5 @@ async def ingest_telemetry(functions: Functions, messages: Sequence[tuple[str, b
             continue
         if parsed.kind == topics.TELE:
             arrived.append(Arrived(parsed, payload))
-    await functions.intake.take(arrived)
+    if arrived:
+        await functions.intake.take(arrived)

@@ -9,8 +9,8 @@ from typing import Any
 
 import pytest
 
-from device_agent.protocol import codec
-from device_agent.protocol.messages import Mode, State
+from device_agent.protocol import codec, topics
+from device_agent.protocol.messages import Measurements, Mode, State
 from function_app.entrypoints import events
 from function_app.ports.tables import Row, StoreError
 from function_app.services.presence import PresenceIngest
@@ -140,3 +140,58 @@ class TestQueue:
         bodies = ["{", json.dumps(rule_event(robot.topic("state"), state(1))), json.dumps({"topic": "x"})]
         answer = cloud.run(events.from_queue(without_store(cloud), queued(*bodies)))
         assert answer == {"batchItemFailures": [{"itemIdentifier": "m1"}]}
+
+
+class TestTelemetry:
+    @pytest.fixture
+    def batches(self, cloud: Cloud, monkeypatch: pytest.MonkeyPatch) -> list[int]:
+        """How many samples each write into a series had."""
+        writer, sizes = cloud.functions.intake._writer, list[int]()
+        add = writer.add
+
+        async def counted(place: Any, samples: Any) -> Any:
+            sizes.append(len(samples))
+            return await add(place, samples)
+
+        monkeypatch.setattr(writer, "add", counted)
+        return sizes
+
+    @staticmethod
+    def measured(cloud: Cloud, robot: Robot) -> list[tuple[str, bytes]]:
+        """Twenty measurements and one that is none."""
+        topic = topics.device(robot.space, robot.id, "arm", topics.TELE, "health")
+        now_ms = cloud.clock.now_ms()
+        bodies = [
+            codec.encode(Measurements(tick_ms=1, at_ms=now_ms - 10 * n, sequence=n, values={"a": 1.0}))
+            for n in range(20)
+        ]
+        return [(topic, body) for body in (*bodies, b"{")]
+
+    def test_event_grids_measurements_are_taken_in_together(
+        self, cloud: Cloud, robot: Robot, batches: list[int]
+    ) -> None:
+        cloud.run(events.from_event_grid(cloud.functions, [cloud_event(*each) for each in self.measured(cloud, robot)]))
+        assert batches == [20]
+
+    def test_a_queues_measurements_are_taken_in_together(self, cloud: Cloud, robot: Robot, batches: list[int]) -> None:
+        bodies = [json.dumps(rule_event(*each)) for each in self.measured(cloud, robot)]
+        for _ in range(2):
+            assert cloud.run(events.from_queue(cloud.functions, queued(*bodies))) == {"batchItemFailures": []}
+        assert batches == [20, 20]
+        (stream,) = cloud.sign_in("anna").get(f"/devices/{robot.device}/data").json()["items"]
+        assert stream["samples"] == 20
+
+    def test_what_was_not_stored_is_delivered_again(
+        self, cloud: Cloud, robot: Robot, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        async def away(*_: Any) -> None:
+            raise StoreError("the store is away")
+
+        messages = self.measured(cloud, robot)
+        monkeypatch.setattr(cloud.functions.tables, "create", away)
+        with pytest.raises(StoreError):
+            cloud.run(events.from_event_grid(cloud.functions, [cloud_event(*each) for each in messages]))
+        answer = cloud.run(
+            events.from_queue(cloud.functions, queued(*(json.dumps(rule_event(*each)) for each in messages)))
+        )
+        assert len(answer["batchItemFailures"]) == len(messages)
