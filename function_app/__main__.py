@@ -39,7 +39,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
             asyncio.run(_check(functions))
             serve(functions)
         elif options.command == "work":
-            asyncio.run(_work(functions))
+            asyncio.run(work(functions))
         else:
             asyncio.run(_link(functions, options.account))
     except PortTaken as taken:
@@ -54,18 +54,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 async def _check(functions: Functions) -> None:
-    """Say at once what is wrong with the tables, not at the first request.
-
-    Raises:
-        StoreError: They cannot be used.
-    """
-    await functions.tables.get("Accounts", "health", "health")
+    """Say at once what is wrong with the tables, not at the first request."""
+    await functions.health.require_tables()
     await functions.tables.close()
-
-
-async def _work(functions: Functions) -> None:
-    await _check(functions)
-    await work(functions)
 
 
 async def _link(functions: Functions, account: str) -> None:

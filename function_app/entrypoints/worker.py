@@ -13,7 +13,16 @@ _log = logging.getLogger(__name__)
 
 
 async def work(functions: Functions) -> None:
-    """Run until SIGINT or SIGTERM."""
+    """Run until SIGINT or SIGTERM.
+
+    Raises:
+        StoreError: The tables cannot be used, at the start.
+    """
+    ending = asyncio.Event()
+    loop = asyncio.get_running_loop()
+    for number in (signal.SIGINT, signal.SIGTERM):
+        loop.add_signal_handler(number, ending.set)
+    await functions.health.require_tables()
 
     async def handle(topic: str, payload: bytes) -> None:
         await ingest(functions, topic, payload)
@@ -26,10 +35,6 @@ async def work(functions: Functions) -> None:
         asyncio.create_task(functions.telemetry.run(handle_telemetry)),
         asyncio.create_task(_sweep(functions)),
     ]
-    ending = asyncio.Event()
-    loop = asyncio.get_running_loop()
-    for number in (signal.SIGINT, signal.SIGTERM):
-        loop.add_signal_handler(number, ending.set)
     waiting = asyncio.create_task(ending.wait())
     done, _ = await asyncio.wait([*tasks, waiting], return_when=asyncio.FIRST_COMPLETED)
     for task in (*tasks, waiting):

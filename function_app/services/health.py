@@ -25,7 +25,15 @@ class CheckHealth:
     async def check(self) -> Health:
         """Read a row, and ask the bus."""
         try:
-            await self._tables.get(store.ACCOUNTS, "health", "health")
+            await self.require_tables()
         except StoreError as error:
             return Health(tables=str(error), broker=await self._bus.status())
         return Health(tables="ok", broker=await self._bus.status())
+
+    async def require_tables(self) -> None:
+        """Read a row.
+
+        Raises:
+            StoreError: The tables cannot be used.
+        """
+        await self._tables.get(store.ACCOUNTS, "health", "health")

@@ -140,8 +140,8 @@ def open_functions(place: Place, *, dies_at: int | None = None, clock: SetClock 
     death = Death(dies_at)
     stores = bootstrap._stores
 
-    def cut(settings: Any) -> Any:
-        tables, blobs = stores(settings)
+    def cut(*given: Any) -> Any:
+        tables, blobs = stores(*given)
         return MortalTables(tables, death), blobs
 
     with (

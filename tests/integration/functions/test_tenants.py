@@ -5,7 +5,9 @@ from typing import Any
 
 import pytest
 
+from device_agent.protocol.messages import Fault, Mode, State
 from function_app.services import store
+from tests.support.brokers import wait_until
 from tests.support.cloud import Cloud, Person, Robot, paired, problem
 
 BODIES: dict[str, Any] = {
@@ -21,6 +23,9 @@ BODIES: dict[str, Any] = {
         "samples": [{"at_ms": 1, "ms": 1}],
     },
     "tell_messages": {"messages": [{"topic": "t", "payload": {}}]},
+    "begin_upload": {"stream": "camera", "length": 3, "content_type": "image/png"},
+    "begin_agent_upload": {"device": "arm", "stream": "camera", "length": 3, "content_type": "image/png"},
+    "complete_agent_upload": {"device": "arm"},
 }
 TABLES = [name for key, name in vars(store).items() if key.isupper() and isinstance(name, str)]
 
@@ -38,25 +43,36 @@ def strangers(cloud: Cloud) -> Any:
         epoch = anna.take(robot.device, lease_ms=600_000).json()["epoch"]
         action = anna.start(robot.device, epoch=epoch, wait_ms=10_000).json()["id"]
         anna.put("/robot-types/ur5/movements/secret", {"source": "'anna'"})
+        hot = Fault(code="hot", message="Too hot.", since_ms=1)
+        state = State(device="arm", at_ms=1, tick_ms=1, mode=Mode.FAULT, epoch=epoch, faults=(hot,))
+        robot.say_state(state)
+        wait_until(lambda: anna.get(f"/devices/{robot.device}/faults").json()["items"], "the fault")
         yield anna, robot, action, bert, other
 
 
 def test_every_route_with_the_others_ids_finds_nothing_and_changes_nothing(
     cloud: Cloud, strangers: tuple[Person, Robot, str, Person, Robot]
 ) -> None:
-    _, robot, action, bert, other = strangers
+    anna, robot, action, bert, other = strangers
+    capture = {"stream": "camera", "length": 3, "content_type": "image/png"}
+    upload = anna.post(f"/devices/{robot.device}/uploads", capture).json()["id"]
+    fault = anna.get(f"/devices/{robot.device}/faults").json()["items"][0]["id"]
     ids = {
         "device": robot.device,
         "agent": robot.id,
         "action": action,
         "robot_type": "ur5",
         "name": "secret",
+        "space": robot.space,
+        "stream": "joints",
+        "fault": fault,
+        "upload": upload,
     }
     told = len(robot.commands)
     before = everything(cloud)
     asked = set()
     for path, operations in cloud.app.openapi()["paths"].items():
-        if not set(re.findall(r"{(\w+)}", path)) & {"device", "agent", "action", "name"}:
+        if not set(re.findall(r"{(\w+)}", path)) & {"device", "agent", "action", "name", "space"}:
             continue
         for method, operation in operations.items():
             name = operation["operationId"]
