@@ -40,6 +40,7 @@ from function_app.services.identity import Identify
 from function_app.services.intake import Intake
 from function_app.services.latency import Latencies
 from function_app.services.lease import Leases
+from function_app.services.leave import Leave
 from function_app.services.mailbox import Mailbox
 from function_app.services.movements import Movements
 from function_app.services.mqtt_credentials import MqttCredentials
@@ -180,6 +181,17 @@ def build(settings: Settings, *, clock: Clock | None = None) -> Functions:
     sending = SendAction(tables=tables, rows=rows, commands=commands, movements=movements, clock=now)
     queues = Queues(tables=tables, devices=devices, rows=rows, pending=pending, sending=sending, clock=now)
     acks = ActionAcks(rows=rows, queues=queues, mailbox=mailbox, clock=now)
+    leave = Leave(
+        tables=tables,
+        rows=rows,
+        queues=queues,
+        pending=pending,
+        commands=commands,
+        access=access,
+        bus=bus,
+        series=writer,
+        clock=now,
+    )
     start_action = StartAction(
         tables=tables,
         devices=devices,
@@ -204,9 +216,9 @@ def build(settings: Settings, *, clock: Clock | None = None) -> Functions:
         clock=now,
         identify=identify,
         sign_in=sign_in,
-        enroll=Enroll(tables=tables, clock=now),
-        claim=Claim(tables=tables, sign_in=sign_in, forget=forget, clock=now),
-        unpair=Unpair(tables=tables, commands=commands, access=access, series=writer),
+        enroll=Enroll(tables=tables, leave=leave, clock=now),
+        claim=Claim(tables=tables, sign_in=sign_in, forget=forget, leave=leave, clock=now),
+        unpair=Unpair(tables=tables, sign_in=sign_in, leave=leave),
         devices=devices,
         leases=Leases(tables=tables, devices=devices, commands=commands, access=access, clock=now),
         robot_types=robot_types,
@@ -240,6 +252,7 @@ def build(settings: Settings, *, clock: Clock | None = None) -> Functions:
             commands=commands,
             sending=sending,
             queues=queues,
+            leave=leave,
             access=access,
             forget=forget,
             conditions=conditions,

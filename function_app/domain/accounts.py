@@ -23,10 +23,11 @@ class Identity:
 
 @dataclass(frozen=True, slots=True)
 class Space:
-    """A room: a place for agents and devices. Belongs to one account."""
+    """A room: a place for agents and devices. Belongs to one account, whose first has ``created_ms`` 0."""
 
     id: str
     name: str
+    created_ms: int = 0
 
 
 class Role(StrEnum):

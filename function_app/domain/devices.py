@@ -12,6 +12,9 @@ POLL_SILENT_MS = 45_000
 POLL_MARK_MS = 15_000
 """How often at most it is written down that an agent has polled."""
 
+_MOST_LEAVING = 16
+"""Only a broker that is away for long lets so many come together; the oldest then keep what is retained of them."""
+
 Transport = Literal["mqtt", "http", "xmpp"]
 """How an agent hears what is addressed to it. Not over MQTT: it, or who speaks XMPP for it, fetches it by HTTP."""
 
@@ -27,12 +30,24 @@ class DeviceSpec:
 
 
 @dataclass(frozen=True, slots=True)
+class Leaving:
+    """What was left and is still to be tidied up: whose it was, where, and which devices."""
+
+    why: Literal["unpaired", "moved", "removed"]
+    account: str
+    space: str
+    pairing: str
+    devices: tuple[str, ...]
+
+
+@dataclass(frozen=True, slots=True)
 class Agent:
     """One identity: a key pair that the agent made itself. Waiting until an account claims it.
 
     Attributes:
         pairing: Changes with each claim: what belongs to an earlier owner's pairing is no longer shown.
         claim_code: The code that claims it now; empty when claimed.
+        leaving: What ``services/leave.py`` has to tidy up.
     """
 
     id: str
@@ -48,6 +63,7 @@ class Agent:
     claim_code: str = ""
     claim_expires_ms: int = 0
     transport: Transport = "mqtt"
+    leaving: tuple[Leaving, ...] = ()
 
     @property
     def claimed(self) -> bool:
@@ -91,7 +107,34 @@ def claim(agent: Agent, *, account: str, space: str, pairing: str, now_ms: int) 
 
 def unpair(agent: Agent) -> Agent:
     """The agent, of nobody."""
-    return replace(agent, account=None, space=None, pairing="", claimed_ms=0, claim_code="", claim_expires_ms=0)
+    return replace(
+        _leaves(agent, "unpaired", [spec.name for spec in agent.devices]),
+        account=None,
+        space=None,
+        pairing="",
+        claimed_ms=0,
+        claim_code="",
+        claim_expires_ms=0,
+    )
+
+
+def move(agent: Agent, space: str) -> Agent:
+    """The agent in another space of its account, with all that is known of its devices."""
+    return replace(_leaves(agent, "moved", [spec.name for spec in agent.devices]), space=space)
+
+
+def introduced(agent: Agent, devices: tuple[DeviceSpec, ...]) -> Agent:
+    """The agent with the devices that it says it has now."""
+    names = {spec.name for spec in devices}
+    removed = [spec.name for spec in agent.devices if spec.name not in names]
+    return replace(_leaves(agent, "removed", removed), devices=devices)
+
+
+def _leaves(agent: Agent, why: Literal["unpaired", "moved", "removed"], names: list[str]) -> Agent:
+    if agent.account is None or agent.space is None or not names:
+        return agent
+    leaving = Leaving(why, agent.account, agent.space, agent.pairing, tuple(names))
+    return replace(agent, leaving=(*agent.leaving, leaving)[-_MOST_LEAVING:])
 
 
 @dataclass(frozen=True, slots=True)
@@ -102,12 +145,14 @@ class Link:
         session: Number of the agent's connection; it rises each time.
         seen_ms: When the cloud took notice [ms since 1970, cloud's clock].
         polled: The agent has no connection but asks again and again; nobody says so when it stops.
+        pairing: Of the agent then: what was said under an earlier owner is not shown.
     """
 
     online: bool
     session: int
     seen_ms: int
     polled: bool = False
+    pairing: str = ""
 
 
 def newer_link(known: Link | None, incoming: Link) -> Link | None:
@@ -116,7 +161,7 @@ def newer_link(known: Link | None, incoming: Link) -> Link | None:
     An old connection's will may arrive after the new connection's "online": the lower session number gives it away.
     Within one session "offline" is final.
     """
-    if known is None or incoming.session > known.session:
+    if known is None or incoming.session > known.session or incoming.pairing != known.pairing:
         return incoming
     if incoming.session < known.session or (incoming.online and not known.online):
         return None
@@ -125,10 +170,11 @@ def newer_link(known: Link | None, incoming: Link) -> Link | None:
 
 @dataclass(frozen=True, slots=True)
 class LastState:
-    """The newest ``state`` message of a device, as it came."""
+    """The newest ``state`` message of a device, as it came, and the agent's pairing then."""
 
     state: dict[str, Any]
     seen_ms: int
+    pairing: str = ""
 
 
 def online(link: Link | None, last_seen_ms: int, now_ms: int) -> bool:
@@ -138,12 +184,12 @@ def online(link: Link | None, last_seen_ms: int, now_ms: int) -> bool:
     return now_ms - last_seen_ms <= (POLL_SILENT_MS if link.polled else SILENT_MS)
 
 
-def polled(known: Link | None, now_ms: int) -> Link | None:
+def polled(known: Link | None, now_ms: int, pairing: str) -> Link | None:
     """What to store when an agent has polled, or ``None`` when that was noted a moment ago.
 
     Asking is better evidence than any earlier word of "offline".
     """
-    fresh = known is not None and now_ms - known.seen_ms < POLL_MARK_MS
+    fresh = known is not None and now_ms - known.seen_ms < POLL_MARK_MS and known.pairing == pairing
     if known is not None and known.online and known.polled and fresh:
         return None
-    return Link(online=True, session=known.session if known else 0, seen_ms=now_ms, polled=True)
+    return Link(online=True, session=known.session if known else 0, seen_ms=now_ms, polled=True, pairing=pairing)

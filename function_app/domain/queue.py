@@ -16,6 +16,7 @@ FAILED_BEFORE = "earlier-failed"
 STOPPED = "stopped"
 UNPAIRED = "unpaired"
 MOVED = "moved"
+REMOVED = "removed"
 DROPPED: Final = {
     FAILED_BEFORE: (
         Status.CANCELLED,
@@ -27,6 +28,7 @@ DROPPED: Final = {
     ),
     UNPAIRED: (Status.FAILED, "The device was un-paired before it ended."),
     MOVED: (Status.FAILED, "The device's agent was moved to another space before it ended. Start it again."),
+    REMOVED: (Status.FAILED, "Its agent no longer has this device."),
 }
 """Why a waiting action ends without its turn: code → its end and what people read."""
 

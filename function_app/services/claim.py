@@ -12,6 +12,7 @@ from function_app.ports.clock import Clock
 from function_app.ports.tables import Conflict, Row, Tables
 from function_app.services import store
 from function_app.services.forget import Forget
+from function_app.services.leave import Leave
 from function_app.services.sign_in import SignIn
 
 WRONG_TRIES = 5
@@ -25,12 +26,18 @@ class _Tries:
     expires_ms: int
 
 
+@dataclass(frozen=True, slots=True)
+class _Member:
+    pairing: str = ""
+
+
 class Claim:
     """Pairing by claim code. What decides is one ETag write on the agent's row."""
 
-    def __init__(self, *, tables: Tables, sign_in: SignIn, forget: Forget, clock: Clock) -> None:
+    def __init__(self, *, tables: Tables, sign_in: SignIn, forget: Forget, leave: Leave, clock: Clock) -> None:
         self._tables = tables
         self._forget = forget
+        self._leave = leave
         self._sign_in = sign_in
         self._clock = clock
 
@@ -63,24 +70,26 @@ class Claim:
         found = await self._tables.get(store.CLAIMS, code[0], code)
         if found is None:
             return None
-        row = await self._tables.get(store.AGENTS, found.data["agent"], "agent")
+        claimed = await store.retry(lambda: self._take(who, code, found.data["agent"], space))
+        if claimed is not None:
+            with contextlib.suppress(Conflict):
+                await self._tables.delete(store.CLAIMS, found)
+        return claimed
+
+    async def _take(self, who: Identity, code: str, agent_id: str, space: str) -> Agent | None:
+        row = await self._tables.get(store.AGENTS, agent_id, "agent")
         if row is None:
             return None
         agent = store.read(row, Agent)
         now_ms = self._clock.now_ms()
         if agent.claimed or agent.claim_code != code or now_ms >= agent.claim_expires_ms:
             return None
+        await self._leave.settle(agent)
         claimed = devices.claim(agent, account=who.account, space=space, pairing=new_id(), now_ms=now_ms)
         # The index first: without the agent's row behind it it shows nothing, so a stop in between leaves no harm.
-        index = Row(who.account, f"agent:{agent.id}", {})
-        with contextlib.suppress(Conflict):
-            await self._tables.create(store.MEMBERS, index)
-        try:
-            await self._tables.replace(store.AGENTS, Row(agent.id, "agent", store.fields(claimed), row.etag))
-        except Conflict:
-            return None
-        with contextlib.suppress(Conflict):
-            await self._tables.delete(store.CLAIMS, found)
+        member = _Member(claimed.pairing)
+        await store.upsert(self._tables, store.MEMBERS, who.account, f"agent:{agent.id}", lambda _: member, _Member)
+        await self._tables.replace(store.AGENTS, Row(agent.id, "agent", store.fields(claimed), row.etag))
         return claimed
 
     async def _count(self, counters: tuple[str, ...]) -> None:

@@ -19,6 +19,7 @@ class Control:
 
     lease: Lease | None = None
     action: str = ""
+    slot_pairing: str = ""
     queue: Queue = field(default_factory=lambda: Queue(""))
     rows: dict[str, Row] = field(default_factory=dict)
 
@@ -49,14 +50,26 @@ async def read_control(tables: Tables, device: Device) -> Control:
     slot = rows.get(SLOT)
     action = slot.data["action"] if slot and slot.data["pairing"] == device.pairing else ""
     queue = _queue(rows)
-    return Control(lease, action, queue if queue.pairing == device.pairing else Queue(device.pairing), rows)
+    return Control(
+        lease=lease,
+        action=action,
+        slot_pairing=device.pairing,
+        queue=queue if queue.pairing == device.pairing else Queue(device.pairing),
+        rows=rows,
+    )
 
 
 async def read_control_rows(tables: Tables, device: str) -> Control:
     """Lease, slot and queue, of whatever pairing."""
     rows = await _rows(tables, device)
-    lease = store.read(rows[LEASE], Lease) if LEASE in rows else None
-    return Control(lease, rows[SLOT].data["action"] if SLOT in rows else "", _queue(rows), rows)
+    slot = rows.get(SLOT)
+    return Control(
+        lease=store.read(rows[LEASE], Lease) if LEASE in rows else None,
+        action=slot.data["action"] if slot else "",
+        slot_pairing=slot.data["pairing"] if slot else "",
+        queue=_queue(rows),
+        rows=rows,
+    )
 
 
 async def read_lease(tables: Tables, device: Device) -> Lease | None:

@@ -1,13 +1,13 @@
 """Devices as an account may see them."""
 
 import asyncio
-from dataclasses import dataclass
-from typing import Any
+from dataclasses import dataclass, replace
+from typing import Any, TypeVar
 
 from device_agent.protocol import topics
 from function_app.domain import devices
 from function_app.domain.accounts import Identity, Role
-from function_app.domain.devices import Agent, Device, DeviceSpec, LastState, Link
+from function_app.domain.devices import Agent, Device, DeviceSpec, LastState, Leaving, Link
 from function_app.domain.ids import device_id, split_device
 from function_app.domain.lease import Lease
 from function_app.domain.problems import Problem, forbidden, invalid, not_found
@@ -15,6 +15,8 @@ from function_app.ports.clock import Clock
 from function_app.ports.tables import Row, Tables
 from function_app.services import store
 from function_app.services.control import read_lease
+
+T = TypeVar("T")
 
 
 @dataclass(frozen=True, slots=True)
@@ -75,7 +77,7 @@ class Devices:
         spec = agent.device(parts[1]) if agent else None
         if agent is None or spec is None:
             return None, None
-        return _device(agent, spec), store.read(rows["link"], Link) if "link" in rows else None
+        return _device(agent, spec), _of(agent, rows, "link", Link)
 
     async def view(self, who: Identity, device: str) -> DeviceView:
         """One device with what is known of it now.
@@ -137,13 +139,13 @@ class Devices:
         if agent is None:
             return []
         now_ms = self._clock.now_ms()
-        link = store.read(rows["link"], Link) if "link" in rows else None
+        link = _of(agent, rows, "link", Link)
         views = []
         for spec in agent.devices:
             if only not in (None, spec.name):
                 continue
             device = _device(agent, spec)
-            last = store.read(rows[key], LastState) if (key := f"state:{spec.name}") in rows else None
+            last = _of(agent, rows, f"state:{spec.name}", LastState)
             seen_ms = max(link.seen_ms if link else 0, last.seen_ms if last else 0)
             lease = await read_lease(self._tables, device)
             views.append(
@@ -195,6 +197,20 @@ def require_online(link: Link | None, now_ms: int) -> None:
 def devices_of(agent: Agent) -> list[Device]:
     """The devices of a claimed agent, as its owner sees them."""
     return [_device(agent, spec) for spec in agent.devices]
+
+
+def left_devices(agent: Agent, leaving: Leaving) -> list[Device]:
+    """The devices that an agent has left behind, as their owner saw them."""
+    before = replace(agent, account=leaving.account, space=leaving.space, pairing=leaving.pairing)
+    gone = DeviceSpec("", "", "", "")
+    return [_device(before, replace(agent.device(name) or gone, name=name)) for name in leaving.devices]
+
+
+def _of(agent: Agent, rows: dict[str, Row], key: str, kind: type[T]) -> T | None:
+    """What was said under the agent's present pairing."""
+    if key not in rows or rows[key].data.get("pairing", "") not in {"", agent.pairing}:
+        return None
+    return store.read(rows[key], kind)
 
 
 def _agent(rows: dict[str, Row], who: Identity) -> Agent | None:

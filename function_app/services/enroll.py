@@ -3,12 +3,13 @@
 import asyncio
 from dataclasses import dataclass, replace
 
-from function_app.domain.devices import Agent, DeviceSpec, Transport
+from function_app.domain.devices import Agent, DeviceSpec, Transport, introduced
 from function_app.domain.ids import new_claim_code
 from function_app.domain.problems import Problem
 from function_app.ports.clock import Clock
 from function_app.ports.tables import Conflict, Row, Tables, Write
 from function_app.services import store
+from function_app.services.leave import Leave
 
 CLAIM_MS = 300_000
 _LOOK_S = 0.2
@@ -28,14 +29,16 @@ class Enrollment:
 class Enroll:
     """Enrolment of agents."""
 
-    def __init__(self, *, tables: Tables, clock: Clock) -> None:
+    def __init__(self, *, tables: Tables, leave: Leave, clock: Clock) -> None:
         self._tables = tables
+        self._leave = leave
         self._clock = clock
 
     async def enroll(self, agent: str, told: Enrollment) -> Agent:
         """Make or refresh the agent's row; while nobody owns it, with a new claim code.
 
-        The code's row is written first: a code without an agent's row behind it claims nothing.
+        What a device that is no longer named was doing ends. The code's row is written first: a code without an agent's
+        row behind it claims nothing.
 
         Raises:
             Problem: ``agent-id-taken``: another key has the same id (one in 2⁵⁰).
@@ -51,7 +54,10 @@ class Enroll:
                 if record.public_key != told.public_key:
                     detail = "Another agent's key has the same id. Make a new key."
                     raise Problem("agent-id-taken", 409, "The id is taken", detail)
-                record = replace(record, name=told.name, software=told.software, devices=told.devices)
+                before = record.leaving
+                record = replace(introduced(record, told.devices), name=told.name, software=told.software)
+                if record.leaving != before:
+                    await self._leave.watch(agent)
             record = replace(record, transport=told.transport)
             if not record.claimed:
                 expires_ms = now_ms + CLAIM_MS
@@ -61,7 +67,10 @@ class Enroll:
             await self._tables.batch(store.AGENTS, [Write("replace" if row else "create", new)])
             return record
 
-        return await store.retry(once)
+        record = await store.retry(once)
+        if record.claimed and record.leaving:
+            await self._leave.finish(agent)
+        return record
 
     async def wait(self, agent: Agent, wait_ms: int) -> Agent:
         """The agent's row, as soon as somebody has claimed it, or as it is when the time is over."""

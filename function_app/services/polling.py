@@ -56,4 +56,6 @@ class Polling:
         if agent.transport == "mqtt":
             return
         now_ms = self._clock.now_ms()
-        await store.upsert(self._tables, store.AGENTS, agent.id, "link", lambda known: polled(known, now_ms), Link)
+        await store.upsert(
+            self._tables, store.AGENTS, agent.id, "link", lambda known: polled(known, now_ms, agent.pairing), Link
+        )

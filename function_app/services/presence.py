@@ -52,7 +52,7 @@ class PresenceIngest:
         now_ms = self._clock.now_ms()
         if topic.kind == topics.CONN:
             presence = codec.decode(payload, Presence)
-            link = Link(presence.online, presence.session, now_ms, agent.transport != "mqtt")
+            link = Link(presence.online, presence.session, now_ms, agent.transport != "mqtt", agent.pairing)
             if link.online:
                 await self._conditions.connected(agent, link.session)
             await store.upsert(
@@ -61,7 +61,7 @@ class PresenceIngest:
         elif topic.kind == topics.STATE:
             said = codec.decode(payload, State)
             await self._conditions.said(agent, topic.device, said)
-            state = LastState(msgspec.to_builtins(said), now_ms)
+            state = LastState(msgspec.to_builtins(said), now_ms, agent.pairing)
             await store.upsert(
                 self._tables, store.AGENTS, topic.agent, f"state:{topic.device}", lambda _: state, LastState
             )

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 from function_app.domain.accounts import Account, Identity, Space
 from function_app.domain.ids import new_id
-from function_app.domain.problems import unauthorized
+from function_app.domain.problems import Problem, unauthorized
 from function_app.ports.broker_access import BrokerAccess, BrokerAccessError
 from function_app.ports.clock import Clock
 from function_app.ports.tables import Conflict, Row, Tables
@@ -24,6 +24,8 @@ from function_app.services.identity import (
 
 LINK_MS = 24 * 3600 * 1000
 FIRST_SPACE = "Home"
+MOST_SPACES = 100
+"""More or less: two that are made at once may both be the last."""
 
 _log = logging.getLogger(__name__)
 
@@ -72,9 +74,22 @@ class SignIn:
         return account
 
     async def spaces(self, account: str) -> tuple[Space, ...]:
-        """The spaces of an account."""
-        page = await self._tables.query(store.ACCOUNTS, account, first="space:", last="space;")
-        return tuple(store.read(row, Space) for row in page.rows)
+        """The spaces of an account, the oldest first."""
+        page = await self._tables.query(store.ACCOUNTS, account, first="space:", last="space;", limit=1000)
+        return tuple(sorted((store.read(row, Space) for row in page.rows), key=lambda space: space.created_ms))
+
+    async def add_space(self, who: Identity, name: str) -> Space:
+        """A further space.
+
+        Raises:
+            Problem: ``too-many-spaces``.
+        """
+        if len(await self.spaces(who.account)) >= MOST_SPACES:
+            detail = f"An account has at most {MOST_SPACES} spaces. Use one of them."
+            raise Problem("too-many-spaces", 409, "Too many spaces", detail)
+        space = Space(id=new_id(12), name=name, created_ms=self._clock.now_ms())
+        await self._tables.create(store.ACCOUNTS, Row(who.account, f"space:{space.id}", store.fields(space)))
+        return space
 
     async def named(self, account: str) -> str:
         """The name of an account; empty when it is gone."""

@@ -19,6 +19,7 @@ from function_app.services.commands import Commands
 from function_app.services.conditions import Conditions
 from function_app.services.forget import DAY_MS, Forget
 from function_app.services.intake import Intake
+from function_app.services.leave import Leave, leaver_of
 from function_app.services.pending import SHARDS, Pending
 from function_app.services.queue import TIMEOUT, Queues, queue_of
 from function_app.services.send_action import MovementChanged, SendAction
@@ -47,6 +48,7 @@ class Sweep:
         commands: Commands,
         sending: SendAction,
         queues: Queues,
+        leave: Leave,
         access: BrokerAccess,
         forget: Forget,
         conditions: Conditions,
@@ -61,6 +63,7 @@ class Sweep:
         self._commands = commands
         self._sending = sending
         self._queues = queues
+        self._leave = leave
         self._access = access
         self._forget = forget
         self._conditions = conditions
@@ -98,6 +101,8 @@ class Sweep:
     async def _look(self, what: str, note: Row) -> None:
         if device := queue_of(what):
             await self._look_at_queue(device, note)
+        elif agent := leaver_of(what):
+            await self._look_at_leaver(agent, note)
         else:
             await self._look_at_action(what, note)
 
@@ -146,6 +151,14 @@ class Sweep:
             await self._queues.watch(device)
         elif self._clock.now_ms() - int(note.key.partition(":")[0]) <= ORPHAN_MS:
             return  # somebody may be about to put an action into it
+        await self._pending.drop(note)
+
+    async def _look_at_leaver(self, agent: str, note: Row) -> None:
+        """Whoever un-paired or moved it may have been killed, or could not reach the broker."""
+        if not await self._leave.finish(agent):
+            await self._leave.watch(agent)
+        elif self._clock.now_ms() - int(note.key.partition(":")[0]) <= ORPHAN_MS:
+            return  # somebody may be about to write what this is about
         await self._pending.drop(note)
 
     async def _end(self, found: Found, status: Status, code: str, message: str, now_ms: int) -> Action | None:

@@ -1,34 +1,24 @@
 """Giving an agent up: its devices are gone for the account, its rights on the broker are taken back."""
 
-import contextlib
-import logging
+from collections.abc import Callable
 
-from device_agent.protocol.messages import ReleaseLease
 from function_app.domain import devices as rules
 from function_app.domain.accounts import Identity
-from function_app.domain.devices import Agent, Device
-from function_app.domain.lease import Lease
+from function_app.domain.devices import Agent
 from function_app.domain.problems import not_found
-from function_app.ports.broker_access import BrokerAccess, BrokerAccessError
-from function_app.ports.command_bus import BusUnavailable
-from function_app.ports.tables import Conflict, Row, Tables
+from function_app.ports.tables import Row, Tables
 from function_app.services import store
-from function_app.services.commands import Commands
-from function_app.services.control import read_control
-from function_app.services.devices import devices_of
-from function_app.services.series import SeriesWriter
-
-_log = logging.getLogger(__name__)
+from function_app.services.leave import Leave
+from function_app.services.sign_in import SignIn
 
 
 class Unpair:
-    """Ends a pairing."""
+    """Ends a pairing, or takes it to another space."""
 
-    def __init__(self, *, tables: Tables, commands: Commands, access: BrokerAccess, series: SeriesWriter) -> None:
+    def __init__(self, *, tables: Tables, sign_in: SignIn, leave: Leave) -> None:
         self._tables = tables
-        self._commands = commands
-        self._access = access
-        self._series = series
+        self._sign_in = sign_in
+        self._leave = leave
 
     async def unpair(self, who: Identity, agent_id: str) -> None:
         """End the pairing. The write on the agent's row decides; all that follows only tidies up.
@@ -39,45 +29,41 @@ class Unpair:
         Raises:
             Problem: ``agent-unknown``, ``busy``.
         """
+        await self._change(who, agent_id, rules.unpair)
+
+    async def move(self, who: Identity, agent_id: str, space: str) -> Agent:
+        """Take an agent to another space of its account. What is known of its devices stays; what they do ends.
+
+        Raises:
+            Problem: ``agent-unknown``, ``space-unknown``, ``busy``.
+        """
+        own = {known.id for known in await self._sign_in.spaces(who.account)}
+
+        def moved(agent: Agent) -> Agent:
+            if space not in own:
+                raise not_found("space", space)
+            return agent if agent.space == space else rules.move(agent, space)
+
+        return await self._change(who, agent_id, moved)
+
+    async def _change(self, who: Identity, agent_id: str, change: Callable[[Agent], Agent]) -> Agent:
+        watched = False
 
         async def once() -> Agent:
+            nonlocal watched
             row = await self._tables.get(store.AGENTS, agent_id, "agent")
             agent = store.read(row, Agent) if row else None
             if row is None or agent is None or agent.account != who.account:
                 raise not_found("agent", agent_id)
-            gone = store.fields(rules.unpair(agent))
-            await self._tables.replace(store.AGENTS, Row(agent_id, "agent", gone, row.etag))
-            return agent
+            changed = change(agent)
+            if changed is not agent:
+                if not watched:
+                    await self._leave.watch(agent_id)
+                    watched = True
+                await self._tables.replace(store.AGENTS, Row(agent_id, "agent", store.fields(changed), row.etag))
+            return changed
 
-        agent = await store.retry(once)
-        for device in devices_of(agent):
-            await self._fence(device, who)
-            await self._series.forget(device.id, device.pairing)
-        await self._forget(who, agent)
-        try:
-            await self._access.revoke(principal=f"agent:{agent.id}")
-        except BrokerAccessError as error:
-            _log.warning("un-pairing of %s: %s", agent.id, error)
-
-    async def _fence(self, device: Device, who: Identity) -> None:
-        """Raise the epoch, so that the former holder's setpoints are old, and bring the device to a hold."""
-
-        async def once() -> Lease:
-            control = await read_control(self._tables, device)
-            lease = Lease(epoch=(control.lease.epoch if control.lease else 0) + 1)
-            await self._tables.batch(store.CONTROL, [control.write_lease(device.id, lease)])
-            return lease
-
-        lease = await store.retry(once)
-        try:
-            await self._commands.send(device, ReleaseLease(), who=who.name, epoch=lease.epoch)
-        except BusUnavailable as error:
-            _log.warning("un-pairing of %s: %s", device.id, error)
-
-    async def _forget(self, who: Identity, agent: Agent) -> None:
-        rows = [await self._tables.get(store.MEMBERS, who.account, f"agent:{agent.id}")]
-        page = await self._tables.query(store.AGENTS, agent.id, first="link", limit=1000)
-        for table, row in ((store.MEMBERS, rows[0]), *((store.AGENTS, row) for row in page.rows)):
-            if row is not None:
-                with contextlib.suppress(Conflict):
-                    await self._tables.delete(table, row)
+        changed = await store.retry(once)
+        if changed.leaving:
+            await self._leave.finish(agent_id)
+        return changed

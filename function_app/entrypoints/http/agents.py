@@ -72,16 +72,10 @@ def router(functions: Functions, caller: Caller) -> Routes:
             agent=agent.id,
             state="claimed" if agent.claimed else "waiting",
             space=agent.space,
-            account=await _account(agent),
+            account=await _account(functions, agent),
             keys=tuple(contract.KeyOut(id=name, public=signing.public_text(key)) for name, key in keys.items()),
         )
         return answer(body)
-
-    async def _account(agent: Agent) -> AccountRef | None:
-        if agent.account is None:
-            return None
-        found = await functions.sign_in.named(agent.account)
-        return AccountRef(id=agent.account, name=found)
 
     @routes.add(
         "POST",
@@ -110,19 +104,22 @@ def router(functions: Functions, caller: Caller) -> Routes:
         """Agents that the account has claimed."""
         who = await caller.account(request)
         agents, following = await functions.devices.agents(who, cursor=cursor, limit=limit)
-        items = tuple(
-            contract.AgentOut(
-                id=agent.id,
-                name=agent.name,
-                software=agent.software,
-                space=agent.space or "",
-                devices=tuple(spec.name for spec in agent.devices),
-                transport=agent.transport,
-                claimed_at=rfc3339(agent.claimed_ms),
-            )
-            for agent in agents
-        )
+        items = tuple(_shown(agent) for agent in agents)
         return answer(contract.AgentList(items=items, cursor=following))
+
+    @routes.add(
+        "PUT",
+        "/agents/{agent}/space",
+        summary="Move an agent to another space",
+        body=contract.MoveRequest,
+        answers={200: contract.AgentOut},
+        problems=(404,),
+    )
+    async def move_agent(request: Request, agent: str) -> Response:
+        """Its history stays; what its devices do ends, control is lost, and its broker connection is cut."""
+        who = await caller.account(request)
+        asked: contract.MoveRequest = await read(request, contract.MoveRequest)
+        return answer(_shown(await functions.unpair.move(who, agent, asked.space)))
 
     @routes.add("DELETE", "/agents/{agent}", summary="Un-pair an agent", answers={204: None}, problems=(404,))
     async def unpair_agent(request: Request, agent: str) -> Response:
@@ -131,3 +128,21 @@ def router(functions: Functions, caller: Caller) -> Routes:
         return empty()
 
     return routes
+
+
+def _shown(agent: Agent) -> contract.AgentOut:
+    return contract.AgentOut(
+        id=agent.id,
+        name=agent.name,
+        software=agent.software,
+        space=agent.space or "",
+        transport=agent.transport,
+        devices=tuple(spec.name for spec in agent.devices),
+        claimed_at=rfc3339(agent.claimed_ms),
+    )
+
+
+async def _account(functions: Functions, agent: Agent) -> AccountRef | None:
+    if agent.account is None:
+        return None
+    return AccountRef(id=agent.account, name=await functions.sign_in.named(agent.account))

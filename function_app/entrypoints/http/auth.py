@@ -57,4 +57,19 @@ def router(functions: Functions, caller: Caller) -> Routes:
         items = tuple(contract.SpaceOut(id=space.id, name=space.name) for space in spaces)
         return answer(contract.SpaceList(items=items, cursor=None))
 
+    @routes.add(
+        "POST",
+        "/spaces",
+        summary="Make a space",
+        body=contract.SpaceRequest,
+        answers={201: contract.SpaceOut},
+        problems=(409,),
+    )
+    async def make_space(request: Request) -> Response:
+        """A further room for agents."""
+        who = await caller.account(request)
+        asked: contract.SpaceRequest = await read(request, contract.SpaceRequest)
+        space = await functions.sign_in.add_space(who, asked.name)
+        return answer(contract.SpaceOut(id=space.id, name=space.name), 201)
+
     return routes

@@ -5,7 +5,18 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from function_app.domain.accounts import Role
-from function_app.domain.devices import SILENT_MS, Agent, Link, claim, newer_link, online, unpair
+from function_app.domain.devices import (
+    SILENT_MS,
+    Agent,
+    DeviceSpec,
+    Link,
+    claim,
+    introduced,
+    move,
+    newer_link,
+    online,
+    unpair,
+)
 from function_app.domain.nesting import MAX_LEVELS, too_deep
 from function_app.domain.times import rfc3339
 
@@ -83,3 +94,36 @@ def test_nesting_is_bounded_and_the_check_itself_is_too() -> None:
     for _ in range(5_000):
         value = [value]
     assert too_deep(value)
+
+
+ARM, CAM = DeviceSpec("arm", "arm", "ur5", ""), DeviceSpec("cam", "camera", "c", "")
+CLAIMED = claim(Agent("a", "lab", "k", "1", (ARM, CAM), 0), account="anna", space="home", pairing="p", now_ms=1)
+
+
+def test_what_leaves_is_told_with_whose_it_was_and_where() -> None:
+    (left,) = unpair(CLAIMED).leaving
+    assert (left.why, left.account, left.space, left.pairing) == ("unpaired", "anna", "home", "p")
+    assert left.devices == ("arm", "cam")
+    moved = move(CLAIMED, "attic")
+    assert (moved.space, moved.pairing, moved.account) == ("attic", "p", "anna")
+    assert [(each.why, each.space) for each in moved.leaving] == [("moved", "home")]
+
+
+def test_only_devices_that_are_no_longer_named_leave_and_only_from_an_owner() -> None:
+    assert [(each.why, each.devices) for each in introduced(CLAIMED, (CAM,)).leaving] == [("removed", ("arm",))]
+    assert introduced(CLAIMED, (CAM, ARM)).leaving == ()
+    assert introduced(Agent("a", "lab", "k", "1", (ARM, CAM), 0), (CAM,)).leaving == ()
+
+
+def test_an_agent_that_is_moved_again_and_again_does_not_grow_without_end() -> None:
+    agent = CLAIMED
+    for number in range(50):
+        agent = move(agent, f"space{number}")
+    assert len(agent.leaving) == 16
+    assert agent.leaving[-1].space == "space48"
+
+
+def test_what_is_said_under_another_pairing_is_news_whatever_its_number() -> None:
+    known = Link(online=True, session=5, seen_ms=1, pairing="p")
+    news = Link(online=False, session=1, seen_ms=2, pairing="q")
+    assert newer_link(known, news) == news

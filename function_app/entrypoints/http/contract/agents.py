@@ -65,6 +65,12 @@ class ClaimRequest(Request, frozen=True, kw_only=True):
     space: Id | None = None
 
 
+class MoveRequest(Request, frozen=True, kw_only=True):
+    """The space to move an agent to, one of the account's."""
+
+    space: Id
+
+
 class AgentOut(Answer, frozen=True, kw_only=True):
     """An agent of the account."""
 

@@ -4,7 +4,7 @@ from typing import Annotated, Literal
 
 from msgspec import Meta
 
-from function_app.entrypoints.http.contract.base import Answer, Request
+from function_app.entrypoints.http.contract.base import Answer, Name, Request
 
 
 class SignInRequest(Request, frozen=True, kw_only=True):
@@ -36,6 +36,12 @@ class Me(Answer, frozen=True, kw_only=True):
     id: str
     name: str
     session: str
+
+
+class SpaceRequest(Request, frozen=True, kw_only=True):
+    """A new space."""
+
+    name: Name
 
 
 class SpaceOut(Answer, frozen=True, kw_only=True):
