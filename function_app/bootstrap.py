@@ -180,7 +180,6 @@ def build(settings: Settings, *, clock: Clock | None = None) -> Functions:
     pending = Pending(tables=tables)
     sending = SendAction(tables=tables, rows=rows, commands=commands, movements=movements, clock=now)
     queues = Queues(tables=tables, devices=devices, rows=rows, pending=pending, sending=sending, clock=now)
-    acks = ActionAcks(rows=rows, queues=queues, mailbox=mailbox, clock=now)
     leave = Leave(
         tables=tables,
         rows=rows,
@@ -192,6 +191,8 @@ def build(settings: Settings, *, clock: Clock | None = None) -> Functions:
         series=writer,
         clock=now,
     )
+    latencies = Latencies(tables=tables, forget=forget, clock=now)
+    acks = ActionAcks(rows=rows, queues=queues, mailbox=mailbox, latencies=latencies, clock=now)
     start_action = StartAction(
         tables=tables,
         devices=devices,
@@ -240,7 +241,7 @@ def build(settings: Settings, *, clock: Clock | None = None) -> Functions:
         faults=faults,
         conditions=conditions,
         diagnostics=diagnostics,
-        latencies=Latencies(tables=tables, forget=forget, clock=now),
+        latencies=latencies,
         intake=intake,
         uploads=uploads,
         transfers=blobs if isinstance(blobs, FileBlobs) else None,

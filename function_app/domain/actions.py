@@ -57,6 +57,7 @@ class Action:
         queued_until_ms: As long as it may wait for its turn [ms since 1970]; 0 for one that never waited.
         turn_ms: When its turn came, for one that has waited [ms since 1970].
         times: Status → when [ms since 1970]; ``published`` by the cloud's clock, the later ones by the agent's.
+        heard: Status → when the cloud heard of it, by its own clock [ms since 1970].
         sequence: Of the newest ack seen.
         cancel_id: Of the command that shall end it, once somebody wants that.
         once: Key of the row that holds the idempotency key it was started with, or empty.
@@ -82,6 +83,7 @@ class Action:
     sequence: int = -1
     cancel_id: str = ""
     once: str = ""
+    heard: dict[str, int] = field(default_factory=dict)
     session: str = ""
     timeout_ms: int = 0
     queued_until_ms: int = 0
@@ -105,7 +107,10 @@ class Action:
 
 @dataclass(frozen=True, slots=True)
 class Report:
-    """One ack about an action. ``output`` is all the script has printed so far, not what is new."""
+    """One ack about an action. ``output`` is all the script has printed so far, not what is new.
+
+    ``heard_ms`` is when it was heard, by the cloud's clock [ms since 1970]; 0: nobody has looked.
+    """
 
     status: Status
     sequence: int
@@ -114,6 +119,7 @@ class Report:
     progress: float | None = None
     output: str = ""
     result: dict[str, Any] = field(default_factory=dict)
+    heard_ms: int = 0
 
 
 def apply_report(action: Action, report: Report) -> Action:
@@ -124,9 +130,11 @@ def apply_report(action: Action, report: Report) -> Action:
     if action.status.terminal or action.status is Status.QUEUED:
         return action  # a queued one was never sent: whoever reports about it makes it up
     times = action.times if report.status.value in action.times else {**action.times, report.status.value: report.at_ms}
+    heard = _heard(action, report)
     if report.sequence <= action.sequence and report.status.rank <= action.status.rank:
-        return action if times is action.times else replace(action, times=times)
-    changed = replace(action, times=times, sequence=max(action.sequence, report.sequence))
+        same = times is action.times and heard is action.heard
+        return action if same else replace(action, times=times, heard=heard)
+    changed = replace(action, times=times, heard=heard, sequence=max(action.sequence, report.sequence))
     if report.status.rank >= action.status.rank:
         changed = replace(changed, status=report.status)
     if report.sequence > action.sequence or report.status.terminal:
@@ -138,6 +146,14 @@ def apply_report(action: Action, report: Report) -> Action:
             reason=report.reason or action.reason,
         )
     return changed
+
+
+def _heard(action: Action, report: Report) -> dict[str, int]:
+    """When each status was first heard: of several that hear the same ack, by whoever was soonest."""
+    known = action.heard.get(report.status.value)
+    if not report.heard_ms or (known is not None and known <= report.heard_ms):
+        return action.heard
+    return {**action.heard, report.status.value: report.heard_ms}
 
 
 def mark_published(action: Action, now_ms: int) -> Action:

@@ -16,6 +16,7 @@ from function_app.domain.nesting import too_deep
 from function_app.ports.clock import Clock
 from function_app.services.action_rows import ActionRows, Found
 from function_app.services.delivery import CONFIRMING
+from function_app.services.latency import Latencies
 from function_app.services.mailbox import Mailbox
 from function_app.services.queue import Queues
 
@@ -28,10 +29,13 @@ _SLOWEST_LOOK_S = 0.5
 class ActionAcks:
     """Applies acks to actions, and waits for them."""
 
-    def __init__(self, *, rows: ActionRows, queues: Queues, mailbox: Mailbox, clock: Clock) -> None:
+    def __init__(
+        self, *, rows: ActionRows, queues: Queues, mailbox: Mailbox, latencies: Latencies, clock: Clock
+    ) -> None:
         self._rows = rows
         self._queues = queues
         self._mailbox = mailbox
+        self._latencies = latencies
         self._clock = clock
 
     async def ingest(self, topic: Topic, payload: bytes, *, by: Transport = "mqtt") -> None:
@@ -45,8 +49,12 @@ class ActionAcks:
         parts = split_command(ack.id)
         if parts is None or parts[0] != device_id(topic.agent, topic.device):
             raise ProtocolError(f"'{ack.id}' is no command to {topic.agent}/{topic.device}")
-        if await self._queues.change(ack.id, lambda action: apply_report(action, report(ack))) is None:
+        heard = report(ack, self._clock.now_ms())
+        found = await self._queues.change(ack.id, lambda action: apply_report(action, heard))
+        if found is None:
             await self._answer(topic.agent, ack)
+        elif ack.status.terminal:
+            await self._latencies.measured(found.action, by)
         if by != "mqtt":
             # Last: until then the agent is given the command again, and answers again.
             await self._mailbox.withdraw(topic.agent, ack.id)
@@ -90,7 +98,7 @@ class ActionAcks:
         while not reached(action, wanted) and (left_s := end - loop.time()) > 0:
             try:
                 async with asyncio.timeout(min(pause_s, left_s)):
-                    reports.append(report(await anext(acks)))
+                    reports.append(report(await anext(acks), self._clock.now_ms()))
                 if action.status is Status.QUEUED:  # not any more, or nobody would report about it
                     found = await self._rows.get(action.id) or found
                     action = _applied(found.action, reports)
@@ -126,12 +134,13 @@ def _applied(action: Action, reports: Iterable[Report]) -> Action:
     return action
 
 
-def report(ack: Ack) -> Report:
+def report(ack: Ack, heard_ms: int) -> Report:
     """An ack as the domain reads it. A result that could not be read again is left out; the end still counts."""
     return Report(
         status=Status(ack.status.value),
         sequence=ack.sequence,
         at_ms=ack.at_ms,
+        heard_ms=heard_ms,
         reason=None if ack.reason is None else msgspec.to_builtins(ack.reason),
         progress=ack.progress,
         output=ack.output,

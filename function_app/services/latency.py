@@ -7,17 +7,19 @@ Partition of ``Latency``: device and pairing. Keys: ``hour:<transport>:<path>:<s
 import asyncio
 import hashlib
 import json
-from collections.abc import Iterable, Sequence
+import logging
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import partial
 from typing import Any, Literal, cast
 
 from function_app.domain import histogram
+from function_app.domain.actions import Action
 from function_app.domain.devices import Device
 from function_app.domain.histogram import Histogram
-from function_app.domain.problems import invalid
+from function_app.domain.problems import Problem, invalid
 from function_app.ports.clock import Clock
-from function_app.ports.tables import Row, Tables, Write
+from function_app.ports.tables import Row, StoreError, Tables, Write
 from function_app.services import store
 from function_app.services.forget import DAY_MS, Forget
 
@@ -48,6 +50,9 @@ KEEP_HOURS_MS = 90 * DAY_MS
 """Hours are forgotten after this time; days stay."""
 _HOURS_A_BATCH = 40
 """With their days, the newest samples and the note of the batch they stay below the tables' limit."""
+
+
+_log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True, slots=True)
@@ -109,8 +114,8 @@ class Latencies:
             Problem: ``invalid``: a time that cannot be; ``idempotency-key-reused``; ``busy``.
         """
         self._check(given)
-        partition = _partition(device)
-        name = once or given.fingerprint()
+        fingerprint = given.fingerprint()
+        name = once or fingerprint
         day = max(at_ms for at_ms, _ in given.samples) // DAY_MS
         mark = _mark(day) + hashlib.sha256(f"{who}\n{name}".encode()).hexdigest()
         hours: dict[int, list[tuple[int, float]]] = {}
@@ -119,7 +124,22 @@ class Latencies:
         starts = sorted(hours)
         for number, first in enumerate(range(0, len(starts), _HOURS_A_BATCH)):
             part = [sample for hour in starts[first : first + _HOURS_A_BATCH] for sample in hours[hour]]
-            await store.retry(partial(self._count, partition, f"{mark}:{number}", given, part))
+            parts = {f"{given.transport}:{given.path}": part}
+            place = _partition(device.id, device.pairing)
+            await store.retry(partial(self._count, place, f"{mark}:{number}", fingerprint, parts))
+
+    async def measured(self, action: Action, transport: Transport) -> None:
+        """Count what the end of an action tells: once, however often its end is heard. Nothing waits for it."""
+        samples = _times(action)
+        if not samples:
+            return
+        parts = {f"{transport}:{path}": [sample] for path, sample in samples.items()}
+        mark = _mark(action.issued_ms // DAY_MS) + hashlib.sha256(action.id.encode()).hexdigest()
+        place = _partition(action.device, action.pairing)
+        try:
+            await store.retry(partial(self._count, place, mark, action.id, parts))
+        except (Problem, StoreError) as error:
+            _log.warning("times of action %s: %s", action.id, error)
 
     async def find(
         self,
@@ -130,7 +150,7 @@ class Latencies:
         path: Path | None = None,
     ) -> list[Found]:
         """What is known in ``span``: one for each transport and path that has ever had samples, by name."""
-        partition = _partition(device)
+        partition = _partition(device.id, device.pairing)
         first, last = "recent:", "recent;"
         page = await self._tables.query(store.LATENCY, partition, first=first, last=last, limit=1000)
         wanted = []
@@ -168,33 +188,34 @@ class Latencies:
             if not 0 <= ms <= histogram.LONGEST_MS:
                 raise invalid(f"A time is 0 to {histogram.LONGEST_MS:.0f} ms, not {ms}.")
 
-    async def _count(self, partition: str, mark: str, given: Samples, part: Sequence[tuple[int, float]]) -> None:
-        """One batch: histograms, newest samples, and the note that says that they are in."""
+    async def _count(
+        self, partition: str, mark: str, fingerprint: str, parts: Mapping[str, Sequence[tuple[int, float]]]
+    ) -> None:
+        """One batch: histograms and newest samples of each transport and path, and the note that they are in."""
         known = await self._tables.get(store.LATENCY, partition, mark)
         if known is not None:
-            if known.data["fingerprint"] != given.fingerprint():
+            if known.data["fingerprint"] != fingerprint:
                 detail = "This Idempotency-Key was used with other samples. Use a new key for new samples."
                 raise invalid(detail, code="idempotency-key-reused")
             return
-        kind = f"{given.transport}:{given.path}"
-        groups: dict[str, list[float]] = {}
-        for at_ms, ms in part:
-            groups.setdefault(_key("hour", kind, at_ms // HOUR_MS * HOUR_MS), []).append(ms)
-            groups.setdefault(_key("day", kind, at_ms // DAY_MS * DAY_MS), []).append(ms)
-        newest = f"recent:{kind}"
-        rows = await self._rows(partition, [*groups, newest])
-        row = rows.get(newest)
-        kept = sorted([*(store.read(row, _Recent).samples if row else ()), *part])[-RECENT:]
-        writes = [
-            _write(partition, newest, _Recent(tuple(kept)), row),
-            Write("create", Row(partition, mark, {"fingerprint": given.fingerprint()})),
-        ]
-        for key, times_ms in groups.items():
-            old = rows.get(key)
-            if old is None and key.startswith("day:"):
-                await self._keep_for_a_while(partition, kind, int(key.rpartition(":")[2]))
-            total = histogram.merge([histogram.of(times_ms), store.read(old, Histogram) if old else Histogram()])
-            writes.append(_write(partition, key, total, old))
+        groups: dict[tuple[str, str, int], list[float]] = {}
+        for kind, part in parts.items():
+            for at_ms, ms in part:
+                groups.setdefault(("hour", kind, at_ms // HOUR_MS * HOUR_MS), []).append(ms)
+                groups.setdefault(("day", kind, at_ms // DAY_MS * DAY_MS), []).append(ms)
+        newest = {f"recent:{kind}": part for kind, part in parts.items()}
+        rows = await self._rows(partition, [*(_key(*group) for group in groups), *newest])
+        writes = [Write("create", Row(partition, mark, {"fingerprint": fingerprint}))]
+        for key, part in newest.items():
+            row = rows.get(key)
+            kept = sorted([*(store.read(row, _Recent).samples if row else ()), *part])[-RECENT:]
+            writes.append(_write(partition, key, _Recent(tuple(kept)), row))
+        for group, times_ms in groups.items():
+            row = rows.get(_key(*group))
+            if row is None and group[0] == "day":
+                await self._keep_for_a_while(partition, *group[1:])
+            total = histogram.merge([histogram.of(times_ms), store.read(row, Histogram) if row else Histogram()])
+            writes.append(_write(partition, _key(*group), total, row))
         await self._tables.batch(store.LATENCY, writes)
 
     async def _keep_for_a_while(self, partition: str, kind: str, day_ms: int) -> None:
@@ -231,5 +252,18 @@ def _key(step: str, kind: str, at_ms: int) -> str:
     return f"{step}:{kind}:{at_ms:014d}"
 
 
-def _partition(device: Device) -> str:
-    return f"{device.id}/{device.pairing}"
+def _times(action: Action) -> dict[str, tuple[int, float]]:
+    """What an action's times tell: differences of one clock each. What a clock makes that was set back is left out."""
+    found: dict[str, tuple[int, float]] = {}
+    published_ms = action.times.get("published")
+    if published_ms is not None and action.heard:
+        found["command-answered"] = (published_ms, min(action.heard.values()) - published_ms)
+        if "started" in action.heard:
+            found["command-started"] = (published_ms, action.heard["started"] - published_ms)
+    if {"received", "started"} <= set(action.times):
+        found["received-started"] = (action.issued_ms, action.times["started"] - action.times["received"])
+    return {path: sample for path, sample in found.items() if 0 <= sample[1] <= histogram.LONGEST_MS}
+
+
+def _partition(device: str, pairing: str) -> str:
+    return f"{device}/{pairing}"

@@ -7,11 +7,15 @@ from typing import Any
 
 import pytest
 
+from device_agent.protocol import codec, topics
+from device_agent.protocol.messages import Ack, AckStatus
 from function_app.domain.accounts import Identity
 from function_app.domain.histogram import ERROR
+from function_app.entrypoints.ingest import ingest
 from function_app.services import store
 from function_app.services.forget import DAY_MS
 from function_app.services.latency import HOUR_MS, KEEP_HOURS_MS
+from tests.support.brokers import wait_until
 from tests.support.cloud import Cloud, Person, Robot, paired, problem
 
 Pair = tuple[Person, Robot]
@@ -216,3 +220,33 @@ def test_hours_are_forgotten_after_their_time_and_days_stay(cloud: Cloud, pair: 
 
 def _identity(who: Person) -> Identity:
     return Identity(who.account, who.name, who.session)
+
+
+def test_the_cloud_counts_what_the_end_of_an_action_tells_once(cloud: Cloud, pair: Pair) -> None:
+    anna, robot = pair
+    clock = cloud.clock
+
+    def late(_: object) -> list[Ack]:
+        """An agent whose clock is ten years ahead, and which takes 250 ms of it to begin."""
+        ahead_ms = 10 * 365 * DAY_MS
+        now_ms = clock.now_ms() + ahead_ms
+        times = ((AckStatus.RECEIVED, 0), (AckStatus.ACCEPTED, 100), (AckStatus.STARTED, 250))
+        return [robot.ack(robot.commands[-1].id, status, at_ms=now_ms + ms) for status, ms in times]
+
+    robot.reports = late
+    for number in range(3):
+        action = anna.start(robot.device, wait_ms=10_000).json()["id"]
+        done = robot.report(action, AckStatus.DONE)
+        wait_until(lambda: len(_ms(anna, robot, "received-started")) > number, "its times")  # noqa: B023 (at once)
+        robot.say(robot.topic(topics.ACK), done)
+    cloud.run(ingest(cloud.functions, robot.topic(topics.ACK), codec.encode(done)))
+    assert _ms(anna, robot, "received-started") == [250.0] * 3
+    answered, started = (_ms(anna, robot, path) for path in ("command-answered", "command-started"))
+    assert len(answered) == len(started) == 3
+    for first, second in zip(answered, started, strict=True):
+        assert 0 <= first <= second < 60_000, "by the cloud's clock, whatever the agent's says"
+
+
+def _ms(who: Person, robot: Robot, path: str) -> list[float]:
+    found = known(who, robot.device, path=path)
+    return found[0]["ms"] if found else []
