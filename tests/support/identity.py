@@ -19,6 +19,8 @@ from cryptography.hazmat.primitives.asymmetric import ec
 from cryptography.x509.oid import NameOID
 
 HOST = "127.0.0.1"
+OBJECT_ID = "5a3c8c8e-0e0c-4b43-9d53-0d0f1a6e4c11"
+TENANT_ID = "b0e1f7d4-21e8-4a35-8c4e-6a0b7c2d9f10"
 SECRET = "the host's own"
 
 
@@ -66,7 +68,8 @@ class _Answer(BaseHTTPRequestHandler):
         (audience,) = asked["resource"]
         now = int(time.time())
         times = {"iat": now - 60, "nbf": now - 60, "exp": now + self.server.lifetime_s}
-        claims = {"aud": audience, "iss": "https://sts.windows.net/telescope/", **times}
+        who = {"oid": OBJECT_ID, "tid": TENANT_ID}
+        claims = {"aud": audience, "iss": "https://sts.windows.net/telescope/", **who, **times}
         token = jwt.encode(claims, "nobody checks it here, all the same", "HS256")
         answer = {"access_token": token, "expires_on": str(now + 3600), "resource": audience, "token_type": "Bearer"}
         body = json.dumps(answer).encode()

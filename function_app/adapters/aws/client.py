@@ -196,8 +196,8 @@ class Client:
                         tcp_keepalive=True,
                         # What the SDK signs addresses with otherwise leaves out the length of what is uploaded.
                         signature_version="s3v4" if self._service == "s3" else None,
-                        # Emulators have no host name for each bucket.
-                        s3={"addressing_style": "auto" if self._endpoint is None else "path"},
+                        # The region in the host's name, or S3 redirects what was signed. Emulators have one name only.
+                        s3={"addressing_style": "virtual" if self._endpoint is None else "path"},
                     ),
                 )
             return self._client

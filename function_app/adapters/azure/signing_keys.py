@@ -4,12 +4,13 @@ import threading
 from datetime import UTC, datetime, timedelta
 from typing import TYPE_CHECKING, Any
 
-from function_app.adapters.azure.client import Place, transport
+from function_app.adapters.azure.client import ATTEMPTS, Place, transport
 
 if TYPE_CHECKING:
     from azure.storage.blob import ContainerClient, UserDelegationKey
 
 LENT = timedelta(hours=12)
+_RETRY_WITHIN_S = 1
 _CLOCKS = timedelta(minutes=5)
 """Azure's clock and ours may differ by this much."""
 
@@ -36,7 +37,9 @@ class SigningKeys:
             return {"user_delegation_key": self._lent}
 
     def _borrow(self, credential: Any, start: datetime, end: datetime) -> "UserDelegationKey":
-        from azure.storage.blob import BlobServiceClient  # noqa: PLC0415 (costs half a second)
+        from azure.storage.blob import BlobServiceClient, LinearRetry  # noqa: PLC0415 (costs half a second)
 
-        with BlobServiceClient(self._place.url, credential=credential, transport=transport()) as service:
+        retry = LinearRetry(backoff=0, retry_total=ATTEMPTS - 1, random_jitter_range=_RETRY_WITHIN_S)
+        options: dict[str, Any] = {"transport": transport(), "retry_policy": retry}
+        with BlobServiceClient(self._place.url, credential=credential, **options) as service:
             return service.get_user_delegation_key(start, end)

@@ -129,6 +129,17 @@ async def through(blobs: Blobs, opened: Open, wire: Wire) -> Blobs:
     return through
 
 
+async def test_addresses_name_the_buckets_region(monkeypatch: pytest.MonkeyPatch) -> None:
+    """S3 redirects what goes to its general address, and a signature is good for one host only."""
+    use_credentials(monkeypatch)
+    for bucket, host in ((NAME, f"{NAME}.s3.eu-west-1.amazonaws.com"), ("a.b", "s3.eu-west-1.amazonaws.com/a.b")):
+        blobs = S3Blobs(bucket=bucket, region="eu-west-1")
+        upload = await blobs.presign_upload("up", length=3, content_type="image/png", lifetime_s=60)
+        assert upload.url.startswith(f"https://{host}/up?")
+        assert "content-length%3Bcontent-type%3Bhost%3Bif-none-match" in upload.url
+        await blobs.close()
+
+
 # ---------------------------------------------------------------- names
 
 SHARED = "🤖" * (names.HEAD + 100)
