@@ -1,4 +1,4 @@
-"""``python -m function_app serve|work|prepare|sign-in-link``: the functions on one machine."""
+"""``python -m function_app serve|work|check-models|prepare|sign-in-link``: the functions on one machine."""
 
 import argparse
 import asyncio
@@ -9,7 +9,8 @@ from collections.abc import Sequence
 from function_app import bootstrap, settings
 from function_app.bootstrap import Functions
 from function_app.entrypoints.serve import PortTaken, serve
-from function_app.entrypoints.worker import work
+from function_app.entrypoints.worker import check_models, work
+from function_app.ports.model_compiler import CompilerMissingError
 from function_app.ports.tables import StoreError
 
 _EXIT_FAILED = 1
@@ -23,6 +24,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     commands.add_parser("serve", help="API and console, under uvicorn")
     commands.add_parser("work", help="ingest from the broker, and timers")
     commands.add_parser("prepare", help="make Amazon's table and bucket, where there are none")
+    checks = commands.add_parser("check-models", help="compile uploaded robot types with MuJoCo, as `work` does too")
+    checks.add_argument("--drain", action="store_true", help="end as soon as none is left")
     link = commands.add_parser("sign-in-link", help="print a one-time sign-in link; makes the account if it is new")
     link.add_argument("--account", default="demo", help="name of the account (default: %(default)s)")
     options = parser.parse_args(arguments)
@@ -40,12 +43,14 @@ def main(arguments: Sequence[str] | None = None) -> int:
             serve(functions)
         elif options.command == "work":
             asyncio.run(work(functions))
+        elif options.command == "check-models":
+            asyncio.run(_check_models(functions, drain=options.drain))
         else:
             asyncio.run(_link(functions, options.account))
     except PortTaken as taken:
         print(f"telescope functions: {taken}", file=sys.stderr)
         return _EXIT_TAKEN
-    except (StoreError, settings.SettingsError) as error:
+    except (StoreError, CompilerMissingError, settings.SettingsError) as error:
         print(f"telescope functions: {error}", file=sys.stderr)
         return _EXIT_FAILED
     except KeyboardInterrupt:
@@ -57,6 +62,13 @@ async def _check(functions: Functions) -> None:
     """Say at once what is wrong with the tables, not at the first request."""
     await functions.health.require_tables()
     await functions.tables.close()
+
+
+async def _check_models(functions: Functions, *, drain: bool) -> None:
+    try:
+        await check_models(functions, drain=drain)
+    finally:
+        await functions.close()
 
 
 async def _link(functions: Functions, account: str) -> None:

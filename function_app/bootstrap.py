@@ -12,6 +12,7 @@ from function_app.adapters.local.clock import SystemClock
 from function_app.adapters.local.command_bus import MqttCommandBus
 from function_app.adapters.local.feed import MqttFeed, MqttTelemetry
 from function_app.adapters.local.keys import FileKeys
+from function_app.adapters.local.model_compiler import MujocoCompiler
 from function_app.adapters.local.tables import SqliteTables
 from function_app.domain.series import Keep
 from function_app.ports.blobs import Blobs, Transfers
@@ -27,6 +28,7 @@ from function_app.services.actions import Actions
 from function_app.services.claim import Claim
 from function_app.services.commands import Commands
 from function_app.services.conditions import Conditions
+from function_app.services.delete_robot_type import DeleteRobotType
 from function_app.services.delivery import Delivery
 from function_app.services.devices import Devices
 from function_app.services.diagnostics import Diagnostics
@@ -42,6 +44,7 @@ from function_app.services.latency import Latencies
 from function_app.services.lease import Leases
 from function_app.services.leave import Leave
 from function_app.services.mailbox import Mailbox
+from function_app.services.model_checks import ModelChecks
 from function_app.services.movements import Movements
 from function_app.services.mqtt_credentials import MqttCredentials
 from function_app.services.pending import Pending
@@ -57,7 +60,9 @@ from function_app.services.sign_in import SignIn
 from function_app.services.start_action import StartAction
 from function_app.services.stop import StopDevices
 from function_app.services.sweep import Sweep
+from function_app.services.tend_robot_types import TendRobotTypes
 from function_app.services.unpair import Unpair
+from function_app.services.upload_robot_type import UploadRobotType
 from function_app.services.uploads import Uploads
 from function_app.settings import AwsStore, AzureStore, EventGridBus, IotBus, Settings
 
@@ -88,6 +93,9 @@ class Functions:
     devices: Devices
     leases: Leases
     robot_types: RobotTypes
+    upload_robot_type: UploadRobotType
+    delete_robot_type: DeleteRobotType
+    model_checks: ModelChecks
     movements: Movements
     start_action: StartAction
     fleet: StartOnMany
@@ -162,7 +170,7 @@ def build(settings: Settings, *, clock: Clock | None = None) -> Functions:
     mailbox = Mailbox(tables=tables, forget=forget, clock=now)
     delivery = Delivery(bus=bus, mailbox=mailbox)
     commands = Commands(delivery=delivery, keys=keys, clock=now)
-    robot_types = RobotTypes(catalogue=catalogue)
+    robot_types = RobotTypes(tables=tables, blobs=blobs, catalogue=catalogue)
     diagnostics = Diagnostics(
         tables=tables, devices=devices, faults=faults, robot_types=robot_types, sign_in=sign_in, clock=now
     )
@@ -223,6 +231,13 @@ def build(settings: Settings, *, clock: Clock | None = None) -> Functions:
         devices=devices,
         leases=Leases(tables=tables, devices=devices, commands=commands, access=access, clock=now),
         robot_types=robot_types,
+        upload_robot_type=UploadRobotType(
+            tables=tables, blobs=blobs, catalogue=catalogue, robot_types=robot_types, clock=now
+        ),
+        delete_robot_type=DeleteRobotType(
+            tables=tables, catalogue=catalogue, devices=devices, movements=movements, clock=now
+        ),
+        model_checks=ModelChecks(tables=tables, blobs=blobs, compiler=MujocoCompiler(), clock=now),
         movements=movements,
         start_action=start_action,
         fleet=StartOnMany(start_action=start_action),
@@ -259,6 +274,7 @@ def build(settings: Settings, *, clock: Clock | None = None) -> Functions:
             conditions=conditions,
             intake=intake,
             uploads=uploads,
+            robot_types=TendRobotTypes(tables=tables, blobs=blobs, clock=now),
             keep_actions_ms=settings.keep_actions_days * DAY_MS,
             clock=now,
         ),

@@ -12,6 +12,9 @@ from device_agent.protocol.messages import Id, Joint, Label, Stream, Text
 
 MANIFEST = "robot.toml"
 MOVEMENTS = "movements"
+MAX_PERIOD_MS = 1000
+MAX_JOINTS = 128
+"""Most that a ``JointPositions`` names."""
 
 
 class Diagnostic(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -109,6 +112,7 @@ def parse(text: str) -> RobotType:
         robot_type = msgspec.convert(raw, RobotType, strict=False)
     except (tomllib.TOMLDecodeError, msgspec.ValidationError) as error:
         raise ProtocolError(str(error)) from error
+    _check_figures(robot_type)
     names = [joint.name for joint in robot_type.joints]
     if len(set(names)) != len(names):
         raise ProtocolError("two joints have the same name")
@@ -123,3 +127,28 @@ def parse(text: str) -> RobotType:
         if not all(math.isfinite(limit) for limit in limits) or limits != sorted(limits):
             raise ProtocolError(f"diagnostics of '{diagnostic.fields}': low, warning_low, warning_high, high must rise")
     return robot_type
+
+
+def _check_figures(robot_type: RobotType) -> None:
+    """Refuse figures with which nothing could be controlled."""
+    if not 1 <= robot_type.period_ms <= MAX_PERIOD_MS:
+        raise ProtocolError(f"period_ms is {robot_type.period_ms}; it must be 1 to {MAX_PERIOD_MS}")
+    if len(robot_type.joints) > MAX_JOINTS:
+        raise ProtocolError(f"{len(robot_type.joints)} joints; {MAX_JOINTS} is the most")
+    if not 0 < robot_type.streaming_speed <= 1:
+        raise ProtocolError(f"streaming_speed is {robot_type.streaming_speed}; it must be above 0 and at most 1")
+    _check_positive(robot_type, ("braking_rad_s2",), "")
+    limits = ("max_velocity_rad_s", "max_acceleration_rad_s2", "max_jerk_rad_s3", "max_effort_nm")
+    for joint in robot_type.joints:
+        _check_positive(joint, limits, f" of '{joint.name}'")
+        if not -math.inf < joint.lower_rad < joint.upper_rad < math.inf:
+            raise ProtocolError(f"lower_rad of '{joint.name}' must be below its upper_rad, and both finite")
+    for stream in robot_type.streams:
+        _check_positive(stream, ("rate_hz",), f" of stream '{stream.name}'")
+
+
+def _check_positive(holder: Struct, fields: tuple[str, ...], where: str) -> None:
+    for field in fields:
+        value = getattr(holder, field)
+        if not 0 < value < math.inf:
+            raise ProtocolError(f"{field}{where} is {value}; it must be above 0 and finite")

@@ -6,9 +6,13 @@ import signal
 from collections.abc import Sequence
 
 from function_app.bootstrap import Functions
+from function_app.domain.problems import Problem
 from function_app.entrypoints.ingest import ingest, ingest_telemetry
+from function_app.ports.model_compiler import CompilerMissingError
+from function_app.ports.tables import StoreError
 
 SWEEP_EVERY_S = 1.0
+CHECK_EVERY_S = 0.2
 _log = logging.getLogger(__name__)
 
 
@@ -34,6 +38,7 @@ async def work(functions: Functions) -> None:
         asyncio.create_task(functions.feed.run(handle)),
         asyncio.create_task(functions.telemetry.run(handle_telemetry)),
         asyncio.create_task(_sweep(functions)),
+        asyncio.create_task(_check_models(functions)),
     ]
     waiting = asyncio.create_task(ending.wait())
     done, _ = await asyncio.wait([*tasks, waiting], return_when=asyncio.FIRST_COMPLETED)
@@ -43,6 +48,33 @@ async def work(functions: Functions) -> None:
     await functions.close()
     for task in done - {waiting}:
         task.result()
+
+
+async def check_models(functions: Functions, *, drain: bool) -> None:
+    """Check uploaded models, for ever or until none is left.
+
+    Raises:
+        CompilerMissingError: This machine cannot.
+    """
+    functions.model_checks.require()
+    while True:
+        try:
+            busy = await functions.model_checks.run()
+        except (StoreError, Problem) as error:
+            _log.warning("model checks: %s", error)
+            busy = False
+        if drain and not busy:
+            return
+        await asyncio.sleep(0 if busy else CHECK_EVERY_S)
+
+
+async def _check_models(functions: Functions) -> None:
+    """A worker without MuJoCo does all the rest."""
+    try:
+        await check_models(functions, drain=False)
+    except CompilerMissingError as error:
+        _log.warning("uploaded models are not checked by this worker: %s", error)
+        await asyncio.Event().wait()
 
 
 async def _sweep(functions: Functions) -> None:

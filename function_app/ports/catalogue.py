@@ -29,5 +29,8 @@ class Catalogue(Protocol):
             StoreError: A folder is broken; the text names file and field.
         """
 
+    async def files(self, robot_type: str) -> Mapping[str, bytes]:
+        """What a type's folder holds, movements too: name → content; empty for a type that is not known."""
+
     async def movements(self, robot_type: str) -> Mapping[str, BuiltIn]:
         """Movements of a type by name; empty for a type that is not known."""

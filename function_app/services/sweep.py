@@ -24,6 +24,7 @@ from function_app.services.pending import SHARDS, Pending
 from function_app.services.queue import TIMEOUT, Queues, queue_of
 from function_app.services.send_action import MovementChanged, SendAction
 from function_app.services.start_action import ABANDON_MS
+from function_app.services.tend_robot_types import TendRobotTypes
 from function_app.services.uploads import Uploads
 
 ORPHAN_MS = 2 * ABANDON_MS
@@ -54,6 +55,7 @@ class Sweep:
         conditions: Conditions,
         intake: Intake,
         uploads: Uploads,
+        robot_types: TendRobotTypes,
         keep_actions_ms: int,
         clock: Clock,
     ) -> None:
@@ -69,6 +71,7 @@ class Sweep:
         self._conditions = conditions
         self._intake = intake
         self._uploads = uploads
+        self._robot_types = robot_types
         self._keep_actions_ms = keep_actions_ms
         self._clock = clock
         self._turn = 0
@@ -93,6 +96,7 @@ class Sweep:
             _log.warning("silent devices: %s", problem.detail)
         await self._intake.distribute_left()
         await self._uploads.forget_due()
+        await self._robot_types.run()
         try:
             await self._access.expire(self._clock.now_ms() / 1000)
         except BrokerAccessError as error:

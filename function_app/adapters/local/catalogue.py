@@ -12,6 +12,8 @@ from device_agent.protocol.topics import is_id
 from function_app.ports.catalogue import BuiltIn
 from function_app.ports.tables import StoreError
 
+_SUFFIXES = frozenset({".toml", ".xml", ".stl", ".obj", ".png", ".md", ".py"})
+
 
 class FolderCatalogue:
     """``Catalogue`` of ``folder``: one robot type in each folder that has a manifest."""
@@ -19,6 +21,7 @@ class FolderCatalogue:
     def __init__(self, folder: Path) -> None:
         self._folder = folder
         self._types: dict[str, RobotType] | None = None
+        self._files: dict[str, dict[str, bytes]] = {}
         self._movements: dict[str, dict[str, BuiltIn]] = {}
 
     async def types(self) -> Mapping[str, RobotType]:
@@ -30,6 +33,19 @@ class FolderCatalogue:
             except (OSError, ProtocolError) as error:
                 raise StoreError(str(error)) from error
         return self._types
+
+    async def files(self, robot_type: str) -> Mapping[str, bytes]:
+        """See ``Catalogue``."""
+        if robot_type not in await self.types():
+            return {}
+        if robot_type not in self._files:
+            folder = self._folder / robot_type
+            paths = [path for path in sorted(folder.rglob("*")) if path.suffix in _SUFFIXES and path.is_file()]
+            try:
+                self._files[robot_type] = {path.relative_to(folder).as_posix(): path.read_bytes() for path in paths}
+            except OSError as error:
+                raise StoreError(str(error)) from error
+        return self._files[robot_type]
 
     async def movements(self, robot_type: str) -> Mapping[str, BuiltIn]:
         """See ``Catalogue``."""

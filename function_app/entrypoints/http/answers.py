@@ -24,6 +24,11 @@ def answer(body: Any, status: int = 200, headers: Mapping[str, str] | None = Non
     return Response(_encode(body), status, headers, media_type=JSON)
 
 
+def content(body: bytes, media_type: str, name: str) -> Response:
+    """A file to keep. Never shown in the page: people upload them."""
+    return Response(body, headers={"Content-Disposition": f'attachment; filename="{name}"'}, media_type=media_type)
+
+
 def empty(headers: Mapping[str, str] | None = None) -> Response:
     """Done, nothing to say."""
     return Response(status_code=204, headers=headers)
@@ -49,13 +54,13 @@ def problem_type(error: Problem) -> str:
     return f"/problems/{error.code}"
 
 
-async def read(request: Request, kind: Any) -> Any:
-    """The request's body as ``kind``.
+async def read(request: Request, kind: Any, *, limit: int = MAX_BODY) -> Any:
+    """The request's body, of at most ``limit`` bytes, as ``kind``.
 
     Raises:
         Problem: ``too-large``, ``invalid`` with the place and what is wrong there.
     """
-    body = await _bytes(request)
+    body = await _bytes(request, limit)
     decoder = _decoders.get(kind)
     if decoder is None:
         decoder = _decoders[kind] = msgspec.json.Decoder(kind, strict=True)
@@ -73,10 +78,10 @@ async def read_or(request: Request, kind: type[T], otherwise: T) -> T:
     return found
 
 
-async def _bytes(request: Request) -> bytes:
+async def _bytes(request: Request, limit: int = MAX_BODY) -> bytes:
     declared = request.headers.get("content-length", "0")
-    if declared.isdecimal() and (len(declared) > _LENGTH_DIGITS or int(declared) > MAX_BODY):
-        raise _too_large()
+    if declared.isdecimal() and (len(declared) > _LENGTH_DIGITS or int(declared) > limit):
+        raise _too_large(limit)
     kept: bytes | None = getattr(request.state, "body", None)
     if kept is not None:
         return kept
@@ -84,13 +89,13 @@ async def _bytes(request: Request) -> bytes:
     length = 0
     async for part in request.stream():
         length += len(part)
-        if length > MAX_BODY:
-            raise _too_large()
+        if length > limit:
+            raise _too_large(limit)
         parts.append(part)
     request.state.body = b"".join(parts)
     body: bytes = request.state.body
     return body
 
 
-def _too_large() -> Problem:
-    return Problem("too-large", 413, "Too large", f"A request's body has at most {MAX_BODY} bytes.")
+def _too_large(limit: int) -> Problem:
+    return Problem("too-large", 413, "Too large", f"A request's body has at most {limit} bytes here.")

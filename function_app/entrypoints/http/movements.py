@@ -27,7 +27,7 @@ def router(functions: Functions, caller: Caller) -> Routes:
         _MOVEMENTS,
         summary="Movements of a robot type",
         answers={200: contract.MovementList},
-        problems=(404, 422),
+        problems=(404, 409, 422),
     )
     async def list_movements(request: Request, robot_type: str, cursor: Cursor = None, limit: Limit = 100) -> Response:
         """Built-in ones and the account's own, by name."""
@@ -54,7 +54,7 @@ def router(functions: Functions, caller: Caller) -> Routes:
         _MOVEMENTS + "/{name}/versions",
         summary="All versions of a movement, newest first",
         answers={200: contract.MovementList},
-        problems=(404, 422),
+        problems=(404, 409, 422),
     )
     async def list_movement_versions(
         request: Request, robot_type: str, name: str, cursor: Cursor = None, limit: Limit = 100

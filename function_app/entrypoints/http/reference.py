@@ -47,8 +47,11 @@ def _operation(method: str, path: str, operation: dict[str, Any]) -> list[str]:
 
 def _schema(content: dict[str, Any]) -> str:
     links = []
-    for media in content.values():
+    for kind, media in content.items():
         schema = media["schema"]
+        if schema.get("format") == "binary":
+            links.append(escape(kind))
+            continue
         for each in schema.get("anyOf", [schema]):
             name = str(each.get("$ref", "")).rpartition("/")[2]
             links.append(f"<a href='#{escape(name)}'>{escape(name)}</a>")

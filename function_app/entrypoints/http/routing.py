@@ -63,7 +63,7 @@ class Routes:
             method: HTTP method.
             path: Below the API's prefix.
             summary: One line.
-            answers: Status → struct of the body (``None``: no body).
+            answers: Status → struct of the body (``None``: no body; text: the media type of a file).
             problems: Statuses of refusals beside 401, 413, 422 and 503, which follow from the rest.
             body: Struct of the request's body.
             body_required: Whether it may be left out.
@@ -79,7 +79,9 @@ class Routes:
         responses: dict[int | str, dict[str, Any]] = {}
         for status, kind in answers.items():
             responses[status] = {"description": _MEANINGS[status]}
-            if kind is not None:
+            if isinstance(kind, str):
+                responses[status]["content"] = {kind: {"schema": {"type": "string", "format": "binary"}}}
+            elif kind is not None:
                 responses[status]["content"] = {JSON: {"schema": self._reference(kind)}}
         for status in sorted(refusals):
             responses[status] = {

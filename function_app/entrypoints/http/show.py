@@ -5,15 +5,16 @@ from typing import Any
 import msgspec
 
 from device_agent.protocol.messages import State
-from device_agent.protocol.robot_type import RobotType
 from function_app.domain.accounts import Identity
 from function_app.domain.actions import Action
 from function_app.domain.lease import Lease
 from function_app.domain.movements import Movement
+from function_app.domain.robot_types import TypeVersion
 from function_app.domain.times import rfc3339
 from function_app.entrypoints.http.contract import actions, devices, movements, robot_types
 from function_app.services.devices import DeviceView
 from function_app.services.parameters import ObjectSchema
+from function_app.services.robot_types import KnownType
 from function_app.services.script_store import signed_text
 
 
@@ -65,17 +66,38 @@ def action(found: Action, position: int | None = None) -> actions.ActionOut:
     )
 
 
-def robot_type(found: RobotType) -> robot_types.RobotTypeOut:
+def robot_type(found: KnownType) -> robot_types.RobotTypeOut:
     """A robot type."""
+    manifest, upload = found.manifest, found.upload
     return robot_types.RobotTypeOut(
-        type=found.type,
-        label=found.label,
-        kind=found.kind,
+        type=manifest.type,
+        label=manifest.label,
+        kind=manifest.kind,
         version=found.version,
-        description=found.description,
-        joints=found.joints,
-        capabilities=found.capabilities,
+        description=manifest.description,
+        driver=manifest.driver,
+        joints=manifest.joints,
+        frames=manifest.frames,
+        capabilities=manifest.capabilities,
+        streams=manifest.streams,
+        built_in=found.built_in,
+        state="ready" if found.usable or upload is None else _upload_state(upload),
+        files=found.files,
+        upload=None if upload is None else _upload(upload),
     )
+
+
+def _upload(upload: TypeVersion) -> robot_types.TypeUploadOut:
+    return robot_types.TypeUploadOut(
+        version=upload.version,
+        state=_upload_state(upload),
+        errors=upload.errors,
+        uploaded_at=rfc3339(upload.created_ms),
+    )
+
+
+def _upload_state(upload: TypeVersion) -> robot_types.State:
+    return "checking" if upload.state == "uploading" else upload.state
 
 
 def movement(found: Movement) -> movements.MovementOut:

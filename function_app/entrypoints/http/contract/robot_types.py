@@ -1,23 +1,63 @@
 """``robot-types``."""
 
-from device_agent.protocol.messages import Joint
-from function_app.entrypoints.http.contract.base import Answer
+from typing import Annotated, Literal
+
+from msgspec import Meta
+
+from device_agent.protocol.messages import Joint, Stream
+from function_app.entrypoints.http.contract.base import Answer, Moment, Request, WaitMs
+from function_app.services.model_files import MAX_FILES, MAX_MANIFEST
+
+MAX_UPLOAD = 8_500_000
+"""Bytes of a request that uploads a robot type: the files' 6 MB as base64, and the rest."""
+State = Literal["checking", "ready", "refused"]
+
+
+class TypeUploadOut(Answer, frozen=True, kw_only=True):
+    """The newest upload. ``errors`` are those of the manifest's check and MuJoCo's own."""
+
+    version: int
+    state: State
+    errors: tuple[str, ...]
+    uploaded_at: Moment
 
 
 class RobotTypeOut(Answer, frozen=True, kw_only=True):
-    """What every robot of one type has in common."""
+    """What every robot of one type has in common, in the version in use: the newest one that was found good.
+
+    ``state`` is ``ready`` as soon as there is one; until then everything is of the newest upload. ``files``: name →
+    bytes.
+    """
 
     type: str
     label: str
     kind: str
     version: int
     description: str
+    driver: str
     joints: tuple[Joint, ...]
+    frames: tuple[str, ...]
     capabilities: tuple[str, ...]
+    streams: tuple[Stream, ...]
+    built_in: bool
+    state: State
+    files: dict[str, int]
+    upload: TypeUploadOut | None
 
 
 class RobotTypeList(Answer, frozen=True, kw_only=True):
-    """Robot types."""
+    """Robot types by id."""
 
     items: tuple[RobotTypeOut, ...]
     cursor: str | None
+
+
+class RobotTypeRequest(Request, frozen=True, kw_only=True):
+    """``manifest`` is the text of a ``robot.toml``; ``files`` name → text of an ``.xml``, base64 of others.
+
+    Waits at most ``wait_ms`` for the verdict.
+    """
+
+    manifest: Annotated[str, Meta(min_length=1, max_length=MAX_MANIFEST)]
+    files: Annotated[dict[str, str], Meta(min_length=1, max_length=MAX_FILES)]
+    wait_ms: WaitMs = 10_000

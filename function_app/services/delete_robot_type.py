@@ -1,0 +1,69 @@
+"""Deleting a robot type that nothing needs any more."""
+
+import contextlib
+from dataclasses import replace
+
+from function_app.domain.accounts import Identity
+from function_app.domain.problems import Problem, not_found
+from function_app.ports.catalogue import Catalogue
+from function_app.ports.clock import Clock
+from function_app.ports.tables import Conflict, Row, Tables
+from function_app.services import store
+from function_app.services.devices import Devices
+from function_app.services.movements import Movements
+from function_app.services.robot_type_rows import INDEX, note_look, place, read_head
+
+AFTER_MS = 60_000
+"""The files of a deleted type stay so long: who has just begun to download them may go on."""
+_NAMED = 5
+
+
+class DeleteRobotType:
+    """Takes an account's own robot type out of use."""
+
+    def __init__(
+        self, *, tables: Tables, catalogue: Catalogue, devices: Devices, movements: Movements, clock: Clock
+    ) -> None:
+        self._tables = tables
+        self._catalogue = catalogue
+        self._devices = devices
+        self._movements = movements
+        self._clock = clock
+
+    async def delete(self, who: Identity, robot_type: str) -> None:
+        """Delete it, all versions. The write on its row decides; the timer deletes versions and files.
+
+        Raises:
+            Problem: ``robot-type-unknown``, ``robot-type-built-in``, ``robot-type-in-use`` with who uses it.
+        """
+        if robot_type in await self._catalogue.types():
+            detail = f"'{robot_type}' comes with the installation and cannot be deleted."
+            raise Problem("robot-type-built-in", 409, "Built-in", detail)
+        where = place(who, robot_type)
+        if where is None:
+            raise not_found("robot-type", robot_type)
+        index = await self._tables.get(store.MEMBERS, who.account, INDEX + robot_type)
+
+        async def once() -> None:
+            row, head = await read_head(self._tables, where)
+            if row is None or head is None or head.deleted:
+                raise not_found("robot-type", robot_type)
+            await self._require_unused(who, robot_type)
+            await note_look(self._tables, where, self._clock.now_ms() + AFTER_MS)
+            gone = replace(head, deleted=True, ready=0, manifest={})
+            await self._tables.replace(store.ROBOT_TYPES, Row(row.partition, row.key, store.fields(gone), row.etag))
+
+        await store.retry(once)
+        if index is not None:
+            with contextlib.suppress(Conflict):
+                await self._tables.delete(store.MEMBERS, index)
+
+    async def _require_unused(self, who: Identity, robot_type: str) -> None:
+        devices = [device.id for device in await self._devices.all(who) if device.robot_type == robot_type]
+        movements = list(await self._movements.own(who, robot_type))
+        users = [f"device {name}" for name in devices] + [f"movement {name}" for name in movements]
+        if users:
+            more = f" and {len(users) - _NAMED} more" if len(users) > _NAMED else ""
+            detail = f"'{robot_type}' is used by {', '.join(users[:_NAMED])}{more}. Un-pair or delete these first."
+            extras = {"devices": devices[:_NAMED], "movements": movements[:_NAMED]}
+            raise Problem("robot-type-in-use", 409, "The robot type is in use", detail, extras=extras)

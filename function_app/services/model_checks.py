@@ -1,0 +1,143 @@
+"""Checking uploaded models: whoever has MuJoCo takes a note, compiles, and writes the verdict.
+
+A note is taken for a time by its ETag: two checkers never hold the same one, and a killed one's is taken up again.
+"""
+
+import asyncio
+import logging
+from dataclasses import replace
+
+import msgspec
+
+from device_agent.protocol.robot_type import MANIFEST, RobotType
+from function_app.domain.robot_types import TypeVersion, with_ready
+from function_app.ports.blobs import Blobs
+from function_app.ports.clock import Clock
+from function_app.ports.model_compiler import CompilerMissingError, ModelCompiler
+from function_app.ports.tables import Conflict, Row, Tables, Write
+from function_app.services import store
+from function_app.services.forget import DAY_MS
+from function_app.services.model_files import malformed
+from function_app.services.robot_type_rows import (
+    CHECKS,
+    HEAD,
+    Place,
+    note_look,
+    read_head,
+    read_version,
+)
+
+LEASE_MS = 60_000
+"""How long a checker may hold a note: longer than a compiler may take."""
+MAX_TRIES = 3
+"""So many checkers may end while they hold a note; then the model is to blame."""
+MAX_ERRORS = 20
+MAX_ERROR = 500
+
+_log = logging.getLogger(__name__)
+
+
+class ModelChecks:
+    """The checker's work."""
+
+    def __init__(self, *, tables: Tables, blobs: Blobs, compiler: ModelCompiler, clock: Clock) -> None:
+        self._tables = tables
+        self._blobs = blobs
+        self._compiler = compiler
+        self._clock = clock
+
+    def require(self) -> None:
+        """See that models can be compiled here.
+
+        Raises:
+            CompilerMissingError: They cannot.
+        """
+        self._compiler.require()
+
+    async def run(self) -> bool:
+        """Deal with one upload; whether there was one.
+
+        Raises:
+            CompilerMissingError: Models cannot be compiled here; the note is free again.
+            StoreError: The stores cannot be used.
+        """
+        page = await self._tables.query(store.MODEL_CHECKS, CHECKS, limit=100)
+        for note in page.rows:
+            if note.data["until_ms"] > self._clock.now_ms():
+                continue
+            try:
+                taken = await self._take(note)
+            except Conflict:
+                continue  # another checker has it
+            try:
+                await self._check(taken)
+                await self._tables.delete(store.MODEL_CHECKS, taken)
+            except CompilerMissingError:
+                await self._tables.replace(store.MODEL_CHECKS, replace(note, etag=taken.etag))
+                raise
+            except Conflict:
+                _log.warning("check %s took too long: another checker has taken it up", note.key)
+            return True
+        return False
+
+    async def _take(self, note: Row) -> Row:
+        until_ms = self._clock.now_ms() + LEASE_MS
+        data = {**note.data, "until_ms": until_ms, "tries": note.data["tries"] + 1}
+        return await self._tables.replace(store.MODEL_CHECKS, replace(note, data=data))
+
+    async def _check(self, note: Row) -> None:
+        where, number = _target(note)
+        _, upload = await read_version(self._tables, where, number)
+        if upload is None or upload.state != "checking":
+            return
+        if note.data["tries"] > MAX_TRIES:
+            errors: tuple[str, ...] = (f"The check was cut off {MAX_TRIES} times. Simplify the model.",)
+        else:
+            errors = await self._errors(where, upload)
+        sentences = tuple(_sentence(error) for error in errors[:MAX_ERRORS])
+        await give_verdict(self._tables, where, number, sentences, self._clock.now_ms())
+
+    async def _errors(self, where: Place, upload: TypeVersion) -> tuple[str, ...]:
+        names = list(upload.files)
+        contents = await asyncio.gather(*(self._blobs.get(where.prefix(upload.version) + name) for name in names))
+        files = {name: content for name, content in zip(names, contents, strict=True) if content is not None}
+        if len(files) < len(names):
+            return ("A file of the upload is gone. Upload it again.",)
+        manifest = msgspec.convert(upload.manifest, RobotType)
+        del files[MANIFEST]
+        return await self._compiler.check(manifest, files) or malformed(files)
+
+
+async def give_verdict(tables: Tables, where: Place, number: int, errors: tuple[str, ...], now_ms: int) -> None:
+    """Write what was found; what nobody waits for any more stays as it is.
+
+    A version that is ready takes the place of those before it in the same batch; these are looked at a day later.
+    """
+
+    async def once() -> None:
+        head_row, head = await read_head(tables, where)
+        row, upload = await read_version(tables, where, number)
+        if row is None or upload is None or head_row is None or head is None:
+            return
+        if not upload.open or not head.needs(number):
+            return
+        done = replace(upload, state="refused" if errors else "ready", errors=errors, checked_ms=now_ms)
+        version_row = Row(row.partition, row.key, store.fields(done), row.etag)
+        writes = [Write("replace", version_row)]
+        if not errors:
+            await note_look(tables, where, now_ms + DAY_MS)
+            head_data = store.fields(with_ready(head, done))
+            writes.append(Write("replace", Row(row.partition, HEAD, head_data, head_row.etag)))
+        await tables.batch(store.ROBOT_TYPES, writes)
+
+    await store.retry(once)
+
+
+def _sentence(error: str) -> str:
+    return error[:MAX_ERROR] + " …" if len(error) > MAX_ERROR else error.rstrip(".") + "."
+
+
+def _target(note: Row) -> tuple[Place, int]:
+    place, _, version = note.key.partition(":")[2].rpartition(":")
+    account, _, robot_type = place.partition("/")
+    return Place(account, robot_type), int(version)

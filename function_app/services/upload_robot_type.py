@@ -1,0 +1,149 @@
+"""Adding a robot type: stored first, then compiled by a checker somewhere, then in use."""
+
+import asyncio
+import contextlib
+import time
+from collections.abc import Mapping
+
+import msgspec
+
+from function_app.domain.accounts import Identity
+from function_app.domain.problems import Problem, busy_store, invalid
+from function_app.domain.robot_types import TypeHead, TypeVersion, next_version
+from function_app.ports.blobs import Blobs
+from function_app.ports.catalogue import Catalogue
+from function_app.ports.clock import Clock
+from function_app.ports.tables import Conflict, Row, Tables, Write
+from function_app.services import store
+from function_app.services.model_files import Upload, read_upload
+from function_app.services.robot_type_rows import (
+    CHECKS,
+    HEAD,
+    INDEX,
+    Place,
+    note_look,
+    read_head,
+    read_version,
+    version_key,
+)
+from function_app.services.robot_types import KnownType, RobotTypes
+
+MAX_OWN = 100
+"""Robot types an account may have."""
+GIVE_UP_MS = 120_000
+"""From then on an upload without a verdict is refused."""
+_LOOK_S = 0.1
+
+
+class UploadRobotType:
+    """Stores an upload and waits for the checker's verdict."""
+
+    def __init__(
+        self, *, tables: Tables, blobs: Blobs, catalogue: Catalogue, robot_types: RobotTypes, clock: Clock
+    ) -> None:
+        self._tables = tables
+        self._blobs = blobs
+        self._catalogue = catalogue
+        self._types = robot_types
+        self._clock = clock
+
+    async def upload(
+        self, who: Identity, manifest: str, files: Mapping[str, str], *, wait_ms: int
+    ) -> tuple[KnownType, bool]:
+        """Add a robot type, or the next version of one; and whether the account had none of this id.
+
+        The note for a look comes first: an upload that a stop cuts off is refused by the timer. Until a version is
+        found good, the one before it stays in use.
+
+        Raises:
+            Problem: ``manifest-invalid``, ``robot-type-invalid``, ``robot-type-built-in``, ``robot-types-full``,
+                ``robot-type-checking``, ``robot-type-refused`` with ``errors``.
+        """
+        given = read_upload(manifest, files)
+        where = Place(who.account, given.robot_type.type)
+        if where.type in await self._catalogue.types():
+            detail = f"'{where.type}' comes with the installation. Give your robot type another id."
+            raise Problem("robot-type-built-in", 409, "Built-in", detail)
+        await note_look(self._tables, where, self._clock.now_ms() + GIVE_UP_MS)
+        await self._index(where)
+        version, new = await self._number(where, given)
+        await self._index(where)
+        for name, content in given.files.items():
+            await self._blobs.put(where.prefix(version) + name, content)
+        await self._ask_for_check(where, version)
+        done = await self._verdict(where, version, wait_ms)
+        if done is not None and done.state == "refused":
+            raise refused(done)
+        return await self._types.view(who, where.type), new
+
+    async def _index(self, where: Place) -> None:
+        """List the type. A new ETag each time keeps a deletion that began before from taking it off the list."""
+        key = INDEX + where.type
+        row = await self._tables.get(store.MEMBERS, where.account, key)
+        with contextlib.suppress(Conflict):
+            if row is not None:
+                await self._tables.replace(store.MEMBERS, row)
+                return
+            page = await self._tables.query(
+                store.MEMBERS, where.account, first=INDEX, last=INDEX + "\x7f", limit=MAX_OWN
+            )
+            if len(page.rows) >= MAX_OWN:
+                detail = f"An account keeps at most {MAX_OWN} robot types. Delete one that is not in use."
+                raise Problem("robot-types-full", 409, "Too many robot types", detail)
+            await self._tables.create(store.MEMBERS, Row(where.account, key, {}))
+
+    async def _number(self, where: Place, given: Upload) -> tuple[int, bool]:
+        """Take the next version's number, and write that it is on its way."""
+        manifest = msgspec.to_builtins(given.robot_type)
+        sizes = {name: len(content) for name, content in given.files.items()}
+
+        async def once() -> tuple[int, bool]:
+            row, head = await read_head(self._tables, where)
+            if head is not None and not head.deleted:
+                await self._require_no_other(where, head)
+            following = next_version(head, given.robot_type.version, where.type)
+            upload = TypeVersion(following.last, "uploading", manifest, sizes, self._clock.now_ms())
+            new_head = Row(where.partition, HEAD, store.fields(following), row.etag if row else "")
+            new_version = Row(where.partition, version_key(following.last), store.fields(upload))
+            writes = [Write("replace" if row else "create", new_head), Write("create", new_version)]
+            await self._tables.batch(store.ROBOT_TYPES, writes)
+            return following.last, head is None or head.deleted
+
+        return await store.retry(once)
+
+    async def _require_no_other(self, where: Place, head: TypeHead) -> None:
+        _, newest = await read_version(self._tables, where, head.last)
+        if newest is not None and newest.open:
+            detail = f"Version {newest.version} of '{where.type}' is still being checked. Wait for its verdict."
+            raise Problem("robot-type-checking", 409, "Still being checked", detail)
+
+    async def _ask_for_check(self, where: Place, version: int) -> None:
+        row, upload = await read_version(self._tables, where, version)
+        there = False
+        if row is not None and upload is not None and upload.state == "uploading":
+            data = {**row.data, "state": "checking"}
+            with contextlib.suppress(Conflict):
+                await self._tables.replace(store.ROBOT_TYPES, Row(row.partition, row.key, data, row.etag))
+                there = True
+        if not there:
+            # It took so long that the timer gave it up, or the type was deleted: nobody needs the files.
+            for name in await self._blobs.list(where.prefix(version)):
+                await self._blobs.delete(name)
+            raise busy_store()
+        key = f"{self._clock.now_ms():013d}:{where.partition}:{version}"
+        await self._tables.create(store.MODEL_CHECKS, Row(CHECKS, key, {"version": version, "until_ms": 0, "tries": 0}))
+
+    async def _verdict(self, where: Place, version: int, wait_ms: int) -> TypeVersion | None:
+        end_s = time.monotonic() + wait_ms / 1000
+        while True:
+            _, upload = await read_version(self._tables, where, version)
+            left_s = end_s - time.monotonic()
+            if upload is None or not upload.open or left_s <= 0:
+                return upload
+            await asyncio.sleep(min(_LOOK_S, left_s))
+
+
+def refused(upload: TypeVersion) -> Problem:
+    """The refusal with all that is wrong."""
+    detail = " ".join(upload.errors) or "The model was refused."
+    return invalid(detail, code="robot-type-refused", errors=list(upload.errors), version=upload.version)
