@@ -21,6 +21,7 @@ from device_agent.runtime.journal import JournalError
 from device_agent.transports.http.api import Claim, CloudApi, CloudError
 
 _POLL_S = 20.0
+_OUTDATED_POLL_S = 0.5
 _EXIT_FAILED = 1
 
 
@@ -145,22 +146,37 @@ def _await_claim(home: Home, api: CloudApi, configuration: Configuration, claim:
 def _run(options: argparse.Namespace) -> int:
     home = Home(options.home)
     if home.pairing() is None:
-        configuration = home.configuration()
-        api = bootstrap.api_of(home, configuration, CloudClock())
-        _await_claim(home, api, configuration, _announce(api, configuration))
-    ending = threading.Event()
-    for number in (signal.SIGINT, signal.SIGTERM):
-        signal.signal(number, lambda *_: ending.set())
+        _pair(home)
     if options.trace is not None:
         options.trace.mkdir(parents=True, exist_ok=True)
-    cell = bootstrap.build(home, trace=options.trace)
+    while _run_until_told(home, options.trace):
+        _pair(home)
+    return 0
+
+
+def _pair(home: Home) -> None:
+    """Learn whose the agent is; where it is nobody's, wait to be claimed."""
+    configuration = home.configuration()
+    api = bootstrap.api_of(home, configuration, CloudClock())
+    _await_claim(home, api, configuration, _announce(api, configuration))
+
+
+def _run_until_told(home: Home, trace: Path | None) -> bool:
+    """Run as the pairing on file says, until told to end; whether instead the agent belongs to another space now."""
+    ending = threading.Event()
+    before = {number: signal.signal(number, lambda *_: ending.set()) for number in (signal.SIGINT, signal.SIGTERM)}
+    cell = bootstrap.build(home, trace=trace)
     try:
         cell.start()
         print("running", flush=True)
-        ending.wait()
+        while not ending.wait(_OUTDATED_POLL_S):
+            if cell.outdated:
+                return True
     finally:
         cell.stop()
-    return 0
+        for number, handler in before.items():
+            signal.signal(number, handler)
+    return False
 
 
 # ------------------------------------------------------------ devices

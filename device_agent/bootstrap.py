@@ -1,6 +1,8 @@
 """Puts an agent together: the one place that picks drivers and transports."""
 
+import threading
 from pathlib import Path
+from typing import Any
 
 from device_agent import drivers
 from device_agent.ports.clock import CloudClock, tick_ms, wall_ms
@@ -20,9 +22,15 @@ ROBOTS = Path(__file__).resolve().parent.parent / "robots"
 class Cell:
     """A running agent and what must be closed with it."""
 
-    def __init__(self, agent: Agent, journal: Journal) -> None:
+    def __init__(self, agent: Agent, journal: Journal, link: "_Link") -> None:
         self._agent = agent
         self._journal = journal
+        self._link = link
+
+    @property
+    def outdated(self) -> bool:
+        """Whether the agent belongs to another space by now: its pairing is to be read, and all of it built again."""
+        return self._link.outdated.is_set()
 
     def start(self) -> None:
         """Start devices and link.
@@ -108,7 +116,7 @@ def build(home: Home, *, trace: Path | None = None) -> Cell:
     for entry in configuration.devices:
         devices[entry.name] = _device(entry, pairing, journal=journal, clock=clock, transport=transport, trace=trace)
     agent = Agent(devices, transport)
-    return Cell(agent, journal)
+    return Cell(agent, journal, link)
 
 
 class _Link:
@@ -117,9 +125,24 @@ class _Link:
     def __init__(self, api: CloudApi, pairing: Pairing) -> None:
         self._api = api
         self._pairing = pairing
+        self.outdated = threading.Event()
 
     def access(self) -> BrokerAccess:
-        given = self._api.credentials()
+        """What the cloud gives.
+
+        Raises:
+            CloudError: Refused; or it is for another space, in which nothing of this cell would be heard.
+            OSError: Not reached.
+        """
+        access = self._read(self._api.credentials())
+        own = f"{topics.ROOT}/{self._pairing.space}/{self._pairing.agent}/"
+        if not all(pattern.startswith(own) for pattern in access.subscribe):
+            self.outdated.set()
+            raise CloudError("this agent belongs to another space now")
+        return access
+
+    @staticmethod
+    def _read(given: dict[str, Any]) -> BrokerAccess:
         try:
             return BrokerAccess(
                 host=str(given["tcp"]["host"]),

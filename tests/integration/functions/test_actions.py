@@ -31,6 +31,29 @@ def test_an_action_waits_until_it_has_started_and_then_until_it_is_done(pair: Pa
     assert anna.start(robot.device, wait_ms=10_000).status_code == 200
 
 
+def test_success_is_told_only_once_the_robot_has_really_started(pair: Pair) -> None:
+    anna, robot = pair
+    robot.reports = lambda _: (AckStatus.RECEIVED, AckStatus.ACCEPTED)
+    answer = anna.start(robot.device, wait_ms=700)
+    assert (answer.status_code, answer.json()["status"]) == (202, "accepted"), "it has it, it does not move yet"
+    action = answer.json()["id"]
+    assert anna.action(action, wait_ms=200, wait_for="started")["status"] == "accepted"
+    waiting = anna.begin("GET", f"/actions/{action}", params={"wait_ms": 20_000, "wait_for": "started"})
+    robot.report(action, AckStatus.STARTED)
+    assert waiting().json()["status"] == "started"
+    assert anna.start(robot.device, once="k").status_code == 409, "another one is refused until this one has ended"
+    robot.report(action, AckStatus.DONE)
+    assert anna.action(action, wait_ms=20_000)["status"] == "done"
+
+
+def test_who_waits_for_the_end_is_told_of_it_and_not_of_the_start(pair: Pair) -> None:
+    anna, robot = pair
+    answer = anna.start(robot.device, wait_ms=500, wait_for="done")
+    assert (answer.status_code, answer.json()["status"]) == (202, "started")
+    robot.report(answer.json()["id"], AckStatus.DONE)
+    assert anna.action(answer.json()["id"], wait_ms=20_000)["status"] == "done"
+
+
 def test_a_call_that_does_not_wait_gets_202_and_the_place_to_ask(pair: Pair) -> None:
     anna, robot = pair
     answer = anna.start(robot.device)

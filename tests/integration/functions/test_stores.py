@@ -12,6 +12,7 @@ import pytest
 
 from device_agent.protocol.messages import AckStatus, RunMovement
 from function_app import bootstrap
+from function_app.services.store import CONTROL
 from function_app.settings import AwsStore, AzureStore
 from tests.support.aws import REGION, start_moto, use_credentials
 from tests.support.azure import start_azurite
@@ -110,3 +111,40 @@ def test_of_many_callers_of_two_instances_one_gets_the_slot(clouds: tuple[Cloud,
             assert sorted(answer.status_code for answer in answers) == [202] + [409] * 7
             robot.report(started["id"], AckStatus.DONE)
             assert there.action(started["id"], wait_ms=10_000, wait_for="done")["status"] == "done"
+
+
+def test_the_queue_of_one_device_over_two_instances_and_what_leaving_ends(clouds: tuple[Cloud, Cloud]) -> None:
+    one, other = clouds
+    with paired(one) as (anna, robot):
+        account = {"id": anna.account, "name": anna.name}
+        there = Person(other, {"access_token": anna.token, "session": anna.session, "account": account})
+        running = anna.start(robot.device, wait_ms=10_000).json()["id"]
+        calls = [
+            person.begin("POST", f"/devices/{robot.device}/actions", json={"request": MOVE, "policy": "queue"})
+            for person in (anna, there) * 2
+        ]
+        asked = {call().json()["id"] for call in calls}
+        places = {anna.action(action)["queue_position"]: action for action in asked}
+        assert sorted(places) == [1, 2, 3, 4]
+        assert there.post(f"/actions/{places[3]}/cancel").json()["status"] == "cancelled"
+        for before, action in ((running, places[1]), (places[1], places[2])):
+            robot.report(before, AckStatus.DONE)
+            assert there.action(action, wait_ms=20_000, wait_for="started")["status"] == "started"
+        for cloud in clouds:
+            cloud.sweep()
+        assert there.delete(f"/agents/{robot.id}").status_code == 204
+        problem(anna.get(f"/actions/{places[2]}"), 404, "action-unknown")
+        rows = one.run(one.functions.tables.query(CONTROL, robot.device, first="action:", last="action;")).rows
+        ends = {row.data["id"]: (row.data["status"], (row.data["reason"] or {}).get("code")) for row in rows}
+        assert ends == {
+            running: ("done", None),
+            places[1]: ("done", None),
+            places[2]: ("failed", "unpaired"),
+            places[3]: ("cancelled", "cancelled"),
+            places[4]: ("failed", "unpaired"),
+        }
+        for row in rows:
+            one.run(one.functions.forget.row(CONTROL, robot.device, row.key, due_ms=1))
+        other.sweep()
+        left = one.run(one.functions.tables.query(CONTROL, robot.device, first="action:", last="action;"))
+        assert left.rows == ()

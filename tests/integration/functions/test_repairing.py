@@ -1,0 +1,93 @@
+"""An agent that runs follows its owner into another space, and another owner, without being started anew."""
+
+import asyncio
+import contextlib
+import re
+import socket
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+import uvicorn
+
+from tests.support.brokers import wait_until
+from tests.support.cloud import Cloud, Person
+
+ROOT = Path(__file__).resolve().parents[3]
+NUDGE = {"kind": "move_joints", "position_rad": {"wrist_3": 0.1}, "speed": 1.0}
+MOST_S = 120.0
+
+
+@contextlib.contextmanager
+def served(cloud: Cloud) -> Iterator[str]:
+    """The functions' address, for a process of its own."""
+    listener = socket.create_server(("127.0.0.1", 0))
+    server = uvicorn.Server(uvicorn.Config(cloud.app, log_level="warning", lifespan="off"))
+    running = asyncio.run_coroutine_threadsafe(server.serve(sockets=[listener]), cloud.loop)
+    try:
+        yield f"http://127.0.0.1:{listener.getsockname()[1]}"
+    finally:
+        server.should_exit = True
+        running.result(MOST_S)
+
+
+@contextlib.contextmanager
+def agent(home: Path) -> Iterator[None]:
+    """The agent's own program."""
+    log = (home / "log").open("w")
+    process = subprocess.Popen(
+        [sys.executable, "-m", "device_agent", "run", "--home", str(home)], cwd=ROOT, stdout=log, stderr=log
+    )
+    try:
+        yield
+        assert process.poll() is None, (home / "log").read_text()
+    finally:
+        process.terminate()
+        assert process.wait(MOST_S) == 0
+        log.close()
+
+
+def enroll(home: Path, *more: str) -> str:
+    """Its claim code."""
+    done = subprocess.run(
+        [sys.executable, "-m", "device_agent", "enroll", "--home", str(home), "--no-wait", *more],
+        cwd=ROOT,
+        capture_output=True,
+        text=True,
+        check=True,
+    )
+    found = re.search(r"claim code (\S+)", done.stdout)
+    assert found is not None, done
+    return found[1]
+
+
+def runs_in(person: Person, device: str, space: str) -> None:
+    """See that the device is there, in this space, and does what it is asked to."""
+
+    def there() -> bool:
+        shown = person.get(f"/devices/{device}").json()
+        return bool(shown["online"] and shown["space"] == space)
+
+    wait_until(there, "the agent to be back", timeout_s=MOST_S)
+    answer = person.start(device, request=NUDGE, wait_ms=30_000, wait_for="done")
+    assert answer.json()["status"] == "done", answer.json()
+
+
+def test_it_follows_to_another_space_and_to_another_owner(cloud: Cloud, tmp_path: Path) -> None:
+    anna, bert = cloud.sign_in("anna"), cloud.sign_in("bert")
+    home = tmp_path / "agent"
+    with served(cloud) as url:
+        code = enroll(home, "--server", url, "--device", "arm=ur5")
+        claimed = anna.post("/agents/claim", {"code": code}).json()
+        device = claimed["devices"][0]["id"]
+        with agent(home):
+            runs_in(anna, device, claimed["space"])
+            attic = anna.post("/spaces", {"name": "Attic"}).json()["id"]
+            assert anna.put(f"/agents/{claimed['agent']}/space", {"space": attic}).status_code == 200
+            runs_in(anna, device, attic)
+            assert anna.delete(f"/agents/{claimed['agent']}").status_code == 204
+            theirs = bert.post("/agents/claim", {"code": enroll(home)})
+            assert theirs.status_code == 200, theirs.text
+            runs_in(bert, device, theirs.json()["space"])
+            assert anna.get(f"/devices/{device}").status_code == 404
