@@ -7,7 +7,7 @@ from typing import Any
 
 import msgspec
 
-from function_app.ports.tables import MAX_BATCH, MAX_DATA_BYTES, MAX_KEY_LENGTH, Row, Write
+from function_app.ports.tables import MAX_BATCH, MAX_BATCH_BYTES, MAX_DATA_BYTES, MAX_KEY_LENGTH, Row, Write
 
 MAX_PAGE = 1_000
 
@@ -28,11 +28,12 @@ def check(row: Row) -> None:
             raise ValueError("partitions and keys are Unicode text without lone surrogates")
 
 
-def check_batch(writes: Sequence[Write]) -> None:
-    """Refuse a batch that is not one.
+def check_batch(writes: Sequence[Write]) -> tuple[bytes, ...]:
+    """The data of each write as JSON, empty for a deletion.
 
     Raises:
-        ValueError: Empty, too many writes, two partitions, a key twice, or a row that cannot be.
+        ValueError: It is no batch: empty, too many writes or too much data, two partitions, a key twice, or a row that
+            cannot be.
     """
     if not 1 <= len(writes) <= MAX_BATCH:
         raise ValueError(f"a batch has 1 to {MAX_BATCH} writes, not {len(writes)}")
@@ -42,6 +43,11 @@ def check_batch(writes: Sequence[Write]) -> None:
         raise ValueError("a batch writes each key once")
     for write in writes:
         check(write.row)
+    texts = tuple(b"" if write.kind == "delete" else encode(write.row.data) for write in writes)
+    size = sum(map(len, texts))
+    if size > MAX_BATCH_BYTES:
+        raise ValueError(f"a batch writes at most {MAX_BATCH_BYTES} bytes, not {size}; make it smaller")
+    return texts
 
 
 def check_limit(limit: int) -> None:

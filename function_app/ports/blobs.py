@@ -29,7 +29,7 @@ class Blobs(Protocol):
     """A store of blobs. Every call is atomic: a reader sees the old content or the new, never half.
 
     All methods raise ``tables.StoreError`` when the store cannot be used, and ``ValueError`` for an empty or too long
-    name or content over ``MAX_BYTES``.
+    name, or where a blob would have more than ``MAX_BYTES``.
     """
 
     async def put(self, name: str, content: bytes) -> None:

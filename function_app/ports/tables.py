@@ -10,6 +10,9 @@ from typing import Any, Literal, Protocol
 
 MAX_BATCH = 100
 """Most writes in one batch: Azure Tables' and DynamoDB's limit."""
+MAX_BATCH_BYTES = 1_000_000
+"""Most data in one batch, as JSON. Azure takes 4 MiB of request; its SDK's escapes make up to three bytes of one, and
+keys and headers of 100 writes take up to 750 KB. DynamoDB takes 4 MB."""
 MAX_DATA_BYTES = 256 * 1024
 MAX_KEY_LENGTH = 512
 
@@ -98,7 +101,7 @@ class Tables(Protocol):
 
         Raises:
             Conflict: One of them does not fit; nothing was written.
-            ValueError: Empty, too many, two partitions, or a key twice.
+            ValueError: Empty, too many, over ``MAX_BATCH_BYTES``, two partitions, or a key twice.
         """
 
     async def close(self) -> None:

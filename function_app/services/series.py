@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 from function_app.domain import series
 from function_app.domain.series import DAY, LEVELS, RAW, Bucket, Keep, Level, Samples
 from function_app.ports.clock import Clock
-from function_app.ports.tables import MAX_BATCH, Conflict, Row, Tables, Write
+from function_app.ports.tables import MAX_BATCH, MAX_BATCH_BYTES, Conflict, Row, Tables, Write
 from function_app.services import store
 from function_app.services.forget import Forget
 from function_app.services.store import retry
@@ -25,8 +25,8 @@ AHEAD_MS = 300_000
 """A device's clock may be wrong by so much towards the future; what is from later than that is not taken in."""
 MARGIN_MS = 3_600_000
 """Rows stay so much longer than late samples are taken in: a writer may be slow, and clocks differ."""
-_MAX_BYTES = 3_000_000
-"""A batch is at most 4 MB; keys, ETags and the like need some of it."""
+_MAX_BYTES = MAX_BATCH_BYTES * 3 // 4
+"""Of a batch; what is known of the stream, and the rows' other fields, need some of it."""
 _BYTES_PER_SUMMARY = 200
 
 _log = logging.getLogger(__name__)

@@ -22,8 +22,6 @@ from function_app.adapters.aws import names
 from function_app.adapters.aws.client import Client, Refused
 from function_app.ports.tables import Conflict, Page, Row, StoreError, Write
 
-MAX_TRANSACTION_BYTES = 4_000_000
-"""Most that one batch may write; Amazon's limit is 4 MB."""
 TRIES = 8
 """How often a write is sent that another transaction stood in the way of: they take some milliseconds."""
 _PAUSE_S = 0.01
@@ -136,12 +134,9 @@ class DynamoTables:
 
     async def batch(self, table: str, writes: Sequence[Write]) -> tuple[Row, ...]:
         """See ``Tables``."""
-        rows.check_batch(writes)
+        texts = rows.check_batch(writes)
         written = tuple(_written(write) for write in writes)
-        items = [_change(table, write, row) for write, row in zip(writes, written, strict=True)]
-        size = sum(_size(next(iter(item.values()))) for item in items)
-        if size > MAX_TRANSACTION_BYTES:
-            raise ValueError(f"a batch writes at most {MAX_TRANSACTION_BYTES} bytes, not {size}; make it smaller")
+        items = [_change(table, *each) for each in zip(writes, written, texts, strict=True)]
         changes = [{kind: {"TableName": self._table, **what} for kind, what in item.items()} for item in items]
         try:
             await self._write("transact_write_items", TransactItems=changes)
@@ -159,7 +154,7 @@ class DynamoTables:
     async def _put(self, table: str, write: Write) -> Row:
         rows.check(write.row)
         row = _written(write)
-        change = _change(table, write, row)["Put"]
+        change = _change(table, write, row, rows.encode(row.data))["Put"]
         try:
             await self._write("put_item", TableName=self._table, **change)
         except Refused as error:
@@ -206,8 +201,8 @@ def _written(write: Write) -> Row:
     return row if write.kind == "delete" else Row(row.partition, row.key, row.data, secrets.token_hex(8))
 
 
-def _change(table: str, write: Write, row: Row) -> dict[str, dict[str, Any]]:
-    """A write as Amazon's transactions have it; ``row`` has the new ETag."""
+def _change(table: str, write: Write, row: Row, text: bytes) -> dict[str, dict[str, Any]]:
+    """A write of ``text`` as Amazon's transactions have it; ``row`` has the new ETag."""
     place = _place(table, row.partition, row.key)
     condition: dict[str, Any] = {"ConditionExpression": "attribute_not_exists(p)"}
     if write.kind != "create":
@@ -217,15 +212,10 @@ def _change(table: str, write: Write, row: Row) -> dict[str, dict[str, Any]]:
         }
     if write.kind == "delete":
         return {"Delete": {"Key": place, **condition}}
-    item = {**place, "etag": {"S": row.etag}, "data": {"S": rows.encode(row.data).decode()}}
+    item = {**place, "etag": {"S": row.etag}, "data": {"S": text.decode()}}
     if names.is_long(row.key):
         item["name"] = {"S": row.key}
     return {"Put": {"Item": item, **condition}}
-
-
-def _size(change: dict[str, Any]) -> int:
-    item: dict[str, dict[str, str]] = change.get("Item") or change["Key"]
-    return sum(len(name) + len(value["S"].encode()) for name, value in item.items())
 
 
 def _place(table: str, partition: str, key: str) -> dict[str, Any]:

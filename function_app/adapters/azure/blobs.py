@@ -240,12 +240,14 @@ def _append(blob: "BlobClient", block: str, content: bytes, metadata: dict[str, 
         try:
             found = blob.get_blob_properties()
         except ResourceNotFoundError:
-            blocks, condition = [], {"match_condition": MatchConditions.IfMissing}
+            size, blocks, condition = 0, [], {"match_condition": MatchConditions.IfMissing}
         else:
+            size = found.size
             condition = {"match_condition": MatchConditions.IfNotModified, "etag": found.etag}
-            blocks = _blocks(blob, found.size, condition)
+            blocks = _blocks(blob, size, condition)
         if block in blocks:
             return True
+        _check_size(size + len(content))
         if content:
             blob.stage_block(block, content)
             blocks.append(block)
@@ -297,5 +299,9 @@ def _name_of(blob: "BlobProperties") -> str:
 
 
 def _check(content: bytes) -> None:
-    if len(content) > MAX_BYTES:
-        raise ValueError(f"a blob holds at most {MAX_BYTES} bytes, not {len(content)}")
+    _check_size(len(content))
+
+
+def _check_size(size: int) -> None:
+    if size > MAX_BYTES:
+        raise ValueError(f"a blob holds at most {MAX_BYTES} bytes, not {size}")

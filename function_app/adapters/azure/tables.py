@@ -25,9 +25,6 @@ from function_app.ports.tables import Conflict, Page, Row, Write
 if TYPE_CHECKING:
     from azure.data.tables import TableClient
 
-MAX_TRANSACTION_BYTES = 1_000_000
-"""Most data in one batch. Azure takes 4 MiB of request; the SDK's escapes make up to three bytes of one, and keys and
-headers of 100 writes take up to 750 KB."""
 PROPERTY_BYTES = 64 * 1024
 """Most that one property holds, in UTF-16."""
 _PAGE = 1_000
@@ -71,14 +68,14 @@ class AzureTables:
     async def create(self, table: str, row: Row) -> Row:
         """See ``Tables``."""
         rows.check(row)
-        entity = _entity(row)
+        entity = _entity(row, rows.encode(row.data))
         return await self._put(table, row, entity, lambda to: to.create_entity(entity, retry_on_methods=_ALWAYS))
 
     async def replace(self, table: str, row: Row) -> Row:
         """See ``Tables``."""
         rows.check(row)
         _check_etag(table, row)
-        entity = _entity(row)
+        entity = _entity(row, rows.encode(row.data))
         return await self._put(
             table, row, entity, lambda to: to.update_entity(entity, **_unchanged(row), **_WHOLE), makes=False
         )
@@ -124,15 +121,11 @@ class AzureTables:
         return Page(tuple(found[:limit]), rows.write_cursor(found[limit].key) if len(found) > limit else None)
 
     async def batch(self, table: str, writes: Sequence[Write]) -> tuple[Row, ...]:
-        """See ``Tables``. The data of all writes has at most ``MAX_TRANSACTION_BYTES``."""
-        rows.check_batch(writes)
+        """See ``Tables``."""
         entities = [
-            _place(write.row.partition, write.row.key) if write.kind == "delete" else _entity(write.row)
-            for write in writes
+            _place(write.row.partition, write.row.key) if write.kind == "delete" else _entity(write.row, text)
+            for write, text in zip(writes, rows.check_batch(writes), strict=True)
         ]
-        size = sum(len(rows.encode(write.row.data)) for write in writes if write.kind != "delete")
-        if size > MAX_TRANSACTION_BYTES:
-            raise ValueError(f"a batch writes at most {MAX_TRANSACTION_BYTES} bytes, not {size}; make it smaller")
         for write in writes:
             if write.kind != "create":
                 _check_etag(table, write.row)
@@ -258,11 +251,11 @@ def _place(partition: str, key: str) -> dict[str, str]:
     }
 
 
-def _entity(row: Row) -> dict[str, str]:
+def _entity(row: Row, text: bytes) -> dict[str, str]:
     entity = {**_place(row.partition, row.key), "Write": secrets.token_hex(8)}
     if names.is_cut(entity["RowKey"], names.MAX_KEY):
         entity["Name"] = names.encode(row.key)
-    for number, part in enumerate(_parts(rows.encode(row.data).decode())):
+    for number, part in enumerate(_parts(text.decode())):
         entity[f"Data{number}"] = part
     return entity
 

@@ -208,6 +208,7 @@ class FileBlobs:
             path.parent.mkdir(parents=True, exist_ok=True)
             descriptor = os.open(path, os.O_CREAT | os.O_WRONLY | os.O_APPEND, 0o600)
             try:
+                _check_size(os.fstat(descriptor).st_size + len(content))
                 written = 0
                 while written < len(content):
                     written += os.write(descriptor, content[written:])
@@ -270,8 +271,12 @@ def _decode(encoded: str) -> str:
 
 
 def _check(content: bytes) -> None:
-    if len(content) > MAX_BYTES:
-        raise ValueError(f"a blob holds at most {MAX_BYTES} bytes, not {len(content)}")
+    _check_size(len(content))
+
+
+def _check_size(size: int) -> None:
+    if size > MAX_BYTES:
+        raise ValueError(f"a blob holds at most {MAX_BYTES} bytes, not {size}")
 
 
 def _unusable(path: Path, error: OSError) -> StoreError:

@@ -4,8 +4,6 @@ Used straight from the event loop: a read or a write costs microseconds, a threa
 processes share the file; SQLite's own lock makes each statement and each batch atomic.
 """
 
-import base64
-import binascii
 import os
 import secrets
 import sqlite3
@@ -14,22 +12,11 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-import msgspec
-
-from function_app.ports.tables import (
-    MAX_BATCH,
-    MAX_DATA_BYTES,
-    MAX_KEY_LENGTH,
-    Conflict,
-    Page,
-    Row,
-    StoreError,
-    Write,
-)
+from function_app.adapters import rows
+from function_app.ports.tables import Conflict, Page, Row, StoreError, Write
 
 BUSY_TIMEOUT_MS = 5_000
 """A writer waits this long for another process's write: they take well under a millisecond each."""
-MAX_PAGE = 1_000
 _PAUSE_S = 0.002
 
 _SCHEMA = """
@@ -46,9 +33,6 @@ _QUERY = "SELECT key, etag, data FROM rows WHERE tab=? AND part=? AND key>=? {la
 _QUERY_OPEN = _QUERY.format(last="")
 _QUERY_CLOSED = _QUERY.format(last="AND key<?")
 
-_encode = msgspec.json.Encoder().encode
-_decode = msgspec.json.Decoder(dict[str, Any]).decode
-
 
 class SqliteTables:
     """``Tables`` in the file ``path``, which is made when it is not there. Opened at the first call."""
@@ -60,19 +44,19 @@ class SqliteTables:
     async def get(self, table: str, partition: str, key: str) -> Row | None:
         """See ``Tables``."""
         found = self._run(_GET, (table, partition, key)).fetchone()
-        return None if found is None else Row(partition, key, _decode(found[1]), found[0])
+        return None if found is None else Row(partition, key, rows.decode(found[1]), found[0])
 
     async def create(self, table: str, row: Row) -> Row:
         """See ``Tables``."""
-        return self._write(table, Write("create", row))
+        return self._write_one(table, Write("create", row))
 
     async def replace(self, table: str, row: Row) -> Row:
         """See ``Tables``."""
-        return self._write(table, Write("replace", row))
+        return self._write_one(table, Write("replace", row))
 
     async def delete(self, table: str, row: Row) -> None:
         """See ``Tables``."""
-        self._write(table, Write("delete", row))
+        self._write_one(table, Write("delete", row))
 
     async def query(
         self,
@@ -85,34 +69,26 @@ class SqliteTables:
         cursor: str | None = None,
     ) -> Page:
         """See ``Tables``."""
-        if not 1 <= limit <= MAX_PAGE:
-            raise ValueError(f"limit must be 1 to {MAX_PAGE}, not {limit}")
-        start = first if cursor is None else max(first, _read_cursor(cursor))
+        rows.check_limit(limit)
+        start = first if cursor is None else max(first, rows.read_cursor(cursor))
         if last is None:
             found = self._run(_QUERY_OPEN, (table, partition, start, limit + 1)).fetchall()
         else:
             found = self._run(_QUERY_CLOSED, (table, partition, start, last, limit + 1)).fetchall()
-        rows = tuple(Row(partition, key, _decode(data), etag) for key, etag, data in found[:limit])
-        return Page(rows, _write_cursor(found[limit][0]) if len(found) > limit else None)
+        page = tuple(Row(partition, key, rows.decode(data), etag) for key, etag, data in found[:limit])
+        return Page(page, rows.write_cursor(found[limit][0]) if len(found) > limit else None)
 
     async def batch(self, table: str, writes: Sequence[Write]) -> tuple[Row, ...]:
         """See ``Tables``."""
-        if not 1 <= len(writes) <= MAX_BATCH:
-            raise ValueError(f"a batch has 1 to {MAX_BATCH} writes, not {len(writes)}")
-        if len({write.row.partition for write in writes}) != 1:
-            raise ValueError("all writes of a batch are in one partition")
-        if len({write.row.key for write in writes}) != len(writes):
-            raise ValueError("a batch writes each key once")
-        for write in writes:
-            _check(write.row)
+        texts = rows.check_batch(writes)
         self._run("BEGIN IMMEDIATE")
         try:
-            rows = tuple(self._write(table, write) for write in writes)
+            written = tuple(self._write(table, *each) for each in zip(writes, texts, strict=True))
             self._run("COMMIT")
         except BaseException:
             self._rollback()
             raise
-        return rows
+        return written
 
     async def close(self) -> None:
         """See ``Tables``."""
@@ -120,16 +96,16 @@ class SqliteTables:
             self._db.close()
             self._db = None
 
-    def _write(self, table: str, write: Write) -> Row:
+    def _write_one(self, table: str, write: Write) -> Row:
+        rows.check(write.row)
+        return self._write(table, write, b"" if write.kind == "delete" else rows.encode(write.row.data))
+
+    def _write(self, table: str, write: Write, data: bytes) -> Row:
         row = write.row
-        _check(row)
         if write.kind == "delete":
             done = self._run(_DELETE, (table, row.partition, row.key, row.etag))
             self._expect_one(done, table, row)
             return row
-        data = _encode(row.data)
-        if len(data) > MAX_DATA_BYTES:
-            raise ValueError(f"a row holds at most {MAX_DATA_BYTES} bytes, not {len(data)}")
         etag = secrets.token_hex(8)
         if write.kind == "create":
             try:
@@ -206,20 +182,3 @@ def _prepare(db: sqlite3.Connection) -> None:
             time.sleep(_PAUSE_S)
         else:
             return
-
-
-def _check(row: Row) -> None:
-    for text in (row.partition, row.key):
-        if not 1 <= len(text) <= MAX_KEY_LENGTH:
-            raise ValueError(f"partitions and keys have 1 to {MAX_KEY_LENGTH} characters, not {len(text)}")
-
-
-def _write_cursor(key: str) -> str:
-    return base64.urlsafe_b64encode(key.encode()).decode().rstrip("=")
-
-
-def _read_cursor(cursor: str) -> str:
-    try:
-        return base64.b64decode(cursor + "=" * (-len(cursor) % 4), altchars=b"-_", validate=True).decode()
-    except (ValueError, binascii.Error) as error:
-        raise ValueError("not a cursor of this list") from error

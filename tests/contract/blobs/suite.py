@@ -5,6 +5,7 @@
 """
 
 import asyncio
+import sys
 from collections.abc import Awaitable, Callable
 from dataclasses import dataclass, replace
 
@@ -168,6 +169,16 @@ class BlobsSuite:
         with pytest.raises(ValueError, match=str(MAX_BYTES)):
             await blobs.append("a", content)
         assert await blobs.list("") == ()
+
+    async def test_no_blob_grows_over_what_one_may_have(self, blobs: Blobs, monkeypatch: pytest.MonkeyPatch) -> None:
+        monkeypatch.setattr(sys.modules[type(blobs).__module__], "MAX_BYTES", 1000)
+        await blobs.put("a", bytes(998))
+        await blobs.append("a", b"1")
+        await blobs.append("a", b"2")
+        for content in (b"3", bytes(500)):
+            with pytest.raises(ValueError, match="1000"):
+                await blobs.append("a", content)
+        assert await blobs.get("a") == bytes(998) + b"12"
 
     async def test_an_upload_goes_straight_to_the_store(self, direct: Direct) -> None:
         content = bytes(range(256)) * 20_000

@@ -254,15 +254,6 @@ async def test_an_append_that_others_never_let_through_is_said_to_be(
     assert await through.get("log") is None
 
 
-async def test_a_blob_does_not_grow_over_what_one_may_have(blobs: Blobs, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(adapter, "MAX_BYTES", 1000)
-    await blobs.put("a", bytes(999))
-    await blobs.append("a", b"1")
-    with pytest.raises(ValueError, match="1000"):
-        await blobs.append("a", b"2")
-    assert await blobs.get("a") == bytes(999) + b"1"
-
-
 # ---------------------------------------------------------------- what can be wrong
 
 

@@ -128,12 +128,11 @@ async def test_many_appends_become_one_block_and_lose_nothing(
 
 async def test_the_largest_blob_is_put_got_and_appended_to_whole(blobs: Blobs) -> None:
     content = bytes(range(256)) * (MAX_BYTES // 256)
-    await blobs.put("a", content)
+    await blobs.put("a", content[:-5])
+    assert await blobs.get("a") == content[:-5]
+    await blobs.append("a", content[-5:-1])
+    await blobs.append("a", content[-1:])
     assert await blobs.get("a") == content
-    await blobs.append("a", b"more")
-    assert await blobs.get("a") == content + b"more"
-    await blobs.append("a", b"!")
-    assert await blobs.get("a") == content + b"more!"
 
 
 # ---------------------------------------------------------------- answers that get lost

@@ -11,6 +11,7 @@ import pytest
 
 from function_app.ports.tables import (
     MAX_BATCH,
+    MAX_BATCH_BYTES,
     MAX_DATA_BYTES,
     MAX_KEY_LENGTH,
     Conflict,
@@ -327,6 +328,21 @@ class TablesSuite:
                 await tables.batch("T", wrong)
         assert (await tables.query("T", "p")).rows == ()
         assert len(await tables.batch("T", writes[:MAX_BATCH])) == MAX_BATCH
+
+    async def test_a_batch_holds_1_mb_of_data_and_no_more(self, tables: Tables) -> None:
+        room = MAX_BATCH_BYTES // 5 - len('{"text":""}')
+        rows = [Row("p", str(number), {"text": "x" * room}) for number in range(5)]
+        written = await tables.batch("T", [Write("create", row) for row in rows])
+        assert (await tables.query("T", "p")).rows == written
+        more = [Write("replace", row) for row in written]
+        more[-1] = Write("replace", Row("p", "4", {"text": "x" * room + "y"}, written[-1].etag))
+        with pytest.raises(ValueError, match=str(MAX_BATCH_BYTES)):
+            await tables.batch("T", more)
+        assert (await tables.query("T", "p")).rows == written
+        # What is deleted does not count.
+        changes = [Write("delete", row) for row in written]
+        await tables.batch("T", [*changes, *(Write("create", Row("p", f"new {row.key}", row.data)) for row in rows)])
+        assert [row.key for row in (await tables.query("T", "p")).rows] == [f"new {number}" for number in range(5)]
 
     async def test_a_batch_is_of_one_partition_and_each_key_once(self, tables: Tables) -> None:
         with pytest.raises(ValueError, match="one partition"):

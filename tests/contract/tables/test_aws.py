@@ -159,15 +159,6 @@ async def test_what_is_read_is_what_was_written_last(through: Tables, wire: Wire
     assert [asked.json["ConsistentRead"] for asked in wire.asked] == [True, True]
 
 
-async def test_a_batch_that_amazon_would_not_take_is_refused_before_it_is_sent(through: Tables, wire: Wire) -> None:
-    wire.spoil()
-    writes = [Write("create", Row("p", str(number), {"text": "x" * 200_000})) for number in range(20)]
-    with pytest.raises(ValueError, match="4000000"):
-        await through.batch("T", writes)
-    assert wire.asked == []
-    assert len(await through.batch("T", writes[:19])) == 19
-
-
 # ---------------------------------------------------------------- lost requests and answers
 
 

@@ -10,9 +10,10 @@ import msgspec
 import pytest
 
 from function_app.adapters.azure.client import ATTEMPTS, Place
-from function_app.adapters.azure.tables import MAX_TRANSACTION_BYTES, AzureTables
+from function_app.adapters.azure.tables import AzureTables
 from function_app.ports.tables import (
     MAX_BATCH,
+    MAX_BATCH_BYTES,
     MAX_DATA_BYTES,
     MAX_KEY_LENGTH,
     Conflict,
@@ -140,13 +141,13 @@ async def test_the_largest_batch_passes_and_a_larger_one_is_refused_before_it_is
     tables: Tables, letter: str
 ) -> None:
     key = "🤖" * (MAX_KEY_LENGTH - 1)
-    bytes_ = MAX_TRANSACTION_BYTES // MAX_BATCH
+    bytes_ = MAX_BATCH_BYTES // MAX_BATCH
     text = letter * ((bytes_ - len('{"text":""}')) // (len(msgspec.json.encode(letter)) - 2))
     writes = [Write("create", Row(key + "p", key + chr(33 + n), {"text": text})) for n in range(MAX_BATCH)]
     written = await tables.batch("T", writes)
     assert (await tables.query("T", key + "p")).rows == written
     more = [Write("replace", Row(row.partition, row.key, {"text": text + "x" * 99}, row.etag)) for row in written]
-    with pytest.raises(ValueError, match=f"at most {MAX_TRANSACTION_BYTES} bytes"):
+    with pytest.raises(ValueError, match=f"at most {MAX_BATCH_BYTES} bytes"):
         await tables.batch("T", more)
     assert (await tables.query("T", key + "p")).rows == written
 
