@@ -9,6 +9,7 @@ from fastapi import FastAPI, Request, Response
 from fastapi.exceptions import RequestValidationError
 from starlette.exceptions import HTTPException
 from starlette.requests import ClientDisconnect
+from starlette.routing import Match
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from function_app.bootstrap import Functions
@@ -40,7 +41,8 @@ from function_app.ports.clock import Clock
 from function_app.ports.tables import StoreError
 
 _log = logging.getLogger(__name__)
-_TITLES = {404: "Nothing here", 405: "Not this method"}
+_WRONG_METHOD = 405
+_TITLES = {404: "Nothing here", _WRONG_METHOD: "Not this method"}
 
 
 def create_app(functions: Functions) -> FastAPI:
@@ -152,7 +154,20 @@ async def _on_http(request: Request, error: Exception) -> Response:
     answer = problem(Problem("http", error.status_code, title, detail))
     for name, value in (error.headers or {}).items():
         answer.headers[name] = value
+    if error.status_code == _WRONG_METHOD:
+        answer.headers["Allow"] = ", ".join(_methods(request))
     return answer
+
+
+def _methods(request: Request) -> list[str]:
+    """What may be asked at this address: the framework names the methods of the first route alone."""
+    found = {
+        method
+        for route in request.app.routes
+        if route.matches(request.scope)[0] is not Match.NONE
+        for method in getattr(route, "methods", None) or ()
+    }
+    return sorted(found)
 
 
 class _Headers:

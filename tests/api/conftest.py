@@ -1,0 +1,29 @@
+import shutil
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from function_app.adapters.local.keys import FileKeys
+from tests.support.brokers import RunningBroker, start_broker
+
+
+@pytest.fixture(scope="session")
+def keys(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Signing keys that the broker knows."""
+    folder = tmp_path_factory.mktemp("api") / "keys"
+    FileKeys(folder).load()
+    return folder
+
+
+@pytest.fixture(scope="session")
+def broker(keys: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator[RunningBroker]:
+    with start_broker("amqtt", tmp_path_factory.mktemp("broker"), keys=keys / "public.json") as running:
+        yield running
+
+
+@pytest.fixture
+def home(tmp_path: Path, keys: Path) -> Path:
+    folder = tmp_path / "home"
+    shutil.copytree(keys, folder / "keys")
+    return folder

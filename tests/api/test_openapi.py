@@ -1,0 +1,126 @@
+"""``schemathesis run`` on the OpenAPI document: no server error, no undocumented status, answers as documented."""
+
+import json
+import os
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+from cryptography.hazmat.primitives import serialization
+
+from device_agent.protocol import signing, topics
+from device_agent.protocol.messages import AckStatus, Fault, Measurements, Mode, State
+from tests.support.brokers import ROOT, RunningBroker
+from tests.support.cloud import API, MOVE
+from tests.support.hosts import Host, start_host
+from tests.support.polling import PollingRobot, Site
+from tests.support.site import Visitor, sign_in
+
+CHECKS = (
+    "not_a_server_error",
+    "status_code_conformance",
+    "content_type_conformance",
+    "response_headers_conformance",
+    "response_schema_conformance",
+    "unsupported_method",
+    "allow_header_conformance",
+    "ignored_auth",
+)
+
+
+@pytest.fixture
+def host(home: Path, broker: RunningBroker) -> Iterator[Host]:
+    environment = {"TELESCOPE_HOME": str(home), "TELESCOPE_MQTT_PORT": str(broker.tcp_port)}
+    with start_host("uvicorn", environment) as host:
+        yield host
+
+
+def pem(key: Any) -> str:
+    text: bytes = key.private_bytes(
+        serialization.Encoding.PEM, serialization.PrivateFormat.PKCS8, serialization.NoEncryption()
+    )
+    return text.decode()
+
+
+def furnish(host: Host, site: Site, anna: Visitor, robot: PollingRobot) -> dict[str, Any]:
+    """Things that there are, for the hooks to name."""
+    spare = [PollingRobot(site) for _ in range(2)]
+    for each in spare:
+        each.pair(anna)
+    assert anna.put("/robot-types/ur5/movements/mine", {"source": "robot.home()"}).status_code == 201
+    actions = []
+    for device in robot.devices:
+        answer = anna.post(f"/devices/{device}/actions", {"request": MOVE, "wait_ms": 10_000})
+        assert answer.status_code == 200, answer.text
+        actions.append(answer.json()["id"])
+    robot.report(actions[0], AckStatus.DONE)
+    now_ms = robot.cloud.clock.now_ms()
+    measured = Measurements(tick_ms=now_ms, at_ms=now_ms, sequence=1, values={"temperature_c": 40.0})
+    robot.say(topics.device(robot.space, robot.id, "arm", topics.TELE, "health"), measured)
+    fault = Fault(code="hot", message="The elbow is hot.", since_ms=now_ms)
+    robot.say_state(State(device="arm", at_ms=now_ms, tick_ms=now_ms, mode=Mode.IDLE, epoch=0, faults=(fault,)))
+    host.tick()
+    faults = anna.get(f"/devices/{robot.device}/faults").json()["items"]
+    streams = anna.get(f"/devices/{robot.device}/data").json()["items"]
+    assert len(faults) == len(streams) == 1
+    new = signing.generate()
+    return {
+        "token": anna.token,
+        "spare_token": "",
+        "agent_key": pem(robot.key),
+        "new_agent_key": pem(new),
+        "new_agent_public": signing.public_text(new.public_key()),
+        "spare_agents": [each.id for each in spare],
+        "ids": {
+            "device": robot.devices,
+            "agent": [robot.id],
+            "action": actions,
+            "robot_type": ["ur5"],
+            "name": ["mine", "wave"],
+            "stream": [each["name"] for each in streams],
+            "fault": [each["id"] for each in faults],
+        },
+    }
+
+
+def run(host: Host, home: Path, *options: str) -> None:
+    site = Site(host.url)
+    with PollingRobot(site, "arm", "leg", "head") as robot:
+        anna = sign_in(host, site, home, "anna")
+        robot.pair(anna)
+        robot.connect()
+        world = furnish(host, site, anna, robot) | {"spare_token": sign_in(host, site, home, "anna").token}
+        (home / "world.json").write_text(json.dumps(world))
+        done = subprocess.run(
+            [
+                str(Path(sys.executable).with_name("schemathesis")), "run", f"{host.url}{API}/openapi.json",
+                "--checks", ",".join(CHECKS), "--generation-database", "none", "--continue-on-failure",
+                "--warnings", "off", "--request-timeout", "60", *options, *os.environ.get("ST_MORE", "").split(),
+            ],
+            cwd=home,
+            env={
+                **os.environ,
+                "PYTHONPATH": str(ROOT),
+                "SCHEMATHESIS_HOOKS": "tests.api.schemathesis_hooks",
+                "TELESCOPE_WORLD": str(home / "world.json"),
+            },
+            capture_output=True,
+            text=True,
+            check=False,
+        )  # fmt: skip
+    site.close()
+    assert done.returncode == 0, done.stdout[-20_000:] + done.stderr[-5_000:]
+
+
+@pytest.mark.timeout(300)
+def test_what_the_document_says_is_what_is_answered(host: Host, home: Path) -> None:
+    run(host, home, "--phases", "examples,coverage,fuzzing", "--max-examples", "12", "--seed", "1")
+
+
+@pytest.mark.long
+@pytest.mark.timeout(3_600)
+def test_what_the_document_says_is_what_is_answered_to_a_thousand_requests_of_a_kind(host: Host, home: Path) -> None:
+    run(host, home, "--max-examples", "1000")
