@@ -106,8 +106,10 @@ class Delivery:
                 status = await self._mailbox.answered(device.agent, command)
                 if status is not None:
                     return status
+                # Not `wait_for`: it loses the end of the time that the caller set when the bell rings in that moment.
                 with contextlib.suppress(TimeoutError):
-                    await asyncio.wait_for(bell.wait(), pause_s)
+                    async with asyncio.timeout(pause_s):
+                        await bell.wait()
                 pause_s = min(2 * pause_s, _SLOWEST_POLL_S)
 
 

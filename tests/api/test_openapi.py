@@ -98,7 +98,7 @@ def run(host: Host, home: Path, *options: str) -> None:
             [
                 str(Path(sys.executable).with_name("schemathesis")), "run", f"{host.url}{API}/openapi.json",
                 "--checks", ",".join(CHECKS), "--generation-database", "none", "--continue-on-failure",
-                "--warnings", "off", "--request-timeout", "60", *options, *os.environ.get("ST_MORE", "").split(),
+                "--warnings", "off", "--request-timeout", "60", *options,
             ],
             cwd=home,
             env={
