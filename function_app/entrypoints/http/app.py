@@ -7,9 +7,9 @@ from typing import Any
 
 from fastapi import FastAPI, Request, Response
 from fastapi.exceptions import RequestValidationError
+from fastapi.routing import APIRoute
 from starlette.exceptions import HTTPException
 from starlette.requests import ClientDisconnect
-from starlette.routing import Match
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from function_app.bootstrap import Functions
@@ -86,6 +86,7 @@ def create_app(functions: Functions) -> FastAPI:
     for routes in resources:
         app.include_router(routes.router, prefix=PREFIX)
     app.include_router(transfers.router(functions.transfers), prefix=PREFIX)
+    app.state.routes = [route for routes in resources for route in routes.router.routes]
     _document(app, [kind for routes in resources for kind in routes.kinds])
     app.add_exception_handler(Problem, _on_problem)
     app.add_exception_handler(StoreError, _on_store)
@@ -161,13 +162,9 @@ async def _on_http(request: Request, error: Exception) -> Response:
 
 def _methods(request: Request) -> list[str]:
     """What may be asked at this address: the framework names the methods of the first route alone."""
-    found = {
-        method
-        for route in request.app.routes
-        if route.matches(request.scope)[0] is not Match.NONE
-        for method in getattr(route, "methods", None) or ()
-    }
-    return sorted(found)
+    path = request.url.path.removeprefix(PREFIX)
+    known: list[APIRoute] = request.app.state.routes
+    return sorted({method for route in known if route.path_regex.match(path) for method in route.methods})
 
 
 class _Headers:
