@@ -7,7 +7,6 @@ from typing import Any
 
 from fastapi import FastAPI, Request, Response
 from fastapi.exceptions import RequestValidationError
-from fastapi.routing import APIRoute
 from starlette.exceptions import HTTPException
 from starlette.requests import ClientDisconnect
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
@@ -163,7 +162,7 @@ async def _on_http(request: Request, error: Exception) -> Response:
 def _methods(request: Request) -> list[str]:
     """What may be asked at this address: the framework names the methods of the first route alone."""
     path = request.url.path.removeprefix(PREFIX)
-    known: list[APIRoute] = request.app.state.routes
+    known: list[Any] = request.app.state.routes
     return sorted({method for route in known if route.path_regex.match(path) for method in route.methods})
 
 
