@@ -12,6 +12,7 @@ import pytest
 
 from device_agent.protocol.messages import AckStatus, RunMovement
 from function_app import bootstrap
+from function_app.services.delete_robot_type import AFTER_MS
 from function_app.services.store import CONTROL
 from function_app.settings import AwsStore, AzureStore
 from tests.support.aws import REGION, start_moto, use_credentials
@@ -19,6 +20,7 @@ from tests.support.azure import start_azurite
 from tests.support.brokers import RunningBroker
 from tests.support.cloud import MOVE, Cloud, Person, paired, problem, settings
 
+UR5 = Path(__file__).parents[3] / "robots" / "ur5"
 MINE = "/robot-types/ur5/movements/mine"
 SOURCE = '"""Wave."""\nrobot.home()\n'
 STORES = ("local", "azure", "aws")
@@ -93,6 +95,31 @@ def test_from_pairing_to_a_movement_that_was_run(clouds: tuple[Cloud, Cloud]) ->
         problem(bert.get(f"/actions/{action['id']}"), 404, "action-unknown")
         problem(bert.get(f"/devices/{robot.device}"), 404, "device-unknown")
         problem(bert.get(MINE), 404, "movement-unknown")
+
+
+def test_a_robot_type_is_uploaded_to_one_checked_by_the_other_and_deleted(clouds: tuple[Cloud, Cloud]) -> None:
+    one, other = clouds
+    anna, again = one.sign_in("anna"), other.sign_in("anna")
+    text = (UR5 / "robot.toml").read_text().replace('type = "ur5"', 'type = "mine"')
+    files = {path.name: path.read_text() for path in UR5.glob("*.xml")}
+    assert anna.post("/robot-types", {"manifest": text, "files": files, "wait_ms": 0}).status_code == 202
+    assert other.run(other.functions.model_checks.run())
+    assert not one.run(one.functions.model_checks.run())
+    assert anna.get("/robot-types/mine").json()["state"] == "ready"
+    assert {"mine", "ur5"} <= {item["type"] for item in again.get("/robot-types").json()["items"]}
+    assert again.get("/robot-types/mine/files/ur5.xml").text == files["ur5.xml"]
+    up = "/robot-types/mine/movements/up"
+    for number in range(3):
+        assert anna.put(up, {"source": f"# {number}"}).json()["version"] == number + 1
+    assert [item["version"] for item in again.get(f"{up}/versions").json()["items"]] == [3, 2, 1]
+    assert again.get(up, params={"version": 2}).json()["source"] == "# 1"
+    problem(anna.delete("/robot-types/mine"), 409, "robot-type-in-use")
+    assert again.delete(up).status_code == 204
+    assert anna.delete("/robot-types/mine").status_code == 204
+    problem(again.get("/robot-types/mine"), 404, "robot-type-unknown")
+    other.clock.advance(AFTER_MS / 1000)
+    other.sweep()
+    assert one.run(one.functions.blobs.list("robot-types/")) == ()
 
 
 def test_of_many_callers_of_two_instances_one_gets_the_slot(clouds: tuple[Cloud, Cloud]) -> None:
