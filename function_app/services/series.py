@@ -25,9 +25,12 @@ AHEAD_MS = 300_000
 """A device's clock may be wrong by so much towards the future; what is from later than that is not taken in."""
 MARGIN_MS = 3_600_000
 """Rows stay so much longer than late samples are taken in: a writer may be slow, and clocks differ."""
+MAX_WRITTEN = 100
+"""Streams whose newest rows are kept in memory."""
 _MAX_BYTES = MAX_BATCH_BYTES * 3 // 4
 """Of a batch; what is known of the stream, and the rows' other fields, need some of it."""
-_BYTES_PER_SUMMARY = 200
+_BYTES_PER_SUMMARY = 240
+_BYTES_PER_NAME = 84
 
 _log = logging.getLogger(__name__)
 
@@ -66,6 +69,8 @@ class _Known:
 
     about: Row | None
     rows: dict[str, Row] = field(default_factory=dict)
+    last_ms: int = 0
+    """Start of the newest window among them."""
 
     def write(self, partition: str, key: str, data: dict[str, Any]) -> Write:
         """The write that puts ``data`` where the row was, or was not."""
@@ -86,6 +91,7 @@ class SeriesWriter:
         self._forget = forget
         self._keep = keep
         self._clock = clock
+        self._written: dict[str, _Known] = {}
 
     async def add(self, place: Place, samples: Samples) -> Samples:
         """Add what is not there yet; gives what was new.
@@ -118,9 +124,14 @@ class SeriesWriter:
 
     async def _add(self, place: Place, windows: _Windows) -> Samples:
         """A part that fits into one batch, or, where what is known already makes it too large, into several."""
+        first_ms, last_ms = windows[0][0], windows[-1][0]
 
         async def once() -> Samples | None:
-            return await self._write(place, windows)
+            # What this instance wrote last, as long as nobody else has: if so, the ETags say it, and it is read.
+            known = self._written.pop(place.partition, None)
+            if known is None or first_ms < known.last_ms:
+                known = await self._read(place.partition, first_ms, last_ms)
+            return await self._write(place, windows, known)
 
         written = await retry(once)
         if written is not None:
@@ -128,14 +139,13 @@ class SeriesWriter:
         half = len(windows) // 2
         return series.merge(await self._add(place, windows[:half]), await self._add(place, windows[half:]))
 
-    async def _write(self, place: Place, windows: _Windows) -> Samples | None:
-        """Read, decide, write; ``None``: too much for one batch.
+    async def _write(self, place: Place, windows: _Windows, known: _Known) -> Samples | None:
+        """Decide and write; ``None``: too much for one batch.
 
         Raises:
             Conflict: Somebody else has written meanwhile.
         """
         partition = place.partition
-        known = await self._read(partition, windows[0][0], windows[-1][0])
         about = store.read(known.about, About) if known.about else About()
         if known.about is None and not await self._announce(place):
             return Samples()
@@ -158,15 +168,27 @@ class SeriesWriter:
             _into(buckets, known, start_ms, series.summarize(fitting))
         if not new:
             return new
-        size = sum(len(write.row.data["data"]) for write in writes)
+        size = sum(
+            len(row["data"]) + _BYTES_PER_NAME * len(row["fields"]) for row in (each.row.data for each in writes)
+        )
         size += _BYTES_PER_SUMMARY * sum(len(each.fields) for each in buckets.values())
         if size > _MAX_BYTES and len(windows) > 1:
             return None
         writes += (known.write(partition, key, each.data()) for key, each in buckets.items())
         writes.append(known.write(partition, ABOUT, store.fields(_grown(about, new, names))))
         await self._note(partition, known, buckets)
-        await self._tables.batch(store.SERIES, writes)
+        self._remember(partition, windows[-1][0], await self._tables.batch(store.SERIES, writes))
         return new
+
+    def _remember(self, partition: str, start_ms: int, written: Sequence[Row]) -> None:
+        """Keep the rows that samples from the same window on will change: a live stream needs no reading then."""
+        rows = {row.key: row for row in written}
+        about = rows.pop(ABOUT)
+        keys = {series.key(level, _start(level, start_ms)) for level in (RAW, *LEVELS)}
+        if keys <= rows.keys():
+            while len(self._written) >= MAX_WRITTEN:
+                self._written.pop(next(iter(self._written)))
+            self._written[partition] = _Known(about, {key: rows[key] for key in keys}, start_ms)
 
     async def _read(self, partition: str, first_ms: int, last_ms: int) -> _Known:
         """All rows that samples between the two windows can change."""

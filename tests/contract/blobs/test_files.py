@@ -1,11 +1,14 @@
 """``FileBlobs`` keeps the port's promises and never leaves its folder."""
 
+import asyncio
 import base64
+import socket
 from collections.abc import AsyncIterator, Awaitable, Callable
 from pathlib import Path
 
 import httpx
 import pytest
+import uvicorn
 from fastapi import FastAPI, Response
 
 from function_app.adapters.local.blobs import FileBlobs
@@ -40,7 +43,7 @@ def again(tmp_path: Path) -> Again:
 
 @pytest.fixture
 async def direct(tmp_path: Path) -> AsyncIterator[Direct]:
-    blobs = FileBlobs(tmp_path / "blobs", key=b"k" * 32, url="http://telescope.test/blobs")
+    blobs = FileBlobs(tmp_path / "blobs", key=b"k" * 32)
     app = FastAPI()
     app.include_router(transfers.router(blobs))
     app.add_exception_handler(Problem, lambda _, error: Response(str(error), error.status))
@@ -52,8 +55,14 @@ async def direct(tmp_path: Path) -> AsyncIterator[Direct]:
         parts[1] = base64.urlsafe_b64encode(body).decode().rstrip("=")
         return f"{head}/{'.'.join(parts)}"
 
-    async with httpx.AsyncClient(transport=httpx.ASGITransport(app)) as client:
+    listener = socket.create_server(("127.0.0.1", 0))
+    blobs._url = f"http://127.0.0.1:{listener.getsockname()[1]}/blobs"
+    server = uvicorn.Server(uvicorn.Config(app, log_level="warning", lifespan="off"))
+    serving = asyncio.create_task(server.serve(sockets=[listener]))
+    async with httpx.AsyncClient() as client:
         yield Direct(blobs, client, renamed)
+    server.should_exit = True
+    await serving
     assert list(tmp_path.rglob("*.part")) == []
 
 

@@ -245,6 +245,34 @@ async def test_a_device_has_so_many_streams_and_a_stream_so_many_fields(house: H
     assert len(part.summaries) == series.MAX_FIELDS
 
 
+async def test_a_live_stream_is_written_without_reading_until_somebody_else_writes_it(house: House) -> None:
+    rows: dict[int, dict[str, float]] = {}
+    reads = 0
+    real = house.writer._read
+
+    async def counted(*arguments: Any) -> Any:
+        nonlocal reads
+        reads += 1
+        return await real(*arguments)
+
+    house.writer._read = counted  # type: ignore[assignment, method-assign]
+    other = house.instance()[2]
+
+    async def add(writer: SeriesWriter, number: int) -> None:
+        new = {house.clock.at_ms + 100 * n: {"a": float(n)} for n in range(number * 50, number * 50 + 50)}
+        rows.update(new)
+        assert len(await writer.add(PLACE, series.gather(new.items()))) == 50
+
+    for number in range(20):
+        await add(house.writer, number)
+    assert reads == 1
+    await add(other, 20)
+    await add(house.writer, 21)
+    assert reads == 2
+    assert len(await house.writer.add(PLACE, series.gather(rows.items()))) == 0
+    await assert_whole(house, rows)
+
+
 # ---------------------------------------------------------------- reading
 
 
