@@ -216,14 +216,19 @@ async def test_a_long_stretch_is_split_into_batches(house: House) -> None:
     await assert_whole(house, rows)
 
 
-async def test_windows_that_are_too_large_for_one_batch_are_written_in_several(house: House) -> None:
+@pytest.mark.parametrize(("fields", "every_ms"), [(100, 100), (250, 400)])
+async def test_windows_that_are_too_large_for_one_batch_are_written_in_several(
+    house: House, fields: int, every_ms: int
+) -> None:
     chance = random.Random(3)  # noqa: S311 (the same each time)
     begin_ms = series.floor(NOW_MS, 60_000) - 600_000
-    rows = {begin_ms + 100 * n: {f"f{m}": chance.random() for m in range(100)} for n in range(4000)}
-    new = await house.writer.add(PLACE, series.gather(rows.items()))
-    assert len(new) == len(rows)
+    names = [f"{'x' * 77}{number:03d}" for number in range(fields)]
+    rows = {begin_ms + at_ms: {name: -chance.random() for name in names} for at_ms in range(0, 300_000, every_ms)}
+    for _ in range(2):
+        new = await house.writer.add(PLACE, series.gather(rows.items()))
+    assert len(new) == 0
     part = await house.read(level="1h", points=10)
-    summaries = [summary for summary in part.summaries["f7"] if summary is not None]
+    summaries = [summary for summary in part.summaries[names[7]] if summary is not None]
     assert sum(summary.samples for summary in summaries) == len(rows)
 
 
