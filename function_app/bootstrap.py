@@ -225,7 +225,7 @@ def build(settings: Settings, *, clock: Clock | None = None) -> Functions:
         clock=now,
         identify=identify,
         sign_in=sign_in,
-        enroll=Enroll(tables=tables, leave=leave, clock=now),
+        enroll=Enroll(tables=tables, leave=leave, forget=forget, clock=now),
         claim=Claim(tables=tables, sign_in=sign_in, forget=forget, leave=leave, clock=now),
         unpair=Unpair(tables=tables, sign_in=sign_in, leave=leave),
         devices=devices,

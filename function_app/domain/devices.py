@@ -12,6 +12,7 @@ POLL_SILENT_MS = 45_000
 POLL_MARK_MS = 15_000
 """How often at most it is written down that an agent has polled."""
 
+NEVER_MS = 2**53
 _MOST_LEAVING = 16
 """Only a broker that is away for long lets so many come together; the oldest then keep what is retained of them."""
 
@@ -48,6 +49,7 @@ class Agent:
         pairing: Changes with each claim: what belongs to an earlier owner's pairing is no longer shown.
         claim_code: The code that claims it now; empty when claimed.
         leaving: What ``services/leave.py`` has to tidy up.
+        expires_ms: From then on it may be forgotten, if nobody has claimed it [ms since 1970].
     """
 
     id: str
@@ -64,6 +66,7 @@ class Agent:
     claim_expires_ms: int = 0
     transport: Transport = "mqtt"
     leaving: tuple[Leaving, ...] = ()
+    expires_ms: int = 0
 
     @property
     def claimed(self) -> bool:
@@ -102,6 +105,7 @@ def claim(agent: Agent, *, account: str, space: str, pairing: str, now_ms: int) 
         claimed_ms=now_ms,
         claim_code="",
         claim_expires_ms=0,
+        expires_ms=NEVER_MS,
     )
 
 

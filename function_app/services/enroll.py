@@ -9,9 +9,12 @@ from function_app.domain.problems import Problem
 from function_app.ports.clock import Clock
 from function_app.ports.tables import Conflict, Row, Tables, Write
 from function_app.services import store
+from function_app.services.forget import DAY_MS, Forget
 from function_app.services.leave import Leave
 
 CLAIM_MS = 300_000
+KEEP_UNCLAIMED_MS = 7 * DAY_MS
+"""An agent that waits shows a new code every few minutes: one that nobody has heard of for so long is gone."""
 _LOOK_S = 0.2
 
 
@@ -29,9 +32,10 @@ class Enrollment:
 class Enroll:
     """Enrolment of agents."""
 
-    def __init__(self, *, tables: Tables, leave: Leave, clock: Clock) -> None:
+    def __init__(self, *, tables: Tables, leave: Leave, forget: Forget, clock: Clock) -> None:
         self._tables = tables
         self._leave = leave
+        self._forget = forget
         self._clock = clock
 
     async def enroll(self, agent: str, told: Enrollment) -> Agent:
@@ -62,7 +66,9 @@ class Enroll:
             if not record.claimed:
                 expires_ms = now_ms + CLAIM_MS
                 code = await self._new_code(agent, expires_ms)
-                record = replace(record, claim_code=code, claim_expires_ms=expires_ms)
+                forget_ms = now_ms + KEEP_UNCLAIMED_MS
+                await self._forget.row(store.AGENTS, agent, "agent", due_ms=(forget_ms // DAY_MS + 1) * DAY_MS)
+                record = replace(record, claim_code=code, claim_expires_ms=expires_ms, expires_ms=forget_ms)
             new = Row(agent, "agent", store.fields(record), row.etag if row else "")
             await self._tables.batch(store.AGENTS, [Write("replace" if row else "create", new)])
             return record
