@@ -10,15 +10,16 @@ from typing import Any
 
 import pytest
 
-from device_agent.protocol.messages import AckStatus, RunMovement
+from device_agent.protocol.messages import AckStatus, RunMovement, StopDevice
 from function_app import bootstrap
 from function_app.services.delete_robot_type import AFTER_MS
 from function_app.services.store import CONTROL
 from function_app.settings import AwsStore, AzureStore
 from tests.support.aws import REGION, start_moto, use_credentials
 from tests.support.azure import start_azurite
-from tests.support.brokers import RunningBroker
+from tests.support.brokers import RunningBroker, wait_until
 from tests.support.cloud import MOVE, Cloud, Person, paired, problem, settings
+from tests.support.polling import PollingRobot
 
 UR5 = Path(__file__).parents[3] / "robots" / "ur5"
 MINE = "/robot-types/ur5/movements/mine"
@@ -175,3 +176,20 @@ def test_the_queue_of_one_device_over_two_instances_and_what_leaving_ends(clouds
         other.sweep()
         left = one.run(one.functions.tables.query(CONTROL, robot.device, first="action:", last="action;"))
         assert left.rows == ()
+
+
+def test_a_robot_that_asks_one_instance_obeys_the_other(clouds: tuple[Cloud, Cloud]) -> None:
+    one, other = clouds
+    anna = other.sign_in("anna")
+    with PollingRobot(one) as robot:
+        robot.pair(one.sign_in("anna"))
+        robot.connect()
+        lease = anna.take(robot.device, wait_ms=20_000).json()
+        assert lease["confirmed"]
+        action = anna.start(robot.device, epoch=lease["epoch"], wait_ms=20_000).json()
+        assert action["status"] == "started"
+        robot.report(action["id"], AckStatus.DONE, result={"reached": True})
+        assert anna.action(action["id"], wait_ms=20_000, wait_for="done")["result"] == {"reached": True}
+        assert anna.post(f"/devices/{robot.device}/stop").status_code == 200
+        wait_until(lambda: robot.heard(StopDevice), "the stop")
+        wait_until(lambda: robot.fetch() == [], "every command to be answered")

@@ -8,7 +8,7 @@ import httpx
 import pytest
 
 from device_agent.protocol import codec, topics
-from device_agent.protocol.messages import Presence
+from device_agent.protocol.messages import AckStatus, MoveJoints, Presence
 from function_app.entrypoints.http.answers import MAX_BODY
 from function_app.entrypoints.http.caller import CLIENT_HEADER
 from tests.support.brokers import wait_until
@@ -16,6 +16,7 @@ from tests.support.cloud import API, MOVE, problem
 from tests.support.hosts import HOSTS, HostFailed, HostKind, start_host
 from tests.support.hosts.host import PATIENCE_S
 from tests.support.hosts.reached import Reached
+from tests.support.polling import PollingRobot
 
 
 @pytest.fixture(scope="module", params=HOSTS)
@@ -114,3 +115,18 @@ def test_an_error_reaches_the_host_so_that_it_delivers_again(kind: HostKind, tmp
         with pytest.raises(HostFailed, match="damaged"):
             host.deliver("ts/v1/space/agent/conn", json.dumps({"online": True, "session": 1, "at_ms": 1}).encode())
         problem(httpx.post(f"{host.url}{API}/auth/sign-in", json={"link": "x"}), 503, "store-unavailable")
+
+
+def test_a_robot_that_polls_does_what_it_is_asked(there: Reached) -> None:
+    """Without a broker anywhere: all that it needs is HTTP."""
+    with there.sign_in("anna") as anna, PollingRobot(there, wait_ms=0, pause_s=0.1) as robot:
+        there.pair(anna, robot)
+        robot.connect()
+        assert anna.get(f"/devices/{robot.device}").json()["online"]
+        body = {"request": MOVE, "wait_ms": 0}
+        action = anna.post(f"/devices/{robot.device}/actions", json=body).json()["id"]
+        wait_until(lambda: anna.get(f"/actions/{action}").json()["status"] == "started", "the action to start")
+        robot.report(action, AckStatus.DONE)
+        assert anna.get(f"/actions/{action}").json()["status"] == "done"
+        assert len(robot.payloads[action]) >= 1
+        assert [command.id for command in robot.heard(MoveJoints)] == [action]
