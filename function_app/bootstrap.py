@@ -197,6 +197,7 @@ def build(settings: Settings, *, clock: Clock | None = None) -> Functions:
         access=access,
         bus=bus,
         series=writer,
+        forget=forget,
         clock=now,
     )
     latencies = Latencies(tables=tables, forget=forget, clock=now)

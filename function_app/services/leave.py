@@ -26,9 +26,10 @@ from function_app.services.action_rows import ActionRows
 from function_app.services.commands import Commands
 from function_app.services.control import read_control_rows
 from function_app.services.devices import left_devices
+from function_app.services.forget import Forget
 from function_app.services.pending import Pending
 from function_app.services.queue import Queues
-from function_app.services.series import SeriesWriter
+from function_app.services.series import MARGIN_MS, SeriesWriter
 
 LOOK_MS: Final = 5_000
 """The timer looks again so often, as long as the broker cannot be told."""
@@ -52,6 +53,7 @@ class Leave:
         access: BrokerAccess,
         bus: CommandBus,
         series: SeriesWriter,
+        forget: Forget,
         clock: Clock,
     ) -> None:
         self._tables = tables
@@ -62,6 +64,7 @@ class Leave:
         self._access = access
         self._bus = bus
         self._series = series
+        self._forget = forget
         self._clock = clock
 
     async def watch(self, agent: str) -> None:
@@ -107,12 +110,20 @@ class Leave:
             await self._delete(store.AGENTS, agent.id, f"state:{device.name}", leaving)
             if leaving.why == "unpaired":
                 await self._series.forget(device.id, device.pairing)
+                await self._forget_measures(device)
             if leaving.why != "moved":
                 await self._delete(store.DESCRIPTIONS, agent.id, device.name, leaving)
         if leaving.why != "removed":
             await self._delete(store.AGENTS, agent.id, "link", leaving)
         if leaving.why == "unpaired":
             await self._delete(store.MEMBERS, leaving.account, f"agent:{agent.id}", leaving)
+
+    async def _forget_measures(self, device: Device) -> None:
+        """Faults, what is watched, and times, once those who do not know yet have stopped to write."""
+        due_ms = self._clock.now_ms() + MARGIN_MS
+        for table in (store.FAULTS, store.DIAGNOSTICS, store.LATENCY):
+            partition = f"{device.id}/{device.pairing}"
+            await self._forget.rows(table, partition, first="", last=None, due_ms=due_ms)
 
     async def _end_actions(self, device: Device, why: str) -> None:
         _, message = DROPPED[why]

@@ -313,3 +313,26 @@ def test_a_robot_type_nobody_knows_and_a_hundred_fields_are_watched_without_limi
         kept = cloud.run(cloud.functions.tables.get(store.DIAGNOSTICS, partition, "health"))
         assert kept is not None
         assert len(codec.encode(kept.data)) < 200_000
+
+
+def test_what_an_earlier_pairing_left_is_forgotten(cloud: Cloud, pair: Pair) -> None:
+    anna, robot = pair
+    Life(cloud, robot).live(4, temperature_c__elbow=still(90))
+    sample = {"at_ms": cloud.clock.now_ms(), "ms": 5.0}
+    latency = {"transport": "mqtt", "path": "operator-device", "samples": [sample]}
+    assert anna.post(f"/devices/{robot.device}/latency", latency).status_code == 204
+    row = cloud.run(cloud.functions.tables.get(store.AGENTS, robot.id, "agent"))
+    assert row is not None
+    partition = f"{robot.device}/{row.data['pairing']}"
+
+    def left() -> set[str]:
+        tables = (store.FAULTS, store.DIAGNOSTICS, store.LATENCY)
+        pages = {table: cloud.run(cloud.functions.tables.query(table, partition)) for table in tables}
+        # How often a code was raised has a note of its own, and says itself how long it stays.
+        return {table for table, page in pages.items() if any("expires_ms" not in row.data for row in page.rows)}
+
+    assert left() == {store.FAULTS, store.DIAGNOSTICS, store.LATENCY}
+    anna.delete(f"/agents/{robot.id}")
+    cloud.clock.advance(2 * 3600)
+    cloud.sweep()
+    assert left() == set()

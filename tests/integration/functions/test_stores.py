@@ -10,8 +10,10 @@ from typing import Any
 
 import pytest
 
-from device_agent.protocol.messages import AckStatus, RunMovement, StopDevice
+from device_agent.protocol import codec, topics
+from device_agent.protocol.messages import AckStatus, Fault, Measurements, Mode, RunMovement, State, StopDevice
 from function_app import bootstrap
+from function_app.entrypoints.ingest import ingest, ingest_telemetry
 from function_app.services.delete_robot_type import AFTER_MS
 from function_app.services.store import CONTROL
 from function_app.settings import AwsStore, AzureStore
@@ -193,3 +195,46 @@ def test_a_robot_that_asks_one_instance_obeys_the_other(clouds: tuple[Cloud, Clo
         assert anna.post(f"/devices/{robot.device}/stop").status_code == 200
         wait_until(lambda: robot.heard(StopDevice), "the stop")
         wait_until(lambda: robot.fetch() == [], "every command to be answered")
+
+
+def test_faults_and_times_are_the_same_wherever_they_are_written(clouds: tuple[Cloud, Cloud]) -> None:
+    one, other = clouds
+    with paired(one) as (anna, robot):
+        account = {"id": anna.account, "name": anna.name}
+        there = Person(other, {"access_token": anna.token, "session": anna.session, "account": account})
+        now_ms = one.clock.now_ms()
+
+        def hears(cloud: Cloud, *codes: str, at_ms: int) -> None:
+            found = tuple(Fault(code=code, message="Look.", since_ms=1) for code in codes)
+            state = State(device="arm", at_ms=at_ms, tick_ms=at_ms, mode=Mode.IDLE, epoch=0, faults=found)
+            cloud.run(ingest(cloud.functions, robot.topic(topics.STATE), codec.encode(state)))
+
+        hears(one, "a/b#c?", at_ms=now_ms)
+        hears(other, "a/b#c?", at_ms=now_ms)
+        measured = [
+            Measurements(
+                tick_ms=1, at_ms=now_ms - 60_000 + 10_000 * number, sequence=1, values={"temperature_c.x": 90.0}
+            )
+            for number in range(5)
+        ]
+        topic = topics.device(robot.space, robot.id, "arm", topics.TELE, "health")
+        for cloud in clouds:
+            cloud.run(ingest_telemetry(cloud.functions, [(topic, codec.encode(message)) for message in measured]))
+        faults = f"/devices/{robot.device}/faults"
+        opened = there.get(faults).json()["items"]
+        assert sorted(fault["code"] for fault in opened) == ["a/b#c?", "health.temperature_c.x"]
+        for fault in opened:
+            assert there.post(f"{faults}/{fault['id']}/acknowledge").status_code == 200
+        assert [fault["state"] for fault in anna.get(faults).json()["items"]] == ["acknowledged"] * 2
+        assert anna.get("/diagnostics").json() == there.get("/diagnostics").json()
+        hears(other, at_ms=now_ms + 1)
+        assert [fault["state"] for fault in anna.get(faults).json()["items"]] == ["acknowledged", "cleared"]
+
+        samples = [{"at_ms": now_ms - number, "ms": 1.5 * number} for number in range(300)]
+        latency = {"transport": "mqtt", "path": "operator-device", "samples": samples}
+        for person in (anna, there):
+            assert person.post(f"/devices/{robot.device}/latency", latency).status_code == 204
+        (kept,) = there.get(f"/devices/{robot.device}/latency").json()["items"]
+        assert (kept["count"], kept["max_ms"], len(kept["ms"])) == (300, 448.5, 300)
+        for cloud in clouds:
+            cloud.sweep()
