@@ -9,7 +9,7 @@ from function_app.domain.times import rfc3339
 from function_app.entrypoints.http.answers import answer
 from function_app.entrypoints.http.caller import Caller
 from function_app.entrypoints.http.contract import data as contract
-from function_app.entrypoints.http.routing import Cursor, Routes
+from function_app.entrypoints.http.routing import Routes
 from function_app.services.series_range import MAX_POINTS, Part, Range
 
 _LAST_MS = 9_999_999_999_999
@@ -20,7 +20,8 @@ Until = Annotated[
     int | None, Query(alias="to", ge=0, le=_LAST_MS, description="To before here [ms since 1970]; the end.")
 ]
 Points = Annotated[int, Query(ge=1, le=MAX_POINTS, description="At most so many points in a page.")]
-Fields = Annotated[str | None, Query(max_length=20_000, description="Only these fields, with commas between.")]
+Fields = Annotated[str | None, Query(max_length=4_000, description="Only these fields, with commas between.")]
+Cursor = Annotated[str | None, Query(max_length=40, description="Where the page before ended.")]
 Resolution = Annotated[
     contract.Resolution | None, Query(description="How fine; without it, as fine as `points` allow on one page.")
 ]
