@@ -105,8 +105,8 @@ class Leave:
 
     async def _settle(self, agent: Agent, leaving: Leaving) -> None:
         for device in left_devices(agent, leaving):
-            await self._end_actions(device, leaving.why)
             await self._fence(device)
+            await self._end_actions(device, leaving.why)
             await self._delete(store.AGENTS, agent.id, f"state:{device.name}", leaving)
             if leaving.why == "unpaired":
                 await self._series.forget(device.id, device.pairing)
@@ -135,14 +135,17 @@ class Leave:
             await self._rows.change(control.action, lambda action: end(action, Status.FAILED, why, message, now_ms))
 
     async def _fence(self, device: Device) -> None:
-        """Raise the epoch, so that the former holder's setpoints are old, and bring the device to a hold."""
+        """Raise the epoch, so that the former holder's setpoints are old, and bring the device to a hold.
+
+        Before its actions end: with them would go the lease that tells that somebody has moved it.
+        """
 
         async def once() -> Lease | None:
             control = await read_control_rows(self._tables, device.id)
             known = control.lease
-            if known is not None and known.account and known.pairing != device.pairing:
+            if known is None or not known.account or known.pairing != device.pairing:
                 return None
-            lease = Lease(epoch=(known.epoch if known else 0) + 1, pairing=device.pairing)
+            lease = Lease(epoch=known.epoch + 1, pairing=device.pairing)
             await self._tables.batch(store.CONTROL, [control.write_lease(device.id, lease)])
             return lease
 

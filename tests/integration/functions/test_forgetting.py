@@ -220,28 +220,28 @@ def test_wrong_tries_are_forgotten_when_they_no_longer_count(alone: Cloud) -> No
     assert notes(alone) == []
 
 
-def test_an_agent_that_nobody_claims_is_forgotten_after_a_week_and_no_other(alone: Cloud) -> None:
-    lost, waiting, claimed, given_back = (alone.robot() for _ in range(4))
-    anna = alone.sign_in("anna")
+def test_an_agent_that_nobody_claims_is_forgotten_after_a_week_and_no_other(cloud: Cloud) -> None:
+    lost, waiting, claimed, given_back = (cloud.robot() for _ in range(4))
+    anna = cloud.sign_in("anna")
     claimed.pair(anna)
     given_back.pair(anna)
     assert anna.delete(f"/agents/{given_back.id}").status_code == 204
     for robot in (lost, waiting, given_back):
         robot.enroll()
     for _ in range(9):
-        alone.clock.advance(24 * 3600)
+        cloud.clock.advance(24 * 3600)
         assert waiting.enroll().status_code == 201
-        alone.sweep()
+        cloud.sweep()
     for _ in range(3):
-        alone.sweep()
-    found = [len(left(alone, store.AGENTS, robot.id)) for robot in (lost, waiting, claimed, given_back)]
+        cloud.sweep()
+    found = [len(left(cloud, store.AGENTS, robot.id)) for robot in (lost, waiting, claimed, given_back)]
     assert found == [0, 1, 1, 0]
-    alone.clock.advance(100 * 24 * 3600)
+    cloud.clock.advance(100 * 24 * 3600)
     for _ in range(5):
-        alone.sweep()
-    anna = alone.sign_in("anna")
+        cloud.sweep()
+    anna = cloud.sign_in("anna")
     assert [item["id"] for item in anna.get("/agents").json()["items"]] == [claimed.id]
-    assert left(alone, store.AGENTS, waiting.id) == []
+    assert left(cloud, store.AGENTS, waiting.id) == []
     given_back.pair(anna)
     assert len(anna.get("/agents").json()["items"]) == 2
 
