@@ -83,6 +83,13 @@ class BusContract:
         await stage.until(3)
         assert [await asyncio.to_thread(stage.kept, topic) for topic in topics] == [b"new", None]
 
+    async def test_an_empty_message_takes_back_what_was_retained(self, stage: Stage) -> None:
+        topic = f"ts/v1/{stage.space}/agent/arm/state"
+        for payload in (b"here", b""):
+            await stage.bus.publish(topic, payload, retain=True)
+        assert [heard.payload for heard in await stage.until(2)] == [b"here", b""]
+        assert not await asyncio.to_thread(stage.kept, topic)
+
     async def test_where_nobody_answers_it_says_so_in_a_sentence_and_in_time(self, stage: Stage) -> None:
         began = time.monotonic()
         with pytest.raises(BusUnavailable) as caught:

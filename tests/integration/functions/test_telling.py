@@ -1,10 +1,13 @@
 """What an agent tells over HTTP is taken in as what it says over MQTT, and nobody else may tell it."""
 
+import json
 import time
 from collections.abc import Iterator
 from typing import Any
 
 import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
 
 from device_agent.protocol import codec, topics
 from device_agent.protocol.messages import (
@@ -192,3 +195,56 @@ class TestWhoMayAsk:
             robot.pair(owner)
             assert robot.fetch() == []
             assert owner.delete(f"/agents/{robot.id}").status_code == 204
+
+
+ODD = st.recursive(
+    st.none()
+    | st.booleans()
+    | st.integers(min_value=-(10**40), max_value=10**40)
+    | st.floats(allow_nan=False, allow_infinity=False)
+    | st.text(st.characters(categories=None), max_size=8),
+    lambda inner: st.lists(inner, max_size=4) | st.dictionaries(st.text(max_size=4), inner, max_size=4),
+    max_leaves=8,
+)
+SAID: list[dict[str, Any]] = [
+    {"online": True, "session": 1, "at_ms": 1, "software": ""},
+    {"device": "arm", "at_ms": 1, "tick_ms": 1, "mode": "idle", "epoch": 0, "faults": []},
+    {"id": "e", "device": "arm", "at_ms": 1, "kind": "k", "severity": "info", "message": "", "data": {}},
+    {"device": "arm", "kind": "arm", "robot_type": "ur5", "label": "", "joints": [], "streams": []},
+    {"id": "", "status": "done", "sequence": 1, "at_ms": 1, "tick_ms": 1, "output": "", "result": {}},
+    {"tick_ms": 1, "at_ms": 1, "sequence": 1, "values": {"t_c": 1.0}},
+]
+"""One message of each class, of which a part is replaced by something odd."""
+
+
+@settings(max_examples=100, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(data=st.data())
+def test_whatever_is_told_is_stored_or_refused(
+    cloud: Cloud, anna: Person, robot: PollingRobot, data: st.DataObject
+) -> None:
+    kinds = [
+        "conn",
+        "arm/state",
+        "arm/event",
+        "arm/desc",
+        "arm/ack",
+        "arm/tele/heat",
+        "arm/tele/joints",
+        "arm/desc/twin",
+    ]
+    messages = []
+    for _ in range(data.draw(st.integers(1, 4))):
+        said = dict(data.draw(st.sampled_from(SAID)))
+        for name in data.draw(st.lists(st.sampled_from(sorted(said)), max_size=2, unique=True)):
+            said[name] = data.draw(ODD)
+        if said.get("id") == "":
+            said["id"] = f"{robot.device}-{'0' * 20}"
+        topic = f"ts/v1/{robot.space}/{robot.id}/{data.draw(st.sampled_from(kinds))}"
+        messages.append((topic, json.dumps(said).encode()))
+    answer = robot.tell_raw(*messages)
+    assert answer.status_code in {200, 422}, answer.text
+    if answer.status_code == 200:
+        assert len(answer.json()["results"]) == len(messages)
+    assert anna.get(f"/devices/{robot.device}").status_code == 200
+    assert anna.get(f"/devices/{robot.device}/data").status_code == 200
+    cloud.sweep()
