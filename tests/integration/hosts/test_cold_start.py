@@ -12,9 +12,10 @@ from tests.support.hosts.host import ROOT
 LIMIT = 600 / 330
 """Of the time that importing FastAPI takes."""
 ROUNDS = 7
-PATIENT_ROUNDS = 40
+PATIENT_ROUNDS = 30
 """A busy machine gets more rounds: only the quickest of each counts."""
 FASTAPI = "import fastapi"
+NOTHING = "pass"
 
 
 @pytest.fixture(scope="module")
@@ -35,24 +36,28 @@ def importing_s(code: str, byte_code: Path) -> float:
 
 
 @pytest.mark.parametrize(
-    "code",
+    ("code", "there"),
     [
-        "import function_app.entrypoints.http, function_app.bootstrap",
-        "import function_app; function_app.app",
-        "import function_app.entrypoints.aws",
+        ("import function_app.entrypoints.http, function_app.bootstrap", NOTHING),
+        # Azure's worker has the binding classes before it looks for functions.
+        ("import function_app; function_app.app", "import azure.functions"),
+        ("import function_app.entrypoints.aws", NOTHING),
     ],
     ids=["application", "azure", "lambda"],
 )
-def test_the_cold_import_stays_near_fastapis_own(code: str, byte_code: Path) -> None:
-    for each in (FASTAPI, code):
+def test_the_cold_import_stays_near_fastapis_own(code: str, there: str, byte_code: Path) -> None:
+    codes = (FASTAPI, code, there, NOTHING)
+    for each in codes:
         importing_s(each, byte_code)  # leaves its byte code
-    known_s, ours_s = float("inf"), float("inf")
+    least_s = dict.fromkeys(codes, float("inf"))
+    ratio = float("inf")
     for done in range(PATIENT_ROUNDS):
-        known_s = min(known_s, importing_s(FASTAPI, byte_code))
-        ours_s = min(ours_s, importing_s(code, byte_code))
-        if done >= ROUNDS - 1 and ours_s <= LIMIT * known_s:
+        for each in dict.fromkeys(codes):
+            least_s[each] = min(least_s[each], importing_s(each, byte_code))
+        ratio = (least_s[code] - least_s[there] + least_s[NOTHING]) / least_s[FASTAPI]
+        if done >= ROUNDS - 1 and ratio <= LIMIT:
             return
-    pytest.fail(f"{code}: {ours_s / known_s:.2f} times as long as FastAPI, more than {LIMIT:.2f}")
+    pytest.fail(f"{code}: {ratio:.2f} times as long as FastAPI, more than {LIMIT:.2f}")
 
 
 def test_no_entry_loads_what_only_some_stores_or_other_programs_need() -> None:
