@@ -6,10 +6,8 @@ import signal
 from collections.abc import Sequence
 
 from function_app.bootstrap import Functions
-from function_app.domain.problems import Problem
 from function_app.entrypoints.ingest import ingest, ingest_telemetry
 from function_app.ports.model_compiler import CompilerMissingError
-from function_app.ports.tables import StoreError
 
 SWEEP_EVERY_S = 1.0
 CHECK_EVERY_S = 0.2
@@ -60,8 +58,10 @@ async def check_models(functions: Functions, *, drain: bool) -> None:
     while True:
         try:
             busy = await functions.model_checks.run()
-        except (StoreError, Problem) as error:
-            _log.warning("model checks: %s", error)
+        except CompilerMissingError:
+            raise
+        except Exception:  # noqa: BLE001 (one bad upload must not end the checker; after some tries it is refused)
+            _log.exception("model checks")
             busy = False
         if drain and not busy:
             return

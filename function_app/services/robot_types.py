@@ -3,6 +3,7 @@
 import asyncio
 import io
 import zipfile
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -127,14 +128,8 @@ class RobotTypes:
         """
         await self.get(who, robot_type)
         known = await self.view(who, robot_type)
-        held = io.BytesIO()
-        with zipfile.ZipFile(held, "w", zipfile.ZIP_DEFLATED) as archive:
-            for name in sorted(known.files):
-                # A fixed time: the same files are the same archive.
-                entry = zipfile.ZipInfo(f"{robot_type}/{name}", _ZIP_TIME)
-                entry.compress_type = zipfile.ZIP_DEFLATED
-                archive.writestr(entry, await self.file(who, robot_type, name))
-        return held.getvalue()
+        files = {f"{robot_type}/{name}": await self.file(who, robot_type, name) for name in sorted(known.files)}
+        return await asyncio.to_thread(_zip, files)
 
     async def _find(self, who: Identity, robot_type: str) -> KnownType | None:
         built_in = (await self._catalogue.types()).get(robot_type)
@@ -163,6 +158,15 @@ class RobotTypes:
         if where is None or head is None or head.deleted:
             raise not_found("robot-type", robot_type)
         return where, head
+
+
+def _zip(files: Mapping[str, bytes]) -> bytes:
+    held = io.BytesIO()
+    with zipfile.ZipFile(held, "w") as archive:
+        for name, content in files.items():
+            entry = zipfile.ZipInfo(name, _ZIP_TIME)  # a fixed time: the same files are the same archive
+            archive.writestr(entry, content, zipfile.ZIP_DEFLATED)
+    return held.getvalue()
 
 
 def _manifest(fields: dict[str, Any]) -> RobotType:
