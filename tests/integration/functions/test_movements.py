@@ -228,6 +228,16 @@ class TestVersions:
         page = alone.run(alone.functions.tables.query(store.MOVEMENTS, f"{anna.account}/ur5"))
         assert len(page.rows) == 2, "a name and a version"
 
+    def test_of_a_deleted_one_its_name_is_all_that_stays(self, home: Path, alone: Cloud, anna: Person) -> None:
+        for number in range(3):
+            anna.put(MINE, {"source": f"# {number}"})
+        anna.delete(MINE)
+        alone.clock.advance((KEPT_MS + 1_000) / 1000)
+        alone.run(alone.functions.forget.run(alone.clock.now_ms()))
+        assert scripts(home) == []
+        page = alone.run(alone.functions.tables.query(store.MOVEMENTS, f"{anna.account}/ur5"))
+        assert [row.key for row in page.rows] == ["mine"]
+
     def test_many_who_save_at_once_get_a_version_each_and_leave_no_other_script(self, home: Path, anna: Person) -> None:
         waiting = [anna.begin("PUT", MINE, json={"source": f"# {number}"}) for number in range(8)]
         saved = [answer().json()["version"] for answer in waiting]
