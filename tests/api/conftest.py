@@ -1,5 +1,6 @@
+import itertools
 import shutil
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
@@ -23,7 +24,18 @@ def broker(keys: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Run
 
 
 @pytest.fixture
-def home(tmp_path: Path, keys: Path) -> Path:
-    folder = tmp_path / "home"
-    shutil.copytree(keys, folder / "keys")
-    return folder
+def new_home(tmp_path: Path, keys: Path) -> Callable[[], Path]:
+    """Makes folders for functions that the broker knows, with nothing else in them."""
+    numbers = itertools.count()
+
+    def made() -> Path:
+        folder = tmp_path / f"home{next(numbers)}"
+        shutil.copytree(keys, folder / "keys")
+        return folder
+
+    return made
+
+
+@pytest.fixture
+def home(new_home: Callable[[], Path]) -> Path:
+    return new_home()

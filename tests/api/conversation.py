@@ -1,0 +1,311 @@
+"""One long conversation with the API: people, a robot that polls, and everything they do, step by step.
+
+Nothing in it waits or runs beside it, so two runs say the same things in the same order.
+"""
+
+import hashlib
+from typing import Any
+
+import httpx
+
+from device_agent.protocol import topics
+from device_agent.protocol.messages import AckStatus, Fault, Measurements, Mode, RunMovement, State
+from tests.api.transcript import Transcript
+from tests.support.brokers import Message
+from tests.support.cloud import API, MOVE
+from tests.support.hosts import Host
+from tests.support.polling import PollingRobot, Site, _Line
+from tests.support.site import Visitor
+
+PUBLIC_URL = "http://telescope.test"
+"""What the functions believe to be their address."""
+ODD = "grüß 🤖 \u202e'\";--\\ \u0001 %2F"
+MINE = "/robot-types/ur5/movements/mine"
+SOURCE = '"""Wäve 🤖."""\nrobot.home()\n'
+CAPTURE = b"\x00\xff raw" * 1000
+
+
+class Recorder(Site):
+    """Writes down all that is asked through it."""
+
+    def __init__(self, base: str) -> None:
+        super().__init__(base)
+        self.transcript = Transcript()
+        self.silent = False
+
+    def ask(self, method: str, path: str, **options: Any) -> httpx.Response:
+        answer = super().ask(method, path, **options)
+        if not self.silent:
+            self.transcript.write(method, path, answer)
+        return answer
+
+
+class SteppedRobot(PollingRobot):
+    """Asks for commands, obeys and reports when the conversation says so."""
+
+    def connect(self) -> "SteppedRobot":
+        self.session += 1
+        line: Any = _Line(self)  # never started: it has no thread
+        self.link = line
+        self.say_presence(online=True)
+        return self
+
+    def step(self) -> None:
+        line: Any = self.link
+        for item in self.poll(wait_ms=0).json()["items"]:
+            self.obey(Message(item["topic"], item["payload"].encode(), 1, retain=False))
+        told, line._said = line._said, []
+        if told:
+            assert self.tell_raw(*told).status_code == 200
+
+
+class Conversation:
+    """All of it, in order. What must be so is asserted by comparing transcripts, and here where it is a promise."""
+
+    def __init__(self, host: Host, links: list[str]) -> None:
+        self.host = host
+        self.site = Recorder(host.url)
+        self._links = links
+        self.robot = SteppedRobot(self.site, "arm", "leg")
+        self.site.transcript.know(self.robot.id, "robot")
+        self.site.transcript.know(self.robot.public, "robot's key")
+
+    def hold(self) -> list[str]:
+        """Gives what was said."""
+        try:
+            self._hold()
+        finally:
+            self.site.close()
+        return self.site.transcript.lines
+
+    def _hold(self) -> None:
+        self.knock()
+        self.anna, self.again, self.bert = (self.sign_in(link) for link in self._links)
+        self.claim()
+        self.look()
+        self.movements()
+        self.lease()
+        self.actions()
+        self.queue()
+        self.fleet()
+        self.measure()
+        self.upload()
+        self.mistakes()
+        self.leave()
+
+    def knock(self) -> None:
+        """As nobody, and as somebody who only says so."""
+        ask = self.site.ask
+        ask("GET", f"{API}/health")
+        ask("GET", f"{API}/devices")
+        ask("GET", f"{API}/devices", headers={"Authorization": "Bearer nonsense"})
+        ask("POST", f"{API}/auth/sign-in", json={"link": "wrong"})
+        ask("POST", f"{API}/auth/sign-in", content=b"{")
+        ask("POST", f"{API}/auth/sign-in", content=b"\xff\xfe")
+        ask("POST", f"{API}/auth/sign-in", json={"link": ODD, "more": 1})
+        ask("POST", f"{API}/auth/sign-in", content=b" " * 1_000_001)
+
+    def sign_in(self, link: str) -> Visitor:
+        answer = self.site.ask("POST", f"{API}/auth/sign-in", json={"link": link})
+        assert answer.status_code == 200, answer.text
+        assert self.site.ask("POST", f"{API}/auth/sign-in", json={"link": link}).status_code == 401
+        person = Visitor(self.site, answer.json())
+        person.get("/accounts/me")
+        person.get("/spaces")
+        return person
+
+    def claim(self) -> None:
+        self.robot.ask("GET", "/agents/enrollment", token="nonsense")
+        code = self.robot.code()
+        self.robot.enrollment()
+        self.anna.post("/agents/claim", {"code": code, "space": "nowhere"})
+        assert self.anna.post("/agents/claim", {"code": f" {code.lower()} "}).status_code == 200
+        assert self.bert.post("/agents/claim", {"code": code}).status_code == 404
+        self.robot.space = self.robot.enrollment()["space"]
+        self.robot.enroll(software="toy 2")
+        self.robot._keys = self.keys()
+        self.robot.connect()
+
+    def keys(self) -> dict[str, Any]:
+        from device_agent.protocol import signing
+
+        return {key["id"]: signing.public_key(key["public"]) for key in self.robot.enrollment()["keys"]}
+
+    def look(self) -> None:
+        device = self.robot.device
+        for person in (self.anna, self.again, self.bert):
+            person.get("/agents")
+            person.get("/devices")
+            for path in ("", "/lease", "/actions", "/data", "/faults", "/latency", "/uploads", "/diagnostics"):
+                answer = person.get(f"/devices/{device}{path}")
+                assert answer.status_code == (404 if person is self.bert else 200), answer.text
+        for odd in ("%F0%9F%A4%96", "..", "a%20b", "%01", "x" * 200, "aaaaaaaaaa-arm", f"{device}%20"):
+            answer = self.anna.get(f"/devices/{odd}")
+            assert answer.status_code == 404, f"{odd}: {answer.status_code} {answer.text}"
+
+    def movements(self) -> None:
+        self.anna.get("/robot-types")
+        self.anna.get("/robot-types/ur5")
+        self.anna.get("/robot-types/none")
+        self.anna.get("/robot-types/ur5/movements", params={"limit": 1})
+        assert self.anna.put(MINE, {"source": SOURCE}).status_code == 201
+        self.anna.put(MINE, {"source": SOURCE + "#", "description": ODD.replace("\u0001", "")})
+        self.anna.put(MINE, {"source": ""})
+        self.anna.put("/robot-types/ur5/movements/a%20b", {"source": SOURCE})
+        self.anna.get(MINE)
+        self.anna.get(f"{MINE}/versions")
+        assert self.bert.get(MINE).status_code == 404
+
+    def lease(self) -> None:
+        path = f"/devices/{self.robot.device}/lease"
+        epoch = self.anna.post(path, {"wait_ms": 0}).json()["epoch"]
+        self.robot.step()
+        assert self.again.post(path, {"wait_ms": 0}).status_code == 409
+        assert self.bert.post(path, {"wait_ms": 0}).status_code == 404
+        self.again.get(path)
+        self.anna.post(path, {"wait_ms": 0, "epoch": epoch, "lease_ms": 60_000})
+        self.anna.post(path, {"wait_ms": 0, "epoch": epoch + 1})
+        self.anna.post(path, {"lease_ms": 1})
+        self.anna.ask("DELETE", path, params={"epoch": epoch + 1})
+        self.anna.ask("DELETE", path)
+        assert self.anna.ask("DELETE", path, params={"epoch": epoch}).status_code == 204
+        self.anna.get(path)
+        self.robot.step()
+
+    def actions(self) -> None:
+        device, asked = self.robot.device, {"request": MOVE}
+        action = self.start(once="a/b#c? ü".encode().hex())
+        assert self.start(once="a/b#c? ü".encode().hex()) == action
+        self.anna.start(device, once="a/b#c? ü".encode().hex(), ttl_ms=5)
+        assert self.anna.start(device).status_code == 409
+        self.robot.step()
+        assert self.anna.action(action)["status"] == "started"
+        assert self.again.post(f"/devices/{device}/actions", {**asked, "epoch": 1}).status_code == 409
+        assert self.bert.get(f"/actions/{action}").status_code == 404
+        assert self.bert.post(f"/actions/{action}/cancel").status_code == 404
+        self.robot.report(action, AckStatus.DONE, result={"odd": ODD})
+        assert self.anna.action(action)["result"] == {"odd": ODD}
+        self.robot.report(action, AckStatus.FAILED)
+        assert self.anna.action(action)["status"] == "done"
+        request = {"kind": "run_movement", "name": "mine", "parameters": {"note": ODD, "deep": [[{"a": 1.5}]]}}
+        wave = self.start(request=request)
+        self.robot.step()
+        (command,) = self.robot.heard(RunMovement)
+        assert isinstance(command.request, RunMovement)
+        assert command.request.source == SOURCE + "#"
+        self.anna.post(f"/actions/{wave}/cancel")
+        self.robot.step()
+        self.robot.report(wave, AckStatus.CANCELLED)
+        self.anna.action(wave)
+        found = self.anna.get(f"/devices/{device}/actions", params={"limit": 1}).json()
+        rest = self.anna.get(f"/devices/{device}/actions", params={"cursor": found["cursor"]}).json()
+        assert [item["id"] for item in (*found["items"], *rest["items"])] == [wave, action]
+        for wrong in ({}, {"request": {"kind": "fly"}}, {**asked, "more": 1}, {**asked, "wait_ms": 30_001}):
+            assert self.anna.post(f"/devices/{device}/actions", wrong).status_code == 422
+
+    def start(self, **options: Any) -> str:
+        answer = self.anna.start(self.robot.device, **options)
+        assert answer.status_code == 202, answer.text
+        action: str = answer.json()["id"]
+        return action
+
+    def queue(self) -> None:
+        first, second, third = (self.start(policy="queue") for _ in range(3))
+        assert self.anna.action(third)["queue_position"] == 2
+        self.anna.post(f"/actions/{second}/cancel")
+        self.robot.step()
+        self.robot.report(first, AckStatus.DONE)
+        self.robot.step()
+        assert self.anna.action(third)["status"] == "started"
+        waiting = self.start(policy="queue")
+        self.anna.post(f"/devices/{self.robot.device}/stop/reset")
+        self.robot.step()
+        self.anna.post(f"/actions/{third}/cancel")
+        self.robot.report(third, AckStatus.FAILED)
+        assert self.anna.action(waiting)["status"] == "cancelled"
+        self.robot.step()
+
+    def fleet(self) -> None:
+        body = {"devices": [*self.robot.devices, "aaaaaaaaaa-arm"], "request": MOVE}
+        answer = self.anna.post("/actions", body)
+        assert answer.status_code == 207, answer.text
+        self.site.silent = True  # which of the devices is told first is nobody's promise
+        self.robot.step()
+        self.site.silent = False
+        for device in self.robot.devices:
+            (item,) = self.anna.get(f"/devices/{device}/actions", params={"limit": 1}).json()["items"]
+            assert item["status"] == "started"
+            name = device.partition("-")[2]
+            self.robot.say(self.robot.topic(topics.ACK, name), self.robot.ack(item["id"], AckStatus.DONE))
+
+        assert self.anna.post(f"/devices/{self.robot.device}/stop", {"reason": ODD[:6]}).json() == {"confirmed": False}
+        self.robot.step()
+
+    def measure(self) -> None:
+        device, robot = self.robot.device, self.robot
+        now_ms = robot.cloud.clock.now_ms()
+        topic = topics.device(robot.space, robot.id, "arm", topics.TELE, "health")
+        for number in range(5):
+            at_ms = now_ms - 1000 * number
+            robot.say(topic, Measurements(tick_ms=at_ms, at_ms=at_ms, sequence=number, values={"temperature_c": 40.5}))
+        fault = Fault(code="hot", message="The elbow is hot.", since_ms=now_ms)
+        robot.say_state(State(device="arm", at_ms=now_ms, tick_ms=now_ms, mode=Mode.IDLE, epoch=0, faults=(fault,)))
+        self.host.tick()
+        self.anna.get(f"/devices/{device}/data")
+        data = self.anna.get(f"/devices/{device}/data/health").json()
+        assert data["fields"]["temperature_c"]["mean"] == [40.5] * 5
+        self.anna.get(f"/devices/{device}/data/none")
+        self.anna.get(f"/devices/{device}/data/health", params={"from": "x"})
+        (found,) = self.anna.get(f"/devices/{device}/faults").json()["items"]
+        self.anna.post(f"/devices/{device}/faults/{found['id']}/acknowledge")
+        self.bert.post(f"/devices/{device}/faults/{found['id']}/acknowledge")
+        samples = [{"at_ms": now_ms, "ms": each} for each in (1.5, 2.5, 200.0)]
+        body = {"transport": "http", "path": "device-cloud", "samples": samples}
+        self.anna.post(f"/devices/{device}/latency", body)
+        assert self.anna.get(f"/devices/{device}/latency").status_code == 200
+        self.anna.post(f"/devices/{device}/latency", {**body, "samples": []})
+
+    def upload(self) -> None:
+        path = f"/devices/{self.robot.device}/uploads"
+        digest = hashlib.sha256(CAPTURE).hexdigest()
+        body = {"stream": "camera", "length": len(CAPTURE), "content_type": "image/png", "name": ODD[:6]}
+        begun = self.anna.post(path, {**body, "sha256": digest}).json()
+        sent = httpx.request(
+            begun["method"], self.reached(begun["url"]), content=CAPTURE, headers=begun["headers"], timeout=60
+        )
+        assert sent.status_code < 300, sent.text
+        stored = self.anna.post(f"{path}/{begun['id']}/complete").json()
+        assert (stored["length"], stored["sha256"]) == (len(CAPTURE), digest)
+        found = self.anna.get(f"{path}/{begun['id']}").json()
+        assert httpx.get(self.reached(found["url"]), timeout=60).content == CAPTURE
+        self.anna.get(path)
+        assert self.bert.get(f"{path}/{begun['id']}").status_code == 404
+        self.anna.delete(f"{path}/{begun['id']}")
+        self.anna.get(f"{path}/{begun['id']}")
+
+    def reached(self, url: str) -> str:
+        """Where the functions keep blobs themselves, they are asked where they are now."""
+        return url.replace(PUBLIC_URL, self.host.url)
+
+    def mistakes(self) -> None:
+        device = self.robot.device
+        for method, path in (("PUT", f"/devices/{device}/lease"), ("PATCH", "/devices"), ("GET", "/nothing")):
+            self.anna.ask(method, path)
+        for query in ({"cursor": ODD}, {"cursor": "x" * 2001}, {"limit": "0"}, {"limit": "1001"}, {"limit": "ü"}):
+            self.anna.get("/devices", params=query)
+        self.anna.post("/mqtt/credentials", {"purpose": "control", "device": device, "epoch": 1})
+        self.robot.ask("GET", "/devices")
+        self.robot.ask("GET", "/agents/aaaaaaaaaa/commands")
+
+    def leave(self) -> None:
+        assert self.anna.delete(f"/agents/{self.robot.id}").status_code == 204
+        assert self.anna.get(f"/devices/{self.robot.device}").status_code == 404
+        self.anna.get("/devices")
+        self.robot.ask("GET", "/agents/enrollment")
+        for number in range(6):
+            answer = self.bert.post("/agents/claim", {"code": f"BCDF-GHJ{'KLMNPQ'[number]}"})
+            assert answer.status_code in {404, 429}
+        assert answer.status_code == 429
+        assert self.anna.post("/auth/sign-out").status_code == 204
+        assert self.anna.get("/accounts/me").status_code == 401
+        assert self.again.get("/accounts/me").status_code == 200

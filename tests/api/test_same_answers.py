@@ -1,0 +1,71 @@
+"""One conversation over each of three stores under each of three hosts: the same answers, word for word."""
+
+import asyncio
+import difflib
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from function_app import bootstrap
+from function_app.settings import read
+from tests.api.conversation import PUBLIC_URL, Conversation
+from tests.conftest import Emulators
+from tests.support.aws import use_credentials
+from tests.support.brokers import RunningBroker
+from tests.support.hosts import HOSTS, HostKind, start_host
+from tests.support.stores import STORES, StoreKind, empty_store, make_places
+
+Talk = Callable[[StoreKind, HostKind, Path], list[str]]
+
+
+def make_links(environment: dict[str, str], *names: str) -> list[str]:
+    async def made() -> list[str]:
+        functions = bootstrap.build(read(environment))
+        links = [await functions.sign_in.link(await functions.sign_in.account(name)) for name in names]
+        await functions.close()
+        return links
+
+    return asyncio.run(made())
+
+
+@pytest.fixture
+def talk(broker: RunningBroker, emulators: Emulators, monkeypatch: pytest.MonkeyPatch) -> Talk:
+    """Holds the conversation, at an empty store; gives its transcript."""
+
+    def held(store: StoreKind, kind: HostKind, home: Path) -> list[str]:
+        if store == "aws":
+            use_credentials(monkeypatch)
+        environment = {
+            "TELESCOPE_HOME": str(home),
+            "TELESCOPE_PUBLIC_URL": PUBLIC_URL,
+            "TELESCOPE_MQTT_PORT": str(broker.tcp_port),
+            **empty_store(store, emulators(store)),
+        }
+        make_places(home, environment)
+        links = make_links(environment, "anna", "anna", "bert")
+        with start_host(kind, environment) as host:
+            return Conversation(host, links).hold()
+
+    return held
+
+
+@pytest.fixture(scope="module")
+def first() -> list[str]:
+    """What was said at the first store and host; filled by the first test that needs it."""
+    return []
+
+
+@pytest.mark.parametrize("kind", HOSTS)
+@pytest.mark.parametrize("store", STORES)
+def test_the_same_is_answered(
+    talk: Talk, first: list[str], new_home: Callable[[], Path], store: StoreKind, kind: HostKind
+) -> None:
+    if not first:
+        first += talk("local", "uvicorn", new_home())
+        assert len(first) > 150
+    if (store, kind) == ("local", "uvicorn"):
+        return
+    said = talk(store, kind, new_home())
+    different = list(difflib.unified_diff(first, said, "local, uvicorn", f"{store}, {kind}", lineterm="", n=0))
+    assert not different, "\n".join(different[:40])

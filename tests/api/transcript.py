@@ -1,0 +1,83 @@
+"""What is said to the API and what it answers, written down such that two runs can be compared.
+
+Ids become the order in which they appeared, times and secrets become what they are.
+"""
+
+import json
+import re
+from typing import Any
+
+import httpx
+
+from tests.support.cloud import API
+
+_NAMED = frozenset({"id", "agent", "account", "session", "space", "action", "upload", "client_id", "public", "fault"})
+"""Fields whose value is an id: it may stand inside other texts as well."""
+_SECRET = frozenset(
+    {"access_token", "claim_code", "password", "username", "url", "cursor", "key", "port", "broker", "websocket_url",
+     "headers", "signature", "bins", "ms"}
+)  # fmt: skip
+_TIMES = ("_ms", "_at", "_in_s", "at")
+_MEANT = frozenset({"lease_ms", "queue_ms", "ttl_ms", "timeout_ms", "wait_ms"})
+"""Times that are not of the clock."""
+_TIME = re.compile(r"\d{4}-\d\d-\d\dT\d\d:\d\d:\d\d\.\d{3}Z")
+_WAIT = re.compile(r"in \d+ s\b")
+NO_CONTENT = 204
+_HEADERS = ("content-type", "location", "allow", "www-authenticate", "cache-control", "x-content-type-options")
+
+
+class Transcript:
+    """Lines, one for each request."""
+
+    def __init__(self) -> None:
+        self.lines: list[str] = []
+        self._ids: dict[str, str] = {}
+
+    def know(self, value: str, name: str) -> None:
+        """Call this text by a name from now on."""
+        self._ids.setdefault(value, f"<{name}>")
+
+    def write(self, method: str, path: str, answer: httpx.Response) -> None:
+        """One request and its answer."""
+        body: Any = answer.text
+        if "json" in answer.headers.get("content-type", "") and answer.content:
+            body = answer.json()
+            self._learn(body)
+            body = self._masked(body)
+        headers = {name: answer.headers[name] for name in _HEADERS if name in answer.headers}
+        headers |= {name: "…" for name in ("retry-after", "x-telescope-time-ms") if name in answer.headers}
+        if answer.status_code == NO_CONTENT:
+            headers.pop("content-type", None)  # Amazon's gateway adds one to what has none
+        said = [method, path.removeprefix(API), answer.status_code, headers, body]
+        self.lines.append(self._named(json.dumps(said, ensure_ascii=False, sort_keys=True)))
+
+    def _learn(self, value: Any) -> None:
+        if isinstance(value, dict):
+            for name, each in value.items():
+                if name in _NAMED and isinstance(each, str) and each and each not in self._ids:
+                    self._ids[each] = f"<{name} {len(self._ids)}>"
+                self._learn(each)
+        elif isinstance(value, list):
+            for each in value:
+                self._learn(each)
+
+    def _masked(self, value: Any) -> Any:
+        if isinstance(value, list):
+            return [self._masked(each) for each in value]
+        if not isinstance(value, dict):
+            return value
+        return {
+            name: "…"
+            if each is not None and _hidden(name)
+            else self._masked(json.loads(each) if name == "payload" else each)
+            for name, each in value.items()
+        }
+
+    def _named(self, text: str) -> str:
+        for value in sorted(self._ids, key=len, reverse=True):
+            text = text.replace(value, self._ids[value])
+        return _WAIT.sub("in … s", _TIME.sub("<time>", text))
+
+
+def _hidden(name: str) -> bool:
+    return name in _SECRET or (name.endswith(_TIMES) and name not in _MEANT)
