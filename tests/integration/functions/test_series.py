@@ -417,6 +417,17 @@ async def test_a_new_owner_sees_nothing_of_the_former_one(house: House) -> None:
     assert (part.at_ms, list(part.values)) == ([house.clock.at_ms], ["b"])
 
 
+async def test_what_was_left_in_the_queue_is_not_the_next_owners(house: House) -> None:
+    device = (await house.intake._agent(AGENT)).devices["arm"]
+    await house.intake._queue([_Part(device, "health", series.gather([(NOW_MS, {"a": 1.0})]))])
+    await house.pair(pairing="p2", account="bert")
+    house.clock.at_ms += LEFT_MS + 1
+    for _ in range(SHARDS):
+        await house.intake.distribute_left()
+    assert await _queued(house) == 0
+    assert await house.reader.streams(Identity("bert", "bert", "s2"), DEVICE) == []
+
+
 async def test_an_observer_that_fails_holds_nothing_up(house: House) -> None:
     async def fail(*_: Any) -> None:
         raise RuntimeError("no")
