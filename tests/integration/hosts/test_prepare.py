@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.support.aws import REGION, start_moto, use_credentials
+from tests.support.aws import REGION, reset, start_moto, use_credentials
 from tests.support.hosts.host import PATIENCE_S, ROOT
 
 
@@ -16,6 +16,7 @@ def test_without_its_table_a_program_ends_with_one_line_and_prepare_makes_it(
 ) -> None:
     use_credentials(monkeypatch)
     with start_moto() as endpoint:
+        reset(endpoint)  # it remembers what other tests of this process have made
         environment = {
             **os.environ,
             "TELESCOPE_HOME": str(tmp_path),
