@@ -29,18 +29,20 @@ class Life:
         self.robot = robot
         self.topic = topics.device(robot.space, robot.id, robot.names[0], topics.TELE, stream)
         self.windows = 0
+        self.now_ms = cloud.clock.now_ms()
+        """The robot's own clock: how long a test takes is nothing to it."""
         self._chance = random.Random(seed)  # noqa: S311 (repeatable noise)
 
     def messages(self, windows: int, **truth: Temperature) -> Iterable[tuple[str, bytes]]:
         """The measurements of so many windows; each truth is given the window's number."""
         for number in range(windows):
             self.cloud.clock.advance(10)
-            now_ms = self.cloud.clock.now_ms()
+            self.now_ms += 10_000
             values: dict[str, float | bool] = {
                 name.replace("__", "."): value(number) + self._chance.gauss(0, 0.2) for name, value in truth.items()
             }
             self.windows += 1
-            message = Measurements(tick_ms=now_ms, at_ms=now_ms, sequence=self.windows, values=values)
+            message = Measurements(tick_ms=self.now_ms, at_ms=self.now_ms, sequence=self.windows, values=values)
             yield self.topic, codec.encode(message)
 
     def live(self, windows: int, **truth: Temperature) -> None:
@@ -95,7 +97,7 @@ def test_a_joint_that_heats_up_is_told_before_its_limit_over_the_broker(
         assert robot.link is not None
         for topic, payload in life.messages(windows, **truth):
             robot.link.publish_acknowledged(topic, payload)
-        newest_ms = cloud.clock.now_ms() - 30_000
+        newest_ms = life.now_ms - 30_000
         wait_until(
             lambda: any(
                 row.data["window_ms"] > newest_ms
@@ -174,6 +176,16 @@ def test_a_warning_becomes_an_error_beyond_the_limit_and_stays_one_fault(cloud: 
     assert (fault["id"], fault["severity"], fault["limit"], fault["worsened"]) == (warned["id"], "error", 80.0, 1)
     life.live(10, temperature_c__elbow=still(45))
     assert open_faults(anna, robot) == []
+
+
+def test_what_passes_its_limit_is_told_at_once_and_not_at_the_end_of_the_minute(cloud: Cloud, pair: Pair) -> None:
+    anna, robot = pair
+    life = Life(cloud, robot)
+    life.now_ms = life.now_ms // 60_000 * 60_000 - 10_000
+    life.live(3, temperature_c__elbow=still(74))
+    life.live(3, temperature_c__elbow=still(90))
+    assert life.now_ms % 60_000 == 50_000, "all in one minute"
+    assert [fault["severity"] for fault in open_faults(anna, robot)] == ["error"]
 
 
 def test_what_nobody_has_said_the_limits_of_is_worth_knowing_and_no_warning(cloud: Cloud, pair: Pair) -> None:

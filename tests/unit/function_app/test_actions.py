@@ -203,3 +203,12 @@ def test_the_next_look_is_later_and_never_after_the_deadline(status: Status, aft
     assert now_ms < due_ms <= NEW.deadline_ms
     if status.rank < Status.RECEIVED.rank and now_ms < NEW.expires_ms:
         assert due_ms <= now_ms + REPEAT_MS
+
+
+def test_what_several_hear_was_heard_when_the_first_of_them_did() -> None:
+    def heard(at_ms: int) -> Report:
+        return Report(Status.RECEIVED, 1, 1_000_100, heard_ms=at_ms)
+
+    action = applied(NEW, [heard(50), heard(30)])
+    assert action.heard == {"received": 30}
+    assert apply_report(action, heard(70)) is action

@@ -21,6 +21,7 @@ from function_app.domain.detectors import (
     Limits,
     Watch,
     step,
+    trend,
 )
 from function_app.domain.estimators import (
     MEMORY,
@@ -287,3 +288,38 @@ def test_the_room_to_the_nearest_limit() -> None:
     assert Limits(warning_high=8).room(2) == 6
     assert Limits(high=8).room(20) == 0
     assert NOTHING.room(1) is None
+
+
+class TestTrend:
+    """Where the last minutes lead."""
+
+    def test_what_comes_to_rest_below_the_limit_never_meets_it(self) -> None:
+        minutes = [35 + 25 * -math.expm1(-number / 15) for number in range(20)]
+        found = trend(minutes, JOINT)
+        assert found is not None
+        assert found.per_s > 0
+        assert found.limit_in_s is None
+
+    def test_what_slows_down_beyond_the_limit_meets_it_when_it_does(self) -> None:
+        minutes = [35 + 60 * -math.expm1(-number / 30) for number in range(20)]
+        meets_s = 60 * (-30 * math.log(1 - 45 / 60) - 19)
+        found = trend(minutes, JOINT)
+        assert found is not None
+        assert found.limit_in_s == pytest.approx(meets_s, rel=0.1)
+
+    def test_only_what_has_lasted_is_proven(self) -> None:
+        begun = trend(
+            [34.5 + 0.05 * number for number in range(10)] + [35.0 + number for number in range(1, 11)], JOINT
+        )
+        lasting = trend([35.0 + number for number in range(20)], JOINT)
+        assert begun is not None
+        assert lasting is not None
+        assert begun.limit_in_s == pytest.approx(35 * 60)
+        assert (begun.proven, lasting.proven) == (False, True)
+
+    def test_too_few_minutes_and_noise_lead_nowhere(self) -> None:
+        assert trend([35.0] * 9, JOINT) is None
+        noise = [35.0, 35.4, 34.8, 35.1, 35.3, 34.9, 35.2, 35.0, 35.3, 35.1]
+        found = trend(noise, JOINT)
+        assert found is not None
+        assert found.limit_in_s is None
