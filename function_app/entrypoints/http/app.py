@@ -163,7 +163,9 @@ def _methods(request: Request) -> list[str]:
     """What may be asked at this address: the framework names the methods of the first route alone."""
     path = request.url.path.removeprefix(PREFIX)
     known: list[Any] = request.app.state.routes
-    return sorted({method for route in known if route.path_regex.match(path) for method in route.methods})
+    # The first one that fits decides: ``agents/enroll`` is no agent.
+    place = next((route.path for route in known if route.path_regex.match(path)), None)
+    return sorted({method for route in known if route.path == place for method in route.methods})
 
 
 class _Headers:
