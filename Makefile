@@ -14,7 +14,7 @@ NPM = $(NODE) --prefix web
 help:
 	@echo "make up            run Telescope on this machine"
 	@echo "make link          print another one-time sign-in link"
-	@echo "make test          check and test everything (about six minutes on two cores)"
+	@echo "make test          check and test everything (about eighteen minutes on two cores, most of it in real processes)"
 	@echo "make test-long     the same with every suite at full size"
 	@echo "make check         linters, types, import contracts, generated files"
 	@echo "make contract      regenerate docs/asyncapi.json and web/src/core/protocol.ts"
@@ -50,12 +50,12 @@ env: .venv/.local
 
 web/node_modules/.installed: web/package-lock.json | .venv/.node
 	@echo "telescope: installing console packages" >&2
-	@$(NPM) ci --silent --no-fund --no-audit
+	@$(NPM) ci --loglevel error --no-fund --no-audit >/dev/null
 	@touch $@
 
 tests/azurite/node_modules/.installed: tests/azurite/package-lock.json | .venv/.node
 	@echo "telescope: installing Azurite" >&2
-	@$(NODE) --prefix tests/azurite ci --silent --no-fund --no-audit
+	@$(NODE) --prefix tests/azurite ci --loglevel error --no-fund --no-audit >/dev/null
 	@touch $@
 
 # The Functions worker runs on every Python that Telescope does, though it asks for 3.13.
