@@ -1,0 +1,214 @@
+"""The office of one device: a thread that obeys signed commands one by one and writes the journal.
+
+The control loop never waits for disk or network; this thread does.
+"""
+
+import logging
+import queue
+import threading
+import time
+from collections.abc import Mapping
+
+from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PublicKey
+
+from device_agent.ports.clock import CloudClock, wall_ms
+from device_agent.protocol import codec, signing
+from device_agent.protocol.errors import ProtocolError, SignatureError
+from device_agent.protocol.messages import (
+    AckStatus,
+    CancelAction,
+    Command,
+    GrantLease,
+    MoveJoints,
+    Reason,
+    ReleaseLease,
+    ResetStop,
+    RunMovement,
+    StopDevice,
+    StopLatch,
+    Twin,
+)
+from device_agent.runtime.actions import Executor
+from device_agent.runtime.controller import Controller
+from device_agent.runtime.journal import Journal
+from device_agent.runtime.lease import Refused
+from device_agent.runtime.voice import Condition, Voice
+
+_FUTURE_MS = 2000
+"""A command may seem issued this much later than now: more than the error of the clock estimate ever is."""
+_MOST_WAITING = 1000
+_log = logging.getLogger(__name__)
+
+
+class Office:
+    """Takes in commands, one after another.
+
+    Args:
+        address: Space, agent and name of the device: what a command must be bound to.
+        controller: Leases, Stop.
+        executor: Actions.
+        voice: Answers.
+        journal: Open.
+        cloud_clock: For ``ttl_ms``.
+        keys: The cloud's pinned public keys by key id.
+    """
+
+    def __init__(
+        self,
+        *,
+        address: tuple[str, str, str],
+        controller: Controller,
+        executor: Executor,
+        voice: Voice,
+        journal: Journal,
+        cloud_clock: CloudClock,
+        keys: Mapping[str, Ed25519PublicKey],
+    ) -> None:
+        self._address = address
+        self._name = address[2]
+        self._controller = controller
+        self._executor = executor
+        self._voice = voice
+        self._journal = journal
+        self._cloud_clock = cloud_clock
+        self._keys = keys
+        self._twin: Twin | None = None
+        self._commands: queue.Queue[bytes] = queue.Queue(maxsize=_MOST_WAITING)
+        self._introduce = threading.Event()
+        self._stopping = threading.Event()
+        self._thread = threading.Thread(target=self._run, name=f"{self._name}-office", daemon=True)
+
+    def start(self, twin: Twin | None) -> None:
+        """Begin to work.
+
+        Args:
+            twin: The drawing that ``introduce`` shows.
+        """
+        self._twin = twin
+        self._thread.start()
+
+    def stop(self) -> None:
+        """Write down what is left, and end. May be called twice."""
+        self._stopping.set()
+        if self._thread.is_alive():
+            self._thread.join(timeout=2)
+
+    def put(self, payload: bytes) -> None:
+        """Hand in a command as it arrived; never blocks.
+
+        Raises:
+            Refused: Too many wait.
+        """
+        try:
+            self._commands.put_nowait(payload)
+        except queue.Full as error:
+            raise Refused("overrun", f"{_MOST_WAITING} commands wait already") from error
+
+    def introduce(self) -> None:
+        """The link has come: say soon what the device is, and what may not have been heard."""
+        self._introduce.set()
+
+    def _run(self) -> None:
+        while not self._stopping.is_set():
+            try:
+                payload = self._commands.get(timeout=0.1)
+            except queue.Empty:
+                payload = None
+            try:
+                if payload is not None:
+                    self._obey(payload)
+                self._keep()
+                if self._introduce.is_set():
+                    self._introduce.clear()
+                    self._voice.introduce(self._twin)
+                self._voice.show(self._condition())
+            except Exception:  # noqa: BLE001 (one bad command must not end the office)
+                _log.exception("%s: command", self._name)
+        self._keep()
+
+    # ------------------------------------------------------------ one command
+
+    def _obey(self, payload: bytes) -> None:
+        try:
+            command = codec.decode(signing.verify(payload, self._keys), Command)
+        except SignatureError as error:
+            self._voice.count("bad_signature")
+            _log.warning("%s: command refused: %s", self._name, error)
+            return
+        except ProtocolError as error:
+            self._voice.count("malformed")
+            _log.warning("%s: command refused: %s", self._name, str(error)[:300])
+            return
+        if (command.space, command.agent, command.device) != self._address:
+            self._voice.count("wrong_address")
+            return
+        first = self._voice.ack(command.id, AckStatus.RECEIVED)
+        seen = self._journal.begin(self._name, first)
+        if seen is not None:
+            self._voice.send_ack(seen)
+            return
+        try:
+            self._check_time(command)
+            self._carry_out(command)
+        except Refused as refused:
+            status = AckStatus.EXPIRED if refused.code == "expired" else AckStatus.FAILED
+            self._voice.report(command.id, status, reason=Reason(code=refused.code, message=refused.message))
+            _log.info("%s: command %s refused: %s", self._name, command.id, refused.message)
+
+    def _check_time(self, command: Command) -> None:
+        if isinstance(command.request, StopDevice):
+            return  # a late Stop is still a Stop
+        now_ms = self._cloud_clock.now_ms()
+        if now_ms is None:
+            raise Refused("no_clock", "the device does not know the cloud's time yet; send it again")
+        if now_ms > command.issued_at_ms + command.ttl_ms:
+            late = round(now_ms - command.issued_at_ms - command.ttl_ms)
+            raise Refused("expired", f"arrived {late} ms after it had run out")
+        if command.issued_at_ms > now_ms + _FUTURE_MS:
+            raise Refused("from_the_future", "issued later than now; the cloud's clock or this device's is wrong")
+
+    def _carry_out(self, command: Command) -> None:
+        match command.request:
+            case GrantLease(holder=holder, lease_ms=lease_ms):
+                self._controller.grant(
+                    epoch=command.epoch, holder=holder, lease_s=lease_ms / 1000, now_s=time.monotonic()
+                )
+            case ReleaseLease():
+                self._controller.release(epoch=command.epoch)
+            case StopDevice(reason=reason):
+                self._controller.stop(StopLatch(by=command.who, reason=reason, at_ms=wall_ms()))
+            case ResetStop():
+                self._controller.reset_stop()
+                _log.warning("%s: Stop reset by %s", self._name, command.who)
+            case CancelAction(action=action):
+                self._executor.cancel(action, command.who)
+            case RunMovement() | MoveJoints():
+                # Journalled as accepted before it begins: after a crash here it is ended, never run again.
+                self._voice.report(command.id, AckStatus.ACCEPTED)
+                self._executor.start(command)
+                self._keep()
+                return
+        self._keep()
+        self._voice.report(command.id, AckStatus.DONE)
+
+    # ------------------------------------------------------------ what is kept and shown
+
+    def _keep(self) -> None:
+        """Write down epochs and latch when they have changed, and which answers have arrived."""
+        self._voice.keep()
+        if self._controller.changed.is_set():
+            self._controller.changed.clear()
+            epoch, burned = self._controller.epochs
+            self._journal.save_epoch(self._name, epoch=epoch, burned=burned)
+            self._journal.save_latch(self._name, self._controller.latch)
+
+    def _condition(self) -> Condition:
+        epoch, _ = self._controller.epochs
+        return Condition(
+            mode=self._controller.mode,
+            epoch=epoch,
+            lease=self._controller.lease(time.monotonic()),
+            latch=self._controller.latch,
+            fault=self._controller.fault,
+            action=self._executor.current(),
+        )

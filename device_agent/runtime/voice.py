@@ -1,0 +1,186 @@
+"""What one device tells the world: acks, ``desc``, ``state``, telemetry, and the refusals it counts."""
+
+import queue
+import threading
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+
+from device_agent.ports.clock import tick_ms, wall_ms
+from device_agent.protocol import codec, topics
+from device_agent.protocol.messages import (
+    Ack,
+    AckStatus,
+    ActionState,
+    Description,
+    Fault,
+    JointTelemetry,
+    LeaseState,
+    Mode,
+    State,
+    StopLatch,
+    Twin,
+)
+from device_agent.protocol.robot_type import RobotType
+from device_agent.runtime.controller import MAX_LOOP_AGE_S, WATCHDOG_S
+from device_agent.runtime.journal import Journal
+from device_agent.runtime.lease import Lease
+
+Publish = Callable[..., bool]
+"""``Transport.publish``."""
+
+STATE_EVERY_S = 30.0
+STATE_GAP_S = 1.0
+
+
+@dataclass(frozen=True, slots=True)
+class Condition:
+    """What ``state`` shows; two that are equal need not be told twice."""
+
+    mode: Mode
+    epoch: int
+    lease: Lease | None
+    latch: StopLatch | None
+    fault: str | None
+    action: ActionState | None
+
+    def shown(self) -> tuple[object, ...]:
+        """What makes a new ``state`` worth sending: progress alone does not."""
+        return (self.mode, self.epoch, self.lease, self.latch, self.fault, self.action and self.action.id)
+
+
+class Voice:
+    """Publishes for one device. Thread-safe but for ``introduce``, ``show`` and ``keep``, which are its office's.
+
+    Args:
+        address: Space, agent and name.
+        label: Its name for people.
+        robot_type: Joints, limits, streams.
+        simulated: Whether no real metal moves.
+        journal: Open.
+        publish: Sends a message.
+
+    Attributes:
+        refusals: How often what was refused, by code.
+    """
+
+    def __init__(
+        self,
+        *,
+        address: tuple[str, str, str],
+        label: str,
+        robot_type: RobotType,
+        simulated: bool,
+        journal: Journal,
+        publish: Publish,
+    ) -> None:
+        self._address = address
+        self._name = address[2]
+        self._label = label
+        self._robot_type = robot_type
+        self._simulated = simulated
+        self._journal = journal
+        self._publish = publish
+        self._delivered: queue.SimpleQueue[Ack] = queue.SimpleQueue()
+        self._sequences: dict[str, int] = {}
+        self._lock = threading.Lock()
+        self._shown: tuple[object, ...] = ()
+        self._shown_at_s = float("-inf")
+        self.refusals: dict[str, int] = {}
+
+    # ------------------------------------------------------------ answers to commands
+
+    def ack(self, command: str, status: AckStatus, **more: object) -> Ack:
+        """The next ack of a command; not yet written or sent."""
+        with self._lock:
+            sequence = self._sequences.get(command, 0) + 1
+            if status.terminal:
+                self._sequences.pop(command, None)
+            else:
+                self._sequences[command] = sequence
+        return Ack(id=command, status=status, sequence=sequence, at_ms=wall_ms(), tick_ms=tick_ms(), **more)  # type: ignore[arg-type]
+
+    def report(self, command: str, status: AckStatus, **more: object) -> None:
+        """Journal and publish the next ack of a command."""
+        ack = self.ack(command, status, **more)
+        self._journal.record(ack)
+        self.send_ack(ack)
+
+    def send_ack(self, ack: Ack) -> None:
+        """Publish an ack that the journal has."""
+        self._publish(self._topic(topics.ACK), codec.encode(ack), qos=1, delivered=lambda: self._delivered.put(ack))
+
+    def keep(self) -> None:
+        """Write down which answers have arrived."""
+        while not self._delivered.empty():
+            self._journal.delivered(self._delivered.get())
+
+    # ------------------------------------------------------------ what the device is, and how
+
+    def introduce(self, twin: Twin | None) -> None:
+        """After each connection: what the device is, how it is, and the answers that may not have arrived."""
+        self._retain(self._topic(topics.DESC), self._description())
+        if twin is not None:
+            self._retain(self._topic(topics.DESC, topics.TWIN), twin)
+        self._shown_at_s = float("-inf")
+        for ack in self._journal.undelivered(self._name):
+            self.send_ack(ack)
+
+    def show(self, now: Condition) -> None:
+        """Publish ``state`` on change, at most once a second, and every 30 s."""
+        now_s = time.monotonic()
+        shown = now.shown()
+        age_s = now_s - self._shown_at_s
+        if age_s < STATE_GAP_S or (shown == self._shown and age_s < STATE_EVERY_S):
+            return
+        at_ms = wall_ms()
+        state = State(
+            device=self._name,
+            at_ms=at_ms,
+            tick_ms=tick_ms(),
+            mode=now.mode,
+            epoch=now.epoch,
+            stop=now.latch,
+            lease=_lease_state(now.lease, now_s),
+            action=now.action,
+            faults=(Fault(code="driver", message=now.fault[:2000], since_ms=at_ms),) if now.fault else (),
+        )
+        if self._retain(self._topic(topics.STATE), state):
+            self._shown, self._shown_at_s = shown, now_s
+
+    def tell(self, telemetry: JointTelemetry) -> None:
+        """Publish a measurement; called by the control loop, must not block."""
+        self._publish(self._topic(topics.TELE, topics.JOINTS), codec.encode(telemetry), qos=0)
+
+    def count(self, code: str) -> None:
+        """Count a refusal."""
+        self.refusals[code] = self.refusals.get(code, 0) + 1
+
+    def _retain(self, topic: str, message: object) -> bool:
+        return self._publish(topic, codec.encode(message, limit=codec.MAX_RETAINED_BYTES), qos=1, retain=True)
+
+    def _description(self) -> Description:
+        kind = self._robot_type
+        return Description(
+            device=self._name,
+            kind=kind.kind,
+            robot_type=kind.type,
+            label=self._label,
+            joints=kind.joints,
+            frames=kind.frames,
+            capabilities=kind.capabilities,
+            streams=kind.streams,
+            watchdog_ms=round(WATCHDOG_S * 1000),
+            max_loop_age_ms=round(MAX_LOOP_AGE_S * 1000),
+            simulated=self._simulated,
+        )
+
+    def _topic(self, kind: str, name: str = "") -> str:
+        return topics.device(*self._address, kind, name)
+
+
+def _lease_state(lease: Lease | None, now_s: float) -> LeaseState | None:
+    if lease is None:
+        return None
+    left_ms = max(0, round((lease.expires_s - now_s) * 1000))
+    return LeaseState(holder=lease.holder, epoch=lease.epoch, expires_in_ms=left_ms)
