@@ -35,17 +35,17 @@ env: .venv/.local
 
 .venv/.local: requirements/local.txt | .venv/.python
 	@echo "telescope: installing Python packages" >&2
-	@$(BIN)/python -m pip install --quiet --disable-pip-version-check -r requirements/local.txt
+	@$(BIN)/python -m pip install --quiet --disable-pip-version-check --no-deps -r requirements/local.txt
 	@touch $@
 
 .venv/.dev: requirements/dev.txt | .venv/.python
 	@echo "telescope: installing Python packages for development" >&2
-	@$(BIN)/python -m pip install --quiet --disable-pip-version-check -r requirements/dev.txt
+	@$(BIN)/python -m pip install --quiet --disable-pip-version-check --no-deps -r requirements/dev.txt
 	@touch $@ .venv/.local
 
 .venv/.node: requirements/node.txt | .venv/.python
 	@{ $(NODE_READY); } 2>/dev/null || { echo "telescope: installing Node.js" >&2; \
-		$(BIN)/python -m pip install --quiet --disable-pip-version-check -r requirements/node.txt; }
+		$(BIN)/python -m pip install --quiet --disable-pip-version-check --no-deps -r requirements/node.txt; }
 	@touch $@
 
 web/node_modules/.installed: web/package-lock.json | .venv/.node

@@ -9,7 +9,7 @@ ROOT = Path(__file__).resolve().parent.parent
 EXPORTS = {
     "requirements.txt": ("functions", "azure"),
     "requirements/aws.txt": ("functions", "aws"),
-    "requirements/agent.txt": ("agent", "sim"),
+    "requirements/agent.txt": ("agent", "sim", "xmpp"),
     "requirements/local.txt": ("local",),
     "requirements/node.txt": ("node",),
     "requirements/dev.txt": ("dev",),
@@ -17,6 +17,8 @@ EXPORTS = {
 }
 OPTIONS = {"requirements/azure-worker.txt": ("--no-deps", "--python-version", "3.13")}
 """For what is not resolved like the others: it only runs beside packages that are there already."""
+NOWHERE = "sys_platform == 'never'"
+"""How ``pyproject.toml`` leaves out what a package asks for and does not need."""
 HEADER = "# Exported from pyproject.toml by `make requirements`: groups {}.\n"
 
 
@@ -35,7 +37,11 @@ def resolved(name: str, groups: tuple[str, ...]) -> str:
             cwd=ROOT,
             check=True,
         )  # fmt: skip
-        lines = [line for line in output.read_text(encoding="utf-8").splitlines() if line and line[0] != "#"]
+        lines = [
+            line
+            for line in output.read_text(encoding="utf-8").splitlines()
+            if line and line[0] != "#" and NOWHERE not in line
+        ]
     return HEADER.format(", ".join(groups)) + "\n".join(lines) + "\n"
 
 
