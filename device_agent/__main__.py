@@ -10,13 +10,15 @@ import time
 from collections.abc import Sequence
 from pathlib import Path
 
-from device_agent import bootstrap, drivers
+import msgspec
+
+from device_agent import bootstrap, drivers, links
 from device_agent.ports.clock import CloudClock
 from device_agent.ports.driver import DriverError
 from device_agent.ports.transport import TransportError
 from device_agent.protocol import robot_type
 from device_agent.protocol.topics import ID_PATTERN, is_id
-from device_agent.runtime.home import Configuration, DeviceEntry, Home, HomeError, Pairing
+from device_agent.runtime.home import Configuration, DeviceEntry, Home, HomeError, HttpPolling, Pairing
 from device_agent.runtime.journal import JournalError
 from device_agent.transports.http.api import Claim, CloudApi, CloudError
 
@@ -55,6 +57,17 @@ def _parser() -> argparse.ArgumentParser:
         help="a device behind this agent, for example arm=ur5; may be given several times",
     )
     enroll.add_argument(
+        "--transport",
+        choices=links.names(),
+        help="how the cloud is reached: by the broker (mqtt, the default), or by requests alone (http)",
+    )
+    enroll.add_argument(
+        "--poll",
+        choices=("long", "plain"),
+        help="with http: the cloud answers when there is something (long, the default), or at once (plain)",
+    )
+    enroll.add_argument("--poll-ms", type=int, metavar="MS", help="with plain polls: one each so many ms")
+    enroll.add_argument(
         "--no-wait", action="store_true", help="print the code and leave; `run` then waits for the claim"
     )
     enroll.set_defaults(command=_enroll)
@@ -87,21 +100,33 @@ def _enroll(options: argparse.Namespace) -> int:
 
 
 def _configuration(options: argparse.Namespace, home: Home) -> Configuration:
+    """What is on file, with what was said now in its place."""
     try:
         before = home.configuration()
     except HomeError:
         before = None
-    if before is not None and not options.device:
-        return Configuration(
-            server=options.server or before.server, name=options.name or before.name, devices=before.devices
-        )
-    if not options.device:
+    if before is None and not options.device:
         raise HomeError("say which devices it has, for example `--device arm=ur5`")
     server = options.server or (before.server if before else "")
     if not server.startswith(("http://", "https://")):
         raise HomeError("say where the server is, for example `--server http://127.0.0.1:8080`")
-    devices = tuple(_entry(text) for text in options.device)
-    return Configuration(server=server, name=options.name or home.folder.resolve().name, devices=devices)
+    polling = _polling(options, before.http if before else HttpPolling())
+    return Configuration(
+        server=server,
+        name=options.name or (before.name if before else home.folder.resolve().name),
+        transport=options.transport or (before.transport if before else links.names()[0]),
+        http=polling,
+        devices=tuple(_entry(text) for text in options.device) or (before.devices if before else ()),
+    )
+
+
+def _polling(options: argparse.Namespace, before: HttpPolling) -> HttpPolling:
+    said = {"poll": options.poll, "poll_ms": options.poll_ms}
+    try:
+        changed = {name: value for name, value in said.items() if value is not None}
+        return msgspec.convert(msgspec.to_builtins(before) | changed, HttpPolling)
+    except msgspec.ValidationError as error:
+        raise HomeError(f"--poll-ms: {error}") from error
 
 
 def _entry(text: str) -> DeviceEntry:
@@ -117,7 +142,10 @@ def _entry(text: str) -> DeviceEntry:
 
 def _announce(api: CloudApi, configuration: Configuration) -> Claim:
     claim = api.enroll(
-        name=configuration.name, software=bootstrap.SOFTWARE, devices=bootstrap.enrolled_devices(configuration)
+        name=configuration.name,
+        software=links.SOFTWARE,
+        transport=configuration.transport,
+        devices=bootstrap.enrolled_devices(configuration),
     )
     if claim.code is not None:
         print(f"claim code {claim.code}  (valid for {claim.expires_in_s:.0f} s)", flush=True)

@@ -1,36 +1,33 @@
-"""Puts an agent together: the one place that picks drivers and transports."""
+"""Puts an agent together: the one place that picks drivers; ``links`` picks the transport."""
 
-import threading
 from pathlib import Path
-from typing import Any
 
-from device_agent import drivers
+from device_agent import drivers, links
 from device_agent.ports.clock import CloudClock, tick_ms, wall_ms
-from device_agent.protocol import robot_type, topics
+from device_agent.ports.transport import Transport
+from device_agent.protocol import robot_type
 from device_agent.protocol.errors import ProtocolError
 from device_agent.runtime.agent import Agent
 from device_agent.runtime.device import Device
 from device_agent.runtime.home import Configuration, DeviceEntry, Home, HomeError, Pairing
 from device_agent.runtime.journal import Journal
-from device_agent.transports.http.api import CloudApi, CloudError
-from device_agent.transports.mqtt import BrokerAccess, MqttTransport
+from device_agent.transports.http.api import CloudApi
 
-SOFTWARE = "telescope-agent 0.1.0"
 ROBOTS = Path(__file__).resolve().parent.parent / "robots"
 
 
 class Cell:
     """A running agent and what must be closed with it."""
 
-    def __init__(self, agent: Agent, journal: Journal, link: "_Link") -> None:
+    def __init__(self, agent: Agent, journal: Journal, membership: links.Membership) -> None:
         self._agent = agent
         self._journal = journal
-        self._link = link
+        self._membership = membership
 
     @property
     def outdated(self) -> bool:
         """Whether the agent belongs to another space by now: its pairing is to be read, and all of it built again."""
-        return self._link.outdated.is_set()
+        return self._membership.outdated.is_set()
 
     def start(self) -> None:
         """Start devices and link.
@@ -104,57 +101,22 @@ def build(home: Home, *, trace: Path | None = None) -> Cell:
     journal = Journal(home.journal)
     journal.open(now_ms=wall_ms())
     journal.end_open(now_ms=wall_ms(), tick_ms=tick_ms())
-    link = _Link(api, pairing)
-    transport = MqttTransport(
-        access=link.access,
-        presence_topic=topics.conn(pairing.space, pairing.agent),
-        next_session=journal.next_session,
-        software=SOFTWARE,
-        quiet=lambda: agent.quiet,
+    membership = links.Membership(api, pairing, configuration, enrolled_devices(configuration))
+    transport = links.make(
+        links.Wiring(
+            configuration=configuration,
+            pairing=pairing,
+            membership=membership,
+            open_api=lambda: api_of(home, configuration, clock),
+            next_session=journal.next_session,
+            quiet=lambda: agent.quiet,
+        )
     )
     devices = {}
     for entry in configuration.devices:
         devices[entry.name] = _device(entry, pairing, journal=journal, clock=clock, transport=transport, trace=trace)
     agent = Agent(devices, transport)
-    return Cell(agent, journal, link)
-
-
-class _Link:
-    """Broker credentials, asked of the cloud at each connection."""
-
-    def __init__(self, api: CloudApi, pairing: Pairing) -> None:
-        self._api = api
-        self._pairing = pairing
-        self.outdated = threading.Event()
-
-    def access(self) -> BrokerAccess:
-        """What the cloud gives.
-
-        Raises:
-            CloudError: Refused; or it is for another space, in which nothing of this cell would be heard.
-            OSError: Not reached.
-        """
-        access = self._read(self._api.credentials())
-        own = f"{topics.ROOT}/{self._pairing.space}/{self._pairing.agent}/"
-        if not all(pattern.startswith(own) for pattern in access.subscribe):
-            self.outdated.set()
-            raise CloudError("this agent belongs to another space now")
-        return access
-
-    @staticmethod
-    def _read(given: dict[str, Any]) -> BrokerAccess:
-        try:
-            return BrokerAccess(
-                host=str(given["tcp"]["host"]),
-                port=int(given["tcp"]["port"]),
-                client_id=str(given["client_id"]),
-                username=str(given["username"]),
-                password=str(given["password"]),
-                subscribe=tuple(str(pattern) for pattern in given["subscribe"]),
-                lifetime_s=float(given["lifetime_s"]),
-            )
-        except (KeyError, TypeError) as error:
-            raise CloudError(f"the cloud's broker credentials lack {error}") from error
+    return Cell(agent, journal, membership)
 
 
 def _device(
@@ -163,7 +125,7 @@ def _device(
     *,
     journal: Journal,
     clock: CloudClock,
-    transport: MqttTransport,
+    transport: Transport,
     trace: Path | None,
 ) -> Device:
     kind = load_type(entry.type)

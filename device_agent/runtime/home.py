@@ -2,7 +2,7 @@
 
 ```
 identity.pem     the private key, mode 0600; never leaves the machine
-agent.toml       server and devices; written by ``enroll``, edited by people
+agent.toml       server, transport and devices; written by ``enroll``, edited by people
 pairing.json     space, account and pinned keys, once claimed
 journal.db       what must not be forgotten
 ```
@@ -13,12 +13,12 @@ import os
 import tempfile
 import tomllib
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any, Literal
 
 import msgspec
 from cryptography.hazmat.primitives import serialization
 from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey, Ed25519PublicKey
-from msgspec import Struct
+from msgspec import Meta, Struct
 
 from device_agent.protocol import signing
 from device_agent.protocol.errors import ProtocolError
@@ -39,12 +39,24 @@ class DeviceEntry(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True)
     options: dict[str, Any] = {}
 
 
+class HttpPolling(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """``[http]`` of ``agent.toml``: how the agent asks for its commands where its transport is ``http``.
+
+    ``long``: the cloud answers when there is one. ``plain``: it answers at once, and is asked every ``poll_ms`` [ms].
+    """
+
+    poll: Literal["long", "plain"] = "long"
+    poll_ms: Annotated[int, Meta(ge=50, le=10_000)] = 1000
+
+
 class Configuration(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """``agent.toml``."""
+    """``agent.toml``. ``transport`` is one of ``device_agent.links.names()``."""
 
     server: str
     name: Label
     devices: tuple[DeviceEntry, ...]
+    transport: str = "mqtt"
+    http: HttpPolling = HttpPolling()
 
 
 class Pairing(Struct, frozen=True, kw_only=True):
@@ -116,13 +128,16 @@ class Home:
 
     def save_configuration(self, configuration: Configuration) -> None:
         """Write ``agent.toml``."""
-        lines = [f"server = {json.dumps(configuration.server)}", f"name = {json.dumps(configuration.name)}"]
+        lines = [f"{key} = {_toml(getattr(configuration, key))}" for key in ("server", "name", "transport")]
+        if configuration.transport == "http" or configuration.http != HttpPolling():
+            lines += ["", "[http]"]
+            lines += [f"{key} = {_toml(getattr(configuration.http, key))}" for key in ("poll", "poll_ms")]
         for device in configuration.devices:
             lines += ["", "[[devices]]"]
-            lines += [f"{key} = {json.dumps(getattr(device, key))}" for key in ("name", "type", "driver", "label")]
+            lines += [f"{key} = {_toml(getattr(device, key))}" for key in ("name", "type", "driver", "label")]
             if device.options:
                 lines.append("[devices.options]")
-                lines += [f"{key} = {json.dumps(value)}" for key, value in device.options.items()]
+                lines += [f"{_toml(key)} = {_toml(value)}" for key, value in device.options.items()]
         self._write(self.folder / "agent.toml", ("\n".join(lines) + "\n").encode())
 
     def pairing(self) -> Pairing | None:
@@ -161,3 +176,12 @@ class Home:
             Path(temporary).replace(path)
         except OSError as error:
             raise HomeError(f"{path} cannot be written: {error.strerror}") from error
+
+
+def _toml(value: Any) -> str:
+    """A value as TOML writes it: as JSON does, but for tables, and for characters that JSON escapes in two halves."""
+    if isinstance(value, dict):
+        return "{" + ", ".join(f"{_toml(key)} = {_toml(each)}" for key, each in value.items()) + "}"
+    if isinstance(value, list):
+        return "[" + ", ".join(_toml(each) for each in value) + "]"
+    return json.dumps(value, ensure_ascii=False).replace("\x7f", "\\u007f")

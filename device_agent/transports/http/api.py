@@ -18,7 +18,15 @@ _TIMEOUT_S = 10.0
 
 
 class CloudError(ValueError):
-    """The cloud said no, or something that is no answer. Its text is fit for a terminal."""
+    """The cloud said no, or something that is no answer. Its text is fit for a terminal.
+
+    Attributes:
+        code: The name of the refusal, as ``agent-unclaimed``; empty when it was no answer.
+    """
+
+    def __init__(self, message: str, code: str = "") -> None:
+        super().__init__(message)
+        self.code = code
 
 
 @dataclass(frozen=True, slots=True)
@@ -45,8 +53,8 @@ class CloudApi:
         self._clock = clock
         self._http = requests.Session()
 
-    def enroll(self, *, name: str, software: str, devices: list[dict[str, str]]) -> Claim:
-        """Make the agent and its devices known.
+    def enroll(self, *, name: str, software: str, transport: str, devices: list[dict[str, str]]) -> Claim:
+        """Make the agent, its devices, and how it is to be reached known. Safe to repeat.
 
         Raises:
             CloudError: Refused.
@@ -59,6 +67,7 @@ class CloudApi:
                 "name": name,
                 "public_key": signing.public_text(self._key.public_key()),
                 "software": software,
+                "transport": transport,
                 "devices": devices,
             },
         )
@@ -113,7 +122,8 @@ class CloudApi:
                 f"{self._base}{path} answered {answer.status_code} without JSON: is it a Telescope server?"
             )
         if not answer.ok:
-            raise CloudError(str(body.get("detail") or body.get("title") or answer.reason))
+            code = str(body.get("type", "")).rpartition("/")[2]
+            raise CloudError(str(body.get("detail") or body.get("title") or answer.reason), code)
         return body
 
     def _token(self) -> str:

@@ -1,0 +1,161 @@
+"""The link of an agent: which transport it speaks, put together, and whether its pairing still holds.
+
+A transport is one line of ``_MAKERS``; what it needs is imported only where it is the one that was chosen.
+"""
+
+import threading
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+from device_agent.ports.transport import Transport
+from device_agent.protocol import topics
+from device_agent.runtime.home import Configuration, HomeError, Pairing
+from device_agent.transports.http.api import CloudApi, CloudError
+
+SOFTWARE = "telescope-agent 0.1.0"
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Wiring:
+    """What a transport is made from.
+
+    Attributes:
+        configuration: With the part of ``agent.toml`` that is the transport's own.
+        pairing: Whose the agent is.
+        membership: Asks the cloud, and notices when that is no longer so.
+        open_api: A view of the HTTP API for one thread.
+        next_session: The next session number, rising across restarts.
+        quiet: Whether a short break of the link would disturb nothing.
+    """
+
+    configuration: Configuration
+    pairing: Pairing
+    membership: "Membership"
+    open_api: Callable[[], CloudApi]
+    next_session: Callable[[], int]
+    quiet: Callable[[], bool]
+
+    @property
+    def presence_topic(self) -> str:
+        """Where the agent's presence goes."""
+        return topics.conn(self.pairing.space, self.pairing.agent)
+
+
+class Membership:
+    """Whether the agent still belongs to the space of its pairing. One thread at a time.
+
+    Args:
+        api: For this thread.
+        pairing: What was true when the agent was built.
+        configuration: What the cloud is told of at the first connection, so that whoever edits ``agent.toml`` need not
+            enroll again.
+        devices: The devices as the cloud is told of them.
+    """
+
+    def __init__(
+        self, api: CloudApi, pairing: Pairing, configuration: Configuration, devices: list[dict[str, str]]
+    ) -> None:
+        self._api = api
+        self._pairing = pairing
+        self._configuration = configuration
+        self._devices = devices
+        self._introduced = False
+        self.outdated = threading.Event()
+
+    def credentials(self) -> dict[str, Any]:
+        """Broker credentials for this space.
+
+        Raises:
+            CloudError: Refused; or they are for another space, in which nothing of this agent would be heard.
+            OSError: Not reached.
+        """
+        given = self._ask(self._api.credentials)
+        own = f"{topics.ROOT}/{self._pairing.space}/{self._pairing.agent}/"
+        if not all(str(pattern).startswith(own) for pattern in given.get("subscribe", ())):
+            raise self._gone("this agent belongs to another space now")
+        return given
+
+    def check(self) -> None:
+        """Look whether the pairing holds.
+
+        Raises:
+            CloudError: It does not, or the cloud refuses the agent.
+            OSError: Not reached.
+        """
+        found = self._ask(self._api.enrollment)
+        if found.get("state") != "claimed":
+            raise self._gone("this agent was un-paired")
+        if found.get("space") != self._pairing.space:
+            raise self._gone("this agent belongs to another space now")
+
+    def _ask(self, call: Callable[[], dict[str, Any]]) -> dict[str, Any]:
+        try:
+            self._introduce()
+            return call()
+        except CloudError as error:
+            if error.code == "agent-unclaimed":
+                raise self._gone("this agent was un-paired") from error
+            # The cloud has forgotten it, or never knew it: an introduction is what it understands then.
+            self._introduced = self._introduced and error.code != "unauthorized"
+            raise
+
+    def _introduce(self) -> None:
+        if self._introduced:
+            return
+        told = self._configuration
+        claim = self._api.enroll(name=told.name, software=SOFTWARE, transport=told.transport, devices=self._devices)
+        if claim.code is not None:
+            raise self._gone("this agent was un-paired")
+        self._introduced = True
+
+    def _gone(self, message: str) -> CloudError:
+        self.outdated.set()
+        return CloudError(message)
+
+
+def names() -> tuple[str, ...]:
+    """The transports there are."""
+    return tuple(_MAKERS)
+
+
+def make(wiring: Wiring) -> Transport:
+    """The transport that ``agent.toml`` names, not yet started.
+
+    Raises:
+        HomeError: There is none of this name.
+    """
+    name = wiring.configuration.transport
+    if name not in _MAKERS:
+        raise HomeError(f"agent.toml: no transport '{name}'; there are: {', '.join(names())}")
+    return _MAKERS[name](wiring)
+
+
+def _mqtt(wiring: Wiring) -> Transport:
+    from device_agent.transports.mqtt import BrokerAccess, MqttTransport  # noqa: PLC0415 (only where it is chosen)
+
+    def access() -> BrokerAccess:
+        given = wiring.membership.credentials()
+        try:
+            return BrokerAccess(
+                host=str(given["tcp"]["host"]),
+                port=int(given["tcp"]["port"]),
+                client_id=str(given["client_id"]),
+                username=str(given["username"]),
+                password=str(given["password"]),
+                subscribe=tuple(str(pattern) for pattern in given["subscribe"]),
+                lifetime_s=float(given["lifetime_s"]),
+            )
+        except (KeyError, TypeError) as error:
+            raise CloudError(f"the cloud's broker credentials lack {error}") from error
+
+    return MqttTransport(
+        access=access,
+        presence_topic=wiring.presence_topic,
+        next_session=wiring.next_session,
+        software=SOFTWARE,
+        quiet=wiring.quiet,
+    )
+
+
+_MAKERS: Mapping[str, Callable[[Wiring], Transport]] = {"mqtt": _mqtt}
