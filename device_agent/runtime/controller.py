@@ -5,12 +5,14 @@ control loop calls ``step``; other threads offer setpoints, moves and stops thro
 """
 
 import threading
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from enum import Enum
 
+from device_agent.protocol.events import EventKind
 from device_agent.protocol.messages import Mode, Setpoint, StopLatch
 from device_agent.protocol.robot_type import RobotType
+from device_agent.runtime.audit import Happened, Severity, Tell, to_nobody
 from device_agent.runtime.lease import Lease, LeaseGate, Refused
 from device_agent.runtime.motion import Motion, MotionError
 
@@ -79,6 +81,7 @@ class Controller:
         robot_type: Joints and limits.
         gate: The lease gate, with the epochs remembered from before.
         latch: The Stop latch remembered from before.
+        tell: Called with each change of authority, with the controller locked: it must be quick and not call back.
 
     Attributes:
         changed: Set whenever epochs or the latch have changed and must be written down; whoever does clears it.
@@ -90,12 +93,14 @@ class Controller:
         gate: LeaseGate,
         *,
         latch: StopLatch | None = None,
+        tell: Tell = to_nobody,
     ) -> None:
         self._joints = robot_type.joints
         self._index = {joint.name: index for index, joint in enumerate(robot_type.joints)}
         self._motion = Motion(robot_type)
         self._gate = gate
         self._latch = latch
+        self._tell = tell
         self._streaming_speed = robot_type.streaming_speed
         self._lock = threading.Lock()
         self.changed = threading.Event()
@@ -126,10 +131,12 @@ class Controller:
             Refused: Stale or ended.
         """
         with self._lock:
-            before = self._gate.epoch
+            before, had = self._gate.epoch, self._gate.granted
             self._gate.grant(epoch=epoch, holder=holder, lease_s=lease_s, now_s=now_s)
             if epoch != before:
-                self._new_epoch()
+                self._new_epoch(had)
+            if had is None or had.epoch != epoch:
+                self._note(EventKind.LEASE_GRANTED, f"{holder} took control", {"epoch": epoch, "holder": holder})
 
     def release(self, *, epoch: int) -> None:
         """The holder gave the lease up, or lost it.
@@ -233,6 +240,8 @@ class Controller:
             if self._latch is None:
                 self._latch = latch
                 self.changed.set()
+                data = {"by": latch.by, "reason": latch.reason}
+                self._note(EventKind.STOP_LATCHED, f"stopped by {latch.by}", data, "warning")
             self._end_lease(Refused("stopped", "the device was stopped"))
 
     def reset_stop(self) -> None:
@@ -250,6 +259,8 @@ class Controller:
     def fail(self, message: str) -> None:
         """The driver no longer answers: hold until ``recover``."""
         with self._lock:
+            if self._fault != message:
+                self._note(EventKind.DRIVER_FAILED, message, {}, "error")
             self._fault = message
             self._end_lease(Refused("fault", message))
 
@@ -258,6 +269,7 @@ class Controller:
         with self._lock:
             if self._fault is not None:
                 self._fault = None
+                self._note(EventKind.DRIVER_RECOVERED, "the device answers again", {})
                 self._motion.start_at(position_rad)
 
     # ------------------------------------------------------------ what others may know
@@ -301,8 +313,9 @@ class Controller:
             now_s: Monotonic clock [s].
         """
         with self._lock:
+            had = self._gate.granted
             if self._gate.expire(now_s):
-                self._end_lease(Refused("lease_lost", "the lease ran out"))
+                self._end_lease(Refused("lease_lost", "the lease ran out"), had)
             self._mode = self._decide(now_s)
             try:
                 position = list(self._motion.update())
@@ -358,32 +371,39 @@ class Controller:
         self._motion.follow(self._target, speed=self._streaming_speed)
 
     def _fence(self, epoch: int) -> None:
-        before = self._gate.epoch
+        before, had = self._gate.epoch, self._gate.granted
         self._gate.fence(epoch)
         if epoch != before:
-            self._new_epoch()
+            self._new_epoch(had)
         elif epoch <= self._gate.burned:
             raise Refused("lease_ended", f"lease {epoch} has ended at the device; take control again")
 
-    def _new_epoch(self) -> None:
+    def _new_epoch(self, had: Lease | None) -> None:
         self.changed.set()
-        self._hold(Refused("lease_lost", "a newer lease took the device"))
+        why = Refused("lease_lost", "a newer lease took the device")
+        self._note_end(had, why)
+        self._hold(why)
         self._setpoint = None
         self._taken, self._taken_sent_ms, self._loop_age_ms, self._limited = 0, 0.0, 0.0, ()
         self._target = list(self._motion.position_rad)
 
-    def _end_lease(self, why: Refused) -> None:
+    def _end_lease(self, why: Refused, had: Lease | None = None) -> None:
         self.changed.set()
+        self._note_end(had or self._gate.granted, why)
         self._gate.burn()
         self._hold(why)
 
     def _hold(self, why: Refused) -> None:
         """Bring the device to rest; whoever moved it, by setpoints or as an action, no longer does."""
         self._setpoint_at_s = float("-inf")
+        data = {"code": why.code, "epoch": self._gate.epoch}
         if self._motion.moving:
+            if self._mode in {Mode.STREAMING, Mode.ACTION}:  # told once, not for each order to hold while it brakes
+                self._note(EventKind.HELD, why.message, data, "warning")
             self._mode = Mode.HOLDING
         if self._tenure is not None:
             lost, self._tenure = self._tenure, None
+            self._note(EventKind.ACTION_LOST, why.message, data, "warning")
             self._interrupt(why)
             lost.why = why
             lost.on_lost(why)
@@ -394,6 +414,14 @@ class Controller:
             interrupted, self._move = self._move, None
             interrupted.end(Outcome.INTERRUPTED, why)
             self._motion.brake()
+
+    def _note_end(self, had: Lease | None, why: Refused) -> None:
+        if had is not None:
+            data = {"epoch": had.epoch, "holder": had.holder, "code": why.code}
+            self._note(EventKind.LEASE_ENDED, f"{had.holder}'s control ended: {why.message}", data)
+
+    def _note(self, kind: EventKind, message: str, data: Mapping[str, object], severity: Severity = "info") -> None:
+        self._tell(Happened(kind, message, severity, data))
 
     def _check_free(self) -> None:
         if self._latch is not None:

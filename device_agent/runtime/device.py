@@ -14,9 +14,11 @@ from device_agent.ports.clock import CloudClock, tick_ms, wall_ms
 from device_agent.ports.driver import Driver
 from device_agent.protocol import codec, topics
 from device_agent.protocol.errors import ProtocolError
+from device_agent.protocol.events import EventKind
 from device_agent.protocol.messages import Setpoint, Stop, StopLatch
 from device_agent.protocol.robot_type import RobotType
 from device_agent.runtime.actions import Executor
+from device_agent.runtime.audit import Audit, Happened
 from device_agent.runtime.controller import Controller
 from device_agent.runtime.journal import Journal
 from device_agent.runtime.lease import LeaseGate, Refused
@@ -24,6 +26,11 @@ from device_agent.runtime.loop import ControlLoop
 from device_agent.runtime.office import Office
 from device_agent.runtime.voice import Publish, Voice
 
+_REFUSED = {
+    topics.CTL: EventKind.SETPOINTS_REFUSED,
+    topics.STOP: EventKind.STOP_REFUSED,
+    topics.CMD: EventKind.COMMAND_REFUSED,
+}
 _log = logging.getLogger(__name__)
 
 
@@ -61,7 +68,8 @@ class Device:
         self._driver = driver
         record = journal.device(name)
         gate = LeaseGate(epoch=record.epoch, burned=record.epoch)  # a restart ends whatever lease there was
-        self._controller = Controller(robot_type, gate, latch=record.latch)
+        self._audit = Audit()
+        self._controller = Controller(robot_type, gate, latch=record.latch, tell=self._audit.note)
         self._controller.changed.set()
         self.voice = Voice(
             address=(space, agent, name),
@@ -80,6 +88,7 @@ class Device:
             controller=self._controller,
             executor=self._executor,
             voice=self.voice,
+            audit=self._audit,
             journal=journal,
             cloud_clock=cloud_clock,
             keys=keys,
@@ -94,6 +103,9 @@ class Device:
             DriverError: The device is not there.
         """
         self._loop.start()
+        epoch, _ = self._controller.epochs
+        data = {"epoch": epoch, "stopped": self._controller.latch is not None}
+        self._audit.note(Happened(EventKind.AGENT_STARTED, "the agent started; leases of before have ended", data=data))
         self._office.start(self._driver.twin())
 
     def stop(self) -> None:
@@ -101,6 +113,7 @@ class Device:
         self._controller.lost(Refused("agent_stopping", "the agent was shut down"))
         self._executor.close()
         self._loop.stop()
+        self._audit.note(Happened(EventKind.AGENT_STOPPED, "the agent was shut down"))
         self._office.stop()
         self._driver.close()
 
@@ -123,10 +136,15 @@ class Device:
             elif topic.kind == topics.CMD:
                 self._office.put(payload)
         except Refused as refused:
-            self.voice.count(refused.code)
+            self._refuse(topic.kind, refused.code, refused.message)
         except ProtocolError as error:
-            self.voice.count("malformed")
             _log.warning("%s: %s refused: %s", self.name, topic.kind, str(error)[:300])
+            self._refuse(topic.kind, "malformed", str(error)[:300])
+
+    def _refuse(self, topic_kind: str, code: str, message: str) -> None:
+        self.voice.count(code)
+        kind = _REFUSED[topic_kind]
+        self._audit.refused(Happened(kind, message, "warning", {"code": code}), code=code, now_s=time.monotonic())
 
     def _take_setpoint(self, epoch: str, payload: bytes) -> None:
         setpoint = codec.decode(payload, Setpoint)

@@ -66,6 +66,11 @@ class LeaseGate:
         """The lease in force, if any."""
         return self._lease if self._lease is not None and now_s < self._lease.expires_s else None
 
+    @property
+    def granted(self) -> Lease | None:
+        """The lease that was granted last and not ended since, also when it has just run out."""
+        return self._lease
+
     def expire(self, now_s: float) -> bool:
         """Burn a lease that has run out; True when there was one."""
         if self._lease is None or now_s < self._lease.expires_s:

@@ -14,6 +14,7 @@ from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PublicKey
 from device_agent.ports.clock import CloudClock, wall_ms
 from device_agent.protocol import codec, signing
 from device_agent.protocol.errors import ProtocolError, SignatureError
+from device_agent.protocol.events import EventKind
 from device_agent.protocol.messages import (
     AckStatus,
     CancelAction,
@@ -29,8 +30,9 @@ from device_agent.protocol.messages import (
     Twin,
 )
 from device_agent.runtime.actions import Executor
+from device_agent.runtime.audit import Audit, Happened
 from device_agent.runtime.controller import Controller
-from device_agent.runtime.journal import Journal
+from device_agent.runtime.journal import Journal, JournalError
 from device_agent.runtime.lease import Refused
 from device_agent.runtime.voice import Condition, Voice
 
@@ -48,6 +50,7 @@ class Office:
         controller: Leases, Stop.
         executor: Actions.
         voice: Answers.
+        audit: What happened, to be told.
         journal: Open.
         cloud_clock: For ``ttl_ms``.
         keys: The cloud's pinned public keys by key id.
@@ -60,6 +63,7 @@ class Office:
         controller: Controller,
         executor: Executor,
         voice: Voice,
+        audit: Audit,
         journal: Journal,
         cloud_clock: CloudClock,
         keys: Mapping[str, Ed25519PublicKey],
@@ -69,6 +73,7 @@ class Office:
         self._controller = controller
         self._executor = executor
         self._voice = voice
+        self._audit = audit
         self._journal = journal
         self._cloud_clock = cloud_clock
         self._keys = keys
@@ -122,9 +127,19 @@ class Office:
                     self._introduce.clear()
                     self._voice.introduce(self._twin)
                 self._voice.show(self._condition())
+                self._tell(time.monotonic())
+            except JournalError as error:
+                _log.error("%s: %s", self._name, error)
+                happened = Happened(EventKind.JOURNAL_FAILED, str(error), "error")
+                self._audit.refused(happened, code="journal", now_s=time.monotonic())
             except Exception:  # noqa: BLE001 (one bad command must not end the office)
                 _log.exception("%s: command", self._name)
         self._keep()
+        self._tell(float("inf"))  # also what a flood has still to say
+
+    def _tell(self, now_s: float) -> None:
+        for happened in self._audit.take(now_s):
+            self._voice.event(happened)
 
     # ------------------------------------------------------------ one command
 
@@ -132,15 +147,13 @@ class Office:
         try:
             command = codec.decode(signing.verify(payload, self._keys), Command)
         except SignatureError as error:
-            self._voice.count("bad_signature")
-            _log.warning("%s: command refused: %s", self._name, error)
+            self._refuse("bad_signature", str(error))
             return
         except ProtocolError as error:
-            self._voice.count("malformed")
-            _log.warning("%s: command refused: %s", self._name, str(error)[:300])
+            self._refuse("malformed", str(error)[:300])
             return
         if (command.space, command.agent, command.device) != self._address:
-            self._voice.count("wrong_address")
+            self._refuse("wrong_address", "it is addressed to another device", command)
             return
         first = self._voice.ack(command.id, AckStatus.RECEIVED)
         seen = self._journal.begin(self._name, first)
@@ -153,7 +166,17 @@ class Office:
         except Refused as refused:
             status = AckStatus.EXPIRED if refused.code == "expired" else AckStatus.FAILED
             self._voice.report(command.id, status, reason=Reason(code=refused.code, message=refused.message))
-            _log.info("%s: command %s refused: %s", self._name, command.id, refused.message)
+            self._refuse(refused.code, refused.message, command)
+
+    def _refuse(self, code: str, message: str, command: Command | None = None) -> None:
+        _log.warning("%s: command %s refused: %s", self._name, command.id if command else "", message)
+        self._voice.count(code)
+        data: dict[str, object] = {"code": code}
+        if command is not None:
+            request = type(command.request).__struct_config__.tag
+            data |= {"command": command.id, "request": request, "who": command.who, "epoch": command.epoch}
+        happened = Happened(EventKind.COMMAND_REFUSED, f"a command was refused: {message}", "warning", data)
+        self._audit.refused(happened, code=code, now_s=time.monotonic())
 
     def _check_time(self, command: Command) -> None:
         if isinstance(command.request, StopDevice):
@@ -178,6 +201,9 @@ class Office:
             case StopDevice(reason=reason):
                 self._controller.stop(StopLatch(by=command.who, reason=reason, at_ms=wall_ms()))
             case ResetStop():
+                if self._controller.latch is not None:
+                    message = f"Stop was reset by {command.who}"
+                    self._audit.note(Happened(EventKind.STOP_RESET, message, data={"by": command.who}))
                 self._controller.reset_stop()
                 _log.warning("%s: Stop reset by %s", self._name, command.who)
             case CancelAction(action=action):

@@ -1,8 +1,9 @@
-"""What one device tells the world: acks, ``desc``, ``state``, telemetry, and the refusals it counts."""
+"""What one device tells the world: acks, events, ``desc``, ``state``, telemetry, and the refusals it counts."""
 
 import queue
 import threading
 import time
+import uuid
 from collections.abc import Callable
 from dataclasses import dataclass
 
@@ -13,6 +14,7 @@ from device_agent.protocol.messages import (
     AckStatus,
     ActionState,
     Description,
+    Event,
     Fault,
     JointTelemetry,
     LeaseState,
@@ -22,6 +24,7 @@ from device_agent.protocol.messages import (
     Twin,
 )
 from device_agent.protocol.robot_type import RobotType
+from device_agent.runtime.audit import Happened
 from device_agent.runtime.controller import MAX_LOOP_AGE_S, WATCHDOG_S
 from device_agent.runtime.journal import Journal
 from device_agent.runtime.lease import Lease
@@ -151,6 +154,19 @@ class Voice:
     def tell(self, telemetry: JointTelemetry) -> None:
         """Publish a measurement; called by the control loop, must not block."""
         self._publish(self._topic(topics.TELE, topics.JOINTS), codec.encode(telemetry), qos=0)
+
+    def event(self, happened: Happened) -> None:
+        """Publish a fact that happened."""
+        event = Event(
+            id=uuid.uuid4().hex,
+            device=self._name,
+            at_ms=happened.at_ms,
+            kind=happened.kind,
+            severity=happened.severity,
+            message=happened.message[:2000],
+            data=dict(happened.data),
+        )
+        self._publish(self._topic(topics.EVENT), codec.encode(event), qos=1)
 
     def count(self, code: str) -> None:
         """Count a refusal."""
