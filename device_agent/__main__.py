@@ -24,6 +24,7 @@ from device_agent.transports.http.api import Claim, CloudApi, CloudError
 
 _POLL_S = 20.0
 _OUTDATED_POLL_S = 0.5
+_AGAIN_S = 5.0
 _EXIT_FAILED = 1
 
 
@@ -183,14 +184,33 @@ def _run(options: argparse.Namespace) -> int:
 
 
 def _pair(home: Home) -> None:
-    """Learn whose the agent is; where it is nobody's, wait to be claimed."""
+    """Learn whose the agent is; where it is nobody's, show a code and wait to be claimed.
+
+    A robot may start before its network does: where the cloud is not reached it is asked again.
+    """
     configuration = home.configuration()
-    api = bootstrap.api_of(home, configuration, CloudClock())
-    _await_claim(home, api, configuration, _announce(api, configuration))
+    before = signal.signal(signal.SIGTERM, _leave)
+    try:
+        while True:
+            api = bootstrap.api_of(home, configuration, CloudClock())
+            try:
+                _await_claim(home, api, configuration, _announce(api, configuration))
+            except OSError as error:
+                print(f"telescope agent: {error}; trying again in {_AGAIN_S:.0f} s", file=sys.stderr, flush=True)
+                time.sleep(_AGAIN_S)
+            else:
+                return
+    finally:
+        signal.signal(signal.SIGTERM, before)
+
+
+def _leave(*_: object) -> None:
+    """Nothing runs yet that would have to be ended first."""
+    raise SystemExit(0)
 
 
 def _run_until_told(home: Home, trace: Path | None) -> bool:
-    """Run as the pairing on file says, until told to end; whether instead the agent belongs to another space now."""
+    """Run as the pairing on file says, until told to end; whether instead the pairing no longer holds."""
     ending = threading.Event()
     before = {number: signal.signal(number, lambda *_: ending.set()) for number in (signal.SIGINT, signal.SIGTERM)}
     cell = bootstrap.build(home, trace=trace)

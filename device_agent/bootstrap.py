@@ -26,7 +26,7 @@ class Cell:
 
     @property
     def outdated(self) -> bool:
-        """Whether the agent belongs to another space by now: its pairing is to be read, and all of it built again."""
+        """Whether the agent was un-paired, or moved: whose it is is to be asked, and all of it built again."""
         return self._membership.outdated.is_set()
 
     def start(self) -> None:
