@@ -1,0 +1,223 @@
+"""A real device, office, executor and journal over a toy arm, in processes that kill themselves at any step.
+
+``python -m tests.faults.mortal_agent`` is a warm parent: each line that it reads is one life (JSON, see ``Life``),
+which it leads in a fork of itself and answers with the exit status. A step is what a ``kill -9`` can fall between: a
+write to the journal, a message published, a move begun.
+
+A life appends to files that outlive it: ``heard`` has every answer that was published, a line each; ``moved`` every
+move that the arm was really told to make, by the command's number, with the cloud's time of that moment.
+"""
+
+import json
+import logging
+import os
+import random
+import signal
+import sys
+import threading
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+from unittest import mock
+
+import msgspec
+from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
+
+from device_agent.ports.clock import CloudClock, tick_ms, wall_ms
+from device_agent.protocol import codec, signing, topics
+from device_agent.protocol.messages import Ack, Command
+from device_agent.runtime.controller import Controller
+from device_agent.runtime.device import Device
+from device_agent.runtime.journal import Journal
+from tests.unit.agent.test_controller import robot_type
+from tests.unit.agent.test_device import ToyDriver
+
+TARGET_RAD = 1e-4
+"""The elbow's target [rad] times this is the number of the command that moved it: so each move says whose it is."""
+SPACE, AGENT, DEVICE = "s", "a", "arm"
+_GIVE_UP_S = 60.0
+_LINK_LOST = 0.03
+_UNHEARD = 0.25
+
+
+class Life(msgspec.Struct):
+    """One life of the agent.
+
+    Attributes:
+        folder: Where journal, ``heard`` and ``moved`` are.
+        key: The cloud's private key, base64.
+        dies_at: The step instead of which it is killed; ``None``: lives on until everything has an end.
+        cloud_ms: The cloud's time at its start; has nothing to do with this machine's.
+        seed: Of what the link does.
+        orders: Command bodies in the order in which they arrive, some several times.
+    """
+
+    folder: str
+    key: bytes
+    dies_at: int | None
+    cloud_ms: int
+    seed: int
+    orders: list[Command]
+
+
+class Steps:
+    """Counts, and kills at the chosen one."""
+
+    def __init__(self, dies_at: int | None) -> None:
+        self._dies_at = dies_at
+        self._lock = threading.Lock()
+        self.count = 0
+
+    def step(self) -> None:
+        with self._lock:
+            if self._dies_at is not None and self.count >= self._dies_at:
+                os.kill(os.getpid(), signal.SIGKILL)
+                time.sleep(_GIVE_UP_S)  # the signal is on its way; nothing may follow
+            self.count += 1
+
+    def around(self, owner: Any, name: str) -> Any:
+        """A patch that makes a call a step on either side."""
+        real = getattr(owner, name)
+
+        def stepping(*arguments: Any, **options: Any) -> Any:
+            self.step()
+            result = real(*arguments, **options)
+            self.step()
+            return result
+
+        return mock.patch.object(owner, name, stepping)
+
+
+class Ledger:
+    """A file to append to, whole lines only; what was written survives the kill of the process."""
+
+    def __init__(self, path: Path) -> None:
+        self._file = os.open(path, os.O_WRONLY | os.O_APPEND | os.O_CREAT, 0o600)
+
+    def add(self, **row: Any) -> None:
+        os.write(self._file, json.dumps(row).encode() + b"\n")
+        os.fsync(self._file)
+
+
+class Body:
+    """The device of one life."""
+
+    def __init__(self, life: Life) -> None:
+        self.life = life
+        self.folder = Path(life.folder)
+        self.steps = Steps(life.dies_at)
+        self.chance = random.Random(life.seed)
+        self.heard = Ledger(self.folder / "heard")
+        self.moved = Ledger(self.folder / "moved")
+        self.ended: set[str] = set()
+        self.clock = CloudClock()
+        self.clock.observe(server_ms=life.cloud_ms, sent_tick_ms=tick_ms(), received_tick_ms=tick_ms())
+
+    def live(self) -> None:
+        key = Ed25519PrivateKey.from_private_bytes(self.life.key)
+        writes = [self.steps.around(Journal, name) for name in ("begin", "record", "delivered", "save_epoch")]
+        with mock.patch.object(Controller, "move", self._counted(Controller.move)):
+            for write in writes:
+                write.start()
+            journal = Journal(self.folder / "journal.db")
+            journal.open(now_ms=wall_ms())
+            journal.end_open(now_ms=wall_ms(), tick_ms=tick_ms())
+            device = Device(
+                name=DEVICE, label="Arm", space=SPACE, agent=AGENT, robot_type=swift(), driver=ToyDriver(),
+                journal=journal, cloud_clock=self.clock, publish=self._publish,
+                keys={signing.key_id(key.public_key()): key.public_key()},
+            )  # fmt: skip
+            device.start()
+            device.link_changed(True)
+            self._deliver(device, key)
+            device.stop()
+            journal.close()
+
+    def _deliver(self, device: Device, key: Ed25519PrivateKey) -> None:
+        topic = topics.Topic(SPACE, AGENT, DEVICE, topics.CMD)
+        for order in self.life.orders:
+            device.receive(topic, signing.sign(codec.encode(order), key))
+            if self.chance.random() < _LINK_LOST:
+                device.link_changed(False)
+                device.link_changed(True)
+            time.sleep(self.chance.choice((0, 0.005, 0.03)))
+        deadline_s = time.monotonic() + _GIVE_UP_S
+        orders = {order.id for order in self.life.orders}
+        while not orders <= self.ended:
+            assert time.monotonic() < deadline_s, f"without an end: {orders - self.ended}"
+            time.sleep(0.002)
+
+    def _counted(self, real: Callable[..., Any]) -> Callable[..., Any]:
+        def move(controller: Controller, tenure: Any, position_rad: dict[str, float], **options: Any) -> Any:
+            self.steps.step()
+            moving = real(controller, tenure, position_rad, **options)
+            self.moved.add(number=round(position_rad["elbow"] / TARGET_RAD), cloud_ms=self.clock.now_ms())
+            self.steps.step()
+            return moving
+
+        return move
+
+    def _publish(
+        self,
+        topic: str,
+        payload: bytes,
+        *,
+        qos: int,
+        retain: bool = False,
+        delivered: Callable[[], None] | None = None,
+    ) -> bool:
+        """A broker that now and then does not confirm; measurements go nowhere."""
+        del qos, retain
+        if topics.parse(topic).kind != topics.ACK:
+            return True
+        self.steps.step()
+        ack = codec.decode(payload, Ack)
+        self.heard.add(id=ack.id, status=ack.status, code=ack.reason.code if ack.reason else "", progress=ack.progress)
+        self.steps.step()
+        if delivered is not None and self.chance.random() > _UNHEARD:
+            delivered()
+        if ack.status.terminal:
+            self.ended.add(ack.id)
+        return True
+
+
+def swift() -> Any:
+    """A toy arm that is there at once: a thousand lives are to take minutes."""
+    slow = robot_type()
+    joints = tuple(
+        msgspec.structs.replace(
+            joint,
+            max_velocity_rad_s=100.0,
+            max_acceleration_rad_s2=1e4,
+            max_jerk_rad_s3=1e7,
+            lower_rad=-30,
+            upper_rad=30,
+        )
+        for joint in slow.joints
+    )
+    return msgspec.structs.replace(slow, joints=joints, period_ms=4, braking_rad_s2=2e4)
+
+
+def main() -> None:
+    logging.disable()
+    for line in sys.stdin:
+        life = msgspec.json.decode(line, type=Life)
+        child = os.fork()
+        if child == 0:
+            code = 1
+            try:
+                body = Body(life)
+                body.live()
+                code = 0
+            except BaseException as error:
+                print(f"{type(error).__name__}: {error}", file=sys.stderr)
+                raise
+            finally:
+                os._exit(code)
+        _, status = os.waitpid(child, 0)
+        print(os.waitstatus_to_exitcode(status), flush=True)
+
+
+if __name__ == "__main__":
+    main()
