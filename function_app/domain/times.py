@@ -2,6 +2,9 @@
 
 from datetime import UTC, datetime
 
+LAST_MS = 9_999_999_999_999
+"""The last moment that is taken for one, in the year 2286 [ms since 1970]: as thirteen digits it sorts as text."""
+
 
 def rfc3339(at_ms: int) -> str:
     """Milliseconds since 1970 as ``2026-01-31T12:00:00.123Z``."""

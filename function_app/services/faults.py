@@ -158,7 +158,7 @@ class Faults:
     async def _tell(self, device: Device) -> None:
         page = await self._tables.query(store.FAULTS, _partition(device), first=_EVENT, last="event;", limit=1000)
         for row in page.rows:
-            await self._events.add(device.id, row.data)
+            await self._events.add(device.id, device.pairing, row.data)
             try:
                 await self._tables.delete(store.FAULTS, row)
             except Conflict:

@@ -119,9 +119,9 @@ class Leave:
             await self._delete(store.MEMBERS, leaving.account, f"agent:{agent.id}", leaving)
 
     async def _forget_measures(self, device: Device) -> None:
-        """Faults, what is watched, and times, once those who do not know yet have stopped to write."""
+        """Events, faults, what is watched, and times, once those who do not know yet have stopped to write."""
         due_ms = self._clock.now_ms() + MARGIN_MS
-        for table in (store.FAULTS, store.DIAGNOSTICS, store.LATENCY):
+        for table in (store.EVENTS, store.FAULTS, store.DIAGNOSTICS, store.LATENCY):
             partition = f"{device.id}/{device.pairing}"
             await self._forget.rows(table, partition, first="", last=None, due_ms=due_ms)
 

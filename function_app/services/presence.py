@@ -11,6 +11,7 @@ from device_agent.protocol.topics import Topic
 from function_app.domain.devices import Agent, LastState, Link, Transport, newer_link
 from function_app.domain.ids import device_id
 from function_app.domain.nesting import MAX_LEVELS, too_deep
+from function_app.domain.times import LAST_MS
 from function_app.ports.clock import Clock
 from function_app.ports.tables import Tables
 from function_app.services import store
@@ -71,10 +72,12 @@ class PresenceIngest:
                 self._tables, store.DESCRIPTIONS, topic.agent, topic.device, lambda _: description, Description
             )
         elif topic.kind == topics.EVENT:
-            await self._event(topic, codec.decode(payload, Event))
+            await self._event(agent, topic, codec.decode(payload, Event))
 
-    async def _event(self, topic: Topic, event: Event) -> None:
+    async def _event(self, agent: Agent, topic: Topic, event: Event) -> None:
         """By its id, so that one that is delivered twice is stored once."""
         if too_deep(event.data):
             raise ProtocolError(f"the event's data are nested more than {MAX_LEVELS} levels deep")
-        await self._events.add(device_id(topic.agent, topic.device), msgspec.to_builtins(event))
+        if event.at_ms > LAST_MS:
+            raise ProtocolError("the event's `at_ms` is not a time of milliseconds since 1970")
+        await self._events.add(device_id(topic.agent, topic.device), agent.pairing, msgspec.to_builtins(event))

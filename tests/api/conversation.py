@@ -136,7 +136,17 @@ class Conversation:
         for person in (self.anna, self.again, self.bert):
             person.get("/agents")
             person.get("/devices")
-            for path in ("", "/lease", "/actions", "/data", "/faults", "/latency", "/uploads", "/diagnostics"):
+            for path in (
+                "",
+                "/lease",
+                "/actions",
+                "/data",
+                "/events",
+                "/faults",
+                "/latency",
+                "/uploads",
+                "/diagnostics",
+            ):
                 answer = person.get(f"/devices/{device}{path}")
                 assert answer.status_code == (404 if person is self.bert else 200), answer.text
         for odd in ("%F0%9F%A4%96", "..", "a%20b", "%01", "x" * 200, "aaaaaaaaaa-arm", f"{device}%20"):

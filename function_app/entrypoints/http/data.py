@@ -5,19 +5,18 @@ from typing import Annotated, cast
 from fastapi import Query, Request, Response
 
 from function_app.bootstrap import Functions
-from function_app.domain.times import rfc3339
+from function_app.domain.times import LAST_MS, rfc3339
 from function_app.entrypoints.http.answers import answer
 from function_app.entrypoints.http.caller import Caller
 from function_app.entrypoints.http.contract import data as contract
 from function_app.entrypoints.http.routing import Routes
 from function_app.services.series_range import MAX_POINTS, Part, Range
 
-_LAST_MS = 9_999_999_999_999
 Since = Annotated[
-    int | None, Query(alias="from", ge=0, le=_LAST_MS, description="From here [ms since 1970]; the beginning.")
+    int | None, Query(alias="from", ge=0, le=LAST_MS, description="From here [ms since 1970]; the beginning.")
 ]
 Until = Annotated[
-    int | None, Query(alias="to", ge=0, le=_LAST_MS, description="To before here [ms since 1970]; the end.")
+    int | None, Query(alias="to", ge=0, le=LAST_MS, description="To before here [ms since 1970]; the end.")
 ]
 Points = Annotated[int, Query(ge=1, le=MAX_POINTS, description="At most so many points in a page.")]
 Fields = Annotated[str | None, Query(max_length=4_000, description="Only these fields, with commas between.")]
