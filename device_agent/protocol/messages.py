@@ -150,12 +150,26 @@ class StopLatch(Struct, frozen=True, kw_only=True):
     at_ms: Milliseconds
 
 
+class OpenRequest(Struct, frozen=True, kw_only=True):
+    """Somebody asks the holder for control, and gets an answer in the time that is left or none."""
+
+    id: Id
+    by: Label
+    expires_in_ms: Milliseconds
+
+
 class LeaseState(Struct, frozen=True, kw_only=True):
-    """The lease that the device obeys now."""
+    """The lease that the device obeys now.
+
+    ``reason`` says why it was taken from somebody else, and is empty where it was not. ``request`` is for people:
+    nothing about motion depends on it.
+    """
 
     holder: Label
     epoch: Count
     expires_in_ms: Milliseconds
+    reason: Text = ""
+    request: OpenRequest | None = None
 
 
 class ActionState(Struct, frozen=True, kw_only=True):
@@ -176,13 +190,18 @@ class Fault(Struct, frozen=True, kw_only=True):
 
 
 class State(Struct, frozen=True, kw_only=True):
-    """``state``: the current condition. Retained; on change and every 30 s, at most once a second."""
+    """``state``: the current condition. Retained; on change and every 30 s, at most once a second.
+
+    ``ended_epoch`` is the highest epoch that the device will never obey again. It only rises, so even an old message
+    tells the truth: a lease of such an epoch is nobody's any more.
+    """
 
     device: Id
     at_ms: Milliseconds
     tick_ms: Milliseconds
     mode: Mode
     epoch: Count
+    ended_epoch: Count = 0
     stop: StopLatch | None = None
     lease: LeaseState | None = None
     action: ActionState | None = None
@@ -288,14 +307,32 @@ class _Order(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True, tag_
 
 
 class GrantLease(_Order, frozen=True, kw_only=True, tag="grant_lease"):
-    """Control of the device now belongs to ``holder``, for ``lease_ms`` from the moment of arrival. Also renews."""
+    """Control of the device now belongs to ``holder``, for ``lease_ms`` from the moment of arrival. Also renews.
+
+    ``reason``: why it was taken from somebody else, for that person to read.
+    """
 
     holder: Label
     lease_ms: Annotated[int, Meta(ge=1, le=3_600_000)]
+    reason: Text = ""
 
 
 class ReleaseLease(_Order, frozen=True, kw_only=True, tag="release_lease"):
     """Nobody controls the device any more; what moves is brought to a hold."""
+
+
+class AskLease(_Order, frozen=True, kw_only=True, tag="ask_lease"):
+    """Show the holder, and everybody, that somebody asks for control. Changes nothing else; lapses by itself."""
+
+    request: Id
+    by: Label
+    answer_within_ms: Annotated[int, Meta(ge=1, le=3_600_000)]
+
+
+class DropRequest(_Order, frozen=True, kw_only=True, tag="drop_request"):
+    """Nobody asks any more: refused, or withdrawn."""
+
+    request: Id
 
 
 class RunMovement(_Order, frozen=True, kw_only=True, tag="run_movement"):
@@ -329,10 +366,24 @@ class StopDevice(_Order, frozen=True, kw_only=True, tag="stop_device"):
 
 
 class ResetStop(_Order, frozen=True, kw_only=True, tag="reset_stop"):
-    """Release the Stop latch. Nothing resumes."""
+    """Release the Stop latch. Nothing resumes.
+
+    It brings an epoch of its own, which ends with it: what was ordered before the reset is never obeyed after it, and a
+    reset that comes late, or again, is older than the latch that it finds.
+    """
 
 
-Request = GrantLease | ReleaseLease | RunMovement | MoveJoints | CancelAction | StopDevice | ResetStop
+Request = (
+    GrantLease
+    | ReleaseLease
+    | AskLease
+    | DropRequest
+    | RunMovement
+    | MoveJoints
+    | CancelAction
+    | StopDevice
+    | ResetStop
+)
 
 
 class Command(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):

@@ -124,7 +124,7 @@ class Controller:
             self._motion.start_at(position_rad)
             self._target = list(position_rad)
 
-    def grant(self, *, epoch: int, holder: str, lease_s: float, now_s: float) -> None:
+    def grant(self, *, epoch: int, holder: str, lease_s: float, now_s: float, reason: str = "") -> None:
         """Take in a signed grant or renewal of the lease.
 
         Raises:
@@ -132,7 +132,7 @@ class Controller:
         """
         with self._lock:
             before, had = self._gate.epoch, self._gate.granted
-            self._gate.grant(epoch=epoch, holder=holder, lease_s=lease_s, now_s=now_s)
+            self._gate.grant(epoch=epoch, holder=holder, lease_s=lease_s, now_s=now_s, reason=reason)
             if epoch != before:
                 self._new_epoch(had)
             if had is None or had.epoch != epoch:
@@ -244,11 +244,16 @@ class Controller:
                 self._note(EventKind.STOP_LATCHED, f"stopped by {latch.by}", data, "warning")
             self._end_lease(Refused("stopped", "the device was stopped"))
 
-    def reset_stop(self) -> None:
-        """Release the latch. Nothing resumes: the lease that was in force has ended."""
+    def reset_stop(self, *, epoch: int) -> None:
+        """Release the latch. Nothing resumes: every lease up to ``epoch``, the reset's own, has ended.
+
+        Raises:
+            Refused: Older than what the device has obeyed: a reset may come late, or again, and find a later latch.
+        """
         with self._lock:
+            self._fence(epoch)
+            self._end_lease(Refused("lease_lost", "Stop was reset; take control again"))
             self._latch = None
-            self.changed.set()
 
     def lost(self, why: Refused) -> None:
         """The link is gone: hold what moves, and let it be taken again. What rests keeps its lease."""

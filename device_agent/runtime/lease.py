@@ -14,11 +14,15 @@ class Refused(Exception):  # noqa: N818 (an answer, not a fault)
 
 @dataclass(frozen=True, slots=True)
 class Lease:
-    """The right to move the device until ``expires_s`` on the agent's monotonic clock [s]."""
+    """The right to move the device until ``expires_s`` on the agent's monotonic clock [s].
+
+    ``reason``: why it was taken from somebody else.
+    """
 
     holder: str
     epoch: int
     expires_s: float
+    reason: str = ""
 
 
 class LeaseGate:
@@ -38,7 +42,7 @@ class LeaseGate:
         self.burned = max(burned, 0)
         self._lease: Lease | None = None
 
-    def grant(self, *, epoch: int, holder: str, lease_s: float, now_s: float) -> None:
+    def grant(self, *, epoch: int, holder: str, lease_s: float, now_s: float, reason: str = "") -> None:
         """Take in a signed grant or renewal.
 
         Raises:
@@ -48,7 +52,9 @@ class LeaseGate:
         if epoch <= self.burned:
             raise Refused("lease_ended", f"lease {epoch} has ended at the device; take control again")
         self.epoch = epoch
-        self._lease = Lease(holder, epoch, now_s + lease_s)
+        if self._lease is not None:  # a renewal: what was said at the beginning still holds
+            reason = reason or self._lease.reason
+        self._lease = Lease(holder, epoch, now_s + lease_s, reason)
 
     def fence(self, epoch: int) -> None:
         """Refuse what comes from an older lease; adopt a newer epoch, which ends the lease in force.

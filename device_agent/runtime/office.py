@@ -17,8 +17,10 @@ from device_agent.protocol.errors import ProtocolError, SignatureError
 from device_agent.protocol.events import EventKind
 from device_agent.protocol.messages import (
     AckStatus,
+    AskLease,
     CancelAction,
     Command,
+    DropRequest,
     GrantLease,
     MoveJoints,
     Reason,
@@ -32,6 +34,7 @@ from device_agent.protocol.messages import (
 from device_agent.runtime.actions import Executor
 from device_agent.runtime.audit import Audit, Happened
 from device_agent.runtime.controller import Controller
+from device_agent.runtime.handover import Handover
 from device_agent.runtime.journal import Journal, JournalError
 from device_agent.runtime.lease import Refused
 from device_agent.runtime.voice import Condition, Voice
@@ -77,6 +80,7 @@ class Office:
         self._journal = journal
         self._cloud_clock = cloud_clock
         self._keys = keys
+        self._handover = Handover()
         self._twin: Twin | None = None
         self._commands: queue.Queue[bytes] = queue.Queue(maxsize=_MOST_WAITING)
         self._introduce = threading.Event()
@@ -191,20 +195,26 @@ class Office:
             raise Refused("from_the_future", "issued later than now; the cloud's clock or this device's is wrong")
 
     def _carry_out(self, command: Command) -> None:
+        now_s = time.monotonic()
         match command.request:
-            case GrantLease(holder=holder, lease_ms=lease_ms):
+            case GrantLease(holder=holder, lease_ms=lease_ms, reason=reason):
                 self._controller.grant(
-                    epoch=command.epoch, holder=holder, lease_s=lease_ms / 1000, now_s=time.monotonic()
+                    epoch=command.epoch, holder=holder, lease_s=lease_ms / 1000, now_s=now_s, reason=reason
                 )
+            case AskLease() as asked:
+                self._handover.ask(asked, epoch=command.epoch, lease=self._controller.lease(now_s), now_s=now_s)
+            case DropRequest(request=request):
+                self._handover.drop(request)
             case ReleaseLease():
                 self._controller.release(epoch=command.epoch)
             case StopDevice(reason=reason):
                 self._controller.stop(StopLatch(by=command.who, reason=reason, at_ms=wall_ms()))
             case ResetStop():
-                if self._controller.latch is not None:
+                latched = self._controller.latch is not None
+                self._controller.reset_stop(epoch=command.epoch)
+                if latched:
                     message = f"Stop was reset by {command.who}"
                     self._audit.note(Happened(EventKind.STOP_RESET, message, data={"by": command.who}))
-                self._controller.reset_stop()
                 _log.warning("%s: Stop reset by %s", self._name, command.who)
             case CancelAction(action=action):
                 self._executor.cancel(action, command.who)
@@ -229,11 +239,15 @@ class Office:
             self._journal.save_latch(self._name, self._controller.latch)
 
     def _condition(self) -> Condition:
-        epoch, _ = self._controller.epochs
+        now_s = time.monotonic()
+        epoch, ended = self._controller.epochs
+        lease = self._controller.lease(now_s)
         return Condition(
             mode=self._controller.mode,
             epoch=epoch,
-            lease=self._controller.lease(time.monotonic()),
+            ended=ended,
+            lease=lease,
+            asked=self._handover.current(lease, now_s),
             latch=self._controller.latch,
             fault=self._controller.fault,
             action=self._executor.current(),

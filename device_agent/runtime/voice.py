@@ -19,6 +19,7 @@ from device_agent.protocol.messages import (
     JointTelemetry,
     LeaseState,
     Mode,
+    OpenRequest,
     State,
     StopLatch,
     Twin,
@@ -26,6 +27,7 @@ from device_agent.protocol.messages import (
 from device_agent.protocol.robot_type import RobotType
 from device_agent.runtime.audit import Happened
 from device_agent.runtime.controller import MAX_LOOP_AGE_S, WATCHDOG_S
+from device_agent.runtime.handover import Asked
 from device_agent.runtime.journal import Journal
 from device_agent.runtime.lease import Lease
 
@@ -42,14 +44,25 @@ class Condition:
 
     mode: Mode
     epoch: int
+    ended: int
     lease: Lease | None
+    asked: Asked | None
     latch: StopLatch | None
     fault: str | None
     action: ActionState | None
 
     def shown(self) -> tuple[object, ...]:
         """What makes a new ``state`` worth sending: progress alone does not."""
-        return (self.mode, self.epoch, self.lease, self.latch, self.fault, self.action and self.action.id)
+        return (
+            self.mode,
+            self.epoch,
+            self.ended,
+            self.lease,
+            self.asked,
+            self.latch,
+            self.fault,
+            self.action and self.action.id,
+        )
 
 
 class Voice:
@@ -143,8 +156,9 @@ class Voice:
             tick_ms=tick_ms(),
             mode=now.mode,
             epoch=now.epoch,
+            ended_epoch=now.ended,
             stop=now.latch,
-            lease=_lease_state(now.lease, now_s),
+            lease=_lease_state(now.lease, now.asked, now_s),
             action=now.action,
             faults=(Fault(code="driver", message=now.fault[:2000], since_ms=at_ms),) if now.fault else (),
         )
@@ -195,8 +209,20 @@ class Voice:
         return topics.device(*self._address, kind, name)
 
 
-def _lease_state(lease: Lease | None, now_s: float) -> LeaseState | None:
+def _lease_state(lease: Lease | None, asked: Asked | None, now_s: float) -> LeaseState | None:
     if lease is None:
         return None
-    left_ms = max(0, round((lease.expires_s - now_s) * 1000))
-    return LeaseState(holder=lease.holder, epoch=lease.epoch, expires_in_ms=left_ms)
+    request = None
+    if asked is not None:
+        request = OpenRequest(id=asked.id, by=asked.by, expires_in_ms=_left_ms(asked.expires_s, now_s))
+    return LeaseState(
+        holder=lease.holder,
+        epoch=lease.epoch,
+        expires_in_ms=_left_ms(lease.expires_s, now_s),
+        reason=lease.reason,
+        request=request,
+    )
+
+
+def _left_ms(expires_s: float, now_s: float) -> int:
+    return max(0, round((expires_s - now_s) * 1000))

@@ -87,6 +87,11 @@ def release(lease: Lease) -> Lease:
     return Lease(epoch=lease.epoch)
 
 
+def overtake(lease: Lease | None, *, pairing: str) -> Lease:
+    """Nobody's lease with the next epoch: all that was ordered under the one before is old."""
+    return Lease(epoch=(lease.epoch if lease else 0) + 1, pairing=pairing)
+
+
 def held(lease: Lease) -> Problem:
     """The refusal that names the holder."""
     ends = rfc3339(lease.expires_ms)

@@ -1,5 +1,6 @@
 """The rows that decide who controls a device: lease, slot and queue, side by side in the device's partition."""
 
+from collections.abc import Callable
 from dataclasses import dataclass, field
 
 from function_app.domain.devices import Device
@@ -70,6 +71,29 @@ async def read_control_rows(tables: Tables, device: str) -> Control:
         queue=_queue(rows),
         rows=rows,
     )
+
+
+async def change_lease(
+    tables: Tables, device: Device, change: Callable[[Lease | None], Lease]
+) -> tuple[Lease | None, Lease]:
+    """Put what ``change`` makes of the lease in its place, by ETag; the lease before and after.
+
+    Args:
+        tables: The store.
+        device: Whose lease.
+        change: Decides; may be called several times.
+
+    Raises:
+        Problem: ``busy``, and whatever ``change`` raises.
+    """
+
+    async def once() -> tuple[Lease | None, Lease]:
+        control = await read_control(tables, device)
+        lease = change(control.lease)
+        await tables.batch(store.CONTROL, [control.write_lease(device.id, lease)])
+        return control.lease, lease
+
+    return await store.retry(once)
 
 
 async def read_lease(tables: Tables, device: Device) -> Lease | None:

@@ -1,7 +1,6 @@
 """Taking, renewing and releasing control of a device."""
 
 import logging
-from collections.abc import Awaitable, Callable
 from dataclasses import replace
 
 from device_agent.protocol.messages import GrantLease, ReleaseLease
@@ -14,9 +13,8 @@ from function_app.ports.broker_access import BrokerAccess, BrokerAccessError
 from function_app.ports.clock import Clock
 from function_app.ports.command_bus import BusUnavailable
 from function_app.ports.tables import Tables
-from function_app.services import store
 from function_app.services.commands import Commands
-from function_app.services.control import read_control, read_lease
+from function_app.services.control import change_lease, read_lease
 from function_app.services.devices import Devices
 
 _log = logging.getLogger(__name__)
@@ -60,7 +58,7 @@ class Leases:
                 return rules.take(lease, who, lease_ms=lease_ms, now_ms=now_ms, pairing=device.pairing)
             return rules.renew(lease, who, epoch=epoch, lease_ms=lease_ms, now_ms=now_ms)
 
-        lease = await self._change(device, changed)
+        _, lease = await change_lease(self._tables, device, changed)
         grant = GrantLease(holder=who.name, lease_ms=lease_ms)
         try:
             confirmed = await self._commands.confirmed(device, grant, who=who.name, epoch=lease.epoch, wait_ms=wait_ms)
@@ -82,26 +80,20 @@ class Leases:
             current = rules.hold(lease, who, epoch=epoch, now_ms=self._clock.now_ms())
             return replace(rules.release(current), pairing=device.pairing)
 
-        await self._change(device, changed)
-        steps: tuple[Callable[[], Awaitable[object]], ...] = (
-            lambda: self._commands.send(device, ReleaseLease(), who=who.name, epoch=epoch),
-            lambda: self._access.revoke(client_id=control_client(device.id, epoch)),
-        )
-        for step in steps:
-            try:
-                await step()
-            except (BusUnavailable, BrokerAccessError) as error:
-                # Released it is; what the device was granted ends by itself with the time it was granted for.
-                _log.warning("release of %s: %s", device.id, error)
+        await change_lease(self._tables, device, changed)
+        # Released it is, whoever can be told: what the device was granted ends with the time it was granted for.
+        try:
+            await self._commands.send(device, ReleaseLease(), who=who.name, epoch=epoch)
+        except BusUnavailable as error:
+            _log.warning("release of %s: %s", device.id, error)
+        await self._revoke(device, epoch)
 
-    async def _change(self, device: Device, change: Callable[[Lease | None], Lease]) -> Lease:
-        async def once() -> Lease:
-            control = await read_control(self._tables, device)
-            lease = change(control.lease)
-            await self._tables.batch(store.CONTROL, [control.write_lease(device.id, lease)])
-            return lease
-
-        return await store.retry(once)
+    async def _revoke(self, device: Device, epoch: int) -> None:
+        """Take back the credentials that carry this epoch's setpoints: fencing that does not need the device."""
+        try:
+            await self._access.revoke(client_id=control_client(device.id, epoch))
+        except BrokerAccessError as error:
+            _log.warning("setpoints of lease %d of %s: %s", epoch, device.id, error)
 
 
 def control_client(device: str, epoch: int) -> str:

@@ -6,6 +6,7 @@ import logging
 
 from device_agent.protocol import codec
 from device_agent.protocol.messages import ResetStop, Stop, StopDevice
+from function_app.domain import lease as rules
 from function_app.domain.accounts import Identity
 from function_app.domain.devices import Device
 from function_app.domain.ids import new_id
@@ -14,7 +15,7 @@ from function_app.domain.queue import STOPPED
 from function_app.ports.command_bus import BusUnavailable
 from function_app.ports.tables import Tables
 from function_app.services.commands import Commands
-from function_app.services.control import read_lease
+from function_app.services.control import change_lease
 from function_app.services.delivery import Delivery
 from function_app.services.devices import Devices
 from function_app.services.queue import Queues
@@ -47,12 +48,11 @@ class StopDevices:
             Problem: ``device-unknown``, ``forbidden``, ``broker-unavailable``: neither way was open.
         """
         device = await self._devices.to_operate(who, device_id)
-        epoch = await self._epoch(device)
         emptying = asyncio.create_task(self._empty(device))
         plain = asyncio.create_task(self._repeat(device, Stop(id=new_id(), by=who.name, reason=reason)))
         try:
             request = StopDevice(reason=reason)
-            return await self._commands.confirmed(device, request, who=who.name, epoch=epoch, wait_ms=CONFIRM_MS)
+            return await self._commands.confirmed(device, request, who=who.name, epoch=0, wait_ms=CONFIRM_MS)
         finally:
             plain.cancel()
             with contextlib.suppress(asyncio.CancelledError, BusUnavailable):
@@ -62,12 +62,15 @@ class StopDevices:
     async def reset(self, who: Identity, device_id: str) -> bool:
         """Release the latch; whether the device has confirmed it within a second. Nothing resumes.
 
+        The reset takes the next epoch for itself: whatever was ordered before it, and is still on its way, is from an
+        older lease then, and a reset that arrives late or twice is older than the latch that it finds.
+
         Raises:
-            Problem: ``device-unknown``, ``forbidden``, ``broker-unavailable``.
+            Problem: ``device-unknown``, ``forbidden``, ``busy``, ``broker-unavailable``.
         """
         device = await self._devices.to_operate(who, device_id)
-        epoch = await self._epoch(device)
-        return await self._commands.confirmed(device, ResetStop(), who=who.name, epoch=epoch, wait_ms=CONFIRM_MS)
+        _, lease = await change_lease(self._tables, device, lambda lease: rules.overtake(lease, pairing=device.pairing))
+        return await self._commands.confirmed(device, ResetStop(), who=who.name, epoch=lease.epoch, wait_ms=CONFIRM_MS)
 
     async def _repeat(self, device: Device, stop: Stop) -> None:
         payload = codec.encode(stop)
@@ -85,7 +88,3 @@ class StopDevices:
         except Problem as problem:
             # The device is stopped, so those that wait fail at their turn.
             _log.warning("queue of %s: %s", device.id, problem.detail)
-
-    async def _epoch(self, device: Device) -> int:
-        lease = await read_lease(self._tables, device)
-        return lease.epoch if lease else 0

@@ -22,6 +22,19 @@ def test_stop_goes_out_plain_and_signed_and_reset_signed(pair: Pair) -> None:
     assert len(robot.heard(ResetStop)) == 1
 
 
+def test_a_reset_begins_a_new_epoch_so_that_nothing_from_before_it_is_obeyed(pair: Pair) -> None:
+    anna, robot = pair
+    epoch = anna.take(robot.device).json()["epoch"]
+    anna.post(f"/devices/{robot.device}/stop")
+    anna.post(f"/devices/{robot.device}/stop/reset")
+    assert robot.heard(ResetStop)[0].epoch == epoch + 1
+    problem(anna.take(robot.device, epoch=epoch), 409, "lease-lost")
+    problem(anna.start(robot.device, epoch=epoch), 409, "lease-lost")
+    anna.post(f"/devices/{robot.device}/stop/reset")
+    assert robot.heard(ResetStop)[1].epoch == epoch + 2, "each reset can be told from every other"
+    assert anna.take(robot.device).json()["epoch"] == epoch + 3
+
+
 def test_it_needs_no_lease_and_no_body(cloud: Cloud, pair: Pair) -> None:
     anna, robot = pair
     anna.take(robot.device)

@@ -222,11 +222,43 @@ def test_stop_latches_and_reset_resumes_nothing() -> None:
         rig.offer(2)
     assert refused.value.code == "stopped"
     rest = rig.elbow
-    rig.controller.reset_stop()
+    rig.controller.reset_stop(epoch=3)
     rig.run(0.5)
     assert rig.elbow == pytest.approx(rest, abs=1e-9)
-    rig.stream(2, 0.5)
+    with pytest.raises(Refused) as refused:
+        rig.offer(2)
+    assert refused.value.code == "no_lease", "a lease from before the reset ends with it: its setpoints resume nothing"
+    rig.take(4)
+    rig.stream(4, 0.5)
     assert rig.elbow != rest
+
+
+def test_a_reset_that_comes_again_or_late_does_not_release_a_later_stop() -> None:
+    rig = Rig()
+    rig.take(1)
+    rig.controller.stop(StopLatch(by="bob", reason="", at_ms=1))
+    rig.controller.reset_stop(epoch=3)
+    rig.controller.stop(StopLatch(by="eve", reason="", at_ms=2))
+    for epoch, code in ((3, "lease_ended"), (2, "stale_epoch"), (0, "stale_epoch")):
+        with pytest.raises(Refused) as refused:
+            rig.controller.reset_stop(epoch=epoch)
+        assert refused.value.code == code
+    assert rig.controller.latch is not None
+    rig.controller.reset_stop(epoch=4)
+    assert rig.controller.latch is None
+
+
+def test_what_was_ordered_before_a_reset_is_not_obeyed_after_it() -> None:
+    rig = Rig()
+    rig.take(1)
+    rig.controller.stop(StopLatch(by="bob", reason="", at_ms=1))
+    rig.controller.reset_stop(epoch=3)
+    for epoch in (1, 2, 3):
+        with pytest.raises(Refused) as refused:
+            rig.controller.begin_action(epoch=epoch, on_lost=lambda _: None)
+        assert refused.value.code in {"stale_epoch", "lease_ended"}
+        with pytest.raises(Refused):
+            rig.take(epoch)
 
 
 def test_the_first_stop_stays_the_one_shown() -> None:

@@ -16,9 +16,11 @@ from device_agent.protocol import codec, signing, topics
 from device_agent.protocol.messages import (
     Ack,
     AckStatus,
+    AskLease,
     CancelAction,
     Command,
     Description,
+    DropRequest,
     GrantLease,
     JointTarget,
     JointTelemetry,
@@ -274,18 +276,17 @@ def test_stop_needs_no_lease_and_survives_a_restart(bench: Bench, tmp_path: Path
     assert ack.status is AckStatus.FAILED
     assert ack.reason is not None
     assert ack.reason.code == "stopped"
-    state: State = eventually(lambda: [s for s in bench.heard(topics.STATE, State) if s.stop])[-1]
+    state = shown(bench, lambda state: state.mode is Mode.STOPPED)
     assert state.stop is not None
     assert state.stop.by == "bob"
-    assert state.mode is Mode.STOPPED
     refused = bench.end(bench.command(MoveJoints(position_rad={"elbow": 0.2}), epoch=2))
     assert refused.reason is not None
     assert refused.reason.code == "stopped"
     again = Bench(tmp_path)
     again.device.start()
     eventually(lambda: again.telemetry().mode is Mode.STOPPED)
-    again.end(again.command(ResetStop()))
-    assert again.end(again.command(MoveJoints(position_rad={"elbow": 0.1}), epoch=3)).status is AckStatus.DONE
+    again.end(again.command(ResetStop(), epoch=3))
+    assert again.end(again.command(MoveJoints(position_rad={"elbow": 0.1}), epoch=4)).status is AckStatus.DONE
     again.device.stop()
     again.journal.close()
 
@@ -381,3 +382,79 @@ def test_garbage_is_counted_and_harms_nothing(bench: Bench) -> None:
             bench.receive(kind, payload, "1")
     eventually(lambda: bench.device.voice.refusals == {"malformed": 12})
     assert bench.telemetry().mode is Mode.IDLE
+
+
+def shown(bench: Bench, wanted: Callable[[State], Any]) -> State:
+    found: State = eventually(lambda: [s for s in bench.heard(topics.STATE, State)[-1:] if wanted(s)])[0]
+    return found
+
+
+def test_state_shows_who_asks_for_control_until_that_is_dropped(bench: Bench) -> None:
+    early = bench.end(bench.command(AskLease(request="r1", by="bob", answer_within_ms=30_000), epoch=1))
+    assert early.reason is not None
+    assert early.reason.code == "no_lease"
+    bench.end(bench.command(GrantLease(holder="ann", lease_ms=60_000, reason="needed in the lab"), epoch=1))
+    bench.end(bench.command(AskLease(request="r1", by="bob", answer_within_ms=30_000), epoch=1))
+    lease = shown(bench, lambda state: state.lease and state.lease.request).lease
+    assert lease is not None
+    assert lease.request is not None
+    assert (lease.holder, lease.reason, lease.request.id, lease.request.by) == ("ann", "needed in the lab", "r1", "bob")
+    assert 0 < lease.request.expires_in_ms <= 30_000
+    bench.end(bench.command(GrantLease(holder="ann", lease_ms=60_000), epoch=1))
+    bench.end(bench.command(DropRequest(request="r1"), epoch=1))
+    lease = shown(bench, lambda state: state.lease and not state.lease.request).lease
+    assert lease is not None
+    assert lease.reason == "needed in the lab", "a renewal does not wipe it out"
+
+
+def test_state_tells_which_leases_will_never_be_obeyed_again(bench: Bench) -> None:
+    bench.end(bench.command(GrantLease(holder="ann", lease_ms=60_000), epoch=4))
+    assert shown(bench, lambda state: state.lease).ended_epoch < 4
+    bench.end(bench.command(ReleaseLease(), epoch=4))
+    assert shown(bench, lambda state: not state.lease).ended_epoch == 4
+
+
+def test_nothing_gets_past_stop(bench: Bench, tmp_path: Path) -> None:
+    bench.end(bench.command(GrantLease(holder="ann", lease_ms=60_000), epoch=1))
+    bench.end(bench.command(StopDevice(reason="smoke")))
+    bench.end(bench.command(GrantLease(holder="eve", lease_ms=60_000), epoch=2))
+    for order in (MoveJoints(position_rad={"elbow": 0.2}), script("robot.home()")):
+        reason = bench.end(bench.command(order, epoch=2)).reason
+        assert reason is not None
+        assert reason.code == "stopped"
+    bench.setpoint(2, 1)
+    assert bench.device.voice.refusals["stopped"] == 3
+    again = Bench(tmp_path)
+    again.key = bench.key
+    again.device.start()
+    eventually(lambda: again.telemetry().mode is Mode.STOPPED)
+    again.device.stop()
+    again.journal.close()
+    assert bench.driver.position == again.driver.position == (0.0, 0.0)
+
+
+def test_a_reset_that_is_played_again_or_comes_late_leaves_a_later_stop_alone(bench: Bench) -> None:
+    bench.end(bench.command(StopDevice()))
+    bench.command(ResetStop(), epoch=3, command_id="reset")
+    bench.end("reset")
+    eventually(lambda: bench.telemetry().mode is not Mode.STOPPED)
+    bench.end(bench.command(StopDevice()))
+    bench.command(ResetStop(), epoch=3, command_id="reset")
+    late = bench.end(bench.command(ResetStop(), epoch=2)).reason
+    again = bench.end(bench.command(ResetStop(), epoch=3)).reason
+    expired = bench.end(bench.command(ResetStop(), epoch=9, issued_at_ms=1)).reason
+    assert [why and why.code for why in (late, again, expired)] == ["stale_epoch", "lease_ended", "expired"]
+    eventually(lambda: bench.telemetry().mode is Mode.STOPPED)
+    assert bench.device._controller.latch is not None
+
+
+def test_what_was_ordered_before_a_reset_and_arrives_after_it_does_not_move(bench: Bench) -> None:
+    bench.end(bench.command(GrantLease(holder="ann", lease_ms=60_000), epoch=1))
+    bench.end(bench.command(StopDevice()))
+    bench.end(bench.command(ResetStop(), epoch=3))
+    for epoch in (1, 2, 3):
+        reason = bench.end(bench.command(MoveJoints(position_rad={"elbow": 0.2}), epoch=epoch)).reason
+        assert reason is not None
+        assert reason.code in {"stale_epoch", "lease_ended"}
+    assert bench.driver.position == (0.0, 0.0)
+    assert bench.end(bench.command(MoveJoints(position_rad={"elbow": 0.2}), epoch=4)).status is AckStatus.DONE

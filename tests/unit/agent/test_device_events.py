@@ -86,14 +86,14 @@ def test_a_stop_in_motion_is_told_as_what_it_did(bench: Bench) -> None:
     assert event(bench, EventKind.HELD).data == {"code": "stopped", "epoch": 1}
     assert event(bench, EventKind.ACTION_LOST).data == {"code": "stopped", "epoch": 1}
     assert event(bench, EventKind.LEASE_ENDED).data["code"] == "stopped"
-    bench.end(bench.command(ResetStop()))
+    bench.end(bench.command(ResetStop(), epoch=2))
     assert event(bench, EventKind.STOP_RESET).data == {"by": "ann"}
     told = bench.heard(topics.EVENT, Event)
     assert len(told) == len({each.id for each in told}) <= 8, "fifty Stops are one fact"
 
 
 def test_a_reset_of_nothing_is_no_event(bench: Bench) -> None:
-    bench.end(bench.command(ResetStop()))
+    bench.end(bench.command(ResetStop(), epoch=3))
     bench.end(bench.command(StopDevice(reason="")))
     assert event(bench, EventKind.STOP_LATCHED)
     assert events(bench, EventKind.STOP_RESET) == []

@@ -16,6 +16,7 @@ import type {
   JointTelemetry,
   LeaseState,
   Mode,
+  OpenRequest,
   Presence,
   Reason,
   State,
@@ -165,8 +166,17 @@ const state = object<Required<State>>({
   tick_ms: count,
   mode,
   epoch: count,
+  ended_epoch: optional(count, 0),
   stop: nullable(object<StopLatch>({ by: text, reason: text, at_ms: count })),
-  lease: nullable(object<LeaseState>({ holder: text, epoch: count, expires_in_ms: count })),
+  lease: nullable<LeaseState>(
+    object<Required<LeaseState>>({
+      holder: text,
+      epoch: count,
+      expires_in_ms: count,
+      reason: optional(text, ""),
+      request: nullable(object<OpenRequest>({ id: text, by: text, expires_in_ms: count })),
+    }),
+  ),
   action: nullable<ActionState>(
     object<Required<ActionState>>({
       id: text,

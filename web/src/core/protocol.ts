@@ -89,7 +89,12 @@ export interface Geometry {
   rgba: [number, number, number, number];
 }
 
-/** `state`: the current condition. Retained; on change and every 30 s, at most once a second. */
+/**
+ * `state`: the current condition. Retained; on change and every 30 s, at most once a second.
+ *
+ * `ended_epoch` is the highest epoch that the device will never obey again. It only rises, so even an old message
+ * tells the truth: a lease of such an epoch is nobody's any more.
+ */
 export interface State {
   /** letters, digits, _ and -, 1 to 64 of them */
   device: string;
@@ -97,6 +102,7 @@ export interface State {
   tick_ms: number;
   mode: Mode;
   epoch: number;
+  ended_epoch?: number;
   stop?: StopLatch | null;
   lease?: LeaseState | null;
   action?: ActionState | null;
@@ -113,10 +119,25 @@ export interface StopLatch {
   at_ms: number;
 }
 
-/** The lease that the device obeys now. */
+/**
+ * The lease that the device obeys now.
+ *
+ * `reason` says why it was taken from somebody else, and is empty where it was not. `request` is for people:
+ * nothing about motion depends on it.
+ */
 export interface LeaseState {
   holder: string;
   epoch: number;
+  expires_in_ms: number;
+  reason?: string;
+  request?: OpenRequest | null;
+}
+
+/** Somebody asks the holder for control, and gets an answer in the time that is left or none. */
+export interface OpenRequest {
+  /** letters, digits, _ and -, 1 to 64 of them */
+  id: string;
+  by: string;
   expires_in_ms: number;
 }
 
@@ -230,19 +251,40 @@ export interface Command {
   ttl_ms: number;
   who: string;
   epoch: number;
-  request: GrantLease | ReleaseLease | RunMovement | MoveJoints | CancelAction | StopDevice | ResetStop;
+  request: GrantLease | ReleaseLease | AskLease | DropRequest | RunMovement | MoveJoints | CancelAction | StopDevice | ResetStop;
 }
 
-/** Control of the device now belongs to `holder`, for `lease_ms` from the moment of arrival. Also renews. */
+/**
+ * Control of the device now belongs to `holder`, for `lease_ms` from the moment of arrival. Also renews.
+ *
+ * `reason`: why it was taken from somebody else, for that person to read.
+ */
 export interface GrantLease {
   kind: "grant_lease";
   holder: string;
   lease_ms: number;
+  reason?: string;
 }
 
 /** Nobody controls the device any more; what moves is brought to a hold. */
 export interface ReleaseLease {
   kind: "release_lease";
+}
+
+/** Show the holder, and everybody, that somebody asks for control. Changes nothing else; lapses by itself. */
+export interface AskLease {
+  kind: "ask_lease";
+  /** letters, digits, _ and -, 1 to 64 of them */
+  request: string;
+  by: string;
+  answer_within_ms: number;
+}
+
+/** Nobody asks any more: refused, or withdrawn. */
+export interface DropRequest {
+  kind: "drop_request";
+  /** letters, digits, _ and -, 1 to 64 of them */
+  request: string;
 }
 
 /** Run one movement script. The source must hash to `sha256` (hex). */
@@ -280,7 +322,12 @@ export interface StopDevice {
   reason?: string;
 }
 
-/** Release the Stop latch. Nothing resumes. */
+/**
+ * Release the Stop latch. Nothing resumes.
+ *
+ * It brings an epoch of its own, which ends with it: what was ordered before the reset is never obeyed after it, and a
+ * reset that comes late, or again, is older than the latch that it finds.
+ */
 export interface ResetStop {
   kind: "reset_stop";
 }
