@@ -10,12 +10,12 @@ import json
 import os
 import pwd
 import secrets
-import shutil
 from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
 from device_agent.protocol import codec, control, grants
+from infra import programs
 
 SERVICE = "service"
 """User name of the functions' own client, and of its role."""
@@ -34,7 +34,6 @@ _PLUGIN_FOLDERS = (
     "usr/local/lib/*-linux-*",
     "opt/homebrew/lib",
 )
-_PATH_BESIDE = "/usr/local/sbin:/usr/sbin:/sbin:/opt/homebrew/sbin"
 _SALT_BYTES = 12
 _HASH_BYTES = 64
 _ITERATIONS = 101
@@ -45,20 +44,13 @@ _MAX_INFLIGHT = 100
 _MAX_QUEUED = 10_000
 
 
-class NotInstalledError(Exception):
-    """The broker or its plugin is not on this machine; the text names the package."""
-
-
 def binary() -> str:
     """Path of the broker, also where the user's PATH leaves out the folders of servers.
 
     Raises:
         NotInstalledError: There is none.
     """
-    found = shutil.which("mosquitto") or shutil.which("mosquitto", path=_PATH_BESIDE)
-    if found is None:
-        raise NotInstalledError(f"mosquitto is not installed; on Debian: apt-get install {PACKAGE}")
-    return found
+    return programs.find("mosquitto", package=PACKAGE)
 
 
 def plugin() -> str:
@@ -70,7 +62,7 @@ def plugin() -> str:
     for folder in _PLUGIN_FOLDERS:
         for path in sorted(Path("/").glob(f"{folder}/{_PLUGIN}")):
             return str(path)
-    raise NotInstalledError(f"mosquitto's {_PLUGIN} is not installed; on Debian: apt-get install {PACKAGE}")
+    raise programs.NotInstalledError(f"mosquitto's {_PLUGIN} is not installed; on Debian: apt-get install {PACKAGE}")
 
 
 def write(home: Path, *, host: str, tcp_port: int, websocket_port: int, plugin_path: str) -> None:

@@ -3,6 +3,7 @@ from pathlib import Path
 
 import pytest
 
+from infra import programs
 from infra.mosquitto import configuration
 
 
@@ -65,12 +66,12 @@ def test_a_machine_without_mosquitto_is_told_which_package_to_install(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("PATH", str(tmp_path))
-    monkeypatch.setattr(configuration, "_PATH_BESIDE", str(tmp_path))
-    with pytest.raises(configuration.NotInstalledError, match="apt-get install mosquitto"):
+    monkeypatch.setattr(programs, "_PATH_BESIDE", str(tmp_path))
+    with pytest.raises(programs.NotInstalledError, match="apt-get install mosquitto"):
         configuration.binary()
 
 
 def test_a_machine_without_the_plugin_is_told_which_package_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(configuration, "_PLUGIN_FOLDERS", ("no/such/folder",))
-    with pytest.raises(configuration.NotInstalledError, match="apt-get install mosquitto"):
+    with pytest.raises(programs.NotInstalledError, match="apt-get install mosquitto"):
         configuration.plugin()

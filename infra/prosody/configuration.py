@@ -1,0 +1,127 @@
+"""What Prosody reads. Format: https://prosody.im/doc/configure, as of Prosody 0.12."""
+
+import ipaddress
+import json
+import os
+import re
+from pathlib import Path
+
+from device_agent.protocol import stanzas
+from infra import programs
+
+CONFIGURATION_FILE = "prosody.cfg.lua"
+PACKAGE = "prosody"
+MODULES = Path(__file__).resolve().parent
+"""Where our own module is."""
+
+_DOMAIN = re.compile(r"\A(?=.{1,253}\Z)[a-z0-9]([a-z0-9-]{0,62}[a-z0-9])?(\.[a-z0-9]([a-z0-9-]{0,62}[a-z0-9])?)*\Z")
+_RATE = "2mb/s"
+"""What one connection may send, the cloud's own excepted: twenty times the telemetry of a robot at 50 Hz."""
+
+
+class ConfigurationError(ValueError):
+    """An argument that would not do, or not be safe; the text says which."""
+
+
+def binary() -> str:
+    """Path of Prosody.
+
+    Raises:
+        NotInstalledError: There is none.
+    """
+    return programs.find("prosody", package=PACKAGE)
+
+
+def write(
+    home: Path,
+    *,
+    domain: str,
+    host: str,
+    port: int,
+    verify_url: str,
+    certificate: Path | None = None,
+    key: Path | None = None,
+) -> None:
+    """Write the configuration file.
+
+    Raises:
+        ConfigurationError: An argument would not do.
+        OSError: ``home`` cannot be written.
+    """
+    text = configuration(
+        home, domain=domain, host=host, port=port, verify_url=verify_url, certificate=certificate, key=key
+    )
+    home.mkdir(parents=True, exist_ok=True, mode=0o700)
+    (home / "certs").mkdir(exist_ok=True)  # where Prosody looks for more of them, and complains when it cannot
+    path = home / CONFIGURATION_FILE
+    if not path.exists() or path.read_text() != text:
+        path.write_text(text)
+
+
+def configuration(
+    home: Path,
+    *,
+    domain: str,
+    host: str,
+    port: int,
+    verify_url: str,
+    certificate: Path | None,
+    key: Path | None,
+) -> str:
+    """The text of ``prosody.cfg.lua``.
+
+    Args:
+        home: Folder for whatever it writes.
+        domain: The part of every JID after the ``@``.
+        host: The address to listen on.
+        port: Of clients.
+        verify_url: Where the functions say who may log in.
+        certificate: Of the domain, with its chain; needed wherever others than this machine can connect.
+        key: Its private key.
+
+    Raises:
+        ConfigurationError: An argument would not do.
+    """
+    if not _DOMAIN.match(domain):
+        raise ConfigurationError(f"'{domain[:80]}' is not a domain in lower case")
+    if (certificate is None) != (key is None):
+        raise ConfigurationError("a certificate needs its key, and a key its certificate")
+    if certificate is None and not ipaddress.ip_address(host).is_loopback:
+        raise ConfigurationError(f"without a certificate it listens on loopback only, not on {host}")
+    encrypted = certificate is not None
+    modules = ["roster", "saslauth", "ping", "disco", "limits", *(["tls"] if encrypted else [])]
+    lines = [
+        "-- Written by `python -m infra.prosody` at each start: change it there.",
+        f"data_path = {_lua(home.absolute())}",
+        f"plugin_paths = {{ {_lua(MODULES)} }}",
+        'log = { warn = "*console" }',
+        "-- Nagle's algorithm costs 44 ms for each small message. Who is silent for so long is asked about, see our module.",
+        f"network_settings = {{ nagle = false, read_timeout = {stanzas.DEAD_S:g} }}",
+        f"modules_enabled = {{ {', '.join(_lua(name) for name in modules)} }}",
+        "-- Nothing leaves for other servers, and nothing is kept for somebody who is away: a late order is no order.",
+        'modules_disabled = { "s2s", "s2s_auth_certs", "offline" }',
+        'storage = "memory"',
+        f"interfaces = {{ {_lua(host)} }}",
+        f"c2s_ports = {{ {port} }}",
+        "s2s_ports = {}",
+        "component_ports = {}",
+        f"c2s_require_encryption = {_lua(encrypted)}",
+        f"allow_unencrypted_plain_auth = {_lua(not encrypted)}",
+        f"c2s_stanza_size_limit = {stanzas.MAX_STANZA_BYTES}",
+        f'limits = {{ c2s = {{ rate = "{_RATE}", burst = "2s" }} }}',
+        f"unlimited_jids = {{ {_lua(f'{stanzas.CLOUD}@{domain}')} }}",
+        *(["run_as_root = true"] if os.geteuid() == 0 else []),
+        f"VirtualHost {_lua(domain)}",
+        'authentication = "telescope"',
+        f"telescope_verify_url = {_lua(verify_url)}",
+    ]
+    if certificate is not None and key is not None:
+        lines.append(f"ssl = {{ certificate = {_lua(certificate.absolute())}, key = {_lua(key.absolute())} }}")
+    return "\n".join(lines) + "\n"
+
+
+def _lua(value: object) -> str:
+    """A value as Lua writes it. Lua reads JSON's escapes of quotes, backslashes and line ends."""
+    if isinstance(value, bool):
+        return "true" if value else "false"
+    return json.dumps(str(value), ensure_ascii=False)
