@@ -64,6 +64,7 @@ from function_app.services.tend_robot_types import TendRobotTypes
 from function_app.services.unpair import Unpair
 from function_app.services.upload_robot_type import UploadRobotType
 from function_app.services.uploads import Uploads
+from function_app.services.xmpp_access import XmppAccess
 from function_app.settings import AwsStore, AzureStore, EventGridBus, IotBus, Settings
 
 TABLES_FILE = "tables.sqlite"
@@ -104,6 +105,7 @@ class Functions:
     action_acks: ActionAcks
     stop: StopDevices
     mqtt_credentials: MqttCredentials
+    xmpp_access: XmppAccess
     presence: PresenceIngest
     polling: Polling
     relay: Relay
@@ -249,6 +251,15 @@ def build(settings: Settings, *, clock: Clock | None = None) -> Functions:
         action_acks=acks,
         stop=StopDevices(tables=tables, devices=devices, commands=commands, queues=queues, delivery=delivery),
         mqtt_credentials=MqttCredentials(tables=tables, devices=devices, access=access, clock=now),
+        xmpp_access=XmppAccess(
+            tables=tables,
+            keys=keys,
+            identify=identify,
+            sign_in=sign_in,
+            devices=devices,
+            clock=now,
+            domain=settings.xmpp_domain,
+        ),
         polling=Polling(tables=tables, mailbox=mailbox, clock=now),
         relay=Relay(bus=bus, clock=now),
         presence=PresenceIngest(tables=tables, events=events, conditions=conditions, clock=now),

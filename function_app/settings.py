@@ -19,6 +19,7 @@ _TABLE = re.compile(r"\A[A-Za-z0-9_.-]{3,255}\Z")
 _BUCKET = re.compile(r"\A(?=.{3,63}\Z)[a-z0-9][a-z0-9.-]*[a-z0-9]\Z")
 _REGION = re.compile(r"\A[a-z]{2,}(-[a-z]+)+-[0-9]+\Z")
 _IDENTITY = re.compile(r"\A([0-9A-Fa-f]{8}(-[0-9A-Fa-f]{4}){3}-[0-9A-Fa-f]{12})?\Z")
+_DOMAIN = re.compile(r"\A(?=.{0,253}\Z)([a-z0-9]([a-z0-9-]{0,61}[a-z0-9])?(\.[a-z0-9]([a-z0-9-]{0,61}[a-z0-9])?)*)?\Z")
 _SHOWN = 80
 """Characters of a wrong value that are shown."""
 
@@ -104,6 +105,8 @@ class Settings:
         public_url: The page's address as people open it; sign-in links begin with it.
         mqtt_host: The broker's address, for the functions and for agents.
         websocket_url: The broker's address for the page.
+        xmpp_domain: The part after the ``@`` of every address at the XMPP server; empty where there is none.
+        xmpp_host: The XMPP server's address, for agents and for the program that speaks for the cloud.
         robots: Folder of the robot types.
         console: Folder of the built console.
         trusted_proxies: Proxies of one's own in front of the API; the last of ``X-Forwarded-For`` are theirs.
@@ -125,6 +128,9 @@ class Settings:
     mqtt_port: int = 8081
     websocket_port: int = 8082
     websocket_url: str = "ws://127.0.0.1:8082/mqtt"
+    xmpp_domain: str = ""
+    xmpp_host: str = "127.0.0.1"
+    xmpp_port: int = 5222
     robots: Path = ROOT / "robots"
     console: Path = ROOT / "web" / "dist"
     trusted_proxies: int = 0
@@ -164,6 +170,9 @@ def read(environment: Mapping[str, str] | None = None) -> Settings:
         mqtt_port=_port(given, "TELESCOPE_MQTT_PORT", port + 1),
         websocket_port=websocket_port,
         websocket_url=_url(given, "TELESCOPE_WEBSOCKET_URL", websocket_url, ("ws", "wss")),
+        xmpp_domain=_matching(given, "TELESCOPE_XMPP_DOMAIN", "", _DOMAIN, "a domain in lower case"),
+        xmpp_host=_host(given, "TELESCOPE_XMPP_HOST", host),
+        xmpp_port=_port(given, "TELESCOPE_XMPP_PORT", 5222),
         robots=_folder(given, "TELESCOPE_ROBOTS", ROOT / "robots"),
         console=_folder(given, "TELESCOPE_CONSOLE", ROOT / "web" / "dist"),
         trusted_proxies=_number(given, "TELESCOPE_TRUSTED_PROXIES", 0, 0, 10),

@@ -69,9 +69,7 @@ def free_ports(host: str, *ports: int) -> list[int]:
         return [each.getsockname()[1] for each in held]
 
 
-def supervise(
-    name: str, command: Sequence[str], *, host: str, ports: Sequence[int], ready: str
-) -> int:
+def supervise(name: str, command: Sequence[str], *, host: str, ports: Sequence[int], ready: str) -> int:
     """Run a server until SIGTERM or SIGINT; prints ``ready`` once it answers on every port; the exit code.
 
     Args:

@@ -173,7 +173,7 @@ class Stream:
         return run
 
 
-class _Client(ClientXMPP):  # type: ignore[misc] (slixmpp is not typed for us)
+class _Client(ClientXMPP):  # type: ignore[misc]  # slixmpp is not looked into
     """slixmpp's client without what it does for chat."""
 
     def __init__(self, login: Login) -> None:

@@ -24,6 +24,7 @@ from function_app.services.forget import Forget
 ALGORITHM = "EdDSA"
 API: Final = "telescope/api"
 SESSION: Final = "telescope/session"
+XMPP: Final = "telescope/xmpp"
 ACCESS_S = 3600
 SESSION_S = 12 * 3600
 AGENT_TOKEN_S = 60
@@ -33,7 +34,7 @@ KNOWN_TOKENS = 4096
 RECHECK_MS = 5_000
 """A token known to this process is checked against sign-outs again after this time."""
 
-Audience = Literal["telescope/api", "telescope/session"]
+Audience = Literal["telescope/api", "telescope/session", "telescope/xmpp"]
 
 
 @dataclass(slots=True)
@@ -140,7 +141,7 @@ class Identify:
             key = (await self._keys.public()).get(str(kid))
             if key is None:
                 raise unauthorized("The access token was not issued here. Sign in again.")
-            claims = _decode(token, key, audience, now_s=self._now_s(), leeway_s=0)
+            claims = decode(token, key, audience, now_s=self._now_s(), leeway_s=0)
             identity = Identity(account=str(claims["sub"]), name=str(claims["name"]), session=str(claims["sid"]))
         except (jwt.PyJWTError, KeyError) as error:
             raise unauthorized(f"The access token is refused: {error}. Sign in again.") from error
@@ -153,7 +154,7 @@ class Identify:
 
     def _check_agent(self, token: str, key: Ed25519PublicKey) -> None:
         try:
-            claims = _decode(token, key, API, now_s=self._now_s(), leeway_s=CLOCK_SKEW_S)
+            claims = decode(token, key, API, now_s=self._now_s(), leeway_s=CLOCK_SKEW_S)
         except jwt.PyJWTError as error:
             raise unauthorized(f"The agent's token is refused: {error}.") from error
         if claims.get("iss") != "agent" or claims["exp"] - claims["iat"] > AGENT_TOKEN_S:
@@ -178,7 +179,7 @@ def new_secret() -> str:
     return secrets.token_urlsafe(32)
 
 
-def _decode(token: str, key: Ed25519PublicKey, audience: str, *, now_s: float, leeway_s: float) -> dict[str, Any]:
+def decode(token: str, key: Ed25519PublicKey, audience: str, *, now_s: float, leeway_s: float) -> dict[str, Any]:
     """The claims of a signed token. Its times are judged here, by our own clock, once they are seen to be numbers.
 
     Raises:

@@ -14,7 +14,7 @@ PACKAGE = "prosody"
 MODULES = Path(__file__).resolve().parent
 """Where our own module is."""
 
-_DOMAIN = re.compile(r"\A(?=.{1,253}\Z)[a-z0-9]([a-z0-9-]{0,62}[a-z0-9])?(\.[a-z0-9]([a-z0-9-]{0,62}[a-z0-9])?)*\Z")
+_DOMAIN = re.compile(r"\A(?=.{1,253}\Z)[a-z0-9]([a-z0-9-]{0,61}[a-z0-9])?(\.[a-z0-9]([a-z0-9-]{0,61}[a-z0-9])?)*\Z")
 _RATE = "2mb/s"
 """What one connection may send, the cloud's own excepted: twenty times the telemetry of a robot at 50 Hz."""
 
@@ -95,7 +95,7 @@ def configuration(
         f"data_path = {_lua(home.absolute())}",
         f"plugin_paths = {{ {_lua(MODULES)} }}",
         'log = { warn = "*console" }',
-        "-- Nagle's algorithm costs 44 ms for each small message. Who is silent for so long is asked about, see our module.",
+        "-- Nagle's algorithm costs 44 ms for each small message. Of who is silent for so long our module decides.",
         f"network_settings = {{ nagle = false, read_timeout = {stanzas.DEAD_S:g} }}",
         f"modules_enabled = {{ {', '.join(_lua(name) for name in modules)} }}",
         "-- Nothing leaves for other servers, and nothing is kept for somebody who is away: a late order is no order.",

@@ -31,6 +31,7 @@ from function_app.entrypoints.http import (
     robot_types,
     transfers,
     uploads,
+    xmpp,
 )
 from function_app.entrypoints.http.answers import JSON, problem
 from function_app.entrypoints.http.caller import COOKIE, Caller
@@ -76,6 +77,7 @@ def create_app(functions: Functions) -> FastAPI:
         robot_types.router(functions, caller),
         movements.router(functions, caller),
         broker.router(functions, caller),
+        xmpp.router(functions, caller),
         latency.router(functions, caller),
         faults.router(functions, caller),
         events.router(functions, caller),
