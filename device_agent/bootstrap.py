@@ -97,11 +97,10 @@ def build(home: Home, *, trace: Path | None = None) -> Cell:
     if pairing is None:
         raise HomeError(f"{home.folder} is not paired; run `python -m device_agent enroll` and redeem its claim code")
     clock = CloudClock()
-    api = api_of(home, configuration, clock)
     journal = Journal(home.journal)
     journal.open(now_ms=wall_ms())
     journal.end_open(now_ms=wall_ms(), tick_ms=tick_ms())
-    membership = links.Membership(api, pairing, configuration, enrolled_devices(configuration))
+    membership = links.Membership(pairing, configuration, enrolled_devices(configuration))
     transport = links.make(
         links.Wiring(
             configuration=configuration,

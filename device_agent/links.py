@@ -23,7 +23,7 @@ class Wiring:
     Attributes:
         configuration: With the part of ``agent.toml`` that is the transport's own.
         pairing: Whose the agent is.
-        membership: Asks the cloud, and notices when that is no longer so.
+        membership: Asks the cloud, and notices when it is no longer so.
         open_api: A view of the HTTP API for one thread.
         next_session: The next session number, rising across restarts.
         quiet: Whether a short break of the link would disturb nothing.
@@ -43,55 +43,51 @@ class Wiring:
 
 
 class Membership:
-    """Whether the agent still belongs to the space of its pairing. One thread at a time.
+    """Whether the agent still belongs to the space of its pairing.
 
     Args:
-        api: For this thread.
         pairing: What was true when the agent was built.
         configuration: What the cloud is told of at the first connection, so that whoever edits ``agent.toml`` need not
             enroll again.
         devices: The devices as the cloud is told of them.
     """
 
-    def __init__(
-        self, api: CloudApi, pairing: Pairing, configuration: Configuration, devices: list[dict[str, str]]
-    ) -> None:
-        self._api = api
+    def __init__(self, pairing: Pairing, configuration: Configuration, devices: list[dict[str, str]]) -> None:
         self._pairing = pairing
         self._configuration = configuration
         self._devices = devices
         self._introduced = False
         self.outdated = threading.Event()
 
-    def credentials(self) -> dict[str, Any]:
+    def credentials(self, api: CloudApi) -> dict[str, Any]:
         """Broker credentials for this space.
 
         Raises:
             CloudError: Refused; or they are for another space, in which nothing of this agent would be heard.
             OSError: Not reached.
         """
-        given = self._ask(self._api.credentials)
+        given = self._ask(api, api.credentials)
         own = f"{topics.ROOT}/{self._pairing.space}/{self._pairing.agent}/"
         if not all(str(pattern).startswith(own) for pattern in given.get("subscribe", ())):
             raise self._gone("this agent belongs to another space now")
         return given
 
-    def check(self) -> None:
-        """Look whether the pairing holds.
+    def check(self, api: CloudApi, *, within_s: float = 10.0) -> None:
+        """Look whether the pairing holds, if the cloud answers within so long [s].
 
         Raises:
             CloudError: It does not, or the cloud refuses the agent.
             OSError: Not reached.
         """
-        found = self._ask(self._api.enrollment)
+        found = self._ask(api, lambda: api.enrollment(within_s=within_s))
         if found.get("state") != "claimed":
             raise self._gone("this agent was un-paired")
         if found.get("space") != self._pairing.space:
             raise self._gone("this agent belongs to another space now")
 
-    def _ask(self, call: Callable[[], dict[str, Any]]) -> dict[str, Any]:
+    def _ask(self, api: CloudApi, call: Callable[[], dict[str, Any]]) -> dict[str, Any]:
         try:
-            self._introduce()
+            self._introduce(api)
             return call()
         except CloudError as error:
             if error.code == "agent-unclaimed":
@@ -100,11 +96,11 @@ class Membership:
             self._introduced = self._introduced and error.code != "unauthorized"
             raise
 
-    def _introduce(self) -> None:
+    def _introduce(self, api: CloudApi) -> None:
         if self._introduced:
             return
         told = self._configuration
-        claim = self._api.enroll(name=told.name, software=SOFTWARE, transport=told.transport, devices=self._devices)
+        claim = api.enroll(name=told.name, software=SOFTWARE, transport=told.transport, devices=self._devices)
         if claim.code is not None:
             raise self._gone("this agent was un-paired")
         self._introduced = True
@@ -134,8 +130,10 @@ def make(wiring: Wiring) -> Transport:
 def _mqtt(wiring: Wiring) -> Transport:
     from device_agent.transports.mqtt import BrokerAccess, MqttTransport  # noqa: PLC0415 (only where it is chosen)
 
+    api = wiring.open_api()
+
     def access() -> BrokerAccess:
-        given = wiring.membership.credentials()
+        given = wiring.membership.credentials(api)
         try:
             return BrokerAccess(
                 host=str(given["tcp"]["host"]),
@@ -158,4 +156,20 @@ def _mqtt(wiring: Wiring) -> Transport:
     )
 
 
-_MAKERS: Mapping[str, Callable[[Wiring], Transport]] = {"mqtt": _mqtt}
+def _http(wiring: Wiring) -> Transport:
+    from device_agent.transports.http.transport import LONG_POLL_S, HttpTransport  # noqa: PLC0415
+
+    polling = wiring.configuration.http
+    return HttpTransport(
+        open_api=wiring.open_api,
+        check=wiring.membership.check,
+        presence_topic=wiring.presence_topic,
+        next_session=wiring.next_session,
+        software=SOFTWARE,
+        quiet=wiring.quiet,
+        wait_s=LONG_POLL_S if polling.poll == "long" else 0.0,
+        pause_s=0.0 if polling.poll == "long" else polling.poll_ms / 1000,
+    )
+
+
+_MAKERS: Mapping[str, Callable[[Wiring], Transport]] = {"mqtt": _mqtt, "http": _http}

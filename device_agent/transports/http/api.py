@@ -1,20 +1,28 @@
-"""The few calls by which an agent becomes known to the cloud and gets its broker credentials."""
+"""The calls of an agent: to become known, to get broker credentials, and, without a broker, to hear and to tell."""
 
 import time
 import uuid
+from collections.abc import Collection, Iterable
 from dataclasses import dataclass
 from typing import Any
 
 import jwt
 import requests
 from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
+from requests.auth import AuthBase
 
 from device_agent.ports.clock import CloudClock, tick_ms
 from device_agent.protocol import signing
+from device_agent.transports.http.connection import Session
 
 _AUDIENCE = "telescope/api"
 _TOKEN_LIFE_S = 60
 _TIMEOUT_S = 10.0
+_CONNECT_S = 3.0
+ANSWER_WITHIN_S = 4.0
+"""What is asked and told all the time is answered within this, or never: the cloud gives a broker that is away 2 s."""
+_SERVER_ERROR = 500
+_TOO_MANY = 429
 
 
 class CloudError(ValueError):
@@ -22,11 +30,13 @@ class CloudError(ValueError):
 
     Attributes:
         code: The name of the refusal, as ``agent-unclaimed``; empty when it was no answer.
+        passing: Whether it may go better later: the server is busy or unwell.
     """
 
-    def __init__(self, message: str, code: str = "") -> None:
+    def __init__(self, message: str, code: str = "", *, passing: bool = False) -> None:
         super().__init__(message)
         self.code = code
+        self.passing = passing
 
 
 @dataclass(frozen=True, slots=True)
@@ -38,8 +48,17 @@ class Claim:
     expires_in_s: float
 
 
+@dataclass(frozen=True, slots=True)
+class Letter:
+    """A command as it would have come on ``topic`` over MQTT, byte for byte."""
+
+    command: str
+    topic: str
+    payload: bytes
+
+
 class CloudApi:
-    """One agent's view of the HTTP API. Thread-safe for one call at a time.
+    """One agent's view of the HTTP API. One call at a time; ``break_off`` at any.
 
     Args:
         server: Base address, ``http://host:port``.
@@ -51,7 +70,7 @@ class CloudApi:
         self._base = server.rstrip("/") + "/api/v1"
         self._key = key
         self._clock = clock
-        self._http = requests.Session()
+        self._http = Session()
 
     def enroll(self, *, name: str, software: str, transport: str, devices: list[dict[str, str]]) -> Claim:
         """Make the agent, its devices, and how it is to be reached known. Safe to repeat.
@@ -73,27 +92,79 @@ class CloudApi:
         )
         return Claim(answer["agent"], answer.get("claim_code"), float(answer.get("expires_in_s") or 0))
 
-    def enrollment(self, *, wait_s: float = 0.0) -> dict[str, Any]:
+    def enrollment(self, *, wait_s: float = 0.0, within_s: float = _TIMEOUT_S) -> dict[str, Any]:
         """Whether somebody has claimed the agent: ``state``, ``space``, ``account``, ``keys``.
 
         Args:
             wait_s: How long the cloud may wait for it to happen before it answers [s].
+            within_s: How long after that an answer is waited for [s].
 
         Raises:
             CloudError: Refused.
             OSError: Not reached.
         """
         wait = {"wait_ms": round(wait_s * 1000)} if wait_s else {}
-        return self._call("GET", "/agents/enrollment", params=wait, timeout=_TIMEOUT_S + wait_s)
+        return self._call("GET", "/agents/enrollment", params=wait, timeout=within_s + wait_s)
 
     def credentials(self) -> dict[str, Any]:
         """Short-lived broker credentials.
 
         Raises:
-            CloudError: Refused; an agent that was un-paired learns it here.
+            CloudError: Refused, so to an agent that was un-paired.
             OSError: Not reached.
         """
         return self._call("POST", "/mqtt/credentials", json={"purpose": "agent"})
+
+    def commands(self, agent: str, *, wait_s: float, limit: int, have: Collection[str]) -> list[Letter]:
+        """Commands that wait for an answer: Stop first, then the oldest first.
+
+        Args:
+            agent: The agent's own id.
+            wait_s: How long the cloud may wait for one [s].
+            limit: At most so many.
+            have: Ids of commands that are not to be given again.
+
+        Raises:
+            CloudError: Refused.
+            TimeoutError: No answer in time.
+            OSError: Not reached.
+        """
+        wait = {"wait_ms": round(wait_s * 1000)} if wait_s else {}
+        asked = {"limit": limit, "have": list(have), **wait}
+        answer = self._call("GET", f"/agents/{agent}/commands", params=asked, timeout=ANSWER_WITHIN_S + wait_s)
+        try:
+            return [Letter(item["id"], item["topic"], item["payload"].encode()) for item in answer["items"]]
+        except (KeyError, TypeError, AttributeError) as error:
+            raise CloudError(f"the cloud's commands lack {error}") from error
+
+    def tell(
+        self, agent: str, messages: Iterable[tuple[str, bytes]], *, within_s: float = ANSWER_WITHIN_S
+    ) -> list[str | None]:
+        """Tell messages, each a topic and JSON.
+
+        Returns:
+            For each message ``None`` once the cloud has stored it, else why it never will.
+
+        Raises:
+            CloudError: Refused altogether.
+            TimeoutError: No answer in time: they may be stored or not, and may be told again.
+            OSError: Not reached; as above.
+        """
+        parts = b",".join(b'{"topic":"%s","payload":%s}' % (topic.encode(), payload) for topic, payload in messages)
+        answer = self._call(
+            "POST",
+            f"/agents/{agent}/messages",
+            data=b'{"messages":[%s]}' % parts,
+            timeout=within_s,
+        )
+        try:
+            return [None if result["status"] == "stored" else str(result["detail"]) for result in answer["results"]]
+        except (KeyError, TypeError) as error:
+            raise CloudError(f"the cloud's answer lacks {error}") from error
+
+    def break_off(self) -> None:
+        """End the call that is under way: it raises ``OSError``. From any thread."""
+        self._http.break_off()
 
     def _call(self, method: str, path: str, *, timeout: float = _TIMEOUT_S, **request: Any) -> dict[str, Any]:
         sent = tick_ms()
@@ -101,11 +172,13 @@ class CloudApi:
             answer = self._http.request(
                 method,
                 self._base + path,
-                headers={"Authorization": f"Bearer {self._token()}"},
-                timeout=timeout,
+                auth=_Bearer(self._token()),
+                timeout=(min(_CONNECT_S, timeout), timeout),
                 allow_redirects=False,
                 **request,
             )
+        except requests.Timeout as error:
+            raise TimeoutError(f"{self._base} does not answer") from error
         except requests.RequestException as error:
             raise OSError(f"{self._base} cannot be reached: {_cause(error)}") from error
         received = tick_ms()
@@ -119,11 +192,13 @@ class CloudApi:
             body = None
         if not isinstance(body, dict):
             raise CloudError(
-                f"{self._base}{path} answered {answer.status_code} without JSON: is it a Telescope server?"
+                f"{self._base}{path} answered {answer.status_code} without JSON: is it a Telescope server?",
+                passing=answer.status_code >= _SERVER_ERROR,
             )
         if not answer.ok:
             code = str(body.get("type", "")).rpartition("/")[2]
-            raise CloudError(str(body.get("detail") or body.get("title") or answer.reason), code)
+            passing = answer.status_code >= _SERVER_ERROR or answer.status_code == _TOO_MANY
+            raise CloudError(str(body.get("detail") or body.get("title") or answer.reason), code, passing=passing)
         return body
 
     def _token(self) -> str:
@@ -132,6 +207,17 @@ class CloudApi:
             now = int(cloud_ms / 1000)
         claims = {"iss": "agent", "aud": _AUDIENCE, "iat": now, "exp": now + _TOKEN_LIFE_S, "jti": uuid.uuid4().hex}
         return jwt.encode(claims, self._key, "EdDSA", headers={"kid": signing.key_id(self._key.public_key())})
+
+
+class _Bearer(AuthBase):
+    """The token of one request. As ``auth``, else a ``.netrc`` that names the server would win over it."""
+
+    def __init__(self, token: str) -> None:
+        self._token = token
+
+    def __call__(self, request: requests.PreparedRequest) -> requests.PreparedRequest:
+        request.headers["Authorization"] = f"Bearer {self._token}"
+        return request
 
 
 def _cause(error: BaseException) -> str:

@@ -2,7 +2,6 @@
 
 import contextlib
 import logging
-import random
 import socket
 import threading
 import time
@@ -19,12 +18,11 @@ from device_agent.ports.clock import wall_ms
 from device_agent.ports.transport import LinkChanged, Receive
 from device_agent.protocol import codec
 from device_agent.protocol.messages import Presence
+from device_agent.transports.back_off import BackOff
 
 KEEP_ALIVE_S = 5
 """A dead peer is noticed after one and a half of these; at rest it costs one ping."""
 _CONNECT_TIMEOUT_S = 5.0
-_FIRST_BACK_OFF_S = 0.2
-_LONGEST_BACK_OFF_S = 15.0
 _REFRESH_AT = 0.8
 """Credentials are renewed after this share of their life, at a quiet moment; at the last moment in any case."""
 _REFRESH_LATEST = 0.97
@@ -118,21 +116,17 @@ class MqttTransport:
     # ------------------------------------------------------------ one connection after another
 
     def _run(self) -> None:
-        back_off_s = _FIRST_BACK_OFF_S
+        back_off = BackOff()
         while not self._stopping.is_set():
-            began_s = time.monotonic()
+            back_off.attempt()
             try:
                 self._connect_once()
             except (OSError, ValueError) as error:
                 _log.warning("no link: %s", error)
             except Exception:  # noqa: BLE001 (whatever it was: a robot that has lost its link must keep trying)
                 _log.exception("no link")
-            if time.monotonic() - began_s > _LONGEST_BACK_OFF_S:
-                back_off_s = _FIRST_BACK_OFF_S
-            # Full jitter: agents that lost one broker together do not come back together.
-            if self._stopping.wait(random.uniform(_FIRST_BACK_OFF_S / 2, back_off_s)):  # noqa: S311 (not a secret)
+            if self._stopping.wait(back_off.wait_s()):
                 return
-            back_off_s = min(2 * back_off_s, _LONGEST_BACK_OFF_S)
 
     def _connect_once(self) -> None:
         access = self._access()
