@@ -2,8 +2,9 @@
 
 from pathlib import Path
 
-from device_agent import drivers, links
+from device_agent import drivers, geometry, links
 from device_agent.ports.clock import CloudClock, tick_ms, wall_ms
+from device_agent.ports.geometry import Geometry, GeometryError
 from device_agent.ports.transport import Transport
 from device_agent.protocol import robot_type
 from device_agent.protocol.errors import ProtocolError
@@ -144,4 +145,12 @@ def _device(
         cloud_clock=clock,
         keys=pairing.public_keys(),
         publish=transport.publish,
+        geometry=_geometry(kind, str(entry.options.get("scene", ""))),
     )
+
+
+def _geometry(kind: robot_type.RobotType, scene: str) -> Geometry | None:
+    try:
+        return geometry.load(kind, ROBOTS / kind.type, scene=scene)
+    except GeometryError as error:
+        raise HomeError(str(error)) from error

@@ -2,13 +2,25 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Protocol
+from typing import NamedTuple, Protocol, runtime_checkable
 
 from device_agent.protocol.messages import Pose, Twin
 
 
 class DriverError(Exception):
     """The hardware or simulation cannot do what was asked. Its text is fit for an operator."""
+
+
+class Twist(NamedTuple):
+    """How a base moves over the floor, seen from itself."""
+
+    forward_m_s: float = 0.0
+    left_m_s: float = 0.0
+    turn_rad_s: float = 0.0
+
+
+REST = Twist()
+"""Not at all."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -68,3 +80,18 @@ class Driver(Protocol):
 
     def close(self) -> None:
         """Let go. May be called twice, and without ``connect``."""
+
+
+@runtime_checkable
+class MobileDriver(Driver, Protocol):
+    """A driver whose robot drives or walks: its robot type has a ``base``."""
+
+    def drive(self, twist: Twist) -> Twist:
+        """Command how the base moves for the next period, already limited by the agent. Called after each ``send``.
+
+        Returns:
+            What was really applied, after the driver's own clamping.
+
+        Raises:
+            DriverError: As for ``observe``.
+        """

@@ -1,6 +1,7 @@
 """A robot type's manifest, ``robots/<type>/robot.toml``: read by agents (limits, model) and the cloud (catalogue)."""
 
 import math
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -8,7 +9,7 @@ import msgspec
 from msgspec import Meta, Struct
 
 from device_agent.protocol.errors import ProtocolError
-from device_agent.protocol.messages import Id, Joint, Label, Stream, Text
+from device_agent.protocol.messages import Id, Joint, Label, Stream, Text, Vector3
 
 MANIFEST = "robot.toml"
 MOVEMENTS = "movements"
@@ -46,6 +47,39 @@ class Diagnostic(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     questions: tuple[Literal["level", "trend", "change", "outlier"], ...] = ("level", "trend", "change", "outlier")
 
 
+class Workspace(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """A box in the robot's base frame that some of its frames never leave.
+
+    Attributes:
+        lower_m: The box's lowest corner; ``upper_m``: its highest [m].
+        frames: The frames that stay inside.
+    """
+
+    lower_m: Vector3
+    upper_m: Vector3
+    frames: Annotated[tuple[Label, ...], Meta(min_length=1)]
+
+
+class Base(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """What a robot that drives or walks can do.
+
+    Attributes:
+        max_linear_m_s: Speed over the floor, in each direction [m/s].
+        max_angular_rad_s: Turning [rad/s].
+        max_linear_acceleration_m_s2: When speeding up [m/s²]; ``max_angular_acceleration_rad_s2``: the same of turning.
+        braking_linear_m_s2: For a hold or a Stop [m/s²]; ``braking_angular_rad_s2``: the same of turning.
+        sideways: Whether it goes sideways, as legs and some wheels do.
+    """
+
+    max_linear_m_s: float
+    max_angular_rad_s: float
+    max_linear_acceleration_m_s2: float
+    max_angular_acceleration_rad_s2: float
+    braking_linear_m_s2: float
+    braking_angular_rad_s2: float
+    sideways: bool = False
+
+
 class RobotType(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """What every robot of one type has in common.
 
@@ -62,6 +96,9 @@ class RobotType(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
         braking_rad_s2: Deceleration for a hold or a Stop [rad/s²], every joint; above ``max_acceleration_rad_s2``.
         diagnostics: How its measurements are to be judged; the first that fits a field counts.
         streaming_speed: Share of each joint's velocity limit that streamed setpoints may use, 0…1.
+        margin_m: How near the robot may come to itself and to what stands around it [m].
+        workspace: Where some of its frames stay.
+        base: What it can do when it drives or walks; without it, it stays where it is.
     """
 
     type: Id
@@ -78,6 +115,9 @@ class RobotType(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     home_rad: dict[str, float]
     braking_rad_s2: float
     streaming_speed: float = 0.35
+    margin_m: float = 0.02
+    workspace: Workspace | None = None
+    base: Base | None = None
     capabilities: tuple[Label, ...] = ()
     streams: tuple[Stream, ...] = ()
     diagnostics: Annotated[tuple[Diagnostic, ...], Meta(max_length=100)] = ()
@@ -143,11 +183,28 @@ def _check_figures(robot_type: RobotType) -> None:
         _check_positive(joint, limits, f" of '{joint.name}'")
         if not -math.inf < joint.lower_rad < joint.upper_rad < math.inf:
             raise ProtocolError(f"lower_rad of '{joint.name}' must be below its upper_rad, and both finite")
+    if not 0 <= robot_type.margin_m < math.inf:
+        raise ProtocolError(f"margin_m is {robot_type.margin_m}; it must be at least 0 and finite")
+    if robot_type.workspace is not None:
+        _check_workspace(robot_type.workspace, robot_type)
+    if robot_type.base is not None:
+        _check_positive(robot_type.base, [field for field in Base.__struct_fields__ if field != "sideways"], " of base")
     for stream in robot_type.streams:
         _check_positive(stream, ("rate_hz",), f" of stream '{stream.name}'")
 
 
-def _check_positive(holder: Struct, fields: tuple[str, ...], where: str) -> None:
+def _check_workspace(box: Workspace, robot_type: RobotType) -> None:
+    for lower, upper in zip(box.lower_m, box.upper_m, strict=True):
+        if not -math.inf < lower < upper < math.inf:
+            raise ProtocolError("workspace: lower_m must be below upper_m in x, y and z, and all of them finite")
+    unknown = sorted(set(box.frames) - set(robot_type.frames))
+    if unknown:
+        raise ProtocolError(f"workspace: no frame '{unknown[0]}'; there are: {', '.join(robot_type.frames)}")
+    if not robot_type.model:
+        raise ProtocolError("workspace needs a model: without one nobody knows where a frame is")
+
+
+def _check_positive(holder: Struct, fields: Sequence[str], where: str) -> None:
     for field in fields:
         value = getattr(holder, field)
         if not 0 < value < math.inf:

@@ -9,7 +9,9 @@ from typing import Any
 from device_agent.ports.driver import Observation
 from device_agent.protocol.messages import AckStatus, ActionState, Command, MoveJoints, Reason, RunMovement
 from device_agent.protocol.robot_type import RobotType
-from device_agent.runtime.controller import Controller, Outcome, Tenure
+from device_agent.runtime.authority import Tenure
+from device_agent.runtime.controller import Controller
+from device_agent.runtime.courses import Outcome
 from device_agent.runtime.lease import Refused
 from device_agent.runtime.movements import MAX_OUTPUT, Script, ScriptFailed
 

@@ -4,17 +4,23 @@ Pure but for ``ruckig``: no thread, no clock, no I/O of its own, so that every p
 control loop calls ``step``; other threads offer setpoints, moves and stops through the methods, which lock.
 """
 
+import math
 import threading
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
-from enum import Enum
+from dataclasses import dataclass
 
+from device_agent.ports.driver import REST, Twist
+from device_agent.ports.geometry import Geometry
 from device_agent.protocol.events import EventKind
 from device_agent.protocol.messages import Mode, Setpoint, StopLatch
 from device_agent.protocol.robot_type import RobotType
-from device_agent.runtime.audit import Happened, Severity, Tell, to_nobody
+from device_agent.runtime.audit import Tell, to_nobody
+from device_agent.runtime.authority import Authority, Tenure
+from device_agent.runtime.base import BaseMotion
+from device_agent.runtime.courses import Course, Drive, Move, Outcome
 from device_agent.runtime.lease import Lease, LeaseGate, Refused
 from device_agent.runtime.motion import Motion, MotionError
+from device_agent.runtime.restrictions import Restriction
 
 WATCHDOG_S = 0.3
 """Commanded velocity is zero this long after the last fresh setpoint."""
@@ -24,46 +30,12 @@ _SOONEST_BRAKING_S = 0.15
 """Braking never begins sooner than this after a setpoint, so that ordinary jitter does not stop the arm."""
 _CREEP_RAD_S = 0.02
 """Slower than this, setpoints that end are a slider let go at its target, not an operator lost in mid-motion."""
-
-
-class Outcome(Enum):
-    """How a move ended."""
-
-    REACHED = "reached"
-    INTERRUPTED = "interrupted"
-
-
-@dataclass(eq=False)
-class Move:
-    """One point-to-point move on its way. ``finished`` is set once, after ``outcome`` and ``why`` are."""
-
-    target_rad: list[float]
-    speed: float
-    finished: threading.Event = field(default_factory=threading.Event)
-    outcome: Outcome | None = None
-    why: Refused | None = None
-
-    def end(self, outcome: Outcome, why: Refused | None = None) -> None:
-        """Wake whoever waits."""
-        self.outcome, self.why = outcome, why
-        self.finished.set()
-
-
-@dataclass(eq=False)
-class Tenure:
-    """An action's hold on the device, from ``begin_action`` until the action ends or ``why`` says who took it away.
-
-    ``on_lost`` is called once, with the controller locked: it must be quick and must not call back.
-    """
-
-    epoch: int
-    on_lost: Callable[[Refused], None]
-    why: Refused | None = None
+_LONGEST_DRIVE_S = 60.0
 
 
 @dataclass(frozen=True, slots=True)
 class Tick:
-    """What one ``step`` decided. ``position_rad`` is for the motors; the rest is for telemetry."""
+    """What one ``step`` decided. ``position_rad`` and ``twist`` are for the motors; the rest is for telemetry."""
 
     position_rad: list[float]
     mode: Mode
@@ -72,6 +44,7 @@ class Tick:
     setpoint_sent_ms: float
     loop_age_ms: float
     limited: tuple[str, ...]
+    twist: Twist = REST
 
 
 class Controller:
@@ -81,6 +54,7 @@ class Controller:
         robot_type: Joints and limits.
         gate: The lease gate, with the epochs remembered from before.
         latch: The Stop latch remembered from before.
+        geometry: The robot's shape; without it nobody knows what it could touch.
         tell: Called with each change of authority, with the controller locked: it must be quick and not call back.
 
     Attributes:
@@ -93,28 +67,28 @@ class Controller:
         gate: LeaseGate,
         *,
         latch: StopLatch | None = None,
+        geometry: Geometry | None = None,
         tell: Tell = to_nobody,
     ) -> None:
         self._joints = robot_type.joints
         self._index = {joint.name: index for index, joint in enumerate(robot_type.joints)}
+        self._period_s = robot_type.period_ms / 1000
         self._motion = Motion(robot_type)
-        self._gate = gate
-        self._latch = latch
-        self._tell = tell
+        self._base = None if robot_type.base is None else BaseMotion(robot_type.base, self._period_s)
+        self._geometry = geometry
+        self._authority = Authority(gate, latch, hold=self._hold, tell=tell)
+        self.changed = self._authority.changed
         self._streaming_speed = robot_type.streaming_speed
         self._lock = threading.Lock()
-        self.changed = threading.Event()
-        self._fault: str | None = None
         self._mode = Mode.IDLE
-        self._move: Move | None = None
-        self._tenure: Tenure | None = None
+        self._course: Course | None = None
         self._target: list[float] = [0.0] * len(self._joints)
         self._setpoint: Setpoint | None = None
-        self._setpoint_at_s = float("-inf")
+        self._setpoint_at_s = -math.inf
         self._taken = 0
         self._taken_sent_ms = 0.0
         self._loop_age_ms = 0.0
-        self._limited: tuple[str, ...] = ()
+        self._ranged: tuple[str, ...] = ()
 
     # ------------------------------------------------------------ what other threads ask
 
@@ -131,12 +105,8 @@ class Controller:
             Refused: Stale or ended.
         """
         with self._lock:
-            before, had = self._gate.epoch, self._gate.granted
-            self._gate.grant(epoch=epoch, holder=holder, lease_s=lease_s, now_s=now_s, reason=reason)
-            if epoch != before:
-                self._new_epoch(had)
-            if had is None or had.epoch != epoch:
-                self._note(EventKind.LEASE_GRANTED, f"{holder} took control", {"epoch": epoch, "holder": holder})
+            if self._authority.grant(epoch=epoch, holder=holder, lease_s=lease_s, now_s=now_s, reason=reason):
+                self._forget_setpoints()
 
     def release(self, *, epoch: int) -> None:
         """The holder gave the lease up, or lost it.
@@ -145,8 +115,7 @@ class Controller:
             Refused: From an older lease.
         """
         with self._lock:
-            self._gate.fence(epoch)
-            self._end_lease(Refused("lease_lost", "control was released"))
+            self._authority.release(epoch)
 
     def fence(self, epoch: int) -> None:
         """Check the epoch of a signed command; a newer one takes the device from whoever had it.
@@ -166,10 +135,11 @@ class Controller:
             tick_ms: The same clock as telemetry shows it [ms].
 
         Raises:
-            Refused: No right, out of order, too old, or of unknown joints. Nothing changed.
+            Refused: No right, out of order, too old, or of unknown joints. Nothing changed. Or the room holds the
+                device; control then has to be taken again, so that the arm does not start when a person leaves.
         """
         with self._lock:
-            lease = self._gate.current(now_s)
+            lease = self._authority.lease(now_s)
             if lease is None or setpoint.epoch != lease.epoch:
                 raise Refused("no_lease", f"lease {setpoint.epoch} is not in force here")
             if self._setpoint is not None and setpoint.sequence <= self._setpoint.sequence:
@@ -179,10 +149,15 @@ class Controller:
                 raise Refused(
                     "too_old", f"answers telemetry of {age_ms} ms ago; {MAX_LOOP_AGE_S * 1000:.0f} ms is the most"
                 )
-            self._check_free()
-            if self._tenure is not None:
+            try:
+                self._authority.check_free()
+            except Refused as refused:
+                if refused.code == "interlock":
+                    self._authority.end(refused)
+                raise
+            if self._authority.tenure is not None:
                 raise Refused("busy", "an action runs; cancel it first")
-            self._check_names(setpoint.target.position_rad)
+            self._check_positions(setpoint.target.position_rad)
             self._setpoint = setpoint
             self._setpoint_at_s = now_s
             self._loop_age_ms = float(age_ms)
@@ -191,35 +166,34 @@ class Controller:
         """An action now has the device, until ``end_action`` or until its lease ends.
 
         Raises:
-            Refused: Stale or ended epoch, stopped, faulty, or another action runs.
+            Refused: Stale or ended epoch, stopped, faulty, held by the room, or another action runs.
         """
         with self._lock:
             self._fence(epoch)
-            self._check_free()
-            if self._tenure is not None:
-                raise Refused("busy", "another action runs on this device")
-            self._setpoint_at_s = float("-inf")
-            self._tenure = Tenure(epoch, on_lost)
-            return self._tenure
+            self._authority.check_free()
+            tenure = self._authority.begin(epoch, on_lost)
+            self._setpoint_at_s = -math.inf
+            return tenure
 
     def end_action(self, tenure: Tenure) -> None:
         """The action is over; what still moves is held."""
         with self._lock:
-            if self._tenure is tenure:
+            if self._authority.tenure is tenure:
                 self._interrupt(Refused("ended", "the action ended"))
-                self._tenure = None
+                self._authority.tenure = None
 
-    def move(self, tenure: Tenure, position_rad: dict[str, float], *, speed: float) -> Move:
+    def move(self, tenure: Tenure, position_rad: Mapping[str, float], *, speed: float) -> Move:
         """Start a move to joint positions [rad] as part of an action; joints not named stay.
 
         Raises:
-            Refused: The action no longer has the device, stopped, faulty, unknown joint, or outside a joint's range.
+            Refused: The action no longer has the device, stopped, faulty, held by the room, unknown joint, a number
+                that is none, or outside a joint's range.
         """
         with self._lock:
-            self._check_free()
-            if self._tenure is not tenure:
-                raise tenure.why or Refused("ended", "the action ended")
-            self._check_names(position_rad)
+            self._check_course(tenure)
+            self._check_positions(position_rad)
+            if not 0 < speed <= 1:
+                raise Refused("bad_speed", f"speed must be above 0 and at most 1, not {speed}")
             target = list(self._motion.position_rad)
             for name, value in position_rad.items():
                 joint = self._joints[self._index[name]]
@@ -229,20 +203,59 @@ class Controller:
                         f"{name} can go from {joint.lower_rad:.4f} to {joint.upper_rad:.4f} rad, not to {value:.4f}",
                     )
                 target[self._index[name]] = value
-            self._interrupt(Refused("replaced", "another move took its place"))
-            self._move = Move(target, speed)
-            self._motion.follow(target, speed=speed, together=True)
-            return self._move
+            self._interrupt(Refused("replaced", "another course took its place"))
+            move = Move(target_rad=target, speed=speed)
+            self._course = move
+            return move
+
+    def drive(self, tenure: Tenure, twist: Twist, *, duration_s: float) -> Drive:
+        """Move the base as part of an action, for ``duration_s`` [s]; then it brakes by itself.
+
+        Raises:
+            Refused: The action no longer has the device, stopped, faulty, held by the room, no base, a number that is
+                none, or beyond the base's limits.
+        """
+        with self._lock:
+            self._check_course(tenure)
+            if self._base is None:
+                raise Refused("no_base", "this robot does not drive")
+            if not 0 < duration_s <= _LONGEST_DRIVE_S:
+                raise Refused(
+                    "bad_duration", f"a drive lasts more than 0 and at most {_LONGEST_DRIVE_S:.0f} s, not {duration_s}"
+                )
+            for asked, limit, name in zip(twist, self._base.limits, Twist._fields, strict=True):
+                if not abs(asked) <= limit:
+                    raise Refused("out_of_range", f"{name} can be up to {limit:.3f}, not {asked}")
+            self._interrupt(Refused("replaced", "another course took its place"))
+            drive = Drive(twist=twist, periods=math.ceil(duration_s / self._period_s))
+            self._course = drive
+            return drive
+
+    def restrict(self, source: str, speed: float, why: str) -> None:
+        """The room slows the device, or holds it with a speed of 0; of several sources the strictest counts.
+
+        A hold ends what moves, and whoever moved it has to take control again.
+
+        Args:
+            source: Who says so; its word stays until its next one, or ``lift``.
+            speed: Share of the speed that it would have, 0…1. What is no such number is 0.
+            why: For people.
+        """
+        with self._lock:
+            self._authority.restrictions.set(source, speed, why)
+            busy = self._authority.tenure is not None or self.moving or self._setpoint_at_s > -math.inf
+            if self._authority.restrictions.speed <= 0 and busy:
+                self._authority.end(Refused("interlock", f"the room holds the device: {why}"))
+
+    def lift(self, source: str) -> None:
+        """A source restricts no more. What was slowed goes on at full speed; what was held stays."""
+        with self._lock:
+            self._authority.restrictions.lift(source)
 
     def stop(self, latch: StopLatch) -> None:
         """Latch Stop. The first latch stays the one shown."""
         with self._lock:
-            if self._latch is None:
-                self._latch = latch
-                self.changed.set()
-                data = {"by": latch.by, "reason": latch.reason}
-                self._note(EventKind.STOP_LATCHED, f"stopped by {latch.by}", data, "warning")
-            self._end_lease(Refused("stopped", "the device was stopped"))
+            self._authority.stop(latch)
 
     def reset_stop(self, *, epoch: int) -> None:
         """Release the latch. Nothing resumes: every lease up to ``epoch``, the reset's own, has ended.
@@ -252,42 +265,44 @@ class Controller:
         """
         with self._lock:
             self._fence(epoch)
-            self._end_lease(Refused("lease_lost", "Stop was reset; take control again"))
-            self._latch = None
+            self._authority.reset_stop()
 
     def lost(self, why: Refused) -> None:
         """The link is gone: hold what moves, and let it be taken again. What rests keeps its lease."""
         with self._lock:
-            if self._motion.moving or self._tenure is not None:
-                self._end_lease(why)
+            if self.moving or self._authority.tenure is not None:
+                self._authority.end(why)
 
     def fail(self, message: str) -> None:
         """The driver no longer answers: hold until ``recover``."""
         with self._lock:
-            if self._fault != message:
-                self._note(EventKind.DRIVER_FAILED, message, {}, "error")
-            self._fault = message
-            self._end_lease(Refused("fault", message))
+            self._authority.fail(message)
 
     def recover(self, position_rad: Sequence[float]) -> None:
         """The driver answers again, at rest at ``position_rad``, shape (n,) [rad]."""
         with self._lock:
-            if self._fault is not None:
-                self._fault = None
-                self._note(EventKind.DRIVER_RECOVERED, "the device answers again", {})
+            if self._authority.recover():
                 self._motion.start_at(position_rad)
+                if self._base is not None:
+                    self._base.start()
 
     # ------------------------------------------------------------ what others may know
 
     @property
     def latch(self) -> StopLatch | None:
         """The Stop latch."""
-        return self._latch
+        return self._authority.latch
 
     @property
     def fault(self) -> str | None:
         """What is wrong with the driver."""
-        return self._fault
+        return self._authority.fault
+
+    @property
+    def restrictions(self) -> tuple[Restriction, ...]:
+        """What the room allows, the strictest first."""
+        with self._lock:
+            return self._authority.restrictions.all
 
     @property
     def mode(self) -> Mode:
@@ -297,17 +312,17 @@ class Controller:
     @property
     def epochs(self) -> tuple[int, int]:
         """Highest epoch seen, highest epoch burned."""
-        return self._gate.epoch, self._gate.burned
+        return self._authority.epochs
 
     def lease(self, now_s: float) -> Lease | None:
         """The lease in force."""
         with self._lock:
-            return self._gate.current(now_s)
+            return self._authority.lease(now_s)
 
     @property
     def moving(self) -> bool:
         """Whether any commanded velocity is not zero."""
-        return self._motion.moving
+        return self._motion.moving or (self._base is not None and self._base.moving)
 
     # ------------------------------------------------------------ the control loop
 
@@ -318,123 +333,134 @@ class Controller:
             now_s: Monotonic clock [s].
         """
         with self._lock:
-            had = self._gate.granted
-            if self._gate.expire(now_s):
-                self._end_lease(Refused("lease_lost", "the lease ran out"), had)
+            self._authority.expire(now_s)
             self._mode = self._decide(now_s)
             try:
-                position = list(self._motion.update())
+                self._motion.update()
+                if self._base is not None:
+                    self._base.update()
             except MotionError as error:
-                self._end_lease(Refused("fault", str(error)))
+                self._authority.end(Refused("fault", str(error)))
                 self._motion.start_at(self._motion.position_rad)
-                self._mode, position = Mode.HOLDING, list(self._motion.position_rad)
-            if self._move is not None and self._motion.reached:
-                done, self._move = self._move, None
-                done.end(Outcome.REACHED)
-            lease = self._gate.current(now_s)
+                self._mode = Mode.HOLDING
+            limited = self._limits()
+            self._advance(limited)
+            lease = self._authority.lease(now_s)
             return Tick(
-                position,
+                list(self._motion.position_rad),
                 self._mode,
                 lease.epoch if lease else 0,
                 self._taken,
                 self._taken_sent_ms,
                 self._loop_age_ms,
-                self._limited,
+                limited,
+                REST if self._base is None else self._base.twist,
             )
 
     def _decide(self, now_s: float) -> Mode:
-        if self._fault is not None:
-            self._motion.brake()
+        if self._authority.fault is not None:
+            self._brake()
             return Mode.FAULT
-        if self._latch is not None:
-            self._motion.brake()
+        if self._authority.latch is not None:
+            self._brake()
             return Mode.STOPPED
-        if self._tenure is not None:
+        if self._authority.restrictions.speed <= 0:
+            self._brake()
+            return Mode.HOLDING
+        if self._authority.tenure is not None:
+            self._follow_course()
             return Mode.ACTION
         age_s = now_s - self._setpoint_at_s
         if self._setpoint is not None and age_s < max(_SOONEST_BRAKING_S, WATCHDOG_S - self._motion.braking_time_s()):
             self._follow(self._setpoint)
             return Mode.STREAMING
         if self._mode is Mode.STREAMING and self._motion.fastest_rad_s > _CREEP_RAD_S:
-            self._end_lease(Refused("watchdog", "setpoints stopped coming"))
-        self._motion.brake()
-        held = self._mode is Mode.HOLDING and (self._motion.moving or self._gate.burned >= self._gate.epoch)
+            self._authority.end(Refused("watchdog", "setpoints stopped coming"))
+        self._setpoint_at_s = -math.inf
+        self._brake()
+        held = self._mode is Mode.HOLDING and (self.moving or self._authority.burned)
         return Mode.HOLDING if held else Mode.IDLE
 
     def _follow(self, setpoint: Setpoint) -> None:
-        if setpoint.sequence == self._taken:
+        if setpoint.sequence != self._taken:
+            limited = []
+            for name, value in setpoint.target.position_rad.items():
+                index = self._index[name]
+                joint = self._joints[index]
+                self._target[index] = min(max(value, joint.lower_rad), joint.upper_rad)
+                if self._target[index] != value:
+                    limited.append(f"{name}: range")
+            self._ranged = tuple(limited)
+            self._taken, self._taken_sent_ms = setpoint.sequence, setpoint.sent_ms
+        self._motion.follow(self._target, speed=self._streaming_speed * self._authority.restrictions.speed)
+
+    def _follow_course(self) -> None:
+        speed = self._authority.restrictions.speed
+        if isinstance(self._course, Move):
+            self._motion.follow(self._course.target_rad, speed=self._course.speed * speed, together=True)
+        elif isinstance(self._course, Drive) and self._base is not None:
+            if self._course.periods > 0:
+                self._base.follow(Twist(*(part * speed for part in self._course.twist)))
+            else:
+                self._base.brake()
+            self._course.periods -= 1
+
+    def _advance(self, limited: tuple[str, ...]) -> None:
+        """See whether the course has come to its end."""
+        course = self._course
+        if course is None:
             return
-        limited = []
-        for name, value in setpoint.target.position_rad.items():
-            index = self._index[name]
-            joint = self._joints[index]
-            self._target[index] = min(max(value, joint.lower_rad), joint.upper_rad)
-            if self._target[index] != value:
-                limited.append(f"{name}: range")
-        self._limited = tuple(limited)
-        self._taken, self._taken_sent_ms = setpoint.sequence, setpoint.sent_ms
-        self._motion.follow(self._target, speed=self._streaming_speed)
+        course.note(limited)
+        if self._motion.reached if isinstance(course, Move) else self._driven(course):
+            self._course = None
+            course.end(Outcome.REACHED)
+
+    def _driven(self, course: Course) -> bool:
+        return isinstance(course, Drive) and course.periods <= 0 and not self.moving
+
+    def _limits(self) -> tuple[str, ...]:
+        """What makes the motion other than asked, for telemetry."""
+        strictest = self._authority.restrictions.strictest
+        slowed = () if strictest is None else (strictest.text,)
+        return self._ranged + slowed
 
     def _fence(self, epoch: int) -> None:
-        before, had = self._gate.epoch, self._gate.granted
-        self._gate.fence(epoch)
-        if epoch != before:
-            self._new_epoch(had)
-        elif epoch <= self._gate.burned:
-            raise Refused("lease_ended", f"lease {epoch} has ended at the device; take control again")
+        if self._authority.fence(epoch):
+            self._forget_setpoints()
 
-    def _new_epoch(self, had: Lease | None) -> None:
-        self.changed.set()
-        why = Refused("lease_lost", "a newer lease took the device")
-        self._note_end(had, why)
-        self._hold(why)
+    def _forget_setpoints(self) -> None:
         self._setpoint = None
-        self._taken, self._taken_sent_ms, self._loop_age_ms, self._limited = 0, 0.0, 0.0, ()
+        self._taken, self._taken_sent_ms, self._loop_age_ms, self._ranged = 0, 0.0, 0.0, ()
         self._target = list(self._motion.position_rad)
 
-    def _end_lease(self, why: Refused, had: Lease | None = None) -> None:
-        self.changed.set()
-        self._note_end(had or self._gate.granted, why)
-        self._gate.burn()
-        self._hold(why)
-
     def _hold(self, why: Refused) -> None:
-        """Bring the device to rest; whoever moved it, by setpoints or as an action, no longer does."""
-        self._setpoint_at_s = float("-inf")
-        data = {"code": why.code, "epoch": self._gate.epoch}
-        if self._motion.moving:
+        """Bring the device to rest; whoever moved it no longer does."""
+        self._setpoint_at_s = -math.inf
+        if self.moving:
             if self._mode in {Mode.STREAMING, Mode.ACTION}:  # told once, not for each order to hold while it brakes
-                self._note(EventKind.HELD, why.message, data, "warning")
+                self._authority.note(EventKind.HELD, why.message, self._authority.said(why), "warning")
             self._mode = Mode.HOLDING
-        if self._tenure is not None:
-            lost, self._tenure = self._tenure, None
-            self._note(EventKind.ACTION_LOST, why.message, data, "warning")
-            self._interrupt(why)
-            lost.why = why
-            lost.on_lost(why)
-        self._motion.brake()
+        self._interrupt(why)
+        self._brake()
 
     def _interrupt(self, why: Refused) -> None:
-        if self._move is not None:
-            interrupted, self._move = self._move, None
+        if self._course is not None:
+            interrupted, self._course = self._course, None
             interrupted.end(Outcome.INTERRUPTED, why)
-            self._motion.brake()
+            self._brake()
 
-    def _note_end(self, had: Lease | None, why: Refused) -> None:
-        if had is not None:
-            data = {"epoch": had.epoch, "holder": had.holder, "code": why.code}
-            self._note(EventKind.LEASE_ENDED, f"{had.holder}'s control ended: {why.message}", data)
+    def _brake(self) -> None:
+        self._motion.brake()
+        if self._base is not None:
+            self._base.brake()
 
-    def _note(self, kind: EventKind, message: str, data: Mapping[str, object], severity: Severity = "info") -> None:
-        self._tell(Happened(kind, message, severity, data))
+    def _check_course(self, tenure: Tenure) -> None:
+        self._authority.check_free()
+        self._authority.check_tenure(tenure)
 
-    def _check_free(self) -> None:
-        if self._latch is not None:
-            raise Refused("stopped", f"stopped by {self._latch.by}; reset Stop first")
-        if self._fault is not None:
-            raise Refused("fault", self._fault)
-
-    def _check_names(self, position_rad: dict[str, float]) -> None:
+    def _check_positions(self, position_rad: Mapping[str, float]) -> None:
         unknown = sorted(set(position_rad) - set(self._index))
         if unknown:
             raise Refused("unknown_joint", f"no joint '{unknown[0][:80]}'; there are {', '.join(self._index)}")
+        if not all(map(math.isfinite, position_rad.values())):
+            raise Refused("not_finite", "a position must be a finite number")

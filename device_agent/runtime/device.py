@@ -12,6 +12,7 @@ from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PublicKey
 
 from device_agent.ports.clock import CloudClock, tick_ms, wall_ms
 from device_agent.ports.driver import Driver
+from device_agent.ports.geometry import Geometry
 from device_agent.protocol import codec, topics
 from device_agent.protocol.errors import ProtocolError
 from device_agent.protocol.events import EventKind
@@ -48,6 +49,7 @@ class Device:
         cloud_clock: For ``ttl_ms``.
         keys: The cloud's pinned public keys by key id.
         publish: Sends a message.
+        geometry: The robot's shape, ``None`` where its type has no model.
     """
 
     def __init__(
@@ -63,13 +65,14 @@ class Device:
         cloud_clock: CloudClock,
         keys: Mapping[str, Ed25519PublicKey],
         publish: Publish,
+        geometry: Geometry | None = None,
     ) -> None:
         self.name = name
         self._driver = driver
         record = journal.device(name)
         gate = LeaseGate(epoch=record.epoch, burned=record.epoch)  # a restart ends whatever lease there was
         self._audit = Audit()
-        self._controller = Controller(robot_type, gate, latch=record.latch, tell=self._audit.note)
+        self._controller = Controller(robot_type, gate, latch=record.latch, geometry=geometry, tell=self._audit.note)
         self._controller.changed.set()
         self.voice = Voice(
             address=(space, agent, name),

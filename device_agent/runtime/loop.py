@@ -7,7 +7,7 @@ import time
 from collections.abc import Callable
 
 from device_agent.ports.clock import tick_ms, wall_ms
-from device_agent.ports.driver import Driver, DriverError, Observation
+from device_agent.ports.driver import Driver, DriverError, MobileDriver, Observation
 from device_agent.protocol.messages import JointTelemetry, Mode
 from device_agent.protocol.robot_type import RobotType
 from device_agent.runtime.controller import Controller, Tick
@@ -41,6 +41,8 @@ class ControlLoop:
     ) -> None:
         self._period_s = robot_type.period_ms / 1000
         self._driver = driver
+        self._base = driver if robot_type.base is not None and isinstance(driver, MobileDriver) else None
+        self._lacks_base = robot_type.base is not None and self._base is None
         self._controller = controller
         self._name = name
         self._tell = tell
@@ -54,8 +56,10 @@ class ControlLoop:
         """Connect the driver and hold where the device is.
 
         Raises:
-            DriverError: The device is not there.
+            DriverError: The device is not there, or its driver cannot move the base that it should have.
         """
+        if self._lacks_base:
+            raise DriverError(f"the robot type of '{self._name}' has a base, but its driver cannot drive")
         self._driver.connect()
         self.seen = self._driver.observe()
         self._controller.start_at(self.seen.position_rad)
@@ -78,6 +82,8 @@ class ControlLoop:
                 self.seen = self._driver.observe()
                 tick = self._controller.step(now_s)
                 applied = self._driver.send(tick.position_rad)
+                if self._base is not None:
+                    self._base.drive(tick.twist)
                 self._measure(now_s, self.seen, tick, applied)
             except DriverError as error:
                 self._fail(str(error))

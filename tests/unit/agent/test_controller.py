@@ -4,7 +4,8 @@ import pytest
 
 from device_agent.protocol.messages import Joint, JointTarget, Mode, Setpoint, StopLatch
 from device_agent.protocol.robot_type import RobotType
-from device_agent.runtime.controller import Controller, Outcome, Tenure
+from device_agent.runtime.controller import Controller
+from device_agent.runtime.courses import Outcome
 from device_agent.runtime.lease import LeaseGate, Refused
 
 PERIOD_S = 0.008
@@ -307,7 +308,7 @@ def test_an_action_that_loses_the_device_moves_it_no_more(cause: str) -> None:
     rig = Rig()
     why: list[Refused] = []
     rig.take(1, lease_s=5.0)
-    tenure: Tenure = rig.controller.begin_action(epoch=1, on_lost=why.append)
+    tenure = rig.controller.begin_action(epoch=1, on_lost=why.append)
     move = rig.controller.move(tenure, {"elbow": 2.9}, speed=0.1)
     rig.run(0.5)
     interruptions()[cause](rig)  # type: ignore[operator]

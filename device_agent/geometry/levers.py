@@ -1,0 +1,90 @@
+"""How far a joint can carry a point: the lever arms that bound speeds and ways, in whatever position."""
+
+from collections.abc import Sequence
+from typing import Any
+
+import mujoco
+import numpy as np
+import numpy.typing as npt
+
+Floats = npt.NDArray[np.float64]
+
+_ROUND = frozenset(
+    int(kind) for kind in (mujoco.mjtGeom.mjGEOM_SPHERE, mujoco.mjtGeom.mjGEOM_CAPSULE, mujoco.mjtGeom.mjGEOM_CYLINDER)
+)
+_SAME = 1e-6
+
+
+class Levers:
+    """Upper bounds of metres per radian (or per metre, for a slide), joint by joint.
+
+    Args:
+        model: ``MjModel``.
+        joints: The joints' indices in the model.
+    """
+
+    def __init__(self, model: Any, joints: Sequence[int]) -> None:
+        self._model = model
+        self._joints = list(joints)
+
+    def of_geoms(self, geoms: Sequence[int]) -> Floats:
+        """Of every point of each shape, shape (geoms, joints)."""
+        return np.array([self._of_geom(int(geom)) for geom in dict.fromkeys(geoms)]).reshape(-1, len(self._joints))
+
+    def of_frame(self, is_site: bool, index: int) -> Floats:
+        """Of the origin of a site or body, shape (joints,)."""
+        model = self._model
+        body = int(model.site_bodyid[index]) if is_site else index
+        return self._of_point(body, model.site_pos[index] if is_site else np.zeros(3), 0.0)
+
+    def between(self, a: int, b: int) -> Floats:
+        """How fast two shapes can near each other, shape (joints,): joints that carry both do not count."""
+        first, second = self._of_geom(a), self._of_geom(b)
+        both = np.array([self._carries(joint, a) and self._carries(joint, b) for joint in self._joints], dtype=bool)
+        lever: Floats = np.where(both, 0.0, first + second)
+        return lever
+
+    def _of_geom(self, geom: int) -> Floats:
+        model = self._model
+        body = int(model.geom_bodyid[geom])
+        lever = self._of_point(body, model.geom_pos[geom], float(np.linalg.norm(model.geom_aabb[geom, 3:])))
+        for index, joint in enumerate(self._joints):
+            if model.jnt_bodyid[joint] == body and self._turns_in_place(geom, joint):
+                lever[index] = 0.0
+        return lever
+
+    def _of_point(self, body: int, position: Floats, radius_m: float) -> Floats:
+        """Of a ball that is fixed in a body."""
+        model = self._model
+        lever = np.zeros(len(self._joints))
+        reach, at = float(np.linalg.norm(position)) + radius_m, body
+        while at > 0:
+            for joint in np.flatnonzero(model.jnt_bodyid == at).tolist():
+                offset = float(np.linalg.norm(model.jnt_pos[joint]))
+                slides = model.jnt_type[joint] == int(mujoco.mjtJoint.mjJNT_SLIDE)
+                if joint in self._joints:
+                    lever[self._joints.index(joint)] = 1.0 if slides else reach + offset
+                reach += float(np.max(np.abs(model.jnt_range[joint]))) if slides else 2 * offset
+            reach += float(np.linalg.norm(model.body_pos[at]))
+            at = int(model.body_parentid[at])
+        return lever
+
+    def _carries(self, joint: int, geom: int) -> bool:
+        at = int(self._model.geom_bodyid[geom])
+        while at > 0 and at != self._model.jnt_bodyid[joint]:
+            at = int(self._model.body_parentid[at])
+        return at > 0
+
+    def _turns_in_place(self, geom: int, joint: int) -> bool:
+        """Whether a shape is round about the joint's own axis, so that the joint does not change where it is."""
+        model = self._model
+        if model.jnt_type[joint] != int(mujoco.mjtJoint.mjJNT_HINGE) or int(model.geom_type[geom]) not in _ROUND:
+            return False
+        axis = model.jnt_axis[joint] / np.linalg.norm(model.jnt_axis[joint])
+        matrix = np.empty(9)
+        mujoco.mju_quat2Mat(matrix, model.geom_quat[geom])
+        offset = model.geom_pos[geom] - model.jnt_pos[joint]
+        on_axis = np.linalg.norm(np.cross(axis, offset)) < _SAME
+        sphere = int(model.geom_type[geom]) == int(mujoco.mjtGeom.mjGEOM_SPHERE)
+        along = sphere or np.linalg.norm(np.cross(axis, matrix.reshape(3, 3)[:, 2])) < _SAME
+        return bool(on_axis and along)

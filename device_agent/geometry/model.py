@@ -1,0 +1,166 @@
+"""A robot's shape in MuJoCo: where its frames are, how near things are, how far a way is clear."""
+
+import math
+import threading
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import mujoco
+import numpy as np
+import numpy.typing as npt
+
+from device_agent.geometry.pairs import Pairs
+from device_agent.geometry.solver import Solver
+from device_agent.ports.geometry import STEP_M, Clearance, GeometryError, Sweep
+from device_agent.protocol.messages import Pose
+from device_agent.protocol.robot_type import RobotType
+
+Floats = npt.NDArray[np.float64]
+
+_SAME_M = 1e-7
+"""Less than this is no change of a distance: far above rounding, far below what creeping could add up to."""
+
+
+class MujocoGeometry:
+    """The robot of one type in its scene.
+
+    Distances are between collision shapes (``mj_geomDistance``), so what the picture shows may be smaller, not larger.
+
+    Args:
+        robot_type: Joints, frames, workspace, margin.
+        scene: MJCF file that holds the robot.
+
+    Raises:
+        GeometryError: The scene cannot be read, lacks a joint or frame of the manifest, or the robot touches something
+            in its home position.
+    """
+
+    def __init__(self, robot_type: RobotType, scene: Path) -> None:
+        try:
+            self._model: Any = mujoco.MjSpec.from_file(str(scene)).compile()
+        except (ValueError, OSError, mujoco.FatalError) as error:
+            raise GeometryError(f"{scene}: MuJoCo cannot build this model: {error}") from error
+        self._data = mujoco.MjData(self._model)
+        self._lock = threading.Lock()
+        self._type = robot_type
+        joints = [self._find(mujoco.mjtObj.mjOBJ_JOINT, "joint", joint.name) for joint in robot_type.joints]
+        self._qpos = np.array([self._model.jnt_qposadr[joint] for joint in joints], dtype=np.intp)
+        self._base = int(self._model.body_rootid[self._model.jnt_bodyid[joints[0]]]) if joints else 0
+        self._frames = {name: self._frame(name) for name in robot_type.frames}
+        self._home = np.array([robot_type.home_rad[joint.name] for joint in robot_type.joints])
+        lower = np.array([joint.lower_rad for joint in robot_type.joints])
+        upper = np.array([joint.upper_rad for joint in robot_type.joints])
+        self._place(self._home)
+        self._pairs = Pairs(self._model, robot_type, joints, self._frames, base=self._base)
+        self._pairs.calibrate(self._data, self._place, home=self._home, lower=lower, upper=upper)
+        self._solver = Solver(self._model, self._qpos, self._frames, lower=lower, upper=upper)
+
+    @property
+    def frames(self) -> tuple[str, ...]:
+        """Names of the frames."""
+        return tuple(self._frames)
+
+    def poses(self, position_rad: Sequence[float]) -> Mapping[str, Pose]:
+        """Pose of each frame in the robot's base frame."""
+        with self._lock:
+            self._place(position_rad)
+            return {name: self._pose(is_site, index) for name, (is_site, index) in self._frames.items()}
+
+    def clearance(self, position_rad: Sequence[float]) -> Clearance:
+        """The tightest place of the robot in one position."""
+        with self._lock:
+            self._place(position_rad)
+            return self._pairs.tightest(self._data)
+
+    def sweep(self, start_rad: Sequence[float], end_rad: Sequence[float], *, step_m: float = STEP_M) -> Sweep:
+        """Go in a straight line through joint space until something is too near, or nearer than it was."""
+        start, way = np.asarray(start_rad, dtype=np.float64), np.subtract(end_rad, start_rad)
+        with self._lock:
+            self._place(start)
+            near = self._pairs.near(self._data, np.abs(way))
+            if near is None:
+                return Sweep(1.0)
+            share = 0.0
+            while True:
+                step = near.safe_share(step_m)
+                if share + step >= 1.0:
+                    step = 1.0 - share
+                share += step
+                self._place(start + share * way)
+                near.look(self._data, left=1.0 - share)
+                if near.broken(_SAME_M):
+                    return Sweep(share - step, near.tightest())
+                if share >= 1.0 or not near.any:
+                    return Sweep(1.0)
+
+    def speed_m_s(self, velocity_rad_s: Sequence[float]) -> float:
+        """A speed that no point of the robot exceeds [m/s]."""
+        return self._pairs.speed_m_s(np.abs(np.asarray(velocity_rad_s, dtype=np.float64)))
+
+    def solve(self, frame: str, pose: Pose, start_rad: Sequence[float]) -> tuple[float, ...]:
+        """Joint positions that bring a frame to a pose in the robot's base frame.
+
+        Raises:
+            GeometryError: No such frame, out of reach, or only by coming too near to something.
+        """
+        if frame not in self._frames:
+            raise GeometryError(f"no frame '{frame[:80]}'; there are: {', '.join(self._frames)}")
+        if not all(map(math.isfinite, pose)):
+            raise GeometryError("a pose must be made of finite numbers")
+        world = self._in_world(pose)
+        tight: Clearance | None = None
+        for found in self._solver.solutions(frame, world, starts=(np.asarray(start_rad, dtype=np.float64), self._home)):
+            clearance = self.clearance(found.tolist())
+            if clearance.room_m >= 0:
+                return tuple(found.tolist())
+            tight = clearance
+        if tight is not None:
+            raise GeometryError(f"{frame} cannot go there: {tight.text} would be too near")
+        miss_m, miss_rad = self._solver.missed
+        raise GeometryError(
+            f"{frame} cannot reach that pose: the nearest it comes is {miss_m * 1000:.0f} mm and "
+            f"{math.degrees(miss_rad):.0f} degrees away"
+        )
+
+    # ------------------------------------------------------------ positions and names
+
+    def _place(self, position_rad: Sequence[float] | Floats) -> None:
+        self._data.qpos[self._qpos] = position_rad
+        mujoco.mj_kinematics(self._model, self._data)
+
+    def _pose(self, is_site: bool, index: int) -> Pose:
+        data = self._data
+        back = data.xmat[self._base].reshape(3, 3).T
+        position = data.site_xpos[index] if is_site else data.xpos[index]
+        matrix = (data.site_xmat[index] if is_site else data.xmat[index]).reshape(3, 3)
+        quaternion = np.empty(4)
+        mujoco.mju_mat2Quat(quaternion, (back @ matrix).ravel())
+        x, y, z = (back @ (position - data.xpos[self._base])).tolist()
+        # A rotation has two quaternions; give the one with w >= 0.
+        w, i, j, k = (quaternion if quaternion[0] >= 0 else -quaternion).tolist()
+        return (x, y, z, w, i, j, k)
+
+    def _in_world(self, pose: Pose) -> tuple[Floats, Floats]:
+        """Position and unit quaternion in the world."""
+        size = math.hypot(*pose[3:])
+        if size <= 0:
+            raise GeometryError("a quaternion must not be all zeros")
+        with self._lock:
+            base_position, base_quaternion = self._data.xpos[self._base].copy(), self._data.xquat[self._base].copy()
+        position, quaternion = np.empty(3), np.empty(4)
+        mujoco.mju_rotVecQuat(position, np.array(pose[:3]), base_quaternion)
+        mujoco.mju_mulQuat(quaternion, base_quaternion, np.array(pose[3:]) / size)
+        return position + base_position, quaternion
+
+    def _frame(self, name: str) -> tuple[bool, int]:
+        site = mujoco.mj_name2id(self._model, mujoco.mjtObj.mjOBJ_SITE, name)
+        if site >= 0:
+            return True, int(site)
+        return False, self._find(mujoco.mjtObj.mjOBJ_BODY, "site or body", name)
+
+    def _find(self, kind: Any, word: str, name: str) -> int:
+        index = int(mujoco.mj_name2id(self._model, kind, name))
+        if index < 0:
+            raise GeometryError(f"the model of '{self._type.type}' has no {word} '{name}'")
+        return index

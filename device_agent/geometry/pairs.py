@@ -1,0 +1,308 @@
+"""Which shapes of a robot may come near which, how near they are, and how fast they can come nearer.
+
+Distances are exact where it matters (``mj_geomDistance``) and bounded where it does not: a pair is measured only when
+its bounding boxes say that it could be the one that counts.
+"""
+
+import math
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import mujoco
+import numpy as np
+import numpy.typing as npt
+
+from device_agent.geometry.levers import Levers
+from device_agent.ports.geometry import Clearance, GeometryError
+from device_agent.protocol.robot_type import RobotType
+
+Floats = npt.NDArray[np.float64]
+Ints = npt.NDArray[np.intp]
+
+_SAMPLES = 150
+_SEED = 9
+_FAR_M = 3.0
+"""Beyond this nobody asks how far; a plane's half space is that deep."""
+_STILL_M = 1e-4
+"""A pair whose distance changes by less over many random positions cannot come nearer, by construction."""
+_NEIGHBOURS = 2
+"""Steps along the tree between links that have one link between them."""
+_FACES = ("lower x", "lower y", "lower z", "upper x", "upper y", "upper z")
+
+
+class Pairs:
+    """All pairs of shapes that could meet, and the frames that must stay in the workspace.
+
+    Left out are pairs that MuJoCo leaves out (one body, parent and child, ``<exclude>``), that no joint moves against
+    each other, and things of the scene that could be anywhere. Of a robot that drives, only its own shapes count.
+
+    Args:
+        model: ``MjModel``.
+        robot_type: Margin and workspace.
+        joints: The joints' indices in the model.
+        frames: Name → whether it is a site, and its index.
+        base: The robot's root body.
+    """
+
+    def __init__(
+        self,
+        model: Any,
+        robot_type: RobotType,
+        joints: Sequence[int],
+        frames: dict[str, tuple[bool, int]],
+        *,
+        base: int,
+    ) -> None:
+        self._model = model
+        self._base = base
+        levers = Levers(model, joints)
+        found = _pairs(model, base, scenery=robot_type.base is None)
+        self._a = np.array([a for a, _ in found], dtype=np.intp)
+        self._b = np.array([b for _, b in found], dtype=np.intp)
+        self._lever = np.array([levers.between(a, b) for a, b in found]).reshape(len(found), len(joints))
+        self._margin = np.array([robot_type.margin_m] * len(found))
+        self._names = [(_name(model, a), _name(model, b)) for a, b in found]
+        self._centre = model.geom_aabb[:, :3].copy()
+        self._half = model.geom_aabb[:, 3:].copy()
+        planes = model.geom_type == int(mujoco.mjtGeom.mjGEOM_PLANE)
+        self._centre[planes], self._half[planes] = (0.0, 0.0, -_FAR_M), (10 * _FAR_M, 10 * _FAR_M, _FAR_M)
+        self._radius = np.linalg.norm(self._half, axis=1)
+        self._everywhere = levers.of_geoms([*self._a, *self._b])
+        self._line = np.zeros(6)
+        box = robot_type.workspace
+        held = () if box is None else box.frames
+        self._held = [(name, *frames[name]) for name in held]
+        self._held_lever = np.array([levers.of_frame(*frames[name]) for name in held]).reshape(len(held), len(joints))
+        self._lower = np.zeros(3) if box is None else np.array(box.lower_m)
+        self._upper = np.zeros(3) if box is None else np.array(box.upper_m)
+
+    def calibrate(
+        self, data: Any, place: Callable[[Floats], None], *, home: Floats, lower: Floats, upper: Floats
+    ) -> None:
+        """Look at many positions: leave out pairs that cannot come nearer; narrow the margin of neighbours.
+
+        Two links with one link between them are near each other by construction. Half of the least distance that was
+        seen is then their margin.
+
+        Raises:
+            GeometryError: In the home position something is too near already.
+        """
+        random = np.random.default_rng(_SEED)
+        count = len(self._a)
+        least, most = np.full(count, np.inf), np.full(count, -np.inf)
+        for index in range(_SAMPLES):
+            place(home if index == 0 else random.uniform(lower, upper))
+            distance = np.array([self._measure(data, pair, _FAR_M) for pair in range(count)])
+            least, most = np.minimum(least, distance), np.maximum(most, distance)
+        apart = [_steps(self._model, a, b) for a, b in zip(self._a, self._b, strict=True)]
+        neighbours = np.array([steps <= _NEIGHBOURS for steps in apart], dtype=bool)
+        narrow = neighbours & (least > 0)
+        self._margin[narrow] = np.minimum(self._margin[narrow], least[narrow] / 2)
+        keep = (most - least >= _STILL_M) | (least <= 0)
+        self._a, self._b, self._lever, self._margin = (
+            array[keep] for array in (self._a, self._b, self._lever, self._margin)
+        )
+        self._names = [name for name, kept in zip(self._names, keep, strict=True) if kept]
+        place(home)
+        clearance = self.tightest(data)
+        if clearance.room_m < 0:
+            raise GeometryError(
+                f"the home position has no room ({clearance.text}, {clearance.room_m * 1000:.1f} mm); "
+                "change home_rad, margin_m or workspace, or <exclude> the pair in the model"
+            )
+
+    def tightest(self, data: Any) -> Clearance:
+        """Where there is least room."""
+        room, between, kind = math.inf, ("", ""), "clearance"
+        bound = self._at_least(data) - self._margin
+        for pair in np.argsort(bound).tolist():
+            if bound[pair] >= room:
+                break
+            found = self._measure(data, pair, _FAR_M) - self._margin[pair]
+            if found < room:
+                room, between = float(found), self._names[pair]
+        for index, rooms in enumerate(self._rooms(data)):
+            face = int(np.argmin(rooms))
+            if rooms[face] < room:
+                room, between, kind = float(rooms[face]), (self._held[index][0], _FACES[face]), "workspace"
+        return Clearance(room, between, kind)
+
+    def near(self, data: Any, way: Floats) -> "Near | None":
+        """The pairs that could meet on a way, measured where it begins; ``None`` when there are none.
+
+        Args:
+            data: Placed at the beginning.
+            way: How far each joint goes, shape (n,) [rad], not negative.
+        """
+        closing = self._lever @ way
+        could = np.flatnonzero(self._at_least(data) - self._margin < closing)
+        held_closing = np.repeat(self._held_lever @ way, len(_FACES))
+        near = Near(self, could, closing[could], held_closing)
+        near.look(data, left=1.0)
+        near.begin()
+        return near if near.any else None
+
+    def speed_m_s(self, velocity_rad_s: Floats) -> float:
+        """The bound of the fastest point's speed; velocities not negative."""
+        return float(np.max(self._everywhere @ velocity_rad_s, initial=0.0))
+
+    # ------------------------------------------------------------ for Near
+
+    def room(self, data: Any, pair: int, far_m: float) -> float:
+        """Of one pair; anything above ``far_m`` may read as that."""
+        margin = float(self._margin[pair])
+        return self._measure(data, pair, far_m + margin) - margin
+
+    def rooms(self, data: Any) -> Floats:
+        """Of each held frame to each face, shape (frames x 6,)."""
+        return self._rooms(data).ravel()
+
+    def named(self, pair: int) -> Clearance:
+        """Who they are; no room told."""
+        return Clearance(0.0, self._names[pair])
+
+    def face(self, index: int) -> Clearance:
+        """Which frame and face; no room told."""
+        return Clearance(0.0, (self._held[index // len(_FACES)][0], _FACES[index % len(_FACES)]), "workspace")
+
+    # ------------------------------------------------------------ distances
+
+    def _measure(self, data: Any, pair: int, far_m: float) -> float:
+        return float(
+            mujoco.mj_geomDistance(self._model, data, int(self._a[pair]), int(self._b[pair]), far_m, self._line)
+        )
+
+    def _at_least(self, data: Any) -> Floats:
+        """A lower bound of each pair's distance: the ball around each against the box around the other."""
+        rotation = data.geom_xmat.reshape(-1, 3, 3)
+        centre = data.geom_xpos + np.einsum("gij,gj->gi", rotation, self._centre)
+        a, b = self._a, self._b
+        between = centre[b] - centre[a]
+        from_a = np.linalg.norm(
+            np.maximum(np.abs(np.einsum("pji,pj->pi", rotation[a], between)) - self._half[a], 0.0), axis=1
+        )
+        from_b = np.linalg.norm(
+            np.maximum(np.abs(np.einsum("pji,pj->pi", rotation[b], between)) - self._half[b], 0.0), axis=1
+        )
+        bound: Floats = np.maximum(from_a - self._radius[b], from_b - self._radius[a])
+        return bound
+
+    def _rooms(self, data: Any) -> Floats:
+        if not self._held:
+            return np.zeros((0, len(_FACES)))
+        world = np.array([data.site_xpos[index] if is_site else data.xpos[index] for _, is_site, index in self._held])
+        position = (world - data.xpos[self._base]) @ data.xmat[self._base].reshape(3, 3)
+        return np.concatenate((position - self._lower, self._upper - position), axis=1)
+
+
+class Near:
+    """The pairs that could meet on one way, while it is gone along.
+
+    What is too near at the beginning may only come further away.
+    """
+
+    def __init__(self, pairs: Pairs, could: Ints, closing: Floats, held_closing: Floats) -> None:
+        self._pairs = pairs
+        self._closing = dict(zip(could.tolist(), closing.tolist(), strict=True))
+        self._held_closing = held_closing
+        self._room: dict[int, float] = dict.fromkeys(self._closing, 0.0)
+        self._held_room = np.zeros(len(held_closing))
+        self._least: dict[int, float] = {}
+        self._held_least = np.zeros(0)
+        self._held_near = np.zeros(0, dtype=np.intp)
+
+    def look(self, data: Any, *, left: float) -> None:
+        """Measure again; forget what cannot meet any more on the share of the way that is ``left``."""
+        for pair, closing in self._closing.items():
+            if pair in self._room:
+                room = self._pairs.room(data, pair, closing)
+                if room < closing * left or room < 0 or left <= 0:
+                    self._room[pair] = room
+                else:
+                    del self._room[pair]
+        self._held_room = self._pairs.rooms(data)
+        self._held_near = np.flatnonzero(self._held_room < self._held_closing * max(left, 0.0))
+
+    def begin(self) -> None:
+        """Remember how it is at the beginning."""
+        self._least = {pair: min(0.0, room) for pair, room in self._room.items()}
+        self._held_least = np.minimum(0.0, self._held_room)
+
+    @property
+    def any(self) -> bool:
+        """Whether anything is left that could meet."""
+        return bool(self._room) or bool(len(self._held_near))
+
+    def safe_share(self, step_m: float) -> float:
+        """Share of the way that can be gone unseen: nothing then comes too near, or by less than ``step_m``."""
+        share = 1.0
+        for pair, room in self._room.items():
+            if self._closing[pair] > 0:
+                share = min(share, max(room, step_m) / self._closing[pair])
+        for index in self._held_near.tolist():
+            if self._held_closing[index] > 0:
+                share = min(share, max(float(self._held_room[index]), step_m) / float(self._held_closing[index]))
+        return share
+
+    def broken(self, same_m: float) -> bool:
+        """Whether something is too near, and nearer than at the beginning."""
+        if any(room < self._least[pair] - same_m for pair, room in self._room.items()):
+            return True
+        return bool(np.any(self._held_room < self._held_least - same_m))
+
+    def tightest(self) -> Clearance:
+        """Where it is worst, compared with the beginning."""
+        room, found = math.inf, Clearance(math.inf, ("", ""))
+        for pair, here in self._room.items():
+            if here - self._least[pair] < room:
+                room, named = here - self._least[pair], self._pairs.named(pair)
+                found = Clearance(here, named.between, named.kind)
+        change = self._held_room - self._held_least
+        if len(change) and float(np.min(change)) < room:
+            index = int(np.argmin(change))
+            named = self._pairs.face(index)
+            found = Clearance(float(self._held_room[index]), named.between, named.kind)
+        return found
+
+
+def _pairs(model: Any, base: int, *, scenery: bool) -> list[tuple[int, int]]:
+    solid = [g for g in range(model.ngeom) if model.geom_contype[g] or model.geom_conaffinity[g]]
+    own = [g for g in solid if model.body_rootid[model.geom_bodyid[g]] == base]
+    still = [g for g in solid if not model.body_weldid[model.geom_bodyid[g]] and g not in own] if scenery else []
+    excluded = {(int(signature) >> 16, int(signature) & 0xFFFF) for signature in model.exclude_signature}
+    candidates = [*still, *own]
+    found = []
+    for index, a in enumerate(candidates):
+        for b in candidates[index + 1 :]:
+            bodies = int(model.geom_bodyid[a]), int(model.geom_bodyid[b])
+            if bodies in excluded or bodies[::-1] in excluded or not _meet(model, a, b):
+                continue
+            found.append((a, b))
+    return found
+
+
+def _meet(model: Any, a: int, b: int) -> bool:
+    """Whether two shapes may collide at all, by the rules of MuJoCo's own collision detection."""
+    if not (model.geom_contype[a] & model.geom_conaffinity[b] or model.geom_contype[b] & model.geom_conaffinity[a]):
+        return False
+    first, second = (int(model.body_weldid[model.geom_bodyid[geom]]) for geom in (a, b))
+    if first == second:
+        return False
+    return not any(
+        one != 0 and int(model.body_weldid[model.body_parentid[other]]) == one
+        for one, other in ((first, second), (second, first))
+    )
+
+
+def _steps(model: Any, a: int, b: int) -> int:
+    """How many links apart two shapes are, up or down the tree; many when one is not above the other."""
+    lower, upper = sorted((int(model.geom_bodyid[a]), int(model.geom_bodyid[b])), reverse=True)
+    steps = 0
+    while lower > upper > 0:
+        lower, steps = int(model.body_parentid[lower]), steps + 1
+    return steps if lower == upper else model.nbody
+
+
+def _name(model: Any, geom: int) -> str:
+    body = int(model.geom_bodyid[geom])
+    return str(model.geom(geom).name or "scenery") if body == 0 else str(model.body(body).name)

@@ -1,0 +1,94 @@
+"""What is known of a robot's shape, whoever moves it. This page is the implementer's manual.
+
+It comes from the robot type's model, not from the driver: the same checks hold for a simulation and for real metal. A
+robot type without a model has no geometry; then only what stands in its manifest limits it, and ``desc`` says so.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Protocol
+
+from device_agent.protocol.messages import Pose
+
+STEP_M = 0.01
+"""Half of the usual margin."""
+
+
+class GeometryError(Exception):
+    """The model cannot be used, or has no answer. Its text is fit for an operator."""
+
+
+@dataclass(frozen=True, slots=True)
+class Clearance:
+    """The tightest place of a robot.
+
+    Attributes:
+        room_m: What is left until the tightest pair is as near as it may be; negative when it is nearer [m].
+        between: The two that are near each other: bodies of the robot, or things that stand still in its scene, or a
+            frame and a face of the workspace.
+        kind: ``clearance`` or ``workspace``.
+    """
+
+    room_m: float
+    between: tuple[str, str]
+    kind: str = "clearance"
+
+    @property
+    def text(self) -> str:
+        """As ``limited`` names it."""
+        return f"{self.kind}: {self.between[0]} \u2013 {self.between[1]}"
+
+
+@dataclass(frozen=True, slots=True)
+class Sweep:
+    """How a straight way between two joint positions went.
+
+    Attributes:
+        share: How much of it is clear, 0…1.
+        clearance: What ends it; ``None`` when all of it is clear.
+    """
+
+    share: float
+    clearance: Clearance | None = None
+
+
+class Geometry(Protocol):
+    """One robot's shape in the scene it stands in. Thread-safe; joint positions are in the robot type's order [rad]."""
+
+    @property
+    def frames(self) -> tuple[str, ...]:
+        """Names of all frames that ``poses`` and ``solve`` know."""
+
+    def poses(self, position_rad: Sequence[float]) -> Mapping[str, Pose]:
+        """Pose of each frame in the robot's base frame."""
+
+    def clearance(self, position_rad: Sequence[float]) -> Clearance:
+        """The tightest place of the robot in one position: itself, what stands around it, its workspace.
+
+        Quick enough for the control loop.
+        """
+
+    def sweep(self, start_rad: Sequence[float], end_rad: Sequence[float], *, step_m: float = STEP_M) -> Sweep:
+        """Go in a straight line through joint space until something is nearer than it may be.
+
+        From where something is too near already: until it comes nearer still, so that it can be left.
+
+        Quick enough for the control loop.
+
+        Args:
+            start_rad: Where the way begins.
+            end_rad: Where it ends.
+            step_m: What comes nearer by less than this, and goes away again, may be missed [m].
+        """
+
+    def speed_m_s(self, velocity_rad_s: Sequence[float]) -> float:
+        """A speed that no point of the robot exceeds, in whatever position, by the lever arms of its joints [m/s]."""
+
+    def solve(self, frame: str, pose: Pose, start_rad: Sequence[float]) -> tuple[float, ...]:
+        """Joint positions that bring a frame to a pose in the robot's base frame, near ``start_rad`` where possible.
+
+        May take tens of milliseconds: never call it from the control loop.
+
+        Raises:
+            GeometryError: No such frame, or out of reach; the text says how near the robot can come.
+        """

@@ -1,0 +1,75 @@
+"""Motion of a base over the floor, one control period at a time: speeds up, keeps its twist for a time, brakes."""
+
+from ruckig import ControlInterface, InputParameter, OutputParameter, Result, Ruckig, Synchronization
+
+from device_agent.ports.driver import REST, Twist
+from device_agent.protocol.robot_type import Base
+from device_agent.runtime.motion import MotionError
+
+_RAMP_S = 0.1
+"""Time in which speeding up reaches its full acceleration."""
+_BRAKING_RAMP_S = 0.01
+_REST = 1e-6
+
+
+class BaseMotion:
+    """The commanded twist of a base.
+
+    Args:
+        base: Its limits.
+        period_s: The control period [s].
+    """
+
+    def __init__(self, base: Base, period_s: float) -> None:
+        linear, angular = base.max_linear_acceleration_m_s2, base.max_angular_acceleration_rad_s2
+        braking, turning = base.braking_linear_m_s2, base.braking_angular_rad_s2
+        self.limits = Twist(base.max_linear_m_s, base.max_linear_m_s * base.sideways, base.max_angular_rad_s)
+        self._acceleration = [linear, linear, angular]
+        self._braking = [braking, braking, turning]
+        self._generator = Ruckig(3, period_s)
+        self._output = OutputParameter(3)
+        self._input = InputParameter(3)
+        self._input.control_interface = ControlInterface.Velocity
+        self._input.synchronization = Synchronization.No
+        self.twist = REST
+        self.start()
+
+    def start(self) -> None:
+        """Begin at rest."""
+        self.twist = REST
+        self._input.current_velocity = list(REST)
+        self._input.current_acceleration = list(REST)
+        self.brake()
+
+    def follow(self, twist: Twist) -> None:
+        """Head for a twist that is inside the limits."""
+        self._aim(twist, self._acceleration, _RAMP_S)
+
+    def brake(self) -> None:
+        """Come to rest as fast as the robot type allows, and stay there."""
+        self._aim(REST, self._braking, _BRAKING_RAMP_S)
+
+    def update(self) -> Twist:
+        """Advance one period.
+
+        Raises:
+            MotionError: The generator found no way; the twist is as it was.
+        """
+        result = self._generator.update(self._input, self._output)
+        if result not in (Result.Working, Result.Finished):
+            raise MotionError(f"no way to go on from here ({result})")
+        self._output.pass_to_input(self._input)
+        self.twist = Twist(*self._output.new_velocity)
+        return self.twist
+
+    @property
+    def moving(self) -> bool:
+        """Whether the commanded twist is not zero."""
+        return any(abs(part) > _REST for part in self.twist)
+
+    def _aim(self, twist: Twist, acceleration: list[float], ramp_s: float) -> None:
+        self._input.target_velocity = list(twist)
+        self._input.target_acceleration = list(REST)
+        self._input.max_velocity = [max(limit, _REST) for limit in self.limits]
+        self._input.max_acceleration = acceleration
+        self._input.max_jerk = [value / ramp_s for value in acceleration]
