@@ -73,26 +73,23 @@ class MujocoGeometry:
             self._place(position_rad)
             return self._pairs.tightest(self._data)
 
-    def sweep(self, start_rad: Sequence[float], end_rad: Sequence[float], *, step_m: float = STEP_M) -> Sweep:
-        """Go in a straight line through joint space until something is too near, or nearer than it was."""
-        start, way = np.asarray(start_rad, dtype=np.float64), np.subtract(end_rad, start_rad)
+    def sweep(self, path_rad: Sequence[Sequence[float]], *, step_m: float = STEP_M) -> Sweep:
+        """Go from one joint position straight to the next until something is too near, or nearer than it was."""
+        path = np.asarray(path_rad, dtype=np.float64)
+        legs = np.diff(path, axis=0)
         with self._lock:
-            self._place(start)
-            near = self._pairs.near(self._data, np.abs(way))
-            if near is None:
-                return Sweep(1.0)
-            share = 0.0
-            while True:
-                step = near.safe_share(step_m)
-                if share + step >= 1.0:
-                    step = 1.0 - share
-                share += step
-                self._place(start + share * way)
-                near.look(self._data, left=1.0 - share)
-                if near.broken(_SAME_M):
-                    return Sweep(share - step, near.tightest())
-                if share >= 1.0 or not near.any:
-                    return Sweep(1.0)
+            self._place(path[0])
+            near = self._pairs.near(self._data, np.abs(legs))
+            for index, leg in enumerate(legs):
+                share = 0.0
+                while share < 1.0 and near.any:
+                    gone = share
+                    share = min(1.0, share + near.safe_share(index, step_m))
+                    self._place(path[index] + share * leg)
+                    near.look(self._data, index, share)
+                    if near.broken(_SAME_M):
+                        return Sweep((index + gone) / len(legs), near.tightest())
+            return Sweep(1.0)
 
     def speed_m_s(self, velocity_rad_s: Sequence[float]) -> float:
         """A speed that no point of the robot exceeds [m/s]."""

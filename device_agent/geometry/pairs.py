@@ -127,20 +127,20 @@ class Pairs:
                 room, between, kind = float(rooms[face]), (self._held[index][0], _FACES[face]), "workspace"
         return Clearance(room, between, kind)
 
-    def near(self, data: Any, way: Floats) -> "Near | None":
-        """The pairs that could meet on a way, measured where it begins; ``None`` when there are none.
+    def near(self, data: Any, legs: Floats) -> "Near":
+        """The pairs that could meet on a way, measured where it begins.
 
         Args:
             data: Placed at the beginning.
-            way: How far each joint goes, shape (n,) [rad], not negative.
+            legs: How far each joint goes on each leg, shape (legs, n) [rad], not negative.
         """
-        closing = self._lever @ way
-        could = np.flatnonzero(self._at_least(data) - self._margin < closing)
-        held_closing = np.repeat(self._held_lever @ way, len(_FACES))
-        near = Near(self, could, closing[could], held_closing)
-        near.look(data, left=1.0)
+        closing = legs @ self._lever.T
+        could = np.flatnonzero(self._at_least(data) - self._margin < closing.sum(axis=0))
+        held_closing = np.repeat(legs @ self._held_lever.T, len(_FACES), axis=1)
+        near = Near(self, could, closing[:, could], held_closing)
+        near.look(data, 0, 0.0)
         near.begin()
-        return near if near.any else None
+        return near
 
     def speed_m_s(self, velocity_rad_s: Floats) -> float:
         """The bound of the fastest point's speed; velocities not negative."""
@@ -157,13 +157,13 @@ class Pairs:
         """Of each held frame to each face, shape (frames x 6,)."""
         return self._rooms(data).ravel()
 
-    def named(self, pair: int) -> Clearance:
-        """Who they are; no room told."""
-        return Clearance(0.0, self._names[pair])
+    def named(self, pair: int, room_m: float) -> Clearance:
+        """Who they are."""
+        return Clearance(room_m, self._names[pair])
 
-    def face(self, index: int) -> Clearance:
-        """Which frame and face; no room told."""
-        return Clearance(0.0, (self._held[index // len(_FACES)][0], _FACES[index % len(_FACES)]), "workspace")
+    def face(self, index: int, room_m: float) -> Clearance:
+        """Which frame, and which face of the workspace."""
+        return Clearance(room_m, (self._held[index // len(_FACES)][0], _FACES[index % len(_FACES)]), "workspace")
 
     # ------------------------------------------------------------ distances
 
@@ -199,29 +199,38 @@ class Near:
     """The pairs that could meet on one way, while it is gone along.
 
     What is too near at the beginning may only come further away.
+
+    Args:
+        pairs: Whose they are.
+        could: Which could meet, shape (p,).
+        closing: How much nearer they could come on each leg, shape (legs, p) [m].
+        held_closing: The same of each held frame to each face, shape (legs, frames x 6) [m].
     """
 
     def __init__(self, pairs: Pairs, could: Ints, closing: Floats, held_closing: Floats) -> None:
         self._pairs = pairs
-        self._closing = dict(zip(could.tolist(), closing.tolist(), strict=True))
+        self._closing = dict(zip(could.tolist(), closing.T.tolist(), strict=True))
+        self._left = dict(zip(could.tolist(), _left(closing).T.tolist(), strict=True))
         self._held_closing = held_closing
+        self._held_left = _left(held_closing)
         self._room: dict[int, float] = dict.fromkeys(self._closing, 0.0)
-        self._held_room = np.zeros(len(held_closing))
+        self._held_room = np.zeros(held_closing.shape[1])
         self._least: dict[int, float] = {}
-        self._held_least = np.zeros(0)
+        self._held_least = self._held_room
         self._held_near = np.zeros(0, dtype=np.intp)
 
-    def look(self, data: Any, *, left: float) -> None:
-        """Measure again; forget what cannot meet any more on the share of the way that is ``left``."""
-        for pair, closing in self._closing.items():
-            if pair in self._room:
-                room = self._pairs.room(data, pair, closing)
-                if room < closing * left or room < 0 or left <= 0:
-                    self._room[pair] = room
-                else:
-                    del self._room[pair]
+    def look(self, data: Any, leg: int, share: float) -> None:
+        """Measure again, at a share of a leg; forget what cannot meet any more on what is left of the way."""
+        for pair in list(self._room):
+            left = self._left[pair][leg] - share * self._closing[pair][leg]
+            room = self._pairs.room(data, pair, left)
+            if room < max(left, 0.0) or room <= 0:
+                self._room[pair] = room
+            else:
+                del self._room[pair]
         self._held_room = self._pairs.rooms(data)
-        self._held_near = np.flatnonzero(self._held_room < self._held_closing * max(left, 0.0))
+        left_m = self._held_left[leg] - share * self._held_closing[leg]
+        self._held_near = np.flatnonzero(self._held_room < left_m)
 
     def begin(self) -> None:
         """Remember how it is at the beginning."""
@@ -233,15 +242,16 @@ class Near:
         """Whether anything is left that could meet."""
         return bool(self._room) or bool(len(self._held_near))
 
-    def safe_share(self, step_m: float) -> float:
-        """Share of the way that can be gone unseen: nothing then comes too near, or by less than ``step_m``."""
+    def safe_share(self, leg: int, step_m: float) -> float:
+        """Share of a leg that can be gone unseen: nothing then comes too near, or by less than ``step_m``."""
         share = 1.0
         for pair, room in self._room.items():
-            if self._closing[pair] > 0:
-                share = min(share, max(room, step_m) / self._closing[pair])
+            if self._closing[pair][leg] > 0:
+                share = min(share, max(room, step_m) / self._closing[pair][leg])
         for index in self._held_near.tolist():
-            if self._held_closing[index] > 0:
-                share = min(share, max(float(self._held_room[index]), step_m) / float(self._held_closing[index]))
+            closing = float(self._held_closing[leg, index])
+            if closing > 0:
+                share = min(share, max(float(self._held_room[index]), step_m) / closing)
         return share
 
     def broken(self, same_m: float) -> bool:
@@ -252,17 +262,21 @@ class Near:
 
     def tightest(self) -> Clearance:
         """Where it is worst, compared with the beginning."""
-        room, found = math.inf, Clearance(math.inf, ("", ""))
-        for pair, here in self._room.items():
-            if here - self._least[pair] < room:
-                room, named = here - self._least[pair], self._pairs.named(pair)
-                found = Clearance(here, named.between, named.kind)
+        worst, found = math.inf, Clearance(math.inf, ("", ""))
+        for pair, room in self._room.items():
+            if room - self._least[pair] < worst:
+                worst, found = room - self._least[pair], self._pairs.named(pair, room)
         change = self._held_room - self._held_least
-        if len(change) and float(np.min(change)) < room:
+        if len(change) and float(np.min(change)) < worst:
             index = int(np.argmin(change))
-            named = self._pairs.face(index)
-            found = Clearance(float(self._held_room[index]), named.between, named.kind)
+            found = self._pairs.face(index, float(self._held_room[index]))
         return found
+
+
+def _left(closing: Floats) -> Floats:
+    """What comes from each leg to the end, shape as ``closing``."""
+    left: Floats = np.cumsum(closing[::-1], axis=0)[::-1]
+    return left
 
 
 def _pairs(model: Any, base: int, *, scenery: bool) -> list[tuple[int, int]]:

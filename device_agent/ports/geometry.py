@@ -41,7 +41,7 @@ class Clearance:
 
 @dataclass(frozen=True, slots=True)
 class Sweep:
-    """How a straight way between two joint positions went.
+    """How a way through joint space went.
 
     Attributes:
         share: How much of it is clear, 0…1.
@@ -68,16 +68,15 @@ class Geometry(Protocol):
         Quick enough for the control loop.
         """
 
-    def sweep(self, start_rad: Sequence[float], end_rad: Sequence[float], *, step_m: float = STEP_M) -> Sweep:
-        """Go in a straight line through joint space until something is nearer than it may be.
+    def sweep(self, path_rad: Sequence[Sequence[float]], *, step_m: float = STEP_M) -> Sweep:
+        """Go from one joint position straight to the next until something is nearer than it may be.
 
         From where something is too near already: until it comes nearer still, so that it can be left.
 
         Quick enough for the control loop.
 
         Args:
-            start_rad: Where the way begins.
-            end_rad: Where it ends.
+            path_rad: At least two positions; each leg counts alike in ``Sweep.share``.
             step_m: What comes nearer by less than this, and goes away again, may be missed [m].
         """
 

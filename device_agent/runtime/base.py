@@ -1,10 +1,10 @@
 """Motion of a base over the floor, one control period at a time: speeds up, keeps its twist for a time, brakes."""
 
-from ruckig import ControlInterface, InputParameter, OutputParameter, Result, Ruckig, Synchronization
+from ruckig import ControlInterface, InputParameter, OutputParameter, Ruckig, Synchronization
 
 from device_agent.ports.driver import REST, Twist
 from device_agent.protocol.robot_type import Base
-from device_agent.runtime.motion import MotionError
+from device_agent.runtime.motion import plan
 
 _RAMP_S = 0.1
 """Time in which speeding up reaches its full acceleration."""
@@ -55,9 +55,7 @@ class BaseMotion:
         Raises:
             MotionError: The generator found no way; the twist is as it was.
         """
-        result = self._generator.update(self._input, self._output)
-        if result not in (Result.Working, Result.Finished):
-            raise MotionError(f"no way to go on from here ({result})")
+        plan(self._generator.update, self._input, self._output)
         self._output.pass_to_input(self._input)
         self.twist = Twist(*self._output.new_velocity)
         return self.twist

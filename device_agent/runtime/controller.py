@@ -10,7 +10,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
 from device_agent.ports.driver import REST, Twist
-from device_agent.ports.geometry import Geometry
+from device_agent.ports.geometry import Clearance, Geometry
 from device_agent.protocol.events import EventKind
 from device_agent.protocol.messages import Mode, Setpoint, StopLatch
 from device_agent.protocol.robot_type import RobotType
@@ -18,19 +18,16 @@ from device_agent.runtime.audit import Tell, to_nobody
 from device_agent.runtime.authority import Authority, Tenure
 from device_agent.runtime.base import BaseMotion
 from device_agent.runtime.courses import Course, Drive, Move, Outcome
+from device_agent.runtime.envelope import Envelope
 from device_agent.runtime.lease import Lease, LeaseGate, Refused
 from device_agent.runtime.motion import Motion, MotionError
 from device_agent.runtime.restrictions import Restriction
+from device_agent.runtime.stream import Stream
 
-WATCHDOG_S = 0.3
-"""Commanded velocity is zero this long after the last fresh setpoint."""
-MAX_LOOP_AGE_S = 0.2
-"""A setpoint that answers telemetry older than this is not fresh."""
-_SOONEST_BRAKING_S = 0.15
-"""Braking never begins sooner than this after a setpoint, so that ordinary jitter does not stop the arm."""
 _CREEP_RAD_S = 0.02
 """Slower than this, setpoints that end are a slider let go at its target, not an operator lost in mid-motion."""
 _LONGEST_DRIVE_S = 60.0
+_SAME_RAD = 1e-6
 
 
 @dataclass(frozen=True, slots=True)
@@ -71,24 +68,17 @@ class Controller:
         tell: Tell = to_nobody,
     ) -> None:
         self._joints = robot_type.joints
-        self._index = {joint.name: index for index, joint in enumerate(robot_type.joints)}
         self._period_s = robot_type.period_ms / 1000
         self._motion = Motion(robot_type)
         self._base = None if robot_type.base is None else BaseMotion(robot_type.base, self._period_s)
-        self._geometry = geometry
+        self._envelope = Envelope(robot_type, geometry)
+        self._stream = Stream(robot_type, self._envelope, geometry)
         self._authority = Authority(gate, latch, hold=self._hold, tell=tell)
         self.changed = self._authority.changed
-        self._streaming_speed = robot_type.streaming_speed
         self._lock = threading.Lock()
         self._mode = Mode.IDLE
         self._course: Course | None = None
-        self._target: list[float] = [0.0] * len(self._joints)
-        self._setpoint: Setpoint | None = None
-        self._setpoint_at_s = -math.inf
-        self._taken = 0
-        self._taken_sent_ms = 0.0
-        self._loop_age_ms = 0.0
-        self._ranged: tuple[str, ...] = ()
+        self._driver_limits: tuple[str, ...] = ()
 
     # ------------------------------------------------------------ what other threads ask
 
@@ -96,7 +86,7 @@ class Controller:
         """Begin at rest where the device is, shape (n,) [rad]."""
         with self._lock:
             self._motion.start_at(position_rad)
-            self._target = list(position_rad)
+            self._stream.begin(position_rad)
 
     def grant(self, *, epoch: int, holder: str, lease_s: float, now_s: float, reason: str = "") -> None:
         """Take in a signed grant or renewal of the lease.
@@ -106,7 +96,7 @@ class Controller:
         """
         with self._lock:
             if self._authority.grant(epoch=epoch, holder=holder, lease_s=lease_s, now_s=now_s, reason=reason):
-                self._forget_setpoints()
+                self._stream.begin(self._motion.position_rad)
 
     def release(self, *, epoch: int) -> None:
         """The holder gave the lease up, or lost it.
@@ -116,15 +106,6 @@ class Controller:
         """
         with self._lock:
             self._authority.release(epoch)
-
-    def fence(self, epoch: int) -> None:
-        """Check the epoch of a signed command; a newer one takes the device from whoever had it.
-
-        Raises:
-            Refused: Stale, or of a lease that has ended here.
-        """
-        with self._lock:
-            self._fence(epoch)
 
     def offer(self, setpoint: Setpoint, *, now_s: float, tick_ms: int) -> None:
         """Take in a streamed setpoint; the newest wins.
@@ -142,13 +123,7 @@ class Controller:
             lease = self._authority.lease(now_s)
             if lease is None or setpoint.epoch != lease.epoch:
                 raise Refused("no_lease", f"lease {setpoint.epoch} is not in force here")
-            if self._setpoint is not None and setpoint.sequence <= self._setpoint.sequence:
-                raise Refused("out_of_order", "a newer setpoint has arrived already")
-            age_ms = tick_ms - setpoint.echo_tick_ms
-            if not 0 <= age_ms <= MAX_LOOP_AGE_S * 1000:
-                raise Refused(
-                    "too_old", f"answers telemetry of {age_ms} ms ago; {MAX_LOOP_AGE_S * 1000:.0f} ms is the most"
-                )
+            self._stream.check(setpoint, tick_ms=tick_ms)
             try:
                 self._authority.check_free()
             except Refused as refused:
@@ -157,10 +132,7 @@ class Controller:
                 raise
             if self._authority.tenure is not None:
                 raise Refused("busy", "an action runs; cancel it first")
-            self._check_positions(setpoint.target.position_rad)
-            self._setpoint = setpoint
-            self._setpoint_at_s = now_s
-            self._loop_age_ms = float(age_ms)
+            self._stream.take(setpoint, now_s=now_s, tick_ms=tick_ms)
 
     def begin_action(self, *, epoch: int, on_lost: Callable[[Refused], None]) -> Tenure:
         """An action now has the device, until ``end_action`` or until its lease ends.
@@ -172,7 +144,7 @@ class Controller:
             self._fence(epoch)
             self._authority.check_free()
             tenure = self._authority.begin(epoch, on_lost)
-            self._setpoint_at_s = -math.inf
+            self._stream.drop()
             return tenure
 
     def end_action(self, tenure: Tenure) -> None:
@@ -187,22 +159,13 @@ class Controller:
 
         Raises:
             Refused: The action no longer has the device, stopped, faulty, held by the room, unknown joint, a number
-                that is none, or outside a joint's range.
+                that is none, outside a joint's range, or no room there.
         """
         with self._lock:
             self._check_course(tenure)
-            self._check_positions(position_rad)
             if not 0 < speed <= 1:
                 raise Refused("bad_speed", f"speed must be above 0 and at most 1, not {speed}")
-            target = list(self._motion.position_rad)
-            for name, value in position_rad.items():
-                joint = self._joints[self._index[name]]
-                if not joint.lower_rad <= value <= joint.upper_rad:
-                    raise Refused(
-                        "out_of_range",
-                        f"{name} can go from {joint.lower_rad:.4f} to {joint.upper_rad:.4f} rad, not to {value:.4f}",
-                    )
-                target[self._index[name]] = value
+            target = self._envelope.target(position_rad, self._motion.position_rad)
             self._interrupt(Refused("replaced", "another course took its place"))
             move = Move(target_rad=target, speed=speed)
             self._course = move
@@ -243,7 +206,7 @@ class Controller:
         """
         with self._lock:
             self._authority.restrictions.set(source, speed, why)
-            busy = self._authority.tenure is not None or self.moving or self._setpoint_at_s > -math.inf
+            busy = self._authority.tenure is not None or self.moving or self._stream.heard
             if self._authority.restrictions.speed <= 0 and busy:
                 self._authority.end(Refused("interlock", f"the room holds the device: {why}"))
 
@@ -285,6 +248,15 @@ class Controller:
                 self._motion.start_at(position_rad)
                 if self._base is not None:
                     self._base.start()
+
+    def applied(self, position_rad: Sequence[float]) -> None:
+        """What the driver made of the last command, shape (n,) [rad]; where it differs, ``limited`` says so."""
+        with self._lock:
+            self._driver_limits = tuple(
+                f"{joint.name}: driver"
+                for joint, asked, done in zip(self._joints, self._motion.position_rad, position_rad, strict=True)
+                if abs(asked - done) > _SAME_RAD
+            )
 
     # ------------------------------------------------------------ what others may know
 
@@ -336,13 +308,11 @@ class Controller:
             self._authority.expire(now_s)
             self._mode = self._decide(now_s)
             try:
-                self._motion.update()
-                if self._base is not None:
-                    self._base.update()
+                self._go()
             except MotionError as error:
                 self._authority.end(Refused("fault", str(error)))
-                self._motion.start_at(self._motion.position_rad)
                 self._mode = Mode.HOLDING
+                self._give_up()
             limited = self._limits()
             self._advance(limited)
             lease = self._authority.lease(now_s)
@@ -350,12 +320,38 @@ class Controller:
                 list(self._motion.position_rad),
                 self._mode,
                 lease.epoch if lease else 0,
-                self._taken,
-                self._taken_sent_ms,
-                self._loop_age_ms,
+                self._stream.taken,
+                self._stream.sent_ms,
+                self._stream.loop_age_ms,
                 limited,
                 REST if self._base is None else self._base.twist,
             )
+
+    def _go(self) -> None:
+        """Advance one period, if from there on the device could still come to rest with room around it."""
+        if not self._motion.braking:
+            obstacle = self._envelope.blocked(self._motion.propose())
+            if obstacle is not None:
+                self._block(obstacle)
+        self._motion.update()
+        if self._base is not None:
+            self._base.update()
+
+    def _give_up(self) -> None:
+        """Brake; where even that cannot be planned, stand still at once."""
+        self._brake()
+        try:
+            self._motion.update()
+        except MotionError:
+            self._motion.start_at(self._motion.position_rad)
+
+    def _block(self, obstacle: Clearance) -> None:
+        if self._course is None:
+            self._stream.block(obstacle)
+            self._motion.brake()
+        else:
+            self._course.note((obstacle.text,))
+            self._interrupt(Refused("no_room", f"something is in the way: {obstacle.text}; the device holds before it"))
 
     def _decide(self, now_s: float) -> Mode:
         if self._authority.fault is not None:
@@ -370,29 +366,15 @@ class Controller:
         if self._authority.tenure is not None:
             self._follow_course()
             return Mode.ACTION
-        age_s = now_s - self._setpoint_at_s
-        if self._setpoint is not None and age_s < max(_SOONEST_BRAKING_S, WATCHDOG_S - self._motion.braking_time_s()):
-            self._follow(self._setpoint)
+        if self._stream.fresh(now_s, self._motion):
+            self._stream.follow(self._motion, allowed=self._authority.restrictions.speed)
             return Mode.STREAMING
         if self._mode is Mode.STREAMING and self._motion.fastest_rad_s > _CREEP_RAD_S:
             self._authority.end(Refused("watchdog", "setpoints stopped coming"))
-        self._setpoint_at_s = -math.inf
+        self._stream.drop()
         self._brake()
         held = self._mode is Mode.HOLDING and (self.moving or self._authority.burned)
         return Mode.HOLDING if held else Mode.IDLE
-
-    def _follow(self, setpoint: Setpoint) -> None:
-        if setpoint.sequence != self._taken:
-            limited = []
-            for name, value in setpoint.target.position_rad.items():
-                index = self._index[name]
-                joint = self._joints[index]
-                self._target[index] = min(max(value, joint.lower_rad), joint.upper_rad)
-                if self._target[index] != value:
-                    limited.append(f"{name}: range")
-            self._ranged = tuple(limited)
-            self._taken, self._taken_sent_ms = setpoint.sequence, setpoint.sent_ms
-        self._motion.follow(self._target, speed=self._streaming_speed * self._authority.restrictions.speed)
 
     def _follow_course(self) -> None:
         speed = self._authority.restrictions.speed
@@ -421,21 +403,18 @@ class Controller:
     def _limits(self) -> tuple[str, ...]:
         """What makes the motion other than asked, for telemetry."""
         strictest = self._authority.restrictions.strictest
-        slowed = () if strictest is None else (strictest.text,)
-        return self._ranged + slowed
+        limited: tuple[str, ...] = () if strictest is None else (strictest.text,)
+        if self._mode is Mode.STREAMING:
+            limited += self._stream.limited
+        return limited + self._driver_limits
 
     def _fence(self, epoch: int) -> None:
         if self._authority.fence(epoch):
-            self._forget_setpoints()
-
-    def _forget_setpoints(self) -> None:
-        self._setpoint = None
-        self._taken, self._taken_sent_ms, self._loop_age_ms, self._ranged = 0, 0.0, 0.0, ()
-        self._target = list(self._motion.position_rad)
+            self._stream.begin(self._motion.position_rad)
 
     def _hold(self, why: Refused) -> None:
         """Bring the device to rest; whoever moved it no longer does."""
-        self._setpoint_at_s = -math.inf
+        self._stream.drop()
         if self.moving:
             if self._mode in {Mode.STREAMING, Mode.ACTION}:  # told once, not for each order to hold while it brakes
                 self._authority.note(EventKind.HELD, why.message, self._authority.said(why), "warning")
@@ -457,10 +436,3 @@ class Controller:
     def _check_course(self, tenure: Tenure) -> None:
         self._authority.check_free()
         self._authority.check_tenure(tenure)
-
-    def _check_positions(self, position_rad: Mapping[str, float]) -> None:
-        unknown = sorted(set(position_rad) - set(self._index))
-        if unknown:
-            raise Refused("unknown_joint", f"no joint '{unknown[0][:80]}'; there are {', '.join(self._index)}")
-        if not all(map(math.isfinite, position_rad.values())):
-            raise Refused("not_finite", "a position must be a finite number")

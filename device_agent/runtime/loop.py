@@ -82,6 +82,7 @@ class ControlLoop:
                 self.seen = self._driver.observe()
                 tick = self._controller.step(now_s)
                 applied = self._driver.send(tick.position_rad)
+                self._controller.applied(applied)
                 if self._base is not None:
                     self._base.drive(tick.twist)
                 self._measure(now_s, self.seen, tick, applied)

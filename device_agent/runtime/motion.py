@@ -1,19 +1,47 @@
 """Jerk-limited motion of all joints of one device, one control period at a time (``ruckig``)."""
 
-from collections.abc import Sequence
+import math
+from collections.abc import Callable, Sequence
+from typing import Any
 
-from ruckig import ControlInterface, InputParameter, OutputParameter, Result, Ruckig, Synchronization
+from ruckig import (
+    ControlInterface,
+    InputParameter,
+    OutputParameter,
+    Result,
+    Ruckig,
+    RuckigError,
+    Synchronization,
+    Trajectory,
+)
 
 from device_agent.protocol.robot_type import RobotType
 
 _BRAKING_RAMP_S = 0.01
 """Time in which braking reaches its full deceleration: short against the 50 ms in which a hold must be complete."""
+_KNOT_S = 0.04
+"""Between knots this far apart in time a braking path is straight to within 4 mm at any speed in use."""
 _REST_RAD_S = 1e-6
 _REACHED_RAD = 1e-4
+_SAME_RAD_S2 = 1e-3
 
 
 class MotionError(Exception):
     """The trajectory generator refused its input; the device must hold."""
+
+
+def plan(generate: Callable[[Any, Any], Result], order: InputParameter, answer: Any) -> None:
+    """Have ``ruckig`` answer an order.
+
+    Raises:
+        MotionError: It found nothing.
+    """
+    try:
+        result = generate(order, answer)
+    except RuckigError as error:
+        raise MotionError(f"no way to go on from here: {error}") from error
+    if result not in (Result.Working, Result.Finished):
+        raise MotionError(f"no way to go on from here ({result})")
 
 
 class Motion:
@@ -35,6 +63,11 @@ class Motion:
         self._output = OutputParameter(len(joints))
         self._target: list[float] = [0.0] * len(joints)
         self._zeros = [0.0] * len(joints)
+        self._planner = Ruckig(len(joints))
+        self._plan = Trajectory(len(joints))
+        self._plan_input = InputParameter(len(joints))
+        self._proposed = False
+        self.braking = True
         self.position_rad: list[float] = [0.0] * len(joints)
         self.velocity_rad_s: list[float] = [0.0] * len(joints)
         self.start_at(self.position_rad)
@@ -46,20 +79,38 @@ class Motion:
         self._input.current_position = self.position_rad
         self._input.current_velocity = self._zeros
         self._input.current_acceleration = self._zeros
+        self._proposed = False
         self.brake()
 
-    def follow(self, target_rad: Sequence[float], *, speed: float = 1.0, together: bool = False) -> None:
+    def follow(
+        self,
+        target_rad: Sequence[float],
+        *,
+        speed: float = 1.0,
+        cap_rad_s: float = math.inf,
+        together: bool = False,
+    ) -> None:
         """Head for ``target_rad``, shape (n,) [rad], already inside the joints' ranges.
+
+        What still brakes harder than it may speed up goes on braking: with ordinary jerk it would take so long to
+        leave that deceleration that it ran backwards.
 
         Args:
             target_rad: Where to come to rest.
-            speed: Share of each joint's velocity limit, 0…1.
+            speed: Share of each joint's velocity limit, above 0 and at most 1.
+            cap_rad_s: What no joint exceeds.
             together: Whether all joints arrive at the same time (a move) or each as fast as it can (a slider).
         """
         self._target = list(target_rad)
+        if any(
+            abs(now) > limit + _SAME_RAD_S2
+            for now, limit in zip(self._input.current_acceleration, self._acceleration_limits, strict=True)
+        ):
+            return
+        self.braking = False
         self._input.control_interface = ControlInterface.Position
         self._input.synchronization = Synchronization.Time if together else Synchronization.No
-        self._input.max_velocity = [limit * speed for limit in self._velocity_limits]
+        self._input.max_velocity = [min(limit * speed, cap_rad_s) for limit in self._velocity_limits]
         self._input.max_acceleration = self._acceleration_limits
         self._input.max_jerk = self._jerk_limits
         self._input.target_position = self._target
@@ -68,17 +119,46 @@ class Motion:
 
     def brake(self) -> None:
         """Come to rest as fast as the robot type allows, and stay there."""
+        if not self.braking:
+            self._proposed = False
+        self.braking = True
+        self._brake(self._input)
+
+    def _brake(self, order: InputParameter) -> None:
         count = len(self._zeros)
-        self._input.control_interface = ControlInterface.Velocity
-        self._input.synchronization = Synchronization.No
-        self._input.max_velocity = self._velocity_limits
-        self._input.max_acceleration = [self._braking] * count
-        self._input.max_jerk = [self._braking / _BRAKING_RAMP_S] * count
-        self._input.target_velocity = self._zeros
-        self._input.target_acceleration = self._zeros
+        order.control_interface = ControlInterface.Velocity
+        order.synchronization = Synchronization.No
+        order.max_velocity = self._velocity_limits
+        order.max_acceleration = [self._braking] * count
+        order.max_jerk = [self._braking / _BRAKING_RAMP_S] * count
+        order.target_velocity = self._zeros
+        order.target_acceleration = self._zeros
+
+    def propose(self) -> list[list[float]]:
+        """Plan one period, and how the device would come to rest if it braked from there on.
+
+        Nothing moves until ``update``; a ``brake`` in between takes it back.
+
+        Returns:
+            Positions along that way, (n,) [rad] each: where it is now, where it would be, then until rest.
+
+        Raises:
+            MotionError: The generator found no trajectory.
+        """
+        plan(self._generator.update, self._input, self._output)
+        self._proposed = True
+        order = self._plan_input
+        order.current_position = self._output.new_position
+        order.current_velocity = self._output.new_velocity
+        order.current_acceleration = self._output.new_acceleration
+        self._brake(order)
+        plan(self._planner.calculate, order, self._plan)
+        knots = max(1, math.ceil(self._plan.duration / _KNOT_S))
+        ahead = [self._plan.at_time(self._plan.duration * (index + 1) / knots)[0] for index in range(knots)]
+        return [list(self.position_rad), list(self._output.new_position), *(list(knot) for knot in ahead)]
 
     def update(self) -> list[float]:
-        """Advance one period.
+        """Advance one period, as proposed if it was.
 
         Returns:
             The position to command now, shape (n,) [rad].
@@ -86,9 +166,9 @@ class Motion:
         Raises:
             MotionError: The generator found no trajectory; position and velocity are as they were.
         """
-        result = self._generator.update(self._input, self._output)
-        if result not in (Result.Working, Result.Finished):
-            raise MotionError(f"no trajectory from here ({result})")
+        if not self._proposed:
+            plan(self._generator.update, self._input, self._output)
+        self._proposed = False
         self._output.pass_to_input(self._input)
         self.position_rad = list(self._output.new_position)
         self.velocity_rad_s = list(self._output.new_velocity)
@@ -109,6 +189,10 @@ class Motion:
         """Whether the device rests at the target of the last ``follow``."""
         near = all(abs(a - b) <= _REACHED_RAD for a, b in zip(self.position_rad, self._target, strict=True))
         return near and not self.moving
+
+    def fastest_allowed_rad_s(self, speed: float) -> float:
+        """The highest speed of any joint at a share of its limit [rad/s]."""
+        return max(self._velocity_limits, default=0.0) * speed
 
     def braking_time_s(self) -> float:
         """How long ``brake`` would take from the present velocity [s], rounded up by the ramps at both ends."""

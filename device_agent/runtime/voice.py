@@ -26,10 +26,10 @@ from device_agent.protocol.messages import (
 )
 from device_agent.protocol.robot_type import RobotType
 from device_agent.runtime.audit import Happened
-from device_agent.runtime.controller import MAX_LOOP_AGE_S, WATCHDOG_S
 from device_agent.runtime.handover import Asked
 from device_agent.runtime.journal import Journal
 from device_agent.runtime.lease import Lease
+from device_agent.runtime.stream import MAX_LOOP_AGE_S, WATCHDOG_S
 
 Publish = Callable[..., bool]
 """``Transport.publish``."""

@@ -2,8 +2,9 @@
 
 import pytest
 
+from device_agent.ports.geometry import Geometry
 from device_agent.protocol.messages import Joint, JointTarget, Mode, Setpoint, StopLatch
-from device_agent.protocol.robot_type import RobotType
+from device_agent.protocol.robot_type import Base, RobotType
 from device_agent.runtime.controller import Controller
 from device_agent.runtime.courses import Outcome
 from device_agent.runtime.lease import LeaseGate, Refused
@@ -12,7 +13,7 @@ PERIOD_S = 0.008
 NAMES = ("shoulder", "elbow")
 
 
-def robot_type() -> RobotType:
+def robot_type(base: Base | None = None) -> RobotType:
     joints = tuple(
         Joint(
             name=name,
@@ -40,15 +41,17 @@ def robot_type() -> RobotType:
         frames=(),
         home_rad=dict.fromkeys(NAMES, 0.0),
         braking_rad_s2=20.0,
+        base=base,
     )
 
 
 class Rig:
     """A controller with a clock of its own and an operator who answers the newest telemetry."""
 
-    def __init__(self, **gate: int) -> None:
-        self.controller = Controller(robot_type(), LeaseGate(**gate))
+    def __init__(self, *, geometry: Geometry | None = None, base: Base | None = None, **gate: int) -> None:
+        self.controller = Controller(robot_type(base), LeaseGate(**gate), geometry=geometry)
         self.controller.start_at([0.0, 0.0])
+        self.limited: set[str] = set()
         self.now_s = 100.0
         self.sequence = 0
         self.velocities: list[float] = []
@@ -77,6 +80,7 @@ class Rig:
         for _ in range(round(seconds / PERIOD_S)):
             self.now_s += PERIOD_S
             tick = self.controller.step(self.now_s)
+            self.limited |= set(tick.limited)
             self.elbow = tick.position_rad[1]
             self.velocities.append((self.elbow - before) / PERIOD_S)
             before = self.elbow
@@ -84,10 +88,10 @@ class Rig:
 
     elbow = 0.0
 
-    def stream(self, epoch: int, seconds: float, elbow: float = 2.0) -> Mode:
+    def stream(self, epoch: int, seconds: float, elbow: float = 2.0, *, age_ms: int = 20) -> Mode:
         mode = self.controller.mode
         for _ in range(round(seconds / 0.024)):
-            self.offer(epoch, elbow)
+            self.offer(epoch, elbow, age_ms=age_ms)
             mode = self.run(0.024)
         return mode
 

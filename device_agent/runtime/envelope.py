@@ -1,0 +1,79 @@
+"""What the robot type and the robot's shape allow: names, ranges, room. The same for every source of motion."""
+
+import math
+from collections.abc import Mapping, Sequence
+
+from device_agent.ports.geometry import Clearance, Geometry
+from device_agent.protocol.robot_type import RobotType
+from device_agent.runtime.lease import Refused
+
+
+class Envelope:
+    """The limits of one device's positions. Keeps nothing, moves nothing.
+
+    Args:
+        robot_type: Joints and their ranges.
+        geometry: The robot's shape; without it nobody knows what it could touch, and only ranges hold.
+    """
+
+    def __init__(self, robot_type: RobotType, geometry: Geometry | None) -> None:
+        self._joints = robot_type.joints
+        self._index = {joint.name: index for index, joint in enumerate(robot_type.joints)}
+        self._geometry = geometry
+
+    def check(self, position_rad: Mapping[str, float]) -> None:
+        """All joints are known, all numbers are numbers.
+
+        Raises:
+            Refused: They are not.
+        """
+        unknown = sorted(set(position_rad) - set(self._index))
+        if unknown:
+            raise Refused("unknown_joint", f"no joint '{unknown[0][:80]}'; there are {', '.join(self._index)}")
+        if not all(map(math.isfinite, position_rad.values())):
+            raise Refused("not_finite", "a position must be a finite number")
+
+    def clamp(self, position_rad: Mapping[str, float], target_rad: list[float]) -> tuple[str, ...]:
+        """Write positions into a target, each inside its range.
+
+        Returns:
+            The joints that were asked beyond it, as ``limited`` names them.
+        """
+        limited = []
+        for name, value in position_rad.items():
+            index = self._index[name]
+            joint = self._joints[index]
+            target_rad[index] = min(max(value, joint.lower_rad), joint.upper_rad)
+            if target_rad[index] != value:
+                limited.append(f"{name}: range")
+        return tuple(limited)
+
+    def target(self, position_rad: Mapping[str, float], now_rad: Sequence[float]) -> list[float]:
+        """Where a move to these positions ends; joints not named stay, shape (n,) [rad].
+
+        Raises:
+            Refused: Unknown joint, a number that is none, outside a joint's range, or no room there.
+        """
+        self.check(position_rad)
+        target = list(now_rad)
+        for name, value in position_rad.items():
+            joint = self._joints[self._index[name]]
+            if not joint.lower_rad <= value <= joint.upper_rad:
+                raise Refused(
+                    "out_of_range",
+                    f"{name} can go from {joint.lower_rad:.4f} to {joint.upper_rad:.4f} rad, not to {value:.4f}",
+                )
+            target[self._index[name]] = value
+        if self._geometry is not None:
+            there = self._geometry.clearance(target)
+            # Whoever is too near something already may go to where there is more room.
+            if there.room_m < min(0.0, self._geometry.clearance(now_rad).room_m):
+                short_mm = math.ceil(-there.room_m * 1000)
+                raise Refused("no_room", f"no room there: {there.text}, {short_mm} mm too near; choose another")
+        return target
+
+    def blocked(self, path_rad: Sequence[Sequence[float]]) -> Clearance | None:
+        """What is in the way, if anything is."""
+        if self._geometry is None or all(position == path_rad[0] for position in path_rad):
+            return None
+        return self._geometry.sweep(path_rad).clearance
