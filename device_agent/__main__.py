@@ -112,13 +112,14 @@ def _configuration(options: argparse.Namespace, home: Home) -> Configuration:
     if not server.startswith(("http://", "https://")):
         raise HomeError("say where the server is, for example `--server http://127.0.0.1:8080`")
     polling = _polling(options, before.http if before else HttpPolling())
-    return Configuration(
+    said = Configuration(
         server=server,
         name=options.name or (before.name if before else home.folder.resolve().name),
         transport=options.transport or (before.transport if before else links.names()[0]),
         http=polling,
         devices=tuple(_entry(text) for text in options.device) or (before.devices if before else ()),
     )
+    return said.keeping(before) if before else said
 
 
 def _polling(options: argparse.Namespace, before: HttpPolling) -> HttpPolling:

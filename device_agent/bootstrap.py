@@ -12,6 +12,7 @@ from device_agent.runtime.agent import Agent
 from device_agent.runtime.device import Device
 from device_agent.runtime.home import Configuration, DeviceEntry, Home, HomeError, Pairing
 from device_agent.runtime.journal import Journal
+from device_agent.runtime.room import Room
 from device_agent.transports.http.api import CloudApi
 
 ROBOTS = Path(__file__).resolve().parent.parent / "robots"
@@ -102,6 +103,12 @@ def build(home: Home, *, trace: Path | None = None) -> Cell:
     journal.open(now_ms=wall_ms())
     journal.end_open(now_ms=wall_ms(), tick_ms=tick_ms())
     membership = links.Membership(pairing, configuration, enrolled_devices(configuration))
+    room = Room(
+        space=pairing.space,
+        agent=pairing.agent,
+        own=[entry.name for entry in configuration.devices],
+        named=configuration.sources,
+    )
     transport = links.make(
         links.Wiring(
             configuration=configuration,
@@ -110,12 +117,15 @@ def build(home: Home, *, trace: Path | None = None) -> Cell:
             open_api=lambda: api_of(home, configuration, clock),
             next_session=journal.next_session,
             quiet=lambda: agent.quiet,
+            listen=room.topics(),
         )
     )
     devices = {}
     for entry in configuration.devices:
-        devices[entry.name] = _device(entry, pairing, journal=journal, clock=clock, transport=transport, trace=trace)
-    agent = Agent(devices, transport)
+        devices[entry.name] = _device(
+            entry, pairing, journal=journal, clock=clock, transport=transport, room=room, trace=trace
+        )
+    agent = Agent(devices, transport, room=room, address=(pairing.space, pairing.agent))
     return Cell(agent, journal, membership)
 
 
@@ -126,6 +136,7 @@ def _device(
     journal: Journal,
     clock: CloudClock,
     transport: Transport,
+    room: Room,
     trace: Path | None,
 ) -> Device:
     kind = load_type(entry.type)
@@ -145,6 +156,8 @@ def _device(
         cloud_clock=clock,
         keys=pairing.public_keys(),
         publish=transport.publish,
+        room=room,
+        interlocks=entry.interlocks,
         geometry=_geometry(kind, str(entry.options.get("scene", ""))),
     )
 

@@ -27,6 +27,7 @@ class Wiring:
         open_api: A view of the HTTP API for one thread.
         next_session: The next session number, rising across restarts.
         quiet: Whether a short break of the link would disturb nothing.
+        listen: Topics of the space's other agents to hear.
     """
 
     configuration: Configuration
@@ -35,6 +36,7 @@ class Wiring:
     open_api: Callable[[], CloudApi]
     next_session: Callable[[], int]
     quiet: Callable[[], bool]
+    listen: tuple[str, ...] = ()
 
     @property
     def presence_topic(self) -> str:
@@ -152,6 +154,7 @@ def _mqtt(wiring: Wiring) -> Transport:
         presence_topic=wiring.presence_topic,
         next_session=wiring.next_session,
         software=SOFTWARE,
+        listen=wiring.listen,
         quiet=wiring.quiet,
     )
 

@@ -27,6 +27,7 @@ SERVICE_PUBLISH = (
     *(f"{_EVERY_DEVICE}/{kind}" for kind in (topics.DESC, topics.STATE, topics.EVENT, topics.ACK)),
     f"{_EVERY_DEVICE}/{topics.DESC}/+",
     f"{_EVERY_DEVICE}/{topics.TELE}/+",
+    f"{_EVERY_DEVICE}/{topics.LATE}/+",
     control.TOPIC,
 )
 """What the functions say: orders; and for agents that speak HTTP, what those have told them."""
@@ -35,6 +36,7 @@ SERVICE_SUBSCRIBE = (
     *(f"{_EVERY_DEVICE}/{kind}" for kind in (topics.DESC, topics.STATE, topics.EVENT, topics.ACK)),
     f"{_EVERY_DEVICE}/{topics.DESC}/+",
     f"{_EVERY_DEVICE}/{topics.TELE}/+",
+    f"{_EVERY_DEVICE}/{topics.LATE}/+",
 )
 """What the functions hear."""
 
@@ -122,8 +124,14 @@ def issued_at(token: str) -> float:
     return float(moment) if isinstance(moment, int | float) else 0.0
 
 
+def agent_orders(space: str, agent: str) -> tuple[str, ...]:
+    """Where an agent hears what is addressed to its devices."""
+    own = f"{topics.ROOT}/{space}/{agent}/+"
+    return (f"{own}/{topics.CMD}", f"{own}/{topics.CTL}/+", f"{own}/{topics.STOP}")
+
+
 def agent_grant(space: str, agent: str, *, token_id: str, lifetime_s: float) -> Grant:
-    """What an agent may do: speak for its own devices, hear what is addressed to them."""
+    """What an agent may do: speak for its own devices, hear what is addressed to them, and what its space measures."""
     own = f"{topics.ROOT}/{space}/{agent}"
     spoken = (topics.DESC, topics.STATE, topics.EVENT, topics.ACK)
     return Grant(
@@ -134,9 +142,13 @@ def agent_grant(space: str, agent: str, *, token_id: str, lifetime_s: float) -> 
             *(f"{own}/+/{kind}" for kind in spoken),
             f"{own}/+/{topics.DESC}/+",
             f"{own}/+/{topics.TELE}/+",
+            f"{own}/+/{topics.LATE}/+",
             f"{own}/+/{topics.CAM}/+",
         ),
-        subscribe=(f"{own}/+/{topics.CMD}", f"{own}/+/{topics.CTL}/+", f"{own}/+/{topics.STOP}"),
+        subscribe=(
+            *agent_orders(space, agent),
+            topics.device(space, topics.ANY, topics.ANY, topics.TELE, topics.ANY),
+        ),
         token_id=token_id,
         expires_at=int(time.time() + lifetime_s),
     )

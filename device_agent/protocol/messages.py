@@ -73,6 +73,18 @@ class Stream(Struct, frozen=True, kw_only=True):
     rate_hz: float
 
 
+class InterlockRule(Struct, frozen=True, kw_only=True):
+    """When the room slows or holds the device: on its condition, and when its sensor was silent for ``stale_ms``.
+
+    ``name`` says device, stream and condition; ``speed`` is the share that is left, 0 for ``hold``.
+    """
+
+    name: Text
+    action: Literal["slow", "hold"]
+    speed: float
+    stale_ms: Milliseconds
+
+
 class Description(Struct, frozen=True, kw_only=True):
     """``desc``: what the device is and can do. Retained."""
 
@@ -87,6 +99,7 @@ class Description(Struct, frozen=True, kw_only=True):
     watchdog_ms: Milliseconds = 0
     max_loop_age_ms: Milliseconds = 0
     simulated: bool = False
+    interlocks: tuple[InterlockRule, ...] = ()
 
 
 class Geometry(Struct, frozen=True, kw_only=True):
@@ -189,6 +202,14 @@ class Fault(Struct, frozen=True, kw_only=True):
     since_ms: Milliseconds
 
 
+class Restriction(Struct, frozen=True, kw_only=True):
+    """What the room allows at this moment: ``speed`` is the share that is left, 0: hold. ``source`` is an interlock."""
+
+    source: Text
+    speed: float
+    why: Text
+
+
 class State(Struct, frozen=True, kw_only=True):
     """``state``: the current condition. Retained; on change and every 30 s, at most once a second.
 
@@ -206,6 +227,7 @@ class State(Struct, frozen=True, kw_only=True):
     lease: LeaseState | None = None
     action: ActionState | None = None
     faults: tuple[Fault, ...] = ()
+    restrictions: tuple[Restriction, ...] = ()
 
 
 class JointTelemetry(Struct, frozen=True, kw_only=True):

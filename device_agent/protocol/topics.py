@@ -16,6 +16,7 @@ CONN = "conn"
 DESC = "desc"
 STATE = "state"
 TELE = "tele"
+LATE = "late"
 CAM = "cam"
 EVENT = "event"
 CMD = "cmd"
@@ -23,8 +24,8 @@ ACK = "ack"
 CTL = "ctl"
 STOP = "stop"
 
-CLASSES = frozenset({DESC, STATE, TELE, CAM, EVENT, CMD, ACK, CTL, STOP})
-_NAME_REQUIRED = frozenset({TELE, CAM, CTL})
+CLASSES = frozenset({DESC, STATE, TELE, LATE, CAM, EVENT, CMD, ACK, CTL, STOP})
+_NAME_REQUIRED = frozenset({TELE, LATE, CAM, CTL})
 _NAME_ALLOWED = _NAME_REQUIRED | {DESC}
 ANY = "+"
 

@@ -7,6 +7,7 @@ from device_agent.ports.transport import Transport
 from device_agent.protocol import topics
 from device_agent.protocol.errors import ProtocolError
 from device_agent.runtime.device import Device
+from device_agent.runtime.room import Room
 
 _log = logging.getLogger(__name__)
 
@@ -17,11 +18,17 @@ class Agent:
     Args:
         devices: By name.
         transport: Not yet started.
+        room: Hears what the space's other agents measure.
+        address: Space and agent.
     """
 
-    def __init__(self, devices: Mapping[str, Device], transport: Transport) -> None:
+    def __init__(
+        self, devices: Mapping[str, Device], transport: Transport, *, room: Room, address: tuple[str, str]
+    ) -> None:
         self._devices = devices
         self._transport = transport
+        self._room = room
+        self._address = address
 
     def start(self) -> None:
         """Start every device, then the link: a device holds before anybody can speak to it.
@@ -48,8 +55,11 @@ class Agent:
     def _receive(self, topic: str, payload: bytes) -> None:
         try:
             parsed = topics.parse(topic)
+            if (parsed.space, parsed.agent) != self._address:
+                self._room.receive(parsed, payload)
+                return
         except ProtocolError as error:
-            _log.warning("message refused: %s", error)
+            _log.warning("message refused: %s", str(error)[:300])
             return
         device = self._devices.get(parsed.device)
         if device is not None:

@@ -6,7 +6,7 @@ does. Setpoints and Stop go from the transport's thread straight into the contro
 
 import logging
 import time
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 
 from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PublicKey
 
@@ -16,15 +16,17 @@ from device_agent.ports.geometry import Geometry
 from device_agent.protocol import codec, topics
 from device_agent.protocol.errors import ProtocolError
 from device_agent.protocol.events import EventKind
-from device_agent.protocol.messages import Setpoint, Stop, StopLatch
+from device_agent.protocol.messages import JointTelemetry, Setpoint, Stop, StopLatch
 from device_agent.protocol.robot_type import RobotType
 from device_agent.runtime.actions import Executor
 from device_agent.runtime.audit import Audit, Happened
 from device_agent.runtime.controller import Controller
+from device_agent.runtime.interlocks import Interlock, Interlocks
 from device_agent.runtime.journal import Journal
 from device_agent.runtime.lease import LeaseGate, Refused
 from device_agent.runtime.loop import ControlLoop
 from device_agent.runtime.office import Office
+from device_agent.runtime.room import Room
 from device_agent.runtime.voice import Publish, Voice
 
 _REFUSED = {
@@ -49,6 +51,8 @@ class Device:
         cloud_clock: For ``ttl_ms``.
         keys: The cloud's pinned public keys by key id.
         publish: Sends a message.
+        room: What the space's other devices have measured last.
+        interlocks: How the room slows or holds this one.
         geometry: The robot's shape, ``None`` where its type has no model.
     """
 
@@ -65,6 +69,8 @@ class Device:
         cloud_clock: CloudClock,
         keys: Mapping[str, Ed25519PublicKey],
         publish: Publish,
+        room: Room,
+        interlocks: Sequence[Interlock] = (),
         geometry: Geometry | None = None,
     ) -> None:
         self.name = name
@@ -79,10 +85,21 @@ class Device:
             label=label,
             robot_type=robot_type,
             simulated=driver.simulated,
+            interlocks=[rule.shown for rule in interlocks],
             journal=journal,
             publish=publish,
         )
-        self._loop = ControlLoop(robot_type, driver, self._controller, name=name, tell=self.voice.tell)
+        self._room = room
+        self._interlocks = Interlocks(
+            interlocks,
+            room,
+            restrict=self._controller.restrict,
+            lift=self._controller.lift,
+            note=lambda happened, code, now_s: self._audit.refused(happened, code=code, now_s=now_s),
+        )
+        self._loop = ControlLoop(
+            robot_type, driver, self._controller, name=name, tell=self._measured, watch=self._interlocks.step
+        )
         self._executor = Executor(
             robot_type, self._controller, observe=lambda: self._loop.seen, report=self.voice.report
         )
@@ -124,6 +141,10 @@ class Device:
     def quiet(self) -> bool:
         """Whether nothing would be disturbed by a short break of the link."""
         return not self._controller.moving and self._executor.current() is None
+
+    def _measured(self, telemetry: JointTelemetry) -> None:
+        self._room.note(self.name, topics.JOINTS, telemetry)
+        self.voice.tell(telemetry)
 
     # ------------------------------------------------------------ what arrives (transport's thread)
 

@@ -19,10 +19,12 @@ import msgspec
 from cryptography.hazmat.primitives import serialization
 from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey, Ed25519PublicKey
 from msgspec import Meta, Struct
+from msgspec.structs import replace
 
 from device_agent.protocol import signing
 from device_agent.protocol.errors import ProtocolError
 from device_agent.protocol.messages import Id, Label
+from device_agent.runtime.interlocks import Interlock
 
 
 class HomeError(Exception):
@@ -37,6 +39,17 @@ class DeviceEntry(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True)
     driver: str = ""
     label: Label = ""
     options: dict[str, Any] = {}
+    interlocks: Annotated[tuple[Interlock, ...], Meta(max_length=32)] = ()
+
+
+class RoomStream(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """One ``[[room]]`` of ``agent.toml``: a stream that movements may ask for, of a device of the same space.
+
+    ``device`` is its id as the console shows it, or the name of one of this agent's own devices.
+    """
+
+    device: Id
+    stream: Id
 
 
 class HttpPolling(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -57,6 +70,20 @@ class Configuration(Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tru
     devices: tuple[DeviceEntry, ...]
     transport: str = "mqtt"
     http: HttpPolling = HttpPolling()
+    room: Annotated[tuple[RoomStream, ...], Meta(max_length=64)] = ()
+
+    def keeping(self, before: "Configuration") -> "Configuration":
+        """This, with what ``enroll`` does not ask for as it was before: the room and each device's interlocks."""
+        rules = {device.name: device.interlocks for device in before.devices}
+        devices = tuple(replace(device, interlocks=rules.get(device.name, ())) for device in self.devices)
+        return replace(self, devices=devices, room=before.room)
+
+    @property
+    def sources(self) -> tuple[tuple[str, str], ...]:
+        """Device and stream of everything of the room that this agent listens to."""
+        named = [(stream.device, stream.stream) for stream in self.room]
+        named += [(rule.device, rule.stream) for device in self.devices for rule in device.interlocks]
+        return tuple(dict.fromkeys(named))
 
 
 class Pairing(Struct, frozen=True, kw_only=True):
@@ -124,6 +151,16 @@ class Home:
         names = [device.name for device in found.devices]
         if not names or len(set(names)) != len(names):
             raise HomeError(f"{path}: needs at least one device, each with a name of its own")
+        for source, _ in found.sources:
+            if source not in names and "-" not in source:
+                raise HomeError(
+                    f"{path}: '{source}' is no device of this agent ({', '.join(names)}); "
+                    "name one of another agent by its id, as the console shows it"
+                )
+        for device in found.devices:
+            rules = [rule.name for rule in device.interlocks]
+            if len(set(rules)) != len(rules):
+                raise HomeError(f"{path}: two interlocks of '{device.name}' have the same device, stream and condition")
         return found
 
     def save_configuration(self, configuration: Configuration) -> None:
@@ -132,12 +169,16 @@ class Home:
         if configuration.transport == "http" or configuration.http != HttpPolling():
             lines += ["", "[http]"]
             lines += [f"{key} = {_toml(getattr(configuration.http, key))}" for key in ("poll", "poll_ms")]
+        for stream in configuration.room:
+            lines += ["", "[[room]]", *_table(stream)]
         for device in configuration.devices:
             lines += ["", "[[devices]]"]
             lines += [f"{key} = {_toml(getattr(device, key))}" for key in ("name", "type", "driver", "label")]
             if device.options:
                 lines.append("[devices.options]")
                 lines += [f"{_toml(key)} = {_toml(value)}" for key, value in device.options.items()]
+            for rule in device.interlocks:
+                lines += ["", "[[devices.interlocks]]", *_table(rule)]
         self._write(self.folder / "agent.toml", ("\n".join(lines) + "\n").encode())
 
     def pairing(self) -> Pairing | None:
@@ -176,6 +217,11 @@ class Home:
             Path(temporary).replace(path)
         except OSError as error:
             raise HomeError(f"{path} cannot be written: {error.strerror}") from error
+
+
+def _table(entry: Struct) -> list[str]:
+    """The fields of an entry that were given."""
+    return [f"{key} = {_toml(value)}" for key, value in msgspec.to_builtins(entry).items() if value is not None]
 
 
 def _toml(value: Any) -> str:

@@ -28,6 +28,7 @@ class ControlLoop:
         controller: Decides.
         name: The device's name.
         tell: Called with telemetry, 20 times a second at rest and 50 times in motion; must not block.
+        watch: Called before each decision with the monotonic clock [s]: the room's interlocks. Quick; raises into a hold.
     """
 
     def __init__(
@@ -38,6 +39,7 @@ class ControlLoop:
         *,
         name: str,
         tell: Callable[[JointTelemetry], None],
+        watch: Callable[[float], None],
     ) -> None:
         self._period_s = robot_type.period_ms / 1000
         self._driver = driver
@@ -46,6 +48,7 @@ class ControlLoop:
         self._controller = controller
         self._name = name
         self._tell = tell
+        self._watch = watch
         self._sequence = 0
         self._next_telemetry_s = 0.0
         self._stopping = threading.Event()
@@ -80,6 +83,7 @@ class ControlLoop:
             now_s = time.monotonic()
             try:
                 self.seen = self._driver.observe()
+                self._watch(now_s)
                 tick = self._controller.step(now_s)
                 applied = self._driver.send(tick.position_rad)
                 self._controller.applied(applied)

@@ -26,6 +26,7 @@ from device_agent.protocol.messages import (
     Reason,
     ReleaseLease,
     ResetStop,
+    Restriction,
     RunMovement,
     StopDevice,
     StopLatch,
@@ -251,4 +252,7 @@ class Office:
             latch=self._controller.latch,
             fault=self._controller.fault,
             action=self._executor.current(),
+            restrictions=tuple(
+                Restriction(source=one.source, speed=one.speed, why=one.why) for one in self._controller.restrictions
+            ),
         )

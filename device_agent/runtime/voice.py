@@ -4,7 +4,7 @@ import queue
 import threading
 import time
 import uuid
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 from device_agent.ports.clock import tick_ms, wall_ms
@@ -16,9 +16,11 @@ from device_agent.protocol.messages import (
     Description,
     Event,
     Fault,
+    InterlockRule,
     JointTelemetry,
     LeaseState,
     Mode,
+    Restriction,
     OpenRequest,
     State,
     StopLatch,
@@ -50,6 +52,7 @@ class Condition:
     latch: StopLatch | None
     fault: str | None
     action: ActionState | None
+    restrictions: tuple[Restriction, ...]
 
     def shown(self) -> tuple[object, ...]:
         """What makes a new ``state`` worth sending: progress alone does not."""
@@ -62,6 +65,7 @@ class Condition:
             self.latch,
             self.fault,
             self.action and self.action.id,
+            self.restrictions,
         )
 
 
@@ -73,6 +77,7 @@ class Voice:
         label: Its name for people.
         robot_type: Joints, limits, streams.
         simulated: Whether no real metal moves.
+        interlocks: How the room slows or holds it.
         journal: Open.
         publish: Sends a message.
 
@@ -87,6 +92,7 @@ class Voice:
         label: str,
         robot_type: RobotType,
         simulated: bool,
+        interlocks: Sequence[InterlockRule],
         journal: Journal,
         publish: Publish,
     ) -> None:
@@ -95,6 +101,7 @@ class Voice:
         self._label = label
         self._robot_type = robot_type
         self._simulated = simulated
+        self._interlocks = tuple(interlocks)
         self._journal = journal
         self._publish = publish
         self._delivered: queue.SimpleQueue[Ack] = queue.SimpleQueue()
@@ -161,6 +168,7 @@ class Voice:
             lease=_lease_state(now.lease, now.asked, now_s),
             action=now.action,
             faults=(Fault(code="driver", message=now.fault[:2000], since_ms=at_ms),) if now.fault else (),
+            restrictions=now.restrictions,
         )
         if self._retain(self._topic(topics.STATE), state):
             self._shown, self._shown_at_s = shown, now_s
@@ -203,6 +211,7 @@ class Voice:
             watchdog_ms=round(WATCHDOG_S * 1000),
             max_loop_age_ms=round(MAX_LOOP_AGE_S * 1000),
             simulated=self._simulated,
+            interlocks=self._interlocks,
         )
 
     def _topic(self, kind: str, name: str = "") -> str:

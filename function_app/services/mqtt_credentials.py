@@ -104,12 +104,14 @@ class MqttCredentials:
     async def agent(self, agent: Agent) -> Issued:
         """To speak for an agent's own devices and hear what is addressed to them.
 
+        It may also hear what its space measures; which of that it does, its own configuration says.
+
         Raises:
             Problem: ``agent-unclaimed``, ``broker-unavailable``.
         """
         space = require_claimed(agent)
         grant = grants.agent_grant(space, agent.id, token_id=new_id(), lifetime_s=AGENT_S)
-        return await self._issue(grant, AGENT_S, grant.publish, grant.subscribe)
+        return await self._issue(grant, AGENT_S, grant.publish, grants.agent_orders(space, agent.id))
 
     async def _issue(
         self, grant: Grant, lifetime_s: int, publish: tuple[str, ...], subscribe: tuple[str, ...]

@@ -27,6 +27,8 @@ _REFRESH_AT = 0.8
 """Credentials are renewed after this share of their life, at a quiet moment; at the last moment in any case."""
 _REFRESH_LATEST = 0.97
 _MOST_QUEUED = 2000
+_MOST_FILTERS = 8
+"""In one SUBSCRIBE: AWS IoT Core takes no more."""
 _log = logging.getLogger(__name__)
 
 
@@ -51,6 +53,7 @@ class MqttTransport:
         presence_topic: Where presence and will go.
         next_session: The next session number, rising across restarts.
         software: Name and version, for presence.
+        listen: Topics of other agents to hear as well, as far as the broker lets it. Without them the link is up, too.
         quiet: Whether a short break would disturb nothing.
     """
 
@@ -61,12 +64,14 @@ class MqttTransport:
         presence_topic: str,
         next_session: Callable[[], int],
         software: str,
+        listen: tuple[str, ...] = (),
         quiet: Callable[[], bool] = lambda: True,
     ) -> None:
         self._access = access
         self._presence_topic = presence_topic
         self._next_session = next_session
         self._software = software
+        self._listen = listen
         self._quiet = quiet
         self._version = MQTTProtocolVersion.MQTTv5
         self._client: mqtt.Client | None = None
@@ -77,6 +82,7 @@ class MqttTransport:
         self._delivered: dict[int, Callable[[], None]] = {}
         self._early: set[int] = set()
         self._session = 0
+        self._orders: int | None = None
         self._gone = threading.Event()
 
     def start(self, receive: Receive, link_changed: LinkChanged) -> None:
@@ -201,17 +207,23 @@ class MqttTransport:
                 _log.warning("the broker refused the connection: %s", code)
             client.disconnect()
             return
-        client.subscribe([(pattern, 1) for pattern in access.subscribe])
+        _, self._orders = client.subscribe([(pattern, 1) for pattern in access.subscribe])
 
     def _on_subscribe(
-        self, client: mqtt.Client, _access: object, _mid: int, codes: list[ReasonCode], _properties: Properties | None
+        self, client: mqtt.Client, _access: object, mid: int, codes: list[ReasonCode], _properties: Properties | None
     ) -> None:
+        if mid != self._orders:
+            if any(code.is_failure for code in codes):
+                _log.warning("the broker does not let this agent hear all that agent.toml names of the room")
+            return
         if any(code.is_failure for code in codes):
             _log.error("the broker refused a subscription; check the agent's rights")
             client.disconnect()
             return
         self._up = True
         client.publish(self._presence_topic, self._presence(online=True), qos=1, retain=True)
+        for first in range(0, len(self._listen), _MOST_FILTERS):
+            client.subscribe([(topic, 0) for topic in self._listen[first : first + _MOST_FILTERS]])
         self._link_changed(True)
 
     def _on_disconnect(

@@ -151,6 +151,22 @@ def test_an_agent_cannot_hear_what_another_has_retained(broker: RunningBroker, s
         assert [m.topic for m in (evil.receive(), *evil.heard())] == [own]
 
 
+def test_an_agent_hears_what_its_own_space_measures_and_nothing_else_of_it(broker: RunningBroker, space: str) -> None:
+    measured = f"ts/v1/{space}/sensors/pir/tele/presence"
+    kinds = ("late/presence", "cam/room", "event", "ack", "cmd", "ctl/1", "stop", "desc", "state")
+    others = [f"ts/v1/{space}/sensors/pir/{kind}" for kind in kinds]
+    others.append(f"ts/v1/{space}-elsewhere/sensors/pir/tele/presence")
+    with (
+        broker.client(f"{space}-speaker", publish=(*others, measured)) as speaker,
+        broker.connect("robot", agent_of(broker, space, "robot")) as robot,
+    ):
+        for topic in (measured, *others):
+            robot.subscribe(topic)
+        for topic in (*others, measured):
+            speaker.publish_acknowledged(topic, b"1")
+        assert [m.topic for m in (robot.receive(), *robot.heard())] == [measured]
+
+
 def test_a_will_on_a_topic_outside_the_grant_is_never_said(broker: RunningBroker, space: str) -> None:
     conn = f"ts/v1/{space}/victim/conn"
     ear, marker = echo(broker, space, conn)

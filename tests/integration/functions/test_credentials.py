@@ -101,7 +101,7 @@ def test_an_agent_speaks_for_its_own_devices(pair: Pair) -> None:
     own = f"ts/v1/{robot.space}/{robot.id}"
     assert (issued["client_id"], issued["lifetime_s"]) == (robot.id, 3600)
     assert sorted(issued["subscribe"]) == sorted([f"{own}/+/cmd", f"{own}/+/ctl/+", f"{own}/+/stop"])
-    spoken = ("desc", "state", "event", "ack", "desc/+", "tele/+", "cam/+")
+    spoken = ("desc", "state", "event", "ack", "desc/+", "tele/+", "late/+", "cam/+")
     assert sorted(issued["publish"]) == sorted([f"{own}/conn", *(f"{own}/+/{kind}" for kind in spoken)])
 
 

@@ -8,10 +8,12 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from device_agent.runtime.home import Configuration, DeviceEntry, Home, HomeError, HttpPolling
+from device_agent.runtime.home import Configuration, DeviceEntry, Home, HomeError, HttpPolling, RoomStream
+from device_agent.runtime.interlocks import Interlock
 
 ARM = DeviceEntry(name="arm", type="ur5")
 MINIMAL = 'server = "http://s"\nname = "n"\n[[devices]]\nname = "arm"\ntype = "ur5"\n'
+INTERLOCK = '[[devices.interlocks]]\ndevice = "a-pir"\nstream = "presence"\nfield = "present"\nequals = true\n'
 LABELS = st.text(max_size=20).filter(lambda text: not any(0xD800 <= ord(each) < 0xE000 for each in text))
 VALUES: Any = st.recursive(
     st.booleans() | st.integers(-(2**31), 2**31) | st.floats(allow_nan=False, allow_infinity=False) | LABELS,
@@ -25,9 +27,17 @@ def test_what_is_written_is_read_again(
     name: str, transport: str, options: dict[str, Any], tmp_path_factory: pytest.TempPathFactory
 ) -> None:
     home = Home(tmp_path_factory.getbasetemp() / "written")
-    devices = (DeviceEntry(name="arm", type="ur5", options=options), DeviceEntry(name="other", type="ur5"))
+    rules = (
+        Interlock(device="abc-pir", stream="presence", field="present", equals=True),
+        Interlock(device="other", stream="joints", field="velocity_rad_s.0", above=0.5, action="slow", stale_s=1),
+    )
+    devices = (
+        DeviceEntry(name="arm", type="ur5", options=options, interlocks=rules),
+        DeviceEntry(name="other", type="ur5", interlocks=rules[:1]),
+    )
+    room = (RoomStream(device="abc-lamp", stream="light"),)
     polling = HttpPolling(poll="plain", poll_ms=250)
-    written = Configuration(server="http://s", name=name, transport=transport, http=polling, devices=devices)
+    written = Configuration(server="http://s", name=name, transport=transport, http=polling, devices=devices, room=room)
     home.save_configuration(written)
     assert home.configuration() == written
 
@@ -46,6 +56,12 @@ def test_a_folder_written_before_there_was_a_choice_speaks_mqtt(tmp_path: Path) 
         ("[http]\npoll_s = 1\n", "poll_s"),
         ("[https]\n", "https"),
         ("= 1\n", "agent.toml"),
+        ('[[room]]\ndevice = "a-b"\n', "stream"),
+        ('[[room]]\ndevice = "pir"\nstream = "presence"\n', "'pir' is no device of this agent .arm.; name one"),
+        (f"{INTERLOCK}[[devices.interlocks]]\nspeed = 0.5\n", "device"),
+        (INTERLOCK.replace("equals = true", ""), "exactly one of above, below, equals"),
+        (INTERLOCK.replace("true", "nan"), "finite"),
+        (INTERLOCK + INTERLOCK, "two interlocks of 'arm'"),
     ],
 )
 def test_what_is_wrong_is_named(tmp_path: Path, text: str, named: str) -> None:
@@ -60,3 +76,27 @@ def test_nobody_else_may_read_it(tmp_path: Path) -> None:
     home.save_configuration(Configuration(server="http://s", name="n", devices=(ARM,)))
     assert stat.S_IMODE(home.folder.stat().st_mode) == 0o700
     assert {stat.S_IMODE(path.stat().st_mode) for path in home.folder.iterdir()} == {0o600}
+
+
+def test_everything_of_the_room_that_is_named_is_a_source_once(tmp_path: Path) -> None:
+    (tmp_path / "agent.toml").write_text(
+        MINIMAL
+        + INTERLOCK
+        + '[[room]]\ndevice = "a-pir"\nstream = "presence"\n[[room]]\ndevice = "arm"\nstream = "x"\n'
+    )
+    assert Home(tmp_path).configuration().sources == (("a-pir", "presence"), ("arm", "x"))
+
+
+def test_enrolling_again_keeps_the_room_and_each_devices_interlocks() -> None:
+    rules = (Interlock(device="a-pir", stream="presence", field="present", equals=True),)
+    before = Configuration(
+        server="http://s",
+        name="n",
+        devices=(DeviceEntry(name="arm", type="ur5", interlocks=rules),),
+        room=(RoomStream(device="a-lamp", stream="light"),),
+    )
+    said = Configuration(server="http://t", name="n", devices=(ARM, DeviceEntry(name="leg", type="ur5")))
+    kept = said.keeping(before)
+    assert kept.server == "http://t"
+    assert [device.interlocks for device in kept.devices] == [rules, ()]
+    assert kept.room == before.room
