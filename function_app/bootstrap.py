@@ -10,7 +10,7 @@ from function_app.adapters.local.broker_access import MosquittoBrokerAccess, Tok
 from function_app.adapters.local.catalogue import FolderCatalogue
 from function_app.adapters.local.clock import SystemClock
 from function_app.adapters.local.command_bus import MqttCommandBus
-from function_app.adapters.local.feed import MqttFeed, MqttTelemetry
+from function_app.adapters.local.feed import MqttFeed, MqttLate, MqttTelemetry
 from function_app.adapters.local.keys import FileKeys
 from function_app.adapters.local.model_compiler import MujocoCompiler
 from function_app.adapters.local.tables import SqliteTables
@@ -83,6 +83,7 @@ class Functions:
     bus: CommandBus
     feed: Feed
     telemetry: Telemetry
+    late: Telemetry
     access: BrokerAccess
     keys: Keys
     clock: Clock
@@ -158,6 +159,7 @@ def build(settings: Settings, *, clock: Clock | None = None) -> Functions:
     bus = _bus(settings, access)
     feed = MqttFeed(host=settings.mqtt_host, port=settings.mqtt_port, credentials=access.service_credentials)
     telemetry = MqttTelemetry(host=settings.mqtt_host, port=settings.mqtt_port, credentials=access.service_credentials)
+    late = MqttLate(host=settings.mqtt_host, port=settings.mqtt_port, credentials=access.service_credentials)
 
     forget = Forget(tables=tables, blobs=blobs)
     events = Events(tables=tables, forget=forget, clock=now)
@@ -223,6 +225,7 @@ def build(settings: Settings, *, clock: Clock | None = None) -> Functions:
         bus=bus,
         feed=feed,
         telemetry=telemetry,
+        late=late,
         access=access,
         keys=keys,
         clock=now,

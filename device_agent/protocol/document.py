@@ -42,7 +42,7 @@ _CHANNELS = (
         "Named values measured at one moment; every stream but `joints`.",
     ),
     _Channel(
-        "late joints",
+        "late_joints",
         f"{_DEVICE}/late/joints",
         "JointTelemetry",
         1,
@@ -50,12 +50,12 @@ _CHANNELS = (
         "Joints measured while the link was down, thinned, with their own times; for the series, never for live views.",
     ),
     _Channel(
-        "late measurements",
+        "late_measurements",
         f"{_DEVICE}/late/{{stream}}",
         "Measurements",
         1,
         False,
-        "As `late joints`; every stream but `joints`.",
+        "As `late_joints`; every stream but `joints`.",
     ),
     _Channel("event", f"{_DEVICE}/event", "Event", 1, False, "A fact that happened; stored."),
     _Channel("ack", f"{_DEVICE}/ack", "Ack", 1, False, "The answer to one command."),

@@ -25,6 +25,8 @@ CTL = "ctl"
 STOP = "stop"
 
 CLASSES = frozenset({DESC, STATE, TELE, LATE, CAM, EVENT, CMD, ACK, CTL, STOP})
+MEASURED = frozenset({TELE, LATE})
+"""What carries measurements: as they are made, and what could not be sent then. Only the first is live."""
 _NAME_REQUIRED = frozenset({TELE, LATE, CAM, CTL})
 _NAME_ALLOWED = _NAME_REQUIRED | {DESC}
 ANY = "+"

@@ -28,7 +28,7 @@ class ControlLoop:
         controller: Decides.
         name: The device's name.
         tell: Called with telemetry, 20 times a second at rest and 50 times in motion; must not block.
-        watch: Called before each decision with the monotonic clock [s]: the room's interlocks. Quick; raises into a hold.
+        watch: Called before each decision with the monotonic clock [s]: the room's interlocks. Quick; an error holds.
     """
 
     def __init__(

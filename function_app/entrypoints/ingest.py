@@ -36,7 +36,7 @@ async def take_in(functions: Functions, topic: Topic, payload: bytes, *, by: Tra
     """
     if topic.kind == topics.ACK:
         await functions.action_acks.ingest(topic, payload, by=by)
-    elif topic.kind == topics.TELE:
+    elif topic.kind in topics.MEASURED:
         await functions.intake.take([Arrived(topic, payload)])
     elif topic.kind in {topics.CONN, topics.DESC, topics.STATE, topics.EVENT}:
         await functions.presence.ingest(topic, payload, by=by)
@@ -44,7 +44,7 @@ async def take_in(functions: Functions, topic: Topic, payload: bytes, *, by: Tra
 
 def is_telemetry(topic: str) -> bool:
     """Whether it looks like a measurement's: those are better taken in together."""
-    return f"/{topics.TELE}/" in topic
+    return any(f"/{kind}/" in topic for kind in topics.MEASURED)
 
 
 async def ingest_telemetry(functions: Functions, messages: Sequence[tuple[str, bytes]]) -> None:
@@ -60,7 +60,7 @@ async def ingest_telemetry(functions: Functions, messages: Sequence[tuple[str, b
         except ProtocolError as error:
             _log.warning("%s", error)
             continue
-        if parsed.kind == topics.TELE:
+        if parsed.kind in topics.MEASURED:
             arrived.append(Arrived(parsed, payload))
     if arrived:
         await functions.intake.take(arrived)

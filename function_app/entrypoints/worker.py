@@ -35,6 +35,7 @@ async def work(functions: Functions) -> None:
     tasks = [
         asyncio.create_task(functions.feed.run(handle)),
         asyncio.create_task(functions.telemetry.run(handle_telemetry)),
+        asyncio.create_task(functions.late.run(handle_telemetry)),
         asyncio.create_task(_sweep(functions)),
         asyncio.create_task(_check_models(functions)),
     ]

@@ -30,6 +30,7 @@ from device_agent.protocol.messages import Ack, Command
 from device_agent.runtime.controller import Controller
 from device_agent.runtime.device import Device
 from device_agent.runtime.journal import Journal
+from device_agent.runtime.room import Room
 from tests.unit.agent.test_controller import robot_type
 from tests.unit.agent.test_device import ToyDriver
 
@@ -127,6 +128,7 @@ class Body:
                 name=DEVICE, label="Arm", space=SPACE, agent=AGENT, robot_type=swift(), driver=ToyDriver(),
                 journal=journal, cloud_clock=self.clock, publish=self._publish,
                 keys={signing.key_id(key.public_key()): key.public_key()},
+                room=Room(space=SPACE, agent=AGENT, own=[DEVICE]),
             )  # fmt: skip
             device.start()
             device.link_changed(True)

@@ -73,6 +73,7 @@ class Cloud:
         self.app = create_app(self.functions)
         self._feed: asyncio.Future[None] | None = None
         self._telemetry: asyncio.Future[None] | None = None
+        self._late: asyncio.Future[None] | None = None
         self._clients: list[httpx.AsyncClient] = []
 
     def run(self, call: Coroutine[Any, Any, T]) -> T:
@@ -135,6 +136,19 @@ class Cloud:
 
         self.run(start())
 
+    def start_late(self) -> None:
+        """Take in what robots measured while their link was down, until the end; returns once it hears them."""
+
+        async def handle(messages: Sequence[tuple[str, bytes]]) -> None:
+            await ingest_telemetry(self.functions, messages)
+
+        async def start() -> None:
+            self._late = asyncio.ensure_future(self.functions.late.run(handle))
+            link: Any = self.functions.late._link  # type: ignore[attr-defined]
+            assert await link.ready(PATIENCE_S), link.trouble
+
+        self.run(start())
+
     def sweep(self) -> None:
         """One round of the timer."""
         self.run(self.functions.sweep.run())
@@ -144,7 +158,7 @@ class Cloud:
 
     def __exit__(self, *_: object) -> None:
         async def end() -> None:
-            for feed in (self._feed, self._telemetry):
+            for feed in (self._feed, self._telemetry, self._late):
                 if feed is not None:
                     feed.cancel()
                     await asyncio.gather(feed, return_exceptions=True)

@@ -24,6 +24,8 @@ TRIES = 6
 FIRST_PAUSE_S = 0.1
 
 COLLECT_S = 2.0
+COLLECT_LATE_S = 0.3
+"""Brokers send about twenty messages before they wait for a confirmation: so this bounds what comes in a second."""
 MAX_COLLECTED = 20_000
 """Measurements that wait to be stored: a hundred robots at 20 Hz for ten seconds."""
 MAX_COLLECTED_BYTES = 32 * 1024 * 1024
@@ -98,6 +100,56 @@ class MqttFeed:
             self._link.acknowledge(oldest.message, oldest.generation)
             _log.warning("ingest is behind: a message of %s was not stored", oldest.message.topic)
         self._waiting.put_nowait(_Arrived(message, self._link.generation, asyncio.get_running_loop().time()))
+
+
+class MqttLate:
+    """``Telemetry`` over MQTT for what was measured while a link was down: each is confirmed once it is stored."""
+
+    def __init__(self, *, host: str, port: int, credentials: Callable[[], ServiceCredentials]) -> None:
+        self._collected: list[_Arrived] = []
+        self._some = asyncio.Event()
+        self._link = MqttLink(
+            host=host,
+            port=port,
+            credentials=credentials,
+            subscriptions=(topics.device(ANY, ANY, ANY, topics.LATE, ANY),),
+            receive=self._arrived,
+            manual_ack=True,
+        )
+
+    async def run(self, handler: BatchHandler) -> None:
+        """See ``Telemetry``. How much waits is bounded by what a broker sends without a confirmation."""
+        self._link.start()
+        try:
+            while True:
+                await self._some.wait()
+                await asyncio.sleep(COLLECT_LATE_S)
+                batch, self._collected = self._collected, []
+                self._some.clear()
+                await self._store([(each.message.topic, bytes(each.message.payload)) for each in batch], handler)
+                for each in batch:
+                    self._link.acknowledge(each.message, each.generation)
+        finally:
+            await self._link.close()
+
+    @staticmethod
+    async def _store(batch: list[tuple[str, bytes]], handler: BatchHandler) -> None:
+        """Until it is stored: there is no hurry, and the agents keep what is not confirmed."""
+        while True:
+            try:
+                await handler(batch)
+            except (StoreError, Problem) as error:
+                _log.warning("late measurements: %s", error)
+                await asyncio.sleep(COLLECT_S)
+            except Exception:  # noqa: BLE001 (whatever it is: what comes next goes on)
+                _log.exception("%d late measurements failed", len(batch))
+                return
+            else:
+                return
+
+    def _arrived(self, message: MQTTMessage) -> None:
+        self._collected.append(_Arrived(message, self._link.generation, asyncio.get_running_loop().time()))
+        self._some.set()
 
 
 class MqttTelemetry:

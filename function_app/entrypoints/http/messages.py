@@ -24,7 +24,7 @@ Limit = Annotated[int, Query(ge=1, le=32, description="At most so many.")]
 Have = Annotated[
     list[str], Query(max_length=32, description="Ids of commands that came already and are not answered yet.")
 ]
-SAID = frozenset({topics.CONN, topics.DESC, topics.STATE, topics.TELE, topics.EVENT, topics.ACK})
+SAID = frozenset({topics.CONN, topics.DESC, topics.STATE, topics.EVENT, topics.ACK}) | topics.MEASURED
 """Classes of topics that agents speak on, and that are JSON."""
 
 
@@ -84,16 +84,20 @@ def router(functions: Functions, caller: Caller) -> Routes:
         for place, told in enumerate(asked.messages):
             try:
                 arrived = Arrived(_own_topic(told.topic, space, asking), bytes(told.payload))
-                if arrived.topic.kind != topics.TELE:
+                if arrived.topic.kind not in topics.MEASURED:
                     await take_in(functions, arrived.topic, arrived.payload, by="http")
                 taken[place] = arrived
             except ProtocolError as error:
                 refused[place] = str(error)
         # All telemetry at once: that costs much less than one by one.
-        measured = [place for place, arrived in taken.items() if arrived.topic.kind == topics.TELE]
+        measured = [place for place, arrived in taken.items() if arrived.topic.kind in topics.MEASURED]
         dropped = await functions.intake.take([taken[place] for place in measured])
         refused |= {measured[number]: why for number, why in dropped.items()}
-        passed = [(asked.messages[place].topic, *arrived) for place, arrived in taken.items() if place not in refused]
+        passed = [
+            (asked.messages[place].topic, *arrived)
+            for place, arrived in taken.items()
+            if place not in refused and arrived.topic.kind != topics.LATE  # nobody looks at it as it comes
+        ]
         await functions.relay.pass_on(passed)
         results = (
             contract.ToldOut(status="refused", detail=f"{refused[place].rstrip('.')}.")

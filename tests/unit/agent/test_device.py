@@ -37,6 +37,7 @@ from device_agent.protocol.messages import (
 )
 from device_agent.runtime.device import Device
 from device_agent.runtime.journal import Journal
+from device_agent.runtime.room import Room
 from tests.unit.agent.test_controller import robot_type
 
 WITHIN_S = 15.0
@@ -95,6 +96,7 @@ class Bench:
             cloud_clock=self.clock,
             keys={signing.key_id(self.key.public_key()): self.key.public_key()},
             publish=self.publish,
+            room=Room(space="s", agent="a", own=["arm"]),
         )
 
     def publish(

@@ -12,6 +12,7 @@ import type {
   Event,
   Fault,
   Geometry,
+  InterlockRule,
   Joint,
   JointTelemetry,
   LeaseState,
@@ -19,6 +20,7 @@ import type {
   OpenRequest,
   Presence,
   Reason,
+  Restriction,
   State,
   StopLatch,
   Stream,
@@ -131,6 +133,10 @@ const description = object<Required<Description>>({
   watchdog_ms: optional(count, 0),
   max_loop_age_ms: optional(count, 0),
   simulated: optional(flag, false),
+  interlocks: optional(
+    list(object<InterlockRule>({ name: text, action: oneOf("slow", "hold"), speed: number, stale_ms: count }), MAX_JOINTS),
+    [],
+  ),
 });
 
 const geometry = object<Geometry>({
@@ -186,6 +192,7 @@ const state = object<Required<State>>({
     }),
   ),
   faults: optional(list(object<Fault>({ code: text, message: text, since_ms: count }), MAX_JOINTS), []),
+  restrictions: optional(list(object<Restriction>({ source: text, speed: number, why: text }), MAX_JOINTS), []),
 });
 
 const measured = list(number, MAX_JOINTS);

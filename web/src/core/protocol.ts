@@ -28,6 +28,7 @@ export interface Description {
   watchdog_ms?: number;
   max_loop_age_ms?: number;
   simulated?: boolean;
+  interlocks?: InterlockRule[];
 }
 
 /** One joint and the limits that the agent enforces. */
@@ -47,6 +48,18 @@ export interface Stream {
   /** letters, digits, _ and -, 1 to 64 of them */
   name: string;
   rate_hz: number;
+}
+
+/**
+ * When the room slows or holds the device: on its condition, and when its sensor was silent for `stale_ms`.
+ *
+ * `name` says device, stream and condition; `speed` is the share that is left, 0 for `hold`.
+ */
+export interface InterlockRule {
+  name: string;
+  action: "hold" | "slow";
+  speed: number;
+  stale_ms: number;
 }
 
 /** `desc/twin`: the drawing from which a page builds its live view. Retained. */
@@ -107,6 +120,7 @@ export interface State {
   lease?: LeaseState | null;
   action?: ActionState | null;
   faults?: Fault[];
+  restrictions?: Restriction[];
 }
 
 /** What the device is doing at this moment. */
@@ -155,6 +169,13 @@ export interface Fault {
   code: string;
   message: string;
   since_ms: number;
+}
+
+/** What the room allows at this moment: `speed` is the share that is left, 0: hold. `source` is an interlock. */
+export interface Restriction {
+  source: string;
+  speed: number;
+  why: string;
 }
 
 /**
