@@ -12,8 +12,8 @@ MOST_MS = 350.0
 """From the last setpoint that reached the agent (or from what else lets it move) to zero commanded velocity."""
 _STILL_RAD = 1e-8
 """Between two lines of the record, 10 ms: below any velocity that a controller commands."""
-_REST_ROWS = 3
-"""Turning back passes through zero; rest is longer."""
+_REST_ROWS = 10
+"""A tenth of a second: turning back passes through zero, and a control loop that is late stands still for a moment."""
 _ROW_MS = 20.0
 """Lines come every 10 ms; a longer gap is a time in which the agent's process did not run."""
 
