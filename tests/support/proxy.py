@@ -42,6 +42,7 @@ class Proxy:
         self._forgotten: list[socket.socket] = []
         self._lock = threading.Lock()
         self._ended = False
+        self._refuses = False
         self._thread = threading.Thread(target=self._run)
         self._thread.start()
 
@@ -77,6 +78,15 @@ class Proxy:
             self._peers.clear()
             self._servers.clear()
 
+    def refuse(self) -> None:
+        """Close every connection, now and from now on, as soon as it is there."""
+        self._refuses = True
+        self.cut()
+
+    def admit(self) -> None:
+        """Let connections through again."""
+        self._refuses = False
+
     def end(self) -> None:
         if self._frozen:
             self.thaw()
@@ -99,12 +109,15 @@ class Proxy:
             return
         if ready is self._listener:
             client, _ = self._listener.accept()
+            self.accepted += 1
+            if self._refuses:
+                client.close()
+                return
             try:
                 server = socket.create_connection((HOST, self._behind))
             except OSError:
                 client.close()
                 return
-            self.accepted += 1
             self._servers.add(server)
             for one, other in ((client, server), (server, client)):
                 one.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
