@@ -13,7 +13,6 @@ from function_app.adapters.local.command_bus import MqttCommandBus
 from function_app.adapters.local.feed import MqttFeed, MqttLate, MqttTelemetry
 from function_app.adapters.local.keys import FileKeys
 from function_app.adapters.local.model_compiler import MujocoCompiler
-from function_app.adapters.local.orders import MqttOrders
 from function_app.adapters.local.tables import SqliteTables
 from function_app.domain.series import Keep
 from function_app.ports.blobs import Blobs, Transfers
@@ -22,12 +21,11 @@ from function_app.ports.clock import Clock
 from function_app.ports.command_bus import CommandBus
 from function_app.ports.feed import Feed, Telemetry
 from function_app.ports.keys import Keys
-from function_app.ports.orders import Orders
 from function_app.ports.tables import Tables
-from function_app.ports.xmpp_line import XmppLine
 from function_app.services.action_acks import ActionAcks
 from function_app.services.action_rows import ActionRows
 from function_app.services.actions import Actions
+from function_app.services.audit import Audit
 from function_app.services.claim import Claim
 from function_app.services.commands import Commands
 from function_app.services.conditions import Conditions
@@ -40,11 +38,13 @@ from function_app.services.events import Events
 from function_app.services.faults import Faults
 from function_app.services.fleet import StartOnMany
 from function_app.services.forget import DAY_MS, Forget
+from function_app.services.handover import Handovers
 from function_app.services.health import CheckHealth
 from function_app.services.identity import Identify
 from function_app.services.intake import Intake
 from function_app.services.latency import Latencies
 from function_app.services.lease import Leases
+from function_app.services.lease_rows import LeaseRows
 from function_app.services.leave import Leave
 from function_app.services.mailbox import Mailbox
 from function_app.services.model_checks import ModelChecks
@@ -68,7 +68,7 @@ from function_app.services.unpair import Unpair
 from function_app.services.upload_robot_type import UploadRobotType
 from function_app.services.uploads import Uploads
 from function_app.services.xmpp_access import XmppAccess
-from function_app.settings import AwsStore, AzureStore, EventGridBus, IotBus, Settings, SettingsError
+from function_app.settings import AwsStore, AzureStore, EventGridBus, IotBus, Settings
 
 TABLES_FILE = "tables.sqlite"
 BLOBS_PATH = "/api/v1/blobs"
@@ -97,6 +97,7 @@ class Functions:
     unpair: Unpair
     devices: Devices
     leases: Leases
+    handovers: Handovers
     robot_types: RobotTypes
     upload_robot_type: UploadRobotType
     delete_robot_type: DeleteRobotType
@@ -112,7 +113,6 @@ class Functions:
     xmpp_access: XmppAccess
     presence: PresenceIngest
     polling: Polling
-    mailbox: Mailbox
     relay: Relay
     forget: Forget
     events: Events
@@ -176,8 +176,7 @@ def build(settings: Settings, *, clock: Clock | None = None) -> Functions:
     writer = SeriesWriter(tables=tables, forget=forget, keep=keep, clock=now)
     uploads = Uploads(tables=tables, blobs=blobs, keep_ms=settings.keep_uploads_days * DAY_MS, clock=now)
     mailbox = Mailbox(tables=tables, forget=forget, clock=now)
-    relay = Relay(bus=bus, clock=now)
-    delivery = Delivery(bus=bus, mailbox=mailbox, relay=relay)
+    delivery = Delivery(bus=bus, mailbox=mailbox)
     commands = Commands(delivery=delivery, keys=keys, clock=now)
     robot_types = RobotTypes(tables=tables, blobs=blobs, catalogue=catalogue)
     diagnostics = Diagnostics(
@@ -195,8 +194,13 @@ def build(settings: Settings, *, clock: Clock | None = None) -> Functions:
     )
     rows = ActionRows(tables=tables)
     pending = Pending(tables=tables)
+    audit = Audit(tables=tables, events=events, pending=pending, clock=now)
+    lease_rows = LeaseRows(tables=tables, audit=audit, clock=now)
+    leases = Leases(
+        tables=tables, devices=devices, rows=lease_rows, commands=commands, access=access, audit=audit, clock=now
+    )
     sending = SendAction(tables=tables, rows=rows, commands=commands, movements=movements, clock=now)
-    queues = Queues(tables=tables, devices=devices, rows=rows, pending=pending, sending=sending, clock=now)
+    queues = Queues(tables=tables, devices=devices, rows=rows, pending=pending, sending=sending, audit=audit, clock=now)
     leave = Leave(
         tables=tables,
         rows=rows,
@@ -221,6 +225,7 @@ def build(settings: Settings, *, clock: Clock | None = None) -> Functions:
         pending=pending,
         queues=queues,
         delivery=delivery,
+        audit=audit,
         clock=now,
     )
     return Functions(
@@ -240,7 +245,16 @@ def build(settings: Settings, *, clock: Clock | None = None) -> Functions:
         claim=Claim(tables=tables, sign_in=sign_in, forget=forget, leave=leave, clock=now),
         unpair=Unpair(tables=tables, sign_in=sign_in, leave=leave),
         devices=devices,
-        leases=Leases(tables=tables, devices=devices, commands=commands, access=access, clock=now),
+        leases=leases,
+        handovers=Handovers(
+            tables=tables,
+            devices=devices,
+            leases=leases,
+            rows=lease_rows,
+            commands=commands,
+            audit=audit,
+            clock=now,
+        ),
         robot_types=robot_types,
         upload_robot_type=UploadRobotType(
             tables=tables, blobs=blobs, catalogue=catalogue, robot_types=robot_types, clock=now
@@ -257,8 +271,16 @@ def build(settings: Settings, *, clock: Clock | None = None) -> Functions:
         ),
         queues=queues,
         action_acks=acks,
-        stop=StopDevices(tables=tables, devices=devices, commands=commands, queues=queues, delivery=delivery),
-        mqtt_credentials=MqttCredentials(tables=tables, devices=devices, access=access, clock=now),
+        stop=StopDevices(
+            devices=devices,
+            sign_in=sign_in,
+            rows=lease_rows,
+            commands=commands,
+            queues=queues,
+            delivery=delivery,
+            audit=audit,
+        ),
+        mqtt_credentials=MqttCredentials(tables=tables, devices=devices, access=access, audit=audit, clock=now),
         xmpp_access=XmppAccess(
             tables=tables,
             keys=keys,
@@ -269,8 +291,7 @@ def build(settings: Settings, *, clock: Clock | None = None) -> Functions:
             domain=settings.xmpp_domain,
         ),
         polling=Polling(tables=tables, mailbox=mailbox, clock=now),
-        mailbox=mailbox,
-        relay=relay,
+        relay=Relay(bus=bus, clock=now),
         presence=PresenceIngest(tables=tables, events=events, conditions=conditions, clock=now),
         forget=forget,
         events=events,
@@ -290,6 +311,7 @@ def build(settings: Settings, *, clock: Clock | None = None) -> Functions:
             sending=sending,
             queues=queues,
             leave=leave,
+            audit=audit,
             access=access,
             forget=forget,
             conditions=conditions,
@@ -312,30 +334,6 @@ def _keep(settings: Settings) -> Keep:
             "10min": settings.keep_10min_days * DAY_MS,
         },
     )
-
-
-def xmpp_line(functions: Functions) -> XmppLine:
-    """The cloud's own connection to the XMPP server, not yet open.
-
-    Raises:
-        SettingsError: The settings name no XMPP server.
-    """
-    from function_app.adapters.local.xmpp_line import SlixmppLine  # noqa: PLC0415 (only where it is in use)
-
-    settings = functions.settings
-    if not settings.xmpp_domain:
-        raise SettingsError("TELESCOPE_XMPP_DOMAIN is empty; it must be the domain that the XMPP server serves")
-
-    async def password() -> str:
-        return (await functions.xmpp_access.cloud()).password
-
-    return SlixmppLine(host=settings.xmpp_host, port=settings.xmpp_port, domain=settings.xmpp_domain, password=password)
-
-
-def orders(functions: Functions) -> Orders:
-    """What the broker brings for agents that a program of ours speaks for, not yet open."""
-    settings = functions.settings
-    return MqttOrders(host=settings.mqtt_host, port=settings.mqtt_port, access=functions.access)
 
 
 async def prepare(settings: Settings) -> None:

@@ -63,24 +63,20 @@ class HttpPolling(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True)
 
 
 class Configuration(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """``agent.toml``. ``transport`` is one of ``device_agent.links.names()``.
-
-    ``trusted-scripts``: movement scripts run also where this machine cannot lock them in. Set by hand, on the machine.
-    """
+    """``agent.toml``. ``transport`` is one of ``device_agent.links.names()``."""
 
     server: str
     name: Label
     devices: tuple[DeviceEntry, ...]
     transport: str = "mqtt"
     http: HttpPolling = HttpPolling()
-    trusted_scripts: bool = msgspec.field(default=False, name="trusted-scripts")
     room: Annotated[tuple[RoomStream, ...], Meta(max_length=64)] = ()
 
     def keeping(self, before: "Configuration") -> "Configuration":
         """This, with what ``enroll`` does not ask for as it was before: the room and each device's interlocks."""
         rules = {device.name: device.interlocks for device in before.devices}
         devices = tuple(replace(device, interlocks=rules.get(device.name, ())) for device in self.devices)
-        return replace(self, devices=devices, room=before.room, trusted_scripts=before.trusted_scripts)
+        return replace(self, devices=devices, room=before.room)
 
     @property
     def sources(self) -> tuple[tuple[str, str], ...]:
@@ -91,16 +87,12 @@ class Configuration(Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tru
 
 
 class Pairing(Struct, frozen=True, kw_only=True):
-    """``pairing.json``: what the agent learned when it was claimed. ``keys`` are pinned: key id → public key.
-
-    ``owner`` is the account's id: scripts of any other account are a stranger's.
-    """
+    """``pairing.json``: what the agent learned when it was claimed. ``keys`` are pinned: key id → public key."""
 
     agent: Id
     space: Id
     account: str
     keys: dict[str, str]
-    owner: str = ""
 
     def public_keys(self) -> dict[str, Ed25519PublicKey]:
         """The pinned keys, ready to verify with."""
@@ -174,8 +166,6 @@ class Home:
     def save_configuration(self, configuration: Configuration) -> None:
         """Write ``agent.toml``."""
         lines = [f"{key} = {_toml(getattr(configuration, key))}" for key in ("server", "name", "transport")]
-        if configuration.trusted_scripts:
-            lines.append("trusted-scripts = true")
         if configuration.transport == "http" or configuration.http != HttpPolling():
             lines += ["", "[http]"]
             lines += [f"{key} = {_toml(getattr(configuration.http, key))}" for key in ("poll", "poll_ms")]

@@ -180,6 +180,11 @@ class LastState:
     seen_ms: int
     pairing: str = ""
 
+    @property
+    def ended_epoch(self) -> int:
+        """The highest epoch that the device says it never obeys again."""
+        return int(self.state.get("ended_epoch", 0))
+
 
 def online(link: Link | None, last_seen_ms: int, now_ms: int) -> bool:
     """Whether the agent may be believed to be there."""

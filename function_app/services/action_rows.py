@@ -11,6 +11,7 @@ from function_app.domain.problems import invalid
 from function_app.domain.queue import FAILED_BEFORE
 from function_app.ports.tables import Row, Tables, Write
 from function_app.services import store
+from function_app.services.audit import lease_change
 from function_app.services.control import Control, read_control_rows
 
 _PREFIX = "action:"
@@ -120,6 +121,7 @@ def _freed(action: Action, control: Control) -> list[Write]:
     if queue != control.queue:
         writes.append(control.write_queue(action.device, queue))
     if control.lease is not None and control.lease.action == action.id:
-        nobody = replace(release(control.lease), pairing=control.lease.pairing)
+        nobody = release(control.lease, now_ms=action.ended_ms)
         writes.append(control.write_lease(action.device, nobody))
+        writes += lease_change(action.device, control.lease, nobody, by=action.who, now_ms=action.ended_ms)
     return writes

@@ -1,9 +1,9 @@
 """The rows that decide who controls a device: lease, slot and queue, side by side in the device's partition."""
 
-from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
-from function_app.domain.devices import Device
+from function_app.domain.accounts import Identity
+from function_app.domain.devices import Device, LastState
 from function_app.domain.lease import Lease, release
 from function_app.domain.queue import Queue
 from function_app.ports.tables import Row, Tables, Write
@@ -73,27 +73,23 @@ async def read_control_rows(tables: Tables, device: str) -> Control:
     )
 
 
-async def change_lease(
-    tables: Tables, device: Device, change: Callable[[Lease | None], Lease]
-) -> tuple[Lease | None, Lease]:
-    """Put what ``change`` makes of the lease in its place, by ETag; the lease before and after.
+async def heed_device(tables: Tables, device: Device, control: Control, who: Identity, now_ms: int) -> Control:
+    """The same, without a lease of somebody else that the device itself has ended, as its ``state`` says.
 
-    Args:
-        tables: The store.
-        device: Whose lease.
-        change: Decides; may be called several times.
-
-    Raises:
-        Problem: ``busy``, and whatever ``change`` raises.
+    A hold, a Stop or a restart ends leases at the device. Such an epoch is never obeyed again, so what the state says
+    of it stays true however old it is.
     """
+    lease = control.lease
+    if lease is None or not lease.anothers(who, now_ms) or not await ended_at_device(tables, device, lease):
+        return control
+    return replace(control, lease=release(lease, now_ms=now_ms))
 
-    async def once() -> tuple[Lease | None, Lease]:
-        control = await read_control(tables, device)
-        lease = change(control.lease)
-        await tables.batch(store.CONTROL, [control.write_lease(device.id, lease)])
-        return control.lease, lease
 
-    return await store.retry(once)
+async def ended_at_device(tables: Tables, device: Device, lease: Lease) -> bool:
+    """Whether the device has said that it will not obey this lease again."""
+    row = await tables.get(store.AGENTS, device.agent, f"state:{device.name}")
+    last = store.read(row, LastState) if row else None
+    return last is not None and last.pairing == device.pairing and last.ended_epoch >= lease.epoch
 
 
 async def read_lease(tables: Tables, device: Device) -> Lease | None:
@@ -115,4 +111,4 @@ def _lease(rows: dict[str, Row], device: Device) -> Lease | None:
     if LEASE not in rows:
         return None
     lease = store.read(rows[LEASE], Lease)
-    return lease if lease.pairing in ("", device.pairing) else release(lease)
+    return lease if lease.pairing in ("", device.pairing) else Lease(epoch=lease.epoch)

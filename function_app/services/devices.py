@@ -46,15 +46,6 @@ class Devices:
         found, _ = await self.with_link(who, device)
         return found
 
-    async def to_operate(self, who: Identity, device: str) -> Device:
-        """One device that ``who`` may move.
-
-        Raises:
-            Problem: ``device-unknown``, ``forbidden``.
-        """
-        found, _ = await self.with_link(who, device)
-        return require_operator(found)
-
     async def with_link(self, who: Identity, device: str) -> tuple[Device, Link | None]:
         """One device and the last word about its agent's connection, in one read.
 
@@ -154,7 +145,7 @@ class Devices:
                     online=devices.online(link, seen_ms, now_ms),
                     last_seen_ms=seen_ms or None,
                     state=last.state if last else None,
-                    lease=lease if lease and lease.live(now_ms) else None,
+                    lease=lease if lease and lease.live(now_ms) and not _ended(lease, last) else None,
                 )
             )
         return views
@@ -168,6 +159,17 @@ def require_operator(device: Device) -> Device:
     """
     if not device.role.may_operate:
         raise forbidden("You may watch this device, not operate it. Ask its owner.")
+    return device
+
+
+def require_owner(device: Device) -> Device:
+    """The same device, once it is seen that its role is the owner's.
+
+    Raises:
+        Problem: ``forbidden``.
+    """
+    if not device.role.may_own:
+        raise forbidden("Only an owner of this device may take control over from somebody. Ask for it instead.")
     return device
 
 
@@ -204,6 +206,11 @@ def left_devices(agent: Agent, leaving: Leaving) -> list[Device]:
     before = replace(agent, account=leaving.account, space=leaving.space, pairing=leaving.pairing)
     gone = DeviceSpec("", "", "", "")
     return [_device(before, replace(agent.device(name) or gone, name=name)) for name in leaving.devices]
+
+
+def _ended(lease: Lease, last: LastState | None) -> bool:
+    """Whether the device has said that it will not obey this lease again."""
+    return last is not None and last.ended_epoch >= lease.epoch
 
 
 def _of(agent: Agent, rows: dict[str, Row], key: str, kind: type[T]) -> T | None:

@@ -14,6 +14,7 @@ from typing import Final
 from device_agent.protocol import topics
 from device_agent.protocol.messages import ReleaseLease
 from function_app.domain.actions import Status, end
+from function_app.domain.authority import ended
 from function_app.domain.devices import Agent, Device, Leaving
 from function_app.domain.lease import Lease
 from function_app.domain.queue import DROPPED
@@ -23,6 +24,7 @@ from function_app.ports.command_bus import BusUnavailable, CommandBus
 from function_app.ports.tables import Conflict, Row, Tables
 from function_app.services import store
 from function_app.services.action_rows import ActionRows
+from function_app.services.audit import told
 from function_app.services.commands import Commands
 from function_app.services.control import read_control_rows
 from function_app.services.devices import left_devices
@@ -105,7 +107,7 @@ class Leave:
 
     async def _settle(self, agent: Agent, leaving: Leaving) -> None:
         for device in left_devices(agent, leaving):
-            await self._fence(device)
+            await self._fence(device, leaving.why)
             await self._end_actions(device, leaving.why)
             await self._delete(store.AGENTS, agent.id, f"state:{device.name}", leaving)
             if leaving.why == "unpaired":
@@ -134,7 +136,7 @@ class Leave:
             now_ms = self._clock.now_ms()
             await self._rows.change(control.action, lambda action: end(action, Status.FAILED, why, message, now_ms))
 
-    async def _fence(self, device: Device) -> None:
+    async def _fence(self, device: Device, why: str) -> None:
         """Raise the epoch, so that the former holder's setpoints are old, and bring the device to a hold.
 
         Before its actions end: with them would go the lease that tells that somebody has moved it.
@@ -146,7 +148,8 @@ class Leave:
             if known is None or not known.account or known.pairing != device.pairing:
                 return None
             lease = Lease(epoch=known.epoch + 1, pairing=device.pairing)
-            await self._tables.batch(store.CONTROL, [control.write_lease(device.id, lease)])
+            facts = told(device.id, device.pairing, [ended(known, lease, why=why, now_ms=self._clock.now_ms())])
+            await self._tables.batch(store.CONTROL, [control.write_lease(device.id, lease), *facts])
             return lease
 
         lease = await store.retry(once)

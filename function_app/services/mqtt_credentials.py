@@ -12,8 +12,9 @@ from function_app.domain.problems import broker_unavailable
 from function_app.ports.broker_access import BrokerAccess, BrokerAccessError, Credentials
 from function_app.ports.clock import Clock
 from function_app.ports.tables import Tables
+from function_app.services.audit import Audit
 from function_app.services.control import read_lease
-from function_app.services.devices import Devices, require_claimed
+from function_app.services.devices import Devices, require_claimed, require_operator
 from function_app.services.identity import principal
 from function_app.services.lease import control_client
 
@@ -40,7 +41,8 @@ class Issued:
 class MqttCredentials:
     """Issues broker credentials."""
 
-    def __init__(self, *, tables: Tables, devices: Devices, access: BrokerAccess, clock: Clock) -> None:
+    def __init__(self, *, tables: Tables, devices: Devices, access: BrokerAccess, audit: Audit, clock: Clock) -> None:
+        self._audit = audit
         self._tables = tables
         self._devices = devices
         self._access = access
@@ -86,9 +88,11 @@ class MqttCredentials:
         Raises:
             Problem: ``device-unknown``, ``forbidden``, ``lease-lost``, ``broker-unavailable``.
         """
-        device = await self._devices.to_operate(who, device_id)
+        device = await self._devices.get(who, device_id)
         now_ms = self._clock.now_ms()
-        lease = rules.hold(await read_lease(self._tables, device), who, epoch=epoch, now_ms=now_ms)
+        async with self._audit.refusals(device, who, "steer"):
+            require_operator(device)
+            lease = rules.hold(await read_lease(self._tables, device), who, epoch=epoch, now_ms=now_ms)
         lifetime_s = max(CONTROL_MIN_S, lease.lease_ms // 1000)
         publish = (f"{device.topic}/{topics.CTL}/{epoch}",)
         grant = Grant(

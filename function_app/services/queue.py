@@ -22,7 +22,8 @@ from function_app.ports.command_bus import BusUnavailable
 from function_app.ports.tables import Row, Tables, Write
 from function_app.services import store
 from function_app.services.action_rows import ActionRows, Found
-from function_app.services.control import read_control, read_control_rows
+from function_app.services.audit import Audit, lease_change
+from function_app.services.control import heed_device, read_control, read_control_rows
 from function_app.services.devices import Devices
 from function_app.services.pending import Pending
 from function_app.services.send_action import MovementChanged, SendAction
@@ -46,6 +47,7 @@ class Queues:
         rows: ActionRows,
         pending: Pending,
         sending: SendAction,
+        audit: Audit,
         clock: Clock,
     ) -> None:
         self._tables = tables
@@ -53,6 +55,7 @@ class Queues:
         self._rows = rows
         self._pending = pending
         self._sending = sending
+        self._audit = audit
         self._clock = clock
 
     async def change(
@@ -155,6 +158,7 @@ class Queues:
             if problem.code not in {"lease-held", "lease-lost"}:
                 raise
             await self._refuse(found, Status.FAILED, problem.code, problem.detail)
+            await self._audit.refused(device, who, "start an action that waited for its turn", problem)
             return True
         if started is None:
             return False
@@ -174,6 +178,7 @@ class Queues:
         if control.action or control.queue.position(found.action.id) != 1:
             return None
         now_ms = self._clock.now_ms()
+        control = await heed_device(self._tables, device, control, who, now_ms)
         lease = run_lease(
             control.lease,
             who,
@@ -191,6 +196,7 @@ class Queues:
         ]
         if lease is not control.lease:
             writes.append(control.write_lease(device.id, lease))
+            writes += lease_change(device.id, control.lease, lease, by=who.name, now_ms=now_ms)
         rows: tuple[Row, ...] = await self._tables.batch(store.CONTROL, writes)
         return Found(started, rows[0])
 

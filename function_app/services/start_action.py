@@ -13,7 +13,7 @@ from device_agent.protocol.messages import Ack, Id, JointPositions, MoveJoints, 
 from function_app.domain import lease as rules
 from function_app.domain.accounts import Identity
 from function_app.domain.actions import REPEAT_MS, Action, Status, reached
-from function_app.domain.devices import Device
+from function_app.domain.devices import Device, Link
 from function_app.domain.ids import command_id
 from function_app.domain.lease import Lease
 from function_app.domain.problems import Problem, busy_store
@@ -23,8 +23,9 @@ from function_app.ports.tables import Row, Tables, Write
 from function_app.services import parameters, store
 from function_app.services.action_acks import ActionAcks
 from function_app.services.action_rows import ActionRows, Found, new_row
+from function_app.services.audit import Audit, lease_change
 from function_app.services.commands import Commands
-from function_app.services.control import Control, read_control
+from function_app.services.control import Control, heed_device, read_control
 from function_app.services.delivery import Delivery, Signed
 from function_app.services.devices import Devices, require_online, require_operator
 from function_app.services.movements import Movements
@@ -33,10 +34,6 @@ from function_app.services.queue import Queues, run_lease
 
 ABANDON_MS = 30_000
 """A start that has not been written after this time is given up: the timer may already have forgotten its note."""
-
-
-PINNED = ("robot_type", "version", "sha256", "author", "key", "signature")
-"""What an action keeps of its movement, so that a command that is sent again is the same one."""
 
 
 class AskMovement(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True, tag_field="kind", tag="run_movement"):
@@ -131,6 +128,7 @@ class StartAction:
         pending: Pending,
         queues: Queues,
         delivery: Delivery,
+        audit: Audit,
         clock: Clock,
     ) -> None:
         self._tables = tables
@@ -142,6 +140,7 @@ class StartAction:
         self._pending = pending
         self._queues = queues
         self._delivery = delivery
+        self._audit = audit
         self._clock = clock
 
     async def start(
@@ -177,12 +176,18 @@ class StartAction:
         if isinstance(start.asked, AskMovement):
             parameters.check(start.asked.parameters)
         device, link = await self._devices.with_link(who, device_id)
+        async with self._audit.refusals(device, who, "start an action"):
+            return await self._at(who, device, link, start, listening)
+
+    async def _at(
+        self, who: Identity, device: Device, link: Link | None, start: Start, listening: AsyncExitStack
+    ) -> "_Begun":
         require_operator(device)
         earlier = await self._earlier(who, device, start)
         if earlier is not None:
             return await self._join(earlier, device, listening)
         require_online(link, self._clock.now_ms())
-        plan = await self._plan(who, device, start)
+        plan = await self._plan(who, device, start.asked)
         ttl_ms = min(start.ttl_ms, start.timeout_ms)
         await self._pending.note(plan.action, plan.created_ms + REPEAT_MS)
         if start.policy == "queue":
@@ -206,8 +211,8 @@ class StartAction:
         acks = await listening.enter_async_context(self._delivery.acks(device, found.action.id))
         return _Begun(await self._rows.get(found.action.id) or found, acks)
 
-    async def _plan(self, who: Identity, device: Device, start: Start) -> _Plan:
-        asked, now_ms = start.asked, self._clock.now_ms()
+    async def _plan(self, who: Identity, device: Device, asked: Asked) -> _Plan:
+        now_ms = self._clock.now_ms()
         request: dict[str, Any] = msgspec.to_builtins(asked)
         action = command_id(device.id, now_ms)
         if isinstance(asked, AskJoints):
@@ -222,14 +227,10 @@ class StartAction:
                 sha256=movement.sha256,
                 source=source,
                 parameters=parameters.fit(movement.parameters_schema, asked.parameters),
-                author=movement.author or who.account,
-                key=movement.key,
-                signature=movement.signature,
-                timeout_ms=start.timeout_ms,
             )
             # With the defaults: a command that is sent again must be the same one.
             request["parameters"] = command.parameters
-            pinned = {name: getattr(command, name) for name in PINNED}
+            pinned = {"robot_type": device.robot_type, "version": movement.version, "sha256": movement.sha256}
             plan = _Plan(device, action, now_ms, request, command, pinned)
         # Before anything is written: what cannot be sent must not take the slot.
         self._commands.check(device, action, plan.command, who=who.name, ttl_ms=1)
@@ -250,8 +251,9 @@ class StartAction:
         """Action, slot, lease and idempotency row in one batch; not fresh: another request with the key was first."""
 
         async def once() -> tuple[Found, bool]:
-            control = await read_control(self._tables, plan.device)
             now_ms = self._clock.now_ms()
+            control = await read_control(self._tables, plan.device)
+            control = await heed_device(self._tables, plan.device, control, who, now_ms)
             if now_ms - plan.created_ms > ABANDON_MS:
                 raise busy_store()
             earlier = await self._earlier(who, plan.device, start)
@@ -287,6 +289,7 @@ class StartAction:
                 writes.append(control.write_queue(plan.device.id, control.queue.joined(plan.action)))
             elif lease is not None and lease is not control.lease:
                 writes.append(control.write_lease(plan.device.id, lease))
+                writes += lease_change(plan.device.id, control.lease, lease, by=who.name, now_ms=now_ms)
             if start.once:
                 data = {"action": plan.action, "request": start.fingerprint()}
                 writes.append(Write("create", Row(plan.device.id, action.once, data)))

@@ -1,42 +1,72 @@
-"""Stop, and its reset. Needs no lease: whoever may operate may stop."""
+"""Stop, and its reset. Needs no lease: whoever may operate may stop, one device or all of them at once.
+
+It is called Stop, not emergency stop: that is a function of the machine itself, hard-wired. See the architecture page.
+"""
 
 import asyncio
 import contextlib
 import logging
+from contextlib import AbstractAsyncContextManager, nullcontext
+from dataclasses import dataclass
+from typing import Final
 
 from device_agent.protocol import codec
 from device_agent.protocol.messages import ResetStop, Stop, StopDevice
 from function_app.domain import lease as rules
 from function_app.domain.accounts import Identity
+from function_app.domain.authority import Fact
 from function_app.domain.devices import Device
 from function_app.domain.ids import new_id
-from function_app.domain.problems import Problem
+from function_app.domain.problems import Problem, not_found
 from function_app.domain.queue import STOPPED
 from function_app.ports.command_bus import BusUnavailable
-from function_app.ports.tables import Tables
+from function_app.ports.tables import StoreError
+from function_app.services.audit import Audit
 from function_app.services.commands import Commands
-from function_app.services.control import change_lease
 from function_app.services.delivery import Delivery
-from function_app.services.devices import Devices
+from function_app.services.devices import Devices, require_operator
+from function_app.services.lease_rows import LeaseRows
 from function_app.services.queue import Queues
+from function_app.services.sign_in import SignIn
 
-REPEAT_S = 0.2
-CONFIRM_MS = 1_000
+REPEAT_S: Final = 0.2
+CONFIRM_MS: Final = 1_000
+AT_ONCE: Final = 16
+"""Devices whose tables are written at the same moment when many are stopped. The Stop itself waits for nothing."""
 
 _log = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True, slots=True)
+class Stopped:
+    """What became of Stop on one device: whether it has confirmed, or why it could not be told."""
+
+    device: str
+    confirmed: bool
+    problem: Problem | None = None
 
 
 class StopDevices:
     """Latches and resets Stop."""
 
     def __init__(
-        self, *, tables: Tables, devices: Devices, commands: Commands, queues: Queues, delivery: Delivery
+        self,
+        *,
+        devices: Devices,
+        sign_in: SignIn,
+        rows: LeaseRows,
+        commands: Commands,
+        queues: Queues,
+        delivery: Delivery,
+        audit: Audit,
     ) -> None:
-        self._tables = tables
         self._devices = devices
+        self._sign_in = sign_in
+        self._rows = rows
         self._commands = commands
         self._queues = queues
         self._delivery = delivery
+        self._audit = audit
 
     async def stop(self, who: Identity, device_id: str, reason: str) -> bool:
         """Latch Stop; whether the device has confirmed it within a second.
@@ -47,17 +77,28 @@ class StopDevices:
         Raises:
             Problem: ``device-unknown``, ``forbidden``, ``broker-unavailable``: neither way was open.
         """
-        device = await self._devices.to_operate(who, device_id)
-        emptying = asyncio.create_task(self._empty(device))
-        plain = asyncio.create_task(self._repeat(device, Stop(id=new_id(), by=who.name, reason=reason)))
-        try:
-            request = StopDevice(reason=reason)
-            return await self._commands.confirmed(device, request, who=who.name, epoch=0, wait_ms=CONFIRM_MS)
-        finally:
-            plain.cancel()
-            with contextlib.suppress(asyncio.CancelledError, BusUnavailable):
-                await plain
-            await emptying
+        device = await self._devices.get(who, device_id)
+        async with self._audit.refusals(device, who, "stop"):
+            require_operator(device)
+        return await self._stop(who, device, reason, nullcontext())
+
+    async def stop_many(self, who: Identity, reason: str, *, space: str | None = None) -> list[Stopped]:
+        """Stop every device that ``who`` may operate, of one space or of all; each has its own answer.
+
+        All are told at the same time, and each for itself is waited for: one that is dead costs the others nothing.
+
+        Raises:
+            Problem: ``space-unknown``.
+        """
+        if space is not None and space not in {known.id for known in await self._sign_in.spaces(who.account)}:
+            raise not_found("space", space)
+        gate = asyncio.Semaphore(AT_ONCE)
+        devices = [
+            device
+            for device in await self._devices.all(who)
+            if device.role.may_operate and space in {None, device.space}
+        ]
+        return await asyncio.gather(*(self._one(who, device, reason, gate) for device in devices))
 
     async def reset(self, who: Identity, device_id: str) -> bool:
         """Release the latch; whether the device has confirmed it within a second. Nothing resumes.
@@ -68,9 +109,34 @@ class StopDevices:
         Raises:
             Problem: ``device-unknown``, ``forbidden``, ``busy``, ``broker-unavailable``.
         """
-        device = await self._devices.to_operate(who, device_id)
-        _, lease = await change_lease(self._tables, device, lambda lease: rules.overtake(lease, pairing=device.pairing))
+        device = await self._devices.get(who, device_id)
+        async with self._audit.refusals(device, who, "reset Stop"):
+            require_operator(device)
+        _, lease = await self._rows.change(
+            who, device, lambda lease, now_ms: rules.overtake(lease, pairing=device.pairing, now_ms=now_ms)
+        )
         return await self._commands.confirmed(device, ResetStop(), who=who.name, epoch=lease.epoch, wait_ms=CONFIRM_MS)
+
+    async def _one(self, who: Identity, device: Device, reason: str, gate: asyncio.Semaphore) -> Stopped:
+        try:
+            return Stopped(device.id, await self._stop(who, device, reason, gate))
+        except Problem as problem:
+            return Stopped(device.id, confirmed=False, problem=problem)
+
+    async def _stop(
+        self, who: Identity, device: Device, reason: str, gate: AbstractAsyncContextManager[object]
+    ) -> bool:
+        """Tell it in both ways; the tables are written beside that, not before."""
+        plain = asyncio.create_task(self._repeat(device, Stop(id=new_id(), by=who.name, reason=reason)))
+        writing = asyncio.create_task(self._write(who, device, reason, gate))
+        try:
+            order = StopDevice(reason=reason)
+            return await self._commands.confirmed(device, order, who=who.name, epoch=0, wait_ms=CONFIRM_MS)
+        finally:
+            plain.cancel()
+            with contextlib.suppress(asyncio.CancelledError, BusUnavailable):
+                await plain
+            await writing
 
     async def _repeat(self, device: Device, stop: Stop) -> None:
         payload = codec.encode(stop)
@@ -82,9 +148,16 @@ class StopDevices:
                 raise
             await asyncio.sleep(REPEAT_S)
 
-    async def _empty(self, device: Device) -> None:
+    async def _write(
+        self, who: Identity, device: Device, reason: str, gate: AbstractAsyncContextManager[object]
+    ) -> None:
+        """Empty the queue, and tell of it. The device is stopped without either: what waits fails at its turn."""
+        message = f"{who.name} stopped it: {reason}" if reason else f"{who.name} stopped it."
         try:
-            await self._queues.halt(device.id, STOPPED)
-        except Problem as problem:
-            # The device is stopped, so those that wait fail at their turn.
-            _log.warning("queue of %s: %s", device.id, problem.detail)
+            async with gate:
+                await self._queues.halt(device.id, STOPPED)
+                await self._audit.happened(
+                    device, Fact.STOP_ORDERED, message, severity="warning", by=who.name, reason=reason
+                )
+        except (Problem, StoreError) as error:
+            _log.warning("stop of %s: %s", device.id, error)

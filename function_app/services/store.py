@@ -23,9 +23,11 @@ ATTEMPTS = "Attempts"
 MEMBERS = "Members"
 """Partition: account id; key ``agent:<agent id>``. Only an index: the agent's own row says whose it is."""
 CONTROL = "Control"
-"""Partition: device id; keys ``now:lease``, ``now:slot``, ``now:queue``, ``action:<suffix>``, ``once:<hash>``."""
+"""Partition: device id; keys ``now:lease``, ``now:slot``, ``now:queue``, ``action:<suffix>``, ``once:<hash>``, and
+``event:<id>``, what is still to be told among the device's events."""
 PENDING = "Pending"
-"""Partition: shard; key: ``<due ms>:<what>``, an action's id, ``queue:<device id>`` or ``leave:<agent id>``."""
+"""Partition: shard; key: ``<due ms>:<what>``, an action's id, ``queue:<device id>``, ``lease:<device id>`` or
+``leave:<agent id>``."""
 ROBOT_TYPES = "RobotTypes"
 """Partition: ``<account>/<robot type>``; keys ``type``, ``version:<number>``. Index in ``Members``: ``type:<type>``."""
 MODEL_CHECKS = "ModelChecks"

@@ -15,6 +15,7 @@ from function_app.ports.command_bus import BusUnavailable
 from function_app.ports.tables import Conflict, Row, Tables
 from function_app.services import store
 from function_app.services.action_rows import ActionRows, Found, place
+from function_app.services.audit import Audit, lease_of
 from function_app.services.commands import Commands
 from function_app.services.conditions import Conditions
 from function_app.services.forget import DAY_MS, Forget
@@ -50,6 +51,7 @@ class Sweep:
         sending: SendAction,
         queues: Queues,
         leave: Leave,
+        audit: Audit,
         access: BrokerAccess,
         forget: Forget,
         conditions: Conditions,
@@ -66,6 +68,7 @@ class Sweep:
         self._sending = sending
         self._queues = queues
         self._leave = leave
+        self._audit = audit
         self._access = access
         self._forget = forget
         self._conditions = conditions
@@ -107,6 +110,9 @@ class Sweep:
             await self._look_at_queue(device, note)
         elif agent := leaver_of(what):
             await self._look_at_leaver(agent, note)
+        elif device := lease_of(what):
+            await self._audit.look(device)
+            await self._pending.drop(note)
         else:
             await self._look_at_action(what, note)
 
@@ -117,6 +123,7 @@ class Sweep:
             if now_ms - int(note.key.partition(":")[0]) > ORPHAN_MS:
                 await self._pending.drop(note)
             return
+        await self._audit.tell(found.action.device)
         verdict = judge(found.action, now_ms)
         if verdict in _ENDING:
             after = await self._ended(found, verdict, now_ms)

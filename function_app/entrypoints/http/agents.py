@@ -96,7 +96,7 @@ def router(functions: Functions, caller: Caller) -> Routes:
             address=client_address(request, functions.settings.trusted_proxies),
         )
         views = await functions.devices.of_agent(who, agent.id)
-        found = tuple(show.device(view, who) for view in views)
+        found = tuple(show.device(view, who, functions.clock.now_ms()) for view in views)
         return answer(contract.Claimed(agent=agent.id, space=agent.space or "", devices=found))
 
     @routes.add("GET", "/agents", summary="The account's agents", answers={200: contract.AgentList}, problems=(422,))

@@ -7,18 +7,19 @@ import msgspec
 from device_agent.protocol.messages import State
 from function_app.domain.accounts import Identity
 from function_app.domain.actions import Action
-from function_app.domain.lease import Lease
+from function_app.domain.lease import Asked, Lease
 from function_app.domain.movements import Movement
 from function_app.domain.robot_types import TypeVersion
 from function_app.domain.times import rfc3339
 from function_app.entrypoints.http.contract import actions, devices, movements, robot_types
+from function_app.entrypoints.http.contract import lease as leases
 from function_app.services.devices import DeviceView
 from function_app.services.parameters import ObjectSchema
 from function_app.services.robot_types import KnownType
 from function_app.services.script_store import signed_text
 
 
-def device(view: DeviceView, who: Identity) -> devices.DeviceOut:
+def device(view: DeviceView, who: Identity, now_ms: int) -> devices.DeviceOut:
     """A device and what is known of it now."""
     known = view.device
     return devices.DeviceOut(
@@ -34,16 +35,36 @@ def device(view: DeviceView, who: Identity) -> devices.DeviceOut:
         online=view.online,
         last_seen_at=None if view.last_seen_ms is None else rfc3339(view.last_seen_ms),
         state=None if view.state is None else msgspec.convert(view.state, State, strict=False),
-        lease=lease(view.lease, who),
+        lease=lease(view.lease, who, now_ms),
     )
 
 
-def lease(found: Lease | None, who: Identity) -> devices.LeaseOut | None:
-    """A live lease."""
+def lease(found: Lease | None, who: Identity, now_ms: int) -> leases.LeaseOut | None:
+    """A live lease, with the open request for it."""
     if found is None:
         return None
-    ends = rfc3339(found.expires_ms)
-    return devices.LeaseOut(holder=found.holder, epoch=found.epoch, expires_at=ends, mine=found.mine(who))
+    asked = None if found.asked is None else control_request(found.asked, found, who, now_ms)
+    return leases.LeaseOut(
+        holder=found.holder,
+        epoch=found.epoch,
+        expires_at=rfc3339(found.expires_ms),
+        mine=found.mine(who),
+        reason=found.reason,
+        request=asked if asked is not None and asked.outcome == "open" else None,
+    )
+
+
+def control_request(asked: Asked, found: Lease, who: Identity, now_ms: int) -> leases.ControlRequestOut:
+    """A request for control."""
+    return leases.ControlRequestOut(
+        id=asked.id,
+        by=asked.by,
+        epoch=asked.epoch,
+        mine=asked.by_me(who),
+        asked_at=rfc3339(asked.asked_ms),
+        expires_at=rfc3339(asked.expires_ms),
+        outcome=asked.how(found, now_ms),
+    )
 
 
 def action(found: Action, position: int | None = None) -> actions.ActionOut:

@@ -21,7 +21,14 @@ def test_a_lease_is_taken_confirmed_renewed_and_released(pair: Pair) -> None:
     assert (renewed["epoch"], renewed["confirmed"]) == (1, True)
     assert renewed["expires_at"] > taken["expires_at"]
     shown = anna.get(f"/devices/{robot.device}").json()["lease"]
-    assert shown == {"holder": "anna", "epoch": 1, "expires_at": renewed["expires_at"], "mine": True}
+    assert shown == {
+        "holder": "anna",
+        "epoch": 1,
+        "expires_at": renewed["expires_at"],
+        "mine": True,
+        "reason": "",
+        "request": None,
+    }
     assert anna.get(f"/devices/{robot.device}/lease").json() == {"lease": shown}
     assert anna.delete(f"/devices/{robot.device}/lease?epoch=1").status_code == 204
     wait_until(lambda: robot.heard(ReleaseLease), "the release")

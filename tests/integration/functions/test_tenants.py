@@ -58,7 +58,9 @@ def test_every_route_with_the_others_ids_finds_nothing_and_changes_nothing(
     capture = {"stream": "camera", "length": 3, "content_type": "image/png"}
     upload = anna.post(f"/devices/{robot.device}/uploads", capture).json()["id"]
     fault = anna.get(f"/devices/{robot.device}/faults").json()["items"][0]["id"]
+    request = cloud.sign_in("anna").post(f"/devices/{robot.device}/lease/requests").json()["request"]["id"]
     ids = {
+        "request_id": request,
         "device": robot.device,
         "agent": robot.id,
         "action": action,
@@ -92,6 +94,12 @@ def test_every_route_with_the_others_ids_finds_nothing_and_changes_nothing(
         "get_lease",
         "take_lease",
         "release_lease",
+        "ask_for_control",
+        "get_control_request",
+        "accept_control_request",
+        "refuse_control_request",
+        "withdraw_control_request",
+        "stop_space",
         "start_action",
         "list_actions",
         "get_action",

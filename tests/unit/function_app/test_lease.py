@@ -74,7 +74,7 @@ def test_a_lease_that_never_was_is_lost() -> None:
 
 
 def test_a_released_lease_is_nobodys_and_keeps_its_epoch() -> None:
-    free = rules.release(take(take(None, ANNA), ANNA))
+    free = rules.release(take(take(None, ANNA), ANNA), now_ms=START)
     assert not free.live(START)
     assert not any(free.mine(who) for who in EVERYBODY)
     assert take(free, BERT).epoch == 3
@@ -107,7 +107,8 @@ def test_whatever_happens_epochs_rise_and_a_live_lease_stays_with_its_holder(ste
             elif lease is not None and what == "renew":
                 lease = rules.renew(lease, who, epoch=lease.epoch, lease_ms=1_000, now_ms=now_ms)
             elif lease is not None:
-                lease = rules.release(rules.hold(lease, who, epoch=lease.epoch, now_ms=now_ms))
+                held = rules.hold(lease, who, epoch=lease.epoch, now_ms=now_ms)
+                lease = rules.release(held, now_ms=now_ms)
         except Problem:
             assert lease is before
         if before is not None and lease is not None:

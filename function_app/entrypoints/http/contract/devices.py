@@ -1,18 +1,10 @@
-"""``devices``: what they are, their lease, Stop."""
+"""``devices``: what they are, and how they are now."""
 
 from typing import Literal
 
-from device_agent.protocol.messages import State, Text
-from function_app.entrypoints.http.contract.base import Answer, Epoch, LeaseMs, Moment, Request, WaitMs
-
-
-class LeaseOut(Answer, frozen=True, kw_only=True):
-    """Who controls a device."""
-
-    holder: str
-    epoch: int
-    expires_at: Moment
-    mine: bool
+from device_agent.protocol.messages import State
+from function_app.entrypoints.http.contract.base import Answer, Moment
+from function_app.entrypoints.http.contract.lease import LeaseOut
 
 
 class DeviceOut(Answer, frozen=True, kw_only=True):
@@ -38,39 +30,3 @@ class DeviceList(Answer, frozen=True, kw_only=True):
 
     items: tuple[DeviceOut, ...]
     cursor: str | None
-
-
-class LeaseRequest(Request, frozen=True, kw_only=True):
-    """Without ``epoch``: take. With it: renew that epoch."""
-
-    lease_ms: LeaseMs = 30_000
-    epoch: Epoch | None = None
-    wait_ms: WaitMs = 1_000
-
-
-class LeaseGranted(Answer, frozen=True, kw_only=True):
-    """The caller's lease. ``confirmed``: the device has acknowledged it."""
-
-    epoch: int
-    holder: str
-    expires_at: Moment
-    lease_ms: int
-    confirmed: bool
-
-
-class LeaseNow(Answer, frozen=True, kw_only=True):
-    """The live lease of a device, if any."""
-
-    lease: LeaseOut | None
-
-
-class StopRequest(Request, frozen=True, kw_only=True):
-    """Why."""
-
-    reason: Text = ""
-
-
-class Confirmed(Answer, frozen=True, kw_only=True):
-    """Whether the device has confirmed within a second."""
-
-    confirmed: bool
