@@ -29,7 +29,7 @@ class Levers:
 
     def of_geoms(self, geoms: Sequence[int]) -> Floats:
         """Of every point of each shape, shape (geoms, joints)."""
-        return np.array([self._of_geom(int(geom)) for geom in dict.fromkeys(geoms)]).reshape(-1, len(self._joints))
+        return np.array([self._of_ball(int(geom)) for geom in dict.fromkeys(geoms)]).reshape(-1, len(self._joints))
 
     def of_frame(self, is_site: bool, index: int) -> Floats:
         """Of the origin of a site or body, shape (joints,)."""
@@ -45,13 +45,19 @@ class Levers:
         return lever
 
     def _of_geom(self, geom: int) -> Floats:
-        model = self._model
-        body = int(model.geom_bodyid[geom])
-        lever = self._of_point(body, model.geom_pos[geom], float(np.linalg.norm(model.geom_aabb[geom, 3:])))
+        """How far a joint can move where a shape is; turning it about its own axis does not."""
+        lever = self._of_ball(geom)
         for index, joint in enumerate(self._joints):
-            if model.jnt_bodyid[joint] == body and self._turns_in_place(geom, joint):
+            if self._model.jnt_bodyid[joint] == self._model.geom_bodyid[geom] and self._turns_in_place(geom, joint):
                 lever[index] = 0.0
         return lever
+
+    def _of_ball(self, geom: int) -> Floats:
+        """Of the ball around a shape."""
+        model = self._model
+        box = model.geom_aabb[geom]
+        radius_m = float(np.linalg.norm(box[:3]) + np.linalg.norm(box[3:]))
+        return self._of_point(int(model.geom_bodyid[geom]), model.geom_pos[geom], radius_m)
 
     def _of_point(self, body: int, position: Floats, radius_m: float) -> Floats:
         """Of a ball that is fixed in a body."""

@@ -116,7 +116,7 @@ class MujocoGeometry:
             raise GeometryError(f"{frame} cannot go there: {tight.text} would be too near")
         miss_m, miss_rad = self._solver.missed
         raise GeometryError(
-            f"{frame} cannot reach that pose: the nearest it comes is {miss_m * 1000:.0f} mm and "
+            f"found no way to bring {frame} there: the nearest it comes is {miss_m * 1000:.0f} mm and "
             f"{math.degrees(miss_rad):.0f} degrees away"
         )
 

@@ -25,6 +25,7 @@ _FAR_M = 3.0
 """Beyond this nobody asks how far; a plane's half space is that deep."""
 _STILL_M = 1e-4
 """A pair whose distance changes by less over many random positions cannot come nearer, by construction."""
+_NOTHING_M = 1e-9
 _NEIGHBOURS = 2
 """Steps along the tree between links that have one link between them."""
 _FACES = ("lower x", "lower y", "lower z", "upper x", "upper y", "upper z")
@@ -246,12 +247,10 @@ class Near:
         """Share of a leg that can be gone unseen: nothing then comes too near, or by less than ``step_m``."""
         share = 1.0
         for pair, room in self._room.items():
-            if self._closing[pair][leg] > 0:
-                share = min(share, max(room, step_m) / self._closing[pair][leg])
+            share = min(share, max(room, step_m) / max(self._closing[pair][leg], _NOTHING_M))
         for index in self._held_near.tolist():
-            closing = float(self._held_closing[leg, index])
-            if closing > 0:
-                share = min(share, max(float(self._held_room[index]), step_m) / closing)
+            room = float(self._held_room[index])
+            share = min(share, max(room, step_m) / max(float(self._held_closing[leg, index]), _NOTHING_M))
         return share
 
     def broken(self, same_m: float) -> bool:

@@ -10,9 +10,9 @@ import numpy.typing as npt
 Floats = npt.NDArray[np.float64]
 Ints = npt.NDArray[np.intp]
 
-_STEPS = 150
+_STEPS = 60
 _STEP_S = 0.1
-_RESTARTS = 12
+_RESTARTS = 40
 _SEED = 4
 _NEAR_M = 1e-4
 _NEAR_RAD = 1e-3

@@ -1,0 +1,121 @@
+"""Every movement, under the control of the agent's own limits: what ships is not held before anything."""
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from device_agent import geometry
+from device_agent.protocol import robot_type
+from device_agent.runtime.controller import Controller
+from device_agent.runtime.courses import Outcome
+from device_agent.runtime.lease import LeaseGate, Refused
+from tests.unit.robots.folders import MOVEMENTS, ROBOTS
+
+LONGEST_S = 60.0
+
+
+class LimitedRobot:
+    """The script's ``robot``: the controller moves it, tick by tick, with its shape known."""
+
+    def __init__(self, folder: Path) -> None:
+        self.type = robot_type.load(folder)
+        self.shape = geometry.load(self.type, folder)
+        self.controller = Controller(self.type, LeaseGate(), geometry=self.shape)
+        self.position = [self.type.home_rad[joint.name] for joint in self.type.joints]
+        self.controller.start_at(self.position)
+        self.tenure = self.controller.begin_action(epoch=1, on_lost=lambda _: None)
+        self.joints = tuple(joint.name for joint in self.type.joints)
+        self.now_s = 0.0
+        self.tightest_m = 1.0
+        self.limited: set[str] = set()
+
+    def move_joints(self, position_rad: Mapping[str, float] | Sequence[float], speed: float = 0.5) -> None:
+        if not isinstance(position_rad, Mapping):
+            position_rad = dict(zip(self.joints, position_rad, strict=True))
+        move = self.controller.move(self.tenure, position_rad, speed=speed)
+        end_s = self.now_s + LONGEST_S
+        while not move.finished.is_set():
+            self.now_s += self.type.period_ms / 1000
+            self.position = self.controller.step(self.now_s).position_rad
+            assert self.now_s < end_s, "did not arrive"
+            if self.shape is not None and round(self.now_s * 1000) % 40 == 0:
+                self.tightest_m = min(self.tightest_m, self.shape.clearance(self.position).room_m)
+        self.limited |= set(move.limited)
+        if move.outcome is not Outcome.REACHED:
+            raise move.why or AssertionError("no reason")
+
+    def home(self, speed: float = 0.5) -> None:
+        self.move_joints(self.type.home_rad, speed=speed)
+
+    def state(self) -> dict[str, Any]:
+        return {"position_rad": dict(zip(self.joints, self.position, strict=True))}
+
+
+def play(path: Path, parameters: dict[str, Any]) -> LimitedRobot:
+    robot = LimitedRobot(ROBOTS / path.parent.parent.name)
+    given = {
+        "robot": robot,
+        "wait": lambda _: None,
+        "parameters": parameters,
+        "progress": lambda _: None,
+        "print": lambda *_: None,
+        "__name__": "__movement__",
+    }
+    exec(compile(path.read_text(encoding="utf-8"), str(path), "exec"), given)  # noqa: S102 - our own scripts
+    return robot
+
+
+@pytest.mark.parametrize("path", MOVEMENTS, ids=lambda path: f"{path.parent.parent.name}-{path.stem}")
+def test_no_shipped_movement_is_limited(path: Path) -> None:
+    robot = play(path, {})
+    assert robot.limited == set()
+    assert robot.tightest_m >= 0
+
+
+@pytest.mark.parametrize(
+    ("name", "parameters"),
+    [
+        ("slow_square", {"side_m": 9, "height_m": 0, "speed": 1.0}),
+        ("pick_and_place", {"times": 1, "speed": 1.0}),
+        ("wave", {"times": 1, "speed": 1.0}),
+    ],
+)
+def test_nor_with_extreme_parameters(name: str, parameters: dict[str, Any]) -> None:
+    assert play(ROBOTS / "ur5" / "movements" / f"{name}.py", parameters).limited == set()
+
+
+def test_a_dive_into_the_table_is_refused_or_held_before_it() -> None:
+    robot = LimitedRobot(ROBOTS / "ur5")
+    with pytest.raises(Refused, match="no room there: workspace: wrist_3 \u2013 lower z, 281 mm too near"):
+        robot.move_joints({"shoulder_lift": -0.2, "elbow": 1.2}, speed=1.0)
+    with pytest.raises(Refused, match="no room there: clearance: table_top \u2013 wrist_3_link"):
+        robot.move_joints({"shoulder_lift": -0.86}, speed=1.0)
+    for target in through_the_table(robot):
+        with pytest.raises(Refused, match="something is in the way: clearance: ") as refused:
+            robot.move_joints(target, speed=1.0)
+        assert refused.value.code == "no_room"
+        assert robot.shape is not None
+        assert robot.shape.clearance(robot.position).room_m >= 0
+        robot.home(speed=1.0)
+
+
+def through_the_table(robot: LimitedRobot) -> list[list[float]]:
+    """Positions with room around them, to which the straight way leads through the table."""
+    assert robot.shape is not None
+    random = np.random.default_rng(11)
+    home = list(robot.position)
+    found: list[list[float]] = []
+    while len(found) < 5:
+        turns = random.uniform(-3, 3, len(home)).tolist()
+        target = [
+            min(max(place + turn, joint.lower_rad), joint.upper_rad)
+            for place, turn, joint in zip(home, turns, robot.type.joints, strict=True)
+        ]
+        if robot.shape.clearance(target).room_m > 0:
+            swept = robot.shape.sweep([home, target])
+            if swept.clearance is not None and "table_top" in swept.clearance.text:
+                found.append(target)
+    return found
