@@ -1,18 +1,21 @@
 """Puts an agent together: the one place that picks drivers; ``links`` picks the transport."""
 
+from collections.abc import Callable
 from pathlib import Path
 
 from device_agent import drivers, geometry, links
 from device_agent.ports.clock import CloudClock, tick_ms, wall_ms
 from device_agent.ports.geometry import Geometry, GeometryError
 from device_agent.ports.transport import Transport
-from device_agent.protocol import robot_type
+from device_agent.protocol import robot_type, topics
 from device_agent.protocol.errors import ProtocolError
 from device_agent.runtime.agent import Agent
 from device_agent.runtime.device import Device
 from device_agent.runtime.home import Configuration, DeviceEntry, Home, HomeError, Pairing
 from device_agent.runtime.journal import Journal
+from device_agent.runtime.outbox import Outbox, Publish
 from device_agent.runtime.room import Room
+from device_agent.runtime.shelf import Shelf
 from device_agent.transports.http.api import CloudApi
 
 ROBOTS = Path(__file__).resolve().parent.parent / "robots"
@@ -120,13 +123,31 @@ def build(home: Home, *, trace: Path | None = None) -> Cell:
             listen=room.topics(),
         )
     )
+    outbox = _outbox(home, configuration, pairing, publish=transport.publish, quiet=lambda: agent.quiet)
     devices = {}
     for entry in configuration.devices:
         devices[entry.name] = _device(
-            entry, pairing, journal=journal, clock=clock, transport=transport, room=room, trace=trace
+            entry, pairing, journal=journal, clock=clock, transport=transport, outbox=outbox, room=room, trace=trace
         )
-    agent = Agent(devices, transport, room=room, address=(pairing.space, pairing.agent))
+    agent = Agent(devices, transport, outbox=outbox, room=room, address=(pairing.space, pairing.agent))
     return Cell(agent, journal, membership)
+
+
+def _outbox(
+    home: Home,
+    configuration: Configuration,
+    pairing: Pairing,
+    *,
+    publish: Publish,
+    quiet: Callable[[], bool],
+) -> Outbox:
+    own = f"{topics.ROOT}/{pairing.space}/{pairing.agent}/"
+    buffer = configuration.buffer
+    shelf = Shelf(
+        home.outbox, own=own, max_bytes=round(buffer.max_mb * 1e6), max_age_ms=round(buffer.max_age_h * 3_600_000)
+    )
+    teller = own + configuration.devices[0].name
+    return Outbox(shelf, publish=publish, teller=teller, quiet=quiet, keep_hz=buffer.measurements_hz)
 
 
 def _device(
@@ -136,6 +157,7 @@ def _device(
     journal: Journal,
     clock: CloudClock,
     transport: Transport,
+    outbox: Outbox,
     room: Room,
     trace: Path | None,
 ) -> Device:
@@ -156,6 +178,7 @@ def _device(
         cloud_clock=clock,
         keys=pairing.public_keys(),
         publish=transport.publish,
+        outbox=outbox,
         room=room,
         interlocks=entry.interlocks,
         geometry=_geometry(kind, str(entry.options.get("scene", ""))),

@@ -7,6 +7,7 @@ from device_agent.ports.transport import Transport
 from device_agent.protocol import topics
 from device_agent.protocol.errors import ProtocolError
 from device_agent.runtime.device import Device
+from device_agent.runtime.outbox import Outbox
 from device_agent.runtime.room import Room
 
 _log = logging.getLogger(__name__)
@@ -18,15 +19,23 @@ class Agent:
     Args:
         devices: By name.
         transport: Not yet started.
+        outbox: Not yet started.
         room: Hears what the space's other agents measure.
         address: Space and agent.
     """
 
     def __init__(
-        self, devices: Mapping[str, Device], transport: Transport, *, room: Room, address: tuple[str, str]
+        self,
+        devices: Mapping[str, Device],
+        transport: Transport,
+        *,
+        outbox: Outbox,
+        room: Room,
+        address: tuple[str, str],
     ) -> None:
         self._devices = devices
         self._transport = transport
+        self._outbox = outbox
         self._room = room
         self._address = address
 
@@ -37,6 +46,7 @@ class Agent:
             DriverError: A device is not there.
             TransportError: The transport's configuration is unusable.
         """
+        self._outbox.start()
         for device in self._devices.values():
             device.start()
         self._transport.start(self._receive, self._link_changed)
@@ -45,6 +55,7 @@ class Agent:
         """Hold and close every device, then say goodbye. May be called twice."""
         for device in self._devices.values():
             device.stop()
+        self._outbox.stop()
         self._transport.stop()
 
     @property
@@ -67,5 +78,6 @@ class Agent:
 
     def _link_changed(self, up: bool) -> None:
         _log.info("link %s", "up" if up else "lost")
+        self._outbox.link_changed(up)
         for device in self._devices.values():
             device.link_changed(up)

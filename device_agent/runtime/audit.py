@@ -4,6 +4,7 @@ The control loop, the transport's thread and the office note; the office alone t
 """
 
 import threading
+import uuid
 from collections import deque
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
@@ -11,12 +12,14 @@ from typing import Any, Literal
 
 from device_agent.ports.clock import wall_ms
 from device_agent.protocol.events import EventKind
+from device_agent.protocol.messages import Event
 
 Severity = Literal["info", "warning", "error"]
 
 GAP_S = 5.0
 """The same refusal is told at most once in this time; those between are counted."""
 _MOST_WAITING = 500
+_LONGEST = 2000
 _MOST_COUNTED = 64
 """Different refusals that are counted one by one; codes are few, so more than these is no honest traffic."""
 
@@ -113,6 +116,24 @@ class Audit:
             self._lost += 1
             return
         self._waiting.append(happened)
+
+
+def event_of(device: str, happened: Happened) -> Event:
+    """A fact as it is told.
+
+    Args:
+        device: Name of the device.
+        happened: With its time.
+    """
+    return Event(
+        id=uuid.uuid4().hex,
+        device=device,
+        at_ms=happened.at_ms,
+        kind=happened.kind,
+        severity=happened.severity,
+        message=happened.message[:_LONGEST],
+        data=dict(happened.data),
+    )
 
 
 def _stamped(happened: Happened) -> Happened:

@@ -26,8 +26,9 @@ from device_agent.runtime.journal import Journal
 from device_agent.runtime.lease import LeaseGate, Refused
 from device_agent.runtime.loop import ControlLoop
 from device_agent.runtime.office import Office
+from device_agent.runtime.outbox import Outbox, Publish
 from device_agent.runtime.room import Room
-from device_agent.runtime.voice import Publish, Voice
+from device_agent.runtime.voice import Voice
 
 _REFUSED = {
     topics.CTL: EventKind.SETPOINTS_REFUSED,
@@ -51,6 +52,7 @@ class Device:
         cloud_clock: For ``ttl_ms``.
         keys: The cloud's pinned public keys by key id.
         publish: Sends a message.
+        outbox: Sends what must not be lost.
         room: What the space's other devices have measured last.
         interlocks: How the room slows or holds this one.
         geometry: The robot's shape, ``None`` where its type has no model.
@@ -69,6 +71,7 @@ class Device:
         cloud_clock: CloudClock,
         keys: Mapping[str, Ed25519PublicKey],
         publish: Publish,
+        outbox: Outbox,
         room: Room,
         interlocks: Sequence[Interlock] = (),
         geometry: Geometry | None = None,
@@ -88,6 +91,7 @@ class Device:
             interlocks=[rule.shown for rule in interlocks],
             journal=journal,
             publish=publish,
+            outbox=outbox,
         )
         self._room = room
         self._interlocks = Interlocks(

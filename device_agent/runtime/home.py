@@ -5,6 +5,7 @@ identity.pem     the private key, mode 0600; never leaves the machine
 agent.toml       server, transport and devices; written by ``enroll``, edited by people
 pairing.json     space, account and pinned keys, once claimed
 journal.db       what must not be forgotten
+outbox.db        what could not be sent yet
 ```
 """
 
@@ -62,6 +63,20 @@ class HttpPolling(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True)
     poll_ms: Annotated[int, Meta(ge=50, le=10_000)] = 1000
 
 
+class Buffer(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """``[buffer]`` of ``agent.toml``: what is kept on disk while the link is down.
+
+    Attributes:
+        max_mb: Most that is kept [MB]; the oldest goes first.
+        max_age_h: Older measurements are dropped [h]; the cloud takes in none that are older than a day.
+        measurements_hz: Of each stream so many in a second are kept, at most [Hz].
+    """
+
+    max_mb: Annotated[float, Meta(ge=1, le=10_000)] = 64
+    max_age_h: Annotated[float, Meta(gt=0, le=720)] = 24
+    measurements_hz: Annotated[float, Meta(ge=0.01, le=20)] = 1
+
+
 class Configuration(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """``agent.toml``. ``transport`` is one of ``device_agent.links.names()``."""
 
@@ -70,13 +85,14 @@ class Configuration(Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tru
     devices: tuple[DeviceEntry, ...]
     transport: str = "mqtt"
     http: HttpPolling = HttpPolling()
+    buffer: Buffer = Buffer()
     room: Annotated[tuple[RoomStream, ...], Meta(max_length=64)] = ()
 
     def keeping(self, before: "Configuration") -> "Configuration":
-        """This, with what ``enroll`` does not ask for as it was before: the room and each device's interlocks."""
+        """This, with what ``enroll`` does not ask for as it was before: buffer, room, each device's interlocks."""
         rules = {device.name: device.interlocks for device in before.devices}
         devices = tuple(replace(device, interlocks=rules.get(device.name, ())) for device in self.devices)
-        return replace(self, devices=devices, room=before.room)
+        return replace(self, devices=devices, room=before.room, buffer=before.buffer)
 
     @property
     def sources(self) -> tuple[tuple[str, str], ...]:
@@ -109,6 +125,7 @@ class Home:
     def __init__(self, folder: Path) -> None:
         self.folder = folder
         self.journal = folder / "journal.db"
+        self.outbox = folder / "outbox.db"
 
     def identity(self, *, create: bool = False) -> Ed25519PrivateKey:
         """The agent's private key.
@@ -169,6 +186,8 @@ class Home:
         if configuration.transport == "http" or configuration.http != HttpPolling():
             lines += ["", "[http]"]
             lines += [f"{key} = {_toml(getattr(configuration.http, key))}" for key in ("poll", "poll_ms")]
+        if configuration.buffer != Buffer():
+            lines += ["", "[buffer]", *_table(configuration.buffer)]
         for stream in configuration.room:
             lines += ["", "[[room]]", *_table(stream)]
         for device in configuration.devices:

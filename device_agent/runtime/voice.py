@@ -3,8 +3,7 @@
 import queue
 import threading
 import time
-import uuid
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 from device_agent.ports.clock import tick_ms, wall_ms
@@ -14,7 +13,6 @@ from device_agent.protocol.messages import (
     AckStatus,
     ActionState,
     Description,
-    Event,
     Fault,
     InterlockRule,
     JointTelemetry,
@@ -27,14 +25,12 @@ from device_agent.protocol.messages import (
     Twin,
 )
 from device_agent.protocol.robot_type import RobotType
-from device_agent.runtime.audit import Happened
+from device_agent.runtime.audit import Happened, event_of
 from device_agent.runtime.handover import Asked
 from device_agent.runtime.journal import Journal
 from device_agent.runtime.lease import Lease
+from device_agent.runtime.outbox import Outbox, Publish
 from device_agent.runtime.stream import MAX_LOOP_AGE_S, WATCHDOG_S
-
-Publish = Callable[..., bool]
-"""``Transport.publish``."""
 
 STATE_EVERY_S = 30.0
 STATE_GAP_S = 1.0
@@ -80,6 +76,7 @@ class Voice:
         interlocks: How the room slows or holds it.
         journal: Open.
         publish: Sends a message.
+        outbox: Sends what must not be lost.
 
     Attributes:
         refusals: How often what was refused, by code.
@@ -95,6 +92,7 @@ class Voice:
         interlocks: Sequence[InterlockRule],
         journal: Journal,
         publish: Publish,
+        outbox: Outbox,
     ) -> None:
         self._address = address
         self._name = address[2]
@@ -104,6 +102,7 @@ class Voice:
         self._interlocks = tuple(interlocks)
         self._journal = journal
         self._publish = publish
+        self._outbox = outbox
         self._delivered: queue.SimpleQueue[Ack] = queue.SimpleQueue()
         self._sequences: dict[str, int] = {}
         self._lock = threading.Lock()
@@ -175,20 +174,15 @@ class Voice:
 
     def tell(self, telemetry: JointTelemetry) -> None:
         """Publish a measurement; called by the control loop, must not block."""
-        self._publish(self._topic(topics.TELE, topics.JOINTS), codec.encode(telemetry), qos=0)
+        payload = codec.encode(telemetry)
+        sent = self._publish(self._topic(topics.TELE, topics.JOINTS), payload, qos=0)
+        late = self._topic(topics.LATE, topics.JOINTS)
+        self._outbox.measured(late, payload, at_ms=telemetry.at_ms, sent=sent, now_s=time.monotonic())
 
     def event(self, happened: Happened) -> None:
-        """Publish a fact that happened."""
-        event = Event(
-            id=uuid.uuid4().hex,
-            device=self._name,
-            at_ms=happened.at_ms,
-            kind=happened.kind,
-            severity=happened.severity,
-            message=happened.message[:2000],
-            data=dict(happened.data),
-        )
-        self._publish(self._topic(topics.EVENT), codec.encode(event), qos=1)
+        """Tell a fact that happened, as soon as it can be."""
+        event = event_of(self._name, happened)
+        self._outbox.happened(self._topic(topics.EVENT), codec.encode(event), at_ms=event.at_ms)
 
     def count(self, code: str) -> None:
         """Count a refusal."""

@@ -30,7 +30,9 @@ from device_agent.protocol.messages import Ack, Command
 from device_agent.runtime.controller import Controller
 from device_agent.runtime.device import Device
 from device_agent.runtime.journal import Journal
+from device_agent.runtime.outbox import Outbox
 from device_agent.runtime.room import Room
+from device_agent.runtime.shelf import Shelf
 from tests.unit.agent.test_controller import robot_type
 from tests.unit.agent.test_device import ToyDriver
 
@@ -128,13 +130,18 @@ class Body:
                 name=DEVICE, label="Arm", space=SPACE, agent=AGENT, robot_type=swift(), driver=ToyDriver(),
                 journal=journal, cloud_clock=self.clock, publish=self._publish,
                 keys={signing.key_id(key.public_key()): key.public_key()},
-                room=Room(space=SPACE, agent=AGENT, own=[DEVICE]),
+                room=Room(space=SPACE, agent=AGENT, own=[DEVICE]), outbox=self._outbox(),
             )  # fmt: skip
             device.start()
             device.link_changed(True)
             self._deliver(device, key)
             device.stop()
             journal.close()
+
+    def _outbox(self) -> Outbox:
+        own = f"ts/v1/{SPACE}/{AGENT}/"
+        shelf = Shelf(self.folder / "outbox.db", own=own, max_bytes=10**7, max_age_ms=3_600_000)
+        return Outbox(shelf, publish=self._publish, teller=own + DEVICE)
 
     def _deliver(self, device: Device, key: Ed25519PrivateKey) -> None:
         topic = topics.Topic(SPACE, AGENT, DEVICE, topics.CMD)

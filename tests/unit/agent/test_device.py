@@ -37,7 +37,9 @@ from device_agent.protocol.messages import (
 )
 from device_agent.runtime.device import Device
 from device_agent.runtime.journal import Journal
+from device_agent.runtime.outbox import Outbox
 from device_agent.runtime.room import Room
+from device_agent.runtime.shelf import Shelf
 from tests.unit.agent.test_controller import robot_type
 
 WITHIN_S = 15.0
@@ -85,6 +87,10 @@ class Bench:
         self.clock = CloudClock()
         self.clock.observe(server_ms=wall_ms(), sent_tick_ms=tick_ms(), received_tick_ms=tick_ms())
         self.number = 0
+        shelf = Shelf(folder / "outbox.db", own="ts/v1/s/a/", max_bytes=10**6, max_age_ms=3_600_000)
+        self.outbox = Outbox(shelf, publish=self.publish, teller="ts/v1/s/a/arm")
+        self.outbox.link_changed(True)
+        self.outbox.start()
         self.device = Device(
             name="arm",
             label="Arm",
@@ -96,6 +102,7 @@ class Bench:
             cloud_clock=self.clock,
             keys={signing.key_id(self.key.public_key()): self.key.public_key()},
             publish=self.publish,
+            outbox=self.outbox,
             room=Room(space="s", agent="a", own=["arm"]),
         )
 
@@ -172,6 +179,7 @@ def bench(tmp_path: Path):
     bench.device.link_changed(True)
     yield bench
     bench.device.stop()
+    bench.outbox.stop()
     bench.journal.close()
 
 

@@ -28,6 +28,7 @@ def bench(tmp_path: Path):
     bench.device.link_changed(True)
     yield bench
     bench.device.stop()
+    bench.outbox.stop()
     bench.journal.close()
 
 
@@ -106,6 +107,7 @@ def test_a_flood_of_setpoints_without_a_lease_is_one_event(bench: Bench) -> None
     assert refused.data == {"code": "no_lease"}
     assert refused.severity == "warning"
     bench.device.stop()
+    eventually(lambda: len(events(bench, EventKind.SETPOINTS_REFUSED)) == 2)
     first, rest = events(bench, EventKind.SETPOINTS_REFUSED)
     assert (first.id, rest.data) == (refused.id, {"code": "no_lease", "count": 199})
 

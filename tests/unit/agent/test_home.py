@@ -5,10 +5,11 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
+from msgspec.structs import replace
 
-from device_agent.runtime.home import Configuration, DeviceEntry, Home, HomeError, HttpPolling, RoomStream
+from device_agent.runtime.home import Buffer, Configuration, DeviceEntry, Home, HomeError, HttpPolling, RoomStream
 from device_agent.runtime.interlocks import Interlock
 
 ARM = DeviceEntry(name="arm", type="ur5")
@@ -22,6 +23,7 @@ VALUES: Any = st.recursive(
 )
 
 
+@settings(deadline=None)
 @given(name=LABELS, transport=st.sampled_from(["mqtt", "http"]), options=st.dictionaries(LABELS, VALUES, max_size=3))
 def test_what_is_written_is_read_again(
     name: str, transport: str, options: dict[str, Any], tmp_path_factory: pytest.TempPathFactory
@@ -37,7 +39,15 @@ def test_what_is_written_is_read_again(
     )
     room = (RoomStream(device="abc-lamp", stream="light"),)
     polling = HttpPolling(poll="plain", poll_ms=250)
-    written = Configuration(server="http://s", name=name, transport=transport, http=polling, devices=devices, room=room)
+    written = Configuration(
+        server="http://s",
+        name=name,
+        transport=transport,
+        http=polling,
+        devices=devices,
+        room=room,
+    )
+    written = replace(written, buffer=Buffer(max_mb=2))
     home.save_configuration(written)
     assert home.configuration() == written
 
@@ -57,6 +67,9 @@ def test_a_folder_written_before_there_was_a_choice_speaks_mqtt(tmp_path: Path) 
         ("[https]\n", "https"),
         ("= 1\n", "agent.toml"),
         ('[[room]]\ndevice = "a-b"\n', "stream"),
+        ("[buffer]\nmax_mb = 0.5\n", "max_mb"),
+        ("[buffer]\nmax_age_h = nan\n", "max_age_h"),
+        ("[buffer]\nmeasurements_hz = 0\n", "measurements_hz"),
         ('[[room]]\ndevice = "pir"\nstream = "presence"\n', "'pir' is no device of this agent .arm.; name one"),
         (f"{INTERLOCK}[[devices.interlocks]]\nspeed = 0.5\n", "device"),
         (INTERLOCK.replace("equals = true", ""), "exactly one of above, below, equals"),
