@@ -161,7 +161,10 @@ def _await_claim(home: Home, api: CloudApi, configuration: Configuration, claim:
         found = api.enrollment(wait_s=_POLL_S if claim.code is not None else 0.0)
         if found.get("state") == "claimed":
             keys = {str(key["id"]): str(key["public"]) for key in found["keys"]}
-            pairing = Pairing(agent=found["agent"], space=found["space"], account=found["account"]["name"], keys=keys)
+            account = found["account"]
+            pairing = Pairing(
+                agent=found["agent"], space=found["space"], account=account["name"], owner=account["id"], keys=keys
+            )
             home.save_pairing(pairing)
             print(f"paired with {pairing.account}", flush=True)
             return pairing

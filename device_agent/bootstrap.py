@@ -4,8 +4,10 @@ from collections.abc import Callable
 from pathlib import Path
 
 from device_agent import drivers, geometry, links
+from device_agent.jail.warm import WarmJail
 from device_agent.ports.clock import CloudClock, tick_ms, wall_ms
 from device_agent.ports.geometry import Geometry, GeometryError
+from device_agent.ports.jail import Jail
 from device_agent.ports.transport import Transport
 from device_agent.protocol import robot_type, topics
 from device_agent.protocol.errors import ProtocolError
@@ -24,8 +26,9 @@ ROBOTS = Path(__file__).resolve().parent.parent / "robots"
 class Cell:
     """A running agent and what must be closed with it."""
 
-    def __init__(self, agent: Agent, journal: Journal, membership: links.Membership) -> None:
+    def __init__(self, agent: Agent, journal: Journal, membership: links.Membership, jail: Jail) -> None:
         self._agent = agent
+        self._jail = jail
         self._journal = journal
         self._membership = membership
 
@@ -41,11 +44,13 @@ class Cell:
             DriverError: A device is not there.
             TransportError: The transport's configuration is unusable.
         """
+        self._jail.start()
         self._agent.start()
 
     def stop(self) -> None:
         """Hold, say goodbye, close. May be called twice."""
         self._agent.stop()
+        self._jail.close()
         self._journal.close()
 
 
@@ -124,13 +129,22 @@ def build(home: Home, *, trace: Path | None = None) -> Cell:
         )
     )
     outbox = _outbox(home, configuration, pairing, publish=transport.publish, quiet=lambda: agent.quiet)
+    jail = WarmJail(trusted=configuration.trusted_scripts)
     devices = {}
     for entry in configuration.devices:
         devices[entry.name] = _device(
-            entry, pairing, journal=journal, clock=clock, transport=transport, outbox=outbox, room=room, trace=trace
+            entry,
+            pairing,
+            journal=journal,
+            clock=clock,
+            transport=transport,
+            outbox=outbox,
+            room=room,
+            jail=jail,
+            trace=trace,
         )
     agent = Agent(devices, transport, outbox=outbox, room=room, address=(pairing.space, pairing.agent))
-    return Cell(agent, journal, membership)
+    return Cell(agent, journal, membership, jail)
 
 
 def _outbox(
@@ -159,6 +173,7 @@ def _device(
     transport: Transport,
     outbox: Outbox,
     room: Room,
+    jail: Jail,
     trace: Path | None,
 ) -> Device:
     kind = load_type(entry.type)
@@ -182,6 +197,8 @@ def _device(
         room=room,
         interlocks=entry.interlocks,
         geometry=_geometry(kind, str(entry.options.get("scene", ""))),
+        jail=jail,
+        owner=pairing.owner,
     )
 
 

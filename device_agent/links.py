@@ -74,6 +74,18 @@ class Membership:
             raise self._gone("this agent belongs to another space now")
         return given
 
+    def xmpp_credentials(self, api: CloudApi) -> dict[str, Any]:
+        """Credentials for the XMPP server.
+
+        Raises:
+            CloudError: Refused; or the agent belongs to another space.
+            OSError: Not reached.
+        """
+        given = self._ask(api, api.xmpp_credentials)
+        if given.get("space") != self._pairing.space:
+            raise self._gone("this agent belongs to another space now")
+        return given
+
     def check(self, api: CloudApi, *, within_s: float = 10.0) -> None:
         """Look whether the pairing holds, if the cloud answers within so long [s].
 
@@ -175,4 +187,35 @@ def _http(wiring: Wiring) -> Transport:
     )
 
 
-_MAKERS: Mapping[str, Callable[[Wiring], Transport]] = {"mqtt": _mqtt, "http": _http}
+def _xmpp(wiring: Wiring) -> Transport:
+    try:
+        from device_agent.transports.xmpp import XmppAccess, XmppTransport  # noqa: PLC0415 (only where it is chosen)
+    except ImportError as error:
+        raise HomeError("agent.toml: transport 'xmpp' needs slixmpp; run `pip install slixmpp`") from error
+    from device_agent.protocol.xmpp_stream import Login  # noqa: PLC0415
+
+    api = wiring.open_api()
+
+    def access() -> XmppAccess:
+        given = wiring.membership.xmpp_credentials(api)
+        try:
+            login = Login(
+                host=str(given["host"]),
+                port=int(given["port"]),
+                jid=str(given["jid"]),
+                password=str(given["password"]),
+            )
+            return XmppAccess(login=login, cloud=str(given["cloud"]), lifetime_s=float(given["lifetime_s"]))
+        except (KeyError, TypeError) as error:
+            raise CloudError(f"the cloud's XMPP credentials lack {error}") from error
+
+    return XmppTransport(
+        access=access,
+        presence_topic=wiring.presence_topic,
+        next_session=wiring.next_session,
+        software=SOFTWARE,
+        quiet=wiring.quiet,
+    )
+
+
+_MAKERS: Mapping[str, Callable[[Wiring], Transport]] = {"mqtt": _mqtt, "http": _http, "xmpp": _xmpp}

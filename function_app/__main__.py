@@ -1,4 +1,4 @@
-"""``python -m function_app serve|work|check-models|prepare|sign-in-link``: the functions on one machine."""
+"""``python -m function_app serve|work|xmpp|check-models|prepare|sign-in-link``: the functions on one machine."""
 
 import argparse
 import asyncio
@@ -23,6 +23,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     commands = parser.add_subparsers(required=True, metavar="COMMAND", dest="command")
     commands.add_parser("serve", help="API and console, under uvicorn")
     commands.add_parser("work", help="ingest from the broker, and timers")
+    commands.add_parser("xmpp", help="speak XMPP for the cloud, with agents that have chosen it")
     commands.add_parser("prepare", help="make Amazon's table and bucket, where there are none")
     checks = commands.add_parser("check-models", help="compile uploaded robot types with MuJoCo, as `work` does too")
     checks.add_argument("--drain", action="store_true", help="end as soon as none is left")
@@ -43,6 +44,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
             serve(functions)
         elif options.command == "work":
             asyncio.run(work(functions))
+        elif options.command == "xmpp":
+            asyncio.run(_speak(functions))
         elif options.command == "check-models":
             asyncio.run(_check_models(functions, drain=options.drain))
         else:
@@ -69,6 +72,12 @@ async def _check_models(functions: Functions, *, drain: bool) -> None:
         await check_models(functions, drain=drain)
     finally:
         await functions.close()
+
+
+async def _speak(functions: Functions) -> None:
+    from function_app.entrypoints.xmpp import speak  # noqa: PLC0415 (what it needs is not everywhere)
+
+    await speak(functions)
 
 
 async def _link(functions: Functions, account: str) -> None:

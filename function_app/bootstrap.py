@@ -13,6 +13,7 @@ from function_app.adapters.local.command_bus import MqttCommandBus
 from function_app.adapters.local.feed import MqttFeed, MqttLate, MqttTelemetry
 from function_app.adapters.local.keys import FileKeys
 from function_app.adapters.local.model_compiler import MujocoCompiler
+from function_app.adapters.local.orders import MqttOrders
 from function_app.adapters.local.tables import SqliteTables
 from function_app.domain.series import Keep
 from function_app.ports.blobs import Blobs, Transfers
@@ -21,7 +22,9 @@ from function_app.ports.clock import Clock
 from function_app.ports.command_bus import CommandBus
 from function_app.ports.feed import Feed, Telemetry
 from function_app.ports.keys import Keys
+from function_app.ports.orders import Orders
 from function_app.ports.tables import Tables
+from function_app.ports.xmpp_line import XmppLine
 from function_app.services.action_acks import ActionAcks
 from function_app.services.action_rows import ActionRows
 from function_app.services.actions import Actions
@@ -68,7 +71,7 @@ from function_app.services.unpair import Unpair
 from function_app.services.upload_robot_type import UploadRobotType
 from function_app.services.uploads import Uploads
 from function_app.services.xmpp_access import XmppAccess
-from function_app.settings import AwsStore, AzureStore, EventGridBus, IotBus, Settings
+from function_app.settings import AwsStore, AzureStore, EventGridBus, IotBus, Settings, SettingsError
 
 TABLES_FILE = "tables.sqlite"
 BLOBS_PATH = "/api/v1/blobs"
@@ -113,6 +116,7 @@ class Functions:
     xmpp_access: XmppAccess
     presence: PresenceIngest
     polling: Polling
+    mailbox: Mailbox
     relay: Relay
     forget: Forget
     events: Events
@@ -176,7 +180,8 @@ def build(settings: Settings, *, clock: Clock | None = None) -> Functions:
     writer = SeriesWriter(tables=tables, forget=forget, keep=keep, clock=now)
     uploads = Uploads(tables=tables, blobs=blobs, keep_ms=settings.keep_uploads_days * DAY_MS, clock=now)
     mailbox = Mailbox(tables=tables, forget=forget, clock=now)
-    delivery = Delivery(bus=bus, mailbox=mailbox)
+    relay = Relay(bus=bus, clock=now)
+    delivery = Delivery(bus=bus, mailbox=mailbox, relay=relay)
     commands = Commands(delivery=delivery, keys=keys, clock=now)
     robot_types = RobotTypes(tables=tables, blobs=blobs, catalogue=catalogue)
     diagnostics = Diagnostics(
@@ -291,7 +296,8 @@ def build(settings: Settings, *, clock: Clock | None = None) -> Functions:
             domain=settings.xmpp_domain,
         ),
         polling=Polling(tables=tables, mailbox=mailbox, clock=now),
-        relay=Relay(bus=bus, clock=now),
+        mailbox=mailbox,
+        relay=relay,
         presence=PresenceIngest(tables=tables, events=events, conditions=conditions, clock=now),
         forget=forget,
         events=events,
@@ -334,6 +340,30 @@ def _keep(settings: Settings) -> Keep:
             "10min": settings.keep_10min_days * DAY_MS,
         },
     )
+
+
+def xmpp_line(functions: Functions) -> XmppLine:
+    """The cloud's own connection to the XMPP server, not yet open.
+
+    Raises:
+        SettingsError: The settings name no XMPP server.
+    """
+    from function_app.adapters.local.xmpp_line import SlixmppLine  # noqa: PLC0415 (only where it is in use)
+
+    settings = functions.settings
+    if not settings.xmpp_domain:
+        raise SettingsError("TELESCOPE_XMPP_DOMAIN is empty; it must be the domain that the XMPP server serves")
+
+    async def password() -> str:
+        return (await functions.xmpp_access.cloud()).password
+
+    return SlixmppLine(host=settings.xmpp_host, port=settings.xmpp_port, domain=settings.xmpp_domain, password=password)
+
+
+def orders(functions: Functions) -> Orders:
+    """What the broker brings for agents that a program of ours speaks for, not yet open."""
+    settings = functions.settings
+    return MqttOrders(host=settings.mqtt_host, port=settings.mqtt_port, access=functions.access)
 
 
 async def prepare(settings: Settings) -> None:

@@ -169,6 +169,22 @@ def service_grant(*, client_id: str, token_id: str, lifetime_s: float) -> Grant:
     )
 
 
+def speaker_grant(*, client_id: str, token_id: str, lifetime_s: float) -> Grant:
+    """What a program may do that speaks another protocol for agents: hear what is addressed to them, setpoints too.
+
+    What they answer it says as the functions do.
+    """
+    kinds = (topics.CMD, topics.STOP, f"{topics.CTL}/+")
+    return Grant(
+        principal="service:speaker",
+        client_id=client_id,
+        publish=(),
+        subscribe=(topics.conn(topics.ANY, topics.ANY), *(f"{_EVERY_DEVICE}/{kind}" for kind in kinds)),
+        token_id=token_id,
+        expires_at=int(time.time() + lifetime_s),
+    )
+
+
 def check(grant: Grant) -> None:
     """Refuse a grant that could not be written into every broker.
 

@@ -357,8 +357,17 @@ class DropRequest(_Order, frozen=True, kw_only=True, tag="drop_request"):
     request: Id
 
 
+SHIPPED = "telescope"
+"""The author of movements that come with Telescope's own robot types. No account's id: those are longer."""
+
+
 class RunMovement(_Order, frozen=True, kw_only=True, tag="run_movement"):
-    """Run one movement script. The source must hash to ``sha256`` (hex)."""
+    """Run one movement script. The source must hash to ``sha256`` (hex).
+
+    ``signature`` is the one that was made, with the cloud's key ``key``, when the movement was saved: over robot type,
+    name, version and hash. ``author`` is the account that saved it, or ``SHIPPED``: each author counts versions by
+    itself, and a device never runs an older one than it has. It is ended after ``timeout_ms``.
+    """
 
     robot_type: Id
     name: Id
@@ -366,6 +375,10 @@ class RunMovement(_Order, frozen=True, kw_only=True, tag="run_movement"):
     sha256: Annotated[str, Meta(pattern="^[0-9a-f]{64}$")]
     source: Annotated[str, Meta(max_length=64_000)]
     parameters: dict[str, Any] = {}
+    author: Label = ""
+    key: Label = ""
+    signature: Label = ""
+    timeout_ms: Annotated[int, Meta(ge=1, le=86_400_000)] = 600_000
 
 
 class MoveJoints(_Order, frozen=True, kw_only=True, tag="move_joints"):

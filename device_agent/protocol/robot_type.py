@@ -80,6 +80,20 @@ class Base(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     sideways: bool = False
 
 
+class Gaze(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """What a robot looks with.
+
+    Attributes:
+        frame: One of the type's ``frames``: of a camera, of a face.
+        axis: The direction in which it looks, in that frame.
+        joints: Those that turn it.
+    """
+
+    frame: Label
+    axis: Vector3 = (1.0, 0.0, 0.0)
+    joints: Annotated[tuple[Label, ...], Meta(min_length=1)]
+
+
 class RobotType(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """What every robot of one type has in common.
 
@@ -99,6 +113,7 @@ class RobotType(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
         margin_m: How near the robot may come to itself and to what stands around it [m].
         workspace: Where some of its frames stay.
         base: What it can do when it drives or walks; without it, it stays where it is.
+        gaze: What it looks with, where that is turned by joints.
     """
 
     type: Id
@@ -118,6 +133,7 @@ class RobotType(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     margin_m: float = 0.02
     workspace: Workspace | None = None
     base: Base | None = None
+    gaze: Gaze | None = None
     capabilities: tuple[Label, ...] = ()
     streams: tuple[Stream, ...] = ()
     diagnostics: Annotated[tuple[Diagnostic, ...], Meta(max_length=100)] = ()
@@ -161,6 +177,8 @@ def parse(text: str) -> RobotType:
     for joint in robot_type.joints:
         if not joint.lower_rad <= robot_type.home_rad[joint.name] <= joint.upper_rad:
             raise ProtocolError(f"home_rad of '{joint.name}' is outside its range")
+    if robot_type.gaze is not None:
+        _check_gaze(robot_type.gaze, robot_type)
     for diagnostic in robot_type.diagnostics:
         given = (diagnostic.low, diagnostic.warning_low, diagnostic.warning_high, diagnostic.high)
         limits = [limit for limit in given if limit is not None]
@@ -202,6 +220,18 @@ def _check_workspace(box: Workspace, robot_type: RobotType) -> None:
         raise ProtocolError(f"workspace: no frame '{unknown[0]}'; there are: {', '.join(robot_type.frames)}")
     if not robot_type.model:
         raise ProtocolError("workspace needs a model: without one nobody knows where a frame is")
+
+
+def _check_gaze(gaze: Gaze, robot_type: RobotType) -> None:
+    for what, named, known in (
+        ("frame", (gaze.frame,), robot_type.frames),
+        ("joint", gaze.joints, tuple(joint.name for joint in robot_type.joints)),
+    ):
+        unknown = sorted(set(named) - set(known))
+        if unknown:
+            raise ProtocolError(f"gaze: no {what} '{unknown[0]}'; there are: {', '.join(known)}")
+    if not 0 < math.hypot(*gaze.axis) < math.inf:
+        raise ProtocolError("gaze: axis must be a direction, with finite numbers that are not all 0")
 
 
 def _check_positive(holder: Struct, fields: Sequence[str], where: str) -> None:

@@ -48,6 +48,14 @@ class Told(NamedTuple):
     id: str = ""
 
 
+class Refused(NamedTuple):
+    """A message that came back. ``final``: whoever is there does not take it, now or later; else nobody was there."""
+
+    id: str
+    why: str
+    final: bool
+
+
 def message(to: str, topic: str, payload: bytes, *, receipt: str = "", body: str = "") -> str:
     """One message as the text of its stanza.
 
@@ -149,12 +157,14 @@ def received(stanza: Element) -> str | None:
     return None if found is None or stanza.get("type") == "error" else found.get("id", "")
 
 
-def refused(stanza: Element) -> tuple[str, str] | None:
-    """Id of the message that was refused, and why; ``None`` where this is no refusal."""
+def refused(stanza: Element) -> Refused | None:
+    """What an error says about a message of ours; ``None`` where this is no error."""
     if stanza.get("type") != "error":
         return None
+    tags = [element.tag for element in stanza.iter()]
     why = next((text.text for text in stanza.iter() if text.tag.endswith("}text") and text.text), None)
-    return stanza.get("id", ""), (why or "nobody takes it there")[:MAX_WHY]
+    final = any(tag.endswith("}not-acceptable") for tag in tags)
+    return Refused(stanza.get("id", ""), (why or "nobody takes it there")[:MAX_WHY], final)
 
 
 def user_at(jid: str, domain: str) -> tuple[str, str] | None:

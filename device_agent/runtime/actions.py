@@ -1,22 +1,21 @@
 """Runs one action at a time on one device, in a thread of its own, and reports each step of it as an ack."""
 
-import hashlib
 import threading
 import time
-from collections.abc import Callable, Sequence
-from typing import Any
+from collections.abc import Callable
+from typing import Any, Protocol
 
-from device_agent.ports.driver import Observation
+from device_agent.ports.jail import Jail
 from device_agent.protocol.messages import AckStatus, ActionState, Command, MoveJoints, Reason, RunMovement
-from device_agent.protocol.robot_type import RobotType
-from device_agent.runtime.authority import Tenure
-from device_agent.runtime.controller import Controller
-from device_agent.runtime.courses import Outcome
 from device_agent.runtime.lease import Refused
-from device_agent.runtime.movements import MAX_OUTPUT, Script, ScriptFailed
+from device_agent.runtime.movements import MAX_OUTPUT, Cell, Script, ScriptFailed
+from device_agent.runtime.robot import Body, ScriptRobot
+from device_agent.runtime.trust import Trust
 
 Report = Callable[..., None]
 """``report(command_id, status, reason=…, progress=…, output=…, result=…)``: journal and publish one ack."""
+Order = RunMovement | MoveJoints
+"""What is an action."""
 
 _TELL_EVERY_S = 0.2
 
@@ -25,38 +24,37 @@ class Executor:
     """The one action of one device. Thread-safe.
 
     Args:
-        robot_type: Names and home position of the joints.
-        controller: What moves the device.
-        observe: The newest measurement, or ``None`` before the first.
+        body: The device.
+        trust: Judges scripts.
+        jail: Where they run.
         report: Journals and publishes an ack.
     """
 
-    def __init__(
-        self,
-        robot_type: RobotType,
-        controller: Controller,
-        *,
-        observe: Callable[[], Observation | None],
-        report: Report,
-    ) -> None:
-        self._robot_type = robot_type
-        self._controller = controller
-        self._observe = observe
+    def __init__(self, body: Body, *, trust: Trust, jail: Jail, report: Report) -> None:
+        self._body = body
+        self._trust = trust
+        self._jail = jail
         self._report = report
         self._lock = threading.Lock()
         self._run: _Run | None = None
 
-    def start(self, command: Command) -> None:
+    def start(self, command: Command, order: Order) -> None:
         """Begin the action of a command that has been accepted; its acks follow by themselves.
 
         Raises:
-            Refused: The device is busy, stopped or faulty, the lease is stale, or the script is not what was signed.
+            Refused: The device is busy, stopped or faulty, the lease is stale, the script is not what was signed or
+                older than one that ran, or this machine cannot lock it in.
         """
         with self._lock:
             if self._run is not None:
                 raise Refused("busy", f"action {self._run.command.id} runs on this device")
-            run = _Run(command, self._robot_type, self._controller, self._observe, self._report)
-            run.begin()
+            run = _Run(command, self._body, self._report)
+            if isinstance(order, RunMovement):
+                cell = self._cell(order)
+                run.begin(_Playing(order, run, cell))
+                self._trust.remember(order)
+            else:
+                run.begin(_Moving(order, run.robot))
             self._run = run
         threading.Thread(target=self._follow, args=(run,), name=f"action-{command.id}", daemon=True).start()
 
@@ -85,62 +83,112 @@ class Executor:
             run.end(AckStatus.FAILED, Refused("agent_stopping", "the agent was shut down"))
             run.over.wait(timeout=2)
 
+    def _cell(self, order: RunMovement) -> Cell:
+        """Where a script may run, once it is seen to be what it should be."""
+        self._trust.check(order)
+        stranger = self._trust.stranger(order)
+        refusal = self._jail.refusal(stranger=stranger)
+        if refusal is not None:
+            raise Refused("no_jail", refusal)
+        return Cell(self._jail, stranger)
+
     def _follow(self, run: "_Run") -> None:
         try:
             run.play()
         finally:
-            run.give_back()
+            run.robot.give_back()
             with self._lock:
                 self._run = None
             run.tell_end()
 
 
-class _Run:
-    """One action from begin to end."""
+class _Activity(Protocol):
+    """What an action does."""
 
-    def __init__(
-        self,
-        command: Command,
-        robot_type: RobotType,
-        controller: Controller,
-        observe: Callable[[], Observation | None],
-        report: Report,
-    ) -> None:
+    def run(self) -> dict[str, Any]:
+        """Do it to its end; gives what there is to tell besides."""
+
+    def kill(self) -> None:
+        """End it, from any thread; never blocks. May be called twice."""
+
+
+class _Moving:
+    """An action that is one move; losing the device ends it."""
+
+    def __init__(self, order: MoveJoints, robot: ScriptRobot) -> None:
+        self._order = order
+        self._robot = robot
+
+    def run(self) -> dict[str, Any]:
+        """See ``_Activity``."""
+        limited = self._robot.move_joints(self._order.position_rad, self._order.speed)
+        return {"limited": limited} if limited else {}
+
+    def kill(self) -> None:
+        """See ``_Activity``."""
+
+
+class _Playing:
+    """An action that is a script, and its time."""
+
+    def __init__(self, order: RunMovement, run: "_Run", cell: Cell) -> None:
+        self._script = Script(order, run.robot, run.tell, cell=cell)
+        self._timeout_s = order.timeout_ms / 1000
+        self._end = run.end
+
+    def kill(self) -> None:
+        """See ``_Activity``."""
+        self._script.kill()
+
+    def run(self) -> dict[str, Any]:
+        """See ``_Activity``."""
+        why = Refused("too_long", f"the movement was ended after its {self._timeout_s:g} s")
+        alarm = threading.Timer(self._timeout_s, self._end, (AckStatus.FAILED, why))
+        alarm.daemon = True
+        alarm.start()
+        try:
+            self._script.run()
+        finally:
+            alarm.cancel()
+        return {}
+
+
+class _Run:
+    """One action from begin to end.
+
+    Args:
+        command: What is to be done.
+        body: The device.
+        report: Journals and publishes an ack.
+    """
+
+    def __init__(self, command: Command, body: Body, report: Report) -> None:
         self.command = command
         self.over = threading.Event()
-        self._robot_type = robot_type
-        self._controller = controller
-        self._observe = observe
+        self.robot = ScriptRobot(body)
+        self._body = body
         self._report = report
-        self._tenure: Tenure | None = None
-        self._script: Script | None = None
         self._ending: tuple[AckStatus, Refused] | None = None
+        self._result: dict[str, Any] = {}
         self._output = ""
         self._progress: float | None = None
         self._told_at_s = 0.0
+        self._activity: _Activity
 
-    def begin(self) -> None:
-        """Check the order and take the device."""
-        order = self.command.request
-        if isinstance(order, RunMovement):
-            if hashlib.sha256(order.source.encode()).hexdigest() != order.sha256:
-                raise Refused("wrong_hash", "the script is not the one that was signed for")
-            if order.robot_type != self._robot_type.type:
-                raise Refused("wrong_type", f"a movement of '{order.robot_type}', not of '{self._robot_type.type}'")
-        self._tenure = self._controller.begin_action(epoch=self.command.epoch, on_lost=self._lost)
-        self._robot = _Robot(self._robot_type, self._controller, self._tenure, self._observe)
-        if isinstance(order, RunMovement):
-            self._script = Script(order, self._robot, self._tell)
+    def begin(self, activity: _Activity) -> None:
+        """Take the device, for this activity.
+
+        Raises:
+            Refused: It cannot be taken.
+        """
+        self._activity = activity
+        self.robot.begin(self.command.epoch, self._lost)
 
     def play(self) -> None:
         """Do it; returns when it is over, however it ended."""
         self._report(self.command.id, AckStatus.STARTED)
-        order = self.command.request
         try:
-            if self._script is not None:
-                self._script.run()
-            elif isinstance(order, MoveJoints):
-                self._robot.move_joints(dict(order.position_rad), order.speed)
+            self._result = self._activity.run()
         except Refused as refused:
             self.end(AckStatus.FAILED, refused)
         except ScriptFailed as failed:
@@ -150,19 +198,12 @@ class _Run:
         """Bring it to an end, from any thread; the first reason stays."""
         if self._ending is None:
             self._ending = (status, why)
-        self.give_back()
-        if self._script is not None:
-            self._script.kill()
-
-    def give_back(self) -> None:
-        """Leave the device; what still moves is held."""
-        if self._tenure is not None:
-            self._controller.end_action(self._tenure)
+        self.robot.give_back()
+        self._activity.kill()
 
     def tell_end(self) -> None:
         """Report the end."""
-        seen = self._observe()
-        result = {} if seen is None else {"position_rad": by_name(self._robot_type, seen.position_rad)}
+        result = self._body.measured() | self._result
         if self._ending is None:
             self._report(self.command.id, AckStatus.DONE, output=self._output, progress=1.0, result=result)
         else:
@@ -173,19 +214,19 @@ class _Run:
 
     def state(self) -> ActionState:
         """As the device's ``state`` shows it."""
-        order = self.command.request
-        name = order.name if isinstance(order, RunMovement) else ""
-        kind = "run_movement" if isinstance(order, RunMovement) else "move_joints"
+        request = self.command.request
+        kind, name = str(type(request).__struct_config__.tag), getattr(request, "name", "")
         return ActionState(id=self.command.id, kind=kind, name=name, progress=self._progress or 0.0)
 
     def _lost(self, why: Refused) -> None:
         # The controller calls this with its lock held: no call back into it from here.
         if self._ending is None:
             self._ending = (AckStatus.FAILED, why)
-        if self._script is not None:
-            self._script.kill()
+        self.robot.end()
+        self._activity.kill()
 
-    def _tell(self, text: str, progress: float | None) -> None:
+    def tell(self, text: str, progress: float | None) -> None:
+        """Take in what a script printed, and how far it says it is."""
         self._output = (self._output + text)[-MAX_OUTPUT:]
         if progress is not None:
             self._progress = progress
@@ -193,48 +234,3 @@ class _Run:
         if now_s - self._told_at_s >= _TELL_EVERY_S:
             self._told_at_s = now_s
             self._report(self.command.id, AckStatus.STARTED, output=self._output, progress=self._progress)
-
-
-class _Robot:
-    """What a script's calls reach, for as long as its action has the device."""
-
-    def __init__(
-        self,
-        robot_type: RobotType,
-        controller: Controller,
-        tenure: Tenure,
-        observe: Callable[[], Observation | None],
-    ) -> None:
-        self._robot_type = robot_type
-        self._controller = controller
-        self._tenure = tenure
-        self._observe = observe
-
-    @property
-    def joints(self) -> tuple[str, ...]:
-        return tuple(joint.name for joint in self._robot_type.joints)
-
-    def move_joints(self, position_rad: dict[str, float], speed: float) -> None:
-        move = self._controller.move(self._tenure, position_rad, speed=speed)
-        move.finished.wait()
-        if move.outcome is not Outcome.REACHED:
-            raise move.why or Refused("interrupted", "the move was interrupted")
-
-    def home(self, speed: float) -> None:
-        self.move_joints(dict(self._robot_type.home_rad), speed)
-
-    def state(self) -> dict[str, Any]:
-        seen = self._observe()
-        if seen is None:
-            raise Refused("no_measurement", "the robot has not been measured yet")
-        return {
-            "position_rad": by_name(self._robot_type, seen.position_rad),
-            "velocity_rad_s": by_name(self._robot_type, seen.velocity_rad_s),
-            "effort_nm": by_name(self._robot_type, seen.effort_nm),
-            "mode": str(self._controller.mode),
-        }
-
-
-def by_name(robot_type: RobotType, values: Sequence[float]) -> dict[str, float]:
-    """Values in joint order as joint name → value."""
-    return dict(zip((joint.name for joint in robot_type.joints), values, strict=True))

@@ -13,6 +13,8 @@ from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PublicKey
 from device_agent.ports.clock import CloudClock, tick_ms, wall_ms
 from device_agent.ports.driver import Driver
 from device_agent.ports.geometry import Geometry
+from device_agent.ports.jail import Jail
+from device_agent.ports.skills import Skills
 from device_agent.protocol import codec, topics
 from device_agent.protocol.errors import ProtocolError
 from device_agent.protocol.events import EventKind
@@ -27,7 +29,9 @@ from device_agent.runtime.lease import LeaseGate, Refused
 from device_agent.runtime.loop import ControlLoop
 from device_agent.runtime.office import Office
 from device_agent.runtime.outbox import Outbox, Publish
+from device_agent.runtime.robot import Body
 from device_agent.runtime.room import Room
+from device_agent.runtime.trust import Trust
 from device_agent.runtime.voice import Voice
 
 _REFUSED = {
@@ -55,6 +59,8 @@ class Device:
         outbox: Sends what must not be lost.
         room: What the space's other devices have measured last.
         interlocks: How the room slows or holds this one.
+        jail: Where movement scripts run.
+        owner: Id of the account that the agent is paired with.
         geometry: The robot's shape, ``None`` where its type has no model.
     """
 
@@ -73,6 +79,8 @@ class Device:
         publish: Publish,
         outbox: Outbox,
         room: Room,
+        jail: Jail,
+        owner: str = "",
         interlocks: Sequence[Interlock] = (),
         geometry: Geometry | None = None,
     ) -> None:
@@ -104,9 +112,16 @@ class Device:
         self._loop = ControlLoop(
             robot_type, driver, self._controller, name=name, tell=self._measured, watch=self._interlocks.step
         )
-        self._executor = Executor(
-            robot_type, self._controller, observe=lambda: self._loop.seen, report=self.voice.report
+        body = Body(
+            robot_type=robot_type,
+            controller=self._controller,
+            observe=lambda: self._loop.seen,
+            geometry=geometry,
+            skills=driver if isinstance(driver, Skills) else None,
+            room=room,
         )
+        trust = Trust(device=name, robot_type=robot_type.type, owner=owner, keys=keys, journal=journal)
+        self._executor = Executor(body, trust=trust, jail=jail, report=self.voice.report)
         self._office = Office(
             address=(space, agent, name),
             controller=self._controller,

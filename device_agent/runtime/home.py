@@ -78,13 +78,17 @@ class Buffer(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
 
 
 class Configuration(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """``agent.toml``. ``transport`` is one of ``device_agent.links.names()``."""
+    """``agent.toml``. ``transport`` is one of ``device_agent.links.names()``.
+
+    ``trusted-scripts``: movement scripts run also where this machine cannot lock them in. Set by hand, on the machine.
+    """
 
     server: str
     name: Label
     devices: tuple[DeviceEntry, ...]
     transport: str = "mqtt"
     http: HttpPolling = HttpPolling()
+    trusted_scripts: bool = msgspec.field(default=False, name="trusted-scripts")
     buffer: Buffer = Buffer()
     room: Annotated[tuple[RoomStream, ...], Meta(max_length=64)] = ()
 
@@ -92,7 +96,9 @@ class Configuration(Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tru
         """This, with what ``enroll`` does not ask for as it was before: buffer, room, each device's interlocks."""
         rules = {device.name: device.interlocks for device in before.devices}
         devices = tuple(replace(device, interlocks=rules.get(device.name, ())) for device in self.devices)
-        return replace(self, devices=devices, room=before.room, buffer=before.buffer)
+        return replace(
+            self, devices=devices, room=before.room, buffer=before.buffer, trusted_scripts=before.trusted_scripts
+        )
 
     @property
     def sources(self) -> tuple[tuple[str, str], ...]:
@@ -103,12 +109,16 @@ class Configuration(Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tru
 
 
 class Pairing(Struct, frozen=True, kw_only=True):
-    """``pairing.json``: what the agent learned when it was claimed. ``keys`` are pinned: key id → public key."""
+    """``pairing.json``: what the agent learned when it was claimed. ``keys`` are pinned: key id → public key.
+
+    ``owner`` is the account's id: scripts of any other account are a stranger's.
+    """
 
     agent: Id
     space: Id
     account: str
     keys: dict[str, str]
+    owner: str = ""
 
     def public_keys(self) -> dict[str, Ed25519PublicKey]:
         """The pinned keys, ready to verify with."""
@@ -183,6 +193,8 @@ class Home:
     def save_configuration(self, configuration: Configuration) -> None:
         """Write ``agent.toml``."""
         lines = [f"{key} = {_toml(getattr(configuration, key))}" for key in ("server", "name", "transport")]
+        if configuration.trusted_scripts:
+            lines.append("trusted-scripts = true")
         if configuration.transport == "http" or configuration.http != HttpPolling():
             lines += ["", "[http]"]
             lines += [f"{key} = {_toml(getattr(configuration.http, key))}" for key in ("poll", "poll_ms")]

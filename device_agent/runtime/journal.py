@@ -1,4 +1,4 @@
-"""What an agent must not forget: commands it has seen, each device's epoch and Stop latch, its session number.
+"""What an agent must not forget: commands it has seen, epochs, Stop latches, movements that ran, its session number.
 
 SQLite, committed to disk before anything that follows from it happens. One file per agent, one connection per thread.
 """
@@ -19,6 +19,9 @@ CREATE TABLE IF NOT EXISTS commands (
 CREATE INDEX IF NOT EXISTS undelivered ON commands (device) WHERE delivered = 0;
 CREATE TABLE IF NOT EXISTS devices (
     device TEXT PRIMARY KEY, epoch INTEGER NOT NULL DEFAULT 0, burned INTEGER NOT NULL DEFAULT 0, latch BLOB);
+CREATE TABLE IF NOT EXISTS movements (
+    device TEXT NOT NULL, author TEXT NOT NULL, robot_type TEXT NOT NULL, name TEXT NOT NULL, version INTEGER NOT NULL,
+    PRIMARY KEY (device, author, robot_type, name)) WITHOUT ROWID;
 CREATE TABLE IF NOT EXISTS counters (name TEXT PRIMARY KEY, value INTEGER NOT NULL);
 """
 _KEEP_MS = 7 * 24 * 3600 * 1000
@@ -165,6 +168,24 @@ class Journal:
                 "INSERT INTO devices (device, latch) VALUES (?, ?) "
                 "ON CONFLICT (device) DO UPDATE SET latch = excluded.latch",
                 (device, codec.encode(latch) if latch else None),
+            )
+
+    def movement(self, device: str, author: str, robot_type: str, name: str) -> int:
+        """The highest version of a movement that has run on a device; 0 for none."""
+        with self._lock:
+            rows = self._execute(
+                "SELECT version FROM movements WHERE device = ? AND author = ? AND robot_type = ? AND name = ?",
+                (device, author, robot_type, name),
+            )
+        return int(rows[0][0]) if rows else 0
+
+    def save_movement(self, device: str, author: str, robot_type: str, name: str, version: int) -> None:
+        """Remember a version that runs; what is remembered never falls."""
+        with self._lock:
+            self._execute(
+                "INSERT INTO movements VALUES (?, ?, ?, ?, ?) ON CONFLICT (device, author, robot_type, name) "
+                "DO UPDATE SET version = max(version, excluded.version)",
+                (device, author, robot_type, name, version),
             )
 
     def next_session(self) -> int:

@@ -1,46 +1,68 @@
-"""Runs a movement script: a process of its own whose only way to the robot is one socket to this agent."""
+"""Runs a movement script in a locked process, and answers what comes out of it."""
 
 import contextlib
-import json
-import math
+import select
 import socket
-import subprocess
-import sys
+import threading
+import time
 from collections.abc import Callable
-from pathlib import Path
+from dataclasses import dataclass, field
 from typing import Any, Protocol
 
+import msgspec
+
+from device_agent.ports.jail import Inmate, Jail, JailError, Limits
+from device_agent.protocol.errors import ProtocolError
 from device_agent.protocol.messages import RunMovement
+from device_agent.runtime import calls
 from device_agent.runtime.lease import Refused
 
-_CHILD = Path(__file__).with_name("movement_child.py")
-_LONGEST_LINE = 1 << 20
 MAX_OUTPUT = 2000
 """Characters of printed output that an ack carries; of more, the newest are kept."""
+_MESSAGES_PER_S = 500.0
+_BYTES_PER_MESSAGE = 1024
+"""A script that says more than that is read more slowly: it waits, the agent's processor does not boil."""
+_BURST = 500.0
+_READY_S = 30.0
+_WRITE_S = 5.0
+"""A process that does not read the answers it asked for is ended after this time."""
+_PIECE = 65_536
 
 
-class ScriptRobot(Protocol):
-    """What a script may ask of its robot. Each method blocks until it is done.
-
-    All of them raise ``Refused`` when the robot does not do it.
-    """
+class Reach(Protocol):
+    """What a script's calls reach."""
 
     @property
     def joints(self) -> tuple[str, ...]:
         """Joint names in order."""
 
-    def move_joints(self, position_rad: dict[str, float], speed: float) -> None:
-        """Move and wait until there [rad]."""
+    @property
+    def frames(self) -> tuple[str, ...]:
+        """Frames that can be brought somewhere."""
 
-    def home(self, speed: float) -> None:
-        """Move home and wait until there."""
+    @property
+    def can(self) -> tuple[str, ...]:
+        """Names of the calls that this robot has."""
 
-    def state(self) -> dict[str, Any]:
-        """The newest measurement, by joint name."""
+    def do(self, call: calls.Call) -> Any:
+        """Do what was asked, to its end; gives the answer, plain JSON.
+
+        Raises:
+            Refused: It was not done.
+        """
 
 
 class ScriptFailed(Exception):  # noqa: N818 (an outcome to report)
     """The script ended with an error; the text names its line."""
+
+
+@dataclass(frozen=True, slots=True)
+class Cell:
+    """Where a script runs: jail and limits, and whether it is a ``stranger``, a script of an unknown owner."""
+
+    jail: Jail
+    stranger: bool
+    limits: Limits = field(default_factory=Limits)
 
 
 class Script:
@@ -48,16 +70,20 @@ class Script:
 
     Args:
         order: Source, name and parameters.
-        robot: What its calls reach.
+        reach: What its calls reach.
         told: Called with what the script printed last and its progress 0…1, if it gave one.
+        cell: Where it runs.
     """
 
-    def __init__(self, order: RunMovement, robot: ScriptRobot, told: Callable[[str, float | None], None]) -> None:
+    def __init__(
+        self, order: RunMovement, reach: Reach, told: Callable[[str, float | None], None], *, cell: Cell
+    ) -> None:
         self._order = order
-        self._robot = robot
+        self._reach = reach
         self._told = told
-        self._killed = False
-        self._process: subprocess.Popen[bytes] | None = None
+        self._cell = cell
+        self._killed = threading.Event()
+        self._inmate: Inmate | None = None
 
     def run(self) -> None:
         """Run to the end.
@@ -65,101 +91,127 @@ class Script:
         Raises:
             ScriptFailed: The script raised, or its process died.
         """
-        ours, theirs = socket.socketpair()
         try:
-            with theirs:
-                self._process = subprocess.Popen(  # noqa: S603 (our own file, run by our own interpreter)
-                    [sys.executable, "-I", "-B", str(_CHILD), str(theirs.fileno())],
-                    pass_fds=(theirs.fileno(),),
-                    stdin=subprocess.DEVNULL,
-                    stdout=subprocess.DEVNULL,
-                    stderr=subprocess.DEVNULL,
-                    env={},
-                    cwd="/",
-                    start_new_session=True,
-                )
-            if self._killed:
-                self._process.kill()
-            self._serve(ours)
-        finally:
-            self.kill()
-            ours.close()
-            if self._process is not None:
-                self._process.wait()
+            self._inmate = inmate = self._cell.jail.open(self._cell.limits, stranger=self._cell.stranger)
+        except JailError as error:
+            raise ScriptFailed(str(error)) from error
+        with contextlib.closing(inmate):
+            if self._killed.is_set():
+                inmate.kill()
+            self._serve(inmate)
 
     def kill(self) -> None:
         """End the process at once, from any thread; ``run`` then raises. May be called twice."""
         # No lock: the control loop may call this, and must not wait for a process to be started.
-        self._killed = True
-        if self._process is not None and self._process.poll() is None:
-            with contextlib.suppress(ProcessLookupError):
-                self._process.kill()
+        self._killed.set()
+        if self._inmate is not None:
+            self._inmate.kill()
 
-    def _serve(self, ours: socket.socket) -> None:
+    def _serve(self, inmate: Inmate) -> None:
+        lines = _Lines(inmate.link, self._killed)
         try:
-            with ours.makefile("rwb") as lines:
-                self._write(
-                    lines,
-                    source=self._order.source,
-                    name=self._order.name,
-                    parameters=self._order.parameters,
-                    joints=self._robot.joints,
-                )
-                while (message := self._read(lines)) is not None:
-                    self._answer(lines, message)
-        except (OSError, ValueError) as error:
-            raise ScriptFailed(f"the script's process ended before the script did ({error})") from error
+            self._send_script(inmate.link, lines)
+            while True:
+                try:
+                    message = calls.parse(lines.read())
+                except ProtocolError as error:
+                    _write(inmate.link, error=str(error)[:MAX_OUTPUT])
+                    continue
+                if isinstance(message, calls.Ended):
+                    break
+                self._take(inmate.link, message)
+        except (OSError, EOFError) as error:
+            raise ScriptFailed(f"the script's process ended before the script did{_because(inmate)}") from error
+        if message.error:
+            raise ScriptFailed(message.error[:MAX_OUTPUT])
 
-    @staticmethod
-    def _read(lines: Any) -> dict[str, Any] | None:
-        """The next message, or ``None`` when the script has ended well."""
-        line = lines.readline(_LONGEST_LINE)
-        message = json.loads(line, parse_constant=_no_constant) if line.endswith(b"\n") else None
-        if not isinstance(message, dict):
-            raise ScriptFailed("the script's process ended before the script did")
-        if "ended" not in message:
-            return message
-        if message.get("error"):
-            raise ScriptFailed(str(message["error"])[:MAX_OUTPUT])
-        return None
+    def _send_script(self, link: socket.socket, lines: "_Lines") -> None:
+        """Once the jail is known to hold."""
+        try:
+            first = calls.parse(lines.read(within_s=_READY_S))
+        except ProtocolError as error:
+            raise EOFError from error
+        if isinstance(first, calls.Unfit):
+            raise ScriptFailed(f"the script was not run, the jail does not hold: {first.why[:MAX_OUTPUT]}")
+        _write(
+            link,
+            source=self._order.source,
+            name=self._order.name,
+            parameters=self._order.parameters,
+            joints=self._reach.joints,
+            frames=self._reach.frames,
+            can=self._reach.can,
+        )
 
-    def _answer(self, lines: Any, message: dict[str, Any]) -> None:
-        if "output" in message:
-            self._told(str(message["output"]), None)
-        elif "progress" in message:
-            self._told("", min(max(_number(message["progress"]), 0.0), 1.0))
-        else:
-            try:
-                self._write(lines, value=self._call(message.get("call"), message.get("arguments") or {}))
-            except Refused as refused:
-                self._write(lines, error=refused.message)
-
-    def _call(self, call: Any, arguments: dict[str, Any]) -> Any:
-        if call == "state":
-            return self._robot.state()
-        speed = _number(arguments.get("speed"))
-        if not 0 < speed <= 1:
-            raise Refused("bad_speed", f"speed must be above 0 and at most 1, not {speed}")
-        if call == "home":
-            return self._robot.home(speed)
-        if call == "move_joints":
-            wanted = arguments.get("position_rad")
-            if not isinstance(wanted, dict) or not wanted:
-                raise Refused("bad_positions", "move_joints needs at least one joint and its position")
-            return self._robot.move_joints({str(name): _number(value) for name, value in wanted.items()}, speed)
-        raise Refused("unknown_call", f"there is no robot.{str(call)[:80]}")
-
-    @staticmethod
-    def _write(lines: Any, **message: Any) -> None:
-        lines.write(json.dumps(message, allow_nan=False).encode() + b"\n")
-        lines.flush()
+    def _take(self, link: socket.socket, message: calls.Message) -> None:
+        match message:
+            case calls.Output(text=text):
+                self._told(text[-MAX_OUTPUT:], None)
+            case calls.Progress(share=share):
+                self._told("", share)
+            case calls.Ready() | calls.Unfit() | calls.Ended():
+                _write(link, error="this is said once")
+            case _:
+                try:
+                    answer = self._reach.do(message)
+                except Refused as refused:
+                    _write(link, error=refused.message)
+                else:
+                    _write(link, value=answer)
 
 
-def _number(value: Any) -> float:
-    if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
-        raise Refused("bad_number", f"{str(value)[:80]} is not a finite number")
-    return float(value)
+class _Lines:
+    """Reads lines, of bounded length and at a bounded rate."""
+
+    def __init__(self, link: socket.socket, killed: threading.Event) -> None:
+        self._link = link
+        self._killed = killed
+        self._rest = b""
+        self._credit = _BURST
+        self._at_s = time.monotonic()
+
+    def read(self, *, within_s: float | None = None) -> bytes:
+        """The next line, without its end.
+
+        Raises:
+            EOFError: The process has ended, or sends a line without end, or nothing ``within_s`` [s].
+            OSError: The same.
+        """
+        while b"\n" not in self._rest:
+            if len(self._rest) >= calls.MAX_LINE or not _readable(self._link, within_s):
+                raise EOFError
+            piece = self._link.recv(_PIECE)
+            if not piece:
+                raise EOFError
+            self._rest += piece
+        line, _, self._rest = self._rest.partition(b"\n")
+        if len(line) >= calls.MAX_LINE:
+            raise EOFError
+        self._pay(1 + len(line) / _BYTES_PER_MESSAGE)
+        return line
+
+    def _pay(self, price: float) -> None:
+        now_s = time.monotonic()
+        self._credit = min(_BURST, self._credit + (now_s - self._at_s) * _MESSAGES_PER_S) - price
+        self._at_s = now_s
+        if self._credit < 0:
+            self._killed.wait(-self._credit / _MESSAGES_PER_S)
 
 
-def _no_constant(text: str) -> float:
-    raise ValueError(f"{text} is not a number")
+def _readable(link: socket.socket, within_s: float | None) -> bool:
+    return bool(select.select([link], [], [], within_s)[0])
+
+
+def _write(link: socket.socket, **message: Any) -> None:
+    link.settimeout(_WRITE_S)
+    try:
+        link.sendall(msgspec.json.encode(message) + b"\n")
+    finally:
+        link.settimeout(None)
+
+
+def _because(inmate: Inmate) -> str:
+    """Why it died, as far as that can be known."""
+    inmate_died = inmate.wait(_WRITE_S)
+    why = inmate.ending() if inmate_died else "it stopped making sense"
+    return f": {why}" if why else ""

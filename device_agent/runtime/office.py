@@ -219,10 +219,10 @@ class Office:
                 _log.warning("%s: Stop reset by %s", self._name, command.who)
             case CancelAction(action=action):
                 self._executor.cancel(action, command.who)
-            case RunMovement() | MoveJoints():
+            case RunMovement() | MoveJoints() as order:
                 # Journalled as accepted before it begins: after a crash here it is ended, never run again.
                 self._voice.report(command.id, AckStatus.ACCEPTED)
-                self._executor.start(command)
+                self._executor.start(command, order)
                 self._keep()
                 return
         self._keep()

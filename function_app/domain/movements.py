@@ -11,6 +11,7 @@ class Movement:
     Attributes:
         since: The first version since it was last made new. A version number is never used twice, so the row of a
             ``deleted`` one stays.
+        author: Account that saved it, or ``SHIPPED`` of the wire contract.
         key: Id of the key that signed robot type, name, version and hash.
         parameters_schema: What an operator may set; ``None``: anything.
     """
@@ -23,6 +24,7 @@ class Movement:
     built_in: bool = False
     deleted: bool = False
     since: int = 1
+    author: str = ""
     key: str = ""
     signature: str = ""
     parameters_schema: dict[str, Any] | None = None

@@ -1,7 +1,10 @@
 """The one way from the cloud to a device, whatever its agent speaks: publish, and hear the answer.
 
-MQTT: the command bus. Otherwise the mailbox, from which the agent fetches. Whoever uses it writes first and sends
-after: what is lost between the two is sent again by the timer, and the device drops doubles by id.
+MQTT: the command bus. Otherwise the mailbox, from which the agent, or who speaks XMPP for it, fetches. Whoever uses it
+writes first and sends after: what is lost between the two is sent again by the timer; the device drops doubles by id.
+
+Who speaks XMPP for an agent hears on the broker what is for it, and answers there: so neither waits for the tables. The
+mailbox is for when the broker, or that program, was away.
 """
 
 import asyncio
@@ -14,6 +17,7 @@ from device_agent.protocol.messages import Ack, AckStatus
 from function_app.domain.devices import Device
 from function_app.ports.command_bus import CommandBus
 from function_app.services.mailbox import Mailbox
+from function_app.services.relay import Relay
 
 _POLL_S = 0.02
 _SLOWEST_POLL_S = 0.2
@@ -33,8 +37,9 @@ class Signed(NamedTuple):
 class Delivery:
     """Sends commands, and waits for the answers to them."""
 
-    def __init__(self, *, bus: CommandBus, mailbox: Mailbox) -> None:
+    def __init__(self, *, bus: CommandBus, mailbox: Mailbox, relay: Relay) -> None:
         self._bus = bus
+        self._relay = relay
         self._mailbox = mailbox
 
     async def send(self, device: Device, signed: Signed) -> None:
@@ -55,6 +60,8 @@ class Delivery:
             expires_ms=signed.expires_ms,
             first=signed.first,
         )
+        if device.transport == "xmpp":
+            await self._pass_on(topic, signed.payload)
 
     async def stop(self, device: Device, payload: bytes) -> None:
         """Publish the plain Stop message. An agent that polls gets the signed one alone: it is kept until answered.
@@ -64,6 +71,8 @@ class Delivery:
         """
         if device.transport == "mqtt":
             await self._bus.publish(f"{device.topic}/{topics.STOP}", payload)
+        elif device.transport == "xmpp":
+            await self._pass_on(f"{device.topic}/{topics.STOP}", payload)
 
     async def withdraw(self, device: Device, command: str) -> None:
         """Take back what its agent has not fetched; what was published stays so."""
@@ -73,7 +82,7 @@ class Delivery:
     @contextlib.asynccontextmanager
     async def acks(self, device: Device, command: str) -> AsyncGenerator[AsyncIterator[Ack] | None]:
         """Acks of one command from now on; ``None`` where they are to be read from the tables. See ``CommandBus``."""
-        if device.transport == "mqtt":
+        if device.transport != "http":
             async with self._bus.acks(device.topic, command) as acks:
                 yield acks
         else:
@@ -86,16 +95,32 @@ class Delivery:
             BusUnavailable: The broker did not confirm it.
         """
         async with self.acks(device, signed.command) as acks:
-            if acks is None and wait_ms:
+            if wait_ms and (acks is None or device.transport != "mqtt"):
                 await self._mailbox.expect(device, signed.command, expires_ms=signed.expires_ms)
             await self.send(device, signed)
             try:
                 async with asyncio.timeout(wait_ms / 1000):
-                    if acks is None:
-                        return await self._noted(device, signed.command) in CONFIRMING
-                    return await _heard(acks) in CONFIRMING
+                    return await self._answer(device, signed.command, acks) in CONFIRMING
             except TimeoutError:
                 return False
+
+    async def _answer(self, device: Device, command: str, acks: AsyncIterator[Ack] | None) -> AckStatus:
+        """The first answer that decides, from wherever it comes first."""
+        if acks is None:
+            return await self._noted(device, command)
+        if device.transport == "mqtt":
+            return await _heard(acks)
+        ways = [asyncio.ensure_future(_heard(acks)), asyncio.ensure_future(self._noted(device, command))]
+        try:
+            done, _ = await asyncio.wait(ways, return_when=asyncio.FIRST_COMPLETED)
+            return done.pop().result()
+        finally:
+            for way in ways:
+                way.cancel()
+            await asyncio.gather(*ways, return_exceptions=True)
+
+    async def _pass_on(self, topic: str, payload: bytes) -> None:
+        await self._relay.pass_on([(topic, topics.parse(topic), payload)])
 
     async def _noted(self, device: Device, command: str) -> AckStatus:
         """The answer, as soon as it is in the tables."""

@@ -11,6 +11,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import Any
 
+from device_agent.protocol.messages import SHIPPED
 from function_app.domain.accounts import Identity
 from function_app.domain.ids import ID
 from function_app.domain.movements import Movement
@@ -157,6 +158,7 @@ class Movements:
             version=0,
             sha256=hashlib.sha256(draft.source.encode()).hexdigest(),
             updated_ms=self._clock.now_ms(),
+            author=who.account,
             parameters_schema=script.schema if draft.parameters_schema is None else draft.parameters_schema,
         )
         lost: list[Movement] = []
@@ -289,6 +291,7 @@ class Movements:
             sha256=item.sha256,
             updated_ms=item.updated_ms,
             built_in=True,
+            author=SHIPPED,
             parameters_schema=script.schema,
         )
         return await self._scripts.sign(robot_type, shown)

@@ -33,8 +33,8 @@ class PresenceIngest:
     async def ingest(self, topic: Topic, payload: bytes, *, by: Transport = "mqtt") -> None:
         """Take one message in.
 
-        What an agent has said over HTTP is told to the broker too and comes back from there, perhaps late: then it is
-        not taken a second time.
+        What an agent has said by another way is told to the broker too and comes back from there, perhaps late: then
+        it is not taken a second time.
 
         Raises:
             ProtocolError: It is not what its topic says.
@@ -47,13 +47,13 @@ class PresenceIngest:
         if agent.space != topic.space or (topic.device and agent.device(topic.device) is None):
             return
         if agent.transport == "mqtt" or by != "mqtt":
-            await self._store(agent, topic, payload)
+            await self._store(agent, topic, payload, by)
 
-    async def _store(self, agent: Agent, topic: Topic, payload: bytes) -> None:
+    async def _store(self, agent: Agent, topic: Topic, payload: bytes, by: Transport) -> None:
         now_ms = self._clock.now_ms()
         if topic.kind == topics.CONN:
             presence = codec.decode(payload, Presence)
-            link = Link(presence.online, presence.session, now_ms, agent.transport != "mqtt", agent.pairing)
+            link = Link(presence.online, presence.session, now_ms, by == "http", agent.pairing)
             if link.online:
                 await self._conditions.connected(agent, link.session)
             await store.upsert(

@@ -1,4 +1,4 @@
-"""What an agent has told over HTTP, told to the broker: for the console, and for whoever else listens there."""
+"""What came by another way than the broker, told there too: for the console, and for whoever else listens."""
 
 import asyncio
 import logging
@@ -19,7 +19,7 @@ _log = logging.getLogger(__name__)
 
 
 class Relay:
-    """Publishes as well as it can: what was told is stored already."""
+    """Publishes as well as it can: what is passed on is stored already."""
 
     def __init__(self, *, bus: CommandBus, clock: Clock) -> None:
         self._bus = bus
@@ -39,7 +39,7 @@ class Relay:
                     group.create_task(self._publish(topic, messages))
         except* (BusUnavailable, TimeoutError) as errors:
             self._rests_until_ms = self._clock.now_ms() + REST_MS
-            _log.warning("what agents tell over HTTP does not reach the broker: %s", errors.exceptions[0])
+            _log.warning("what did not come by the broker does not reach it: %s", errors.exceptions[0])
 
     async def _publish(self, topic: str, messages: Iterable[tuple[Topic, bytes]]) -> None:
         for parsed, payload in messages:

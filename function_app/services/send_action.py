@@ -70,10 +70,9 @@ class SendAction:
         if source is None:
             raise MovementChanged
         return RunMovement(
-            robot_type=action.pinned["robot_type"],
+            **action.pinned,
             name=action.request["name"],
-            version=action.pinned["version"],
-            sha256=action.pinned["sha256"],
             source=source,
             parameters=action.request["parameters"],
+            timeout_ms=action.timeout_ms,
         )

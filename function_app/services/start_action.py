@@ -36,6 +36,10 @@ ABANDON_MS = 30_000
 """A start that has not been written after this time is given up: the timer may already have forgotten its note."""
 
 
+PINNED = ("robot_type", "version", "sha256", "author", "key", "signature")
+"""What an action keeps of its movement, so that a command that is sent again is the same one."""
+
+
 class AskMovement(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True, tag_field="kind", tag="run_movement"):
     """Run a movement of the device's robot type, in its newest version."""
 
@@ -187,7 +191,7 @@ class StartAction:
         if earlier is not None:
             return await self._join(earlier, device, listening)
         require_online(link, self._clock.now_ms())
-        plan = await self._plan(who, device, start.asked)
+        plan = await self._plan(who, device, start)
         ttl_ms = min(start.ttl_ms, start.timeout_ms)
         await self._pending.note(plan.action, plan.created_ms + REPEAT_MS)
         if start.policy == "queue":
@@ -211,8 +215,8 @@ class StartAction:
         acks = await listening.enter_async_context(self._delivery.acks(device, found.action.id))
         return _Begun(await self._rows.get(found.action.id) or found, acks)
 
-    async def _plan(self, who: Identity, device: Device, asked: Asked) -> _Plan:
-        now_ms = self._clock.now_ms()
+    async def _plan(self, who: Identity, device: Device, start: Start) -> _Plan:
+        asked, now_ms = start.asked, self._clock.now_ms()
         request: dict[str, Any] = msgspec.to_builtins(asked)
         action = command_id(device.id, now_ms)
         if isinstance(asked, AskJoints):
@@ -227,10 +231,14 @@ class StartAction:
                 sha256=movement.sha256,
                 source=source,
                 parameters=parameters.fit(movement.parameters_schema, asked.parameters),
+                author=movement.author or who.account,
+                key=movement.key,
+                signature=movement.signature,
+                timeout_ms=start.timeout_ms,
             )
             # With the defaults: a command that is sent again must be the same one.
             request["parameters"] = command.parameters
-            pinned = {"robot_type": device.robot_type, "version": movement.version, "sha256": movement.sha256}
+            pinned = {name: getattr(command, name) for name in PINNED}
             plan = _Plan(device, action, now_ms, request, command, pinned)
         # Before anything is written: what cannot be sent must not take the slot.
         self._commands.check(device, action, plan.command, who=who.name, ttl_ms=1)

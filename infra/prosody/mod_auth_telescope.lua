@@ -143,11 +143,12 @@ end
 
 module:provides("auth", provider);
 
--- A session lives no longer than its right: whoever stays logs in again.
+-- A session lives no longer than its right: whoever stays logs in again. The cloud's own right does not end.
 module:hook("authentication-success", function (event)
 	local session = event.session;
 	local answer = admitted[session.username];
 	session.telescope = answer and answer.kind;
+	if session.telescope == CLOUD then return; end
 	module:add_timer(answer and answer.lifetime_s or 0, function ()
 		if not session.destroyed and session.conn then
 			session:close({ condition = "policy-violation", text = "the password has expired" });

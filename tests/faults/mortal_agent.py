@@ -24,6 +24,7 @@ from unittest import mock
 import msgspec
 from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
 
+from device_agent.jail.warm import WarmJail
 from device_agent.ports.clock import CloudClock, tick_ms, wall_ms
 from device_agent.protocol import codec, signing, topics
 from device_agent.protocol.messages import Ack, Command
@@ -128,7 +129,7 @@ class Body:
             journal.end_open(now_ms=wall_ms(), tick_ms=tick_ms())
             device = Device(
                 name=DEVICE, label="Arm", space=SPACE, agent=AGENT, robot_type=swift(), driver=ToyDriver(),
-                journal=journal, cloud_clock=self.clock, publish=self._publish,
+                journal=journal, cloud_clock=self.clock, publish=self._publish, jail=WarmJail(),
                 keys={signing.key_id(key.public_key()): key.public_key()},
                 room=Room(space=SPACE, agent=AGENT, own=[DEVICE]), outbox=self._outbox(),
             )  # fmt: skip

@@ -9,7 +9,7 @@ import contextlib
 import selectors
 import socket
 import threading
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 
 HOST = "127.0.0.1"
 
@@ -17,13 +17,19 @@ HOST = "127.0.0.1"
 class Proxy:
     """Passes bytes both ways.
 
+    Args:
+        behind: The server's port.
+        heard: Told what goes to clients, before it does.
+
     Attributes:
         port: Where clients connect.
         accepted: Number of connections so far.
     """
 
-    def __init__(self, behind: int) -> None:
+    def __init__(self, behind: int, heard: Callable[[bytes], None] | None = None) -> None:
         self.accepted = 0
+        self._heard = heard
+        self._frozen = False
         self._behind = behind
         self._listener = socket.create_server((HOST, 0))
         self.port: int = self._listener.getsockname()[1]
@@ -32,18 +38,36 @@ class Proxy:
         self._wake, self._woken = socket.socketpair()
         self._selector.register(self._woken, selectors.EVENT_READ)
         self._peers: dict[socket.socket, socket.socket] = {}
+        self._servers: set[socket.socket] = set()
+        self._forgotten: list[socket.socket] = []
         self._lock = threading.Lock()
         self._ended = False
+        self._refuses = False
         self._thread = threading.Thread(target=self._run)
         self._thread.start()
+
+    def freeze(self) -> None:
+        """Nothing comes through, and nobody is told: what is sent waits for ``thaw``, as on a link that stalls."""
+        with self._lock:
+            self._frozen = True
+            for each in (self._listener, *self._peers):
+                self._selector.unregister(each)
+
+    def thaw(self) -> None:
+        """Go on, with all that was sent meanwhile."""
+        with self._lock:
+            self._frozen = False
+            for each in (self._listener, *self._peers):
+                self._selector.register(each, selectors.EVENT_READ)
 
     def swallow(self) -> None:
         """Nothing comes through on the connections of now, and nobody is told: as when a router forgets them."""
         with self._lock:
             for each in self._peers:
                 self._selector.unregister(each)
-            self._forgotten = list(self._peers)
+            self._forgotten.extend(self._peers)
             self._peers.clear()
+            self._servers.clear()
 
     def cut(self) -> None:
         """Close the connections of now."""
@@ -52,13 +76,25 @@ class Proxy:
                 self._selector.unregister(each)
                 each.close()
             self._peers.clear()
+            self._servers.clear()
+
+    def refuse(self) -> None:
+        """Close every connection, now and from now on, as soon as it is there."""
+        self._refuses = True
+        self.cut()
+
+    def admit(self) -> None:
+        """Let connections through again."""
+        self._refuses = False
 
     def end(self) -> None:
+        if self._frozen:
+            self.thaw()
         self._ended = True
         self._wake.send(b"x")
         self._thread.join()
         self.cut()
-        for each in (*getattr(self, "_forgotten", ()), self._listener, self._wake, self._woken):
+        for each in (*self._forgotten, self._listener, self._wake, self._woken):
             each.close()
         self._selector.close()
 
@@ -69,10 +105,20 @@ class Proxy:
                     self._turn(key.fileobj)
 
     def _turn(self, ready: object) -> None:
+        if self._frozen:
+            return
         if ready is self._listener:
             client, _ = self._listener.accept()
-            server = socket.create_connection((HOST, self._behind))
             self.accepted += 1
+            if self._refuses:
+                client.close()
+                return
+            try:
+                server = socket.create_connection((HOST, self._behind))
+            except OSError:
+                client.close()
+                return
+            self._servers.add(server)
             for one, other in ((client, server), (server, client)):
                 one.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
                 self._peers[one] = other
@@ -83,19 +129,22 @@ class Proxy:
             with contextlib.suppress(OSError):
                 content = ready.recv(65_536)
             if content:
+                if self._heard is not None and ready in self._servers:
+                    self._heard(content)
                 with contextlib.suppress(OSError):
                     other.sendall(content)
                 return
             for each in (ready, other):
                 self._selector.unregister(each)
                 del self._peers[each]
+                self._servers.discard(each)
                 each.close()
 
 
 @contextlib.contextmanager
-def start_proxy(behind: int) -> Iterator[Proxy]:
+def start_proxy(behind: int, heard: Callable[[bytes], None] | None = None) -> Iterator[Proxy]:
     """A proxy before a port of this machine."""
-    proxy = Proxy(behind)
+    proxy = Proxy(behind, heard)
     try:
         yield proxy
     finally:

@@ -166,6 +166,15 @@ class CloudApi:
         """End the call that is under way: it raises ``OSError``. From any thread."""
         self._http.break_off()
 
+    def xmpp_credentials(self) -> dict[str, Any]:
+        """Credentials for the XMPP server.
+
+        Raises:
+            CloudError: Refused; an agent that was un-paired learns it here.
+            OSError: Not reached.
+        """
+        return self._call("POST", "/xmpp/credentials", json={"purpose": "agent"})
+
     def _call(self, method: str, path: str, *, timeout: float = _TIMEOUT_S, **request: Any) -> dict[str, Any]:
         sent = tick_ms()
         try:

@@ -37,6 +37,7 @@ _LIMIT = 32
 _AGAIN_S = 5.0
 """A command that nobody has answered for so long may be given again: the journal knows it."""
 _BUSY_PAUSE_S = 0.2
+_BREAK_EVERY_S = 0.02
 _GOODBYE_S = 0.7
 T = TypeVar("T")
 _log = logging.getLogger(__name__)
@@ -119,12 +120,15 @@ class HttpTransport:
         self._stopping.set()
         self._interrupt.set()
         self._tray.close()
-        self._poll_api.break_off()
-        for thread in reversed(self._threads):
-            if thread is not threading.current_thread():
-                thread.join(_GOODBYE_S)
+        others = [thread for thread in self._threads if thread is not threading.current_thread()]
+        goodbye_s = time.monotonic() + _GOODBYE_S
+        while any(thread.is_alive() for thread in others) and time.monotonic() < goodbye_s + _GOODBYE_S:
+            # Again and again: a call may just be about to begin.
+            self._poll_api.break_off()
+            if time.monotonic() > goodbye_s:
                 self._tell_api.break_off()
-                thread.join(_GOODBYE_S)
+            for thread in others:
+                thread.join(_BREAK_EVERY_S)
 
     # ------------------------------------------------------------ the poll thread
 
@@ -260,7 +264,10 @@ class HttpTransport:
             if self._stopping.is_set():
                 self._tray.put_back(batch)
             elif self._interrupt.is_set() or not self._up:
-                self._stopping.wait(_BUSY_PAUSE_S)  # the link is lost: what was for it is nobody's
+                # The link is lost: what was for it is nobody's. The poll thread may not have seen it yet.
+                if self._up:
+                    self._poll_api.break_off()
+                self._stopping.wait(_BREAK_EVERY_S)
             else:
                 self._try_to_tell(batch)
         self._say_goodbye()

@@ -21,7 +21,8 @@ from device_agent.protocol.messages import Presence
 from device_agent.transports.back_off import BackOff
 
 KEEP_ALIVE_S = 5
-"""A dead peer is noticed after one and a half of these; at rest it costs one ping."""
+"""A dead peer is noticed after two of these at most; at rest it costs one ping."""
+NOTICED_WITHIN_S = 2.0 * KEEP_ALIVE_S
 _CONNECT_TIMEOUT_S = 5.0
 _REFRESH_AT = 0.8
 """Credentials are renewed after this share of their life, at a quiet moment; at the last moment in any case."""

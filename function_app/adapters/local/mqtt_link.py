@@ -13,7 +13,7 @@ import logging
 import random
 import socket
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Awaitable, Callable, Iterable, Sequence
 from typing import Any
 
 import paho.mqtt.client as mqtt
@@ -53,7 +53,7 @@ class MqttLink:
         *,
         host: str,
         port: int,
-        credentials: Callable[[], ServiceCredentials],
+        credentials: Callable[[], ServiceCredentials | Awaitable[ServiceCredentials]],
         subscriptions: Sequence[str] = (),
         receive: Callable[[mqtt.MQTTMessage], None] | None = None,
         manual_ack: bool = False,
@@ -161,6 +161,25 @@ class MqttLink:
             self._client.ack(message.mid, message.qos)
             self._flush(self._client)
 
+    async def hear(self, patterns: Sequence[str]) -> None:
+        """Subscribe to these too, on this connection and on those that follow."""
+        self._subscriptions = tuple(dict.fromkeys((*self._subscriptions, *patterns)))
+        client, generation = self._client, self.generation
+        if client is None:
+            return
+        try:
+            await self._subscribe(client, patterns)
+        except (BusUnavailable, TimeoutError) as error:
+            self._abandon(generation, str(error) or "a subscription was not confirmed")
+
+    def unhear(self, patterns: Iterable[str]) -> None:
+        """Subscribe to these no longer."""
+        gone = set(patterns)
+        self._subscriptions = tuple(pattern for pattern in self._subscriptions if pattern not in gone)
+        if self._client is not None and gone:
+            self._client.unsubscribe(sorted(gone))
+            self._flush(self._client)
+
     async def close(self) -> None:
         """Disconnect. May be called twice."""
         if self._keeper is not None:
@@ -175,7 +194,8 @@ class MqttLink:
         while True:
             client: mqtt.Client | None = None
             try:
-                credentials = self._credentials()
+                given = self._credentials()
+                credentials = given if isinstance(given, ServiceCredentials) else await given
                 client = await self._connect(credentials)
                 pause_s = FIRST_RETRY_S
                 await self._stay(client, credentials.expires_at)
@@ -207,7 +227,7 @@ class MqttLink:
                 if not reason.is_failure:
                     self._client = client
                     self.generation += 1
-                    await self._subscribe(client)
+                    await self._subscribe(client, self._subscriptions)
                     self._turn_at, self._unproven = self._clocks(), False
                     self._ready.set()
                     self._tried.set()
@@ -290,9 +310,9 @@ class MqttLink:
             client.on_message = lambda _client, _data, message: receive(message)
         return client
 
-    async def _subscribe(self, client: mqtt.Client) -> None:
-        for start in range(0, len(self._subscriptions), MAX_FILTERS):
-            filters = [(pattern, self._qos) for pattern in self._subscriptions[start : start + MAX_FILTERS]]
+    async def _subscribe(self, client: mqtt.Client, patterns: Sequence[str]) -> None:
+        for start in range(0, len(patterns), MAX_FILTERS):
+            filters = [(pattern, self._qos) for pattern in patterns[start : start + MAX_FILTERS]]
             result, mid = client.subscribe(filters)
             if result != MQTTErrorCode.MQTT_ERR_SUCCESS or mid is None:
                 raise BusUnavailable("the broker went away")

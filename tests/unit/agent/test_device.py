@@ -8,12 +8,15 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
+import msgspec
 import pytest
+from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
 
 from device_agent.ports.clock import CloudClock, tick_ms, wall_ms
 from device_agent.ports.driver import DriverError, Observation
 from device_agent.protocol import codec, signing, topics
 from device_agent.protocol.messages import (
+    SHIPPED,
     Ack,
     AckStatus,
     AskLease,
@@ -40,6 +43,7 @@ from device_agent.runtime.journal import Journal
 from device_agent.runtime.outbox import Outbox
 from device_agent.runtime.room import Room
 from device_agent.runtime.shelf import Shelf
+from tests.support.jail import warm_jail
 from tests.unit.agent.test_controller import robot_type
 
 WITHIN_S = 15.0
@@ -104,6 +108,7 @@ class Bench:
             publish=self.publish,
             outbox=self.outbox,
             room=Room(space="s", agent="a", own=["arm"]),
+            jail=warm_jail(),
         )
 
     def publish(
@@ -139,6 +144,9 @@ class Bench:
         self.receive(topics.CMD, signing.sign(codec.encode(command), self.key))
         return command.id
 
+    def script(self, source: str, version: int = 1, author: str = SHIPPED) -> RunMovement:
+        return signed_movement(source, self.key, version=version, author=author)
+
     def receive(self, kind: str, payload: bytes, name: str = "") -> None:
         self.device.receive(topics.Topic("s", "a", "arm", kind, name), payload)
 
@@ -163,6 +171,22 @@ class Bench:
         return seen
 
 
+def signed_movement(source: str, key: Ed25519PrivateKey, *, version: int = 1, author: str = SHIPPED) -> RunMovement:
+    """As the cloud sends it."""
+    digest = hashlib.sha256(source.encode()).hexdigest()
+    text = signing.movement_text("toy", "dance", version, digest)
+    return RunMovement(
+        robot_type="toy",
+        name="dance",
+        version=version,
+        sha256=digest,
+        source=source,
+        author=author,
+        key=signing.key_id(key.public_key()),
+        signature=signing.sign_text(text, key, context=signing.MOVEMENT_CONTEXT),
+    )
+
+
 def eventually(probe: Callable[[], Any]) -> Any:
     deadline_s = time.monotonic() + WITHIN_S
     while time.monotonic() < deadline_s:
@@ -181,11 +205,6 @@ def bench(tmp_path: Path):
     bench.device.stop()
     bench.outbox.stop()
     bench.journal.close()
-
-
-def script(source: str) -> RunMovement:
-    digest = hashlib.sha256(source.encode()).hexdigest()
-    return RunMovement(robot_type="toy", name="dance", version=1, sha256=digest, source=source)
 
 
 def test_it_introduces_itself_when_the_link_comes_up(bench: Bench) -> None:
@@ -279,7 +298,7 @@ def test_an_epoch_in_the_topic_that_differs_from_the_message_is_refused(bench: B
 
 
 def test_stop_needs_no_lease_and_survives_a_restart(bench: Bench, tmp_path: Path) -> None:
-    running = bench.command(script("wait(600)"), epoch=1)
+    running = bench.command(bench.script("wait(600)"), epoch=1)
     eventually(lambda: [ack for ack in bench.acks(running) if ack.status is AckStatus.STARTED])
     bench.receive(topics.STOP, codec.encode(Stop(id="s1", by="bob", reason="smoke")))
     ack = bench.end(running)
@@ -308,7 +327,7 @@ def test_a_signed_stop_is_obeyed_however_late(bench: Bench) -> None:
 
 
 def test_a_second_action_is_refused_while_one_runs_and_the_first_can_be_cancelled(bench: Bench) -> None:
-    first = bench.command(script("print('hello')\nwait(600)"), epoch=1)
+    first = bench.command(bench.script("print('hello')\nwait(600)"), epoch=1)
     eventually(lambda: [ack for ack in bench.acks(first) if ack.status is AckStatus.STARTED])
     second = bench.end(bench.command(MoveJoints(position_rad={"elbow": 0.2}), epoch=1))
     assert second.reason is not None
@@ -323,9 +342,9 @@ def test_a_second_action_is_refused_while_one_runs_and_the_first_can_be_cancelle
 
 
 def test_a_script_with_another_hash_or_of_another_robot_does_not_run(bench: Bench) -> None:
-    good = script("print(1)")
-    forged = RunMovement(robot_type="toy", name="dance", version=1, sha256=good.sha256, source="print(2)")
-    other = RunMovement(robot_type="nao", name="dance", version=1, sha256=good.sha256, source=good.source)
+    good = bench.script("print(1)")
+    forged = msgspec.structs.replace(good, source="print(2)")
+    other = msgspec.structs.replace(good, robot_type="nao")
     codes = []
     for order in (forged, other):
         reason = bench.end(bench.command(order, epoch=1)).reason
@@ -335,7 +354,7 @@ def test_a_script_with_another_hash_or_of_another_robot_does_not_run(bench: Benc
 
 def test_the_release_of_a_lease_ends_its_action(bench: Bench) -> None:
     bench.end(bench.command(GrantLease(holder="ann", lease_ms=60_000), epoch=1))
-    running = bench.command(script("wait(600)"), epoch=1)
+    running = bench.command(bench.script("wait(600)"), epoch=1)
     eventually(lambda: [ack for ack in bench.acks(running) if ack.status is AckStatus.STARTED])
     bench.end(bench.command(ReleaseLease(), epoch=1))
     reason = bench.end(running).reason
@@ -344,7 +363,7 @@ def test_the_release_of_a_lease_ends_its_action(bench: Bench) -> None:
 
 
 def test_a_lost_link_ends_what_runs_and_the_answer_is_sent_when_it_is_back(bench: Bench) -> None:
-    running = bench.command(script("wait(600)"), epoch=1)
+    running = bench.command(bench.script("wait(600)"), epoch=1)
     eventually(lambda: [ack for ack in bench.acks(running) if ack.status is AckStatus.STARTED])
     gone = threading.Event()
 
@@ -428,7 +447,7 @@ def test_nothing_gets_past_stop(bench: Bench, tmp_path: Path) -> None:
     bench.end(bench.command(GrantLease(holder="ann", lease_ms=60_000), epoch=1))
     bench.end(bench.command(StopDevice(reason="smoke")))
     bench.end(bench.command(GrantLease(holder="eve", lease_ms=60_000), epoch=2))
-    for order in (MoveJoints(position_rad={"elbow": 0.2}), script("robot.home()")):
+    for order in (MoveJoints(position_rad={"elbow": 0.2}), bench.script("robot.home()")):
         reason = bench.end(bench.command(order, epoch=2)).reason
         assert reason is not None
         assert reason.code == "stopped"

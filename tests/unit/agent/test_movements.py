@@ -1,45 +1,103 @@
-"""Movement scripts in real processes, with a robot that only takes notes."""
+"""Movement scripts in the real jail, with a robot that only takes notes."""
 
+import contextlib
 import hashlib
+import json
+import socket
 import threading
 import time
+from collections.abc import Iterator
 from typing import Any
 
 import pytest
 
+from device_agent.ports.jail import JailError, Limits
 from device_agent.protocol.messages import RunMovement
+from device_agent.runtime import calls, movements
 from device_agent.runtime.lease import Refused
-from device_agent.runtime.movements import Script, ScriptFailed
+from device_agent.runtime.movements import Cell, Script, ScriptFailed
+from tests.support.jail import warm_jail
 
 
 class Notes:
     joints = ("shoulder", "elbow")
+    frames = ("tool",)
+    can = ("move_joints", "home", "state")
 
     def __init__(self) -> None:
         self.calls: list[Any] = []
 
-    def move_joints(self, position_rad: dict[str, float], speed: float) -> None:
-        if "knee" in position_rad:
-            raise Refused("unknown_joint", "no joint 'knee'")
-        self.calls.append((position_rad, speed))
+    def do(self, call: calls.Call) -> Any:
+        match call:
+            case calls.MoveJoints(position_rad=position_rad, speed=speed):
+                if "knee" in position_rad:
+                    raise Refused("unknown_joint", "no joint 'knee'")
+                self.calls.append((position_rad, speed))
+            case calls.AskState():
+                return {"position_rad": {"shoulder": 0.1, "elbow": 0.2}, "mode": "action"}
+            case _:
+                self.calls.append(call)
+        return None
 
-    def home(self, speed: float) -> None:
-        self.calls.append(("home", speed))
 
-    def state(self) -> dict[str, Any]:
-        return {"position_rad": {"shoulder": 0.1, "elbow": 0.2}, "mode": "action"}
+class Told:
+    def __init__(self) -> None:
+        self.printed = ""
+        self.progress: list[float] = []
 
-
-def run(source: str, parameters: dict[str, Any] | None = None) -> tuple[Notes, str, list[float]]:
-    notes, printed, progress = Notes(), [], []
-
-    def told(text: str, share: float | None) -> None:
-        printed.append(text)
+    def __call__(self, text: str, share: float | None) -> None:
+        self.printed += text
         if share is not None:
-            progress.append(share)
+            self.progress.append(share)
 
-    Script(order(source, parameters), notes, told).run()
-    return notes, "".join(printed), progress
+
+class FakeInmate:
+    """A process that says what it is told to."""
+
+    def __init__(self, *, dies: bool = True) -> None:
+        self.link, self.theirs = socket.socketpair()
+        self.dies = dies
+        self.killed = False
+
+    def say(self, *lines: bytes) -> None:
+        self.theirs.sendall(b"".join(line + b"\n" for line in lines))
+
+    def kill(self) -> None:
+        self.killed = True
+
+    def wait(self, timeout_s: float) -> bool:
+        del timeout_s
+        return self.dies
+
+    def ending(self) -> str:
+        return "it crashed"
+
+    def close(self) -> None:
+        self.link.close()
+        self.theirs.close()
+
+
+class FakeJail:
+    trusted = False
+
+    def __init__(self, inmate: FakeInmate | None) -> None:
+        self.inmate = inmate
+
+    def start(self) -> None:
+        pass
+
+    def refusal(self, *, stranger: bool) -> str | None:
+        del stranger
+        return None
+
+    def open(self, limits: Limits, *, stranger: bool) -> FakeInmate:
+        del limits, stranger
+        if self.inmate is None:
+            raise JailError("no process can be started for the script")
+        return self.inmate
+
+    def close(self) -> None:
+        pass
 
 
 def order(source: str, parameters: dict[str, Any] | None = None) -> RunMovement:
@@ -49,25 +107,62 @@ def order(source: str, parameters: dict[str, Any] | None = None) -> RunMovement:
     )
 
 
+def run(source: str, parameters: dict[str, Any] | None = None) -> tuple[Notes, Told]:
+    notes, told = Notes(), Told()
+    Script(order(source, parameters), notes, told, cell=Cell(warm_jail(), stranger=False)).run()
+    return notes, told
+
+
+def run_fake(inmate: FakeInmate) -> Told:
+    told = Told()
+    Script(order(""), Notes(), told, cell=Cell(FakeJail(inmate), stranger=False)).run()
+    return told
+
+
 def test_a_script_moves_prints_and_reads_its_parameters() -> None:
-    notes, printed, progress = run(
+    notes, told = run(
         "for angle in parameters['angles']:\n"
         "    robot.move_joints({'elbow': angle}, speed=0.3)\n"
         "robot.move_joints([1, 2])\n"
         "robot.home()\n"
         "wait(0.01)\n"
         "progress(0.5)\n"
-        "print('elbow', robot.state()['position_rad']['elbow'])\n",
+        "print('elbow', robot.state()['position_rad']['elbow'], robot.joints, robot.frames, robot.can[0])\n",
         {"angles": [0.5, 1]},
     )
     assert notes.calls == [
         ({"elbow": 0.5}, 0.3),
         ({"elbow": 1.0}, 0.3),
         ({"shoulder": 1.0, "elbow": 2.0}, 0.5),
-        ("home", 0.5),
+        calls.Home(speed=0.5),
     ]
-    assert printed == "elbow 0.2\n"
-    assert progress == [0.5]
+    assert told.printed == "elbow 0.2 ('shoulder', 'elbow') ('tool',) move_joints\n"
+    assert told.progress == [0.5]
+
+
+def test_every_call_of_the_api_arrives_as_it_was_meant() -> None:
+    notes, _ = run(
+        "robot.move_to([0.1, 0, 0.3], rpy_rad=(0, 0, 1), speed=0.2)\n"
+        "robot.move_to((0.1, 0, 0.3), quaternion=(1, 0, 0, 0), frame='camera')\n"
+        "robot.drive(0.1, turn_rad_s=0.5, duration_s=2)\n"
+        "robot.look((1, 0, 0))\n"
+        "robot.say('ahoj', language='sk')\n"
+        "robot.stiffness(0.5, ['elbow'])\n"
+        "robot.express('smile', 0.7)\n"
+        "robot.behaviour('wave')\n"
+        "room.latest('agent-pir', 'presence')\n"
+    )
+    assert notes.calls == [
+        calls.MoveTo(frame="tool", position_m=(0.1, 0, 0.3), rpy_rad=(0, 0, 1), speed=0.2),
+        calls.MoveTo(frame="camera", position_m=(0.1, 0, 0.3), quaternion=(1, 0, 0, 0), speed=0.5),
+        calls.Drive(forward_m_s=0.1, left_m_s=0, turn_rad_s=0.5, duration_s=2),
+        calls.Look(position_m=(1, 0, 0), speed=0.5),
+        calls.Say(text="ahoj", language="sk"),
+        calls.Stiffness(value=0.5, joints=("elbow",)),
+        calls.Express(name="smile", strength=0.7),
+        calls.Behaviour(name="wave"),
+        calls.AskLatest(device="agent-pir", stream="presence"),
+    ]
 
 
 @pytest.mark.parametrize(
@@ -78,12 +173,19 @@ def test_a_script_moves_prints_and_reads_its_parameters() -> None:
         ("robot.move_joints({'elbow': float('nan')})", "line 1: ValueError"),
         ("robot.move_joints({'elbow': 10**400})", "line 1: OverflowError"),
         ("robot.move_joints([1])", "line 1: RobotError: 1 positions for 2 joints"),
+        ("robot.move_joints({})", "line 1: RobotError: not a valid"),
         ("\nrobot.move_joints({'knee': 1})", "line 2: RobotError: no joint 'knee'"),
-        ("robot.move_joints({'elbow': 1}, speed=0)", "line 1: RobotError: speed"),
-        ("robot.fly()", "line 1: AttributeError"),
+        ("robot.move_to([1, 2])", "line 1: RobotError: position_m needs 3 numbers, not 2"),
+        ("robot.move_to([1, 2, 3], quaternion=[1, 0, 0, 0], rpy_rad=[0, 0, 0])", "line 1: RobotError: give a"),
+        ("\n\nrobot.fly()", "line 3: AttributeError: there is no robot.fly; there are behaviour, drive"),
         ("if True print", "line 1: SyntaxError"),
         ("raise SystemExit(3)", "line 1: SystemExit: 3"),
+        ("import asyncio", "line 1: ModuleNotFoundError: a script cannot import 'asyncio'; it can import abc"),
+        ("x = bytearray(2**30)", "line 1: MemoryError"),
         ("import os\nos._exit(1)", "ended before the script did"),
+        ("import os\nos._exit(7)", "ended before the script did: it ended with 7"),
+        ("import ctypes\nctypes.string_at(0)", "ended before the script did: it crashed"),
+        ("import ctypes\nctypes.CDLL(None).ptrace(0, 0, 0, 0)", "did: it tried something that no script may"),
     ],
 )
 def test_a_script_that_fails_says_where(source: str, says: str) -> None:
@@ -93,12 +195,33 @@ def test_a_script_that_fails_says_where(source: str, says: str) -> None:
 
 
 def test_a_script_may_catch_what_the_robot_refuses() -> None:
-    _, printed, _ = run("try:\n    robot.move_joints({'knee': 1})\nexcept RobotError as e:\n    print(e)\n")
-    assert printed == "no joint 'knee'\n"
+    _, told = run("try:\n    robot.move_joints({'knee': 1})\nexcept RobotError as e:\n    print(e)\n")
+    assert told.printed == "no joint 'knee'\n"
 
 
-def test_a_script_is_killed_at_once() -> None:
-    script = Script(order("wait(600)"), Notes(), lambda _text, _share: None)
+@pytest.mark.parametrize(
+    "source",
+    [
+        "import numpy as np; print(round(float(np.linalg.det(np.linalg.inv(np.diag([2.0, 4.0])))), 6))",
+        "import datetime as d; print(d.datetime.strptime('2026', '%Y').year)",
+        "import statistics, itertools, dataclasses, re, heapq, decimal; print(decimal.Decimal('0.1'))",
+        "import random, secrets, uuid, hashlib; print(len(uuid.uuid4().hex))",
+        "import time; print(time.localtime().tm_year > 2000, 'é'.encode('cp1252'))",
+    ],
+)
+def test_what_a_script_usually_imports_works(source: str) -> None:
+    _, told = run(source)
+    assert told.printed
+
+
+def test_two_scripts_draw_different_random_numbers() -> None:
+    source = "import random, numpy\nprint(random.random(), numpy.random.rand())"
+    first, second = run(source)[1].printed, run(source)[1].printed
+    assert len({*first.split(), *second.split()}) == 4
+
+
+@contextlib.contextmanager
+def running(script: Script) -> Iterator[list[ScriptFailed]]:
     failures: list[ScriptFailed] = []
 
     def body() -> None:
@@ -109,25 +232,110 @@ def test_a_script_is_killed_at_once() -> None:
 
     thread = threading.Thread(target=body)
     thread.start()
-    deadline_s = time.monotonic() + 10
-    while script._process is None and time.monotonic() < deadline_s:
-        time.sleep(0.01)
-    script.kill()
+    yield failures
     thread.join(10)
     assert not thread.is_alive()
-    assert failures
+
+
+def test_a_script_is_killed_at_once() -> None:
+    told = Told()
+    source = "import signal\nsignal.signal(signal.SIGTERM, signal.SIG_IGN)\nprint('here')\nwhile True: pass"
+    script = Script(order(source), Notes(), told, cell=Cell(warm_jail(), stranger=False))
+    with running(script) as failures:
+        while not told.printed:
+            time.sleep(0.01)
+        script.kill()
+        script.kill()
+    assert [str(failure) for failure in failures] == ["the script's process ended before the script did"]
 
 
 def test_a_script_killed_before_it_began_does_not_run() -> None:
     notes = Notes()
-    script = Script(order("robot.home()"), notes, lambda _text, _share: None)
+    script = Script(order("robot.home()"), notes, Told(), cell=Cell(warm_jail(), stranger=False))
     script.kill()
     with pytest.raises(ScriptFailed):
         script.run()
     assert notes.calls == []
 
 
-def test_a_script_sees_no_environment_of_the_agent(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("TELESCOPE_SECRET", "x")
-    _, printed, _ = run("import os\nprint(sorted(k for k in os.environ if k.startswith('TELESCOPE')))")
-    assert printed == "[]\n"
+def test_without_a_process_it_says_why() -> None:
+    script = Script(order(""), Notes(), Told(), cell=Cell(FakeJail(None), stranger=False))
+    with pytest.raises(ScriptFailed, match="no process can be started"):
+        script.run()
+
+
+def test_a_jail_that_does_not_hold_gets_no_script() -> None:
+    inmate = FakeInmate()
+    inmate.say(b'{"kind": "unfit", "why": "landlock: no"}')
+    with pytest.raises(ScriptFailed, match="the jail does not hold: landlock: no"):
+        run_fake(inmate)
+
+
+@pytest.mark.parametrize("first", [b'{"kind": "nonsense"}', b"", b"\xff\xfe"])
+def test_a_process_that_does_not_begin_as_it_should_gets_no_script(first: bytes) -> None:
+    inmate = FakeInmate()
+    inmate.say(first)
+    with pytest.raises(ScriptFailed, match="ended before the script did: it crashed"):
+        run_fake(inmate)
+
+
+def test_a_process_that_says_nothing_is_given_up(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(movements, "_READY_S", 0.05)
+    with pytest.raises(ScriptFailed, match="it stopped making sense"):
+        run_fake(FakeInmate(dies=False))
+
+
+def test_a_line_without_end_is_the_end() -> None:
+    inmate = FakeInmate()
+    inmate.say(b'{"kind": "ready"}')
+    flood = threading.Thread(target=_flood, args=(inmate.theirs,))
+    flood.start()
+    with pytest.raises(ScriptFailed, match="ended before"):
+        run_fake(inmate)
+    flood.join(10)
+
+
+def _flood(link: socket.socket) -> None:
+    with contextlib.suppress(OSError):
+        link.sendall(b" " * (4 * calls.MAX_LINE))
+
+
+def test_a_line_that_is_too_long_is_the_end() -> None:
+    with socket.socket() as unread:
+        lines = movements._Lines(unread, threading.Event())
+        lines._rest = b" " * calls.MAX_LINE + b"\n"
+        with pytest.raises(EOFError):
+            lines.read()
+
+
+def test_what_is_said_twice_or_is_no_message_is_answered_with_an_error() -> None:
+    inmate = FakeInmate()
+    inmate.say(
+        b'{"kind": "ready"}',
+        b'{"kind": "ready"}',
+        b'{"kind": "progress", "share": 7}',
+        b'{"kind": "output", "text": "x"}',
+        b'{"kind": "ended", "error": ""}',
+    )
+    answers = inmate.theirs.dup()
+    told = run_fake(inmate)
+    assert (told.printed, told.progress) == ("x", [])
+    got = [json.loads(line) for line in answers.makefile("rb").read().splitlines()]
+    assert got[0]["name"] == "wave"
+    assert got[1] == {"error": "this is said once"}
+    assert "share" in got[2]["error"]
+    answers.close()
+
+
+def test_a_script_that_floods_is_read_slowly(monkeypatch: pytest.MonkeyPatch) -> None:
+    ours, theirs = socket.socketpair()
+    with ours, theirs:
+        killed = threading.Event()
+        waited: list[float] = []
+        monkeypatch.setattr(killed, "wait", waited.append)
+        lines = movements._Lines(ours, killed)
+        theirs.sendall(b"{}\n" * 700)
+        for _ in range(700):
+            assert lines.read() == b"{}"
+    assert len(waited) > 100
+    assert 0 < max(waited) < 10

@@ -14,6 +14,7 @@ from function_app.ports.broker_access import ServiceCredentials
 from function_app.services.delivery import Delivery, Signed
 from function_app.services.forget import Forget
 from function_app.services.mailbox import Mailbox
+from function_app.services.relay import Relay
 
 ARM = Device(
     id="aaaaaaaaaa-arm", name="arm", label="Arm", kind="arm", robot_type="ur5", agent="aaaaaaaaaa", space="s",
@@ -37,7 +38,9 @@ async def confirmed(folder: Path, wait_ms: int) -> bool:
     signed = Signed("aaaaaaaaaa-arm-00000000000000000000", b"{}", SystemClock().now_ms() + 5_000)
     try:
         async with asyncio.timeout(20):
-            return await Delivery(bus=bus, mailbox=mailbox).confirmed(ARM, signed, wait_ms=wait_ms)
+            return await Delivery(bus=bus, mailbox=mailbox, relay=Relay(bus=bus, clock=SystemClock())).confirmed(
+                ARM, signed, wait_ms=wait_ms
+            )
     finally:
         await tables.close()
 

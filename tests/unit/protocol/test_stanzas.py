@@ -72,7 +72,9 @@ def test_an_ordinary_message_and_one_that_came_back_are_none_of_ours() -> None:
 
 def test_a_receipt_and_a_refusal_name_their_message() -> None:
     assert stanzas.received(XML(stanzas.receipt("a@b/c", "7"))) == "7"
-    assert stanzas.refused(XML(stanzas.refusal("a@b/c", "8", "not a topic"))) == ("8", "not a topic")
+    assert stanzas.refused(XML(stanzas.refusal("a@b/c", "8", "not a topic"))) == ("8", "not a topic", True)
+    bounced = "<message type='error' id='9'><error type='cancel'><service-unavailable/></error></message>"
+    assert stanzas.refused(XML(bounced)) == ("9", "nobody takes it there", False)
     assert stanzas.refused(XML(stanzas.receipt("a@b/c", "7"))) is None
     assert stanzas.received(XML(stanzas.refusal("a@b/c", "8", ""))) is None
 

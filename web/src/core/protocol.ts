@@ -308,7 +308,13 @@ export interface DropRequest {
   request: string;
 }
 
-/** Run one movement script. The source must hash to `sha256` (hex). */
+/**
+ * Run one movement script. The source must hash to `sha256` (hex).
+ *
+ * `signature` is the one that was made, with the cloud's key `key`, when the movement was saved: over robot type,
+ * name, version and hash. `author` is the account that saved it, or `SHIPPED`: each author counts versions by
+ * itself, and a device never runs an older one than it has. It is ended after `timeout_ms`.
+ */
 export interface RunMovement {
   kind: "run_movement";
   /** letters, digits, _ and -, 1 to 64 of them */
@@ -319,6 +325,10 @@ export interface RunMovement {
   sha256: string;
   source: string;
   parameters?: Record<string, unknown>;
+  author?: string;
+  key?: string;
+  signature?: string;
+  timeout_ms?: number;
 }
 
 /** Move to joint positions and end there. */

@@ -1,0 +1,172 @@
+"""What a script may use: ``robot``, ``room``, ``parameters``, ``wait``, ``progress``, ``print``, ``RobotError``.
+
+Every call of ``robot`` blocks until it is done and raises ``RobotError``, with the reason, when it is not done: the
+robot cannot do this, a limit is in the way, somebody stopped it. SI units and radians.
+
+A script's process has nothing else: no file, no network, no other process. It may import what ``modules`` names.
+"""
+
+import time
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any
+
+Ask = Callable[..., Any]
+"""``ask(kind, **arguments)``: sends a call to the agent and gives its answer."""
+Tell = Callable[..., None]
+"""``tell(kind, **arguments)``: sends what needs no answer."""
+
+
+class RobotError(Exception):
+    """The robot did not do what the script asked; says why. Ends the script unless it is caught."""
+
+
+class Robot:
+    """``robot``: the device that the script runs on. ``help(robot)`` is this page.
+
+    Attributes:
+        joints: Names of its joints, in the order of lists of positions.
+        frames: Names of the frames that ``move_to`` can bring somewhere.
+        can: Names of the calls that this robot has; any other raises ``RobotError``.
+    """
+
+    def __init__(self, ask: Ask, *, joints: Sequence[str], frames: Sequence[str], can: Sequence[str]) -> None:
+        self._ask = ask
+        self.joints = tuple(joints)
+        self.frames = tuple(frames)
+        self.can = tuple(can)
+
+    def move_joints(self, position_rad: Mapping[str, float] | Sequence[float], speed: float = 0.5) -> None:
+        """Move joints and wait until they are there.
+
+        Args:
+            position_rad: Joint name → position [rad] (the others stay), or a list in the order of ``robot.joints``.
+            speed: Share of each joint's velocity limit, above 0, up to 1.
+        """
+        self._ask("move_joints", position_rad=self._by_name(position_rad), speed=float(speed))
+
+    def move_to(
+        self,
+        position_m: Sequence[float],
+        *,
+        quaternion: Sequence[float] | None = None,
+        rpy_rad: Sequence[float] | None = None,
+        frame: str = "",
+        speed: float = 0.5,
+    ) -> None:
+        """Bring a frame of the robot to a pose, and wait until it is there.
+
+        Args:
+            position_m: x, y, z in the robot's base frame [m].
+            quaternion: Orientation (w, x, y, z), or
+            rpy_rad: roll, pitch, yaw about the base's x, y, z [rad]. With neither the frame keeps its orientation.
+            frame: One of ``robot.frames``; the last of them, an arm's flange, when it is not named.
+            speed: Share of each joint's velocity limit, above 0, up to 1.
+        """
+        if quaternion is not None and rpy_rad is not None:
+            raise RobotError("give a quaternion or rpy_rad, not both")
+        self._ask(
+            "move_to",
+            frame=frame or (self.frames[-1] if self.frames else ""),
+            position_m=_numbers(position_m, 3, "position_m"),
+            quaternion=None if quaternion is None else _numbers(quaternion, 4, "quaternion"),
+            rpy_rad=None if rpy_rad is None else _numbers(rpy_rad, 3, "rpy_rad"),
+            speed=float(speed),
+        )
+
+    def home(self, speed: float = 0.5) -> None:
+        """Move to the robot type's home position and wait until there."""
+        self._ask("home", speed=float(speed))
+
+    def drive(
+        self, forward_m_s: float = 0.0, left_m_s: float = 0.0, turn_rad_s: float = 0.0, *, duration_s: float = 1.0
+    ) -> None:
+        """Drive the base at a velocity for a time, then stand. ``turn_rad_s`` is counter-clockwise."""
+        self._ask(
+            "drive",
+            forward_m_s=float(forward_m_s),
+            left_m_s=float(left_m_s),
+            turn_rad_s=float(turn_rad_s),
+            duration_s=float(duration_s),
+        )
+
+    def look(self, position_m: Sequence[float], speed: float = 0.5) -> None:
+        """Turn the gaze to a point x, y, z in the robot's base frame [m]."""
+        self._ask("look", position_m=_numbers(position_m, 3, "position_m"), speed=float(speed))
+
+    def say(self, text: str, language: str = "") -> None:
+        """Speak and wait for the end; ``language`` as ``en`` or ``sk``, else the robot's own."""
+        self._ask("say", text=str(text), language=str(language))
+
+    def stiffness(self, value: float, joints: Sequence[str] = ()) -> None:
+        """How firmly joints hold, 0 (limp) to 1; all of them when none is named."""
+        self._ask("stiffness", value=float(value), joints=[str(name) for name in joints])
+
+    def express(self, name: str, strength: float = 1.0) -> None:
+        """Show an expression, ``strength`` 0 to 1."""
+        self._ask("express", name=str(name), strength=float(strength))
+
+    def behaviour(self, name: str) -> None:
+        """Run a behaviour that the robot has of its own, and wait for its end."""
+        self._ask("behaviour", name=str(name))
+
+    def state(self) -> dict[str, Any]:
+        """Measured ``position_rad``, ``velocity_rad_s``, ``effort_nm`` by joint name, ``frames`` by name, ``mode``.
+
+        A frame is x, y, z [m] and quaternion w, x, y, z in the robot's base frame.
+        """
+        state: dict[str, Any] = self._ask("state")
+        return state
+
+    def _by_name(self, position_rad: Mapping[str, float] | Sequence[float]) -> dict[str, float]:
+        if isinstance(position_rad, Mapping):
+            return {str(name): float(value) for name, value in position_rad.items()}
+        if len(position_rad) != len(self.joints):
+            raise RobotError(f"{len(position_rad)} positions for {len(self.joints)} joints: {', '.join(self.joints)}")
+        return {name: float(value) for name, value in zip(self.joints, position_rad, strict=True)}
+
+    def __getattr__(self, name: str) -> Any:
+        known = sorted(key for key in type(self).__dict__ if not key.startswith("_"))
+        raise AttributeError(f"there is no robot.{name}; there are {', '.join(known)}, joints, frames, can")
+
+
+class Room:
+    """``room``: what the other devices of the space have measured last."""
+
+    def __init__(self, ask: Ask) -> None:
+        self._ask = ask
+
+    def latest(self, device: str, stream: str) -> dict[str, Any] | None:
+        """The newest measurement of a stream: ``values`` by name and ``age_s``, its age [s] since it was heard here.
+
+        ``None`` when nothing has been heard. Decide by ``age_s`` whether it still counts.
+        """
+        found: dict[str, Any] | None = self._ask("latest", device=str(device), stream=str(stream))
+        return found
+
+
+def names(tell: Tell, ask: Ask, flush: Callable[[], None], task: Mapping[str, Any]) -> dict[str, Any]:
+    """The names that a script finds."""
+
+    def wait(duration_s: float) -> None:
+        """Wait [s]; the robot holds."""
+        flush()
+        time.sleep(duration_s)
+
+    def progress(share: float) -> None:
+        """Say how much is done, 0 to 1."""
+        tell("progress", share=min(1.0, max(0.0, float(share))))
+
+    return {
+        "robot": Robot(ask, joints=task["joints"], frames=task["frames"], can=task["can"]),
+        "room": Room(ask),
+        "parameters": task["parameters"],
+        "wait": wait,
+        "progress": progress,
+        "RobotError": RobotError,
+    }
+
+
+def _numbers(values: Sequence[float], count: int, name: str) -> list[float]:
+    if len(values) != count:
+        raise RobotError(f"{name} needs {count} numbers, not {len(values)}")
+    return [float(value) for value in values]

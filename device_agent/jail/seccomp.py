@@ -1,0 +1,92 @@
+"""seccomp: the few system calls that a script's process has left.
+
+An allow-list without a single call that takes a path, makes a descriptor or a process, or reaches another process.
+``libseccomp`` writes the filter for the machine's own architecture; calls of any other (32-bit, x32) kill.
+"""
+
+import errno
+import os
+from typing import Any, Protocol
+
+
+class Filter(Protocol):
+    """A filter that is built; ``load`` puts it in force for ever."""
+
+    def load(self) -> None:
+        """Lock this process."""
+
+
+_ALLOWED = (
+    # The socket to the agent, and the null device as standard input and output: nothing else is open.
+    ("read", "write", "close", "poll", "ppoll", "select", "pselect6"),
+    # Memory, within RLIMIT_AS.
+    ("brk", "munmap", "mremap", "madvise"),
+    # Time and waiting.
+    ("clock_gettime", "clock_getres", "gettimeofday", "time", "nanosleep", "clock_nanosleep", "restart_syscall"),
+    # Python's own locks and signal handling. A handler is no way out: what ends a script is SIGKILL.
+    ("futex", "rt_sigaction", "rt_sigprocmask", "rt_sigreturn", "sigaltstack", "sched_yield"),
+    ("getrandom", "getpid", "gettid", "getuid", "geteuid", "getgid", "getegid", "getrusage", "times"),
+    ("sched_getaffinity",),
+    ("exit", "exit_group"),
+)
+_DEADLY = (
+    ("execve", "execveat", "ptrace", "process_vm_readv", "process_vm_writev", "pidfd_getfd", "kcmp"),
+    ("mount", "umount2", "pivot_root", "chroot", "unshare", "setns", "open_tree", "move_mount", "fsopen", "fsmount"),
+    ("bpf", "perf_event_open", "userfaultfd", "io_uring_setup", "io_uring_enter", "io_uring_register"),
+    ("keyctl", "add_key", "request_key", "personality", "memfd_create", "memfd_secret", "seccomp"),
+    ("init_module", "finit_module", "delete_module", "kexec_load", "reboot", "swapon", "iopl", "ioperm"),
+    ("modify_ldt", "name_to_handle_at", "open_by_handle_at", "fanotify_init", "quotactl", "acct", "settimeofday"),
+)
+"""No slip of a script's author ends here: whoever tries is killed. All the rest is refused as "not permitted"."""
+_WRITABLE, _EXECUTABLE = 2, 4
+
+
+def build() -> Filter:
+    """The filter for this machine; building takes some milliseconds, so once for all scripts.
+
+    Raises:
+        ImportError: ``pyseccomp`` is not installed.
+        RuntimeError: libseccomp is not.
+        OSError: The filter cannot be made here.
+    """
+    import pyseccomp as library  # noqa: PLC0415 (only Linux has it, and not every Linux)
+
+    filter_ = library.SyscallFilter(defaction=library.ERRNO(errno.EPERM))
+    filter_.set_attr(library.Attr.ACT_BADARCH, library.KILL_PROCESS)
+    for names, action in ((_ALLOWED, library.ALLOW), (_DEADLY, library.KILL_PROCESS)):
+        for name in (name for group in names for name in group):
+            _add(library, filter_, action, name)
+    _allow_memory(library, filter_)
+    # Asking for a limit, of this process alone; never setting one.
+    _add(
+        library,
+        filter_,
+        library.ALLOW,
+        "prlimit64",
+        library.Arg(0, library.EQ, 0),
+        library.Arg(2, library.EQ, 0),
+    )
+    return filter_  # type: ignore[no-any-return]
+
+
+def _allow_memory(library: Any, filter_: Any) -> None:
+    """Memory that can be written can never be run: no code of a script's own making."""
+    for name in ("mmap", "mmap2"):
+        for lacks in (_WRITABLE, _EXECUTABLE):
+            _add(library, filter_, library.ALLOW, name, library.Arg(2, library.MASKED_EQ, lacks, 0))
+    _add(library, filter_, library.ALLOW, "mprotect", library.Arg(2, library.MASKED_EQ, _EXECUTABLE, 0))
+
+
+def _add(library: Any, filter_: Any, action: int, name: str, *arguments: Any) -> None:
+    """One rule; a call that this architecture or this libseccomp does not know needs none."""
+    if library.resolve_syscall(library.system_arch(), name) >= 0:
+        filter_.add_rule(action, name, *arguments)
+
+
+def in_force() -> bool:
+    """Whether this process is locked: it tries what no script may."""
+    try:
+        os.getpgid(0)
+    except PermissionError:
+        return True
+    return False

@@ -1,0 +1,72 @@
+"""Where movement scripts run: in processes that can do nothing but speak to the agent. The implementer's manual."""
+
+import socket
+from dataclasses import dataclass
+from typing import Protocol
+
+
+class JailError(Exception):
+    """A script cannot be run safely, or at all. Its text says what to do."""
+
+
+@dataclass(frozen=True, slots=True)
+class Limits:
+    """What one script may use.
+
+    Attributes:
+        cpu_s: Processor time [s].
+        memory_bytes: Address space, of which Python and NumPy take about 120 MB.
+    """
+
+    cpu_s: int = 120
+    memory_bytes: int = 512 * 2**20
+
+
+class Inmate(Protocol):
+    """The locked process of one script.
+
+    Attributes:
+        link: The agent's end of its only socket (a stream). Its first line says whether the jail holds.
+    """
+
+    link: socket.socket
+
+    def kill(self) -> None:
+        """End it at once, whatever it does about signals. From any thread, never blocks, may be called twice."""
+
+    def wait(self, timeout_s: float) -> bool:
+        """Whether it is dead within that time [s]."""
+
+    def ending(self) -> str:
+        """Once it is dead: why, if that was not of its own will or by ``kill``; else empty."""
+
+    def close(self) -> None:
+        """Kill it and let go of it. May be called twice."""
+
+
+class Jail(Protocol):
+    """Makes inmates. Thread-safe; the constructor starts nothing."""
+
+    @property
+    def trusted(self) -> bool:
+        """Whether the agent's owner has allowed scripts to run behind fewer layers than all."""
+
+    def start(self) -> None:
+        """Look what this machine has, and be ready. May be called twice. Never raises: ``refusal`` tells."""
+
+    def refusal(self, *, stranger: bool) -> str | None:
+        """Why scripts are refused here, and what to do about it; ``None`` where they run.
+
+        Args:
+            stranger: Whether it is a script of an unknown owner, which needs one wall more.
+        """
+
+    def open(self, limits: Limits, *, stranger: bool) -> Inmate:
+        """A new locked process, which waits for its script.
+
+        Raises:
+            JailError: There is a ``refusal``, or the process could not be made.
+        """
+
+    def close(self) -> None:
+        """End all inmates. May be called twice."""

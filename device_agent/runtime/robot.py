@@ -1,0 +1,283 @@
+"""What a script's calls reach on its own device, for as long as its action has it."""
+
+import math
+import threading
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, assert_never
+
+from device_agent.ports import skills
+from device_agent.ports.driver import Observation, Twist
+from device_agent.ports.geometry import Geometry, GeometryError
+from device_agent.ports.skills import Skill, SkillError, Skills
+from device_agent.protocol.messages import Quaternion, Vector3
+from device_agent.protocol.robot_type import RobotType
+from device_agent.runtime import calls, gaze
+from device_agent.runtime.authority import Tenure
+from device_agent.runtime.controller import Controller
+from device_agent.runtime.courses import Course, Outcome
+from device_agent.runtime.lease import Refused
+from device_agent.runtime.room import Room
+
+CARTESIAN = "cartesian"
+"""A capability that a manifest may name, besides those of ``ports.skills``."""
+_SHORTEST = 1e-6
+
+
+@dataclass(frozen=True, slots=True)
+class Body:
+    """A device as its scripts meet it.
+
+    Attributes:
+        robot_type: Joints, frames, capabilities, home.
+        controller: What moves it.
+        observe: The newest measurement, or ``None`` before the first.
+        geometry: Its shape, where its type has a model.
+        skills: What its driver can besides.
+        room: What the space's other devices have measured last.
+    """
+
+    robot_type: RobotType
+    controller: Controller
+    observe: Callable[[], Observation | None]
+    geometry: Geometry | None
+    skills: Skills | None
+    room: Room
+
+    def seen(self) -> Observation:
+        """The newest measurement.
+
+        Raises:
+            Refused: There is none yet.
+        """
+        seen = self.observe()
+        if seen is None:
+            raise Refused("no_measurement", "the robot has not been measured yet")
+        return seen
+
+    def measured(self) -> dict[str, Any]:
+        """Where it is, as results show it; empty before the first measurement."""
+        seen = self.observe()
+        return {} if seen is None else {"position_rad": by_name(self.robot_type, seen.position_rad)}
+
+    def can(self) -> tuple[str, ...]:
+        """Names of the calls that scripts have on this robot."""
+        kind, named = self.robot_type, set(self.robot_type.capabilities)
+        by_skill = named if self.skills is not None else set()
+        has = {
+            "move_joints": bool(kind.joints),
+            "home": bool(kind.joints),
+            "move_to": CARTESIAN in named and self.geometry is not None,
+            "drive": kind.base is not None,
+            "look": skills.GAZE in by_skill or (kind.gaze is not None and self.geometry is not None),
+            "say": skills.SPEECH in by_skill,
+            "stiffness": skills.STIFFNESS in by_skill,
+            "express": skills.EXPRESSIONS in by_skill,
+            "behaviour": skills.BEHAVIOURS in by_skill,
+            "state": True,
+            "latest": True,
+        }
+        return tuple(name for name, there in has.items() if there)
+
+
+class ScriptRobot:
+    """``Reach`` of one action.
+
+    Args:
+        body: The device.
+    """
+
+    def __init__(self, body: Body) -> None:
+        self._body = body
+        self._tenure = Tenure(epoch=-1, on_lost=_nobody)  # of nothing, until ``begin``
+        self._over = threading.Event()
+        self.joints = tuple(joint.name for joint in body.robot_type.joints)
+        self.frames = () if body.geometry is None else tuple(body.geometry.frames)
+        self.can = body.can()
+
+    def begin(self, epoch: int, on_lost: Callable[[Refused], None]) -> None:
+        """Take the device. ``on_lost`` is called when somebody takes it away, with the controller locked.
+
+        Raises:
+            Refused: It cannot be taken.
+        """
+        self._tenure = self._body.controller.begin_action(epoch=epoch, on_lost=on_lost)
+
+    def end(self) -> None:
+        """The action is over, or has lost the device: no skill goes on. Never blocks."""
+        self._over.set()
+
+    def give_back(self) -> None:
+        """Leave the device; what still moves is held."""
+        self.end()
+        self._body.controller.end_action(self._tenure)
+
+    def do(self, call: calls.Call) -> Any:
+        """See ``Reach``."""
+        kind = str(type(call).__struct_config__.tag)
+        if kind not in self.can:
+            raise Refused("cannot", f"this robot has no {kind}; it has {', '.join(self.can)}")
+        match call:
+            case calls.MoveJoints(position_rad=position_rad, speed=speed):
+                self.move_joints(position_rad, speed)
+            case calls.Home(speed=speed):
+                self.move_joints(self._body.robot_type.home_rad, speed)
+            case calls.MoveTo():
+                self._move_to(call)
+            case calls.Drive():
+                self._drive(call)
+            case calls.Look(position_m=position_m, speed=speed):
+                self._look(position_m, speed)
+            case calls.AskState():
+                return self._state()
+            case calls.AskLatest(device=device, stream=stream):
+                return self._latest(device, stream)
+            case _:
+                self._perform(_skill(call))
+        return None
+
+    def move_joints(self, position_rad: Mapping[str, float], speed: float) -> tuple[str, ...]:
+        """Move and wait until there [rad].
+
+        Returns:
+            What limited it on its way.
+
+        Raises:
+            Refused: It did not get there.
+        """
+        _check_share("speed", speed, least=math.nextafter(0, 1))
+        return _follow(self._body.controller.move(self._tenure, dict(position_rad), speed=speed))
+
+    def _move_to(self, call: calls.MoveTo) -> None:
+        geometry, start = self._shape(), self._body.seen().position_rad
+        if call.frame not in geometry.frames:
+            raise Refused("unknown_frame", f"no frame '{call.frame[:80]}'; there are {', '.join(geometry.frames)}")
+        quaternion = call.quaternion
+        if call.rpy_rad is not None:
+            quaternion = _from_rpy(call.rpy_rad)
+        if quaternion is None:
+            w, x, y, z = geometry.poses(start)[call.frame][3:]
+            quaternion = (w, x, y, z)
+        length = math.hypot(*quaternion)
+        if not _SHORTEST < length < math.inf:
+            raise Refused("bad_quaternion", "the quaternion (w, x, y, z) has no direction")
+        w, x, y, z = (part / length for part in quaternion)
+        try:
+            solved = geometry.solve(call.frame, (*call.position_m, w, x, y, z), start)
+        except GeometryError as error:
+            raise Refused("out_of_reach", str(error)) from error
+        self.move_joints(by_name(self._body.robot_type, solved), call.speed)
+
+    def _drive(self, call: calls.Drive) -> None:
+        twist = Twist(call.forward_m_s, call.left_m_s, call.turn_rad_s)
+        _follow(self._body.controller.drive(self._tenure, twist, duration_s=call.duration_s))
+
+    def _look(self, position_m: Vector3, speed: float) -> None:
+        _check_share("speed", speed, least=math.nextafter(0, 1))
+        if self._body.robot_type.gaze is None:
+            self._perform(skills.LookAt(position_m, speed))
+        else:
+            start = self._body.seen().position_rad
+            self.move_joints(gaze.aim(self._body.robot_type, self._shape(), start, position_m), speed)
+
+    def _shape(self) -> Geometry:
+        if self._body.geometry is None:
+            raise Refused("no_model", "this robot's type has no model")
+        return self._body.geometry
+
+    def _state(self) -> dict[str, Any]:
+        seen, kind = self._body.seen(), self._body.robot_type
+        return {
+            "position_rad": by_name(kind, seen.position_rad),
+            "velocity_rad_s": by_name(kind, seen.velocity_rad_s),
+            "effort_nm": by_name(kind, seen.effort_nm),
+            "frames": dict(zip(kind.frames, seen.frames, strict=False)),
+            "mode": str(self._body.controller.mode),
+        }
+
+    def _latest(self, device: str, stream: str) -> dict[str, Any] | None:
+        reading = self._body.room.latest(device, stream)
+        return None if reading is None else {"values": dict(reading.values), "age_s": reading.age_s}
+
+    def _perform(self, skill: Skill) -> None:
+        if self._body.skills is None:
+            raise Refused("cannot", "this robot's driver has no skills")
+        if not self._over.is_set():
+            try:
+                self._body.skills.perform(skill, _Stage(self, self._over))
+            except SkillError as error:
+                raise self._tenure.why or Refused("skill_failed", str(error)) from error
+        if self._over.is_set():
+            raise self._tenure.why or Refused("ended", "the action ended")
+
+
+class _Stage:
+    """``Stage`` of one skill."""
+
+    def __init__(self, robot: ScriptRobot, over: threading.Event) -> None:
+        self._robot = robot
+        self._over = over
+
+    @property
+    def ended(self) -> bool:
+        """See ``Stage``."""
+        return self._over.is_set()
+
+    def wait(self, timeout_s: float) -> bool:
+        """See ``Stage``."""
+        return self._over.wait(timeout_s)
+
+    def move_joints(self, position_rad: dict[str, float], speed: float) -> None:
+        """See ``Stage``."""
+        try:
+            self._robot.move_joints(position_rad, speed)
+        except Refused as refused:
+            raise SkillError(refused.message) from refused
+
+
+def _skill(call: calls.Say | calls.Stiffness | calls.Express | calls.Behaviour) -> Skill:
+    match call:
+        case calls.Say(text=text, language=language):
+            return skills.Say(text, language)
+        case calls.Stiffness(value=value, joints=joints):
+            _check_share("stiffness", value)
+            return skills.Stiffen(value, joints)
+        case calls.Express(name=name, strength=strength):
+            _check_share("strength", strength)
+            return skills.Express(name, strength)
+        case calls.Behaviour(name=name):
+            return skills.Behave(name)
+    assert_never(call)
+
+
+def _check_share(name: str, value: float, *, least: float = 0.0) -> None:
+    if not least <= value <= 1:  # false for NaN
+        raise Refused(f"bad_{name}", f"{name} must be {'above ' if least else ''}0 and at most 1, not {value}")
+
+
+def _follow(course: Course) -> tuple[str, ...]:
+    """Wait for its end; what limited it."""
+    course.finished.wait()
+    if course.outcome is not Outcome.REACHED:
+        raise course.why or Refused("interrupted", "the move was interrupted")
+    return course.limited
+
+
+def _from_rpy(rpy_rad: Vector3) -> Quaternion:
+    """Roll, pitch, yaw about the fixed x, y, z [rad]."""
+    (cr, sr), (cp, sp), (cy, sy) = ((math.cos(angle / 2), math.sin(angle / 2)) for angle in rpy_rad)
+    return (
+        cr * cp * cy + sr * sp * sy,
+        sr * cp * cy - cr * sp * sy,
+        cr * sp * cy + sr * cp * sy,
+        cr * cp * sy - sr * sp * cy,
+    )
+
+
+def _nobody(_: Refused) -> None:
+    """Nobody is told."""
+
+
+def by_name(robot_type: RobotType, values: Sequence[float]) -> dict[str, float]:
+    """Values in joint order as joint name → value."""
+    return dict(zip((joint.name for joint in robot_type.joints), values, strict=True))

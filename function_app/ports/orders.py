@@ -1,0 +1,24 @@
+"""What is addressed to agents that a program speaks for, as it passes on the broker: quick, not sure."""
+
+from collections.abc import Callable
+from typing import Protocol
+
+Hear = Callable[[str, bytes], None]
+"""Given topic and payload; must not block."""
+
+
+class Orders(Protocol):
+    """Commands, Stop and setpoints to chosen agents. What is missed here is in the mailbox, setpoints excepted."""
+
+    @property
+    def up(self) -> bool:
+        """Whether they are heard now."""
+
+    async def run(self, hear: Hear) -> None:
+        """Deliver until cancelled; reconnects for ever."""
+
+    async def add(self, space: str, agent: str) -> None:
+        """Hear what is for this agent too. Adding twice is adding once."""
+
+    def drop(self, space: str, agent: str) -> None:
+        """Hear it no longer."""

@@ -1,0 +1,49 @@
+from collections.abc import Callable, Iterator
+from typing import Any
+
+import pytest
+
+from tests.contract.transports.suite import Spoken
+from tests.support.ground import Ground, Link, start_ground
+
+
+@pytest.fixture(scope="module")
+def grounds(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Callable[[Any], Ground]]:
+    """One server and one broker of a kind for all tests of a module, started when the first one needs them."""
+    import contextlib
+
+    running: dict[str, Ground] = {}
+    with contextlib.ExitStack() as stack:
+
+        def start(kind: Any) -> Ground:
+            if kind not in running:
+                running[kind] = stack.enter_context(start_ground(kind, tmp_path_factory.mktemp(kind)))
+            return running[kind]
+
+        yield start
+
+
+@pytest.fixture
+def spoken(request: pytest.FixtureRequest) -> Spoken:
+    """The transport under test: an attribute of the class that inherits the suite."""
+    found: Spoken = request.cls.spoken
+    return found
+
+
+@pytest.fixture
+def ground(spoken: Spoken, grounds: Callable[[Any], Ground]) -> Ground:
+    return grounds(spoken.broker)
+
+
+@pytest.fixture
+def link(ground: Ground, spoken: Spoken) -> Iterator[Link]:
+    """A transport that is not yet started."""
+    with Link(ground, spoken.configuration) as link:
+        yield link
+
+
+@pytest.fixture
+def fragile(ground: Ground, spoken: Spoken) -> Iterator[Link]:
+    """As ``link``, through a proxy before what its connection ends at."""
+    with Link(ground, spoken.configuration, through=spoken.endpoint) as link:
+        yield link

@@ -1,0 +1,24 @@
+"""``device_agent run``, whose broker is reached through another port and whose watchdog may be set wrong."""
+
+import sys
+from typing import Any
+
+import paho.mqtt.client as paho
+
+from device_agent import __main__
+from device_agent.runtime import stream
+
+
+def main(mqtt_port: str, watchdog_s: str, *arguments: str) -> int:
+    connect = paho.Client.connect
+
+    def redirected(client: paho.Client, host: str, _port: int, **options: Any) -> Any:
+        return connect(client, host, int(mqtt_port), **options)
+
+    paho.Client.connect = redirected  # type: ignore[method-assign,assignment]
+    stream.WATCHDOG_S = float(watchdog_s)
+    return __main__.main(("run", *arguments))
+
+
+if __name__ == "__main__":
+    sys.exit(main(*sys.argv[1:]))

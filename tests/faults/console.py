@@ -1,0 +1,332 @@
+"""An operator's page without the page: takes control, streams setpoints and gives up by the rules of ``web/src/core``.
+
+``python -m tests.faults.console`` is a warm parent: each line that it reads (JSON, see ``Seat``) becomes an operator, a
+fork of itself, whose process id it answers with. An operator obeys lines over the Unix socket it was given, ``take``,
+``sweep`` and ``rest``, and says there what happens to it: ``held``, ``moving``, ``lost``, ``ended``.
+"""
+
+import contextlib
+import json
+import os
+import signal
+import socket
+import sys
+import threading
+import time
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from typing import Any
+
+import msgspec
+import paho.mqtt.client as paho
+import requests
+from paho.mqtt.enums import CallbackAPIVersion
+
+from device_agent.protocol import codec
+from device_agent.protocol.messages import JointTarget, JointTelemetry, Mode, Setpoint, State
+
+PERIOD_S = 0.025
+FRESH_S = 0.2
+ABANDON_S = 1.0
+RETRY_S = 1.0
+_BACK_OFF_S = 0.25
+_NEAR_RAD = 0.3
+"""This close to one end of its way the operator turns to the other, so that the arm is hardly ever at rest."""
+_MOVING_RAD_S = 0.3
+
+
+class Seat(msgspec.Struct):
+    """Where an operator sits.
+
+    Attributes:
+        socket: Path of the Unix socket of whoever leads it.
+        api: The API's address.
+        token: Access token.
+        mqtt_port: Where it reaches the broker.
+        device: Its device's id.
+        joint: Index of the joint that it moves, between ``low_rad`` and ``high_rad``.
+        stubborn: A page whose clock is broken: streams on after its lease has run out.
+    """
+
+    socket: str
+    api: str
+    token: str
+    mqtt_port: int
+    device: str
+    topic: str
+    joints: list[str]
+    joint: int
+    low_rad: float
+    high_rad: float
+    lease_ms: int
+    stubborn: bool = False
+
+
+class Link:
+    """One connection to the broker that comes back after a loss with new credentials, until it is closed."""
+
+    def __init__(self, seat: Seat, obtain: Callable[[], dict[str, Any]], hear: Callable[[str, bytes], None]) -> None:
+        self._seat = seat
+        self._obtain = obtain
+        self._hear = hear
+        self._closed = threading.Event()
+        self._client: paho.Client | None = None
+        threading.Thread(target=self._run, daemon=True).start()
+
+    def publish(self, topic: str, payload: bytes) -> bool:
+        client = self._client
+        return client is not None and client.is_connected() and client.publish(topic, payload).rc == 0
+
+    def close(self) -> None:
+        self._closed.set()
+        if self._client is not None:
+            self._client.disconnect()
+
+    def _run(self) -> None:
+        while not self._closed.is_set():
+            with contextlib.suppress(OSError, ValueError, requests.RequestException):
+                self._once(self._obtain())
+            self._closed.wait(_BACK_OFF_S)
+
+    def _once(self, issued: dict[str, Any]) -> None:
+        gone = threading.Event()
+        client = paho.Client(
+            CallbackAPIVersion.VERSION2, issued["client_id"], protocol=paho.MQTTv311, reconnect_on_failure=False
+        )
+        client.username_pw_set(issued["username"], issued["password"])
+        client.connect_timeout = 5
+        client.on_socket_open = _send_at_once
+        client.on_disconnect = lambda *_: gone.set()
+        client.on_message = lambda _c, _u, message: self._hear(message.topic, bytes(message.payload))
+        wanted = [(topic, 0) for topic in issued["subscribe"] if topic.startswith(self._seat.topic + "/")]
+
+        def subscribe(*_: Any) -> None:
+            if wanted:
+                client.subscribe(wanted)
+
+        client.on_connect = subscribe
+        client.connect("127.0.0.1", self._seat.mqtt_port, keepalive=60)
+        self._client = client
+        client.loop_start()
+        while not gone.wait(0.5) and not self._closed.is_set():
+            pass
+        client.disconnect()
+        client.loop_stop()
+
+
+def _send_at_once(_client: paho.Client, _userdata: Any, opened: Any) -> None:
+    opened.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+
+
+class Operator:
+    """One person before one device."""
+
+    def __init__(self, seat: Seat) -> None:
+        self.seat = seat
+        self._http = requests.Session()
+        self._http.headers["Authorization"] = f"Bearer {seat.token}"
+        self._calls = ThreadPoolExecutor(2)
+        self._leader = socket.socket(socket.AF_UNIX)
+        self._leader.connect(seat.socket)
+        self._seen: tuple[JointTelemetry, float] | None = None
+        self._state_epoch = 0
+        self._link: Link | None = None
+        self._watch = Link(seat, lambda: self._post("/mqtt/credentials", purpose="watch"), self._heard)
+        self.epoch: int | None = None
+        self._obeyed = False
+        self._ends_s = 0.0
+        self._renew_s = 0.0
+        self._sweeping = False
+        self._told = True
+        self._sequence = 0
+        self._target_rad: list[float] = []
+        self._sent_s = 0.0
+
+    def run(self) -> None:
+        """Obey, and tick 40 times a second, until whoever leads it goes away."""
+        self._leader.settimeout(PERIOD_S)
+        orders = b""
+        next_s = time.monotonic()
+        while True:
+            self._leader.settimeout(max(0.001, next_s - time.monotonic()))
+            try:
+                read = self._leader.recv(4096)
+                if not read:
+                    return
+                orders += read
+            except TimeoutError:
+                pass
+            while b"\n" in orders:
+                line, _, orders = orders.partition(b"\n")
+                getattr(self, line.decode())()
+            if time.monotonic() >= next_s:
+                next_s = max(next_s + PERIOD_S, time.monotonic())
+                self._tick()
+
+    # ------------------------------------------------------------ orders
+
+    def take(self) -> None:
+        """Take control; a lease that may be left is given up first."""
+        if self.epoch is not None:
+            self._lose("taken again", tell=False)
+        asked_s = time.monotonic()
+        try:
+            granted = self._lease(None)
+        except (ValueError, requests.RequestException) as error:
+            self._tell(refused=str(error)[:200])
+            return
+        epoch = self.epoch = granted["epoch"]
+        self._obeyed, self._sequence, self._sweeping = False, 0, False
+        self._renewed(granted, asked_s)
+        self._link = Link(
+            self.seat,
+            lambda: self._post("/mqtt/credentials", purpose="control", device=self.seat.device, epoch=epoch),
+            lambda _t, _p: None,
+        )
+        self._tell(held=epoch, confirmed=granted["confirmed"])
+
+    def sweep(self) -> None:
+        """Drag the slider to and fro."""
+        seen = self._seen
+        if self.epoch is None or seen is None:
+            self._tell(ended="blind")
+            return
+        self._target_rad = list(seen[0].commanded_rad)
+        self._turn()
+        self._sent_s = time.monotonic()
+        self._sweeping, self._told = True, False
+
+    def rest(self) -> None:
+        """Let the slider go."""
+        self._sweeping = False
+
+    # ------------------------------------------------------------ the page's rules
+
+    def _tick(self) -> None:
+        self._keep_lease()
+        seen, now_s = self._seen, time.monotonic()
+        if self.epoch is None or not self._sweeping or seen is None:
+            return
+        message, received_s = seen
+        if now_s - received_s > FRESH_S:
+            if now_s - self._sent_s > ABANDON_S:
+                self._end("lost-sight")
+        elif message.mode in (Mode.STOPPED, Mode.FAULT, Mode.ACTION):
+            self._end(str(message.mode))
+        else:
+            self._stream(message, now_s)
+
+    def _stream(self, message: JointTelemetry, now_s: float) -> None:
+        assert self.epoch is not None
+        at_rad = message.commanded_rad[self.seat.joint]
+        if abs(at_rad - self._target_rad[self.seat.joint]) < _NEAR_RAD:
+            self._turn()
+        if message.epoch == self.epoch:
+            self._sequence = max(self._sequence, message.setpoint_sequence)
+        self._sequence += 1
+        target = JointTarget(position_rad=dict(zip(self.seat.joints, self._target_rad, strict=True)))
+        setpoint = Setpoint(
+            epoch=self.epoch,
+            sequence=self._sequence,
+            echo_tick_ms=message.tick_ms,
+            sent_ms=now_s * 1000,
+            target=target,
+        )
+        if self._link is not None and self._link.publish(f"{self.seat.topic}/ctl/{self.epoch}", codec.encode(setpoint)):
+            self._sent_s = now_s
+        elif now_s - self._sent_s > ABANDON_S:
+            self._end("no-connection")
+        if not self._told and abs(message.velocity_rad_s[self.seat.joint]) > _MOVING_RAD_S:
+            self._told = True
+            self._tell(moving=True)
+
+    def _turn(self) -> None:
+        at_rad = self._target_rad[self.seat.joint]
+        middle = (self.seat.low_rad + self.seat.high_rad) / 2
+        self._target_rad[self.seat.joint] = self.seat.low_rad if at_rad > middle else self.seat.high_rad
+
+    def _keep_lease(self) -> None:
+        epoch, now_s = self.epoch, time.monotonic()
+        if epoch is None:
+            return
+        seen = self._seen
+        heard = max(seen[0].epoch if seen else 0, self._state_epoch)
+        if heard > epoch:
+            self._lose("somebody else has control")
+        elif seen and seen[0].epoch == epoch:
+            self._obeyed = True
+        elif seen and self._obeyed and seen[0].epoch == 0:
+            self._lose("the robot has ended it")
+        if self.epoch is None:
+            return
+        if now_s > self._ends_s and not self.seat.stubborn:
+            self._lose("ran out")
+        elif now_s > self._renew_s:
+            self._renew_s = float("inf")
+            self._calls.submit(self._renew, epoch)
+
+    def _renew(self, epoch: int) -> None:
+        asked_s = time.monotonic()
+        try:
+            granted = self._lease(epoch)
+            if self.epoch == epoch:
+                self._renewed(granted, asked_s)
+        except ValueError:
+            self._renew_s = float("inf")  # refused; what the robot says of it decides
+        except requests.RequestException:
+            self._renew_s = time.monotonic() + RETRY_S
+
+    def _renewed(self, granted: dict[str, Any], asked_s: float) -> None:
+        self._ends_s = asked_s + granted["lease_ms"] / 1000
+        self._renew_s = time.monotonic() + granted["lease_ms"] / 3000
+
+    def _lose(self, why: str, *, tell: bool = True) -> None:
+        self.epoch = None
+        self._sweeping = False
+        if self._link is not None:
+            self._link.close()
+            self._link = None
+        if tell:
+            self._tell(lost=why)
+
+    def _end(self, why: str) -> None:
+        self._sweeping = False
+        self._tell(ended=why)
+
+    # ------------------------------------------------------------ wires
+
+    def _heard(self, topic: str, payload: bytes) -> None:
+        if topic.endswith("/tele/joints"):
+            self._seen = (codec.decode(payload, JointTelemetry), time.monotonic())
+        elif topic.endswith("/state"):
+            self._state_epoch = codec.decode(payload, State).epoch
+
+    def _lease(self, epoch: int | None) -> dict[str, Any]:
+        asked = {"lease_ms": self.seat.lease_ms, "wait_ms": 2000} | ({} if epoch is None else {"epoch": epoch})
+        return self._post(f"/devices/{self.seat.device}/lease", **asked)
+
+    def _post(self, path: str, **body: Any) -> dict[str, Any]:
+        answer = self._http.post(self.seat.api + path, json=body, timeout=5)
+        if answer.status_code >= 400:
+            raise ValueError(f"{path}: {answer.status_code} {answer.text}")
+        found: dict[str, Any] = answer.json()
+        return found
+
+    def _tell(self, **what: Any) -> None:
+        self._leader.sendall(json.dumps(what).encode() + b"\n")
+
+
+def main() -> None:
+    signal.signal(signal.SIGCHLD, signal.SIG_IGN)
+    for line in sys.stdin:
+        seat = msgspec.json.decode(line, type=Seat)
+        child = os.fork()
+        if child == 0:
+            with contextlib.suppress(ConnectionError):  # whoever leads it has gone
+                Operator(seat).run()
+            os._exit(0)
+        print(child, flush=True)
+
+
+if __name__ == "__main__":
+    main()

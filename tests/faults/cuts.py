@@ -1,0 +1,312 @@
+"""Cuts whatever an arm in motion hangs on, and has the simulation's own record say when it came to rest.
+
+Each round: an operator takes control and sweeps the arm to and fro; at a random moment something is cut; while it is,
+and after it has been mended, nothing may move until somebody takes control again.
+"""
+
+import contextlib
+import os
+import random
+import signal
+import time
+from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, field
+
+import httpx
+
+from infra.local.processes import Child
+from tests.faults.judge import Record, Verdict, judge, share
+from tests.faults.stack import MOVEMENT, PATIENCE_S, Console, Stack, now_ms
+
+Mend = Callable[[], None]
+OPERATOR = (
+    "console killed",
+    "console stopped",
+    "operator cut off",
+    "operator's link stalls",
+    "operator's link forgotten",
+)
+SCRIPT = ("script's processes killed",)
+EVERYBODY = (
+    "agent cut off", "agent's link stalls", "agent's link forgotten", "broker killed", "broker stopped",
+    "functions killed", "functions stopped", "agent stopped",
+)  # fmt: skip
+LEASE_MS = 30_000
+SHORT_LEASE_MS = 1_500
+_ON_THE_WAY_MS = 50.0
+"""A setpoint that was sent before a cut arrives at most this much later."""
+_LOOK_MS = 400.0
+_UNDER_WAY_S = 0.4
+"""What a script's first move takes to be in full swing."""
+
+
+@dataclass(frozen=True, slots=True)
+class Result:
+    """One arm at one cut."""
+
+    cut: str
+    arm: str
+    verdict: Verdict
+
+
+@dataclass
+class Tally:
+    """Everything that was seen.
+
+    Attributes:
+        cuts: How often each was made with something in motion.
+        spoilt: Rounds in which nothing moved when the cut came: not counted, made again.
+    """
+
+    results: list[Result] = field(default_factory=list)
+    cuts: dict[str, int] = field(default_factory=dict)
+    spoilt: int = 0
+
+    @property
+    def broken(self) -> list[Result]:
+        return [each for each in self.results if not each.verdict.kept]
+
+    @property
+    def count(self) -> int:
+        return sum(self.cuts.values())
+
+    def add(self, cut: str, results: list[Result]) -> bool:
+        """Count a cut; whether anything was in motion."""
+        moving = [each for each in results if each.verdict.in_motion]
+        still_wrong = [each for each in results if each.verdict.moved_again and not each.verdict.in_motion]
+        self.results += moving + still_wrong
+        if not moving:
+            self.spoilt += 1
+            return False
+        self.cuts[cut] = self.cuts.get(cut, 0) + 1
+        return True
+
+    def table(self) -> Iterator[str]:
+        """Markdown: to zero commanded velocity, from the last right to move and from the cut."""
+        yield "| cut | cuts | arms in motion | p50 ms | p99 ms | max ms | from the cut, max ms | starved | broken |"
+        yield "| --- | ---: | ---: | ---: | ---: | ---: | ---: | ---: | ---: |"
+        for cut in (*self.cuts, "all"):
+            found = [each.verdict for each in self.results if cut in (each.cut, "all")]
+            rest = [each.rest_ms for each in found]
+            starved = sum(each.starved_ms > 0 for each in found)
+            broken = sum(not each.kept for each in found)
+            figures = (share(rest, 0.5), share(rest, 0.99), max(rest), max(each.cut_ms for each in found))
+            shown = " | ".join(f"{figure:.0f}" for figure in figures)
+            cuts = self.count if cut == "all" else self.cuts[cut]
+            yield f"| {cut} | {cuts} | {len(found)} | {shown} | {starved} | {broken} |"
+
+
+class Arm:
+    """One arm, its record and whoever sits before it."""
+
+    def __init__(self, stack: Stack, name: str) -> None:
+        self.stack = stack
+        self.name = name
+        self.record = Record(stack.trace / f"{name}.ndjson")
+        self.console: Console | None = None
+        self.kind = (0, False)
+
+    def sit(self, lease_ms: int = LEASE_MS, *, stubborn: bool = False) -> Console:
+        """An operator of this kind, a new one where the last is of another or is gone."""
+        if self.console is None or self.kind != (lease_ms, stubborn):
+            self.leave()
+            self.console = self.stack.console(self.name, lease_ms=lease_ms, stubborn=stubborn)
+            self.kind = (lease_ms, stubborn)
+        return self.console
+
+    def leave(self) -> None:
+        if self.console is not None:
+            self.console.end()
+            self.console = None
+
+    def set_in_motion(self, lease_ms: int = LEASE_MS, *, stubborn: bool = False) -> bool:
+        """Take control and sweep; whether it moves."""
+        deadline_s = time.monotonic() + PATIENCE_S
+        while time.monotonic() < deadline_s:
+            console = self.sit(lease_ms, stubborn=stubborn)
+            console.order("take")
+            held = console.hear("held", "refused", within_s=10)
+            if held is None:
+                self.leave()
+            elif held.get("confirmed"):
+                break
+            time.sleep(0.1)
+        else:
+            raise AssertionError(f"{self.name}: no control within {PATIENCE_S} s")
+        for _ in range(20):
+            console.order("sweep")
+            said = console.hear("moving", "lost", "ended", within_s=3)
+            if said != {"ended": "blind"}:
+                return said is not None and "moving" in said
+            time.sleep(0.1)
+        return False
+
+    def run_script(self) -> bool:
+        """Have a script sweep the arm; whether it runs."""
+        device = f"/devices/{self.stack.agent_id}-{self.name}"
+        try:
+            epoch = self.stack.post(f"{device}/lease", lease_ms=LEASE_MS, wait_ms=2_000)["epoch"]
+            asked = {"kind": "run_movement", "name": MOVEMENT}
+            action = self.stack.post(f"{device}/actions", request=asked, epoch=epoch, wait_ms=10_000)
+        except httpx.HTTPError:
+            return False
+        time.sleep(_UNDER_WAY_S)
+        return bool(action["status"] == "started")
+
+    def verdict(self, cut_ms: float, since_ms: float, *, begin_ms: float | None = None) -> Verdict:
+        """Of what happened until now; ``begin_ms``: when it last moved freely, where that is not the cut."""
+        end_ms, begin_ms = now_ms(), cut_ms if begin_ms is None else begin_ms
+        rows = [row for row in self.record.read() if begin_ms - _LOOK_MS <= row.tick_ms <= end_ms]
+        self.record.forget(end_ms - _LOOK_MS)
+        return judge(rows, cut_ms=cut_ms, since_ms=since_ms)
+
+    def last_setpoint_ms(self, cut_ms: float) -> float:
+        """When the agent was given the last one that was sent before the cut."""
+        given = self.stack.setpoints[self.name]
+        self.stack.setpoints[self.name] = given[-200:]
+        return max((at_ms for at_ms in given if at_ms <= cut_ms + _ON_THE_WAY_MS), default=cut_ms)
+
+
+class Bench:
+    """Makes rounds, and counts."""
+
+    def __init__(self, stack: Stack, *, seed: int) -> None:
+        self.stack = stack
+        self.chance = random.Random(seed)
+        self.arms = [Arm(stack, name) for name in stack.names]
+        self.tally = Tally()
+
+    def close(self) -> None:
+        for arm in self.arms:
+            arm.leave()
+            arm.record.close()
+
+    def one_by_one(self, rounds: int) -> None:
+        """Every arm by itself, all at the same time: so many rounds each."""
+        chances = [random.Random(self.chance.random()) for _ in self.arms]
+
+        def work(arm: Arm, chance: random.Random) -> None:
+            for number in range(rounds):
+                cut = OPERATOR[(number + self.arms.index(arm)) % len(OPERATOR)]
+                while not self.tally.add(cut, [self._operator_round(arm, cut, chance)]):
+                    pass
+
+        with ThreadPoolExecutor(len(self.arms)) as pool:
+            for done in [pool.submit(work, arm, chance) for arm, chance in zip(self.arms, chances, strict=True)]:
+                done.result()
+
+    def together(self, cut: str) -> None:
+        """One cut for all arms."""
+        while not self.tally.add(cut, self._round_of_all(cut)):
+            pass
+
+    # ------------------------------------------------------------ rounds
+
+    def _operator_round(self, arm: Arm, cut: str, chance: random.Random) -> Result:
+        while not arm.set_in_motion():
+            pass
+        time.sleep(chance.uniform(0, 0.6))
+        mend = self._cut_operator(arm, cut)
+        cut_ms = now_ms()
+        time.sleep(chance.uniform(0.45, 0.9))
+        mend()
+        time.sleep(0.5)
+        return Result(cut, arm.name, arm.verdict(cut_ms, arm.last_setpoint_ms(cut_ms)))
+
+    def _cut_operator(self, arm: Arm, cut: str) -> Mend:
+        console = arm.console
+        assert console is not None
+        match cut:
+            case "console killed":
+                console.signal(signal.SIGKILL)
+                return arm.leave
+            case "console stopped":
+                console.signal(signal.SIGSTOP)
+                return lambda: console.signal(signal.SIGCONT)
+            case "operator cut off":
+                console.proxy.cut()
+                return _nothing
+            case "operator's link stalls":
+                console.proxy.freeze()
+                return console.proxy.thaw
+            case "operator's link forgotten":
+                console.proxy.swallow()
+                return arm.leave
+        raise AssertionError(cut)
+
+    def _round_of_all(self, cut: str) -> list[Result]:
+        functions, script = cut.startswith("functions"), cut in SCRIPT
+        stubborn = functions and self.chance.random() < 0.5
+
+        def begin(arm: Arm) -> bool:
+            if script:
+                return arm.run_script()
+            return arm.set_in_motion(SHORT_LEASE_MS if functions else LEASE_MS, stubborn=stubborn)
+
+        with ThreadPoolExecutor(len(self.arms)) as pool:
+            list(pool.map(begin, self.arms))
+        time.sleep(self.chance.uniform(0, 0.6))
+        mend = self._cut_all(cut)
+        cut_ms = now_ms()
+        time.sleep(self.chance.uniform(0.45, 1.2) + functions * SHORT_LEASE_MS / 1000)
+        since_ms = {arm.name: self._since_ms(arm, cut, cut_ms) for arm in self.arms}
+        mended_ms = now_ms()
+        mend()
+        time.sleep(0.6)
+        begin_ms = cut_ms
+        if cut == "agent stopped":  # nothing moved while it was; from its waking on it has to know better
+            cut_ms, since_ms = mended_ms, dict.fromkeys(since_ms, mended_ms)
+        return [Result(cut, arm.name, arm.verdict(cut_ms, since_ms[arm.name], begin_ms=begin_ms)) for arm in self.arms]
+
+    def _since_ms(self, arm: Arm, cut: str, cut_ms: float) -> float:
+        """From when on nothing gave the arm the right to move."""
+        if cut.startswith("functions"):
+            grants = [at_ms for at_ms in self.stack.commands[arm.name] if at_ms <= cut_ms + _ON_THE_WAY_MS]
+            return max(grants) + SHORT_LEASE_MS
+        return cut_ms if cut in SCRIPT else arm.last_setpoint_ms(cut_ms)
+
+    def _cut_all(self, cut: str) -> Mend:
+        stack = self.stack
+        what, _, how = cut.rpartition(" ")
+        match how:
+            case "stopped":
+                return self._stopped(self._children[what])
+            case "killed" if what in self._children:
+                stack.signal(self._children[what], signal.SIGKILL)
+                return lambda: self._revive(self._children[what])
+            case "killed":
+                for process in stack.children_of_agent():
+                    with contextlib.suppress(ProcessLookupError):
+                        os.kill(process, signal.SIGKILL)
+                return _nothing
+            case _:
+                return self._cut_link(how)
+
+    def _cut_link(self, how: str) -> Mend:
+        link = self.stack.agent_mqtt
+        match how:
+            case "off":
+                link.cut()
+            case "forgotten":
+                link.swallow()
+            case "stalls":
+                link.freeze()
+                return link.thaw
+        return _nothing
+
+    @property
+    def _children(self) -> dict[str, Child]:
+        return {"broker": self.stack.broker, "functions": self.stack.functions, "agent": self.stack.agent}
+
+    def _stopped(self, child: Child) -> Mend:
+        self.stack.signal(child, signal.SIGSTOP)
+        return lambda: self.stack.signal(child, signal.SIGCONT)
+
+    def _revive(self, child: Child) -> None:
+        self.stack.revive(child)
+        self.stack.await_health()
+
+
+def _nothing() -> None:
+    """It mends itself."""

@@ -1,0 +1,119 @@
+"""Judges, by the simulation's own record, whether an arm came to rest in time and stayed there."""
+
+import json
+import math
+from collections.abc import Iterable
+from dataclasses import dataclass
+from itertools import pairwise
+from pathlib import Path
+from typing import NamedTuple
+
+MOST_MS = 350.0
+"""From the last setpoint that reached the agent (or from what else lets it move) to zero commanded velocity."""
+_STILL_RAD = 1e-8
+"""Between two lines of the record, 10 ms: below any velocity that a controller commands."""
+_REST_ROWS = 10
+"""A tenth of a second: turning back passes through zero, and a control loop that is late stands still for a moment."""
+_ROW_MS = 20.0
+"""Lines come every 10 ms; a longer gap is a time in which the agent's process did not run."""
+
+
+class Row(NamedTuple):
+    """One line of the record: time on the machine's monotonic clock, and where the arm is commanded to be."""
+
+    tick_ms: float
+    target_rad: tuple[float, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class Verdict:
+    """What one cut did to one arm.
+
+    Attributes:
+        speed_rad_s: Fastest commanded joint at the cut.
+        rest_ms: From the reference to the first line of rest; infinite where there was none.
+        cut_ms: The same from the cut.
+        starved_ms: Time in between in which the agent's process did not run at all: the machine's, not the agent's.
+        moved_again: Whether anything was commanded to move after rest.
+    """
+
+    speed_rad_s: float
+    rest_ms: float
+    cut_ms: float
+    starved_ms: float
+    moved_again: bool
+
+    @property
+    def in_motion(self) -> bool:
+        return self.speed_rad_s > 0.05
+
+    @property
+    def kept(self) -> bool:
+        return self.rest_ms <= MOST_MS + self.starved_ms and not self.moved_again
+
+
+def judge(rows: list[Row], *, cut_ms: float, since_ms: float) -> Verdict:
+    """What happened from the cut to the end of ``rows``.
+
+    Args:
+        rows: From some lines before the cut to the moment before somebody may move the arm again.
+        cut_ms: When the cut was made.
+        since_ms: From when on nothing gave the arm the right to move.
+    """
+    before = [row for row in rows if row.tick_ms <= cut_ms][-3:]
+    speed = _speed(before[0], before[-1]) if len(before) > 1 else 0.0
+    after = [row for row in rows if row.tick_ms > min(cut_ms, since_ms)]
+    still = 0
+    for index in range(1, len(after)):
+        still = still + 1 if _same(after[index - 1], after[index]) else 0
+        if still >= _REST_ROWS and after[index - still].tick_ms > cut_ms:
+            rest = after[index - still]
+            moved_again = not all(_same(rest, later) for later in after[index:])
+            starved = _starved(after[: index - still + 1])
+            return Verdict(speed, rest.tick_ms - since_ms, rest.tick_ms - cut_ms, starved, moved_again)
+    return Verdict(speed, math.inf, math.inf, 0.0, moved_again=True)
+
+
+class Record:
+    """A trace file, read as it grows."""
+
+    def __init__(self, path: Path) -> None:
+        self._file = path.open("rb")
+        self._torn = b""
+        self.rows: list[Row] = []
+
+    def read(self) -> list[Row]:
+        """All rows since ``forget``."""
+        lines = (self._torn + self._file.read()).split(b"\n")
+        self._torn = lines.pop()
+        for line in lines:
+            row = json.loads(line)
+            if "target" in row:
+                self.rows.append(Row(row["tick_ms"], tuple(row["target"])))
+        return self.rows
+
+    def forget(self, before_ms: float) -> None:
+        self.rows = [row for row in self.rows if row.tick_ms >= before_ms]
+
+    def close(self) -> None:
+        self._file.close()
+
+
+def share(values: Iterable[float], part: float) -> float:
+    """The value below which ``part`` of them lie."""
+    ordered = sorted(values)
+    return ordered[min(len(ordered) - 1, math.ceil(part * len(ordered)) - 1)] if ordered else math.nan
+
+
+def _speed(first: Row, last: Row) -> float:
+    seconds = (last.tick_ms - first.tick_ms) / 1000
+    return max(abs(b - a) for a, b in zip(first.target_rad, last.target_rad, strict=True)) / seconds
+
+
+def _same(one: Row, other: Row) -> bool:
+    return all(abs(a - b) <= _STILL_RAD for a, b in zip(one.target_rad, other.target_rad, strict=True))
+
+
+def _starved(rows: list[Row]) -> float:
+    gaps = (later.tick_ms - row.tick_ms for row, later in pairwise(rows))
+    return sum(gap - _ROW_MS for gap in gaps if gap > _ROW_MS)

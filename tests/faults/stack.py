@@ -1,0 +1,266 @@
+"""The whole product in processes that can be cut off, frozen and killed one by one: several arms behind one agent."""
+
+import contextlib
+import json
+import os
+import re
+import shutil
+import signal
+import socket
+import subprocess
+import sys
+import tempfile
+import threading
+import time
+from collections import defaultdict
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import httpx
+import msgspec
+
+from infra.local.processes import Child
+from tests.faults.console import Seat
+from tests.support.brokers import ROOT, BrokerKind, wait_until
+from tests.support.machine import free_ports
+from tests.support.proxy import HOST, Proxy
+
+PATIENCE_S = 60.0
+_ORDERS = re.compile(rb"/(arm[0-9])/(ctl|cmd)\b")
+MOVEMENT = "sweep"
+SCRIPT = """
+while True:
+    for pan in (1.4, -1.4):
+        robot.move_joints({"shoulder_pan": pan}, speed=0.35)
+"""
+
+
+def now_ms() -> float:
+    """The clock of the record: monotonic, one for all processes of this machine."""
+    return time.monotonic() * 1000
+
+
+class Console:
+    """One operator's process, and what it says."""
+
+    def __init__(self, process: int, listener: socket.socket, proxy: Proxy) -> None:
+        self.process = process
+        self.proxy = proxy
+        self.said: list[dict[str, Any]] = []
+        self._line, _ = listener.accept()
+        self._line.settimeout(0.05)
+        self._torn = b""
+
+    def order(self, what: str) -> None:
+        """Raises: OSError: It is dead."""
+        self.said.clear()
+        self._line.sendall(what.encode() + b"\n")
+
+    def hear(self, *kinds: str, within_s: float) -> dict[str, Any] | None:
+        """The first thing of one of these kinds that it says after the last order."""
+        deadline_s = time.monotonic() + within_s
+        while True:
+            found = next((each for each in self.said if set(kinds) & set(each)), None)
+            if found is not None or time.monotonic() > deadline_s:
+                return found
+            with contextlib.suppress(TimeoutError, ConnectionError):
+                self._torn += self._line.recv(4096)
+            *lines, self._torn = self._torn.split(b"\n")
+            self.said += [json.loads(line) for line in lines]
+
+    def signal(self, number: int) -> None:
+        with contextlib.suppress(ProcessLookupError):
+            os.kill(self.process, number)
+
+    def end(self) -> None:
+        self.signal(signal.SIGKILL)
+        self._line.close()
+        self.proxy.end()
+
+
+class Stack:
+    """Started processes. ``start`` gives one."""
+
+    def __init__(self, kind: BrokerKind, arms: int, *, watchdog_s: float) -> None:
+        self.names = [f"arm{number}" for number in range(arms)]
+        self.home = Path(tempfile.mkdtemp(prefix="ts-"))  # a Unix socket's path has a hundred characters at most
+        self.port = free_ports()
+        self.setpoints: dict[str, list[float]] = defaultdict(list)
+        self.commands: dict[str, list[float]] = defaultdict(list)
+        self._environment = os.environ | {
+            "TELESCOPE_HOME": str(self.home), "TELESCOPE_PORT": str(self.port), "TELESCOPE_BROKER": kind
+        }  # fmt: skip
+        self._logs = self.home / "logs"
+        self._logs.mkdir()
+        self._closing = contextlib.ExitStack()
+        self._watchdog_s = watchdog_s
+        self._kind = kind
+
+    def begin(self) -> None:
+        link = self._program("function_app", "sign-in-link", "--account", "ann").partition("#sign-in=")[2]
+        ports = ["--tcp-port", str(self.port + 1), "--websocket-port", str(self.port + 2)]
+        keys = ["--keys", str(self.home / "keys" / "public.json")]
+        site = ["--home", str(self.home / "mosquitto")]
+        self.broker = self._child("broker", f"infra.{self._kind}", *ports, *(keys if self._kind == "amqtt" else site))
+        self.broker.await_line("ready", PATIENCE_S)
+        self.functions = self._child("functions", "function_app", "serve")
+        self._child("worker", "function_app", "work")
+        self.api = f"http://{HOST}:{self.port}/api/v1"
+        self.http = self._closing.enter_context(httpx.Client(base_url=self.api, timeout=15))
+        self.await_health()
+        self.token = self.post("/auth/sign-in", link=link)["access_token"]
+        self.http.headers["Authorization"] = f"Bearer {self.token}"
+        self.http.cookies.clear()
+        self.agent_mqtt = self._proxy(self.port + 1, self._heard)
+        self._begin_agent()
+        saved = self.http.put(f"/robot-types/ur5/movements/{MOVEMENT}", json={"source": SCRIPT})
+        assert saved.is_success, saved.text
+        self._consoles = self._warm("tests.faults.console")
+
+    def _begin_agent(self) -> None:
+        devices = [part for name in self.names for part in ("--device", f"{name}=ur5")]
+        home = ["--home", str(self.home / "agent")]
+        said = self._program(
+            "device_agent", "enroll", *home, "--server", f"http://{HOST}:{self.port}", "--name", "bench", *devices,
+            "--no-wait",
+        ).split()  # fmt: skip
+        self.agent_id = self.post("/agents/claim", code=said[said.index("code") + 1])["agent"]
+        self.trace = self.home / "trace"
+        proxied = [str(self.agent_mqtt.port), str(self._watchdog_s)]
+        self.agent = self._child("agent", "tests.faults.agent", *proxied, *home, "--trace", str(self.trace))
+        self.agent.await_line("running", PATIENCE_S)
+        wait_until(lambda: all(each["online"] for each in self.devices()), "the arms to be online", PATIENCE_S)
+        (self.space,) = {each["topic"].split("/")[2] for each in self.devices()}
+
+    # ------------------------------------------------------------ for the bench
+
+    def devices(self) -> list[dict[str, Any]]:
+        found: list[dict[str, Any]] = self.http.get("/devices").json()["items"]
+        return found
+
+    def post(self, path: str, **body: Any) -> dict[str, Any]:
+        """Raises: httpx.HTTPError: Refused or not reached."""
+        answer = self.http.post(path, json=body)
+        answer.raise_for_status()
+        found: dict[str, Any] = answer.json()
+        return found
+
+    def await_health(self) -> None:
+        def well() -> bool:
+            with contextlib.suppress(httpx.HTTPError, ValueError):
+                return bool(self.http.get("/health", timeout=1).json()["broker"] == "ok")
+            return False
+
+        wait_until(well, "the functions to be well", PATIENCE_S)
+
+    def console(self, name: str, *, lease_ms: int, stubborn: bool) -> Console:
+        """A new operator before this arm."""
+        path = self.home / f"{name}.socket"
+        path.unlink(missing_ok=True)
+        proxy = Proxy(self.port + 1)
+        with socket.socket(socket.AF_UNIX) as listener:
+            listener.bind(str(path))
+            listener.listen(1)
+            listener.settimeout(PATIENCE_S)
+            seat = Seat(
+                socket=str(path), api=self.api, token=self.token, mqtt_port=proxy.port,
+                device=f"{self.agent_id}-{name}", topic=f"ts/v1/{self.space}/{self.agent_id}/{name}",
+                joints=["shoulder_pan", "shoulder_lift", "elbow", "wrist_1", "wrist_2", "wrist_3"], joint=0,
+                low_rad=-1.4, high_rad=1.4, lease_ms=lease_ms, stubborn=stubborn,
+            )  # fmt: skip
+            return Console(int(self._consoles(msgspec.json.encode(seat).decode())), listener, proxy)
+
+    def children_of_agent(self) -> list[int]:
+        """The process ids of all that the agent has started, and what those have."""
+        parents = {}
+        for folder in Path("/proc").glob("[0-9]*"):
+            with contextlib.suppress(OSError):
+                parents[int(folder.name)] = int((folder / "stat").read_text().rpartition(")")[2].split()[1])
+        found = [self.pid(self.agent)]
+        for process in found:
+            found += [child for child, parent in parents.items() if parent == process]
+        return found[1:]
+
+    @staticmethod
+    def pid(child: Child) -> int:
+        assert child._process is not None
+        return child._process.pid
+
+    def signal(self, child: Child, number: int) -> None:
+        os.kill(self.pid(child), number)
+
+    def revive(self, child: Child) -> None:
+        """Start what was killed."""
+        assert child._process is not None
+        child._process.wait(PATIENCE_S)
+        child.start()
+
+    # ------------------------------------------------------------ processes
+
+    def _heard(self, content: bytes) -> None:
+        at_ms = now_ms()
+        for name, kind in _ORDERS.findall(content):
+            (self.setpoints if kind == b"ctl" else self.commands)[name.decode()].append(at_ms)
+
+    def _program(self, *arguments: str) -> str:
+        done = subprocess.run(
+            [sys.executable, "-m", *arguments],
+            cwd=ROOT,
+            env=self._environment,
+            capture_output=True,
+            text=True,
+            check=False,
+        )
+        assert done.returncode == 0, done.stderr
+        return done.stdout.strip()
+
+    def _child(self, name: str, module: str, *arguments: str) -> Child:
+        child = Child(name, ["-m", module, *arguments], dict(self._environment), self._logs)
+        self._closing.callback(self._stop, child)
+        child.start()
+        return child
+
+    def _stop(self, child: Child) -> None:
+        with contextlib.suppress(ProcessLookupError):
+            self.signal(child, signal.SIGCONT)
+        child.stop()
+
+    def _proxy(self, behind: int, heard: Callable[[bytes], None]) -> Proxy:
+        proxy = Proxy(behind, heard)
+        self._closing.callback(proxy.end)
+        return proxy
+
+    def _warm(self, module: str) -> Callable[[str], str]:
+        parent = self._closing.enter_context(
+            subprocess.Popen(
+                [sys.executable, "-m", module], cwd=ROOT, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
+            )
+        )
+
+        lock = threading.Lock()
+
+        def ask(line: str) -> str:
+            assert parent.stdout is not None
+            with lock:
+                print(line, file=parent.stdin, flush=True)
+                return parent.stdout.readline()
+
+        assert parent.stdin is not None
+        self._closing.callback(parent.stdin.close)
+        return ask
+
+    def close(self) -> None:
+        self._closing.close()
+        shutil.rmtree(self.home, ignore_errors=True)
+
+
+@contextlib.contextmanager
+def start(kind: BrokerKind, arms: int, *, watchdog_s: float = 0.3) -> Iterator[Stack]:
+    """The product with so many arms, for the time of a ``with``."""
+    stack = Stack(kind, arms, watchdog_s=watchdog_s)
+    try:
+        stack.begin()
+        yield stack
+    finally:
+        stack.close()

@@ -1,0 +1,85 @@
+"""Whatever is cut while an arm moves, it is at rest 350 ms later, and stays there until somebody takes control."""
+
+import math
+import random
+
+import pytest
+
+from tests.faults.cuts import EVERYBODY, OPERATOR, SCRIPT, Bench, Tally
+from tests.faults.judge import Row, judge
+from tests.faults.stack import start
+from tests.support.brokers import BROKERS, BrokerKind
+
+EVERY_ROUND_MS = 10.0
+
+
+def bench(kind: BrokerKind, arms: int, plan: list[str], *, rounds: int, seed: int, watchdog_s: float = 0.3) -> Tally:
+    """Run ``plan``, cuts that concern all arms, with ``rounds`` cuts of each arm's own operator between."""
+    with start(kind, arms, watchdog_s=watchdog_s) as stack:
+        made = Bench(stack, seed=seed)
+        try:
+            for cut in ("", *plan):
+                if cut:
+                    made.together(cut)
+                made.one_by_one(rounds)
+        finally:
+            made.close()
+            print(*made.tally.table(), f"spoilt {made.tally.spoilt}", sep="\n")
+            print(*made.tally.broken, sep="\n")
+    return made.tally
+
+
+def test_an_arm_in_motion_rests_in_time_whatever_is_cut() -> None:
+    tally = bench("amqtt", 3, ["agent cut off", "broker stopped"], rounds=2, seed=4)
+    assert not tally.broken
+    assert tally.count >= 20
+
+
+@pytest.mark.long
+@pytest.mark.timeout(1800)
+@pytest.mark.parametrize("kind", BROKERS)
+def test_an_arm_in_motion_rests_in_time_at_each_of_a_thousand_cuts(kind: BrokerKind) -> None:
+    plan = [*EVERYBODY, *SCRIPT] * 4
+    random.Random(4).shuffle(plan)
+    tally = bench(kind, 4, plan, rounds=3, seed=5)
+    assert not tally.broken
+    assert tally.count >= 450
+
+
+@pytest.mark.long
+@pytest.mark.timeout(600)
+def test_a_watchdog_of_a_second_is_found() -> None:
+    tally = bench("amqtt", 3, [], rounds=len(OPERATOR), seed=6, watchdog_s=1.0)
+    late = [each for each in tally.broken if not math.isinf(each.verdict.rest_ms) and each.verdict.rest_ms > 500]
+    assert len(late) > tally.count / 2
+
+
+def rows(*targets: float) -> list[Row]:
+    return [Row(1000 + EVERY_ROUND_MS * index, (target, 0.0)) for index, target in enumerate(targets)]
+
+
+def test_the_judge_measures_to_the_first_line_of_rest() -> None:
+    moving = [0.01 * index for index in range(21)]
+    found = judge(rows(*moving, *[0.3] * 40), cut_ms=1100, since_ms=1090)
+    assert found.in_motion
+    assert (found.rest_ms, found.cut_ms, found.starved_ms) == (120, 110, 0)
+    assert found.kept
+
+
+@pytest.mark.parametrize(
+    "targets",
+    [
+        [0.01 * index for index in range(100)],
+        [*(0.01 * index for index in range(60)), *[0.6] * 40],
+        [*(0.01 * index for index in range(21)), *[0.3] * 30, 0.30001, *[0.3] * 20],
+    ],
+    ids=["never at rest", "too late", "moves again"],
+)
+def test_the_judge_finds(targets: list[float]) -> None:
+    assert not judge(rows(*targets), cut_ms=1100, since_ms=1100).kept
+
+
+def test_turning_back_is_not_rest() -> None:
+    up = [0.01 * index for index in range(15)]
+    found = judge(rows(*up, up[-1], *reversed(up), *[0.0] * 40), cut_ms=1100, since_ms=1100)
+    assert found.rest_ms == 200
