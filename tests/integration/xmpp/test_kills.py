@@ -1,0 +1,63 @@
+"""Whoever is killed and comes back: nothing runs twice, and nothing that was promised is lost."""
+
+from device_agent.protocol.messages import AckStatus, MoveJoints, StopDevice
+from tests.support.brokers import wait_until
+from tests.support.cloud import Person
+from tests.support.xmpp import XmppRobot, XmppSite, start_prosody
+
+
+def test_of_two_who_speak_one_may_go_and_no_agent_is_served_twice(
+    site: XmppSite, anna: Person, robot: XmppRobot
+) -> None:
+    second = site.speak()
+    try:
+        robots = [robot]
+        for number in range(3):
+            other = site.robot(f"arm{number}")
+            other.pair(anna)
+            robots.append(other.connect())
+        first = site.speaking[0]
+        for each in robots:
+            assert first.serves(each.id) != second.serves(each.id)
+        first.end()
+        site.speaking.remove(first)
+        wait_until(lambda: all(second.serves(each.id) for each in robots), "all at the second")
+        for each in robots:
+            wait_until(lambda each=each: each.changes[-1], "its link")  # type: ignore[misc]
+            assert anna.take(each.device, wait_ms=10_000).json()["confirmed"]
+            assert all(len(payloads) == 1 for payloads in each.payloads.values()), "each command once"
+    finally:
+        for each in robots[1:]:
+            each.__exit__()
+
+
+def test_a_stop_while_nobody_speaks_is_brought_later(site: XmppSite, anna: Person, robot: XmppRobot) -> None:
+    site.speaking.pop().end()
+    wait_until(lambda: robot.changes[-1] is False, "the loss: the cloud is not there")
+    wait_until(lambda: not anna.get(f"/devices/{robot.device}").json()["online"], "offline")
+    assert anna.post(f"/devices/{robot.device}/stop").json() == {"confirmed": False}
+    site.speak()
+    wait_until(lambda: robot.changes[-1] is True, "the way back")
+    wait_until(lambda: robot.heard(StopDevice), "the Stop that waited")
+    assert robot.session >= 2
+
+
+def test_after_a_killed_server_all_find_together_and_go_on(site: XmppSite, anna: Person, robot: XmppRobot) -> None:
+    robot.silent = True
+    action = anna.start(robot.device).json()["id"]
+    wait_until(lambda: robot.heard(MoveJoints), "the command")
+    site.prosody.kill()
+    wait_until(lambda: robot.changes[-1] is False, "the loss")
+    waiting = anna.begin("POST", f"/devices/{robot.device}/stop")
+    robot.silent = False
+    with start_prosody(site.prosody.home, f"{site.url}/api/v1/xmpp/verify", port=site.prosody.port) as again:
+        site.prosody.process = again.process
+        wait_until(lambda: robot.changes[-1] is True, "the way back", 30)
+        assert waiting().status_code == 200
+        wait_until(lambda: robot.heard(StopDevice), "the Stop")
+        wait_until(lambda: anna.get(f"/devices/{robot.device}").json()["online"], "online again")
+        robot.report(action, AckStatus.STARTED)
+        robot.report(action, AckStatus.DONE)
+        assert anna.action(action, wait_ms=10_000, wait_for="done")["status"] == "done"
+        assert len(robot.heard(MoveJoints)) == 1, "once, however often it came"
+        assert len(set(robot.payloads[action])) == 1

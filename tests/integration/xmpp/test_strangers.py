@@ -1,0 +1,212 @@
+"""Whoever has no right, or another tenant's, gets nowhere; and nothing that anybody sends ends the one who speaks."""
+
+import contextlib
+import json
+import time
+from collections.abc import Iterator
+from xml.sax.saxutils import quoteattr
+
+import pytest
+
+from device_agent.protocol import codec, stanzas, topics
+from device_agent.protocol.messages import Presence
+from function_app.services.xmpp_access import AGENT_S
+from tests.support.brokers import wait_until
+from tests.support.cloud import Person
+from tests.support.xmpp import DOMAIN, XmppClient, XmppRobot, XmppSite
+
+QUIET_S = 0.3
+
+
+def password_of(robot: XmppRobot) -> str:
+    given: str = robot.ask("POST", "/xmpp/credentials", json={"purpose": "agent"}).json()["password"]
+    return given
+
+
+@contextlib.contextmanager
+def as_agent(site: XmppSite, robot: XmppRobot) -> Iterator[XmppClient]:
+    """A client with an agent's own password, that can say what it likes."""
+    with site.client(robot.id, password_of(robot)) as client:
+        assert client.opened, client.trouble
+        wait_until(lambda: client.there(stanzas.CLOUD), "whoever speaks for the cloud")
+        yield client
+
+
+def cloud_jid(client: XmppClient) -> str:
+    return next(
+        each.get("from", "") for each in reversed(client.presences) if each.get("from", "").startswith("cloud@")
+    )
+
+
+@pytest.fixture
+def unheard(site: XmppSite, anna: Person) -> Iterator[XmppRobot]:
+    """Anna's, and not connected."""
+    with site.robot() as robot:
+        robot.pair(anna)
+        yield robot
+
+
+class TestLogin:
+    def test_nobody_logs_in_with_somebody_elses_password_or_another_token(
+        self, site: XmppSite, anna: Person, unheard: XmppRobot
+    ) -> None:
+        mine = password_of(unheard)
+        hers = anna.post("/xmpp/credentials", {"purpose": "watch"}).json()["password"]
+        with site.robot() as other:
+            other.pair(site.cloud.sign_in("bert"))
+            wrong = [
+                (unheard.id, "wrong"),
+                (unheard.id, unheard.token()),
+                (unheard.id, password_of(other)),
+                (unheard.id, hers),
+                (unheard.id, mine[:-4] + "AAAA"),
+                (other.id, mine),
+                (anna.account, mine),
+                (anna.account, anna.token),
+                (stanzas.CLOUD, mine),
+                (stanzas.CLOUD, hers),
+                ("somebody", hers),
+            ]
+            for user, password in wrong:
+                with site.client(user, password) as client:
+                    assert not client.opened, (user, password)
+
+    def test_a_password_is_good_for_nothing_else(self, site: XmppSite, anna: Person, unheard: XmppRobot) -> None:
+        mine = password_of(unheard)
+        hers = anna.post("/xmpp/credentials", {"purpose": "watch"}).json()["password"]
+        for token in (mine, hers):
+            headers = {"Authorization": f"Bearer {token}"}
+            for method, path in (("GET", "/devices"), ("GET", "/agents/enrollment"), ("POST", "/xmpp/credentials")):
+                answer = site.cloud.ask(method, f"/api/v1{path}", headers=headers, json={"purpose": "watch"})
+                assert answer.status_code == 401, path
+
+    def test_a_password_ends(self, site: XmppSite, unheard: XmppRobot) -> None:
+        mine = password_of(unheard)
+        site.cloud.clock.advance(AGENT_S + 1)
+        try:
+            with site.client(unheard.id, mine) as client:
+                assert not client.opened
+        finally:
+            site.cloud.clock.advance(-AGENT_S - 1)
+
+    def test_who_has_signed_out_does_not_come_back(self, site: XmppSite) -> None:
+        carl = site.cloud.sign_in("carl")
+        hers = carl.post("/xmpp/credentials", {"purpose": "watch"}).json()["password"]
+        assert carl.post("/auth/sign-out").status_code == 204
+        with site.client(carl.account, hers) as client:
+            assert not client.opened
+
+    def test_without_an_xmpp_server_there_are_no_passwords_and_it_says_so(self, anna: Person, site: XmppSite) -> None:
+        access = site.cloud.functions.xmpp_access
+        domain, access._domain = access._domain, ""
+        try:
+            answer = anna.post("/xmpp/credentials", {"purpose": "watch"})
+            assert (answer.status_code, answer.json()["type"]) == (409, "/problems/xmpp-unavailable")
+        finally:
+            access._domain = domain
+
+
+class TestTenants:
+    def test_nobody_but_the_cloud_is_spoken_to(self, site: XmppSite, anna: Person, unheard: XmppRobot) -> None:
+        bert = site.cloud.sign_in("bert")
+        with site.robot() as other, contextlib.ExitStack() as stack:
+            other.pair(bert)
+            mine = stack.enter_context(as_agent(site, unheard))
+            hers = stack.enter_context(site.person(anna))
+            its = stack.enter_context(as_agent(site, other))
+            his = stack.enter_context(site.person(bert))
+            users = {mine: unheard.id, hers: anna.account, its: other.id, his: bert.account}
+            for sender, own in users.items():
+                for user in (*users.values(), "cloud" if sender in (hers, his) else "nobody"):
+                    for to in (f"{user}@{DOMAIN}", f"{user}@{DOMAIN}/test", f"{user}@elsewhere.example"):
+                        if own == user and to.endswith((DOMAIN, "/test")):
+                            continue
+                        sender.say(stanzas.message(to, unheard.topic(topics.STATE), b"{}", receipt="1"))
+                        sender.say(f"<presence to='{to}' type='subscribe'/>")
+                        sender.say(f"<iq to='{to}' type='get' id='2'><ping xmlns='urn:xmpp:ping'/></iq>")
+            time.sleep(QUIET_S)
+            for client in users:
+                assert not [each for each in client.messages if each.get("type") != "error"]
+                assert not [each for each in client.presences if each.get("type") == "subscribe"]
+            assert not mine.there(other.id)
+            assert not mine.there(bert.account)
+            assert mine.there(anna.account)
+            assert its.there(bert.account)
+
+    def test_a_roster_is_the_clouds_to_write(self, site: XmppSite, unheard: XmppRobot) -> None:
+        with as_agent(site, unheard) as client:
+            item = "<item jid='zzzzzzzzzz@telescope.localhost' subscription='both'/>"
+            client.say(f"<iq type='set' id='3'><query xmlns='jabber:iq:roster'>{item}</query></iq>")
+            client.say("<presence to='zzzzzzzzzz@telescope.localhost'/>")
+            client.say(stanzas.forget(DOMAIN, unheard.id))
+            time.sleep(QUIET_S)
+            assert not client.ended
+
+    def test_an_agent_speaks_for_itself_alone(self, site: XmppSite, anna: Person, unheard: XmppRobot) -> None:
+        with site.robot() as other, as_agent(site, unheard) as client:
+            other.pair(site.cloud.sign_in("bert"))
+            other.connect()
+            to = cloud_jid(client)
+            greeting = codec.encode(Presence(online=True, session=99, at_ms=1))
+            client.say(stanzas.message(to, topics.conn(other.space, other.id), greeting, receipt="1"))
+            client.say(stanzas.message(to, topics.conn(other.space, unheard.id), greeting, receipt="2"))
+            client.say(stanzas.message(to, topics.conn(unheard.space, unheard.id), greeting, receipt="3"))
+            wait_until(lambda: any(stanzas.received(each) == "3" for each in client.messages), "the receipt")
+            foreign = other.ack("0" * 31, "done")  # type: ignore[arg-type]
+            client.say(stanzas.message(to, other.topic(topics.ACK), codec.encode(foreign), receipt="4"))
+            client.say(stanzas.message(to, unheard.topic(topics.CMD), b"{}", receipt="5"))
+            client.say(stanzas.message(to, unheard.topic(topics.STATE, "another"), b"{}", receipt="6"))
+            wait_until(lambda: len(refusals(client)) >= 4, "four refusals")
+            assert {number for number, _, final in refusals(client) if final} == {"2", "4", "5", "6"}
+            assert other.changes == [True]
+            assert anna.get(f"/devices/{unheard.device}").json()["online"]
+
+
+def refusals(client: XmppClient) -> list[stanzas.Refused]:
+    return [found for each in client.messages if (found := stanzas.refused(each)) is not None]
+
+
+HOSTILE = [
+    "<m xmlns='urn:telescope:v1'/>",
+    "<m xmlns='urn:telescope:v1' topic='ts/v1/../..'>{}</m>",
+    f"<m xmlns='urn:telescope:v1' topic={quoteattr('ts/v1/' + 'a/' * 190)}>{{}}</m>",
+    "<m xmlns='urn:telescope:v1' topic='ts/v1/+/+/+/cmd'>{}</m>",
+    "<m xmlns='urn:telescope:v1' topic='TOPIC'>" + "[" * 60_000 + "</m>",
+    "<m xmlns='urn:telescope:v1' topic='TOPIC'>{&quot;at_ms&quot;: NaN}</m>",
+    "<m xmlns='urn:telescope:v1' topic='TOPIC' as='base64'>****</m>",
+    "<m xmlns='urn:telescope:v1' topic='TOPIC'>" + "<a>" * 500 + "</a>" * 500 + "</m>",
+    "<received xmlns='urn:xmpp:receipts'/>",
+    "<body>hello</body>",
+    "",
+]
+
+
+def test_nothing_that_an_agent_sends_ends_the_one_who_speaks(
+    site: XmppSite, unheard: XmppRobot, robot: XmppRobot, anna: Person
+) -> None:
+    with as_agent(site, unheard) as client:
+        to = cloud_jid(client)
+        greeting = codec.encode(Presence(online=True, session=1, at_ms=1))
+        client.say(stanzas.message(to, topics.conn(unheard.space, unheard.id), greeting, receipt="0"))
+        for kind in (topics.STATE, topics.ACK, topics.EVENT, topics.DESC, "tele/joints"):
+            for number, inside in enumerate(HOSTILE):
+                wanted = "" if number % 2 else "<request xmlns='urn:xmpp:receipts'/>"
+                body = inside.replace("TOPIC", unheard.topic(kind))
+                client.say(f"<message to='{to}' id='{kind[:4]}{number}'>{wanted}{body}</message>")
+        for deep in (json.dumps({"a": 1}), "nonsense", '{"online": 7}', "[]"):
+            client.say(stanzas.message(to, topics.conn(unheard.space, unheard.id), deep.encode(), receipt="9"))
+        client.say(f"<presence to='{to}' type='unavailable'/><presence to='{to}'><priority>x</priority></presence>")
+        client.say(f"<iq to='{to}' type='set' id='8'><query xmlns='jabber:iq:roster'/></iq>")
+        wait_until(lambda: len(refusals(client)) >= 10, "refusals")
+    assert site.speaking[0].serves(robot.id)
+    assert robot.changes == [True]
+    assert anna.take(robot.device, wait_ms=10_000).json()["confirmed"]
+
+
+def test_a_stanza_that_is_too_long_ends_its_senders_connection_alone(
+    site: XmppSite, unheard: XmppRobot, robot: XmppRobot
+) -> None:
+    with as_agent(site, unheard) as client:
+        client.say(f"<message to='{cloud_jid(client)}'><body>{'x' * (2 * stanzas.MAX_STANZA_BYTES)}</body></message>")
+        wait_until(lambda: client.ended, "the end of the connection")
+    assert robot.changes == [True]
