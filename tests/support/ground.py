@@ -93,7 +93,9 @@ class Ground:
         environment: The server's settings, for whoever starts another program beside it.
     """
 
-    def __init__(self, kind: BrokerKind, folder: Path, stack: contextlib.ExitStack) -> None:
+    def __init__(
+        self, kind: BrokerKind, folder: Path, stack: contextlib.ExitStack, more: Mapping[str, str] | None = None
+    ) -> None:
         home = folder / "home"
         FileKeys(home / "keys").load()
         self.stack = stack
@@ -105,6 +107,7 @@ class Ground:
             "TELESCOPE_HOME": str(home),
             "TELESCOPE_BROKER": kind,
             "TELESCOPE_MQTT_PORT": str(self.broker.port),
+            **(more or {}),
         }
         self.endpoints: dict[str, Endpoint] = {
             "broker": self.broker,
@@ -151,10 +154,10 @@ class Ground:
 
 
 @contextlib.contextmanager
-def start_ground(kind: BrokerKind, folder: Path) -> Iterator[Ground]:
-    """Everything, until the end of the ``with``."""
+def start_ground(kind: BrokerKind, folder: Path, more: Mapping[str, str] | None = None) -> Iterator[Ground]:
+    """Everything, with these settings more, until the end of the ``with``."""
     with contextlib.ExitStack() as stack:
-        yield Ground(kind, folder, stack)
+        yield Ground(kind, folder, stack, more)
 
 
 class Link:

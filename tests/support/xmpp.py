@@ -99,6 +99,21 @@ def start_prosody(home: Path, verify_url: str, *, port: int = 0) -> Iterator[Pro
                     process.wait(PATIENCE_S)
 
 
+class ProsodyEnd:
+    """Prosody, as what a transport's connection ends at."""
+
+    def __init__(self, home: Path, verify_url: str, port: int, stack: contextlib.ExitStack) -> None:
+        self.port = port
+        self._begin = lambda: stack.enter_context(start_prosody(home, verify_url, port=port))
+        self._now = self._begin()
+
+    def kill(self) -> None:
+        self._now.kill()
+
+    def revive(self) -> None:
+        self._now = self._begin()
+
+
 @contextlib.contextmanager
 def served(cloud: Cloud, listener: socket.socket) -> Iterator[None]:
     """The functions' HTTP at a socket that listens already."""

@@ -31,9 +31,11 @@ _REFRESH_AT = 0.8
 _REFRESH_LATEST = 0.97
 _LOOK_S = 0.25
 _MOST_UNSENT_BYTES = 128 * 1024
-"""More than this not yet taken by the kernel, and measurements are left out: old ones are worth nothing."""
+"""More than this not yet taken by the kernel, and of each measurement only the newest is kept to be sent."""
+_UNSENT_LOOK_S = 0.02
 _MOST_QUEUED_BYTES = 4 * 1024 * 1024
 """More than this, and nothing is taken any more."""
+NOTICED_WITHIN_S = stanzas.DEAD_S + stanzas.PING_S
 _log = logging.getLogger(__name__)
 
 
@@ -207,6 +209,7 @@ class _Link:
         self._lock = threading.Lock()
         self._queued_bytes = 0
         self._number = 0
+        self._newest: dict[str, str] = {}
         self._delivered: dict[str, Callable[[], None]] = {}
         self._answers: dict[str, asyncio.Future[str]] = {}
 
@@ -217,8 +220,6 @@ class _Link:
         peer = self.peer
         if not self.up or peer is None:
             return False
-        if qos == 0 and self.stream.unsent_bytes > _MOST_UNSENT_BYTES:
-            return False
         with self._lock:
             if self._queued_bytes + len(payload) > _MOST_QUEUED_BYTES:
                 return False
@@ -227,7 +228,10 @@ class _Link:
             number = str(self._number) if qos else ""
         stanza = stanzas.message(peer, topic, payload, receipt=number)
         try:
-            self._loop.call_soon_threadsafe(self._write, stanza, len(payload), number, delivered)
+            if qos:
+                self._loop.call_soon_threadsafe(self._write, stanza, len(payload), number, delivered)
+            else:
+                self._loop.call_soon_threadsafe(self._measure, topic, stanza, len(payload))
         except RuntimeError:  # the loop has ended meanwhile
             return False
         return True
@@ -273,6 +277,24 @@ class _Link:
         if number and delivered is not None:
             self._delivered[number] = delivered
         self.stream.send(stanza)
+
+    def _measure(self, topic: str, stanza: str, size: int) -> None:
+        with self._lock:
+            self._queued_bytes -= size
+        if not self._newest and self.stream.unsent_bytes <= _MOST_UNSENT_BYTES:
+            self.stream.send(stanza)
+            return
+        if not self._newest:
+            self._loop.call_later(_UNSENT_LOOK_S, self._send_newest)
+        self._newest[topic] = stanza
+
+    def _send_newest(self) -> None:
+        if self.stream.unsent_bytes > _MOST_UNSENT_BYTES:
+            self._loop.call_later(_UNSENT_LOOK_S, self._send_newest)
+            return
+        newest, self._newest = self._newest, {}
+        for stanza in newest.values():
+            self.stream.send(stanza)
 
     # ------------------------------------------------------------ in
 
