@@ -8,7 +8,9 @@ NODE_READY = command -v npm >/dev/null && node -e 'process.exit(parseInt(process
 NODE = PATH="$(if $(wildcard $(BIN)/npm),$(CURDIR)/$(BIN):)$$PATH" npm
 NPM = $(NODE) --prefix web
 
-.PHONY: help up link env console test test-long check contract requirements clean
+SECONDS_EACH ?= 60
+
+.PHONY: help up link env console test test-long coverage fuzz check contract requirements clean
 .DELETE_ON_ERROR:
 
 help:
@@ -16,6 +18,8 @@ help:
 	@echo "make link          print another one-time sign-in link"
 	@echo "make test          check and test everything (about eighteen minutes on two cores, most of it in real processes)"
 	@echo "make test-long     the same with every suite at full size"
+	@echo "make coverage      every branch of the agent's runtime, by its unit tests alone"
+	@echo "make fuzz          each parser under a fuzzer, SECONDS_EACH=60"
 	@echo "make check         linters, types, import contracts, generated files"
 	@echo "make contract      regenerate docs/asyncapi.json and web/src/core/protocol.ts"
 	@echo "make requirements  regenerate requirements.txt and requirements/*.txt"
@@ -81,6 +85,13 @@ test-long: .venv/.dev console check tests/azurite/node_modules/.installed .venv/
 	@tests/system-packages
 	@$(NPM) test --silent
 	@$(BIN)/python -m pytest
+
+coverage: .venv/.dev
+	@$(BIN)/python -m pytest -q tests/unit/agent -m "not long" --cov=device_agent/runtime --cov-branch \
+		--cov-report=term-missing:skip-covered --cov-fail-under=100
+
+fuzz: .venv/.dev
+	@$(BIN)/python -m tests.fuzz $(SECONDS_EACH)
 
 check: .venv/.dev web/node_modules/.installed
 	@$(BIN)/ruff check .

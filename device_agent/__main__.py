@@ -20,6 +20,7 @@ from device_agent.protocol import robot_type
 from device_agent.protocol.topics import ID_PATTERN, is_id
 from device_agent.runtime.home import Configuration, DeviceEntry, Home, HomeError, HttpPolling, Pairing
 from device_agent.runtime.journal import JournalError
+from device_agent.transports.http import answers
 from device_agent.transports.http.api import Claim, CloudApi, CloudError
 
 _POLL_S = 20.0
@@ -150,27 +151,30 @@ def _announce(api: CloudApi, configuration: Configuration) -> Claim:
         devices=bootstrap.enrolled_devices(configuration),
     )
     if claim.code is not None:
-        print(f"claim code {claim.code}  (valid for {claim.expires_in_s:.0f} s)", flush=True)
+        print(f"claim code {claim.code}  (valid for {claim.expires_in_s or 0:.0f} s)", flush=True)
     return claim
 
 
 def _await_claim(home: Home, api: CloudApi, configuration: Configuration, claim: Claim) -> Pairing:
     """Wait until somebody redeems the code; a code that runs out is replaced."""
-    expires_s = time.monotonic() + claim.expires_in_s
+    expires_s = time.monotonic() + (claim.expires_in_s or 0)
     while True:
         found = api.enrollment(wait_s=_POLL_S if claim.code is not None else 0.0)
         if found.get("state") == "claimed":
-            keys = {str(key["id"]): str(key["public"]) for key in found["keys"]}
-            account = found["account"]
+            claimed = answers.read(found, answers.Claimed)
             pairing = Pairing(
-                agent=found["agent"], space=found["space"], account=account["name"], owner=account["id"], keys=keys
+                agent=claimed.agent,
+                space=claimed.space,
+                account=claimed.account.name,
+                owner=claimed.account.id,
+                keys={key.id: key.public for key in claimed.keys},
             )
             home.save_pairing(pairing)
             print(f"paired with {pairing.account}", flush=True)
             return pairing
         if time.monotonic() > expires_s:
             claim = _announce(api, configuration)
-            expires_s = time.monotonic() + claim.expires_in_s
+            expires_s = time.monotonic() + (claim.expires_in_s or 0)
 
 
 # ------------------------------------------------------------ run

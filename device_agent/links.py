@@ -11,6 +11,7 @@ from typing import Any
 from device_agent.ports.transport import Transport
 from device_agent.protocol import topics
 from device_agent.runtime.home import Configuration, HomeError, Pairing
+from device_agent.transports.http import answers
 from device_agent.transports.http.api import CloudApi, CloudError
 
 SOFTWARE = "telescope-agent 0.1.0"
@@ -147,19 +148,16 @@ def _mqtt(wiring: Wiring) -> Transport:
     api = wiring.open_api()
 
     def access() -> BrokerAccess:
-        given = wiring.membership.credentials(api)
-        try:
-            return BrokerAccess(
-                host=str(given["tcp"]["host"]),
-                port=int(given["tcp"]["port"]),
-                client_id=str(given["client_id"]),
-                username=str(given["username"]),
-                password=str(given["password"]),
-                subscribe=tuple(str(pattern) for pattern in given["subscribe"]),
-                lifetime_s=float(given["lifetime_s"]),
-            )
-        except (KeyError, TypeError) as error:
-            raise CloudError(f"the cloud's broker credentials lack {error}") from error
+        given = answers.read(wiring.membership.credentials(api), answers.MqttCredentials)
+        return BrokerAccess(
+            host=given.tcp.host,
+            port=given.tcp.port,
+            client_id=given.client_id,
+            username=given.username,
+            password=given.password,
+            subscribe=given.subscribe,
+            lifetime_s=given.lifetime_s,
+        )
 
     return MqttTransport(
         access=access,
@@ -197,17 +195,9 @@ def _xmpp(wiring: Wiring) -> Transport:
     api = wiring.open_api()
 
     def access() -> XmppAccess:
-        given = wiring.membership.xmpp_credentials(api)
-        try:
-            login = Login(
-                host=str(given["host"]),
-                port=int(given["port"]),
-                jid=str(given["jid"]),
-                password=str(given["password"]),
-            )
-            return XmppAccess(login=login, cloud=str(given["cloud"]), lifetime_s=float(given["lifetime_s"]))
-        except (KeyError, TypeError) as error:
-            raise CloudError(f"the cloud's XMPP credentials lack {error}") from error
+        given = answers.read(wiring.membership.xmpp_credentials(api), answers.XmppCredentials)
+        login = Login(host=given.host, port=given.port, jid=given.jid, password=given.password)
+        return XmppAccess(login=login, cloud=given.cloud, lifetime_s=given.lifetime_s)
 
     return XmppTransport(
         access=access,

@@ -224,7 +224,7 @@ class Home:
             found.public_keys()
         except FileNotFoundError:
             return None
-        except (OSError, msgspec.DecodeError, ProtocolError) as error:
+        except (OSError, msgspec.DecodeError, UnicodeDecodeError, RecursionError, ProtocolError) as error:
             raise HomeError(f"{path}: {error}; delete it and enroll again") from error
         return found
 

@@ -1,6 +1,5 @@
 """Whatever is cut while an arm moves, it is at rest 350 ms later, and stays there until somebody takes control."""
 
-import math
 import random
 
 import pytest
@@ -50,8 +49,7 @@ def test_an_arm_in_motion_rests_in_time_at_each_of_a_thousand_cuts(kind: BrokerK
 @pytest.mark.timeout(600)
 def test_a_watchdog_of_a_second_is_found() -> None:
     tally = bench("amqtt", 3, [], rounds=len(OPERATOR), seed=6, watchdog_s=1.0)
-    late = [each for each in tally.broken if not math.isinf(each.verdict.rest_ms) and each.verdict.rest_ms > 500]
-    assert len(late) > tally.count / 2
+    assert len(tally.broken) > 0.9 * tally.count
 
 
 def rows(*targets: float) -> list[Row]:

@@ -1,0 +1,77 @@
+"""What the cloud answers to an agent, each as a type: whatever else comes is told as such, never obeyed by half."""
+
+from typing import Annotated, Any, TypeVar
+
+import msgspec
+from msgspec import Meta, Struct
+
+from device_agent.protocol.messages import Id
+from device_agent.transports.http.api import CloudError
+
+Port = Annotated[int, Meta(ge=1, le=65_535)]
+Lifetime = Annotated[float, Meta(gt=0)]
+T = TypeVar("T")
+
+
+class Address(Struct, frozen=True, kw_only=True):
+    """Where a broker takes MQTT."""
+
+    host: str
+    port: Port
+
+
+class MqttCredentials(Struct, frozen=True, kw_only=True):
+    """Broker credentials, good for ``lifetime_s`` from now [s]."""
+
+    tcp: Address
+    client_id: str
+    username: str
+    password: str
+    subscribe: tuple[str, ...]
+    lifetime_s: Lifetime
+
+
+class XmppCredentials(Struct, frozen=True, kw_only=True):
+    """An XMPP login, good for ``lifetime_s`` from now [s]; ``cloud`` is who to speak with."""
+
+    host: str
+    port: Port
+    jid: str
+    password: str
+    cloud: str
+    lifetime_s: Lifetime
+
+
+class Owner(Struct, frozen=True, kw_only=True):
+    """The account that an agent belongs to."""
+
+    id: str
+    name: str
+
+
+class Key(Struct, frozen=True, kw_only=True):
+    """One of the cloud's public keys."""
+
+    id: str
+    public: str
+
+
+class Claimed(Struct, frozen=True, kw_only=True):
+    """Whose the agent is, and which keys to pin."""
+
+    agent: Id
+    space: Id
+    account: Owner
+    keys: tuple[Key, ...]
+
+
+def read(answer: dict[str, Any], kind: type[T]) -> T:
+    """The answer as ``kind``; what else is in it is passed over.
+
+    Raises:
+        CloudError: It is not; the text says where.
+    """
+    try:
+        return msgspec.convert(answer, kind)
+    except msgspec.ValidationError as error:
+        raise CloudError(f"the cloud's answer cannot be used: {error}") from error
