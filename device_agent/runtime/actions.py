@@ -132,7 +132,7 @@ class _Playing:
     """An action that is a script, and its time."""
 
     def __init__(self, order: RunMovement, run: "_Run", cell: Cell) -> None:
-        self._script = Script(order, run.robot, run.tell, cell=cell)
+        self._script = Script(order, run.robot, run.tell, cell=cell, died=run.robot.give_back)
         self._timeout_s = order.timeout_ms / 1000
         self._end = run.end
 

@@ -26,6 +26,7 @@ _BURST = 500.0
 _READY_S = 30.0
 _WRITE_S = 5.0
 """A process that does not read the answers it asked for is ended after this time."""
+_LOOK_S = 60.0
 _PIECE = 65_536
 
 
@@ -73,16 +74,25 @@ class Script:
         reach: What its calls reach.
         told: Called with what the script printed last and its progress 0…1, if it gave one.
         cell: Where it runs.
+        died: Called, from another thread, once its process is dead, however it ended: what it moves must not go on.
     """
 
     def __init__(
-        self, order: RunMovement, reach: Reach, told: Callable[[str, float | None], None], *, cell: Cell
+        self,
+        order: RunMovement,
+        reach: Reach,
+        told: Callable[[str, float | None], None],
+        *,
+        cell: Cell,
+        died: Callable[[], None],
     ) -> None:
         self._order = order
         self._reach = reach
         self._told = told
         self._cell = cell
+        self._died = died
         self._killed = threading.Event()
+        self._over = threading.Event()
         self._inmate: Inmate | None = None
 
     def run(self) -> None:
@@ -95,10 +105,17 @@ class Script:
             self._inmate = inmate = self._cell.jail.open(self._cell.limits, stranger=self._cell.stranger)
         except JailError as error:
             raise ScriptFailed(str(error)) from error
+        watch = threading.Thread(target=self._watch, args=(inmate,), name="script-watch", daemon=True)
         with contextlib.closing(inmate):
             if self._killed.is_set():
                 inmate.kill()
-            self._serve(inmate)
+            watch.start()
+            try:
+                self._serve(inmate)
+            finally:
+                self._over.set()
+                inmate.kill()
+                watch.join(_WRITE_S)
 
     def kill(self) -> None:
         """End the process at once, from any thread; ``run`` then raises. May be called twice."""
@@ -106,6 +123,13 @@ class Script:
         self._killed.set()
         if self._inmate is not None:
             self._inmate.kill()
+
+    def _watch(self, inmate: Inmate) -> None:
+        """Whoever serves the script may be busy with its last call for as long as a move takes."""
+        while not inmate.wait(_LOOK_S):
+            if self._over.is_set():
+                return
+        self._died()
 
     def _serve(self, inmate: Inmate) -> None:
         lines = _Lines(inmate.link, self._killed)

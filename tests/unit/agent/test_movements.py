@@ -40,6 +40,10 @@ class Notes:
         return None
 
 
+def nothing() -> None:
+    """Nobody needs to know that the process is dead."""
+
+
 class Told:
     def __init__(self) -> None:
         self.printed = ""
@@ -109,13 +113,13 @@ def order(source: str, parameters: dict[str, Any] | None = None) -> RunMovement:
 
 def run(source: str, parameters: dict[str, Any] | None = None) -> tuple[Notes, Told]:
     notes, told = Notes(), Told()
-    Script(order(source, parameters), notes, told, cell=Cell(warm_jail(), stranger=False)).run()
+    Script(order(source, parameters), notes, told, cell=Cell(warm_jail(), stranger=False), died=nothing).run()
     return notes, told
 
 
 def run_fake(inmate: FakeInmate) -> Told:
     told = Told()
-    Script(order(""), Notes(), told, cell=Cell(FakeJail(inmate), stranger=False)).run()
+    Script(order(""), Notes(), told, cell=Cell(FakeJail(inmate), stranger=False), died=nothing).run()
     return told
 
 
@@ -240,7 +244,7 @@ def running(script: Script) -> Iterator[list[ScriptFailed]]:
 def test_a_script_is_killed_at_once() -> None:
     told = Told()
     source = "import signal\nsignal.signal(signal.SIGTERM, signal.SIG_IGN)\nprint('here')\nwhile True: pass"
-    script = Script(order(source), Notes(), told, cell=Cell(warm_jail(), stranger=False))
+    script = Script(order(source), Notes(), told, cell=Cell(warm_jail(), stranger=False), died=nothing)
     with running(script) as failures:
         while not told.printed:
             time.sleep(0.01)
@@ -249,9 +253,34 @@ def test_a_script_is_killed_at_once() -> None:
     assert [str(failure) for failure in failures] == ["the script's process ended before the script did"]
 
 
+def test_a_script_that_dies_in_the_middle_of_a_call_lets_go_of_the_robot_at_once() -> None:
+    let_go = threading.Event()
+
+    class Busy(Notes):
+        def do(self, call: calls.Call) -> Any:
+            del call
+            inmate = script._inmate
+            assert inmate is not None
+            inmate.kill()
+            assert let_go.wait(10), "the call went on for as long as it liked"
+            raise Refused("ended", "the action ended")
+
+    script = Script(order("robot.home()"), Busy(), Told(), cell=Cell(warm_jail(), stranger=False), died=let_go.set)
+    with pytest.raises(ScriptFailed, match="ended before the script did"):
+        script.run()
+
+
+def test_a_process_that_cannot_be_killed_does_not_hold_up_the_action() -> None:
+    inmate = FakeInmate(dies=False)
+    inmate.say(b'{"kind":"ready"}', b'{"kind":"ended"}')
+    died = threading.Event()
+    Script(order(""), Notes(), Told(), cell=Cell(FakeJail(inmate), stranger=False), died=died.set).run()
+    assert not died.is_set()
+
+
 def test_a_script_killed_before_it_began_does_not_run() -> None:
     notes = Notes()
-    script = Script(order("robot.home()"), notes, Told(), cell=Cell(warm_jail(), stranger=False))
+    script = Script(order("robot.home()"), notes, Told(), cell=Cell(warm_jail(), stranger=False), died=nothing)
     script.kill()
     with pytest.raises(ScriptFailed):
         script.run()
@@ -259,7 +288,7 @@ def test_a_script_killed_before_it_began_does_not_run() -> None:
 
 
 def test_without_a_process_it_says_why() -> None:
-    script = Script(order(""), Notes(), Told(), cell=Cell(FakeJail(None), stranger=False))
+    script = Script(order(""), Notes(), Told(), cell=Cell(FakeJail(None), stranger=False), died=nothing)
     with pytest.raises(ScriptFailed, match="no process can be started"):
         script.run()
 
