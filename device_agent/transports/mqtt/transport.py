@@ -126,12 +126,15 @@ class MqttTransport:
         back_off = BackOff()
         while not self._stopping.is_set():
             back_off.attempt()
+            version = self._version
             try:
                 self._connect_once()
             except (OSError, ValueError) as error:
                 _log.warning("no link: %s", error)
             except Exception:  # noqa: BLE001 (whatever it was: a robot that has lost its link must keep trying)
                 _log.exception("no link")
+            if self._version is not version:
+                continue  # the broker is there, it only speaks an older MQTT
             if self._stopping.wait(back_off.wait_s()):
                 return
 
