@@ -167,6 +167,7 @@ class Office:
             return
         try:
             self._check_time(command)
+            self._write_down(command.epoch)
             self._carry_out(command)
         except Refused as refused:
             status = AckStatus.EXPIRED if refused.code == "expired" else AckStatus.FAILED
@@ -194,6 +195,12 @@ class Office:
             raise Refused("expired", f"arrived {late} ms after it had run out")
         if command.issued_at_ms > now_ms + _FUTURE_MS:
             raise Refused("from_the_future", "issued later than now; the cloud's clock or this device's is wrong")
+
+    def _write_down(self, epoch: int) -> None:
+        """Journal a newer epoch before it is obeyed: killed in between, the agent must not obey an older one again."""
+        known, burned = self._controller.epochs
+        if epoch > known:
+            self._journal.save_epoch(self._name, epoch=epoch, burned=burned)
 
     def _carry_out(self, command: Command) -> None:
         now_s = time.monotonic()

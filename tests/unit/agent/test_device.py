@@ -38,6 +38,7 @@ from device_agent.protocol.messages import (
     StopDevice,
     Twin,
 )
+from device_agent.runtime.controller import Controller
 from device_agent.runtime.device import Device
 from device_agent.runtime.journal import Journal
 from device_agent.runtime.outbox import Outbox
@@ -487,3 +488,17 @@ def test_what_was_ordered_before_a_reset_and_arrives_after_it_does_not_move(benc
         assert reason.code in {"stale_epoch", "lease_ended"}
     assert bench.driver.position == (0.0, 0.0)
     assert bench.end(bench.command(MoveJoints(position_rad={"elbow": 0.2}), epoch=4)).status is AckStatus.DONE
+
+
+def test_a_new_epoch_stands_in_the_journal_before_it_is_obeyed(bench: Bench, monkeypatch: pytest.MonkeyPatch) -> None:
+    written: list[int] = []
+    grant = Controller.grant
+
+    def watched(controller: Controller, **given: Any) -> None:
+        written.append(bench.journal.device("arm").epoch)
+        grant(controller, **given)
+
+    monkeypatch.setattr(Controller, "grant", watched)
+    for epoch in (4, 4, 7):
+        assert bench.end(bench.command(GrantLease(holder="ann", lease_ms=1000), epoch=epoch)).status is AckStatus.DONE
+    assert written == [4, 4, 7]

@@ -1,0 +1,337 @@
+"""Handovers of control over a bad network, as many as wanted, all from one seed.
+
+The robot is the real controller with the real lease gate. The cloud, the operators and the network are played: grants,
+renewals, releases and setpoints are lost, doubled, delayed and overtake one another; operators go on after they have
+lost control; somebody keeps old grants and sends them again; the robot restarts with what its journal has. What must
+never happen is judged by a witness who sees all that reaches the robot and knows nothing of how the gate decides.
+"""
+
+import heapq
+import random
+from collections.abc import Callable
+from contextlib import suppress
+from dataclasses import dataclass, field
+
+from device_agent.protocol.messages import Joint, JointTarget, Mode, Setpoint, StopLatch
+from device_agent.protocol.robot_type import RobotType
+from device_agent.runtime.controller import Controller
+from device_agent.runtime.lease import Lease, LeaseGate, Refused
+
+PERIOD_S = 0.008
+HANDOVERS = 50
+"""In one history, of one robot."""
+_JOINT = Joint(
+    name="elbow",
+    label="Elbow",
+    lower_rad=-3.0,
+    upper_rad=3.0,
+    max_velocity_rad_s=3.0,
+    max_acceleration_rad_s2=8.0,
+    max_jerk_rad_s3=80.0,
+    max_effort_nm=100.0,
+)
+_TYPE = RobotType(
+    type="toy",
+    label="Toy",
+    kind="robot",
+    version=1,
+    description="",
+    model="",
+    scene="",
+    driver="none",
+    period_ms=8,
+    joints=(_JOINT,),
+    frames=(),
+    home_rad={"elbow": 0.0},
+    braking_rad_s2=20.0,
+)
+MakeGate = Callable[[int, int], LeaseGate]
+
+
+def real_gate(epoch: int, burned: int) -> LeaseGate:
+    """The one that ships."""
+    return LeaseGate(epoch=epoch, burned=burned)
+
+
+@dataclass(order=True, slots=True)
+class Message:
+    """Something on its way to the robot."""
+
+    arrives_s: float
+    number: int
+    kind: str = field(compare=False)
+    epoch: int = field(compare=False)
+    lease_s: float = field(compare=False, default=0.0)
+    sequence: int = field(compare=False, default=0)
+
+
+@dataclass(slots=True)
+class Witness:
+    """Knows what has reached the robot, and so whose word counts."""
+
+    newest: int = 0
+    expires_s: dict[int, float] = field(default_factory=dict)
+    ended: set[int] = field(default_factory=set)
+
+    def granted(self, epoch: int, now_s: float, lease_s: float) -> None:
+        """A signed grant or renewal arrived."""
+        # Until the control loop's next period a renewal may come in time.
+        if epoch in self.expires_s and now_s > self.expires_s[epoch] + PERIOD_S:
+            self.ended.add(epoch)
+        self.expires_s[epoch] = now_s + lease_s
+        self.newest = max(self.newest, epoch)
+
+    def ordered(self, epoch: int) -> None:
+        """Some other signed order arrived."""
+        self.newest = max(self.newest, epoch)
+
+    def all_ended(self) -> None:
+        """A Stop, or a restart: no lease of before counts."""
+        self.ended.update(self.expires_s)
+        self.ended.add(self.newest)
+
+    def stale(self, epoch: int, now_s: float, *, needs_lease: bool) -> bool:
+        """Whether to obey an order of this epoch now is to obey somebody who has control no more, or never had it."""
+        if epoch < self.newest or epoch in self.ended:
+            return True
+        return needs_lease and self.expires_s.get(epoch, -1.0) < now_s
+
+
+@dataclass(slots=True)
+class Tally:
+    """What came of it."""
+
+    handovers: int = 0
+    delivered: int = 0
+    obeyed: int = 0
+    stale: int = 0
+
+
+class History:
+    """One robot, and everybody who wants it.
+
+    Args:
+        seed: All chance comes from it.
+        gate: Makes the lease gate.
+        journal_first: Whether an epoch is written down before it is obeyed.
+    """
+
+    def __init__(self, seed: int, gate: MakeGate = real_gate, *, journal_first: bool = True) -> None:
+        self._random = random.Random(seed)
+        self._make_gate = gate
+        self._journal_first = journal_first
+        self._saved = 0
+        self._latch: StopLatch | None = None
+        self._robot = self._started()
+        self._witness = Witness()
+        self._queue: list[Message] = []
+        self._number = 0
+        self.tally = Tally()
+
+    def run(self, handovers: int = HANDOVERS) -> Tally:
+        """Play it to the end."""
+        self._plan(handovers)
+        while self._queue:
+            message = heapq.heappop(self._queue)
+            self._robot.step(message.arrives_s)
+            self.tally.delivered += 1
+            getattr(self, f"_{message.kind}")(message)
+        return self.tally
+
+    # ------------------------------------------------------------ cloud, operators, network
+
+    def _plan(self, handovers: int) -> None:
+        chance = self._random
+        now_s = 1.0
+        for number in range(1, handovers + 1):
+            self.tally.handovers += 1
+            epoch = 2 * number  # the odd ones are those of resets of Stop
+            if chance.random() < 0.2:
+                self._send("reset", now_s - 0.05, epoch - 1)
+            lease_s = chance.uniform(0.3, 2.0)
+            self._send("grant", now_s, epoch, lease_s)
+            if chance.random() < 0.5:
+                self._send("grant", now_s + lease_s * 0.6, epoch, lease_s)
+            # Whoever has lost control may not know it for long.
+            for sequence in range(1, 5):
+                self._send("setpoint", now_s + chance.uniform(0.0, 2.5), epoch, sequence=sequence)
+            what = chance.random()
+            if what < 0.3:
+                self._send("release", now_s + chance.uniform(0.1, 1.5), epoch)
+            elif what < 0.6:
+                self._send("act", now_s + chance.uniform(0.0, 1.5), epoch)
+            if what > 0.9:
+                self._put("restart", now_s + chance.uniform(0.0, 2.0), epoch)
+            elif what > 0.85:
+                self._send("stop", now_s + chance.uniform(0.0, 2.0), epoch)
+            now_s += chance.uniform(0.05, 1.5)
+
+    def _send(self, kind: str, now_s: float, epoch: int, lease_s: float = 0.0, sequence: int = 0) -> None:
+        chance = self._random
+        if chance.random() < 0.1:
+            return  # lost
+        for _ in range(2 if chance.random() < 0.1 else 1):
+            way = chance.random()
+            longest_s = 0.05 if way < 0.8 else 1.0 if way < 0.97 else 20.0
+            self._put(kind, now_s + chance.random() * longest_s, epoch, lease_s, sequence)
+
+    def _put(self, kind: str, arrives_s: float, epoch: int, lease_s: float = 0.0, sequence: int = 0) -> None:
+        self._number += 1
+        heapq.heappush(self._queue, Message(arrives_s, self._number, kind, epoch, lease_s, sequence))
+
+    # ------------------------------------------------------------ the robot
+
+    def _started(self) -> Controller:
+        controller = Controller(_TYPE, self._make_gate(self._saved, self._saved), latch=self._latch)
+        controller.start_at([0.0])
+        return controller
+
+    def _signed(self, epoch: int, obey: Callable[[], None]) -> None:
+        """As the office does: an epoch stands in the journal before it is obeyed. It may be killed at any moment."""
+        if self._journal_first:
+            self._saved = max(self._saved, epoch)
+        when = self._random.random()
+        if when > 0.01:
+            with suppress(Refused):
+                obey()
+        if when < 0.02:
+            self._restart_now()
+        self._saved = max(self._saved, self._robot.epochs[0])
+
+    def _grant(self, message: Message) -> None:
+        now_s, epoch, lease_s = message.arrives_s, message.epoch, message.lease_s
+        self._witness.granted(epoch, now_s, lease_s)
+        self._signed(epoch, lambda: self._robot.grant(epoch=epoch, holder="h", lease_s=lease_s, now_s=now_s))
+
+    def _release(self, message: Message) -> None:
+        self._witness.ordered(message.epoch)
+        self._signed(message.epoch, lambda: self._robot.release(epoch=message.epoch))
+        self._witness.ended.add(message.epoch)
+
+    def _act(self, message: Message) -> None:
+        stale = self._witness.stale(message.epoch, message.arrives_s, needs_lease=False)
+        self._witness.ordered(message.epoch)
+
+        def act() -> None:
+            tenure = self._robot.begin_action(epoch=message.epoch, on_lost=lambda _: None)
+            self._robot.end_action(tenure)
+            self._judge(stale=stale)
+
+        self._signed(message.epoch, act)
+
+    def _setpoint(self, message: Message) -> None:
+        now_s = message.arrives_s
+        tick_ms = round(now_s * 1000)
+        setpoint = Setpoint(
+            epoch=message.epoch,
+            sequence=message.sequence,
+            echo_tick_ms=tick_ms,
+            sent_ms=0.0,
+            target=JointTarget(position_rad={"elbow": 1.0 if message.epoch % 2 else -1.0}),
+        )
+        try:
+            self._robot.offer(setpoint, now_s=now_s, tick_ms=tick_ms)
+        except Refused:
+            return
+        if self._robot.step(now_s).mode is Mode.STREAMING:
+            self._judge(stale=self._witness.stale(message.epoch, now_s, needs_lease=True))
+
+    def _stop(self, _message: Message) -> None:
+        self._witness.all_ended()
+        self._latch = StopLatch(by="bob", reason="", at_ms=1)
+        self._robot.stop(self._latch)
+
+    def _reset(self, message: Message) -> None:
+        self._witness.ordered(message.epoch)
+        self._signed(message.epoch, lambda: self._robot.reset_stop(epoch=message.epoch))
+        self._latch = self._robot.latch
+        self._witness.ended.add(message.epoch)
+
+    def _restart(self, _message: Message) -> None:
+        self._restart_now()
+
+    def _restart_now(self) -> None:
+        self._witness.all_ended()
+        self._robot = self._started()
+
+    def _judge(self, *, stale: bool) -> None:
+        self.tally.obeyed += 1
+        self.tally.stale += stale
+
+
+# ------------------------------------------------------------ gates that must be caught
+
+
+class _Whatever(int):
+    """An epoch that equals every other."""
+
+    __slots__ = ()
+
+    def __eq__(self, _other: object) -> bool:
+        return True
+
+    def __ne__(self, _other: object) -> bool:
+        return False
+
+    __hash__ = int.__hash__
+
+
+class NoCheck(LeaseGate):
+    """Obeys everybody who ever had control."""
+
+    def grant(self, *, epoch: int, holder: str, lease_s: float, now_s: float, reason: str = "") -> None:
+        """Take in any."""
+        self.epoch, self.burned = epoch, 0
+        self._lease = Lease(holder, _Whatever(epoch), now_s + lease_s, reason)
+
+    def fence(self, epoch: int) -> None:
+        """Refuse none."""
+        self.burned = min(self.burned, epoch - 1)
+
+    def current(self, now_s: float) -> Lease | None:  # noqa: ARG002
+        """For ever."""
+        return self._lease
+
+    def expire(self, now_s: float) -> bool:  # noqa: ARG002
+        """Never."""
+        return False
+
+
+class ExpiryOnly(LeaseGate):
+    """Obeys everybody whose lease has not run out, as if clocks were all that is needed."""
+
+    def __init__(self, *, epoch: int = 0, burned: int = 0) -> None:
+        super().__init__(epoch=epoch, burned=burned)
+        self._until_s: dict[int, float] = {}
+
+    def grant(self, *, epoch: int, holder: str, lease_s: float, now_s: float, reason: str = "") -> None:
+        """Take in any."""
+        self._until_s[epoch] = now_s + lease_s
+        self.epoch, self.burned = max(self.epoch, epoch), 0
+        self._lease = Lease(holder, _Whatever(epoch), max(self._until_s.values()), reason)
+
+    def fence(self, epoch: int) -> None:
+        """Refuse none."""
+        self.burned = min(self.burned, epoch - 1)
+
+
+def no_check(epoch: int, burned: int) -> LeaseGate:
+    """A mutant."""
+    return NoCheck(epoch=epoch, burned=burned)
+
+
+def expiry_only(epoch: int, burned: int) -> LeaseGate:
+    """A mutant."""
+    return ExpiryOnly(epoch=epoch, burned=burned)
+
+
+def play(handovers: int, *, seed: int = 0, gate: MakeGate = real_gate, journal_first: bool = True) -> Tally:
+    """As many handovers as asked, in histories of fifty; history ``n`` has the seed ``seed + n``."""
+    total = Tally()
+    for history in range(max(1, handovers // HANDOVERS)):
+        tally = History(seed + history, gate, journal_first=journal_first).run()
+        total.handovers += tally.handovers
+        total.delivered += tally.delivered
+        total.obeyed += tally.obeyed
+        total.stale += tally.stale
+    return total

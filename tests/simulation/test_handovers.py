@@ -1,0 +1,49 @@
+"""Nobody who has lost control is obeyed: a million handovers, and the mutants that the same suite must catch."""
+
+import os
+import time
+from concurrent.futures import ProcessPoolExecutor
+
+import pytest
+
+from tests.simulation.handovers import HANDOVERS, MakeGate, Tally, expiry_only, no_check, play
+
+WHOLE = 1_000_000
+PART = 50_000
+
+
+def test_no_stale_order_is_obeyed() -> None:
+    tally = play(PART)
+    assert tally.stale == 0
+    assert tally.obeyed > PART / 4, "most handovers must lead to something"
+
+
+@pytest.mark.parametrize("mutant", [no_check, expiry_only])
+def test_a_gate_without_the_fence_is_caught(mutant: MakeGate) -> None:
+    assert play(PART // 20, gate=mutant).stale > 10
+
+
+def test_a_journal_that_is_written_after_obeying_is_caught() -> None:
+    assert play(PART // 5, journal_first=False).stale > 0
+
+
+@pytest.mark.long
+@pytest.mark.timeout(1800)
+def test_a_million_handovers() -> None:
+    began_s = time.monotonic()
+    workers = os.cpu_count() or 1
+    each = WHOLE // workers
+    with ProcessPoolExecutor(workers) as pool:
+        tallies: list[Tally] = list(pool.map(_share, range(workers), [each] * workers))
+    total = sum(tally.handovers for tally in tallies)
+    print(
+        f"{total} handovers, {sum(tally.delivered for tally in tallies)} messages, "
+        f"{sum(tally.obeyed for tally in tallies)} orders obeyed, "
+        f"{sum(tally.stale for tally in tallies)} of them stale; {time.monotonic() - began_s:.0f} s"
+    )
+    assert total >= WHOLE
+    assert sum(tally.stale for tally in tallies) == 0
+
+
+def _share(worker: int, handovers: int) -> Tally:
+    return play(handovers, seed=10_000_000 + worker * handovers // HANDOVERS)
