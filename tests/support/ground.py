@@ -90,6 +90,7 @@ class Ground:
 
     Attributes:
         endpoints: ``server`` and ``broker``; who adds a transport adds what it ends at.
+        home: The cloud's folder.
         environment: The server's settings, for whoever starts another program beside it.
     """
 
@@ -114,6 +115,7 @@ class Ground:
             "server": Server(self.environment, stack),
         }
         self.url = f"http://{HOST}:{self.endpoints['server'].port}"
+        self.home = home
         self._last_ms = 0
         self.cloud = stack.enter_context(Cloud(settings(home, self.broker.now)))
         self.cloud.start_ingest()
@@ -131,12 +133,12 @@ class Ground:
         self._last_ms = max(self._last_ms + 1, self.cloud.clock.now_ms())
         command = command_id(device.id, self._last_ms)
         signed = Signed(command, payload, self.cloud.clock.now_ms() + in_ms, first)
-        self.cloud.run(self._delivery.send(device, signed))
+        self.cloud.run(self.delivery.send(device, signed))
         return command
 
     def keep(self, topic: str, payload: bytes) -> None:
         """Have the broker keep a message."""
-        self.cloud.run(self._delivery._bus.publish(topic, payload, retain=True))
+        self.cloud.run(self.delivery._bus.publish(topic, payload, retain=True))
 
     def ear(self, agent: str) -> Client:
         """What a page hears at the broker of an agent."""
@@ -149,7 +151,7 @@ class Ground:
         return client
 
     @property
-    def _delivery(self) -> Delivery:
+    def delivery(self) -> Delivery:
         return self.cloud.functions.stop._delivery
 
 

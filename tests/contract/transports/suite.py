@@ -34,12 +34,14 @@ class Spoken:
         configuration: Its part of ``agent.toml``.
         endpoint: What its connection ends at, one of ``ground.endpoints``.
         notices_s: How soon it notices, while something moves, that a network swallows everything.
+        stores: Whether what was confirmed is in the cloud's tables: a broker confirms for itself alone.
         broker: Which broker is there.
     """
 
     configuration: Mapping[str, Any] = field(default_factory=dict)
     endpoint: str
     notices_s: float
+    stores: bool = False
     broker: BrokerKind = "amqtt"
 
 

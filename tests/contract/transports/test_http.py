@@ -1,12 +1,15 @@
 """HTTP, with long and with plain polls."""
 
+import pytest
+
 from device_agent.runtime.home import HttpPolling
 from device_agent.transports.http.transport import NOTICED_WITHIN_S
+from tests.contract.transports.agent_suite import AgentSuite
 from tests.contract.transports.suite import Spoken, TransportSuite
 
 
 class TestLongPolls(TransportSuite):
-    spoken = Spoken(configuration={"transport": "http"}, endpoint="server", notices_s=NOTICED_WITHIN_S)
+    spoken = Spoken(configuration={"transport": "http"}, endpoint="server", notices_s=NOTICED_WITHIN_S, stores=True)
 
 
 class TestPlainPolls(TransportSuite):
@@ -14,4 +17,14 @@ class TestPlainPolls(TransportSuite):
         configuration={"transport": "http", "http": HttpPolling(poll="plain", poll_ms=100)},
         endpoint="server",
         notices_s=NOTICED_WITHIN_S,
+        stores=True,
     )
+
+
+class TestAgentOnLongPolls(AgentSuite):
+    spoken = TestLongPolls.spoken
+
+
+@pytest.mark.long
+class TestAgentOnPlainPolls(AgentSuite):
+    spoken = TestPlainPolls.spoken
