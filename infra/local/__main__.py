@@ -51,6 +51,9 @@ class Machine:
         self._run("functions", "-m", "function_app", "serve")
         self._run("worker", "-m", "function_app", "work")
         self._await_health()
+        if self._chosen.xmpp:
+            self._run("xmpp-server", *self._prosody()).await_line("ready", _START_WITHIN_S)
+            self._run("xmpp", "-m", "function_app", "xmpp")
         self._pair(link)
         agent = ["-m", "device_agent", "run", "--home", str(self._agent_home)]
         if trace := os.environ.get("TELESCOPE_TRACE"):
@@ -79,7 +82,7 @@ class Machine:
     # ------------------------------------------------------------ steps
 
     def _check(self) -> None:
-        missing = [name for name in _NEEDS if not installed(name)]
+        missing = [name for name in (*_NEEDS, *(["slixmpp"] if self._chosen.xmpp else [])) if not installed(name)]
         if missing:
             raise StartError(f"Python package '{missing[0]}' is missing; run `make env`")
         chosen = self._chosen
@@ -87,10 +90,12 @@ class Machine:
             (chosen.port, "page"),
             (chosen.mqtt_port, "MQTT"),
             (chosen.websocket_port, "MQTT over WebSocket"),
+            *([(chosen.xmpp_port, "XMPP")] if chosen.xmpp else []),
         ):
             if taken(chosen.host, port):
+                more = "three" if chosen.xmpp else "two"
                 raise StartError(
-                    f"port {port} ({what}) is taken; set TELESCOPE_PORT to a free one (it and the next two are used)"
+                    f"port {port} ({what}) is taken; set TELESCOPE_PORT to a free one (it and the next {more} are used)"
                 )
         try:
             self._logs.mkdir(parents=True, exist_ok=True, mode=0o700)
@@ -110,6 +115,12 @@ class Machine:
         if chosen.broker == "mosquitto":
             return ["-m", "infra.mosquitto", "--home", str(chosen.home / "mosquitto"), *ports]
         return ["-m", "infra.amqtt", "--keys", str(chosen.home / "keys" / "public.json"), *ports]
+
+    def _prosody(self) -> list[str]:
+        chosen = self._chosen
+        verify_url = f"{chosen.url}/api/v1/xmpp/verify"
+        place = ["--home", str(chosen.home / "prosody"), "--host", chosen.host, "--port", str(chosen.xmpp_port)]
+        return ["-m", "infra.prosody", *place, "--domain", settings.XMPP_DOMAIN, "--verify-url", verify_url]
 
     def _run(self, name: str, *arguments: str) -> Child:
         child = Child(name, arguments, self._environment, self._logs)

@@ -6,6 +6,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal, cast
 
+XMPP_DOMAIN = "telescope.localhost"
+"""Of one machine: no name that anybody could look up."""
+
 
 class SettingsError(Exception):
     """A setting is wrong; the text names it and what it may be."""
@@ -13,12 +16,13 @@ class SettingsError(Exception):
 
 @dataclass(frozen=True, slots=True)
 class Settings:
-    """Where things are. Ports follow ``port``: MQTT is the next one, MQTT over WebSocket the one after."""
+    """Where things are. Ports follow ``port``: MQTT is the next one, MQTT over WebSocket the one after, then XMPP."""
 
     home: Path
     port: int
     broker: Literal["amqtt", "mosquitto"]
     host: str = "127.0.0.1"
+    xmpp: bool = False
 
     @property
     def mqtt_port(self) -> int:
@@ -29,6 +33,11 @@ class Settings:
     def websocket_port(self) -> int:
         """MQTT over WebSocket."""
         return self.port + 2
+
+    @property
+    def xmpp_port(self) -> int:
+        """XMPP, where it is wanted."""
+        return self.port + 3
 
     @property
     def url(self) -> str:
@@ -44,6 +53,9 @@ class Settings:
             "TELESCOPE_MQTT_PORT": str(self.mqtt_port),
             "TELESCOPE_WEBSOCKET_PORT": str(self.websocket_port),
             "TELESCOPE_BROKER": self.broker,
+            "TELESCOPE_XMPP_DOMAIN": XMPP_DOMAIN if self.xmpp else "",
+            "TELESCOPE_XMPP_HOST": self.host,
+            "TELESCOPE_XMPP_PORT": str(self.xmpp_port),
             "PYTHONUNBUFFERED": "1",
         }
 
@@ -55,10 +67,13 @@ def read(environment: Mapping[str, str]) -> Settings:
         SettingsError: One is wrong.
     """
     port = environment.get("TELESCOPE_PORT", "8080")
-    if not port.isdecimal() or not 1 <= int(port) <= 65533:  # noqa: PLR2004 (two more ports follow)
-        raise SettingsError(f"TELESCOPE_PORT is '{port}'; it must be a number from 1 to 65533")
+    if not port.isdecimal() or not 1 <= int(port) <= 65532:  # noqa: PLR2004 (three more ports follow)
+        raise SettingsError(f"TELESCOPE_PORT is '{port}'; it must be a number from 1 to 65532")
     broker = environment.get("TELESCOPE_BROKER", "amqtt")
     if broker not in ("amqtt", "mosquitto"):
         raise SettingsError(f"TELESCOPE_BROKER is '{broker}'; it must be amqtt or mosquitto")
+    xmpp = environment.get("TELESCOPE_XMPP", "0")
+    if xmpp not in ("0", "1"):
+        raise SettingsError(f"TELESCOPE_XMPP is '{xmpp}'; it must be 1, for an XMPP server too, or 0")
     home = Path(environment.get("TELESCOPE_HOME", ".telescope")).expanduser().resolve()
-    return Settings(home=home, port=int(port), broker=cast("Literal['amqtt', 'mosquitto']", broker))
+    return Settings(home=home, port=int(port), broker=cast("Literal['amqtt', 'mosquitto']", broker), xmpp=xmpp == "1")
