@@ -85,6 +85,7 @@ class Conversation:
         self.look()
         self.movements()
         self.lease()
+        self.handover()
         self.actions()
         self.queue()
         self.fleet()
@@ -182,6 +183,39 @@ class Conversation:
         self.anna.get(path)
         self.robot.step()
 
+    def handover(self) -> None:
+        """From hand to hand: refused, withdrawn, accepted; then taken over, and given back."""
+        path = f"/devices/{self.robot.device}/lease"
+        requests = f"{path}/requests"
+        assert self.again.post(requests).status_code == 409
+        self.anna.post(path, {"wait_ms": 0})
+        asked = {"wait_ms": 0, "within_ms": 60_000}
+        first = self.again.post(requests, asked).json()["request"]["id"]
+        assert self.again.post(requests, asked).status_code == 200
+        assert self.anna.post(requests, asked).status_code == 409
+        assert self.bert.post(requests, asked).status_code == 404
+        self.again.post(requests, {"within_ms": 1})
+        self.robot.step()
+        self.anna.get(path)
+        assert self.again.post(f"{requests}/{first}/accept").status_code == 403
+        assert self.anna.post(f"{requests}/{first}/refuse").json()["outcome"] == "refused"
+        assert self.anna.post(f"{requests}/{first}/accept", {"wait_ms": 0}).status_code == 409
+        second = self.again.post(requests, asked).json()["request"]["id"]
+        self.again.delete(f"{requests}/{second}")
+        self.again.get(f"{requests}/{second}")
+        third = self.again.post(requests, asked).json()["request"]["id"]
+        given = self.anna.post(f"{requests}/{third}/accept", {"wait_ms": 0}).json()
+        self.robot.step()
+        assert self.again.get(path).json()["lease"]["epoch"] == given["epoch"]
+        assert self.again.delete(f"{requests}/{third}").status_code == 409
+        assert self.anna.get(f"{requests}/{first}").status_code == 404
+        self.anna.post(path, {"wait_ms": 0, "epoch": given["epoch"] - 1})
+        self.anna.post(path, {"take_over": True})
+        taken = self.anna.post(path, {"wait_ms": 0, "take_over": True, "reason": ODD[:6]}).json()
+        self.again.get(path)
+        assert self.anna.ask("DELETE", path, params={"epoch": taken["epoch"]}).status_code == 204
+        self.robot.step()
+
     def actions(self) -> None:
         device, asked = self.robot.device, {"request": MOVE}
         action = self.start(once="a/b#c? ü".encode().hex())
@@ -250,6 +284,11 @@ class Conversation:
 
         assert self.anna.post(f"/devices/{self.robot.device}/stop", {"reason": ODD[:6]}).json() == {"confirmed": False}
         self.robot.step()
+        (space,) = self.bert.get("/spaces").json()["items"]
+        assert self.anna.post(f"/spaces/{space['id']}/stop").status_code == 404
+        assert self.bert.post(f"/spaces/{space['id']}/stop").json() == {"items": []}
+        assert self.bert.post("/stop", {"reason": 1}).status_code == 422
+        assert self.bert.post("/stop").json() == {"items": []}
 
     def measure(self) -> None:
         device, robot = self.robot.device, self.robot

@@ -45,7 +45,7 @@ def pem(key: Any) -> str:
     return text.decode()
 
 
-def furnish(host: Host, site: Site, anna: Visitor, robot: PollingRobot) -> dict[str, Any]:
+def furnish(host: Host, site: Site, anna: Visitor, another: Visitor, robot: PollingRobot) -> dict[str, Any]:
     """Things that there are, for the hooks to name."""
     spare = [PollingRobot(site) for _ in range(2)]
     for each in spare:
@@ -66,6 +66,9 @@ def furnish(host: Host, site: Site, anna: Visitor, robot: PollingRobot) -> dict[
     faults = anna.get(f"/devices/{robot.device}/faults").json()["items"]
     streams = anna.get(f"/devices/{robot.device}/data").json()["items"]
     assert len(faults) == len(streams) == 1
+    held = robot.devices[-1]
+    anna.post(f"/devices/{held}/lease", {"lease_ms": 600_000})
+    request = another.post(f"/devices/{held}/lease/requests", {"within_ms": 120_000}).json()["request"]["id"]
     new = signing.generate()
     return {
         "token": anna.token,
@@ -82,6 +85,8 @@ def furnish(host: Host, site: Site, anna: Visitor, robot: PollingRobot) -> dict[
             "name": ["mine", "wave"],
             "stream": [each["name"] for each in streams],
             "fault": [each["id"] for each in faults],
+            "request_id": [request],
+            "space": [robot.space],
         },
     }
 
@@ -92,7 +97,8 @@ def run(host: Host, home: Path, *options: str) -> None:
         anna = sign_in(host, site, home, "anna")
         robot.pair(anna)
         robot.connect()
-        world = furnish(host, site, anna, robot) | {"spare_token": sign_in(host, site, home, "anna").token}
+        another = sign_in(host, site, home, "anna")
+        world = furnish(host, site, anna, another, robot) | {"spare_token": another.token}
         (home / "world.json").write_text(json.dumps(world))
         done = subprocess.run(
             [

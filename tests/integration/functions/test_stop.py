@@ -1,10 +1,14 @@
 """Stop and its reset: two ways out, no lease asked for."""
 
+from collections.abc import Callable, Iterator
+from typing import Any
+
 import pytest
 
 from device_agent.protocol.messages import ResetStop, StopDevice
 from tests.support.brokers import BROKERS, wait_until
-from tests.support.cloud import Cloud, Person, Robot, problem
+from tests.support.cloud import Cloud, Person, Robot, paired, problem
+from tests.support.knife import elsewhere
 
 Pair = tuple[Person, Robot]
 
@@ -65,3 +69,81 @@ def test_a_reason_has_at_most_2000_characters(pair: Pair) -> None:
     problem(anna.post(f"/devices/{robot.device}/stop", {"reason": "x" * 2001}), 422, "invalid")
     assert robot.stops == []
     assert anna.post(f"/devices/{robot.device}/stop", {"reason": "🛑" * 2000}).json() == {"confirmed": True}
+
+
+@pytest.fixture
+def two_rooms(cloud: Cloud) -> Iterator[tuple[Person, Robot, Robot, str]]:
+    """Anna with two arms in her first space, and one in the lab."""
+    with paired(cloud, "anna", "left", "right") as (anna, here), cloud.robot() as there:
+        lab = anna.post("/spaces", {"name": "Lab"}).json()["id"]
+        there.pair(anna)
+        assert anna.put(f"/agents/{there.id}/space", {"space": lab}).status_code == 200
+        there.space = lab
+        there.connect()
+        yield anna, here, there, lab
+
+
+def stopped(answer: Any) -> dict[str, bool]:
+    return {item["device"]: item["confirmed"] for item in answer.json()["items"]}
+
+
+def test_everything_in_a_space_is_stopped_and_nothing_elsewhere(two_rooms: tuple[Person, Robot, Robot, str]) -> None:
+    anna, here, there, lab = two_rooms
+    answer = anna.post(f"/spaces/{here.space}/stop", {"reason": "smoke"})
+    assert (answer.status_code, stopped(answer)) == (200, dict.fromkeys(here.devices, True))
+    assert sorted(command.device for command in here.heard(StopDevice)) == ["left", "right"]
+    assert {stop.reason for stop in here.stops} == {"smoke"}
+    assert not there.heard(StopDevice)
+    assert not there.stops
+    assert stopped(anna.post(f"/spaces/{lab}/stop")) == {there.device: True}
+    problem(anna.post("/spaces/nowhere/stop"), 404, "space-unknown")
+
+
+def test_everything_that_one_may_operate_is_stopped_and_what_is_anothers_is_not(
+    cloud: Cloud, two_rooms: tuple[Person, Robot, Robot, str]
+) -> None:
+    anna, here, there, _ = two_rooms
+    with paired(cloud, "bert") as (bert, other):
+        answer = anna.post("/stop")
+        assert (answer.status_code, stopped(answer)) == (200, dict.fromkeys([*here.devices, there.device], True))
+        assert not other.commands
+        assert not other.stops
+        assert stopped(bert.post("/stop")) == {other.device: True}
+    assert cloud.sign_in("nobody").post("/stop").json() == {"items": []}
+
+
+def test_one_that_is_dead_keeps_no_other_waiting_and_is_named(two_rooms: tuple[Person, Robot, Robot, str]) -> None:
+    anna, here, there, _ = two_rooms
+    waiting = [anna.start(here.device, policy="queue", wait_ms=0).json()["id"] for _ in range(3)]
+    there.silent = True
+    asking = anna.begin("POST", "/stop")
+    wait_until(lambda: len(here.heard(StopDevice)) == 2, "the others' Stop")
+    answer = asking()
+    assert answer.status_code == 207
+    assert stopped(answer) == {here.devices[0]: True, here.devices[1]: True, there.device: False}
+    assert len(there.stops) >= 3, "repeated until its time is over"
+    assert [anna.action(action)["status"] for action in waiting[1:]] == ["cancelled"] * 2
+    events = anna.get(f"/devices/{there.device}/events").json()["items"]
+    assert [item["kind"] for item in events if item["kind"].startswith("stop")] == ["stop-ordered"]
+
+
+def test_without_a_broker_each_says_so(open_cloud: Callable[..., Cloud], pair: Pair) -> None:
+    anna, robot = pair
+    alone = elsewhere(open_cloud(at=None), anna)
+    answer = alone.post("/stop")
+    assert answer.status_code == 207
+    (item,) = answer.json()["items"]
+    assert (item["device"], item["status"], item["confirmed"]) == (robot.device, 503, False)
+    assert item["problem"]["type"] == "/problems/broker-unavailable"
+
+
+def test_stop_and_its_reset_are_told_with_who_did_it(pair: Pair) -> None:
+    anna, robot = pair
+    anna.take(robot.device)
+    anna.post(f"/devices/{robot.device}/stop", {"reason": "smoke"})
+    anna.post(f"/devices/{robot.device}/stop/reset")
+    events = anna.get(f"/devices/{robot.device}/events").json()["items"]
+    reset, stop, _ = events
+    assert (reset["kind"], reset["data"]["by"], reset["data"]["from"]) == ("stop-reset-ordered", "anna", "anna")
+    assert (stop["kind"], stop["data"]) == ("stop-ordered", {"by": "anna", "reason": "smoke"})
+    assert stop["severity"] == "warning"

@@ -37,6 +37,8 @@ def test_to_ask_changes_nothing_about_the_lease() -> None:
     assert how(asked, START + 9_999) == "open"
     assert how(asked, START + 10_000) == "lapsed"
     assert ask(asked) is asked
+    short = lease.renew(HELD, ANNA, epoch=1, lease_ms=5_000, now_ms=START)
+    assert how(ask(short), START + 5_000) == "ended", "with the lease that it asks for"
     assert kinds(HELD, asked) == [Fact.REQUESTED]
 
 
