@@ -110,7 +110,7 @@ def _drop_privileges() -> None:
         _control(_AMBIENT, _AMBIENT_CLEAR_ALL)
     _clear_capabilities()
     _control(_SET_DUMPABLE, 0)
-    _control(_SET_NO_NEW_PRIVILEGES, 1)
+    give_up_privileges()
 
 
 def _clear_capabilities() -> None:
@@ -127,6 +127,11 @@ def _lock(filter_: seccomp.Filter | None) -> None:
     filter_.load()
     if not seccomp.in_force():
         raise OSError("the filter does not hold")
+
+
+def give_up_privileges() -> None:
+    """Gain none from here on: what Landlock and seccomp ask for."""
+    _control(_SET_NO_NEW_PRIVILEGES, 1)
 
 
 def _control(option: int, value: int) -> None:

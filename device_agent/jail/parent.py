@@ -16,6 +16,7 @@ import signal
 import socket
 import sys
 import time
+from collections.abc import Callable
 from typing import Any, NoReturn
 
 from device_agent.jail import confine, landlock, modules, script, seccomp
@@ -50,8 +51,22 @@ class _Parent:
             self._filter = seccomp.build()
         except (ImportError, RuntimeError, OSError) as error:
             self._missing[SECCOMP] = str(error)
-        if not landlock.abi():
-            self._missing[LANDLOCK] = "the kernel has none"
+        self._probe(LANDLOCK, landlock.restrict)
+        if self._filter is not None:
+            self._probe(SECCOMP, self._filter.load)
+
+    def _probe(self, layer: str, apply: Callable[[], None]) -> None:
+        """Put a layer on a process that is for nothing else: what works once will for scripts."""
+        pid = os.fork()
+        if pid == 0:
+            try:
+                confine.give_up_privileges()
+                apply()
+                os._exit(0)
+            finally:
+                os._exit(1)
+        if os.waitstatus_to_exitcode(os.waitpid(pid, 0)[1]) != 0:
+            self._missing[layer] = f"the kernel does not have it; Landlock ABI {landlock.abi()}"
 
     def serve(self) -> None:
         """Introduce, then answer one request after another."""

@@ -23,6 +23,8 @@ _MAIN = Path(__file__).with_name("__main__.py")
 _START_S = 60.0
 """A cold parent imports NumPy: 0.3 s on an idle machine."""
 _ANSWER_S = 5.0
+_DEAD_S = 5.0
+"""More than any process takes to die, unless the kernel itself is stuck."""
 _ENVIRONMENT = {
     "LANG": "C.UTF-8",
     # One thread: a second could not be started in a script's process, and would not survive the fork.
@@ -256,6 +258,8 @@ class _Inmate:
         """See ``Inmate``."""
         self.kill()
         self.link.close()
+        if self._descriptor >= 0 and not self.wait(_DEAD_S):
+            _log.error("the process of a script does not die")
         with self._lock:
             if self._descriptor >= 0:
                 os.close(self._descriptor)

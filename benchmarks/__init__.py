@@ -1,0 +1,1 @@
+"""Measurements that a person runs; the page of each figure says which."""
