@@ -112,6 +112,11 @@ class Bench:
             jail=warm_jail(),
         )
 
+    def stop(self) -> None:
+        self.device.stop()
+        self.outbox.stop()
+        self.journal.close()
+
     def publish(
         self,
         topic: str,
@@ -203,9 +208,7 @@ def bench(tmp_path: Path):
     bench.device.start()
     bench.device.link_changed(True)
     yield bench
-    bench.device.stop()
-    bench.outbox.stop()
-    bench.journal.close()
+    bench.stop()
 
 
 def test_it_introduces_itself_when_the_link_comes_up(bench: Bench) -> None:
@@ -317,8 +320,7 @@ def test_stop_needs_no_lease_and_survives_a_restart(bench: Bench, tmp_path: Path
     eventually(lambda: again.telemetry().mode is Mode.STOPPED)
     again.end(again.command(ResetStop(), epoch=3))
     assert again.end(again.command(MoveJoints(position_rad={"elbow": 0.1}), epoch=4)).status is AckStatus.DONE
-    again.device.stop()
-    again.journal.close()
+    again.stop()
 
 
 def test_a_signed_stop_is_obeyed_however_late(bench: Bench) -> None:
@@ -402,8 +404,7 @@ def test_a_lease_from_before_a_restart_is_not_obeyed(bench: Bench, tmp_path: Pat
     assert ack.reason is not None
     assert ack.reason.code == "lease_ended"
     assert again.end(again.command(GrantLease(holder="ann", lease_ms=60_000), epoch=5)).status is AckStatus.DONE
-    again.device.stop()
-    again.journal.close()
+    again.stop()
 
 
 def test_garbage_is_counted_and_harms_nothing(bench: Bench) -> None:
@@ -458,8 +459,7 @@ def test_nothing_gets_past_stop(bench: Bench, tmp_path: Path) -> None:
     again.key = bench.key
     again.device.start()
     eventually(lambda: again.telemetry().mode is Mode.STOPPED)
-    again.device.stop()
-    again.journal.close()
+    again.stop()
     assert bench.driver.position == again.driver.position == (0.0, 0.0)
 
 
