@@ -9,7 +9,6 @@ import json
 import os
 import random
 import sys
-import tempfile
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -79,12 +78,12 @@ def main(folder: str, names: str, *options: str) -> int:
                 output = os.open(Path(folder) / f"{name}{start}", os.O_WRONLY | os.O_CREAT)
                 os.dup2(output, sys.stdout.fileno())
                 os.dup2(output, sys.stderr.fileno())
-                _fuzz(name, options, with_examples=not start)
+                _fuzz(Path(folder), name, options, with_examples=not start)
             worst = max(worst, abs(os.waitstatus_to_exitcode(os.waitpid(child, 0)[1])))
     return worst
 
 
-def _fuzz(name: str, options: tuple[str, ...], *, with_examples: bool) -> None:
+def _fuzz(folder: Path, name: str, options: tuple[str, ...], *, with_examples: bool) -> None:
     """Never returns: libFuzzer ends the process."""
     from tests.fuzz.targets import TARGETS
 
@@ -96,15 +95,15 @@ def _fuzz(name: str, options: tuple[str, ...], *, with_examples: bool) -> None:
         found = reshape(data, prefix, chance) if chance.random() < _RESHAPED else None
         return found if found is not None and len(found) <= most else bytes(atheris.Mutate(data, most))
 
-    with tempfile.TemporaryDirectory(prefix="ts-corpus-") as corpus:
-        for number, seed in enumerate(target.seeds if with_examples else ()):
-            (Path(corpus) / str(number)).write_bytes(seed)
-        longest = max(4096, *(2 * len(seed) for seed in target.seeds))
-        arguments = [name, corpus, f"-max_len={longest}", "-timeout=20", "-rss_limit_mb=2048", "-artifact_prefix=/tmp/"]
-        atheris.Setup(
-            [*arguments, *(options if with_examples else ("-runs=1",))], target.try_out, custom_mutator=mutate
-        )
-        atheris.Fuzz()
+    corpus = folder / f"{name}-corpus{'' if with_examples else _EMPTY}"
+    corpus.mkdir()
+    for number, seed in enumerate(target.seeds if with_examples else ()):
+        (corpus / str(number)).write_bytes(seed)
+    longest = max(4096, *(2 * len(seed) for seed in target.seeds))
+    arguments = [name, str(corpus), f"-max_len={longest}", "-timeout=20", "-rss_limit_mb=2048"]
+    arguments += ["-artifact_prefix=/tmp/", *(options if with_examples else ("-runs=1",))]
+    atheris.Setup(arguments, target.try_out, custom_mutator=mutate)
+    atheris.Fuzz()
 
 
 if __name__ == "__main__":

@@ -4,8 +4,10 @@ A target is given bytes. It lets nothing out but what the parser documents, look
 finite, and that what was read, written and read again is the same.
 """
 
+import atexit
 import contextlib
 import math
+import shutil
 import tempfile
 from collections.abc import AsyncIterator, Callable
 from dataclasses import dataclass
@@ -193,6 +195,7 @@ def _stanza(data: bytes) -> None:
 
 
 _FOLDER = Path(tempfile.mkdtemp(prefix="ts-fuzz-"))
+atexit.register(shutil.rmtree, _FOLDER, ignore_errors=True)
 
 
 def _home(data: bytes) -> None:
