@@ -1,5 +1,6 @@
 """Runs one action at a time on one device, in a thread of its own, and reports each step of it as an ack."""
 
+import logging
 import threading
 import time
 from collections.abc import Callable
@@ -18,6 +19,7 @@ Order = RunMovement | MoveJoints
 """What is an action."""
 
 _TELL_EVERY_S = 0.2
+_log = logging.getLogger(__name__)
 
 
 class Executor:
@@ -186,13 +188,16 @@ class _Run:
 
     def play(self) -> None:
         """Do it; returns when it is over, however it ended."""
-        self._report(self.command.id, AckStatus.STARTED)
         try:
+            self._report(self.command.id, AckStatus.STARTED)
             self._result = self._activity.run()
         except Refused as refused:
             self.end(AckStatus.FAILED, refused)
         except ScriptFailed as failed:
             self.end(AckStatus.FAILED, Refused("script_failed", str(failed)))
+        except Exception as error:  # noqa: BLE001 (whatever it was: what was not done must not be told as done)
+            _log.exception("action %s", self.command.id)
+            self.end(AckStatus.FAILED, Refused("internal", f"internal error: {error}; look at the agent's log"))
 
     def end(self, status: AckStatus, why: Refused) -> None:
         """Bring it to an end, from any thread; the first reason stays."""

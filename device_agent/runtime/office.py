@@ -170,9 +170,17 @@ class Office:
             self._write_down(command.epoch)
             self._carry_out(command)
         except Refused as refused:
-            status = AckStatus.EXPIRED if refused.code == "expired" else AckStatus.FAILED
-            self._voice.report(command.id, status, reason=Reason(code=refused.code, message=refused.message))
-            self._refuse(refused.code, refused.message, command)
+            self._end_refused(command, refused)
+        except JournalError:
+            raise
+        except Exception as error:  # noqa: BLE001 (whoever asked must hear an end of it)
+            _log.exception("%s: command %s", self._name, command.id)
+            self._end_refused(command, Refused("internal", f"internal error: {error}; look at the agent's log"))
+
+    def _end_refused(self, command: Command, refused: Refused) -> None:
+        status = AckStatus.EXPIRED if refused.code == "expired" else AckStatus.FAILED
+        self._voice.report(command.id, status, reason=Reason(code=refused.code, message=refused.message[:2000]))
+        self._refuse(refused.code, refused.message[:2000], command)
 
     def _refuse(self, code: str, message: str, command: Command | None = None) -> None:
         _log.warning("%s: command %s refused: %s", self._name, command.id if command else "", message)
