@@ -204,6 +204,7 @@ def _xmpp(wiring: Wiring) -> Transport:
         presence_topic=wiring.presence_topic,
         next_session=wiring.next_session,
         software=SOFTWARE,
+        listen=wiring.listen,
         quiet=wiring.quiet,
     )
 

@@ -170,11 +170,11 @@ def service_grant(*, client_id: str, token_id: str, lifetime_s: float) -> Grant:
 
 
 def speaker_grant(*, client_id: str, token_id: str, lifetime_s: float) -> Grant:
-    """What a program may do that speaks another protocol for agents: hear what is addressed to them, setpoints too.
+    """What a program may do that speaks another protocol for agents: hear what they might, setpoints too.
 
     What they answer it says as the functions do.
     """
-    kinds = (topics.CMD, topics.STOP, f"{topics.CTL}/+")
+    kinds = (topics.CMD, topics.STOP, f"{topics.CTL}/+", f"{topics.TELE}/+")
     return Grant(
         principal="service:speaker",
         client_id=client_id,

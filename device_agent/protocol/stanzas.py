@@ -13,6 +13,7 @@ with nobody else.
 import base64
 import binascii
 import re
+from collections.abc import Iterable
 from typing import NamedTuple
 from xml.etree.ElementTree import Element, SubElement, tostring
 
@@ -33,6 +34,7 @@ MAX_STANZA_BYTES = 192 * 1024
 """The longest payload in base64, and room for what is around it."""
 MAX_TOPIC = 400
 MAX_WHY = 400
+MAX_LISTEN = 64
 
 _ELEMENT = f"{{{NAMESPACE}}}m"
 _UNFIT = re.compile("[^\\t\\n -\ud7ff\ue000-\ufffd\U00010000-\U0010ffff]")
@@ -56,7 +58,9 @@ class Refused(NamedTuple):
     final: bool
 
 
-def message(to: str, topic: str, payload: bytes, *, receipt: str = "", body: str = "") -> str:
+def message(
+    to: str, topic: str, payload: bytes, *, receipt: str = "", body: str = "", listen: Iterable[str] = ()
+) -> str:
     """One message as the text of its stanza.
 
     Args:
@@ -65,6 +69,7 @@ def message(to: str, topic: str, payload: bytes, *, receipt: str = "", body: str
         payload: Any bytes; those that XML cannot carry travel as base64.
         receipt: An id, where a receipt is wanted.
         body: What an ordinary client shows.
+        listen: With an agent's greeting: topics of the space's other agents that it wants to hear.
     """
     stanza = Element("message", {"to": to})
     if receipt:
@@ -72,6 +77,8 @@ def message(to: str, topic: str, payload: bytes, *, receipt: str = "", body: str
         SubElement(stanza, "request", {"xmlns": RECEIPTS})
     if body:
         SubElement(stanza, "body").text = "".join(letter for letter in body if not _UNFIT.match(letter))
+    for wanted in listen:
+        SubElement(stanza, "listen", {"xmlns": NAMESPACE, "topic": wanted})
     element = SubElement(stanza, "m", {"xmlns": NAMESPACE, "topic": topic})
     element.text = _plain(payload)
     if element.text is None:
@@ -149,6 +156,12 @@ def read(stanza: Element) -> Told | None:
     if message_id and not _ID.match(message_id):
         raise ProtocolError("the id of a message that wants a receipt is letters, digits, _, . and -, 64 at most")
     return Told(topic, payload, message_id)
+
+
+def listened(stanza: Element) -> tuple[str, ...]:
+    """What somebody who greets wants to hear; what is more than ``MAX_LISTEN`` is left out."""
+    wanted = (element.get("topic", "") for element in stanza.findall(f"{{{NAMESPACE}}}listen"))
+    return tuple(topic for topic in wanted if len(topic) <= MAX_TOPIC)[:MAX_LISTEN]
 
 
 def received(stanza: Element) -> str | None:

@@ -1,6 +1,6 @@
 """What is addressed to agents that a program speaks for, as it passes on the broker: quick, not sure."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Protocol
 
 Hear = Callable[[str, bytes], None]
@@ -17,8 +17,8 @@ class Orders(Protocol):
     async def run(self, hear: Hear) -> None:
         """Deliver until cancelled; reconnects for ever."""
 
-    async def add(self, space: str, agent: str) -> None:
-        """Hear what is for this agent too. Adding twice is adding once."""
+    async def add(self, space: str, agent: str, listen: Sequence[str] = ()) -> None:
+        """Hear what is for this agent too, and the topics that it listens to, instead of those before."""
 
     def drop(self, space: str, agent: str) -> None:
         """Hear it no longer."""

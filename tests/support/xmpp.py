@@ -215,6 +215,8 @@ class XmppRobot(Robot):
     Attributes:
         setpoints: What came on ``ctl``, as it came.
         changes: What the transport has told of its link.
+        listen: Topics of others that it wants to hear, and
+        overheard: what came of them.
     """
 
     def __init__(self, place: Any, names: tuple[str, ...]) -> None:
@@ -222,6 +224,8 @@ class XmppRobot(Robot):
         self.setpoints: list[tuple[str, bytes]] = []
         self.changes: list[bool] = []
         self.refused: list[str] = []
+        self.listen: tuple[str, ...] = ()
+        self.overheard: list[tuple[str, bytes]] = []
 
     def introduction(self, **changes: Any) -> dict[str, Any]:
         return super().introduction(**{"transport": "xmpp", **changes})
@@ -249,6 +253,8 @@ class XmppRobot(Robot):
     def obey(self, message: Message) -> None:
         if "/ctl/" in message.topic:
             self.setpoints.append((message.topic, message.payload))
+        if "/tele/" in message.topic:
+            self.overheard.append((message.topic, message.payload))
         super().obey(message)
 
 
@@ -261,6 +267,7 @@ class _Line:
             presence_topic=f"ts/v1/{robot.space}/{robot.id}/conn",
             next_session=robot.next_session,
             software="toy 1",
+            listen=robot.listen,
         )
         self.transport.start(
             lambda topic, payload: robot.obey(Message(topic, payload, 1, retain=False)), robot.changes.append

@@ -62,6 +62,7 @@ class XmppTransport:
         presence_topic: Where presence goes.
         next_session: The next session number, rising across restarts.
         software: Name and version, for presence.
+        listen: Topics of the space's other agents to hear as well.
         quiet: Whether a short break of the link would disturb nothing.
     """
 
@@ -72,12 +73,14 @@ class XmppTransport:
         presence_topic: str,
         next_session: Callable[[], int],
         software: str,
+        listen: tuple[str, ...] = (),
         quiet: Callable[[], bool] = lambda: True,
     ) -> None:
         self._access = access
         self._presence_topic = presence_topic
         self._next_session = next_session
         self._software = software
+        self._listen = listen
         self._quiet = quiet
         self._stopping = threading.Event()
         self._thread: threading.Thread | None = None
@@ -175,7 +178,7 @@ class XmppTransport:
             return False
         link.peer = random.choice(sorted(link.present))  # noqa: S311 (spreads agents, hides nothing)
         link.session = self._next_session()
-        await link.tell(self._presence_topic, self._presence(link, online=True), _CONFIRM_S)
+        await link.tell(self._presence_topic, self._presence(link, online=True), _CONFIRM_S, listen=self._listen)
         link.up = link.peer is not None
         link.left = False
         return link.up
@@ -236,7 +239,7 @@ class _Link:
             return False
         return True
 
-    async def tell(self, topic: str, payload: bytes, within_s: float) -> None:
+    async def tell(self, topic: str, payload: bytes, within_s: float, *, listen: tuple[str, ...] = ()) -> None:
         """Send a message of our own, and wait until it is confirmed.
 
         Raises:
@@ -248,7 +251,7 @@ class _Link:
             self._number += 1
             number = str(self._number)
         answer = self._answers[number] = self._loop.create_future()
-        self.stream.send(stanzas.message(self.peer, topic, payload, receipt=number))
+        self.stream.send(stanzas.message(self.peer, topic, payload, receipt=number, listen=listen))
         try:
             async with asyncio.timeout(within_s):
                 why = await answer

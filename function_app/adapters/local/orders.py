@@ -2,7 +2,7 @@
 
 import asyncio
 import secrets
-from collections.abc import Awaitable, Callable
+from collections.abc import Awaitable, Callable, Sequence
 
 from paho.mqtt.client import MQTTMessage
 
@@ -20,6 +20,7 @@ class MqttOrders:
 
     def __init__(self, *, host: str, port: int, access: BrokerAccess) -> None:
         self._hear: Hear | None = None
+        self._wanted: dict[tuple[str, str], tuple[str, ...]] = {}
         self._link = MqttLink(host=host, port=port, credentials=_credentials(access), receive=self._arrived)
 
     @property
@@ -36,13 +37,21 @@ class MqttOrders:
         finally:
             await self._link.close()
 
-    async def add(self, space: str, agent: str) -> None:
+    async def add(self, space: str, agent: str, listen: Sequence[str] = ()) -> None:
         """See ``Orders``."""
-        await self._link.hear(_patterns(space, agent))
+        self.drop(space, agent)
+        wanted = (*_patterns(space, agent), *listen)
+        fresh = [pattern for pattern in dict.fromkeys(wanted) if not self._heard(pattern)]
+        self._wanted[space, agent] = wanted
+        await self._link.hear(fresh)
 
     def drop(self, space: str, agent: str) -> None:
         """See ``Orders``."""
-        self._link.unhear(_patterns(space, agent))
+        gone = self._wanted.pop((space, agent), ())
+        self._link.unhear([pattern for pattern in gone if not self._heard(pattern)])
+
+    def _heard(self, pattern: str) -> bool:
+        return any(pattern in wanted for wanted in self._wanted.values())
 
     def _arrived(self, message: MQTTMessage) -> None:
         # An order that a broker kept is not an order of now.

@@ -3,7 +3,7 @@
 import asyncio
 import contextlib
 import logging
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 from device_agent.protocol import codec, stanzas, topics
 from device_agent.protocol.errors import ProtocolError
@@ -46,6 +46,7 @@ class Served:
         jid: Its whole JID.
         greeting: Its own presence message, and
         greeted: the same as it came.
+        listen: Topics of its space's other agents that it wants to hear.
         broker_up: Whether orders come by the broker now.
         measured: Given each measurement that was passed on.
         told: Given each other message once it is stored.
@@ -60,6 +61,7 @@ class Served:
         jid: str,
         greeting: Presence,
         greeted: Told,
+        listen: Sequence[str],
         broker_up: Callable[[], bool],
         measured: Callable[[Arrived], None],
         told: Callable[[Agent, Told], None],
@@ -68,6 +70,7 @@ class Served:
         self.jid = jid
         self.greeting = greeting
         self.greeted = greeted
+        self.listen = frozenset(listen)
         self._functions = functions
         self._line = line
         self._broker_up = broker_up
@@ -94,7 +97,7 @@ class Served:
 
     def order(self, topic: str, payload: bytes) -> None:
         """Something for it came by the broker."""
-        if f"/{topics.CTL}/" in topic and self._line.congested():
+        if (f"/{topics.CTL}/" in topic or f"/{topics.TELE}/" in topic) and self._line.congested():
             return  # the next one is newer
         self._line.send(stanzas.message(self.jid, topic, payload))
 

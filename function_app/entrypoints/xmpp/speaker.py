@@ -88,7 +88,7 @@ class Speaker:
         served = self._served.get(user)
         greeting = _greeting(told, user)
         if greeting is not None and (served is None or served.greeting.session != greeting.session):
-            self._start(self._greeted(user, jid, told, greeting))
+            self._start(self._greeted(user, jid, told, greeting, stanzas.listened(stanza)))
         elif served is not None and served.jid == jid:
             served.say(told)
         elif told.id:
@@ -122,6 +122,11 @@ class Speaker:
     def order(self, topic: str, payload: bytes) -> None:
         """Something came by the broker."""
         parts = topic.split("/")
+        if len(parts) > 5 and parts[5] == topics.TELE:  # noqa: PLR2004 (ts/v1/space/agent/device/tele/…)
+            for listener in self._served.values():
+                if topic in listener.listen:
+                    listener.order(topic, payload)
+            return
         served = self._served.get(parts[3]) if len(parts) > 4 else None  # noqa: PLR2004 (ts/v1/space/agent/…)
         if served is None or parts[2] != served.agent.space:
             return
@@ -148,7 +153,7 @@ class Speaker:
         found = stanzas.user_at(jid, self._line.domain)
         return found[0] if found is not None and found[1] and len(found[0]) == AGENT_LENGTH else None
 
-    async def _greeted(self, user: str, jid: str, told: Told, greeting: Presence) -> None:
+    async def _greeted(self, user: str, jid: str, told: Told, greeting: Presence, wanted: tuple[str, ...]) -> None:
         try:
             agent = await self._known(user)
         except (StoreError, Problem) as error:
@@ -165,6 +170,7 @@ class Speaker:
             return
         if before is not None:
             before.leave(replaced=True)
+        listen = [topic for topic in wanted if _may_hear(agent, topic)]
         served = self._served[user] = Served(
             self._functions,
             self._line,
@@ -172,12 +178,13 @@ class Speaker:
             jid=jid,
             greeting=greeting,
             greeted=told._replace(id=""),
+            listen=listen,
             broker_up=lambda: self._orders.up,
             measured=self._measured,
             told=self._show,
         )
         served.say(told)
-        await self._orders.add(agent.space or "", agent.id)
+        await self._orders.add(agent.space or "", agent.id, listen)
         self._start(self._serve(served))
 
     async def _known(self, user: str) -> Agent | None:
@@ -255,6 +262,15 @@ def _greeting(told: Told, user: str) -> Presence | None:
     except ProtocolError:
         return None
     return said if said.online else None
+
+
+def _may_hear(agent: Agent, topic: str) -> bool:
+    """What any agent may hear: what its space measures."""
+    try:
+        parsed = topics.parse(topic)
+    except ProtocolError:
+        return False
+    return parsed.space == agent.space and parsed.kind == topics.TELE
 
 
 def _unfit(agent: Agent | None, told: Told) -> str | None:

@@ -132,3 +132,27 @@ def test_a_command_is_told_again_until_it_is_answered(anna: Person, robot: XmppR
     robot.silent = False
     robot.report(action, AckStatus.STARTED)
     assert anna.action(action, wait_ms=10_000, wait_for="started")["status"] == "started"
+
+
+def test_it_hears_what_its_space_measures_where_it_asks_for_it_and_nothing_of_another(
+    site: XmppSite, broker: RunningBroker, anna: Person
+) -> None:
+    bert = site.cloud.sign_in("bert")
+    with site.robot() as robot, site.robot() as eye, site.robot() as foreign:
+        robot.pair(anna)
+        eye.pair(anna)
+        foreign.pair(bert)
+
+        def tele(of: XmppRobot, stream: str) -> str:
+            return topics.device(of.space, of.id, "arm", topics.TELE, stream)
+
+        robot.listen = (tele(eye, "motion"), tele(foreign, "motion"), robot.topic(topics.STATE), "ts/v1/+/+/+/tele/+")
+        robot.connect()
+        with site.watcher(broker) as someone:
+            for of in (foreign, eye):
+                someone.publish(tele(of, "motion"), b'{"of": "%s"}' % of.id.encode(), qos=0)
+                someone.publish(tele(of, "warmth"), b"{}", qos=0)
+            wait_until(lambda: robot.overheard, "the measurement")
+            someone.publish(tele(eye, "motion"), b"last", qos=0)
+            wait_until(lambda: robot.overheard[-1][1] == b"last", "the last measurement")
+        assert {topic for topic, _ in robot.overheard} == {tele(eye, "motion")}

@@ -86,3 +86,10 @@ def test_a_foreign_address_is_nobody(jid: str) -> None:
 
 def test_an_address_of_this_server_is_taken_apart() -> None:
     assert stanzas.user_at("abc@lab/x@y/z", "lab") == ("abc", "x@y/z")
+
+
+def test_a_greeting_says_what_it_wants_to_hear_and_no_more_than_is_heard_to() -> None:
+    wanted = [f"ts/v1/lab/a/b/tele/{number}" for number in range(stanzas.MAX_LISTEN + 1)]
+    stanza = XML(stanzas.message("a@b/c", TOPIC, b"{}", receipt="1", listen=["x" * 401, *wanted]))
+    assert stanzas.listened(stanza) == tuple(wanted[: stanzas.MAX_LISTEN])
+    assert stanzas.read(stanza) == Told(TOPIC, b"{}", "1")
