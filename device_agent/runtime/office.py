@@ -3,11 +3,13 @@
 The control loop never waits for disk or network; this thread does.
 """
 
+import contextlib
 import logging
 import queue
 import threading
 import time
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
+from functools import partial
 
 from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PublicKey
 
@@ -22,12 +24,10 @@ from device_agent.protocol.messages import (
     Command,
     DropRequest,
     GrantLease,
-    MoveJoints,
     Reason,
     ReleaseLease,
     ResetStop,
     Restriction,
-    RunMovement,
     StopDevice,
     StopLatch,
     Twin,
@@ -120,30 +120,39 @@ class Office:
 
     def _run(self) -> None:
         while not self._stopping.is_set():
-            try:
+            with contextlib.suppress(queue.Empty):
                 payload = self._commands.get(timeout=0.1)
-            except queue.Empty:
-                payload = None
-            try:
-                if payload is not None:
-                    self._obey(payload)
-                self._keep()
-                if self._introduce.is_set():
-                    self._introduce.clear()
-                    self._voice.introduce(self._twin)
-                self._voice.show(self._condition())
-                self._tell(time.monotonic())
-            except JournalError as error:
-                _log.error("%s: %s", self._name, error)
-                happened = Happened(EventKind.JOURNAL_FAILED, str(error), "error")
-                self._audit.refused(happened, code="journal", now_s=time.monotonic())
-            except Exception:  # noqa: BLE001 (one bad command must not end the office)
-                _log.exception("%s: command", self._name)
-        self._keep()
-        self._tell(float("inf"))  # also what a flood has still to say
+                self._guarded(partial(self._obey, payload))
+            # Each by itself: with a full disk, what is shown and told must go on.
+            for step in (self._keep, self._show, self._tell):
+                self._guarded(step)
+        self._guarded(self._keep)
+        self._guarded(partial(self._tell, last=True))
 
-    def _tell(self, now_s: float) -> None:
-        for happened in self._audit.take(now_s):
+    def _guarded(self, step: Callable[[], None]) -> None:
+        """One bad command, or a disk that is full, must not end the office."""
+        try:
+            step()
+        except JournalError as error:
+            self._journal_failed(error)
+        except Exception:  # noqa: BLE001 (see above)
+            _log.exception("%s: office", self._name)
+
+    def _journal_failed(self, error: JournalError) -> None:
+        happened = Happened(EventKind.JOURNAL_FAILED, str(error), "error")
+        self._audit.refused(happened, code="journal", now_s=time.monotonic())
+
+    def _show(self) -> None:
+        if self._introduce.is_set():
+            self._introduce.clear()
+            self._voice.introduce(self._twin)
+        self._voice.show(self._condition())
+
+    def _tell(self, *, last: bool = False) -> None:
+        """Tell what happened; at the last also what a flood has still to say."""
+        for happened in self._audit.take(float("inf") if last else time.monotonic()):
+            if happened.severity == "error":
+                _log.error("%s: %s", self._name, happened.message)
             self._voice.event(happened)
 
     # ------------------------------------------------------------ one command
@@ -234,7 +243,7 @@ class Office:
                 _log.warning("%s: Stop reset by %s", self._name, command.who)
             case CancelAction(action=action):
                 self._executor.cancel(action, command.who)
-            case RunMovement() | MoveJoints() as order:
+            case order:  # an action
                 # Journalled as accepted before it begins: after a crash here it is ended, never run again.
                 self._voice.report(command.id, AckStatus.ACCEPTED)
                 self._executor.start(command, order)
@@ -251,8 +260,12 @@ class Office:
         if self._controller.changed.is_set():
             self._controller.changed.clear()
             epoch, burned = self._controller.epochs
-            self._journal.save_epoch(self._name, epoch=epoch, burned=burned)
-            self._journal.save_latch(self._name, self._controller.latch)
+            try:
+                self._journal.save_epoch(self._name, epoch=epoch, burned=burned)
+                self._journal.save_latch(self._name, self._controller.latch)
+            except JournalError:
+                self._controller.changed.set()  # still to be written, as soon as that goes again
+                raise
 
     def _condition(self) -> Condition:
         now_s = time.monotonic()

@@ -40,6 +40,7 @@ from device_agent.protocol.messages import (
 )
 from device_agent.runtime.controller import Controller
 from device_agent.runtime.device import Device
+from device_agent.runtime.interlocks import Interlock
 from device_agent.runtime.journal import Journal
 from device_agent.runtime.outbox import Outbox
 from device_agent.runtime.room import Room
@@ -82,7 +83,7 @@ class ToyDriver:
 class Bench:
     """A device, the cloud's key, and everything the device has said."""
 
-    def __init__(self, folder: Path) -> None:
+    def __init__(self, folder: Path, *, interlocks: Sequence[Interlock] = ()) -> None:
         self.key = signing.generate()
         self.said: list[tuple[str, bytes]] = []
         self.driver = ToyDriver()
@@ -108,7 +109,8 @@ class Bench:
             keys={signing.key_id(self.key.public_key()): self.key.public_key()},
             publish=self.publish,
             outbox=self.outbox,
-            room=Room(space="s", agent="a", own=["arm"]),
+            room=Room(space="s", agent="a", own=["arm"], named=[(rule.device, rule.stream) for rule in interlocks]),
+            interlocks=interlocks,
             jail=warm_jail(),
         )
 

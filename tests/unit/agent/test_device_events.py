@@ -1,8 +1,11 @@
 """Every change of authority at a device and every refusal leaves an event."""
 
+import queue
 import sqlite3
+import time
 from pathlib import Path
 from typing import Any
+from unittest import mock
 
 import pytest
 
@@ -10,14 +13,19 @@ from device_agent.protocol import codec, signing, topics
 from device_agent.protocol.events import EventKind
 from device_agent.protocol.messages import (
     AckStatus,
+    Description,
     Event,
     GrantLease,
+    Mode,
     MoveJoints,
     ReleaseLease,
     ResetStop,
+    State,
     Stop,
     StopDevice,
+    Twin,
 )
+from device_agent.runtime.interlocks import Interlock
 from tests.unit.agent.test_device import Bench, eventually
 
 
@@ -156,4 +164,89 @@ def test_a_journal_that_cannot_be_written_is_told_and_the_command_not_obeyed(
         failed = event(bench, EventKind.JOURNAL_FAILED)
         assert failed.severity == "error"
         assert "disk full" in failed.message
-    assert bench.device._controller.lease(0.0) is None
+        assert bench.device._controller.lease(0.0) is None
+        bench.receive(topics.STOP, codec.encode(Stop(id="s1", by="cat")))
+        eventually(lambda: bench.device._controller.mode is Mode.STOPPED)
+        time.sleep(0.3)
+    eventually(lambda: bench.journal.device("arm").latch is not None)
+
+
+def test_a_journal_that_fails_at_the_end_is_told_too(bench: Bench) -> None:
+    bench.journal.close()
+    bench.device._controller.changed.set()
+    bench.device.stop()
+    assert event(bench, EventKind.JOURNAL_FAILED)
+    assert event(bench, EventKind.AGENT_STOPPED)
+
+
+def test_commands_beyond_what_can_wait_are_refused_and_told(bench: Bench, monkeypatch: pytest.MonkeyPatch) -> None:
+    def full(_: bytes) -> None:
+        raise queue.Full
+
+    monkeypatch.setattr(bench.device._office._commands, "put_nowait", full)
+    bench.command(ResetStop())
+    assert event(bench, EventKind.COMMAND_REFUSED).data == {"code": "overrun"}
+
+
+def test_a_mistake_in_the_office_ends_neither_the_office_nor_the_device(
+    bench: Bench, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    def mistake(_: object) -> None:
+        raise RuntimeError("a mistake")
+
+    with monkeypatch.context() as patch:
+        patch.setattr(bench.device.voice, "show", mistake)
+        eventually(lambda: "a mistake" in caplog.text)
+    take_control(bench)
+
+
+def test_what_is_not_for_a_device_is_let_go_and_the_drawing_is_shown(tmp_path: Path) -> None:
+    bench = Bench(tmp_path)
+    bench.driver.twin = lambda: Twin(device="arm", bodies=())  # type: ignore[method-assign]
+    bench.device.start()
+    bench.device.link_changed(True)
+    bench.receive(topics.TELE, b"{}", "joints")
+    assert eventually(lambda: bench.heard(topics.DESC, Twin, topics.TWIN)) == [Twin(device="arm", bodies=())]
+    assert bench.device.quiet
+    assert bench.device.voice.refusals == {}
+    bench.device.stop()
+    bench.outbox.stop()
+    bench.journal.close()
+
+
+def test_a_room_that_is_not_known_holds_and_is_shown(tmp_path: Path) -> None:
+    rule = Interlock(device="sensors-pir", stream="presence", field="present", equals=True)
+    bench = Bench(tmp_path, interlocks=(rule,))
+    bench.device.start()
+    bench.device.link_changed(True)
+    (acted,) = eventually(lambda: events(bench, EventKind.INTERLOCK_ACTED))
+    assert acted.data["interlock"] == rule.name
+    (shown,) = eventually(lambda: [state.restrictions for state in bench.heard(topics.STATE, State)][-1:])
+    assert [(each.source, each.speed) for each in shown] == [(rule.name, 0.0)]
+    assert bench.heard(topics.DESC, Description)[0].interlocks == (rule.shown,)
+    take_control(bench)
+    refused = bench.end(bench.command(MoveJoints(position_rad={"elbow": 1.0}), epoch=1))
+    assert refused.status is AckStatus.FAILED
+    assert not bench.device._controller.moving
+    bench.device.stop()
+    bench.outbox.stop()
+    bench.journal.close()
+
+
+def test_a_state_that_the_link_did_not_take_is_told_again(bench: Bench, monkeypatch: pytest.MonkeyPatch) -> None:
+    eventually(lambda: bench.heard(topics.STATE, State))
+    with monkeypatch.context() as patch:
+        patch.setattr(bench.device.voice, "_publish", lambda *_, **__: False)
+        bench.device.link_changed(True)
+        time.sleep(0.3)
+    before = len(bench.heard(topics.STATE, State))
+    eventually(lambda: len(bench.heard(topics.STATE, State)) > before)
+
+
+def test_an_answer_that_nobody_confirmed_is_given_again_over_the_next_link(bench: Bench) -> None:
+    with mock.patch.object(bench.device.voice, "_delivered"):
+        command = bench.command(StopDevice())
+        bench.end(command)
+    before = len(bench.acks(command))
+    bench.device.link_changed(True)
+    eventually(lambda: len(bench.acks(command)) > before)

@@ -5,11 +5,23 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from cryptography.hazmat.primitives import serialization
+from cryptography.hazmat.primitives.asymmetric import ec
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from msgspec.structs import replace
 
-from device_agent.runtime.home import Buffer, Configuration, DeviceEntry, Home, HomeError, HttpPolling, RoomStream
+from device_agent.protocol import signing
+from device_agent.runtime.home import (
+    Buffer,
+    Configuration,
+    DeviceEntry,
+    Home,
+    HomeError,
+    HttpPolling,
+    Pairing,
+    RoomStream,
+)
 from device_agent.runtime.interlocks import Interlock
 
 ARM = DeviceEntry(name="arm", type="ur5")
@@ -47,7 +59,7 @@ def test_what_is_written_is_read_again(
         devices=devices,
         room=room,
     )
-    written = replace(written, buffer=Buffer(max_mb=2))
+    written = replace(written, buffer=Buffer(max_mb=2), trusted_scripts=bool(options))
     home.save_configuration(written)
     assert home.configuration() == written
 
@@ -113,3 +125,46 @@ def test_enrolling_again_keeps_the_room_and_each_devices_interlocks() -> None:
     assert kept.server == "http://t"
     assert [device.interlocks for device in kept.devices] == [rules, ()]
     assert kept.room == before.room
+
+
+def test_what_was_written_of_identity_and_pairing_is_read_again(tmp_path: Path) -> None:
+    home = Home(tmp_path)
+    key = home.identity(create=True)
+    assert home.identity(create=True).private_bytes_raw() == home.identity().private_bytes_raw()
+    assert home.pairing() is None
+    keys = {signing.key_id(key.public_key()): signing.public_text(key.public_key())}
+    pairing = Pairing(agent="a", space="s", account="ann", keys=keys)
+    home.save_pairing(pairing)
+    assert home.pairing() == pairing
+    assert list(pairing.public_keys()) == list(keys)
+    home.save_pairing(None)
+    assert home.pairing() is None
+
+
+def test_what_is_missing_or_damaged_says_what_to_do(tmp_path: Path) -> None:
+    home = Home(tmp_path)
+    with pytest.raises(HomeError, match="enroll` first"):
+        home.identity()
+    with pytest.raises(HomeError, match="enroll` first"):
+        home.configuration()
+    (tmp_path / "identity.pem").write_bytes(b"nonsense")
+    with pytest.raises(HomeError, match="cannot be read as a private key"):
+        home.identity()
+    pem = ec.generate_private_key(ec.SECP256R1()).private_bytes(
+        serialization.Encoding.PEM, serialization.PrivateFormat.PKCS8, serialization.NoEncryption()
+    )
+    (tmp_path / "identity.pem").write_bytes(pem)
+    with pytest.raises(HomeError, match="not an Ed25519 key"):
+        home.identity()
+    (tmp_path / "pairing.json").write_bytes(b"{")
+    with pytest.raises(HomeError, match="delete it and enroll again"):
+        home.pairing()
+    (tmp_path / "agent.toml").write_text('server = "s"\nname = "n"\ndevices = []\n')
+    with pytest.raises(HomeError, match="at least one device"):
+        home.configuration()
+
+
+def test_a_folder_that_cannot_be_written_is_named(tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("no folder")
+    with pytest.raises(HomeError, match="cannot be written"):
+        Home(tmp_path / "file").save_pairing(Pairing(agent="a", space="s", account="ann", keys={}))
