@@ -39,10 +39,10 @@ class Role(StrEnum):
 
     @property
     def may_operate(self) -> bool:
-        """Take the lease, start actions, stop."""
+        """Take control and ask for it, start actions, stop, reset. A viewer watches: a shared link stops no room."""
         return self is not Role.VIEWER
 
     @property
     def may_own(self) -> bool:
-        """Un-pair, share."""
+        """Un-pair, share, take control over from somebody."""
         return self is Role.OWNER

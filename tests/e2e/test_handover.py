@@ -1,0 +1,118 @@
+"""Control of the simulated arm from hand to hand, in mid-motion, with the real agent: what moves is held at once."""
+
+import contextlib
+import time
+from collections.abc import Iterator
+from typing import Any
+
+import httpx
+import pytest
+
+from tests.support.brokers import wait_until
+from tests.support.machine import Api, Machine, Trace
+
+FAR, NEAR = {"elbow": 1.9}, {"elbow": 1.1}
+SLOW = 0.05
+
+
+@pytest.fixture
+def two(machine: Machine) -> Iterator[tuple[Api, Api, str]]:
+    """Two sessions of one owner, and the arm: free, and not stopped, before and after."""
+    with machine.api() as ann, machine.api() as bob:
+        device = ann.device()["id"]
+        yield ann, bob, device
+        with contextlib.suppress(AssertionError):
+            ann.post(f"/devices/{device}/stop/reset")
+
+
+def commanded_speed(trace: Trace) -> float:
+    first, *_, last = trace.rows(20)
+    passed_s: float = (last["at_ms"] - first["at_ms"]) / 1000
+    moved_rad: float = max(abs(last["target"][name] - first["target"][name]) for name in last["target"])
+    return moved_rad / passed_s
+
+
+def move(api: Api, device: str, epoch: int, target: dict[str, float]) -> str:
+    """Begin to move slowly; gives the action once the arm is on its way."""
+    request = {"kind": "move_joints", "position_rad": target, "speed": SLOW}
+    body = {"request": request, "epoch": epoch, "wait_ms": 10_000}
+    action: str = api.post(f"/devices/{device}/actions", body)["id"]
+    return action
+
+
+def state(api: Api, device: str) -> dict[str, Any]:
+    found: dict[str, Any] = api.get(f"/devices/{device}")["state"]
+    return found
+
+
+def ended(api: Api, action: str) -> dict[str, Any]:
+    found: dict[str, Any] = api.get(f"/actions/{action}", wait_ms=20_000, wait_for="done")
+    return found
+
+
+def refused(api: Api, path: str, body: Any) -> str:
+    answer = api.http.post(path, json=body)
+    assert answer.status_code == httpx.codes.CONFLICT, answer.text
+    code: str = answer.json()["type"].rpartition("/")[2]
+    return code
+
+
+def test_who_is_handed_control_finds_the_arm_at_rest_and_the_former_holder_moves_nothing(
+    machine: Machine, two: tuple[Api, Api, str]
+) -> None:
+    ann, bob, device = two
+    trace = machine.trace()
+    epoch = ann.post(f"/devices/{device}/lease", {"lease_ms": 60_000})["epoch"]
+    action = move(ann, device, epoch, FAR)
+    wait_until(lambda: commanded_speed(trace) > SLOW / 10, "motion", 20)
+    asked = bob.post(f"/devices/{device}/lease/requests", {"lease_ms": 60_000})
+    assert asked["confirmed"] is True
+    request = asked["request"]["id"]
+    wait_until(lambda: (state(ann, device)["lease"] or {}).get("request"), "the request in the device's state", 20)
+    assert state(ann, device)["lease"]["request"]["id"] == request
+    assert commanded_speed(trace) > 0, "asking changes nothing about motion"
+    given = ann.post(f"/devices/{device}/lease/requests/{request}/accept")
+    assert (given["epoch"], given["confirmed"]) == (epoch + 1, True)
+    last = ended(ann, action)
+    assert (last["status"], last["reason"]["code"]) == ("failed", "lease_lost")
+    wait_until(lambda: commanded_speed(trace) == 0, "rest", 10)
+    wait_until(lambda: state(bob, device)["lease"]["epoch"] == epoch + 1, "the new holder in the state", 20)
+    request_body = {"request": {"kind": "move_joints", "position_rad": FAR}, "epoch": epoch}
+    assert refused(ann, f"/devices/{device}/actions", request_body) == "lease-lost"
+    taken = ann.post(f"/devices/{device}/lease", {"take_over": True, "reason": "to try it"})
+    assert (taken["epoch"], taken["confirmed"]) == (epoch + 2, True)
+    wait_until(lambda: state(bob, device)["lease"]["reason"] == "to try it", "the reason in the state", 20)
+    ann.http.delete(f"/devices/{device}/lease", params={"epoch": epoch + 2})
+
+
+def test_after_a_stop_of_everything_only_who_takes_control_anew_moves_it(
+    machine: Machine, two: tuple[Api, Api, str]
+) -> None:
+    ann, bob, device = two
+    trace = machine.trace()
+    epoch = ann.post(f"/devices/{device}/lease", {"lease_ms": 60_000})["epoch"]
+    action = move(ann, device, epoch, NEAR)
+    wait_until(lambda: commanded_speed(trace) > SLOW / 10, "motion", 20)
+    answer = bob.post("/stop", {"reason": "to try it"})
+    assert [item["confirmed"] for item in answer["items"] if item["device"] == device] == [True]
+    assert ended(ann, action)["reason"]["code"] == "stopped"
+    wait_until(lambda: commanded_speed(trace) == 0, "rest", 10)
+    wait_until(lambda: state(ann, device)["stop"], "the latch in the state", 20)
+    # The device has ended Ann's lease, so control is anybody's; but it moves nothing while it is stopped.
+    wait_until(lambda: ann.get(f"/devices/{device}/lease")["lease"] is None, "the end of the lease", 20)
+    other = bob.post(f"/devices/{device}/lease", {"lease_ms": 60_000})["epoch"]
+    still = ended(bob, move(bob, device, other, NEAR))
+    assert (still["status"], still["reason"]["code"]) == ("failed", "stopped")
+    assert ann.post(f"/devices/{device}/stop/reset") == {"confirmed": True}
+    request_body = {"request": {"kind": "move_joints", "position_rad": NEAR}, "epoch": other}
+    assert refused(bob, f"/devices/{device}/actions", request_body) == "lease-lost"
+    time.sleep(0.5)
+    assert commanded_speed(trace) == 0, "the reset resumes nothing"
+    fresh = bob.post(f"/devices/{device}/lease", {"lease_ms": 60_000})["epoch"]
+    again = move(bob, device, fresh, NEAR)
+    wait_until(lambda: commanded_speed(trace) > SLOW / 10, "motion", 20)
+    bob.post(f"/actions/{again}/cancel")
+    ended(bob, again)
+    bob.http.delete(f"/devices/{device}/lease", params={"epoch": fresh})
+    kinds = [item["kind"] for item in ann.get(f"/devices/{device}/events", limit=50)["items"]]
+    assert {"stop-ordered", "stop-latched", "stop-reset-ordered", "stop-reset", "control-taken"} <= set(kinds)
