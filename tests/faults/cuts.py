@@ -32,6 +32,8 @@ EVERYBODY = (
     "agent cut off", "agent's link stalls", "agent's link forgotten", "broker killed", "broker stopped",
     "functions killed", "functions stopped", "agent stopped",
 )  # fmt: skip
+WATCHED = (*OPERATOR, "agent's link stalls", "agent's link forgotten", "broker stopped")
+"""Of these nobody tells the agent: it is the watchdog that notices."""
 LEASE_MS = 30_000
 SHORT_LEASE_MS = 1_500
 _ON_THE_WAY_MS = 50.0
@@ -74,8 +76,7 @@ class Tally:
     def add(self, cut: str, results: list[Result]) -> bool:
         """Count a cut; whether anything was in motion."""
         moving = [each for each in results if each.verdict.in_motion]
-        still_wrong = [each for each in results if each.verdict.moved_again and not each.verdict.in_motion]
-        self.results += moving + still_wrong
+        self.results += moving
         if not moving:
             self.spoilt += 1
             return False
@@ -154,12 +155,12 @@ class Arm:
         time.sleep(_UNDER_WAY_S)
         return bool(action["status"] == "started")
 
-    def verdict(self, cut_ms: float, since_ms: float, *, begin_ms: float | None = None) -> Verdict:
+    def verdict(self, cut: str, cut_ms: float, since_ms: float, *, begin_ms: float | None = None) -> Verdict:
         """Of what happened until now; ``begin_ms``: when it last moved freely, where that is not the cut."""
         end_ms, begin_ms = now_ms(), cut_ms if begin_ms is None else begin_ms
         rows = [row for row in self.record.read() if begin_ms - _LOOK_MS <= row.tick_ms <= end_ms]
         self.record.forget(end_ms - _LOOK_MS)
-        return judge(rows, cut_ms=cut_ms, since_ms=since_ms)
+        return judge(rows, cut_ms=cut_ms, since_ms=since_ms, watched=cut in WATCHED)
 
     def last_setpoint_ms(self, cut_ms: float) -> float:
         """When the agent was given the last one that was sent before the cut."""
@@ -212,7 +213,7 @@ class Bench:
         time.sleep(chance.uniform(0.45, 0.9))
         mend()
         time.sleep(0.5)
-        return Result(cut, arm.name, arm.verdict(cut_ms, arm.last_setpoint_ms(cut_ms)))
+        return Result(cut, arm.name, arm.verdict(cut, cut_ms, arm.last_setpoint_ms(cut_ms)))
 
     def _cut_operator(self, arm: Arm, cut: str) -> Mend:
         console = arm.console
@@ -226,7 +227,8 @@ class Bench:
                 return lambda: console.signal(signal.SIGCONT)
             case "operator cut off":
                 console.proxy.cut()
-                return _nothing
+                console.proxy.freeze()
+                return console.proxy.thaw
             case "operator's link stalls":
                 console.proxy.freeze()
                 return console.proxy.thaw
@@ -257,7 +259,9 @@ class Bench:
         begin_ms = cut_ms
         if cut == "agent stopped":  # nothing moved while it was; from its waking on it has to know better
             cut_ms, since_ms = mended_ms, dict.fromkeys(since_ms, mended_ms)
-        return [Result(cut, arm.name, arm.verdict(cut_ms, since_ms[arm.name], begin_ms=begin_ms)) for arm in self.arms]
+        return [
+            Result(cut, arm.name, arm.verdict(cut, cut_ms, since_ms[arm.name], begin_ms=begin_ms)) for arm in self.arms
+        ]
 
     def _since_ms(self, arm: Arm, cut: str, cut_ms: float) -> float:
         """From when on nothing gave the arm the right to move."""

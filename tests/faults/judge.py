@@ -16,6 +16,9 @@ _REST_ROWS = 10
 """A tenth of a second: turning back passes through zero, and a control loop that is late stands still for a moment."""
 _ROW_MS = 20.0
 """Lines come every 10 ms; a longer gap is a time in which the agent's process did not run."""
+_LET_GO_RAD_S = 0.03
+_LET_GO_AFTER_MS = 140.0
+"""Braking begins later than this. Who hardly moves by then has let the slider go: control stays, and may be used."""
 
 
 class Row(NamedTuple):
@@ -33,8 +36,10 @@ class Verdict:
         speed_rad_s: Fastest commanded joint at the cut.
         rest_ms: From the reference to the first line of rest; infinite where there was none.
         cut_ms: The same from the cut.
-        starved_ms: Time in between in which the agent's process did not run at all: the machine's, not the agent's.
+        starved_ms: Time in between in which the control loop did not get to run: lines that are late, or that have no
+            new command though the arm moves (one is due every 8 ms). The machine's fault, not the agent's.
         moved_again: Whether anything was commanded to move after rest.
+        let_go: Whether it hardly moved any more when braking would have begun.
     """
 
     speed_rad_s: float
@@ -42,27 +47,31 @@ class Verdict:
     cut_ms: float
     starved_ms: float
     moved_again: bool
+    let_go: bool = False
 
     @property
     def in_motion(self) -> bool:
-        return self.speed_rad_s > 0.05
+        return self.speed_rad_s > 0.05 and not self.let_go
 
     @property
     def kept(self) -> bool:
         return self.rest_ms <= MOST_MS + self.starved_ms and not self.moved_again
 
 
-def judge(rows: list[Row], *, cut_ms: float, since_ms: float) -> Verdict:
+def judge(rows: list[Row], *, cut_ms: float, since_ms: float, watched: bool = True) -> Verdict:
     """What happened from the cut to the end of ``rows``.
 
     Args:
         rows: From some lines before the cut to the moment before somebody may move the arm again.
         cut_ms: When the cut was made.
         since_ms: From when on nothing gave the arm the right to move.
+        watched: Whether it is the watchdog that has to notice.
     """
     before = [row for row in rows if row.tick_ms <= cut_ms][-3:]
     speed = _speed(before[0], before[-1]) if len(before) > 1 else 0.0
     after = [row for row in rows if row.tick_ms > min(cut_ms, since_ms)]
+    later = [row for row in after if row.tick_ms <= since_ms + _LET_GO_AFTER_MS][-3:]
+    let_go = watched and len(later) > 1 and _speed(later[0], later[-1]) < _LET_GO_RAD_S
     still = 0
     for index in range(1, len(after)):
         still = still + 1 if _same(after[index - 1], after[index]) else 0
@@ -70,8 +79,8 @@ def judge(rows: list[Row], *, cut_ms: float, since_ms: float) -> Verdict:
             rest = after[index - still]
             moved_again = not all(_same(rest, later) for later in after[index:])
             starved = _starved(after[: index - still + 1])
-            return Verdict(speed, rest.tick_ms - since_ms, rest.tick_ms - cut_ms, starved, moved_again)
-    return Verdict(speed, math.inf, math.inf, 0.0, moved_again=True)
+            return Verdict(speed, rest.tick_ms - since_ms, rest.tick_ms - cut_ms, starved, moved_again, let_go)
+    return Verdict(speed, math.inf, math.inf, 0.0, moved_again=True, let_go=let_go)
 
 
 class Record:
@@ -115,5 +124,9 @@ def _same(one: Row, other: Row) -> bool:
 
 
 def _starved(rows: list[Row]) -> float:
-    gaps = (later.tick_ms - row.tick_ms for row, later in pairwise(rows))
-    return sum(gap - _ROW_MS for gap in gaps if gap > _ROW_MS)
+    """Of rows that end with the first of rest."""
+    total_ms = 0.0
+    for row, later in pairwise(rows[:-1]):
+        gap_ms = later.tick_ms - row.tick_ms
+        total_ms += gap_ms if _same(row, later) else max(0.0, gap_ms - _ROW_MS)
+    return total_ms

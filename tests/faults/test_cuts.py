@@ -63,10 +63,10 @@ def rows(*targets: float) -> list[Row]:
 
 
 def test_the_judge_measures_to_the_first_line_of_rest() -> None:
-    moving = [0.01 * index for index in range(21)]
-    found = judge(rows(*moving, *[0.3] * 40), cut_ms=1100, since_ms=1090)
+    moving = [0.01 * index for index in range(31)]
+    found = judge(rows(*moving, *[0.4] * 40), cut_ms=1100, since_ms=1090)
     assert found.in_motion
-    assert (found.rest_ms, found.cut_ms, found.starved_ms) == (120, 110, 0)
+    assert (found.rest_ms, found.cut_ms, found.starved_ms) == (220, 210, 0)
     assert found.kept
 
 
@@ -81,6 +81,22 @@ def test_the_judge_measures_to_the_first_line_of_rest() -> None:
 )
 def test_the_judge_finds(targets: list[float]) -> None:
     assert not judge(rows(*targets), cut_ms=1100, since_ms=1100).kept
+
+
+def test_a_control_loop_that_did_not_get_to_run_is_told_from_one_that_is_late() -> None:
+    moving = [0.01 * index for index in range(15)]
+    found = judge(
+        rows(*moving, *[0.14] * 5, *(0.14 + each for each in moving), *[0.28] * 40), cut_ms=1100, since_ms=1100
+    )
+    assert (found.rest_ms, found.starved_ms) == (240, 60)
+
+
+def test_a_slider_that_was_let_go_is_not_an_arm_in_motion() -> None:
+    settled = [0.01 * index for index in range(12)]
+    found = judge(rows(*settled, *[0.11] * 40, 0.5), cut_ms=1100, since_ms=1100)
+    assert found.moved_again
+    assert not found.in_motion
+    assert not judge(rows(*settled, *[0.11] * 40, 0.5), cut_ms=1100, since_ms=1100, watched=False).kept
 
 
 def test_turning_back_is_not_rest() -> None:
