@@ -3,6 +3,7 @@
 A transport is one line of ``_MAKERS``; what it needs is imported only where it is the one that was chosen.
 """
 
+import logging
 import threading
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
@@ -14,6 +15,7 @@ from device_agent.runtime.home import Configuration, HomeError, Pairing
 from device_agent.transports.http import answers
 from device_agent.transports.http.api import CloudApi, CloudError
 
+_log = logging.getLogger(__name__)
 SOFTWARE = "telescope-agent 0.1.0"
 
 
@@ -172,6 +174,8 @@ def _mqtt(wiring: Wiring) -> Transport:
 def _http(wiring: Wiring) -> Transport:
     from device_agent.transports.http.transport import LONG_POLL_S, HttpTransport  # noqa: PLC0415
 
+    if wiring.listen:
+        _log.warning("HTTP brings nothing of the room: interlocks on %s always act", ", ".join(wiring.listen))
     polling = wiring.configuration.http
     return HttpTransport(
         open_api=wiring.open_api,
