@@ -15,6 +15,8 @@ _SMOOTHING = 0.2
 """Weight of the newest loop age: one late answer is not a slow link."""
 _EVERY = 4
 """Periods between two looks ahead."""
+_LAG_S = 0.1
+"""Slowing down follows what is seen by so much: a look every fourth period, and the jerk limit."""
 _AHEAD = 1.25
 """How much further than needed it looks, so that a limit can also rise again."""
 _STEP_M = 0.05
@@ -76,7 +78,7 @@ class Pace:
         if self._geometry is None or self._periods % _EVERY:
             return self._cap_rad_s
         fastest = max(map(abs, velocity_rad_s), default=0.0)
-        blind_s = self.age_s + self._watchdog_s + braking_s
+        blind_s = self.age_s + self._watchdog_s + braking_s + _LAG_S
         ahead_s = _AHEAD * blind_s
         end = [position + velocity * ahead_s for position, velocity in zip(position_rad, velocity_rad_s, strict=True)]
         share = self._geometry.sweep((position_rad, end), step_m=_STEP_M).share

@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Mapping, Sequence
+from itertools import pairwise
 
 import pytest
 from ruckig import Result
@@ -33,14 +34,12 @@ class Wall:
         return Clearance(self.at_rad - position_rad[1], ("hand", "wall"))
 
     def sweep(self, path_rad: Sequence[Sequence[float]], *, step_m: float = 0.01) -> Sweep:  # noqa: ARG002
-        least = min(0.0, self.clearance(path_rad[0]).room_m) - 1e-7
-        legs = len(path_rad) - 1
-        for leg in range(legs):
-            for part in range(1, 101):
-                place = [a + (b - a) * part / 100 for a, b in zip(path_rad[leg], path_rad[leg + 1], strict=True)]
-                found = self.clearance(place)
-                if found.room_m < least:
-                    return Sweep((leg + (part - 1) / 100) / legs, found)
+        rooms = [self.clearance(position).room_m for position in path_rad]
+        least = min(0.0, rooms[0]) - 1e-7
+        for leg, (begin, end) in enumerate(pairwise(rooms)):
+            if end < least:
+                share = (leg + (begin - least) / (begin - end)) / (len(rooms) - 1)
+                return Sweep(share, Clearance(end, ("hand", "wall")))
         return Sweep(1.0)
 
     def speed_m_s(self, velocity_rad_s: Sequence[float]) -> float:
@@ -148,8 +147,7 @@ def test_speed_falls_before_the_wall_by_how_old_the_picture_is() -> None:
             rig.stream(1, 0.024, age_ms=age_ms)
             velocity = rig.velocities[-1]
             blind_s = age_ms / 1000 + 0.3 + abs(velocity) / 20.0
-            # A look ahead every 32 ms, and the jerk with which it slows down, are behind by this much.
-            assert velocity <= max(0.02, (1.5 - rig.elbow) / blind_s) * 1.1 + 0.05
+            assert velocity <= max(0.02, (1.5 - rig.elbow) / blind_s) + 1e-3
         fastest[age_ms] = rig.now_s
         assert "speed: loop age" in rig.limited
         assert rig.elbow == pytest.approx(1.5, abs=0.02)
