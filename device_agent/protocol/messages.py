@@ -86,7 +86,11 @@ class InterlockRule(Struct, frozen=True, kw_only=True):
 
 
 class Description(Struct, frozen=True, kw_only=True):
-    """``desc``: what the device is and can do. Retained."""
+    """``desc``: what the device is and can do. Retained.
+
+    ``limits`` names what the agent itself holds, whoever moves the device: ``clearance`` and ``workspace`` are missing
+    where nobody knows the robot's shape.
+    """
 
     device: Id
     kind: Label
@@ -99,6 +103,7 @@ class Description(Struct, frozen=True, kw_only=True):
     watchdog_ms: Milliseconds = 0
     max_loop_age_ms: Milliseconds = 0
     simulated: bool = False
+    limits: tuple[Label, ...] = ()
     interlocks: tuple[InterlockRule, ...] = ()
 
 

@@ -271,6 +271,11 @@ class Controller:
         return self._authority.fault
 
     @property
+    def limits(self) -> tuple[str, ...]:
+        """What it holds whoever moves the device, by name."""
+        return self._envelope.limits
+
+    @property
     def restrictions(self) -> tuple[Restriction, ...]:
         """What the room allows, the strictest first."""
         with self._lock:

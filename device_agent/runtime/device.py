@@ -96,6 +96,7 @@ class Device:
             label=label,
             robot_type=robot_type,
             simulated=driver.simulated,
+            limits=self._controller.limits,
             interlocks=[rule.shown for rule in interlocks],
             journal=journal,
             publish=publish,

@@ -14,12 +14,19 @@ class Envelope:
     Args:
         robot_type: Joints and their ranges.
         geometry: The robot's shape; without it nobody knows what it could touch, and only ranges hold.
+
+    Attributes:
+        limits: What is held, by name.
     """
 
     def __init__(self, robot_type: RobotType, geometry: Geometry | None) -> None:
         self._joints = robot_type.joints
         self._index = {joint.name: index for index, joint in enumerate(robot_type.joints)}
         self._geometry = geometry
+        shape = (
+            () if geometry is None else ("clearance",) if robot_type.workspace is None else ("clearance", "workspace")
+        )
+        self.limits = ("position", "velocity", "acceleration", "jerk", *shape)
 
     def check(self, position_rad: Mapping[str, float]) -> None:
         """All joints are known, all numbers are numbers.

@@ -73,6 +73,7 @@ class Voice:
         label: Its name for people.
         robot_type: Joints, limits, streams.
         simulated: Whether no real metal moves.
+        limits: What the agent itself holds, whoever moves it.
         interlocks: How the room slows or holds it.
         journal: Open.
         publish: Sends a message.
@@ -89,6 +90,7 @@ class Voice:
         label: str,
         robot_type: RobotType,
         simulated: bool,
+        limits: Sequence[str],
         interlocks: Sequence[InterlockRule],
         journal: Journal,
         publish: Publish,
@@ -99,6 +101,7 @@ class Voice:
         self._label = label
         self._robot_type = robot_type
         self._simulated = simulated
+        self._limits = tuple(limits)
         self._interlocks = tuple(interlocks)
         self._journal = journal
         self._publish = publish
@@ -205,6 +208,7 @@ class Voice:
             watchdog_ms=round(WATCHDOG_S * 1000),
             max_loop_age_ms=round(MAX_LOOP_AGE_S * 1000),
             simulated=self._simulated,
+            limits=self._limits,
             interlocks=self._interlocks,
         )
 

@@ -350,3 +350,16 @@ def test_losing_the_link_at_rest_keeps_the_lease() -> None:
     rig.take(1)
     rig.controller.lost(Refused("link_lost", ""))
     assert rig.controller.lease(rig.now_s) is not None
+
+
+def test_a_driver_that_fails_again_is_one_fault_and_one_that_never_failed_does_not_recover() -> None:
+    rig = Rig()
+    rig.controller.recover([1.0, 1.0])
+    rig.run(PERIOD_S)
+    assert rig.elbow == 0.0, "a device that is well stays where it is"
+    rig.controller.fail("no answer")
+    rig.controller.fail("no answer")
+    assert rig.run(PERIOD_S) is Mode.FAULT
+    rig.controller.recover([1.0, 1.0])
+    assert rig.run(PERIOD_S) is Mode.IDLE
+    assert rig.elbow == 1.0

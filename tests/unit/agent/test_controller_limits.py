@@ -4,11 +4,13 @@ import math
 from collections.abc import Mapping, Sequence
 from itertools import pairwise
 
+import msgspec
 import pytest
 from ruckig import Result
 
 from device_agent.ports.geometry import Clearance, Sweep
 from device_agent.protocol.messages import Mode, Pose
+from device_agent.protocol.robot_type import Workspace
 from device_agent.runtime.courses import Outcome
 from device_agent.runtime.envelope import Envelope
 from device_agent.runtime.lease import Refused
@@ -264,6 +266,15 @@ def test_where_not_even_braking_can_be_planned_the_command_stands_still_at_once(
     rest = rig.elbow
     assert rig.stream(1, 0.024) is Mode.HOLDING
     assert rig.elbow == rest
+
+
+def test_it_says_what_it_holds_and_what_it_cannot_know() -> None:
+    known = ("position", "velocity", "acceleration", "jerk")
+    assert Rig().controller.limits == known
+    assert Rig(geometry=Wall()).controller.limits == (*known, "clearance")
+    box = Workspace(lower_m=(-1, -1, 0), upper_m=(1, 1, 1), frames=("hand",))
+    kind = msgspec.structs.replace(robot_type(), workspace=box)
+    assert Envelope(kind, Wall()).limits == (*known, "clearance", "workspace")
 
 
 def test_a_path_that_leads_nowhere_is_not_looked_at() -> None:

@@ -13,7 +13,12 @@ export interface Presence {
   software?: string;
 }
 
-/** `desc`: what the device is and can do. Retained. */
+/**
+ * `desc`: what the device is and can do. Retained.
+ *
+ * `limits` names what the agent itself holds, whoever moves the device: `clearance` and `workspace` are missing
+ * where nobody knows the robot's shape.
+ */
 export interface Description {
   /** letters, digits, _ and -, 1 to 64 of them */
   device: string;
@@ -28,6 +33,7 @@ export interface Description {
   watchdog_ms?: number;
   max_loop_age_ms?: number;
   simulated?: boolean;
+  limits?: string[];
   interlocks?: InterlockRule[];
 }
 
