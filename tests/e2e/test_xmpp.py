@@ -2,6 +2,7 @@
 
 import contextlib
 import os
+import signal
 import statistics
 import subprocess
 import sys
@@ -55,6 +56,11 @@ class Agent:
                 stderr=log,
                 env=self._environment,
             )
+
+    @property
+    def pid(self) -> int:
+        assert self._process is not None
+        return self._process.pid
 
     def kill(self) -> None:
         assert self._process is not None
@@ -144,6 +150,27 @@ def next_done(api: Api, device: str) -> bool:
         f"/devices/{device}/actions", json={"request": request, "wait_ms": 20_000, "wait_for": "done"}
     )
     return answer.is_success and answer.json()["status"] == "done"
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("who", ["the agent", "who speaks for the cloud"])
+def test_whoever_is_frozen_is_gone_within_ten_seconds(machine: Machine, api: Api, agent: Agent, who: str) -> None:
+    api.device(NAME)
+    pid = agent.pid if who == "the agent" else machine.pid("function_app xmpp")
+
+    def gone() -> bool:
+        if who == "the agent":
+            return not next(each for each in api.get("/devices")["items"] if each["name"] == NAME)["online"]
+        return (agent.home / "log").read_text().rstrip().endswith("link lost")
+
+    os.kill(pid, signal.SIGSTOP)
+    began_s = time.monotonic()
+    try:
+        wait_until(gone, "it to be seen as gone", 30)
+        assert time.monotonic() - began_s < 10
+    finally:
+        os.kill(pid, signal.SIGCONT)
+    wait_until(lambda: next_done(api, api.device(NAME)["id"]), "the next action", 40)
 
 
 @contextlib.contextmanager

@@ -65,23 +65,12 @@ class Prosody:
 
 
 @contextlib.contextmanager
-def start_prosody(home: Path, verify_url: str, *, port: int = 0) -> Iterator[Prosody]:
+def start_prosody(home: Path, verify_url: str, *, port: int = 0, more: tuple[str, ...] = ()) -> Iterator[Prosody]:
     home.mkdir(parents=True, exist_ok=True)
+    named = ("--domain", DOMAIN, "--verify-url", verify_url, *more)
     with (home / "stderr").open("a") as stderr:
         process = subprocess.Popen(
-            [
-                sys.executable,
-                "-m",
-                "infra.prosody",
-                "--home",
-                str(home),
-                "--domain",
-                DOMAIN,
-                "--verify-url",
-                verify_url,
-                "--port",
-                str(port),
-            ],
+            [sys.executable, "-m", "infra.prosody", "--home", str(home), "--port", str(port), *named],
             cwd=ROOT,
             stdout=subprocess.PIPE,
             stderr=stderr,

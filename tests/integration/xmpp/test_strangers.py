@@ -80,6 +80,19 @@ class TestLogin:
                 answer = site.cloud.ask(method, f"/api/v1{path}", headers=headers, json={"purpose": "watch"})
                 assert answer.status_code == 401, path
 
+    def test_a_password_of_an_earlier_pairing_is_refused(self, site: XmppSite, anna: Person) -> None:
+        with site.robot() as robot:
+            robot.pair(anna)
+            before = password_of(robot)
+            assert anna.delete(f"/agents/{robot.id}").status_code == 204
+            with site.client(robot.id, before) as client:
+                assert not client.opened
+            robot.pair(site.cloud.sign_in("bert"))
+            with site.client(robot.id, before) as client:
+                assert not client.opened
+            with site.client(robot.id, password_of(robot)) as client:
+                assert client.opened
+
     def test_a_password_ends(self, site: XmppSite, unheard: XmppRobot) -> None:
         mine = password_of(unheard)
         site.cloud.clock.advance(AGENT_S + 1)
