@@ -1,4 +1,4 @@
-"""``python -m device_agent enroll|run|devices``: the agent's command line."""
+"""``python -m device_agent enroll|run|doctor|devices``: the agent's command line."""
 
 import argparse
 import logging
@@ -12,7 +12,7 @@ from pathlib import Path
 
 import msgspec
 
-from device_agent import bootstrap, drivers, links
+from device_agent import bootstrap, doctor, drivers, links, service
 from device_agent.ports.clock import CloudClock
 from device_agent.ports.driver import DriverError
 from device_agent.ports.transport import TransportError
@@ -32,6 +32,7 @@ _EXIT_FAILED = 1
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run one command; returns the exit code."""
     options = _parser().parse_args(arguments)
+    os.umask(0o077)  # what the agent writes is nobody else's to read
     logging.basicConfig(level=logging.INFO, format="%(asctime)s %(levelname)s %(message)s", stream=sys.stderr)
     try:
         code: int = options.command(options)
@@ -61,7 +62,7 @@ def _parser() -> argparse.ArgumentParser:
     enroll.add_argument(
         "--transport",
         choices=links.names(),
-        help="how the cloud is reached: by the broker (mqtt, the default), or by requests alone (http)",
+        help="how the cloud is reached: by a broker (mqtt, the default), by requests alone (http), or by XMPP (xmpp)",
     )
     enroll.add_argument(
         "--poll",
@@ -78,10 +79,14 @@ def _parser() -> argparse.ArgumentParser:
     run.add_argument("--trace", type=Path, metavar="FOLDER", help="simulated devices write what really happened here")
     run.set_defaults(command=_run)
 
+    examine = commands.add_parser("doctor", help="look whether everything is there that the agent needs")
+    examine.add_argument("--json", action="store_true", help="for programs: one object with all findings")
+    examine.set_defaults(command=_doctor)
+
     devices = commands.add_parser("devices", help="list this agent's devices, and known robot types and drivers")
     devices.set_defaults(command=_devices)
 
-    for command in (enroll, run, devices):
+    for command in (enroll, run, examine, devices):
         command.add_argument("--home", type=Path, default=default, help="the agent's folder (default: %(default)s)")
     return parser
 
@@ -159,6 +164,7 @@ def _await_claim(home: Home, api: CloudApi, configuration: Configuration, claim:
     """Wait until somebody redeems the code; a code that runs out is replaced."""
     expires_s = time.monotonic() + (claim.expires_in_s or 0)
     while True:
+        service.alive()
         found = api.enrollment(wait_s=_POLL_S if claim.code is not None else 0.0)
         if found.get("state") == "claimed":
             claimed = answers.read(found, answers.Claimed)
@@ -182,12 +188,13 @@ def _await_claim(home: Home, api: CloudApi, configuration: Configuration, claim:
 
 def _run(options: argparse.Namespace) -> int:
     home = Home(options.home)
-    if home.pairing() is None:
-        _pair(home)
-    if options.trace is not None:
-        options.trace.mkdir(parents=True, exist_ok=True)
-    while _run_until_told(home, options.trace):
-        _pair(home)
+    with home.hold():
+        if home.pairing() is None:
+            _pair(home)
+        if options.trace is not None:
+            options.trace.mkdir(parents=True, exist_ok=True)
+        while _run_until_told(home, options.trace):
+            _pair(home)
     return 0
 
 
@@ -197,6 +204,7 @@ def _pair(home: Home) -> None:
     A robot may start before its network does: where the cloud is not reached it is asked again.
     """
     configuration = home.configuration()
+    service.ready("waiting to be claimed")
     before = signal.signal(signal.SIGTERM, _leave)
     try:
         while True:
@@ -225,7 +233,9 @@ def _run_until_told(home: Home, trace: Path | None) -> bool:
     try:
         cell.start()
         print("running", flush=True)
+        service.ready("running")
         while not ending.wait(_OUTDATED_POLL_S):
+            service.alive()
             if cell.outdated:
                 return True
     finally:
@@ -233,6 +243,23 @@ def _run_until_told(home: Home, trace: Path | None) -> bool:
         for number, handler in before.items():
             signal.signal(number, handler)
     return False
+
+
+# ------------------------------------------------------------ doctor
+
+
+def _doctor(options: argparse.Namespace) -> int:
+    found = []
+    for finding in doctor.examine(Home(options.home)):
+        found.append(finding)
+        if not options.json:
+            print(f"{finding.level:8} {finding.check}: {finding.message}", flush=True)
+            if finding.advice:
+                print(f"{'':8} → {finding.advice}", flush=True)
+    good = all(finding.level != "problem" for finding in found)
+    if options.json:
+        print(msgspec.json.encode({"ok": good, "findings": found}).decode())
+    return 0 if good else _EXIT_FAILED
 
 
 # ------------------------------------------------------------ devices

@@ -59,6 +59,8 @@ class WarmJail:
 
     def start(self) -> None:
         """See ``Jail``."""
+        if sys.platform != "linux":
+            return
         with contextlib.suppress(JailError), self._lock:
             self._own.start()
             if self._own.missing:
@@ -81,6 +83,11 @@ class WarmJail:
                 "(Debian: apt-get install bubblewrap), or save the movement with the account the robot is paired with."
             )
         return None
+
+    @property
+    def missing(self) -> dict[str, str]:
+        """Layer → why this machine has it not; known after ``start``."""
+        return dict(self._own.missing)
 
     def open(self, limits: Limits, *, stranger: bool) -> Inmate:
         """See ``Jail``."""

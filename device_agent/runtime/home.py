@@ -6,13 +6,17 @@ agent.toml       server, transport and devices; written by ``enroll``, edited by
 pairing.json     space, account and pinned keys, once claimed
 journal.db       what must not be forgotten
 outbox.db        what could not be sent yet
+running.lock     held by the agent that runs: two on one robot would fight
 ```
 """
 
+import contextlib
 import json
 import os
+import sqlite3
 import tempfile
 import tomllib
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -235,6 +239,27 @@ class Home:
             path.unlink(missing_ok=True)
         else:
             self._write(path, msgspec.json.encode(pairing))
+
+    @contextlib.contextmanager
+    def hold(self) -> Iterator[None]:
+        """Be the only one who runs this agent, until the end of the ``with`` or of the process.
+
+        A lock of SQLite's: the same on every system, and gone with its holder however that ends.
+
+        Raises:
+            HomeError: Another process runs it, or there is no agent.
+        """
+        if not self.folder.is_dir():
+            raise HomeError(f"{self.folder} holds no agent; run `python -m device_agent enroll` first")
+        path = self.folder / "running.lock"
+        with contextlib.closing(sqlite3.connect(path, timeout=0, isolation_level=None)) as lock:
+            try:
+                lock.execute("BEGIN EXCLUSIVE")
+            except sqlite3.OperationalError as error:
+                if "locked" in str(error):
+                    raise HomeError(f"another process runs the agent of {self.folder} already; end it first") from error
+                raise HomeError(f"{path} cannot be written: {error}") from error
+            yield
 
     def _write(self, path: Path, content: bytes) -> None:
         """Whole or not at all, readable by the owner alone."""
