@@ -11,7 +11,7 @@ from tests.support.hosts.host import ROOT
 
 LIMIT = 600 / 330
 """Of the time that importing FastAPI takes."""
-ROUNDS = 7
+ROUNDS = 3
 PATIENT_ROUNDS = 30
 """A busy machine gets more rounds: only the quickest of each counts."""
 FASTAPI = "import fastapi"

@@ -28,7 +28,8 @@ NEVER = ("numpy", "pandas", "mujoco", "scipy", "uvicorn")
 def for_azure(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """What Azure's build installs."""
     folder = tmp_path_factory.mktemp("azure") / "package"
-    command = [sys.executable, "-m", "pip", "install", "--quiet", "--disable-pip-version-check", "--no-compile"]
+    # uv resolves and unpacks as pip does, in a tenth of the time.
+    command = [sys.executable, "-m", "uv", "pip", "install", "--quiet", "--python", sys.executable]
     done = subprocess.run(
         [*command, "--target", str(folder), "-r", str(ROOT / "requirements.txt")],
         capture_output=True,
