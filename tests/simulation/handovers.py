@@ -297,6 +297,20 @@ class NoCheck(LeaseGate):
         return False
 
 
+class _Unexpired(int):
+    """An epoch that equals every one whose lease has not run out."""
+
+    live: frozenset[int]
+
+    def __eq__(self, other: object) -> bool:
+        return other in self.live
+
+    def __ne__(self, other: object) -> bool:
+        return other not in self.live
+
+    __hash__ = int.__hash__
+
+
 class ExpiryOnly(LeaseGate):
     """Obeys everybody whose lease has not run out, as if clocks were all that is needed."""
 
@@ -308,11 +322,19 @@ class ExpiryOnly(LeaseGate):
         """Take in any."""
         self._until_s[epoch] = now_s + lease_s
         self.epoch, self.burned = max(self.epoch, epoch), 0
-        self._lease = Lease(holder, _Whatever(epoch), max(self._until_s.values()), reason)
+        self._lease = Lease(holder, epoch, max(self._until_s.values()), reason)
 
     def fence(self, epoch: int) -> None:
         """Refuse none."""
         self.burned = min(self.burned, epoch - 1)
+
+    def current(self, now_s: float) -> Lease | None:
+        """The lease of whoever asks, if it has not run out."""
+        if self._lease is None:
+            return None
+        asked = _Unexpired(self._lease.epoch)
+        asked.live = frozenset(epoch for epoch, until_s in self._until_s.items() if now_s < until_s)
+        return Lease(self._lease.holder, asked, self._lease.expires_s)
 
 
 def no_check(epoch: int, burned: int) -> LeaseGate:
