@@ -257,6 +257,7 @@ def build(settings: Settings, *, clock: Clock | None = None) -> Functions:
             leases=leases,
             rows=lease_rows,
             commands=commands,
+            identify=identify,
             audit=audit,
             clock=now,
         ),

@@ -18,6 +18,7 @@ from function_app.services.audit import Audit
 from function_app.services.commands import Commands
 from function_app.services.control import read_lease
 from function_app.services.devices import Devices, require_operator
+from function_app.services.identity import Identify
 from function_app.services.lease import Leases
 from function_app.services.lease_rows import LeaseRows
 
@@ -35,6 +36,7 @@ class Handovers:
         leases: Leases,
         rows: LeaseRows,
         commands: Commands,
+        identify: Identify,
         audit: Audit,
         clock: Clock,
     ) -> None:
@@ -43,6 +45,7 @@ class Handovers:
         self._leases = leases
         self._rows = rows
         self._commands = commands
+        self._identify = identify
         self._audit = audit
         self._clock = clock
 
@@ -151,12 +154,15 @@ class Handovers:
         )
 
     async def _require_asker(self, device: Device, request: str) -> None:
-        """Whoever asked must still be one who may operate."""
-        _, asked = rules.find(await read_lease(self._tables, device), request)
-        found, _ = await self._devices.find(Identity(asked.account, asked.by, asked.session), device.id)
-        if found is None or not found.role.may_operate:
-            detail = f"{asked.by} may not operate this device any more. Control stays with you."
-            raise Problem("asker-gone", 409, "Who asked may not operate", detail)
+        """Whoever asked must still be there, and one who may operate. What is over already, the rule answers."""
+        lease, asked = rules.find(await read_lease(self._tables, device), request)
+        if asked.how(lease, self._clock.now_ms()) != "open":
+            return
+        asker = Identity(asked.account, asked.by, asked.session)
+        found, _ = await self._devices.find(asker, device.id)
+        if found is None or not found.role.may_operate or await self._identify.signed_out(asker):
+            detail = f"{asked.by} has signed out, or may not operate this device any more. Control stays with you."
+            raise Problem("asker-gone", 409, "Who asked is gone", detail)
 
     async def _drop(self, who: Identity, device: Device, lease: Lease, request: str) -> None:
         """Have the device show it no longer. Where that does not arrive, its time is over there soon by itself."""

@@ -148,8 +148,12 @@ class Identify:
         await self._check_signed_out(identity)
         return _Known(identity, int(claims["exp"]) * 1000, self._clock.now_ms())
 
+    async def signed_out(self, who: Identity) -> bool:
+        """Whether somebody has ended this session."""
+        return await self._tables.get(store.ACCOUNTS, who.account, f"signed-out:{who.session}") is not None
+
     async def _check_signed_out(self, who: Identity) -> None:
-        if await self._tables.get(store.ACCOUNTS, who.account, f"signed-out:{who.session}") is not None:
+        if await self.signed_out(who):
             raise unauthorized("This session was signed out. Sign in again.")
 
     def _check_agent(self, token: str, key: Ed25519PublicKey) -> None:

@@ -8,6 +8,7 @@ import pytest
 from device_agent.protocol.messages import AskLease, DropRequest, GrantLease, Mode, ReleaseLease, State
 from function_app.domain.accounts import Role
 from function_app.ports.broker_access import Credentials
+from function_app.ports.tables import StoreError
 from function_app.services import devices as devices_service
 from tests.support.brokers import BROKERS, RunningBroker, wait_until
 from tests.support.cloud import Cloud, Person, Robot, problem
@@ -265,6 +266,27 @@ def test_who_may_no_longer_operate_is_given_nothing(held: Three, monkeypatch: py
     monkeypatch.setattr(devices_service.Devices, "find", found)
     assert "stays with you" in problem(anna.post(at(robot, request, "accept")), 409, "asker-gone")["detail"]
     assert lease(anna, robot)["epoch"] == 1
+
+
+def test_who_has_signed_out_is_given_nothing(held: Three) -> None:
+    anna, other, robot = held
+    request = asked(other, robot)
+    assert other.post("/auth/sign-out").status_code == 204
+    problem(anna.post(at(robot, request, "accept")), 409, "asker-gone")
+    assert lease(anna, robot)["mine"] is True
+    assert anna.post(at(robot, request, "refuse")).json()["outcome"] == "refused"
+
+
+def test_a_refusal_that_cannot_be_told_is_a_refusal_still(
+    cloud: Cloud, held: Three, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    _, other, robot = held
+
+    async def full(*_: object) -> None:
+        raise StoreError("The disk is full.")
+
+    monkeypatch.setattr(cloud.functions.events, "add", full)
+    problem(other.take(robot.device), 409, "lease-held")
 
 
 def test_a_lease_that_the_device_has_ended_is_anybodys(cloud: Cloud, held: Three) -> None:
