@@ -77,7 +77,10 @@ async def _check_models(functions: Functions, *, drain: bool) -> None:
 async def _speak(functions: Functions) -> None:
     from function_app.entrypoints.xmpp import speak  # noqa: PLC0415 (what it needs is not everywhere)
 
-    await speak(functions)
+    try:
+        await speak(functions)
+    except ModuleNotFoundError as error:
+        raise settings.SettingsError(f"speaking XMPP needs the Python package {error.name}; run `make env`") from error
 
 
 async def _link(functions: Functions, account: str) -> None:

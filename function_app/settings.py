@@ -260,7 +260,8 @@ def _aws(given: Mapping[str, str]) -> AwsStore:
 def _matching(given: Mapping[str, str], name: str, otherwise: str, pattern: re.Pattern[str], what: str) -> str:
     text = given.get(name, otherwise)
     if not pattern.match(text):
-        raise SettingsError(f"{name} is '{text[:_SHOWN]}'; it must be {what}")
+        shown = " ".join(text[:_SHOWN].split())  # on one line, whatever it is
+        raise SettingsError(f"{name} is '{shown}'; it must be {what}")
     return text
 
 

@@ -9,7 +9,7 @@ import contextlib
 import ipaddress
 import logging
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 from xml.etree.ElementTree import Element
 
@@ -39,7 +39,7 @@ class Login:
     host: str
     port: int
     jid: str
-    password: str
+    password: str = field(repr=False)
 
     @property
     def domain(self) -> str:

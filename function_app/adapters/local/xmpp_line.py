@@ -8,6 +8,8 @@ from collections.abc import Awaitable, Callable
 
 from device_agent.protocol.stanzas import CLOUD
 from device_agent.protocol.xmpp_stream import Login, Stream
+from function_app.domain.problems import Problem
+from function_app.ports.tables import StoreError
 from function_app.ports.xmpp_line import Listener
 
 FIRST_RETRY_S = 0.1
@@ -37,25 +39,33 @@ class SlixmppLine:
         """See ``XmppLine``."""
         pause_s = FIRST_RETRY_S
         while True:
-            jid = f"{CLOUD}@{self._domain}/{secrets.token_hex(8)}"
-            login = Login(self._host, self._port, jid, await self._password())
-            stream = Stream(login, message=listener.message, presence=listener.presence)
             try:
-                await stream.open()
-                self._stream, self._trouble, pause_s = stream, "", FIRST_RETRY_S
-                _log.info("speaking XMPP at %s:%d", self._host, self._port)
-                await stream.stay()
-            except OSError as error:
+                stream = await self._open(listener)
+                try:
+                    self._stream, self._trouble, pause_s = stream, "", FIRST_RETRY_S
+                    _log.info("speaking XMPP at %s:%d", self._host, self._port)
+                    await stream.stay()
+                finally:
+                    self._stream = None
+                    await stream.close()
+                    listener.lost()
+            except (OSError, StoreError, Problem) as error:
                 if str(error) != self._trouble:
                     _log.warning("XMPP: %s", error)
                 self._trouble = str(error)
-            finally:
-                was, self._stream = self._stream, None
-                await stream.close()
-                if was is not None:
-                    listener.lost()
             await asyncio.sleep(pause_s * random.uniform(0.5, 1.0))  # noqa: S311 (spreads reconnects, hides nothing)
             pause_s = min(2 * pause_s, LAST_RETRY_S)
+
+    async def _open(self, listener: Listener) -> Stream:
+        jid = f"{CLOUD}@{self._domain}/{secrets.token_hex(8)}"
+        login = Login(self._host, self._port, jid, await self._password())
+        stream = Stream(login, message=listener.message, presence=listener.presence)
+        try:
+            await stream.open()
+        except BaseException:
+            await stream.close()
+            raise
+        return stream
 
     def send(self, stanza: str) -> bool:
         """See ``XmppLine``."""

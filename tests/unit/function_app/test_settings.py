@@ -60,7 +60,7 @@ def test_an_ipv6_address_is_bracketed_in_urls() -> None:
 WRONG = [
     *(
         (name, value)
-        for name in ("TELESCOPE_PORT", "TELESCOPE_MQTT_PORT", "TELESCOPE_WEBSOCKET_PORT")
+        for name in ("TELESCOPE_PORT", "TELESCOPE_MQTT_PORT", "TELESCOPE_WEBSOCKET_PORT", "TELESCOPE_XMPP_PORT")
         for value in ("", "0", "65536", "-1", "80.0", "http", " 80", "٣", "1e3", "9" * 5000)
     ),
     ("TELESCOPE_PORT", "65535"),  # no room for the two that follow
@@ -75,6 +75,8 @@ WRONG = [
         ("TELESCOPE_WEBSOCKET_URL", value)
         for value in ("", "http://x", "ws://", "ws://a;script-src *", "ws://a b", "wss://x:99999")
     ),
+    *(("TELESCOPE_XMPP_DOMAIN", value) for value in ("Lab", "a b", "lab.", "-lab", "lab/x", "a@b", "lab\n", "x" * 254)),
+    ("TELESCOPE_XMPP_HOST", ""),
     ("TELESCOPE_HOST", ""),
     ("TELESCOPE_HOST", "a b"),
     ("TELESCOPE_MQTT_HOST", ""),
@@ -144,3 +146,18 @@ def test_how_many_proxies_are_believed() -> None:
     assert settings.read({"TELESCOPE_TRUSTED_PROXIES": "2"}).trusted_proxies == 2
     with pytest.raises(SettingsError, match="TELESCOPE_TRUSTED_PROXIES"):
         settings.read({"TELESCOPE_TRUSTED_PROXIES": "11"})
+
+
+def test_speaking_xmpp_without_a_server_is_one_line(tmp_path: Path) -> None:
+    done = subprocess.run(
+        [sys.executable, "-m", "function_app", "xmpp"],
+        cwd=ROOT,
+        env={**os.environ, "TELESCOPE_HOME": str(tmp_path)},
+        capture_output=True,
+        text=True,
+        timeout=60,
+        check=False,
+    )
+    assert (done.returncode, done.stdout) == (1, "")
+    assert done.stderr.splitlines()[-1].startswith("telescope functions: TELESCOPE_XMPP_DOMAIN is empty; it must be")
+    assert "Traceback" not in done.stderr
