@@ -161,7 +161,9 @@ def _outbox(
         home.outbox, own=own, max_bytes=round(buffer.max_mb * 1e6), max_age_ms=round(buffer.max_age_h * 3_600_000)
     )
     teller = own + configuration.devices[0].name
-    return Outbox(shelf, publish=publish, teller=teller, quiet=quiet, keep_hz=buffer.measurements_hz)
+    # Over the others a message is confirmed once it is stored.
+    settle_s = buffer.settle_s if configuration.transport == "mqtt" else 0.0
+    return Outbox(shelf, publish=publish, teller=teller, quiet=quiet, keep_hz=buffer.measurements_hz, settle_s=settle_s)
 
 
 def _device(

@@ -74,11 +74,14 @@ class Buffer(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
         max_mb: Most that is kept [MB]; the oldest goes first.
         max_age_h: Older measurements are dropped [h]; the cloud takes in none that are older than a day.
         measurements_hz: Of each stream so many in a second are kept, at most [Hz].
+        settle_s: Over MQTT nothing of it is sent so soon after the link has come [s]: the cloud's worker, which has
+            lost the same broker, may still be on its way back.
     """
 
     max_mb: Annotated[float, Meta(ge=1, le=10_000)] = 64
     max_age_h: Annotated[float, Meta(gt=0, le=720)] = 24
     measurements_hz: Annotated[float, Meta(ge=0.01, le=20)] = 1
+    settle_s: Annotated[float, Meta(ge=0, le=600)] = 8
 
 
 class Configuration(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):

@@ -59,6 +59,8 @@ class Outbox:
         teller: Device topic, ``ts/v1/{space}/{agent}/{device}``, under which trouble with the disk is told.
         quiet: Whether nothing moves.
         keep_hz: Measurements of one stream that are kept in a second, at most [Hz].
+        settle_s: After the link has come nothing is sent for so long [s]: where the other side confirms before it has
+            stored, as a broker does, whoever stores may still be on the way back.
     """
 
     def __init__(
@@ -69,12 +71,15 @@ class Outbox:
         teller: str,
         quiet: Callable[[], bool] = lambda: True,
         keep_hz: float = 1.0,
+        settle_s: float = 0.0,
     ) -> None:
         self._shelf = shelf
         self._publish = publish
         self._teller = teller
         self._quiet = quiet
         self._period_s = 1 / keep_hz
+        self._settle_s = settle_s
+        self._send_from_s = float("inf")
         # What other threads touch; the rest is the own thread's.
         self._lock = threading.Lock()
         self._streams: dict[str, _Unsure] = {}
@@ -182,8 +187,9 @@ class Outbox:
             self._save(now_s)
             if self._began.is_set():
                 self._began.clear()
+                self._send_from_s = now_s + self._settle_s
                 self._begin()
-            if self._up.is_set():
+            if self._up.is_set() and now_s >= self._send_from_s:
                 self._send(now_s)
         except ShelfError as error:
             self._fail(error, now_s)

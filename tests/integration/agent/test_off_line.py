@@ -15,6 +15,7 @@ from tests.support.own_agent import OwnAgent
 TOML = """
 [buffer]
 measurements_hz = 5
+settle_s = 0.5
 
 [[devices]]
 name = "arm"

@@ -82,6 +82,7 @@ def test_a_folder_written_before_there_was_a_choice_speaks_mqtt(tmp_path: Path) 
         ("[buffer]\nmax_mb = 0.5\n", "max_mb"),
         ("[buffer]\nmax_age_h = nan\n", "max_age_h"),
         ("[buffer]\nmeasurements_hz = 0\n", "measurements_hz"),
+        ("[buffer]\nsettle_s = -1\n", "settle_s"),
         ('[[room]]\ndevice = "pir"\nstream = "presence"\n', "'pir' is no device of this agent .arm.; name one"),
         (f"{INTERLOCK}[[devices.interlocks]]\nspeed = 0.5\n", "device"),
         (INTERLOCK.replace("equals = true", ""), "exactly one of above, below, equals"),

@@ -172,6 +172,22 @@ def test_it_sends_slowly_and_more_slowly_while_something_moves(bench: Bench) -> 
     assert bench.link.payloads() == [str(number).encode() for number in range(len(bench.link.said))]
 
 
+def test_after_the_link_has_come_it_waits_for_whoever_stores_to_be_back_too(tmp_path: Path) -> None:
+    bench = Bench(tmp_path)
+    bench.outbox._settle_s = 8.0
+    bench.event("held")
+    for _ in range(2):
+        bench.outbox.link_changed(True)
+        bench.rounds(32)
+        assert bench.link.said == []
+    bench.rounds(2)
+    assert bench.link.payloads(topics.EVENT) == [b"held"]
+    bench.event("live")
+    bench.rounds()
+    assert bench.link.payloads(topics.EVENT) == [b"held", b"live"], "from then on at once"
+    bench.shelf.close()
+
+
 def test_no_more_than_a_window_is_under_way(bench: Bench) -> None:
     bench.measure(0, 100, sent=False)
     bench.link.confirms = False
