@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import Any
 
 from device_agent.jail.layers import LAYERS, LONGEST_MESSAGE
-from device_agent.ports.jail import Inmate, JailError, Limits
+from device_agent.ports.jail import Inmate, JailError, Limits, Standing
 
 _MAIN = Path(__file__).with_name("__main__.py")
 _START_S = 60.0
@@ -51,7 +51,7 @@ class WarmJail:
     """
 
     def __init__(self, *, trusted: bool = False, layers: Sequence[str] = LAYERS) -> None:
-        self.trusted = trusted
+        self._trusted = trusted
         self._layers = tuple(layers)
         self._own = _WarmParent(tuple)
         self._walled = _WarmParent(_bubblewrap)
@@ -59,12 +59,16 @@ class WarmJail:
 
     def start(self) -> None:
         """See ``Jail``."""
-        if sys.platform != "linux":
-            return
-        with contextlib.suppress(JailError), self._lock:
-            self._own.start()
-            if self._own.missing:
-                _log.warning("scripts: %s", self._lack(self._own))
+        standing = self.standing()
+        if standing.how != "jailed":
+            _log.warning("movement scripts are %s: %s", standing.how, standing.why)
+
+    def standing(self) -> Standing:
+        """See ``Jail``."""
+        refusal = self.refusal(stranger=False)
+        if refusal is not None:
+            return Standing("refused", refusal)
+        return Standing("trusted", self._lack(self._own)) if self._own.missing else Standing("jailed")
 
     def refusal(self, *, stranger: bool) -> str | None:
         """See ``Jail``."""
@@ -75,7 +79,7 @@ class WarmJail:
                 self._own.start()
             except JailError as error:
                 return str(error)
-        if self._own.missing and not self.trusted:
+        if self._own.missing and not self._trusted:
             return f"{self._lack(self._own)} {_WHAT_TO_DO}"
         if stranger and shutil.which("bwrap") is None:
             return (
@@ -118,7 +122,7 @@ class WarmJail:
 
     def _layers_at(self, parent: "_WarmParent") -> list[str]:
         layers = [layer for layer in self._layers if layer not in parent.missing]
-        if len(layers) < len(self._layers) and not self.trusted:
+        if len(layers) < len(self._layers) and not self._trusted:
             raise JailError(f"{self._lack(parent)} {_WHAT_TO_DO}")
         return layers
 

@@ -2,7 +2,7 @@
 
 import socket
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Literal, Protocol
 
 
 class JailError(Exception):
@@ -21,6 +21,19 @@ class Limits:
 
     cpu_s: int = 120
     memory_bytes: int = 256 * 2**20
+
+
+@dataclass(frozen=True, slots=True)
+class Standing:
+    """How scripts run on this machine.
+
+    Attributes:
+        how: In the jail with all its layers; with fewer, since the owner trusts them; or not at all.
+        why: What is missing, and what to do about it; empty where they are ``jailed``.
+    """
+
+    how: Literal["jailed", "trusted", "refused"]
+    why: str = ""
 
 
 class Inmate(Protocol):
@@ -48,12 +61,11 @@ class Inmate(Protocol):
 class Jail(Protocol):
     """Makes inmates. Thread-safe; the constructor starts nothing."""
 
-    @property
-    def trusted(self) -> bool:
-        """Whether the agent's owner has allowed scripts to run behind fewer layers than all."""
-
     def start(self) -> None:
         """Look what this machine has, and be ready. May be called twice. Never raises: ``refusal`` tells."""
+
+    def standing(self) -> Standing:
+        """How scripts of the robot's own people run here."""
 
     def refusal(self, *, stranger: bool) -> str | None:
         """Why scripts are refused here, and what to do about it; ``None`` where they run.

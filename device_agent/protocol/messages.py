@@ -90,6 +90,9 @@ class Description(Struct, frozen=True, kw_only=True):
 
     ``limits`` names what the agent itself holds, whoever moves the device: ``clearance`` and ``workspace`` are missing
     where nobody knows the robot's shape.
+
+    ``scripts``: movement scripts run in the jail, run with less (``trusted``, as the agent's owner wants it), or are
+    refused; ``scripts_note`` says why, and what to do.
     """
 
     device: Id
@@ -105,6 +108,8 @@ class Description(Struct, frozen=True, kw_only=True):
     simulated: bool = False
     limits: tuple[Label, ...] = ()
     interlocks: tuple[InterlockRule, ...] = ()
+    scripts: Literal["jailed", "trusted", "refused"] = "refused"
+    scripts_note: Text = ""
 
 
 class Geometry(Struct, frozen=True, kw_only=True):

@@ -201,8 +201,7 @@ class _Run:
 
     def end(self, status: AckStatus, why: Refused) -> None:
         """Bring it to an end, from any thread; the first reason stays."""
-        if self._ending is None:
-            self._ending = (status, why)
+        self._ending = self._ending or (status, why)
         self.robot.give_back()
         self._activity.kill()
 
@@ -225,8 +224,7 @@ class _Run:
 
     def _lost(self, why: Refused) -> None:
         # The controller calls this with its lock held: no call back into it from here.
-        if self._ending is None:
-            self._ending = (AckStatus.FAILED, why)
+        self._ending = self._ending or (AckStatus.FAILED, why)
         self.robot.end()
         self._activity.kill()
 

@@ -39,6 +39,7 @@ _REFUSED = {
     topics.STOP: EventKind.STOP_REFUSED,
     topics.CMD: EventKind.COMMAND_REFUSED,
 }
+_SCRIPTS = {"refused": EventKind.SCRIPTS_REFUSED, "trusted": EventKind.SCRIPTS_TRUSTED}
 _log = logging.getLogger(__name__)
 
 
@@ -86,6 +87,7 @@ class Device:
     ) -> None:
         self.name = name
         self._driver = driver
+        self._jail = jail
         record = journal.device(name)
         gate = LeaseGate(epoch=record.epoch, burned=record.epoch)  # a restart ends whatever lease there was
         self._audit = Audit()
@@ -146,6 +148,9 @@ class Device:
         epoch, _ = self._controller.epochs
         data = {"epoch": epoch, "stopped": self._controller.latch is not None}
         self._audit.note(Happened(EventKind.AGENT_STARTED, "the agent started; leases of before have ended", data=data))
+        self.voice.scripts = scripts = self._jail.standing()
+        if scripts.how != "jailed":
+            self._audit.note(Happened(_SCRIPTS[scripts.how], scripts.why, "warning", {"why": scripts.why}))
         self._office.start(self._driver.twin())
 
     def stop(self) -> None:

@@ -4,7 +4,7 @@ import math
 import threading
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, assert_never
+from typing import Any
 
 from device_agent.ports import skills
 from device_agent.ports.driver import Observation, Twist
@@ -245,9 +245,7 @@ def _skill(call: calls.Say | calls.Stiffness | calls.Express | calls.Behaviour) 
         case calls.Express(name=name, strength=strength):
             _check_share("strength", strength)
             return skills.Express(name, strength)
-        case calls.Behaviour(name=name):
-            return skills.Behave(name)
-    assert_never(call)
+    return skills.Behave(call.name)
 
 
 def _check_share(name: str, value: float, *, least: float = 0.0) -> None:

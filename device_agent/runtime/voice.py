@@ -7,6 +7,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 from device_agent.ports.clock import tick_ms, wall_ms
+from device_agent.ports.jail import Standing
 from device_agent.protocol import codec, topics
 from device_agent.protocol.messages import (
     Ack,
@@ -81,6 +82,7 @@ class Voice:
 
     Attributes:
         refusals: How often what was refused, by code.
+        scripts: How movement scripts run here, as ``desc`` says it.
     """
 
     def __init__(
@@ -112,6 +114,7 @@ class Voice:
         self._shown: tuple[object, ...] = ()
         self._shown_at_s = float("-inf")
         self.refusals: dict[str, int] = {}
+        self.scripts = Standing("refused", "the agent has not looked yet what this machine has")
 
     # ------------------------------------------------------------ answers to commands
 
@@ -210,6 +213,8 @@ class Voice:
             simulated=self._simulated,
             limits=self._limits,
             interlocks=self._interlocks,
+            scripts=self.scripts.how,
+            scripts_note=self.scripts.why[:2000],
         )
 
     def _topic(self, kind: str, name: str = "") -> str:

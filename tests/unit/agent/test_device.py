@@ -14,6 +14,8 @@ from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
 
 from device_agent.ports.clock import CloudClock, tick_ms, wall_ms
 from device_agent.ports.driver import DriverError, Observation
+from device_agent.ports.geometry import Geometry
+from device_agent.ports.jail import Jail
 from device_agent.protocol import codec, signing, topics
 from device_agent.protocol.messages import (
     SHIPPED,
@@ -38,6 +40,7 @@ from device_agent.protocol.messages import (
     StopDevice,
     Twin,
 )
+from device_agent.protocol.robot_type import RobotType
 from device_agent.runtime.controller import Controller
 from device_agent.runtime.device import Device
 from device_agent.runtime.interlocks import Interlock
@@ -49,6 +52,7 @@ from tests.support.jail import warm_jail
 from tests.unit.agent.test_controller import robot_type
 
 WITHIN_S = 15.0
+OWNER = "accountaaaaaaaaa"
 
 
 class ToyDriver:
@@ -83,10 +87,19 @@ class ToyDriver:
 class Bench:
     """A device, the cloud's key, and everything the device has said."""
 
-    def __init__(self, folder: Path, *, interlocks: Sequence[Interlock] = ()) -> None:
+    def __init__(
+        self,
+        folder: Path,
+        *,
+        interlocks: Sequence[Interlock] = (),
+        driver: ToyDriver | None = None,
+        kind: RobotType | None = None,
+        geometry: Geometry | None = None,
+        jail: Jail | None = None,
+    ) -> None:
         self.key = signing.generate()
         self.said: list[tuple[str, bytes]] = []
-        self.driver = ToyDriver()
+        self.driver = driver or ToyDriver()
         self.journal = Journal(folder / "journal.db")
         self.journal.open(now_ms=wall_ms())
         self.journal.end_open(now_ms=wall_ms(), tick_ms=tick_ms())
@@ -102,7 +115,7 @@ class Bench:
             label="Arm",
             space="s",
             agent="a",
-            robot_type=robot_type(),
+            robot_type=kind or robot_type(),
             driver=self.driver,
             journal=self.journal,
             cloud_clock=self.clock,
@@ -111,7 +124,9 @@ class Bench:
             outbox=self.outbox,
             room=Room(space="s", agent="a", own=["arm"], named=[(rule.device, rule.stream) for rule in interlocks]),
             interlocks=interlocks,
-            jail=warm_jail(),
+            geometry=geometry,
+            jail=jail or warm_jail(),
+            owner=OWNER,
         )
 
     def stop(self) -> None:

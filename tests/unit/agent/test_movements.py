@@ -11,7 +11,7 @@ from typing import Any
 
 import pytest
 
-from device_agent.ports.jail import JailError, Limits
+from device_agent.ports.jail import JailError, Limits, Standing
 from device_agent.protocol.messages import RunMovement
 from device_agent.runtime import calls, movements
 from device_agent.runtime.lease import Refused
@@ -82,13 +82,14 @@ class FakeInmate:
 
 
 class FakeJail:
-    trusted = False
-
     def __init__(self, inmate: FakeInmate | None) -> None:
         self.inmate = inmate
 
     def start(self) -> None:
         pass
+
+    def standing(self) -> Standing:
+        return Standing("jailed")
 
     def refusal(self, *, stranger: bool) -> str | None:
         del stranger

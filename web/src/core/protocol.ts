@@ -18,6 +18,9 @@ export interface Presence {
  *
  * `limits` names what the agent itself holds, whoever moves the device: `clearance` and `workspace` are missing
  * where nobody knows the robot's shape.
+ *
+ * `scripts`: movement scripts run in the jail, run with less (`trusted`, as the agent's owner wants it), or are
+ * refused; `scripts_note` says why, and what to do.
  */
 export interface Description {
   /** letters, digits, _ and -, 1 to 64 of them */
@@ -35,6 +38,8 @@ export interface Description {
   simulated?: boolean;
   limits?: string[];
   interlocks?: InterlockRule[];
+  scripts?: "jailed" | "refused" | "trusted";
+  scripts_note?: string;
 }
 
 /** One joint and the limits that the agent enforces. */
