@@ -105,4 +105,8 @@ def verify_text(text: str, signature: str, key: Ed25519PublicKey, *, context: by
 
 
 def _unbase64(text: str) -> bytes:
-    return base64.b64decode(text + "=" * (-len(text) % 4), altchars=b"-_", validate=True)
+    """Bytes of base64url; each has one text alone, so that no character of it may differ."""
+    content = base64.b64decode(text + "=" * (-len(text) % 4), altchars=b"-_", validate=True)
+    if base64.urlsafe_b64encode(content).rstrip(b"=").decode() != text:
+        raise binascii.Error("bits are set that belong to no byte")
+    return content
