@@ -255,10 +255,11 @@ class Home:
         if not self.folder.is_dir():
             raise HomeError(f"{self.folder} holds no agent; run `python -m device_agent enroll` first")
         path = self.folder / "running.lock"
-        with contextlib.closing(sqlite3.connect(path, timeout=0, isolation_level=None)) as lock:
+        with contextlib.ExitStack() as holding:
             try:
+                lock = holding.enter_context(contextlib.closing(sqlite3.connect(path, timeout=0, isolation_level=None)))
                 lock.execute("BEGIN EXCLUSIVE")
-            except sqlite3.OperationalError as error:
+            except sqlite3.Error as error:
                 if "locked" in str(error):
                     raise HomeError(f"another process runs the agent of {self.folder} already; end it first") from error
                 raise HomeError(f"{path} cannot be written: {error}") from error

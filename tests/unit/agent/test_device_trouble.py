@@ -8,8 +8,9 @@ import pytest
 
 from device_agent.ports.driver import DriverError, Observation
 from device_agent.protocol import topics
-from device_agent.protocol.messages import AckStatus, GrantLease, Mode, MoveJoints, Twin
+from device_agent.protocol.messages import AckStatus, Event, GrantLease, Mode, MoveJoints, Twin
 from device_agent.runtime import office
+from device_agent.runtime.journal import Journal, JournalError
 from device_agent.runtime.office import Office
 from device_agent.runtime.robot import ScriptRobot
 from tests.unit.agent.test_device import Bench, ToyDriver, eventually
@@ -51,6 +52,18 @@ def test_an_action_that_meets_a_bug_has_failed_and_the_next_one_runs(
 def test_a_command_that_meets_a_bug_has_failed(bench: Bench, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(Office, "_carry_out", broken)
     assert code(bench, bench.command(GrantLease(holder="ann", lease_ms=1000), epoch=1)) == "internal"
+
+
+def test_a_command_that_could_not_be_written_down_is_not_obeyed(bench: Bench, monkeypatch: pytest.MonkeyPatch) -> None:
+    def full(*_: Any, **__: Any) -> None:
+        raise JournalError("is the disk full?")
+
+    monkeypatch.setattr(Journal, "save_epoch", full)
+    command = bench.command(MOVE, epoch=7)
+    eventually(lambda: [event for event in bench.heard(topics.EVENT, Event) if "disk" in event.message])
+    assert {ack.status for ack in bench.acks(command)} <= {AckStatus.RECEIVED}
+    assert bench.driver.position == (0.0, 0.0)
+    monkeypatch.undo()
 
 
 def test_what_else_goes_wrong_does_not_end_the_office(bench: Bench, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -169,3 +169,9 @@ def test_a_folder_that_cannot_be_written_is_named(tmp_path: Path) -> None:
     (tmp_path / "file").write_text("no folder")
     with pytest.raises(HomeError, match="cannot be written"):
         Home(tmp_path / "file").save_pairing(Pairing(agent="a", space="s", account="ann", keys={}))
+
+
+def test_a_lock_that_cannot_be_written_is_named(tmp_path: Path) -> None:
+    (tmp_path / "running.lock").mkdir()
+    with pytest.raises(HomeError, match=r"running\.lock cannot be written"), Home(tmp_path).hold():
+        pass

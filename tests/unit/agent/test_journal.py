@@ -131,3 +131,9 @@ def test_epochs_are_on_disk_when_they_are_saved(journal: Journal, tmp_path: Path
     with sqlite3.connect(tmp_path / "journal.db") as other:
         assert other.execute("SELECT epoch FROM devices").fetchone() == (9,)
     other.close()
+
+
+def test_a_confirmation_that_comes_after_the_end_is_passed_over(journal: Journal) -> None:
+    journal.close()
+    journal.delivered(ack("c1"))
+    journal.close()
