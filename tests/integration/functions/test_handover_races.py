@@ -162,7 +162,7 @@ def see_one_outcome(place: Place, rounds: int) -> None:
         )
 
     outcomes = run_here(place, whole)
-    assert len(outcomes) > 2, f"nobody raced: {outcomes}"
+    assert len(outcomes) > 1, f"nobody raced: {outcomes}"
     for (device, epoch), kinds in orders(place).items():
         granted = kinds["grant_lease"] + kinds["reset_stop"]
         assert granted <= 1, f"epoch {epoch} of {device} was given twice"
