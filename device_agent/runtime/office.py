@@ -116,6 +116,7 @@ class Office:
 
     def introduce(self) -> None:
         """The link has come: say soon what the device is, and what may not have been heard."""
+        self._voice.link_came()
         self._introduce.set()
 
     def _run(self) -> None:

@@ -78,7 +78,7 @@ class Outbox:
         self._teller = teller
         self._quiet = quiet
         self._period_s = 1 / keep_hz
-        self._settle_s = settle_s
+        self.settle_s = settle_s
         self._send_from_s = float("inf")
         # What other threads touch; the rest is the own thread's.
         self._lock = threading.Lock()
@@ -187,7 +187,7 @@ class Outbox:
             self._save(now_s)
             if self._began.is_set():
                 self._began.clear()
-                self._send_from_s = now_s + self._settle_s
+                self._send_from_s = now_s + self.settle_s
                 self._begin()
             if self._up.is_set() and now_s >= self._send_from_s:
                 self._send(now_s)

@@ -5,6 +5,7 @@ import threading
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import partial
 
 from device_agent.ports.clock import tick_ms, wall_ms
 from device_agent.ports.jail import Standing
@@ -109,6 +110,8 @@ class Voice:
         self._publish = publish
         self._outbox = outbox
         self._delivered: queue.SimpleQueue[Ack] = queue.SimpleQueue()
+        self._believed_from_s = float("-inf")
+        self._answer_again = False
         self._sequences: dict[str, int] = {}
         self._lock = threading.Lock()
         self._shown: tuple[object, ...] = ()
@@ -136,7 +139,11 @@ class Voice:
 
     def send_ack(self, ack: Ack) -> None:
         """Publish an ack that the journal has."""
-        self._publish(self._topic(topics.ACK), codec.encode(ack), qos=1, delivered=lambda: self._delivered.put(ack))
+        self._publish(self._topic(topics.ACK), codec.encode(ack), qos=1, delivered=partial(self._confirmed, ack))
+
+    def _confirmed(self, ack: Ack) -> None:
+        if time.monotonic() >= self._believed_from_s:
+            self._delivered.put(ack)
 
     def keep(self) -> None:
         """Write down which answers have arrived."""
@@ -145,18 +152,29 @@ class Voice:
 
     # ------------------------------------------------------------ what the device is, and how
 
+    def link_came(self) -> None:
+        """Until the outbox begins to send, a confirmation does not say that the cloud has an answer: see ``Outbox``."""
+        self._believed_from_s = time.monotonic() + self._outbox.settle_s
+        self._answer_again = self._outbox.settle_s > 0
+
     def introduce(self, twin: Twin | None) -> None:
         """After each connection: what the device is, how it is, and the answers that may not have arrived."""
         self._retain(self._topic(topics.DESC), self._description())
         if twin is not None:
             self._retain(self._topic(topics.DESC, topics.TWIN), twin)
         self._shown_at_s = float("-inf")
+        self._answer()
+
+    def _answer(self) -> None:
         for ack in self._journal.undelivered(self._name):
             self.send_ack(ack)
 
     def show(self, now: Condition) -> None:
         """Publish ``state`` on change, at most once a second, and every 30 s."""
         now_s = time.monotonic()
+        if self._answer_again and now_s >= self._believed_from_s:
+            self._answer_again = False
+            self._answer()
         shown = now.shown()
         age_s = now_s - self._shown_at_s
         if age_s < STATE_GAP_S or (shown == self._shown and age_s < STATE_EVERY_S):

@@ -250,3 +250,24 @@ def test_an_answer_that_nobody_confirmed_is_given_again_over_the_next_link(bench
     before = len(bench.acks(command))
     bench.device.link_changed(True)
     eventually(lambda: len(bench.acks(command)) > before)
+
+
+def test_while_a_link_is_young_answers_are_not_believed_to_have_arrived_and_given_once_more(tmp_path: Path) -> None:
+    bench = Bench(tmp_path)
+    bench.outbox.settle_s = 1000.0
+    bench.device.start()
+    bench.device.link_changed(True)
+    command = bench.command(StopDevice())
+    answer = bench.end(command)
+    time.sleep(0.3)
+    assert bench.journal.undelivered("arm") == (answer,)
+    bench.device.voice._believed_from_s = 0.0
+    eventually(lambda: bench.acks(command)[-2:] == [answer, answer])
+    eventually(lambda: bench.journal.undelivered("arm") == ())
+    later = bench.command(StopDevice())
+    bench.end(later)
+    eventually(lambda: bench.journal.undelivered("arm") == ())
+    assert [ack.status for ack in bench.acks(later)] == [AckStatus.DONE]
+    bench.device.stop()
+    bench.outbox.stop()
+    bench.journal.close()

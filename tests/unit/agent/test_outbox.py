@@ -174,7 +174,7 @@ def test_it_sends_slowly_and_more_slowly_while_something_moves(bench: Bench) -> 
 
 def test_after_the_link_has_come_it_waits_for_whoever_stores_to_be_back_too(tmp_path: Path) -> None:
     bench = Bench(tmp_path)
-    bench.outbox._settle_s = 8.0
+    bench.outbox.settle_s = 8.0
     bench.event("held")
     for _ in range(2):
         bench.outbox.link_changed(True)
