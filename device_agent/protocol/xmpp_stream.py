@@ -20,6 +20,8 @@ from slixmpp.xmlstream.matcher import MatchXPath
 from device_agent.protocol import stanzas
 
 _LOGIN_S = 5.0
+_GOODBYE_S = 0.2
+_GOODBYE_LOOKS = 20
 _CLIENT = "jabber:client"
 _HANDLERS_FOR_CHAT = ("IM", "IMError", "Presence", "Roster Update")
 
@@ -157,11 +159,17 @@ class Stream:
             return
         self._lost.set()
         client.cancel_connection_attempt()
-        if client.transport is not None:
+        transport: Any = client.transport
+        if transport is not None:
             # The server tells everybody who knows us; whether it closes its side is of no interest.
             client.send_raw(stanzas.presence(available=False) + client.stream_footer)
-            client.transport.close()
+            for _ in range(_GOODBYE_LOOKS):
+                if not transport.get_write_buffer_size():
+                    break
+                await asyncio.sleep(_GOODBYE_S / _GOODBYE_LOOKS)
+            transport.abort()  # under TLS, `close` would wait for the other side
         await client.quit()
+        await asyncio.sleep(0)  # the socket is closed by the loop's next turn
 
     def _on(self, handle: Callable[[Element], None]) -> Callable[[Any], None]:
         def run(stanza: Any) -> None:
