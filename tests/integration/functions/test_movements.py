@@ -10,7 +10,10 @@ import pytest
 from cryptography.exceptions import InvalidSignature
 
 from device_agent.protocol import signing
-from device_agent.protocol.messages import AckStatus, RunMovement
+from device_agent.protocol.messages import SHIPPED, AckStatus, RunMovement
+from device_agent.runtime.journal import Journal
+from device_agent.runtime.lease import Refused
+from device_agent.runtime.trust import Trust
 from function_app.ports.tables import Row
 from function_app.services import store
 from function_app.services.movements import KEPT_MS
@@ -170,6 +173,42 @@ def test_an_action_runs_the_newest_version_of_the_callers_own(pair: tuple[Person
     anna.start(robot.device, request=asked, wait_ms=10_000, wait_for="done")
     ran = [command.request for command in robot.heard(RunMovement)]
     assert [each.source for each in ran if isinstance(each, RunMovement)] == [*sources, anna.get(WAVE).json()["source"]]
+
+
+def test_no_version_that_may_run_is_older_for_the_device_than_one_that_ran(
+    pair: tuple[Person, Robot], tmp_path: Path
+) -> None:
+    anna, robot = pair
+    robot.reports = lambda _: (AckStatus.DONE,)
+    asked = {"kind": "run_movement", "name": "wave"}
+
+    def run() -> None:
+        anna.start(robot.device, request=asked, wait_ms=10_000, wait_for="done")
+
+    run()
+    for source in ("robot.home()\n", "robot.home()  # again\n"):
+        anna.put(WAVE, {"source": source})
+        run()
+    anna.delete(WAVE)
+    run()
+    anna.put(WAVE, {"source": "robot.home()  # made anew\n"})
+    run()
+    orders = [command.request for command in robot.heard(RunMovement)]
+    journal = Journal(tmp_path / "journal.db")
+    journal.open(now_ms=0)
+    trust = Trust(device="arm", robot_type="ur5", owner=anna.account, keys=robot._keys, journal=journal)
+    for order in orders:
+        assert isinstance(order, RunMovement)
+        trust.check(order)
+        trust.remember(order)
+        assert not trust.stranger(order)
+        assert order.timeout_ms == 300_000
+    with pytest.raises(Refused, match="older than version"):
+        trust.check(orders[1])  # type: ignore[arg-type]
+    journal.close()
+    assert [each.author for each in orders if isinstance(each, RunMovement)] == [
+        SHIPPED, anna.account, anna.account, SHIPPED, anna.account,
+    ]  # fmt: skip
 
 
 class TestVersions:
