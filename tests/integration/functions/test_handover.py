@@ -7,7 +7,8 @@ import pytest
 
 from device_agent.protocol.messages import AskLease, DropRequest, GrantLease, Mode, ReleaseLease, State
 from function_app.domain.accounts import Role
-from function_app.ports.broker_access import Credentials
+from function_app.ports.broker_access import BrokerAccessError, Credentials
+from function_app.ports.command_bus import BusUnavailable
 from function_app.ports.tables import StoreError
 from function_app.services import devices as devices_service
 from tests.support.brokers import BROKERS, RunningBroker, wait_until
@@ -350,3 +351,26 @@ def test_release_and_the_lease_of_an_action_are_told(cloud: Cloud, held: Three) 
         "control-taken",
         {"epoch": action["epoch"], "holder": "anna", "action": action["id"]},
     )
+
+
+def test_while_the_broker_is_away_the_tables_decide_and_nothing_is_confirmed(
+    cloud: Cloud, held: Three, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    anna, other, robot = held
+
+    async def away(*_: object, **__: object) -> None:
+        raise BusUnavailable("The broker does not answer")
+
+    async def gone(*_: object, **__: object) -> None:
+        raise BrokerAccessError("The broker does not answer")
+
+    monkeypatch.setattr(cloud.functions.bus, "publish", away)
+    monkeypatch.setattr(cloud.functions.access, "revoke", gone)
+    answer = ask(other, robot)
+    assert (answer.status_code, answer.json()["confirmed"]) == (201, False)
+    assert anna.post(at(robot, answer.json()["request"]["id"], "refuse")).json()["outcome"] == "refused"
+    given = anna.post(at(robot, asked(other, robot), "accept")).json()
+    assert (given["epoch"], given["confirmed"], given["request"]["outcome"]) == (2, False, "accepted")
+    assert lease(other, robot)["mine"] is True
+    assert other.delete(f"/devices/{robot.device}/lease?epoch=2").status_code == 204
+    assert lease(other, robot) is None
