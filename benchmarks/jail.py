@@ -63,15 +63,15 @@ def main(runs: int = 300) -> None:
     jail = WarmJail()
     begun_s = time.perf_counter()
     jail.start()
-    print(f"warm parent ready after {(time.perf_counter() - begun_s) * 1000:.0f} ms; {runs} runs each [ms]")  # noqa: T201
+    print(f"warm parent ready after {(time.perf_counter() - begun_s) * 1000:.0f} ms; {runs} runs each [ms]")
     for stranger in (False, True):
         with contextlib.closing(jail.open(Limits(), stranger=stranger)):
             pass  # the first starts the warm parent
         for name, source in SCRIPTS.items():
             starts, stops = measure(jail, source, runs, stranger=stranger)
             where = "bubblewrap: " if stranger else ""
-            print(f"{where + name:50} start {percentiles(starts)}")  # noqa: T201
-            print(f"{'':50} stop  {percentiles(stops)}")  # noqa: T201
+            print(f"{where + name:50} start {percentiles(starts)}")
+            print(f"{'':50} stop  {percentiles(stops)}")
     jail.close()
 
 

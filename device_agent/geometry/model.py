@@ -12,12 +12,17 @@ import numpy.typing as npt
 
 from device_agent.geometry.pairs import Pairs
 from device_agent.geometry.solver import Solver
-from device_agent.ports.geometry import STEP_M, Clearance, GeometryError, Sweep
+from device_agent.ports.geometry import Clearance, GeometryError, Sweep
 from device_agent.protocol.messages import Pose
 from device_agent.protocol.robot_type import RobotType
 
 Floats = npt.NDArray[np.float64]
 
+_STEP_M = 0.01
+"""What comes nearer by less than this, and goes away again, may be missed: half of the usual margin."""
+_GLANCES = 6
+_CLOSER = 3
+"""How often the place is halved in which a glance finds a way to end."""
 _SAME_M = 1e-7
 """Less than this is no change of a distance: far above rounding, far below what creeping could add up to."""
 
@@ -73,7 +78,7 @@ class MujocoGeometry:
             self._place(position_rad)
             return self._pairs.tightest(self._data)
 
-    def sweep(self, path_rad: Sequence[Sequence[float]], *, step_m: float = STEP_M) -> Sweep:
+    def sweep(self, path_rad: Sequence[Sequence[float]]) -> Sweep:
         """Go from one joint position straight to the next until something is too near, or nearer than it was."""
         path = np.asarray(path_rad, dtype=np.float64)
         legs = np.diff(path, axis=0)
@@ -84,12 +89,31 @@ class MujocoGeometry:
                 share = 0.0
                 while share < 1.0 and near.any:
                     gone = share
-                    share = min(1.0, share + near.safe_share(index, step_m))
+                    share = min(1.0, share + near.safe_share(index, _STEP_M))
                     self._place(path[index] + share * leg)
                     near.look(self._data, index, share)
                     if near.broken(_SAME_M):
                         return Sweep((index + gone) / len(legs), near.tightest())
             return Sweep(1.0)
+
+    def glance(self, start_rad: Sequence[float], end_rad: Sequence[float]) -> float:
+        """The share of a straight way that seems clear, by six places on it, and three where it ends."""
+        start, way = np.asarray(start_rad, dtype=np.float64), np.subtract(end_rad, start_rad)
+        with self._lock:
+            self._place(start)
+            before = self._pairs.too_near(self._data)
+
+            def clear(share: float) -> bool:
+                self._place(start + share * way)
+                return self._pairs.too_near(self._data) <= before
+
+            for index in range(_GLANCES):
+                if not clear((index + 1) / _GLANCES):
+                    low, half = index / _GLANCES, 0.5 / _GLANCES
+                    for _ in range(_CLOSER):
+                        low, half = (low + half if clear(low + half) else low), half / 2
+                    return low
+            return 1.0
 
     def speed_m_s(self, velocity_rad_s: Sequence[float]) -> float:
         """A speed that no point of the robot exceeds [m/s]."""

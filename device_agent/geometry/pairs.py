@@ -143,6 +143,12 @@ class Pairs:
         near.begin()
         return near
 
+    def too_near(self, data: Any) -> frozenset[int]:
+        """Which pairs, and which frames beyond which faces, are nearer than they may be."""
+        pairs = np.flatnonzero(self._at_least(data) < self._margin).tolist()
+        near = {pair for pair in pairs if self.room(data, pair, 0.0) < 0}
+        return frozenset(near.union((np.flatnonzero(self.rooms(data) < 0) + len(self._a)).tolist()))
+
     def speed_m_s(self, velocity_rad_s: Floats) -> float:
         """The bound of the fastest point's speed; velocities not negative."""
         return float(np.max(self._everywhere @ velocity_rad_s, initial=0.0))

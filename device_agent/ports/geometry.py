@@ -10,9 +10,6 @@ from typing import Protocol
 
 from device_agent.protocol.messages import Pose
 
-STEP_M = 0.01
-"""Half of the usual margin."""
-
 
 class GeometryError(Exception):
     """The model cannot be used, or has no answer. Its text is fit for an operator."""
@@ -68,7 +65,7 @@ class Geometry(Protocol):
         Quick enough for the control loop.
         """
 
-    def sweep(self, path_rad: Sequence[Sequence[float]], *, step_m: float = STEP_M) -> Sweep:
+    def sweep(self, path_rad: Sequence[Sequence[float]]) -> Sweep:
         """Go from one joint position straight to the next until something is nearer than it may be.
 
         From where something is too near already: until it comes nearer still, so that it can be left.
@@ -77,7 +74,12 @@ class Geometry(Protocol):
 
         Args:
             path_rad: At least two positions; each leg counts alike in ``Sweep.share``.
-            step_m: What comes nearer by less than this, and goes away again, may be missed [m].
+        """
+
+    def glance(self, start_rad: Sequence[float], end_rad: Sequence[float]) -> float:
+        """The share of a straight way that seems clear, by a few places on it.
+
+        What is thin may be missed: this is for how fast to go there, ``sweep`` for whether.
         """
 
     def speed_m_s(self, velocity_rad_s: Sequence[float]) -> float:

@@ -19,7 +19,6 @@ _LAG_S = 0.1
 """Slowing down follows what is seen by so much: a look every fourth period, and the jerk limit."""
 _AHEAD = 1.25
 """How much further than needed it looks, so that a limit can also rise again."""
-_STEP_M = 0.05
 _CREEP_RAD_S = 0.02
 """Never slower than this, so that a target close to something is reached; the brakes hold before the margin."""
 _EASY_S = 0.1
@@ -81,6 +80,6 @@ class Pace:
         blind_s = self.age_s + self._watchdog_s + braking_s + _LAG_S
         ahead_s = _AHEAD * blind_s
         end = [position + velocity * ahead_s for position, velocity in zip(position_rad, velocity_rad_s, strict=True)]
-        share = self._geometry.sweep((position_rad, end), step_m=_STEP_M).share
+        share = self._geometry.glance(position_rad, end)
         self._cap_rad_s = math.inf if share >= 1.0 else max(_CREEP_RAD_S, fastest * share * ahead_s / blind_s)
         return self._cap_rad_s

@@ -38,13 +38,13 @@ class Post(Wall):
         shoulder, elbow = position_rad
         return Clearance(max(self.at_rad - elbow, abs(shoulder - 0.8) - 0.2), ("hand", "post"))
 
-    def sweep(self, path_rad: Sequence[Sequence[float]], *, step_m: float = 0.01) -> Sweep:
+    def sweep(self, path_rad: Sequence[Sequence[float]]) -> Sweep:
         fine = [
             [a + (b - a) * part / 10 for a, b in zip(begin, end, strict=True)]
             for begin, end in pairwise(path_rad)
             for part in range(10)
         ]
-        return super().sweep([*fine, path_rad[-1]], step_m=step_m)
+        return super().sweep([*fine, path_rad[-1]])
 
 
 class Chance:

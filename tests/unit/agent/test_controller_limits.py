@@ -35,7 +35,7 @@ class Wall:
     def clearance(self, position_rad: Sequence[float]) -> Clearance:
         return Clearance(self.at_rad - position_rad[1], ("hand", "wall"))
 
-    def sweep(self, path_rad: Sequence[Sequence[float]], *, step_m: float = 0.01) -> Sweep:  # noqa: ARG002
+    def sweep(self, path_rad: Sequence[Sequence[float]]) -> Sweep:
         rooms = [self.clearance(position).room_m for position in path_rad]
         least = min(0.0, rooms[0]) - 1e-7
         for leg, (begin, end) in enumerate(pairwise(rooms)):
@@ -43,6 +43,9 @@ class Wall:
                 share = (leg + (begin - least) / (begin - end)) / (len(rooms) - 1)
                 return Sweep(share, Clearance(end, ("hand", "wall")))
         return Sweep(1.0)
+
+    def glance(self, start_rad: Sequence[float], end_rad: Sequence[float]) -> float:
+        return self.sweep([start_rad, end_rad]).share
 
     def speed_m_s(self, velocity_rad_s: Sequence[float]) -> float:
         return abs(velocity_rad_s[1])
@@ -208,7 +211,7 @@ def test_a_shape_that_fails_under_way_is_no_permission() -> None:
     """The loop that calls ``step`` takes any error for a fault, and holds."""
 
     class Broken(Wall):
-        def sweep(self, path_rad: Sequence[Sequence[float]], *, step_m: float = 0.01) -> Sweep:  # noqa: ARG002
+        def sweep(self, path_rad: Sequence[Sequence[float]]) -> Sweep:  # noqa: ARG002
             raise RuntimeError("no shape")
 
     rig = Rig(geometry=Broken())

@@ -89,6 +89,16 @@ def test_who_is_too_near_may_leave_but_not_go_on(shape: MujocoGeometry) -> None:
     assert stopped.clearance.text == "clearance: table_top \u2013 wrist_3_link"
 
 
+def test_a_glance_sees_how_far_a_way_is_clear(shape: MujocoGeometry) -> None:
+    assert shape.glance(HOME, [1.0, *HOME[1:]]) == 1.0
+    for lift in (-0.8, -0.5, 0.3):
+        down = [0.0, lift, *HOME[2:]]
+        assert shape.glance(HOME, down) == pytest.approx(shape.sweep([HOME, down]).share, abs=0.04)
+    low = [0.0, -0.86, *HOME[2:]]
+    assert shape.glance(low, HOME) == 1.0
+    assert shape.glance(low, [0.0, 0.3, *HOME[2:]]) < 1.0, "something else comes too near on that way"
+
+
 def test_no_point_is_faster_than_the_bound(shape: MujocoGeometry) -> None:
     model = mujoco.MjModel.from_xml_path(str(UR5 / KIND.scene))
     data = mujoco.MjData(model)
