@@ -11,7 +11,7 @@ import pytest
 
 from device_agent.ports import skills
 from device_agent.ports.driver import Observation, Twist
-from device_agent.ports.geometry import STEP_M, Clearance, GeometryError, Sweep
+from device_agent.ports.geometry import Clearance, GeometryError, Sweep
 from device_agent.ports.jail import Standing
 from device_agent.ports.skills import Skill, SkillError, Stage
 from device_agent.protocol import codec, topics
@@ -80,9 +80,12 @@ class Head:
         del position_rad
         return Clearance(10.0, ("face", "floor"))
 
-    def sweep(self, path_rad: Sequence[Sequence[float]], *, step_m: float = STEP_M) -> Sweep:
-        del path_rad, step_m
+    def sweep(self, path_rad: Sequence[Sequence[float]]) -> Sweep:
+        del path_rad
         return Sweep(1.0)
+
+    def glance(self, start_rad: Sequence[float], end_rad: Sequence[float]) -> float:
+        raise NotImplementedError
 
     def speed_m_s(self, velocity_rad_s: Sequence[float]) -> float:
         return max(map(abs, velocity_rad_s))
