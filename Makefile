@@ -76,12 +76,13 @@ web/dist/index.html: web/node_modules/.installed web/index.html web/package.json
 	@$(NPM) run --silent build -- --logLevel warn
 	@touch $@
 
-test: .venv/.dev console check tests/azurite/node_modules/.installed .venv/.azure-worker
+# The agent's unit tests run once: where their coverage is counted.
+test: .venv/.dev console check tests/azurite/node_modules/.installed .venv/.azure-worker coverage
 	@tests/system-packages
 	@$(NPM) test --silent
-	@$(BIN)/python -m pytest -m "not long"
+	@$(BIN)/python -m pytest -m "not long" --ignore tests/unit/agent
 
-test-long: .venv/.dev console check tests/azurite/node_modules/.installed .venv/.azure-worker
+test-long: .venv/.dev console check tests/azurite/node_modules/.installed .venv/.azure-worker coverage
 	@tests/system-packages
 	@$(NPM) test --silent
 	@$(BIN)/python -m pytest
