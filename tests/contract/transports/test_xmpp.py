@@ -5,6 +5,7 @@ from collections.abc import Iterator
 import pytest
 
 from device_agent.transports.xmpp.transport import NOTICED_WITHIN_S
+from tests.contract.transports.agent_suite import AgentSuite
 from tests.contract.transports.suite import Spoken, TransportSuite
 from tests.support.brokers import HOST
 from tests.support.ground import Ground, start_ground
@@ -26,6 +27,14 @@ def xmpp_ground(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Ground]:
 
 class TestXmpp(TransportSuite):
     spoken = Spoken(configuration={"transport": "xmpp"}, endpoint="xmpp", notices_s=NOTICED_WITHIN_S)
+
+    @pytest.fixture
+    def ground(self, xmpp_ground: Ground) -> Ground:
+        return xmpp_ground
+
+
+class TestAgentOnXmpp(AgentSuite):
+    spoken = TestXmpp.spoken
 
     @pytest.fixture
     def ground(self, xmpp_ground: Ground) -> Ground:

@@ -204,7 +204,7 @@ sys.exit(main(sys.argv[1:]))
 """The agent's program, on a system that has nothing of Unix's own. Libraries are imported before it becomes one."""
 
 
-@pytest.mark.parametrize("platform", ["win32", "darwin"])
+@pytest.mark.parametrize("platform", ["win32", pytest.param("darwin", marks=pytest.mark.long)])
 def test_where_there_is_no_jail_it_runs_without_scripts(ground: Ground, folder: Path, platform: str) -> None:
     device = claimed(ground, folder, "--transport", "http" if platform == "win32" else "mqtt")
     source = ELSEWHERE.replace("PLATFORM", repr(platform))
