@@ -98,6 +98,7 @@ class Bench:
         jail: Jail | None = None,
     ) -> None:
         self.key = signing.generate()
+        self.kind = kind or robot_type()
         self.said: list[tuple[str, bytes]] = []
         self.driver = driver or ToyDriver()
         self.journal = Journal(folder / "journal.db")
@@ -115,7 +116,7 @@ class Bench:
             label="Arm",
             space="s",
             agent="a",
-            robot_type=kind or robot_type(),
+            robot_type=self.kind,
             driver=self.driver,
             journal=self.journal,
             cloud_clock=self.clock,
@@ -168,7 +169,7 @@ class Bench:
         return command.id
 
     def script(self, source: str, version: int = 1, author: str = SHIPPED) -> RunMovement:
-        return signed_movement(source, self.key, version=version, author=author)
+        return signed_movement(source, self.key, version=version, author=author, robot_type=self.kind.type)
 
     def receive(self, kind: str, payload: bytes, name: str = "") -> None:
         self.device.receive(topics.Topic("s", "a", "arm", kind, name), payload)
@@ -194,12 +195,14 @@ class Bench:
         return seen
 
 
-def signed_movement(source: str, key: Ed25519PrivateKey, *, version: int = 1, author: str = SHIPPED) -> RunMovement:
+def signed_movement(
+    source: str, key: Ed25519PrivateKey, *, version: int = 1, author: str = SHIPPED, robot_type: str = "toy"
+) -> RunMovement:
     """As the cloud sends it."""
     digest = hashlib.sha256(source.encode()).hexdigest()
-    text = signing.movement_text("toy", "dance", version, digest)
+    text = signing.movement_text(robot_type, "dance", version, digest)
     return RunMovement(
-        robot_type="toy",
+        robot_type=robot_type,
         name="dance",
         version=version,
         sha256=digest,
