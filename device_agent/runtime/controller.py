@@ -77,6 +77,7 @@ class Controller:
         self.changed = self._authority.changed
         self._lock = threading.Lock()
         self._mode = Mode.IDLE
+        self._due_s = math.inf
         self._course: Course | None = None
         self._driver_limits: tuple[str, ...] = ()
 
@@ -310,10 +311,11 @@ class Controller:
             now_s: Monotonic clock [s].
         """
         with self._lock:
+            late_s, self._due_s = now_s - self._due_s, now_s + self._period_s
             self._authority.expire(now_s)
             self._mode = self._decide(now_s)
             try:
-                self._go()
+                self._go(late_s)
             except MotionError as error:
                 self._authority.end(Refused("fault", str(error)))
                 self._mode = Mode.HOLDING
@@ -332,8 +334,10 @@ class Controller:
                 REST if self._base is None else self._base.twist,
             )
 
-    def _go(self) -> None:
+    def _go(self, late_s: float) -> None:
         """Advance one period, if from there on the device could still come to rest with room around it."""
+        if self._motion.braking and self._motion.moving and late_s > self._period_s / 2:
+            self._motion.make_up(late_s)  # a busy machine must not stretch a hold
         if not self._motion.braking:
             obstacle = self._envelope.blocked(self._motion.propose())
             if obstacle is not None:

@@ -174,6 +174,28 @@ class Motion:
         self.velocity_rad_s = list(self._output.new_velocity)
         return self.position_rad
 
+    def make_up(self, lost_s: float) -> None:
+        """Count time in which no period was commanded as braked: the device was left standing where it is.
+
+        Only the velocity falls, by what braking would have taken from it; there is no jump.
+
+        Args:
+            lost_s: How much later than it was due the present period begins [s].
+
+        Raises:
+            MotionError: The generator found no trajectory.
+        """
+        order = self._plan_input
+        order.current_position = self._input.current_position
+        order.current_velocity = self._input.current_velocity
+        order.current_acceleration = self._input.current_acceleration
+        self._brake(order)
+        plan(self._planner.calculate, order, self._plan)
+        _, velocity, acceleration = self._plan.at_time(min(lost_s, self._plan.duration))
+        self._input.current_velocity = velocity
+        self._input.current_acceleration = acceleration
+        self.velocity_rad_s = list(velocity)
+
     @property
     def moving(self) -> bool:
         """Whether any commanded velocity is not zero."""
