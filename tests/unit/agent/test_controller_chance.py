@@ -64,6 +64,7 @@ class Chance:
         self.position = [0.0, 0.0]
         self.velocity = [0.0, 0.0]
         self.unmoved_since_s = 0.0
+        self.rest_from_s = 0.0
         self.unasked = 0
         self.burned = 0
         self.slowed_for, self.share = 0, 1.0
@@ -130,6 +131,7 @@ class Chance:
             assert self.epoch > self.burned, "a lease that has ended"
             assert self.speed() > 0, "the room holds it"
             self.may_move_until_s = self.now_s + REST_WITHIN_S
+            self.rest_from_s = self.now_s + REST_WITHIN_S
             for _ in range(3):
                 self.tick()
 
@@ -240,6 +242,9 @@ class Chance:
         moving = max(map(abs, self.velocity)) > 1e-6 or any(abs(part) > 1e-6 for part in tick.twist)
         if asked:
             self.unmoved_since_s = self.now_s
+        if self.tenure is not None:
+            self.rest_from_s = self.now_s + REST_WITHIN_S
+        assert not moving or self.now_s <= self.rest_from_s + PERIOD_S, "zero 300 ms after the last setpoint"
         if self.now_s - self.unmoved_since_s > 0.2:
             assert not moving, "a hold is complete within 200 ms"
         if self.tenure is None and self.now_s > self.may_move_until_s + PERIOD_S and tick.mode is Mode.STREAMING:
