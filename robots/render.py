@@ -1,5 +1,7 @@
 """Draw a robot type's scene at home: ``python robots/render.py ur5 docs/pictures/ur5.png``.
 
+With ``joint=position`` behind it [rad], elsewhere: ``… ur5 docs/pictures/held.png shoulder_lift=-0.881``.
+
 Looks through the scene's camera ``picture``. Needs a software renderer (Debian: ``libosmesa6``), no display.
 """  # noqa: INP001 - a script beside the folders it draws, not a package
 
@@ -23,12 +25,12 @@ from device_agent.protocol import robot_type  # noqa: E402
 WIDTH, HEIGHT, CAMERA = 800, 600, "picture"
 
 
-def render(name: str) -> Any:
-    """The picture of a robot type at home, shape (height, width, 3), 8 bits a colour."""
+def render(name: str, position_rad: dict[str, float]) -> Any:
+    """The picture of a robot type, shape (height, width, 3), 8 bits a colour; joints not named are at home."""
     manifest = robot_type.load(ROBOTS / name)
     model = mujoco.MjModel.from_xml_path(str(ROBOTS / name / manifest.scene))
     data = mujoco.MjData(model)
-    for joint, position in manifest.home_rad.items():
+    for joint, position in (manifest.home_rad | position_rad).items():
         data.joint(joint).qpos[0] = position
     mujoco.mj_forward(model, data)
     with mujoco.Renderer(model, HEIGHT, WIDTH) as renderer:
@@ -52,8 +54,11 @@ def main() -> None:
     parser = argparse.ArgumentParser(description="Draw a robot type's scene at home.")
     parser.add_argument("type", choices=sorted(path.parent.name for path in ROBOTS.glob("*/robot.toml")))
     parser.add_argument("file", type=Path)
+    parser.add_argument("position", nargs="*", metavar="joint=position")
     arguments = parser.parse_args()
-    arguments.file.write_bytes(png(render(arguments.type)))
+    named = (text.partition("=") for text in arguments.position)
+    position_rad = {joint: float(position) for joint, _, position in named}
+    arguments.file.write_bytes(png(render(arguments.type, position_rad)))
 
 
 if __name__ == "__main__":

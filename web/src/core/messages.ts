@@ -133,6 +133,9 @@ const description = object<Required<Description>>({
   watchdog_ms: optional(count, 0),
   max_loop_age_ms: optional(count, 0),
   simulated: optional(flag, false),
+  limits: optional(list(text, MAX_JOINTS), []),
+  scripts: optional(oneOf("jailed", "refused", "trusted"), "refused"),
+  scripts_note: optional(text, ""),
   interlocks: optional(
     list(object<InterlockRule>({ name: text, action: oneOf("slow", "hold"), speed: number, stale_ms: count }), MAX_JOINTS),
     [],
