@@ -24,7 +24,6 @@ from unittest import mock
 import msgspec
 from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
 
-from device_agent.jail.warm import WarmJail
 from device_agent.ports.clock import CloudClock, tick_ms, wall_ms
 from device_agent.protocol import codec, signing, topics
 from device_agent.protocol.messages import Ack, Command
@@ -34,6 +33,7 @@ from device_agent.runtime.journal import Journal
 from device_agent.runtime.outbox import Outbox
 from device_agent.runtime.room import Room
 from device_agent.runtime.shelf import Shelf
+from tests.support.jail import LateJail
 from tests.unit.agent.test_controller import robot_type
 from tests.unit.agent.test_device import ToyDriver
 
@@ -129,7 +129,7 @@ class Body:
             journal.end_open(now_ms=wall_ms(), tick_ms=tick_ms())
             device = Device(
                 name=DEVICE, label="Arm", space=SPACE, agent=AGENT, robot_type=swift(), driver=ToyDriver(),
-                journal=journal, cloud_clock=self.clock, publish=self._publish, jail=WarmJail(),
+                journal=journal, cloud_clock=self.clock, publish=self._publish, jail=LateJail(),
                 keys={signing.key_id(key.public_key()): key.public_key()},
                 room=Room(space=SPACE, agent=AGENT, own=[DEVICE]), outbox=self._outbox(),
             )  # fmt: skip

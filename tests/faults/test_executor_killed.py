@@ -1,6 +1,5 @@
 """The executor under ``kill -9`` at any step: nothing is done twice, nothing stays without an end."""
 
-import hashlib
 import json
 import random
 import subprocess
@@ -17,6 +16,7 @@ from device_agent.protocol import signing
 from device_agent.protocol.messages import AckStatus, CancelAction, Command, GrantLease, MoveJoints, RunMovement
 from tests.faults.mortal_agent import AGENT, DEVICE, SPACE, TARGET_RAD, Life
 from tests.support.brokers import ROOT
+from tests.unit.agent.test_device import signed_movement
 
 LIVES = 30
 """Lives on one journal, one after another; the last is not cut short."""
@@ -73,7 +73,8 @@ class Cloud:
                 slow = self.order(MoveJoints(position_rad=elbow | {"shoulder": 3.0}, speed=_SLOW))
                 made += [slow, self.order(CancelAction(action=slow.id))]
             elif kind < 0.3:
-                made.append(self.order(script(elbow["elbow"])))
+                source = f"progress(0.5)\nrobot.move_joints({elbow}, speed=1.0)\n"
+                made.append(self.order(signed_movement(source, self.key)))
             elif kind < 0.4:
                 made.append(self.order(GrantLease(holder="ann", lease_ms=5000)))
             else:
@@ -133,12 +134,6 @@ class Cloud:
 
 SLACK_MS = 1000
 """From the look at the clock to the motors' first step, on a busy machine."""
-
-
-def script(elbow_rad: float) -> RunMovement:
-    source = f"progress(0.5)\nrobot.move_joints({{'elbow': {elbow_rad}}}, speed=1.0)\n"
-    digest = hashlib.sha256(source.encode()).hexdigest()
-    return RunMovement(robot_type="toy", name="dance", version=1, sha256=digest, source=source)
 
 
 def lead(agent: Agent, folder: Path, journals: int, *, seed: int) -> Counter[str]:

@@ -5,6 +5,7 @@ import threading
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
+from typing import Literal
 
 import msgspec
 import pytest
@@ -12,7 +13,6 @@ import pytest
 from device_agent.ports import skills
 from device_agent.ports.driver import Observation, Twist
 from device_agent.ports.geometry import Clearance, GeometryError, Sweep
-from device_agent.ports.jail import Standing
 from device_agent.ports.skills import Skill, SkillError, Stage
 from device_agent.protocol import codec, topics
 from device_agent.protocol.messages import (
@@ -31,6 +31,7 @@ from device_agent.runtime.controller import Controller
 from device_agent.runtime.lease import LeaseGate, Refused
 from device_agent.runtime.robot import Body, ScriptRobot
 from device_agent.runtime.room import Room
+from tests.support.jail import LACK, NoJail
 from tests.unit.agent.test_controller import robot_type
 from tests.unit.agent.test_device import Bench, ToyDriver, eventually
 
@@ -273,37 +274,19 @@ def test_a_move_says_what_limited_it(bench: Bench) -> None:
     assert ack.result["limited"] == ["interlock: somebody is near"]
 
 
-class Shut:
-    """A jail on a machine that has none."""
-
-    def __init__(self, how: str) -> None:
-        self.how = how
-
-    def standing(self) -> Standing:
-        return Standing(self.how, "no seccomp; install libseccomp2")  # type: ignore[arg-type]
-
-    def refusal(self, *, stranger: bool) -> str | None:
-        del stranger
-        return "no seccomp; install libseccomp2"
-
-    def start(self) -> None: ...
-
-    def close(self) -> None: ...
-
-    def open(self, *_: object, **__: object) -> None: ...
-
-
 @pytest.mark.parametrize("how", ["refused", "trusted"])
-def test_where_scripts_cannot_be_locked_in_it_is_said_at_once(tmp_path: Path, how: str) -> None:
-    bench = Bench(tmp_path, jail=Shut(how))  # type: ignore[arg-type]
+def test_where_scripts_cannot_be_locked_in_it_is_said_at_once(
+    tmp_path: Path, how: Literal["refused", "trusted"]
+) -> None:
+    bench = Bench(tmp_path, jail=NoJail(how))
     bench.device.start()
     bench.device.link_changed(True)
     described: Description = eventually(lambda: bench.heard(topics.DESC, Description))[0]
-    assert (described.scripts, described.scripts_note) == (how, "no seccomp; install libseccomp2")
+    assert (described.scripts, described.scripts_note) == (how, LACK)
     eventually(lambda: [event for event in bench.heard(topics.EVENT, Event) if event.kind == f"scripts-{how}"])
     reason = bench.end(bench.command(bench.script("print(1)"), epoch=1)).reason
     assert reason is not None
-    assert (reason.code, reason.message) == ("no_jail", "no seccomp; install libseccomp2")
+    assert (reason.code, reason.message) == ("no_jail", LACK)
     bench.stop()
 
 
