@@ -39,6 +39,7 @@ SHORT_LEASE_MS = 1_500
 _ON_THE_WAY_MS = 50.0
 """A setpoint that was sent before a cut arrives at most this much later."""
 _LOOK_MS = 400.0
+_WORTH_TELLING_MS = 10.0
 _UNDER_WAY_S = 0.4
 """What a script's first move takes to be in full swing."""
 
@@ -90,7 +91,7 @@ class Tally:
         for cut in (*self.cuts, "all"):
             found = [each.verdict for each in self.results if cut in (each.cut, "all")]
             rest = [each.rest_ms for each in found]
-            starved = sum(each.starved_ms > 0 for each in found)
+            starved = sum(each.starved_ms > _WORTH_TELLING_MS for each in found)
             broken = sum(not each.kept for each in found)
             figures = (share(rest, 0.5), share(rest, 0.99), max(rest), max(each.cut_ms for each in found))
             shown = " | ".join(f"{figure:.0f}" for figure in figures)
@@ -280,7 +281,7 @@ class Bench:
                 stack.signal(self._children[what], signal.SIGKILL)
                 return lambda: self._revive(self._children[what])
             case "killed":
-                for process in stack.children_of_agent():
+                for process in stack.below(stack.agent):
                     with contextlib.suppress(ProcessLookupError):
                         os.kill(process, signal.SIGKILL)
                 return _nothing

@@ -174,15 +174,15 @@ class Stack:
             )  # fmt: skip
             return Console(int(self._consoles(msgspec.json.encode(seat).decode())), listener, proxy)
 
-    def children_of_agent(self) -> list[int]:
-        """The process ids of all that the agent has started, and what those have."""
+    def below(self, child: Child) -> list[int]:
+        """The process ids of all that a program has started, and what those have."""
         parents = {}
         for folder in Path("/proc").glob("[0-9]*"):
             with contextlib.suppress(OSError):
                 parents[int(folder.name)] = int((folder / "stat").read_text().rpartition(")")[2].split()[1])
-        found = [self.pid(self.agent)]
+        found = [self.pid(child)]
         for process in found:
-            found += [child for child, parent in parents.items() if parent == process]
+            found += [each for each, parent in parents.items() if parent == process]
         return found[1:]
 
     @staticmethod
@@ -191,7 +191,10 @@ class Stack:
         return child._process.pid
 
     def signal(self, child: Child, number: int) -> None:
-        os.kill(self.pid(child), number)
+        """To a program and all below it: mosquitto runs behind a program of ours."""
+        for process in (self.pid(child), *self.below(child)):
+            with contextlib.suppress(ProcessLookupError):
+                os.kill(process, number)
 
     def revive(self, child: Child) -> None:
         """Start what was killed."""
@@ -225,8 +228,7 @@ class Stack:
         return child
 
     def _stop(self, child: Child) -> None:
-        with contextlib.suppress(ProcessLookupError):
-            self.signal(child, signal.SIGCONT)
+        self.signal(child, signal.SIGCONT)
         child.stop()
 
     def _proxy(self, behind: int, heard: Callable[[bytes], None]) -> Proxy:
