@@ -91,6 +91,17 @@ def take(page: Page) -> None:
     expect(page.get_by_test_id("slider-elbow")).to_be_enabled()
 
 
+def release(page: Page) -> None:
+    """Give control up, where the robot has not ended it: on a busy machine setpoints come late, and it holds."""
+    for _ in range(30):
+        if page.get_by_test_id("control-state").get_attribute("data-state") != "mine":
+            return
+        with contextlib.suppress(Error):  # gone between the look and the click
+            page.get_by_test_id("release-control").click(timeout=1000)
+            return
+    pytest.fail("control is still held, and cannot be given up")
+
+
 def drag(page: Page, share: float, joint: str = "elbow", *, let_go: bool = True) -> None:
     """Drag the slider with the mouse to a share of its width."""
     slider = page.get_by_test_id(f"slider-{joint}")
@@ -191,7 +202,7 @@ def test_stop_latches_until_it_is_reset(browser: Browser, machine: Machine) -> N
         page.wait_for_timeout(500)
         assert abs(elbow(trace) - rest) < 0.005, "resetting Stop must resume nothing"
         drive(page, 0.8, lambda: abs(elbow(trace) - rest) > 0.05, "motion after control was taken again")
-        page.get_by_test_id("release-control").click()
+        release(page)
 
 
 def end_in_mid_motion(page: Page, trace: Trace, end: Callable[[], None]) -> float:
@@ -333,7 +344,7 @@ def test_pictures_for_the_documentation(browser: Browser, machine: Machine, tmp_
             page.wait_for_timeout(500)
             page.screenshot(path=tmp_path / f"operate-{width}.png")
             assert (tmp_path / f"operate-{width}.png").stat().st_size > 20_000
-        page.get_by_test_id("release-control").click()
+        release(page)
 
 
 def test_a_browser_that_is_killed_in_mid_motion_stops_the_arm(playwright: Playwright, machine: Machine) -> None:
