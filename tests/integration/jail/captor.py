@@ -32,7 +32,7 @@ from device_agent.runtime.movements import Cell, Script, ScriptFailed
 from tests.integration.jail.attacks import ATTACKS
 
 SECRET = "the-agents-secret-7e1e5c09e"
-PATIENCE_S = 0.4
+PATIENCE_S = 0.2
 """What has not ended by itself after this time is killed, as Stop does."""
 LIMITS = Limits(cpu_s=2)
 _NAMES = {word.split("'")[1] for source in ATTACKS.values() for word in source.split("call(")[1:] if word[0] == "'"}
