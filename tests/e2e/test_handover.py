@@ -11,8 +11,9 @@ import pytest
 from tests.support.brokers import wait_until
 from tests.support.machine import Api, Machine, Trace
 
-FAR, NEAR = {"elbow": 1.9}, {"elbow": 1.1}
+FAR, NEAR = {"shoulder_pan": 2.0}, {"shoulder_pan": -2.0}
 SLOW = 0.05
+"""A dozen seconds each way, so that a busy machine still finds the arm on its way."""
 
 
 @pytest.fixture
