@@ -51,6 +51,10 @@ def ended(api: Api, action: str) -> dict[str, Any]:
     return found
 
 
+def kinds(api: Api, device: str) -> set[str]:
+    return {item["kind"] for item in api.get(f"/devices/{device}/events", limit=50)["items"]}
+
+
 def refused(api: Api, path: str, body: Any) -> str:
     answer = api.http.post(path, json=body)
     assert answer.status_code == httpx.codes.CONFLICT, answer.text
@@ -115,5 +119,6 @@ def test_after_a_stop_of_everything_only_who_takes_control_anew_moves_it(
     bob.post(f"/actions/{again}/cancel")
     ended(bob, again)
     bob.http.delete(f"/devices/{device}/lease", params={"epoch": fresh})
-    kinds = [item["kind"] for item in ann.get(f"/devices/{device}/events", limit=50)["items"]]
-    assert {"stop-ordered", "stop-latched", "stop-reset-ordered", "stop-reset", "control-taken"} <= set(kinds)
+    told = {"stop-ordered", "stop-latched", "stop-reset-ordered", "stop-reset", "control-taken"}
+    # The device's own come when its link is settled.
+    wait_until(lambda: told <= kinds(ann, device), "the events of cloud and device", 40)
