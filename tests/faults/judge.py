@@ -55,7 +55,8 @@ class Verdict:
 
     @property
     def kept(self) -> bool:
-        return self.rest_ms <= MOST_MS + self.starved_ms and not self.moved_again
+        most_ms = MOST_MS + self.starved_ms + (_ROW_MS if self.starved_ms else 0.0)  # which is known to a line or two
+        return self.rest_ms <= most_ms and not self.moved_again
 
 
 def judge(rows: list[Row], *, cut_ms: float, since_ms: float, watched: bool = True) -> Verdict:

@@ -97,6 +97,7 @@ class Stack:
         self._closing = contextlib.ExitStack()
         self._watchdog_s = watchdog_s
         self._kind = kind
+        self._dying: list[int] = []
 
     def begin(self) -> None:
         link = self._program("function_app", "sign-in-link", "--account", "ann").partition("#sign-in=")[2]
@@ -192,14 +193,17 @@ class Stack:
 
     def signal(self, child: Child, number: int) -> None:
         """To a program and all below it: mosquitto runs behind a program of ours."""
-        for process in (self.pid(child), *self.below(child)):
+        below = self.below(child)
+        self._dying = below if number == signal.SIGKILL else []
+        for process in (self.pid(child), *below):
             with contextlib.suppress(ProcessLookupError):
                 os.kill(process, number)
 
     def revive(self, child: Child) -> None:
-        """Start what was killed."""
+        """Start what was killed, once what it ran has let go of its ports."""
         assert child._process is not None
         child._process.wait(PATIENCE_S)
+        wait_until(lambda: not any(map(_alive, self._dying)), "what was killed to be gone", PATIENCE_S)
         child.start()
 
     # ------------------------------------------------------------ processes
@@ -258,6 +262,13 @@ class Stack:
     def close(self) -> None:
         self._closing.close()
         shutil.rmtree(self.home, ignore_errors=True)
+
+
+def _alive(process: int) -> bool:
+    try:
+        return Path(f"/proc/{process}/stat").read_text().rpartition(")")[2].split()[0] != "Z"
+    except OSError:
+        return False
 
 
 @contextlib.contextmanager
