@@ -16,7 +16,7 @@ SECONDS_EACH ?= 60
 help:
 	@echo "make up            run Telescope on this machine"
 	@echo "make link          print another one-time sign-in link"
-	@echo "make test          check and test everything (about eighteen minutes on two cores, most of it in real processes)"
+	@echo "make test          check and test everything (about twenty-five minutes on two cores, most of it in real processes)"
 	@echo "make test-long     the same with every suite at full size"
 	@echo "make coverage      every branch of the agent's runtime, by its unit tests alone"
 	@echo "make fuzz          each parser under a fuzzer, SECONDS_EACH=60"
