@@ -67,8 +67,9 @@ interface StreamNoteProps {
 
 function StreamNote({ device, streamer, blocked }: StreamNoteProps) {
   const [state, text] = streamText(device, streamer, blocked);
+  const limited = state === "streaming" && limitsOf(device).length > 0;
   return (
-    <span class={`quiet stream-${state}`} data-testid="stream-state" data-state={state} role="status">
+    <span class={`quiet stream-${limited ? "limited" : state}`} data-testid="stream-state" data-state={state} role="status">
       {text}
     </span>
   );
@@ -78,12 +79,17 @@ function streamText(device: DeviceStore, streamer: SetpointStreamer | null, bloc
   if (blocked !== null || streamer === null) return ["blocked", blocked ?? ""];
   const state = streamer.state.value;
   if (state === "waiting") return [state, texts.joints.waiting];
-  const limited = device.telemetry.value?.message.limited ?? [];
   if (state === "streaming") {
+    const limited = limitsOf(device);
     return [state, limited.length > 0 ? texts.joints.limited(limited.join(", ")) : texts.joints.streaming];
   }
   const ended = streamer.ended.value;
   return [state, ended === null ? "" : texts.joints.ended[ended]];
+}
+
+/** What makes the motion other than asked for, as the robot names it. */
+function limitsOf(device: DeviceStore): readonly string[] {
+  return device.telemetry.value?.message.limited ?? [];
 }
 
 interface JointRowProps {
