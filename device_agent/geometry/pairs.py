@@ -23,6 +23,8 @@ _SAMPLES = 150
 _SEED = 9
 _FAR_M = 3.0
 """Beyond this nobody asks how far; a plane's half space is that deep."""
+_CLOSE_M = 0.1
+"""Pairs whose bounding boxes leave more room than this between them are not measured to know how much room there is."""
 _STILL_M = 1e-4
 """A pair whose distance changes by less over many random positions cannot come nearer, by construction."""
 _NOTHING_M = 1e-9
@@ -148,6 +150,22 @@ class Pairs:
         pairs = np.flatnonzero(self._at_least(data) < self._margin).tolist()
         near = {pair for pair in pairs if self.room(data, pair, 0.0) < 0}
         return frozenset(near.union((np.flatnonzero(self.rooms(data) < 0) + len(self._a)).tolist()))
+
+    def rooms_at_least(self, data: Any) -> Floats:
+        """A lower bound of the room of each pair, then of each frame to each face, shape (pairs + frames x 6,) [m]."""
+        bound = self._at_least(data) - self._margin
+        for pair in np.flatnonzero(bound < _CLOSE_M).tolist():
+            bound[pair] = self.room(data, pair, 2 * _CLOSE_M)
+        return np.concatenate((bound, self.rooms(data)))
+
+    def closing(self, way_rad: Floats) -> Floats:
+        """How much nearer each of ``rooms_at_least`` could come, shape (ways, pairs + frames x 6) [m].
+
+        Args:
+            way_rad: How far each joint goes, shape (ways, n) [rad], not negative.
+        """
+        held = np.repeat(way_rad @ self._held_lever.T, len(_FACES), axis=1)
+        return np.concatenate((way_rad @ self._lever.T, held), axis=1)
 
     def speed_m_s(self, velocity_rad_s: Floats) -> float:
         """The bound of the fastest point's speed; velocities not negative."""

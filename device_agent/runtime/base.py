@@ -10,6 +10,7 @@ _RAMP_S = 0.1
 """Time in which speeding up reaches its full acceleration."""
 _BRAKING_RAMP_S = 0.01
 _REST = 1e-6
+_SAME = 1e-3
 
 
 class BaseMotion:
@@ -42,7 +43,14 @@ class BaseMotion:
         self.brake()
 
     def follow(self, twist: Twist) -> None:
-        """Head for a twist that is inside the limits."""
+        """Head for a twist that is inside the limits.
+
+        What still brakes harder than it may speed up goes on braking, as joints do (see ``Motion.follow``): it would
+        run backwards, and faster than it may.
+        """
+        now = self._input.current_acceleration
+        if any(abs(part) > limit + _SAME for part, limit in zip(now, self._acceleration, strict=True)):
+            return
         self._aim(twist, self._acceleration, _RAMP_S)
 
     def brake(self) -> None:

@@ -63,6 +63,20 @@ def test_whatever_takes_the_device_away_brakes_the_base(cause: str) -> None:
     assert not rig.controller.moving
 
 
+def test_a_base_that_is_told_to_go_on_while_it_brakes_does_not_run_backwards() -> None:
+    motion = BaseMotion(BASE, PERIOD_S)
+    motion.follow(Twist(-0.2))
+    for _ in range(100):
+        motion.update()
+    motion.brake()
+    for _ in range(2):
+        motion.update()
+    for _ in range(200):
+        motion.follow(Twist(-0.2))
+        assert motion.update().forward_m_s <= 1e-6
+    assert motion.twist == pytest.approx(Twist(-0.2))
+
+
 def test_a_drive_is_slowed_by_the_room() -> None:
     rig = Rig(base=BASE)
     drive = driving(rig)
