@@ -8,6 +8,7 @@ from typing import Annotated, Any, Literal
 import msgspec
 from msgspec import Meta, Struct
 
+from device_agent.protocol import abilities
 from device_agent.protocol.errors import ProtocolError
 from device_agent.protocol.messages import Id, Joint, Label, Stream, Text, Vector3
 
@@ -94,8 +95,8 @@ class Gaze(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     joints: Annotated[tuple[Label, ...], Meta(min_length=1)]
 
 
-class RobotType(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """What every robot of one type has in common.
+class RobotType(abilities.Abilities, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """What every robot of one type has in common; with what ``Abilities`` lists.
 
     Attributes:
         type: Id of the type, the folder's name.
@@ -177,6 +178,7 @@ def parse(text: str) -> RobotType:
     for joint in robot_type.joints:
         if not joint.lower_rad <= robot_type.home_rad[joint.name] <= joint.upper_rad:
             raise ProtocolError(f"home_rad of '{joint.name}' is outside its range")
+    abilities.check(robot_type, robot_type.joints, robot_type.home_rad)
     if robot_type.gaze is not None:
         _check_gaze(robot_type.gaze, robot_type)
     for diagnostic in robot_type.diagnostics:

@@ -1,0 +1,154 @@
+"""What travels towards a robot: signed commands, streamed setpoints, Stop.
+
+Unknown fields are refused: an old agent must not obey half of a newer order.
+"""
+
+from typing import Annotated, Any
+
+from msgspec import Meta, Struct
+
+from device_agent.protocol.fields import Count, Id, JointPositions, Label, Milliseconds, Text
+
+
+class _Order(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True, tag_field="kind"):
+    """What is asked; its ``kind`` says which."""
+
+
+class GrantLease(_Order, frozen=True, kw_only=True, tag="grant_lease"):
+    """Control of the device now belongs to ``holder``, for ``lease_ms`` from the moment of arrival. Also renews.
+
+    ``reason``: why it was taken from somebody else, for that person to read.
+    """
+
+    holder: Label
+    lease_ms: Annotated[int, Meta(ge=1, le=3_600_000)]
+    reason: Text = ""
+
+
+class ReleaseLease(_Order, frozen=True, kw_only=True, tag="release_lease"):
+    """Nobody controls the device any more; what moves is brought to a hold."""
+
+
+class AskLease(_Order, frozen=True, kw_only=True, tag="ask_lease"):
+    """Show the holder, and everybody, that somebody asks for control. Changes nothing else; lapses by itself."""
+
+    request: Id
+    by: Label
+    answer_within_ms: Annotated[int, Meta(ge=1, le=3_600_000)]
+
+
+class DropRequest(_Order, frozen=True, kw_only=True, tag="drop_request"):
+    """Nobody asks any more: refused, or withdrawn."""
+
+    request: Id
+
+
+SHIPPED = "telescope"
+"""The author of movements that come with Telescope's own robot types. No account's id: those are longer."""
+
+
+class RunMovement(_Order, frozen=True, kw_only=True, tag="run_movement"):
+    """Run one movement script. The source must hash to ``sha256`` (hex).
+
+    ``signature`` is the one that was made, with the cloud's key ``key``, when the movement was saved: over robot type,
+    name, version and hash. ``author`` is the account that saved it, or ``SHIPPED``: each author counts versions by
+    itself, and a device never runs an older one than it has. It is ended after ``timeout_ms``.
+    """
+
+    robot_type: Id
+    name: Id
+    version: Count
+    sha256: Annotated[str, Meta(pattern="^[0-9a-f]{64}$")]
+    source: Annotated[str, Meta(max_length=64_000)]
+    parameters: dict[str, Any] = {}
+    author: Label = ""
+    key: Label = ""
+    signature: Label = ""
+    timeout_ms: Annotated[int, Meta(ge=1, le=86_400_000)] = 600_000
+
+
+class MoveJoints(_Order, frozen=True, kw_only=True, tag="move_joints"):
+    """Move to joint positions and end there."""
+
+    position_rad: JointPositions
+    speed: Annotated[float, Meta(gt=0, le=1, description="share of each joint's velocity limit")] = 0.5
+
+
+class CancelAction(_Order, frozen=True, kw_only=True, tag="cancel_action"):
+    """End the named action; the device holds where it is."""
+
+    action: Id
+
+
+class StopDevice(_Order, frozen=True, kw_only=True, tag="stop_device"):
+    """Latch Stop."""
+
+    reason: Text = ""
+
+
+class ResetStop(_Order, frozen=True, kw_only=True, tag="reset_stop"):
+    """Release the Stop latch. Nothing resumes.
+
+    It brings an epoch of its own, which ends with it: what was ordered before the reset is never obeyed after it, and a
+    reset that comes late, or again, is older than the latch that it finds.
+    """
+
+
+Request = (
+    GrantLease
+    | ReleaseLease
+    | AskLease
+    | DropRequest
+    | RunMovement
+    | MoveJoints
+    | CancelAction
+    | StopDevice
+    | ResetStop
+)
+
+
+class Command(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """``cmd``: a request to a device; travels inside ``signing.Signed``.
+
+    ``space``, ``agent`` and ``device`` bind it to one device, ``epoch`` to one lease; it runs at most once per
+    ``id`` and never later than ``issued_at_ms + ttl_ms`` on the cloud's clock, which the agent reads as an offset to
+    its own monotonic clock.
+    """
+
+    id: Id
+    space: Id
+    agent: Id
+    device: Id
+    issued_at_ms: Milliseconds
+    ttl_ms: Annotated[int, Meta(ge=1, le=86_400_000)]
+    who: Label
+    epoch: Count
+    request: Request
+
+
+class JointTarget(_Order, frozen=True, kw_only=True, tag="joints"):
+    """Go to these joint positions, as fast as limits allow."""
+
+    position_rad: JointPositions
+
+
+class Setpoint(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """``ctl/{epoch}``: one streamed setpoint. The newest wins; ``sequence`` starts at 1 in each lease.
+
+    ``echo_tick_ms`` is ``tick_ms`` of the last telemetry the operator saw: its age on the robot's own clock is the
+    loop age. ``sent_ms`` is any clock of the operator's [ms]; telemetry echoes it.
+    """
+
+    epoch: Count
+    sequence: Annotated[int, Meta(ge=1, le=2**53)]
+    echo_tick_ms: Milliseconds
+    sent_ms: float
+    target: JointTarget
+
+
+class Stop(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """``stop``: latch Stop now. Needs no lease and no signature: the broker lets only those publish it who may."""
+
+    id: Id
+    by: Label
+    reason: Text = ""

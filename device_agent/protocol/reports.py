@@ -1,0 +1,312 @@
+"""What travels from an agent: what its devices are, how they are, what they measured, answered, and what happened.
+
+Unknown fields pass, so that an old console still reads a newer robot.
+"""
+
+from enum import StrEnum
+from typing import Annotated, Any, Literal
+
+from msgspec import Meta, Struct
+
+from device_agent.protocol.fields import (
+    MAX_VALUES,
+    Count,
+    Field,
+    Id,
+    Label,
+    Milliseconds,
+    Pose,
+    Quaternion,
+    Text,
+    Vector3,
+)
+
+
+class Presence(Struct, frozen=True, kw_only=True):
+    """``conn``: the agent's link to the broker. Retained, and the will.
+
+    ``session`` rises at each connection; an ``online=False`` with a lower session than one already seen is old news.
+    """
+
+    online: bool
+    session: Count
+    at_ms: Milliseconds
+    software: Label = ""
+
+
+class Joint(Struct, frozen=True, kw_only=True):
+    """One joint and the limits that the agent enforces."""
+
+    name: Label
+    label: Label
+    lower_rad: float
+    upper_rad: float
+    max_velocity_rad_s: float
+    max_acceleration_rad_s2: float
+    max_jerk_rad_s3: float
+    max_effort_nm: float
+
+
+class Stream(Struct, frozen=True, kw_only=True):
+    """One stream at ``tele/{name}``: ``joints`` carries ``JointTelemetry``, all others ``Measurements``."""
+
+    name: Id
+    rate_hz: float
+
+
+class InterlockRule(Struct, frozen=True, kw_only=True):
+    """When the room slows or holds the device: on its condition, and when its sensor was silent for ``stale_ms``.
+
+    ``name`` says device, stream and condition; ``speed`` is the share that is left, 0 for ``hold``.
+    """
+
+    name: Text
+    action: Literal["slow", "hold"]
+    speed: float
+    stale_ms: Milliseconds
+
+
+class Description(Struct, frozen=True, kw_only=True):
+    """``desc``: what the device is and can do. Retained.
+
+    ``limits`` names what the agent itself holds, whoever moves the device: ``clearance`` and ``workspace`` are missing
+    where nobody knows the robot's shape.
+
+    ``scripts``: movement scripts run in the jail, run with less (``trusted``, as the agent's owner wants it), or are
+    refused; ``scripts_note`` says why, and what to do.
+    """
+
+    device: Id
+    kind: Label
+    robot_type: Id
+    label: Label
+    joints: tuple[Joint, ...] = ()
+    frames: tuple[Label, ...] = ()
+    capabilities: tuple[Label, ...] = ()
+    streams: tuple[Stream, ...] = ()
+    watchdog_ms: Milliseconds = 0
+    max_loop_age_ms: Milliseconds = 0
+    simulated: bool = False
+    limits: tuple[Label, ...] = ()
+    interlocks: tuple[InterlockRule, ...] = ()
+    scripts: Literal["jailed", "trusted", "refused"] = "refused"
+    scripts_note: Text = ""
+
+
+class Geometry(Struct, frozen=True, kw_only=True):
+    """One primitive shape of a body.
+
+    ``size_m`` is as MuJoCo gives it: box half extents; sphere radius; capsule and
+    cylinder radius, half length along z; ellipsoid radii; plane half extents.
+    """
+
+    shape: Literal["box", "sphere", "capsule", "cylinder", "ellipsoid", "plane"]
+    size_m: Vector3
+    position_m: Vector3
+    quaternion: Quaternion
+    rgba: Quaternion
+
+
+class TwinJoint(Struct, frozen=True, kw_only=True):
+    """The joint by which a body turns or slides: axis and anchor in the body's own frame."""
+
+    name: Label
+    kind: Literal["hinge", "slide"]
+    axis: Vector3
+    anchor_m: Vector3
+    reference_rad: float = 0.0
+
+
+class Body(Struct, frozen=True, kw_only=True):
+    """One body of the tree; ``parent`` is its index in ``Twin.bodies``, -1 for a root."""
+
+    name: Label
+    parent: int
+    position_m: Vector3
+    quaternion: Quaternion
+    joint: TwinJoint | None = None
+    geometries: tuple[Geometry, ...] = ()
+
+
+class Twin(Struct, frozen=True, kw_only=True):
+    """``desc/twin``: the drawing from which a page builds its live view. Retained."""
+
+    device: Id
+    bodies: tuple[Body, ...]
+
+
+class Mode(StrEnum):
+    """What the device is doing at this moment."""
+
+    IDLE = "idle"
+    STREAMING = "streaming"
+    ACTION = "action"
+    HOLDING = "holding"
+    STOPPED = "stopped"
+    FAULT = "fault"
+
+
+class StopLatch(Struct, frozen=True, kw_only=True):
+    """Who stopped the device, and when. There until somebody who may resets it."""
+
+    by: Label
+    reason: Text
+    at_ms: Milliseconds
+
+
+class OpenRequest(Struct, frozen=True, kw_only=True):
+    """Somebody asks the holder for control, and gets an answer in the time that is left or none."""
+
+    id: Id
+    by: Label
+    expires_in_ms: Milliseconds
+
+
+class LeaseState(Struct, frozen=True, kw_only=True):
+    """The lease that the device obeys now.
+
+    ``reason`` says why it was taken from somebody else, and is empty where it was not. ``request`` is for people:
+    nothing about motion depends on it.
+    """
+
+    holder: Label
+    epoch: Count
+    expires_in_ms: Milliseconds
+    reason: Text = ""
+    request: OpenRequest | None = None
+
+
+class ActionState(Struct, frozen=True, kw_only=True):
+    """The action that the device runs now."""
+
+    id: Id
+    kind: Label
+    name: Label = ""
+    progress: float = 0.0
+
+
+class Fault(Struct, frozen=True, kw_only=True):
+    """Something wrong that lasts."""
+
+    code: Label
+    message: Text
+    since_ms: Milliseconds
+
+
+class Restriction(Struct, frozen=True, kw_only=True):
+    """What the room allows at this moment: ``speed`` is the share that is left, 0: hold. ``source`` is an interlock."""
+
+    source: Text
+    speed: float
+    why: Text
+
+
+class State(Struct, frozen=True, kw_only=True):
+    """``state``: the current condition. Retained; on change and every 30 s, at most once a second.
+
+    ``ended_epoch`` is the highest epoch that the device will never obey again. It only rises, so even an old message
+    tells the truth: a lease of such an epoch is nobody's any more.
+    """
+
+    device: Id
+    at_ms: Milliseconds
+    tick_ms: Milliseconds
+    mode: Mode
+    epoch: Count
+    ended_epoch: Count = 0
+    stop: StopLatch | None = None
+    lease: LeaseState | None = None
+    action: ActionState | None = None
+    faults: tuple[Fault, ...] = ()
+    restrictions: tuple[Restriction, ...] = ()
+
+
+class JointTelemetry(Struct, frozen=True, kw_only=True):
+    """``tele/joints``: all joints of one device at one tick, in the order of ``Description.joints``.
+
+    ``epoch`` is that of the lease in force at the device, 0 when none is: whoever thinks to have control and reads 0
+    has it no longer. ``setpoint_sequence`` is the newest setpoint the control loop has taken (0: none in this lease),
+    and ``setpoint_sent_ms`` the operator's own clock in it, so that the page measures its round trip on one clock.
+    ``limited`` names what changed a setpoint on its way to the motors.
+    """
+
+    tick_ms: Milliseconds
+    at_ms: Milliseconds
+    sequence: Count
+    mode: Mode
+    position_rad: tuple[float, ...]
+    velocity_rad_s: tuple[float, ...]
+    effort_nm: tuple[float, ...]
+    commanded_rad: tuple[float, ...]
+    frames: tuple[Pose, ...] = ()
+    epoch: Count = 0
+    setpoint_sequence: Count = 0
+    setpoint_sent_ms: float = 0.0
+    loop_age_ms: float = 0.0
+    limited: tuple[Label, ...] = ()
+
+
+class Measurements(Struct, frozen=True, kw_only=True):
+    """``tele/{stream}``, every stream but ``joints``: named values, all measured at one moment.
+
+    A name is a quantity with its unit, then a dot and the part of the device where there are several:
+    ``temperature_c.elbow``. ``sequence`` counts up from one start of the agent to the next.
+    """
+
+    tick_ms: Milliseconds
+    at_ms: Milliseconds
+    sequence: Count
+    values: Annotated[dict[Field, float | bool], Meta(min_length=1, max_length=MAX_VALUES)]
+
+
+class Event(Struct, frozen=True, kw_only=True):
+    """``event``: a fact that happened, in the past tense. Stored."""
+
+    id: Id
+    device: Id
+    at_ms: Milliseconds
+    kind: Label
+    severity: Literal["info", "warning", "error"]
+    message: Text
+    data: dict[str, Any] = {}
+
+
+class AckStatus(StrEnum):
+    """How far a command has come. The last four are terminal."""
+
+    RECEIVED = "received"
+    ACCEPTED = "accepted"
+    STARTED = "started"
+    DONE = "done"
+    FAILED = "failed"
+    EXPIRED = "expired"
+    CANCELLED = "cancelled"
+
+    @property
+    def terminal(self) -> bool:
+        """Whether nothing follows."""
+        return self in TERMINAL
+
+
+TERMINAL = frozenset({AckStatus.DONE, AckStatus.FAILED, AckStatus.EXPIRED, AckStatus.CANCELLED})
+
+
+class Reason(Struct, frozen=True, kw_only=True):
+    """Why a command ended as it did: a code for programs, a sentence for people that says what to do."""
+
+    code: Label
+    message: Text
+
+
+class Ack(Struct, frozen=True, kw_only=True):
+    """``ack``: the device's answer to one command. ``sequence`` orders the acks of one command."""
+
+    id: Id
+    status: AckStatus
+    sequence: Count
+    at_ms: Milliseconds
+    tick_ms: Milliseconds
+    reason: Reason | None = None
+    progress: float | None = None
+    output: Text = ""
+    result: dict[str, Any] = {}
