@@ -17,6 +17,7 @@ from device_agent.ports.clock import CloudClock
 from device_agent.ports.driver import DriverError
 from device_agent.ports.transport import TransportError
 from device_agent.protocol import robot_type
+from device_agent.protocol import room as rooms
 from device_agent.protocol.topics import ID_PATTERN, is_id
 from device_agent.runtime.home import Configuration, DeviceEntry, Home, HomeError, HttpPolling, Pairing
 from device_agent.runtime.journal import JournalError
@@ -60,6 +61,13 @@ def _parser() -> argparse.ArgumentParser:
         help="a device behind this agent, for example arm=ur5; may be given several times",
     )
     enroll.add_argument(
+        "--room",
+        action="append",
+        metavar="ROOM",
+        default=[],
+        help="a simulated room with all that is in it, for example lab; may be given several times",
+    )
+    enroll.add_argument(
         "--transport",
         choices=links.names(),
         help="how the cloud is reached: by a broker (mqtt, the default), by requests alone (http), or by XMPP (xmpp)",
@@ -83,7 +91,7 @@ def _parser() -> argparse.ArgumentParser:
     examine.add_argument("--json", action="store_true", help="for programs: one object with all findings")
     examine.set_defaults(command=_doctor)
 
-    devices = commands.add_parser("devices", help="list this agent's devices, and known robot types and drivers")
+    devices = commands.add_parser("devices", help="list this agent's devices, and known robot types, rooms and drivers")
     devices.set_defaults(command=_devices)
 
     for command in (enroll, run, examine, devices):
@@ -112,8 +120,8 @@ def _configuration(options: argparse.Namespace, home: Home) -> Configuration:
         before = home.configuration()
     except HomeError:
         before = None
-    if before is None and not options.device:
-        raise HomeError("say which devices it has, for example `--device arm=ur5`")
+    if before is None and not options.device and not options.room:
+        raise HomeError("say which devices it has, for example `--device arm=ur5` or `--room lab`")
     server = options.server or (before.server if before else "")
     if not server.startswith(("http://", "https://")):
         raise HomeError("say where the server is, for example `--server http://127.0.0.1:8080`")
@@ -123,7 +131,7 @@ def _configuration(options: argparse.Namespace, home: Home) -> Configuration:
         name=options.name or (before.name if before else home.folder.resolve().name),
         transport=options.transport or (before.transport if before else links.names()[0]),
         http=polling,
-        devices=tuple(_entry(text) for text in options.device) or (before.devices if before else ()),
+        devices=_entries(options) or (before.devices if before else ()),
     )
     return said.keeping(before) if before else said
 
@@ -135,6 +143,13 @@ def _polling(options: argparse.Namespace, before: HttpPolling) -> HttpPolling:
         return msgspec.convert(msgspec.to_builtins(before) | changed, HttpPolling)
     except msgspec.ValidationError as error:
         raise HomeError(f"--poll-ms: {error}") from error
+
+
+def _entries(options: argparse.Namespace) -> tuple[DeviceEntry, ...]:
+    entries = [_entry(text) for text in options.device]
+    for name in options.room:
+        entries += bootstrap.entries_of(name)
+    return tuple(entries)
 
 
 def _entry(text: str) -> DeviceEntry:
@@ -269,11 +284,13 @@ def _devices(options: argparse.Namespace) -> int:
     home = Home(options.home)
     try:
         for device in home.configuration().devices:
-            print(f"device  {device.name}: {device.type}, {device.driver or bootstrap.load_type(device.type).driver}")
+            print(f"device  {device.name}: {device.type}, {device.driver or bootstrap.type_of(device).driver}")
     except HomeError as error:
         print(error)
     for path in sorted(bootstrap.ROBOTS.glob(f"*/{robot_type.MANIFEST}")):
         print(f"type    {path.parent.name}: {bootstrap.load_type(path.parent.name).label}")
+    for path in sorted(bootstrap.ROOMS.glob(f"*/{rooms.MANIFEST}")):
+        print(f"room    {path.parent.name}: {bootstrap.load_room(path.parent.name).label}")
     for name in drivers.names():
         print(f"driver  {name}")
     return 0

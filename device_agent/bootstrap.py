@@ -6,10 +6,12 @@ from pathlib import Path
 from device_agent import drivers, geometry, links
 from device_agent.jail.warm import WarmJail
 from device_agent.ports.clock import CloudClock, tick_ms, wall_ms
+from device_agent.ports.driver import Driver
 from device_agent.ports.geometry import Geometry, GeometryError
 from device_agent.ports.jail import Jail
 from device_agent.ports.transport import Transport
 from device_agent.protocol import robot_type, topics
+from device_agent.protocol import room as rooms
 from device_agent.protocol.errors import ProtocolError
 from device_agent.runtime.agent import Agent
 from device_agent.runtime.device import Device
@@ -21,6 +23,7 @@ from device_agent.runtime.shelf import Shelf
 from device_agent.transports.http.api import CloudApi
 
 ROBOTS = Path(__file__).resolve().parent.parent / "robots"
+ROOMS = ROBOTS / "rooms"
 
 
 class Cell:
@@ -70,6 +73,92 @@ def load_type(name: str) -> robot_type.RobotType:
         raise HomeError(str(error)) from error
 
 
+def load_room(name: str) -> rooms.Room:
+    """A room of this installation.
+
+    Raises:
+        HomeError: Unknown, or its manifest is wrong; the text lists the known ones.
+    """
+    if not (ROOMS / name / rooms.MANIFEST).is_file():
+        known = sorted(path.parent.name for path in ROOMS.glob(f"*/{rooms.MANIFEST}"))
+        raise HomeError(f"no room '{name}'; there are: {', '.join(known)}")
+    try:
+        return rooms.load(ROOMS / name)
+    except ProtocolError as error:
+        raise HomeError(str(error)) from error
+
+
+def type_of(entry: DeviceEntry) -> robot_type.RobotType:
+    """The robot type of a configured device; of a room's device, what the room's manifest says of it.
+
+    Raises:
+        HomeError: The type or room is unknown, or the room has nothing of that name and type.
+    """
+    if not entry.room:
+        return load_type(entry.type)
+    room = load_room(entry.room)
+    device, robot = room.device(entry.name), room.robot(entry.name)
+    if device is None and robot is None:
+        raise HomeError(f"room '{entry.room}' has no '{entry.name}'; it has: {', '.join(room.names)}")
+    kind = load_type(robot.type) if robot is not None else device.robot_type()  # type: ignore[union-attr]
+    if kind.type != entry.type:
+        raise HomeError(f"'{entry.name}' of room '{entry.room}' is a {kind.type}, not a {entry.type}")
+    return kind
+
+
+def entries_of(name: str) -> list[DeviceEntry]:
+    """What ``agent.toml`` says of all that is in a room.
+
+    Raises:
+        HomeError: The room, or the type of a robot in it, is unknown.
+    """
+    room = load_room(name)
+    return [
+        DeviceEntry(name=robot.name, type=robot.type, room=name, label=robot.label or load_type(robot.type).label)
+        for robot in room.robots
+    ]
+
+
+def geometry_of(entry: DeviceEntry, kind: robot_type.RobotType) -> Geometry | None:
+    """The shape of a configured device in the scene or room that it stands in.
+
+    Raises:
+        GeometryError: The model cannot be used.
+        HomeError: The room is unknown.
+    """
+    scene, standing = str(entry.options.get("scene", "")), None
+    if entry.room:
+        room = load_room(entry.room)
+        robot = room.robot(entry.name)
+        if robot is not None and room.model:
+            standing = geometry.Standing(
+                room=ROOMS / room.room / room.model, position_m=robot.position_m, yaw_rad=robot.yaw_rad
+            )
+    return geometry.load(kind, ROBOTS / kind.type, scene=scene, standing=standing)
+
+
+def driver_of(entry: DeviceEntry, kind: robot_type.RobotType, *, trace: Path | None = None) -> Driver:
+    """The driver of a configured device, not connected.
+
+    Args:
+        entry: The device.
+        kind: Its robot type.
+        trace: A folder for what really happened, where it is simulated.
+
+    Raises:
+        DriverError: Unknown, or an option is.
+    """
+    options: dict[str, object] = dict(entry.options)
+    name = entry.driver or kind.driver
+    folder = ROBOTS / kind.type
+    if name == "mujoco":
+        if trace is not None:
+            options["trace"] = str(trace / f"{entry.name}.ndjson")
+        if entry.room:
+            options["room"] = str(ROOMS / entry.room)
+    return drivers.load(name)(kind, folder, options, entry.name)
+
+
 def api_of(home: Home, configuration: Configuration, clock: CloudClock, *, create: bool = False) -> CloudApi:
     """The agent's view of the HTTP API.
 
@@ -83,7 +172,7 @@ def enrolled_devices(configuration: Configuration) -> list[dict[str, str]]:
     """The devices as the cloud is told of them."""
     entries = []
     for device in configuration.devices:
-        kind = load_type(device.type)
+        kind = type_of(device)
         entries.append(
             {"name": device.name, "kind": kind.kind, "robot_type": kind.type, "label": device.label or kind.label}
         )
@@ -178,19 +267,14 @@ def _device(
     jail: Jail,
     trace: Path | None,
 ) -> Device:
-    kind = load_type(entry.type)
-    options: dict[str, object] = dict(entry.options)
-    name = entry.driver or kind.driver
-    if trace is not None and name == "mujoco":
-        options["trace"] = str(trace / f"{entry.name}.ndjson")
-    driver = drivers.load(name)(kind, ROBOTS / kind.type, options, entry.name)
+    kind = type_of(entry)
     return Device(
         name=entry.name,
         label=entry.label or kind.label,
         space=pairing.space,
         agent=pairing.agent,
         robot_type=kind,
-        driver=driver,
+        driver=driver_of(entry, kind, trace=trace),
         journal=journal,
         cloud_clock=clock,
         keys=pairing.public_keys(),
@@ -198,14 +282,14 @@ def _device(
         outbox=outbox,
         room=room,
         interlocks=entry.interlocks,
-        geometry=_geometry(kind, str(entry.options.get("scene", ""))),
+        geometry=_geometry(entry, kind),
         jail=jail,
         owner=pairing.owner,
     )
 
 
-def _geometry(kind: robot_type.RobotType, scene: str) -> Geometry | None:
+def _geometry(entry: DeviceEntry, kind: robot_type.RobotType) -> Geometry | None:
     try:
-        return geometry.load(kind, ROBOTS / kind.type, scene=scene)
+        return geometry_of(entry, kind)
     except GeometryError as error:
         raise HomeError(str(error)) from error

@@ -6,7 +6,7 @@ import subprocess
 import sys
 from collections.abc import Iterator, Mapping
 
-from device_agent import bootstrap, drivers, geometry
+from device_agent import bootstrap
 from device_agent.doctor.finding import Finding, ok, problem, warning
 from device_agent.ports.driver import DriverError
 from device_agent.ports.geometry import GeometryError
@@ -29,15 +29,14 @@ def device(entry: DeviceEntry) -> Iterator[Finding]:
     """Its type, model and driver. A simulated one is built; a real one is left alone, for it may be at work."""
     name = f"device {entry.name}"
     try:
-        kind = bootstrap.load_type(entry.type)
-        folder = bootstrap.ROBOTS / kind.type
-        shape = geometry.load(kind, folder, scene=str(entry.options.get("scene", "")))
-        driver = drivers.load(entry.driver or kind.driver)(kind, folder, dict(entry.options), entry.name)
+        kind = bootstrap.type_of(entry)
+        shape = bootstrap.geometry_of(entry, kind)
+        driver = bootstrap.driver_of(entry, kind)
         if driver.simulated:
             driver.connect()
             driver.close()
     except HomeError as error:
-        yield problem(name, str(error), "Correct the device's `type` in agent.toml.")
+        yield problem(name, str(error), "Correct the device's `type` or `room` in agent.toml.")
         return
     except (DriverError, GeometryError) as error:
         yield problem(name, str(error), "Correct the device in agent.toml, or install what its driver needs.")
@@ -82,7 +81,7 @@ def renderer(configuration: Configuration) -> Iterator[Finding]:
 
 def _driver_of(entry: DeviceEntry) -> str:
     try:
-        return bootstrap.load_type(entry.type).driver
+        return bootstrap.type_of(entry).driver
     except HomeError:
         return ""
 

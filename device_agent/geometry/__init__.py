@@ -2,19 +2,21 @@
 
 from pathlib import Path
 
+from device_agent.geometry.standing import Standing
 from device_agent.ports.geometry import Geometry, GeometryError
 from device_agent.protocol.robot_type import RobotType
 
-__all__ = ["load"]
+__all__ = ["Standing", "load"]
 
 
-def load(robot_type: RobotType, folder: Path, *, scene: str = "") -> Geometry | None:
+def load(robot_type: RobotType, folder: Path, *, scene: str = "", standing: Standing | None = None) -> Geometry | None:
     """The geometry of a robot type; ``None`` where its manifest names no model.
 
     Args:
         robot_type: The manifest.
         folder: The robot type's folder.
         scene: MJCF file of what stands around the robot instead of the manifest's, relative to the folder.
+        standing: The room that it stands in and where, instead of a scene.
 
     Raises:
         GeometryError: The model cannot be read or does not fit the manifest, or MuJoCo is not installed.
@@ -27,4 +29,6 @@ def load(robot_type: RobotType, folder: Path, *, scene: str = "") -> Geometry | 
         raise GeometryError(
             f"'{robot_type.type}' has a model, and nothing here can read it ({error}); install mujoco-core"
         ) from error
+    if standing is not None:
+        return MujocoGeometry(robot_type, folder / robot_type.model, standing=standing)
     return MujocoGeometry(robot_type, folder / (scene or robot_type.scene or robot_type.model))

@@ -37,6 +37,21 @@ class Levers:
         body = int(model.site_bodyid[index]) if is_site else index
         return self._of_point(body, model.site_pos[index] if is_site else np.zeros(3), 0.0)
 
+    def reach_m(self, geom: int, base: int) -> float:
+        """How far any point of a shape can come from the origin of the robot's base, whatever its joints do [m]."""
+        model = self._model
+        box = model.geom_aabb[geom]
+        reach = float(np.linalg.norm(box[:3]) + np.linalg.norm(box[3:]) + np.linalg.norm(model.geom_pos[geom]))
+        at = int(model.geom_bodyid[geom])
+        while at not in (0, base):
+            for joint in np.flatnonzero(model.jnt_bodyid == at).tolist():
+                slides = model.jnt_type[joint] == int(mujoco.mjtJoint.mjJNT_SLIDE)
+                offset = float(np.linalg.norm(model.jnt_pos[joint]))
+                reach += float(np.max(np.abs(model.jnt_range[joint]))) if slides else 2 * offset
+            reach += float(np.linalg.norm(model.body_pos[at]))
+            at = int(model.body_parentid[at])
+        return reach
+
     def between(self, a: int, b: int) -> Floats:
         """How fast two shapes can near each other, shape (joints,): joints that carry both do not count."""
         first, second = self._of_geom(a), self._of_geom(b)

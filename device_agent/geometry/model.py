@@ -10,8 +10,9 @@ import mujoco
 import numpy as np
 import numpy.typing as npt
 
-from device_agent.geometry.pairs import Pairs
+from device_agent.geometry.pairs import ROOM_PREFIX, Pairs
 from device_agent.geometry.solver import Solver
+from device_agent.geometry.standing import Standing
 from device_agent.ports.geometry import Clearance, GeometryError, Sweep
 from device_agent.protocol.messages import Pose
 from device_agent.protocol.robot_type import RobotType
@@ -35,17 +36,19 @@ class MujocoGeometry:
     Args:
         robot_type: Joints, frames, workspace, margin.
         scene: MJCF file that holds the robot.
+        standing: The room to put it into.
 
     Raises:
         GeometryError: The scene cannot be read, lacks a joint or frame of the manifest, or the robot touches something
             in its home position.
     """
 
-    def __init__(self, robot_type: RobotType, scene: Path) -> None:
+    def __init__(self, robot_type: RobotType, scene: Path, *, standing: Standing | None = None) -> None:
         try:
-            self._model: Any = mujoco.MjSpec.from_file(str(scene)).compile()
+            self._model: Any = _spec(scene, standing).compile()
         except (ValueError, OSError, mujoco.FatalError) as error:
-            raise GeometryError(f"{scene}: MuJoCo cannot build this model: {error}") from error
+            where = scene if standing is None else f"{scene} in {standing.room}"
+            raise GeometryError(f"{where}: MuJoCo cannot build this model: {error}") from error
         self._data = mujoco.MjData(self._model)
         self._lock = threading.Lock()
         self._type = robot_type
@@ -208,3 +211,22 @@ class MujocoGeometry:
         if index < 0:
             raise GeometryError(f"the model of '{self._type.type}' has no {word} '{name}'")
         return index
+
+
+def _spec(scene: Path, standing: Standing | None) -> Any:
+    """The robot where it stands; a room is put around it, so that the robot's own names stay as they are."""
+    robot = mujoco.MjSpec.from_file(str(scene))
+    if standing is None:
+        return robot
+    room = mujoco.MjSpec.from_file(str(standing.room))
+    robot.compiler.conflict = mujoco.mjtConflict.mjCONFLICT_MERGE  # options do not matter: nothing is stepped here
+    position, quaternion = np.empty(3), np.empty(4)
+    half_rad = standing.yaw_rad / 2
+    mujoco.mju_negPose(
+        position,
+        quaternion,
+        np.array(standing.position_m),
+        np.array((math.cos(half_rad), 0.0, 0.0, math.sin(half_rad))),
+    )
+    robot.attach(room, prefix=ROOM_PREFIX, frame=robot.worldbody.add_frame(pos=position, quat=quaternion))
+    return robot

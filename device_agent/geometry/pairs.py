@@ -19,6 +19,8 @@ from device_agent.protocol.robot_type import RobotType
 Floats = npt.NDArray[np.float64]
 Ints = npt.NDArray[np.intp]
 
+ROOM_PREFIX = "room/"
+"""Before the names of things of the room that a robot was put into."""
 _SAMPLES = 150
 _SEED = 9
 _FAR_M = 3.0
@@ -28,6 +30,8 @@ _CLOSE_M = 0.1
 _STILL_M = 1e-4
 """A pair whose distance changes by less over many random positions cannot come nearer, by construction."""
 _NOTHING_M = 1e-9
+_BEYOND_M = 0.3
+"""Things of the scene that stay further than the margin and this out of reach are left out."""
 _NEIGHBOURS = 2
 """Steps along the tree between links that have one link between them."""
 _FACES = ("lower x", "lower y", "lower z", "upper x", "upper y", "upper z")
@@ -37,7 +41,8 @@ class Pairs:
     """All pairs of shapes that could meet, and the frames that must stay in the workspace.
 
     Left out are pairs that MuJoCo leaves out (one body, parent and child, ``<exclude>``), that no joint moves against
-    each other, and things of the scene that could be anywhere. Of a robot that drives, only its own shapes count.
+    each other, and things of the scene that could be anywhere or are out of reach. Of a robot that drives, only its own
+    shapes count.
 
     Args:
         model: ``MjModel``.
@@ -59,7 +64,8 @@ class Pairs:
         self._model = model
         self._base = base
         levers = Levers(model, joints)
-        found = _pairs(model, base, scenery=robot_type.base is None)
+        scenery_m = None if robot_type.base is not None else robot_type.margin_m + _BEYOND_M
+        found = _pairs(model, base, levers, scenery_m=scenery_m)
         self._a = np.array([a for a, _ in found], dtype=np.intp)
         self._b = np.array([b for _, b in found], dtype=np.intp)
         self._lever = np.array([levers.between(a, b) for a, b in found]).reshape(len(found), len(joints))
@@ -302,19 +308,40 @@ def _left(closing: Floats) -> Floats:
     return left
 
 
-def _pairs(model: Any, base: int, *, scenery: bool) -> list[tuple[int, int]]:
+def _pairs(model: Any, base: int, levers: Levers, *, scenery_m: float | None) -> list[tuple[int, int]]:
+    """Who could meet: the robot's own shapes, and things that stand still within ``scenery_m`` of its reach."""
     solid = [g for g in range(model.ngeom) if model.geom_contype[g] or model.geom_conaffinity[g]]
     own = [g for g in solid if model.body_rootid[model.geom_bodyid[g]] == base]
-    still = [g for g in solid if not model.body_weldid[model.geom_bodyid[g]] and g not in own] if scenery else []
+    still = [g for g in solid if not model.body_weldid[model.geom_bodyid[g]] and g not in own]
+    if scenery_m is None:
+        still = []
     excluded = {(int(signature) >> 16, int(signature) & 0xFFFF) for signature in model.exclude_signature}
     candidates = [*still, *own]
+    reach_m = {geom: levers.reach_m(geom, base) for geom in own}
+    away_m = _away(model, still, base)
     found = []
     for index, a in enumerate(candidates):
         for b in candidates[index + 1 :]:
+            if a in away_m and away_m[a] > reach_m.get(b, 0.0) + (scenery_m or 0.0):
+                continue
             bodies = int(model.geom_bodyid[a]), int(model.geom_bodyid[b])
             if bodies in excluded or bodies[::-1] in excluded or not _meet(model, a, b):
                 continue
             found.append((a, b))
+    return found
+
+
+def _away(model: Any, still: Sequence[int], base: int) -> dict[int, float]:
+    """A lower bound of how far each still thing is from the base's origin [m]; it never moves, so that counts once."""
+    data = mujoco.MjData(model)
+    mujoco.mj_kinematics(model, data)
+    found = {}
+    for geom in still:
+        if model.geom_type[geom] == int(mujoco.mjtGeom.mjGEOM_PLANE):
+            continue  # endless
+        offset = data.geom_xmat[geom].reshape(3, 3).T @ (data.xpos[base] - data.geom_xpos[geom])
+        box = model.geom_aabb[geom]
+        found[geom] = float(np.linalg.norm(np.maximum(np.abs(offset - box[:3]) - box[3:], 0.0)))
     return found
 
 
@@ -342,4 +369,6 @@ def _steps(model: Any, a: int, b: int) -> int:
 
 def _name(model: Any, geom: int) -> str:
     body = int(model.geom_bodyid[geom])
-    return str(model.geom(geom).name or "scenery") if body == 0 else str(model.body(body).name)
+    return (
+        str(model.geom(geom).name.removeprefix(ROOM_PREFIX) or "scenery") if body == 0 else str(model.body(body).name)
+    )

@@ -37,10 +37,14 @@ class HomeError(Exception):
 
 
 class DeviceEntry(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """One ``[[devices]]`` of ``agent.toml``. ``driver`` is empty for the one that the robot type names."""
+    """One ``[[devices]]`` of ``agent.toml``. ``driver`` is empty for the one that the robot type names.
+
+    ``room``: it stands in that room, whose manifest has a robot or a device of the same name and type.
+    """
 
     name: Id
     type: Id
+    room: str = ""
     driver: str = ""
     label: Label = ""
     options: dict[str, Any] = {}
@@ -212,6 +216,8 @@ class Home:
         for device in configuration.devices:
             lines += ["", "[[devices]]"]
             lines += [f"{key} = {_toml(getattr(device, key))}" for key in ("name", "type", "driver", "label")]
+            if device.room:
+                lines.append(f"room = {_toml(device.room)}")
             if device.options:
                 lines.append("[devices.options]")
                 lines += [f"{_toml(key)} = {_toml(value)}" for key, value in device.options.items()]

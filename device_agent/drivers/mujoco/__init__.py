@@ -3,36 +3,44 @@
 from collections.abc import Mapping
 from pathlib import Path
 
+from device_agent.drivers.mujoco import worlds
+from device_agent.drivers.mujoco.assembly import Placement
 from device_agent.drivers.mujoco.driver import MujocoDriver
 from device_agent.drivers.mujoco.snapshot import Snapshot
 from device_agent.drivers.mujoco.twin import draw
-from device_agent.drivers.mujoco.world import Placement, World
+from device_agent.drivers.mujoco.world import World
 from device_agent.ports.driver import DriverError
 from device_agent.protocol.robot_type import RobotType
 
-__all__ = ["MujocoDriver", "Placement", "Snapshot", "World", "create", "draw"]
+__all__ = ["MujocoDriver", "Placement", "Snapshot", "World", "create", "draw", "worlds"]
 
-_OPTIONS = ("scene", "trace")
+_OPTIONS = ("room", "scene", "trace")
 
 
 def create(robot_type: RobotType, folder: Path, options: Mapping[str, object], device: str) -> MujocoDriver:
-    """The driver of one robot in a world of its own: the factory that ``drivers.load("mujoco")`` gives.
+    """The driver of one robot, alone or in a room: the factory that ``drivers.load("mujoco")`` gives.
 
-    Options (text): ``scene``, an MJCF file instead of the manifest's, relative to the robot's folder; ``trace``, a file
-    to which the world appends its true state at 100 Hz (see ``trace.Trace``).
+    Options (text): ``room``, a room's folder, relative to the robot's: the robot is the one of its manifest with the
+    device's name, and all that is in the room shares one world; without it the robot has a world of its own, with
+    ``scene``, an MJCF file instead of the manifest's, relative to the robot's folder; ``trace``, a file to which the
+    world appends the robot's true state at 100 Hz (see ``trace.Trace``).
 
     Raises:
-        DriverError: An option is unknown or not text.
+        DriverError: An option is unknown or not text, or the room cannot be used.
     """
     for name, value in options.items():
         if name not in _OPTIONS:
             raise DriverError(f"driver 'mujoco' has no option '{name}'; it has: {', '.join(_OPTIONS)}")
         if not isinstance(value, str) or not value:
-            raise DriverError(f"option '{name}' of driver 'mujoco' must be the path of a file, not {value!r}")
-    trace = options.get("trace")
-    world = World(
-        folder / str(options.get("scene", robot_type.scene)),
-        home=robot_type.home_rad,
-        trace=Path(str(trace)) if trace else None,
-    )
-    return MujocoDriver(robot_type=robot_type, world=world, device=device)
+            raise DriverError(f"option '{name}' of driver 'mujoco' must be the path of a file or folder, not {value!r}")
+    trace = Path(str(options["trace"])) if "trace" in options else None
+    if "room" not in options:
+        scene = folder / str(options.get("scene", robot_type.scene))
+        world = World(scene, home=robot_type.home_rad, trace=trace)
+        return MujocoDriver(robot_type=robot_type, world=world, device=device)
+    if "scene" in options:
+        raise DriverError("driver 'mujoco' takes a room or a scene, not both")
+    world = worlds.of(folder / str(options["room"]))
+    if trace is not None:
+        world.trace(trace, prefix=worlds.prefix(device))
+    return MujocoDriver(robot_type=robot_type, world=world, device=device, prefix=worlds.prefix(device))

@@ -9,8 +9,9 @@ import mujoco
 import numpy as np
 
 from device_agent.drivers.mujoco import twin
+from device_agent.drivers.mujoco.assembly import SCALAR_JOINTS
 from device_agent.drivers.mujoco.snapshot import Floats, Ints, Snapshot
-from device_agent.drivers.mujoco.world import SCALAR_JOINTS, STALE_S, World
+from device_agent.drivers.mujoco.world import STALE_S, World
 from device_agent.ports.driver import DriverError, Observation
 from device_agent.protocol.messages import Pose, Twin
 from device_agent.protocol.robot_type import RobotType

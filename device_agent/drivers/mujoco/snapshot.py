@@ -25,6 +25,8 @@ class Snapshot:
         body_quaternion: Of each body in the world, shape (nbody, 4).
         site_position_m: Of each site in the world, shape (nsite, 3) [m].
         site_matrix: Rotation of each site in the world, row-major, shape (nsite, 9).
+        mocap_position_m: Of what is moved by hand rather than by physics, shape (nmocap, 3) [m].
+        mocap_quaternion: The same's orientation, shape (nmocap, 4).
         lag_ms: Simulated time lost so far because the machine could not keep up [ms].
         fault: Why the world stands still, empty while it is well.
     """
@@ -39,6 +41,8 @@ class Snapshot:
     body_quaternion: Floats
     site_position_m: Floats
     site_matrix: Floats
+    mocap_position_m: Floats
+    mocap_quaternion: Floats
     lag_ms: float
     fault: str
     addresses: Mapping[str, int] = field(repr=False)

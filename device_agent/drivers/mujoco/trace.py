@@ -26,15 +26,28 @@ class Trace:
     ``ctrl`` (what the actuator follows). Writing is part of stepping: slow disks show as lag, full ones end the trace.
     """
 
-    def __init__(self, path: Path, model: Any, joints: Sequence[str]) -> None:
+    def __init__(self, path: Path, model: Any, joints: Sequence[str], *, prefix: str = "") -> None:
         """Open the file and write the first line.
+
+        Args:
+            path: The file.
+            model: ``MjModel``.
+            joints: Names of all hinges and slides.
+            prefix: Of one robot's joints and actuators: only they are told, without it.
 
         Raises:
             DriverError: The file cannot be written.
         """
-        self._velocities = [int(model.jnt_dofadr[model.joint(name).id]) for name in joints]
+        own = [name for name in joints if name.startswith(prefix)]
+        actuators = [model.actuator(index).name for index in range(model.nu)]
+        self._positions = [int(model.jnt_qposadr[model.joint(name).id]) for name in own]
+        self._velocities = [int(model.jnt_dofadr[model.joint(name).id]) for name in own]
+        self._actuators = [index for index, name in enumerate(actuators) if name.startswith(prefix)]
         self._next_s = -np.inf
-        columns = {"joints": list(joints), "actuators": [model.actuator(index).name for index in range(model.nu)]}
+        columns = {
+            "joints": [name.removeprefix(prefix) for name in own],
+            "actuators": [actuators[index].removeprefix(prefix) for index in self._actuators],
+        }
         try:
             self._file = path.open("a", encoding="utf-8", buffering=1)
         except OSError as error:
@@ -55,10 +68,10 @@ class Trace:
             "at_ms": round(time.time() * 1000, 3),
             "time_s": round(snapshot.time_s, 6),
             "lag_ms": round(snapshot.lag_ms, 3),
-            "qpos": [round(value, 9) for value in snapshot.position_rad.values()],
+            "qpos": np.round(snapshot.qpos[self._positions], 9).tolist(),
             "qvel": np.round(snapshot.qvel[self._velocities], 9).tolist(),
-            "target": np.round(target, 9).tolist(),
-            "ctrl": np.round(snapshot.ctrl, 9).tolist(),
+            "target": np.round(target[self._actuators], 9).tolist(),
+            "ctrl": np.round(snapshot.ctrl[self._actuators], 9).tolist(),
         }
         try:
             self._file.write(json.dumps(row) + "\n")

@@ -1,10 +1,12 @@
-"""One MuJoCo world, stepped in real time in a thread of its own, shared by any number of drivers.
+"""One MuJoCo world, stepped in real time in a thread of its own, shared by any number of drivers and sensors.
 
 No lock is held while stepping. A driver hands in its newest command by swapping one reference, and reads an immutable
-``Snapshot`` that the thread puts in place after each group of steps.
+``Snapshot`` that the thread puts in place after each group of steps. What goes on in it by itself (``Process``) is done
+in the thread before each group.
 """
 
 import logging
+import math
 import threading
 import time
 from collections.abc import Mapping, Sequence
@@ -15,13 +17,14 @@ from typing import Any
 import mujoco
 import numpy as np
 
+from device_agent.drivers.mujoco.assembly import SCALAR_JOINTS, TIMESTEP_S, Placement, assemble, at_home
 from device_agent.drivers.mujoco.snapshot import Floats, Ints, Snapshot
 from device_agent.drivers.mujoco.trace import Trace
 from device_agent.ports.driver import DriverError
+from device_agent.ports.world import Process
 
 log = logging.getLogger(__name__)
 
-TIMESTEP_S = 0.002
 GROUP_STEPS = 2
 """Steps between two snapshots: half of the shortest control period in use (8 ms)."""
 MAX_CATCH_UP_S = 0.04
@@ -30,26 +33,9 @@ STALE_S = 2.0
 """Age at which a snapshot of a running world means that its thread hangs."""
 WARN_EVERY_S = 10.0
 _STOP_TIMEOUT_S = 5.0
-SCALAR_JOINTS = frozenset({int(mujoco.mjtJoint.mjJNT_HINGE), int(mujoco.mjtJoint.mjJNT_SLIDE)})
-"""Joint types with one position. As ``int``: MuJoCo's enumerations do not equal the numbers in its arrays."""
+_SET_S = 3.0
+"""Time in which something of the room goes through the whole of its range: a door, blinds, a camera that turns."""
 _DIVERGED = ("mjWARN_BADQPOS", "mjWARN_BADQVEL", "mjWARN_BADQACC", "mjWARN_BADCTRL")
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Placement:
-    """One robot put into a scene.
-
-    Attributes:
-        prefix: Put before every name of the robot's model, ``arm/`` for example; unique in its world.
-        model: MJCF file of the robot alone.
-        position_m: Of the robot's base in the world [m].
-        quaternion: Of the robot's base in the world (w, x, y, z).
-    """
-
-    prefix: str
-    model: Path
-    position_m: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    quaternion: tuple[float, float, float, float] = (1.0, 0.0, 0.0, 0.0)
 
 
 @dataclass(frozen=True, slots=True)
@@ -94,7 +80,12 @@ class World:
         self._scene = scene
         self._robots = tuple(robots)
         self._home = dict(home or {})
-        self._trace_path = trace
+        self._trace_files: dict[Path, str] = {} if trace is None else {trace: ""}
+        self._traces: tuple[Trace, ...] = ()
+        self._processes: tuple[Process, ...] = ()
+        self._quantities: Mapping[str, float] = {}
+        self._settings: dict[str, float] = {}
+        self._sounds: dict[str, tuple[float, float]] = {}
         self._users = 0
         self._life = threading.Lock()  # guards starting and stopping only
         self._thread: threading.Thread | None = None
@@ -140,8 +131,8 @@ class World:
             return
         # Else MuJoCo writes its warnings into a file in whatever folder the agent was started.
         mujoco.set_mju_user_warning(_warn)
-        model = self._compile()
-        data = self._at_home(model)
+        model = assemble(self._scene, self._robots)
+        data = at_home(model, self._home, scene=self._scene)
         self._addresses = {
             model.joint(index).name: int(model.jnt_qposadr[index])
             for index in range(model.njnt)
@@ -166,7 +157,7 @@ class World:
             time_s = self.snapshot().time_s
             self._commands.clear()
             self._ramps.clear()
-            self._data = self._at_home(self._model)
+            self._data = at_home(self._model, self._home, scene=self._scene)
             self._data.time = time_s  # time only ever rises
             self._fault = ""
             self._publish()
@@ -213,6 +204,80 @@ class World:
         """
         self._commands[who] = _Command(actuators, np.array(target, dtype=np.float64), ramp_s)
 
+    def trace(self, path: Path, *, prefix: str) -> None:
+        """Append the truth of one robot to a file while the world runs; its joints are those with this prefix.
+
+        Raises:
+            DriverError: The world runs already, and the file cannot be written.
+        """
+        with self._life:
+            if path in self._trace_files:
+                return
+            self._trace_files[path] = prefix
+            if self._thread is not None:
+                self._traces = (*self._traces, Trace(path, self._model, list(self._addresses), prefix=prefix))
+
+    # ------------------------------------------------------------ for the room
+
+    def add(self, process: Process) -> None:
+        """Have something go on in it, from the next group of steps."""
+        self._processes = (*self._processes, process)
+
+    def copy(self, into: Any) -> None:
+        """The newest snapshot as an ``MjData`` of the caller's own, with the poses of all that can be seen.
+
+        Contacts and sensors are not computed.
+        """
+        snapshot = self.snapshot()
+        into.time = snapshot.time_s
+        into.qpos[:], into.qvel[:], into.ctrl[:] = snapshot.qpos, snapshot.qvel, snapshot.ctrl
+        into.mocap_pos[:], into.mocap_quat[:] = snapshot.mocap_position_m, snapshot.mocap_quaternion
+        mujoco.mj_kinematics(self._model, into)
+        mujoco.mj_comPos(self._model, into)
+        mujoco.mj_camlight(self._model, into)
+
+    @property
+    def quantities(self) -> Mapping[str, float]:
+        """What has no place in MuJoCo's state, the newest of each."""
+        return self._quantities
+
+    def tell(self, quantities: Mapping[str, float]) -> None:
+        """Put new values of some quantities in place. For processes."""
+        self._quantities = {**self._quantities, **quantities}
+
+    @property
+    def settings(self) -> Mapping[str, float]:
+        """What was ``set`` last."""
+        return self._settings
+
+    def set(self, name: str, value: float) -> float:
+        """Set something of the room; an actuator of its model goes there at its own pace.
+
+        Raises:
+            DriverError: Not finite.
+        """
+        if not math.isfinite(value):
+            raise DriverError(f"'{name}' cannot be set to a number that is not finite")
+        actuator = int(mujoco.mj_name2id(self.model, mujoco.mjtObj.mjOBJ_ACTUATOR, name))
+        if actuator >= 0:
+            lower, upper = self._model.actuator_ctrlrange[actuator].tolist()
+            value = min(max(value, lower), upper)
+            share = abs(value - float(self.snapshot().ctrl[actuator])) / (upper - lower)
+            self.command(f"set {name}", np.array([actuator], dtype=np.intp), [value], ramp_s=share * _SET_S)
+        self._settings[name] = value
+        return value
+
+    @property
+    def sounds(self) -> Mapping[str, tuple[float, float]]:
+        """What is or was to be heard: level a metre away [dB], and until when [s of simulated time]."""
+        return self._sounds
+
+    def sound(self, name: str, level_db: float, *, for_s: float) -> None:
+        """Let something be heard from now on; the same name again takes its place."""
+        self._sounds[name] = (level_db, self.snapshot().time_s + for_s)
+
+    # ------------------------------------------------------------ by hand
+
     def step(self, count: int) -> Snapshot:
         """Advance by ``count`` steps of 2 ms, by hand.
 
@@ -222,7 +287,9 @@ class World:
         if self._thread is not None:
             raise DriverError("the world runs in real time; step is for a world driven by hand")
         _ = self.model
-        self._advance(count)
+        while count > 0:
+            self._advance(min(count, GROUP_STEPS))
+            count -= GROUP_STEPS
         self._publish()
         if self._fault:
             raise DriverError(self._fault)
@@ -231,10 +298,18 @@ class World:
     # ------------------------------------------------------------ stepping
 
     def _begin(self) -> None:
-        trace = None if self._trace_path is None else Trace(self._trace_path, self._model, list(self._addresses))
+        traces: list[Trace] = []
+        try:
+            for path, prefix in self._trace_files.items():
+                traces.append(Trace(path, self._model, list(self._addresses), prefix=prefix))
+        except DriverError:
+            for trace in traces:
+                trace.close()
+            raise
+        self._traces = tuple(traces)
         self._stopping.clear()
         self._publish()
-        self._thread = threading.Thread(target=self._run, args=(trace,), name="mujoco-world", daemon=True)
+        self._thread = threading.Thread(target=self._run, name="mujoco-world", daemon=True)
         self._thread.start()
 
     def _end(self) -> None:
@@ -246,38 +321,6 @@ class World:
             raise DriverError(f"the simulation did not stop within {_STOP_TIMEOUT_S:.0f} s")
         self._thread = None
 
-    def _compile(self) -> Any:
-        try:
-            spec = mujoco.MjSpec.from_file(str(self._scene))
-            # One world has one time step and one integrator; the robots' servos are tuned for this pair.
-            spec.option.timestep = TIMESTEP_S
-            spec.option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
-            # A diverged world must stop and say so. MuJoCo's own answer is to jump back to the start.
-            spec.option.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_AUTORESET)
-            for robot in self._robots:
-                frame = spec.worldbody.add_frame(pos=robot.position_m, quat=robot.quaternion)
-                spec.attach(mujoco.MjSpec.from_file(str(robot.model)), prefix=robot.prefix, frame=frame)
-            return spec.compile()
-        except (ValueError, OSError, mujoco.FatalError) as error:
-            raise DriverError(f"{self._scene}: MuJoCo cannot build this world: {error}") from error
-
-    def _at_home(self, model: Any) -> Any:
-        """A fresh state: joints at home, every position servo holding where its joint starts."""
-        data = mujoco.MjData(model)
-        for name, position in self._home.items():
-            joint = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_JOINT, name)
-            if joint < 0:
-                known = ", ".join(model.joint(index).name for index in range(model.njnt))
-                raise DriverError(f"{self._scene}: no joint '{name}'; the model has: {known}")
-            data.qpos[model.jnt_qposadr[joint]] = position
-        for actuator in range(model.nu):
-            joint = model.actuator_trnid[actuator, 0]
-            by_joint = model.actuator_trntype[actuator] == int(mujoco.mjtTrn.mjTRN_JOINT)
-            if by_joint and model.actuator_biasprm[actuator, 1] < 0 and model.jnt_type[joint] in SCALAR_JOINTS:
-                data.ctrl[actuator] = data.qpos[model.jnt_qposadr[joint]]
-        mujoco.mj_forward(model, data)
-        return data
-
     def _advance(self, count: int) -> None:
         model, data = self._model, self._data
         for who, command in list(self._commands.items()):
@@ -285,6 +328,8 @@ class World:
             if ramp is None or ramp.command is not command:
                 self._ramps[who] = _Ramp(command, max(command.ramp_s, TIMESTEP_S))
         active = [ramp for ramp in self._ramps.values() if ramp.remaining_s > 0]
+        for process in self._processes:
+            process.step(model, data, data.time)
         for _ in range(count):
             for ramp in active:
                 _follow(ramp, data.ctrl)
@@ -308,11 +353,13 @@ class World:
                 data.xquat,
                 data.site_xpos,
                 data.site_xmat,
+                data.mocap_pos,
+                data.mocap_quat,
             )
         ]
         for array in arrays:
             array.setflags(write=False)
-        qpos, qvel, effort, ctrl, xpos, xquat, site_xpos, site_xmat = arrays
+        qpos, qvel, effort, ctrl, xpos, xquat, site_xpos, site_xmat, mocap_pos, mocap_quat = arrays
         self._snapshot = Snapshot(
             time_s=float(data.time),
             taken_s=time.monotonic(),
@@ -324,10 +371,17 @@ class World:
             body_quaternion=xquat,
             site_position_m=site_xpos,
             site_matrix=site_xmat,
+            mocap_position_m=mocap_pos,
+            mocap_quaternion=mocap_quat,
             lag_ms=self._lag_s * 1000,
             fault=self._fault,
             addresses=self._addresses,
         )
+
+    def _write_traces(self) -> None:
+        snapshot, targets = self.snapshot(), self._targets()
+        for trace in self._traces:
+            trace.write(snapshot, targets)
 
     def _targets(self) -> Floats:
         """The newest command of each actuator, shape (nu,)."""
@@ -336,18 +390,18 @@ class World:
             target[command.actuators] = command.target
         return target
 
-    def _run(self, trace: Trace | None) -> None:
+    def _run(self) -> None:
         try:
-            self._keep_time(trace)
+            self._keep_time()
         except Exception as error:  # nothing may end this thread unseen: drivers read the fault
             log.exception("the simulation stopped")
             self._fault = f"the simulation stopped: {error}"
             self._publish()
         finally:
-            if trace is not None:
+            for trace in self._traces:
                 trace.close()
 
-    def _keep_time(self, trace: Trace | None) -> None:
+    def _keep_time(self) -> None:
         group_s = GROUP_STEPS * TIMESTEP_S
         due = time.monotonic()
         warned = -WARN_EVERY_S
@@ -357,8 +411,8 @@ class World:
             if self._fault:
                 log.error(self._fault)
                 return
-            if trace is not None:
-                trace.write(self.snapshot(), self._targets())
+            if self._traces:
+                self._write_traces()
             due += group_s
             now = time.monotonic()
             if now - due > MAX_CATCH_UP_S:

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 from device_agent.drivers.mujoco import Placement, Snapshot, World
-from device_agent.drivers.mujoco import world as world_module
+from device_agent.drivers.mujoco.assembly import TIMESTEP_S
 from device_agent.drivers.mujoco.world import MAX_CATCH_UP_S
 from device_agent.ports.driver import DriverError
 from device_agent.protocol import robot_type
@@ -325,7 +325,7 @@ def test_many_robots_share_a_world_and_move_apart(tmp_path: Path):
     ]
     world = World(room, robots=robots, home={f"{name}/elbow": 0.5 for name in "abcd"})
     world.build()
-    assert world.model.opt.timestep == world_module.TIMESTEP_S
+    assert world.model.opt.timestep == TIMESTEP_S
     world.command("b", np.arange(6, 12), [0.3, 0.0, 0.5, 0.0, 0.0, 0.0], ramp_s=0.2)
     position = world.step(500).position_rad
     assert position["b/shoulder_pan"] == pytest.approx(0.3, abs=0.01)
