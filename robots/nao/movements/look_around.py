@@ -1,0 +1,30 @@
+"""Look left, right, up and down, as somebody who has just come in."""
+
+PARAMETERS = {
+    "speed": {
+        "type": "number",
+        "minimum": 0.05,
+        "maximum": 0.5,
+        "default": 0.15,
+        "description": "Share of the joints' velocity limits",
+    },
+    "pause_s": {
+        "type": "number",
+        "minimum": 0,
+        "maximum": 5,
+        "default": 0.5,
+        "unit": "s",
+        "description": "How long to look each way",
+    },
+}
+
+speed = min(0.5, max(0.05, float(parameters.get("speed", 0.15))))
+pause_s = min(5.0, max(0.0, float(parameters.get("pause_s", 0.5))))
+
+ways = [(1.0, -0.1), (0.0, -0.35), (-1.0, -0.1), (0.0, 0.3)]
+robot.home(speed=0.3)
+for index, (yaw, pitch) in enumerate(ways):
+    robot.move_joints({"HeadYaw": yaw, "HeadPitch": pitch}, speed=speed)
+    wait(pause_s)
+    progress((index + 1) / len(ways))
+robot.home(speed=speed)
