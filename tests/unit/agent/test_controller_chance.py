@@ -27,6 +27,9 @@ MAX_SPEED, MAX_ACCELERATION, BRAKING, RANGE = 3.0, 8.0, 20.0, 3.0
 WALL_RAD = 1.4
 REST_WITHIN_S = 0.3
 EVENTS = 120
+CLIPPED = BRAKING * 0.04**2 / 8
+"""A braking way is looked at by straight lines between knots 40 ms apart (``Motion.propose``): the way itself bends by so
+much at most, and may cut a corner of something by it. Real margins are wider."""
 JERK_PERIODS = 20
 """What speeds up when the room slows it needs a tenth of a second to turn."""
 
@@ -231,7 +234,7 @@ class Chance:
             self.velocity[index] = velocity
         self.position = tick.position_rad
         if self.shape is not None:
-            assert self.shape.clearance(self.position).room_m >= -1e-6
+            assert self.shape.clearance(self.position).room_m >= -CLIPPED
         for speed, limit in zip(tick.twist, self.controller._base.limits, strict=True):  # type: ignore[union-attr]
             assert abs(speed) <= limit + 1e-6
         allowed = self.tenure is not None or self.now_s <= self.may_move_until_s + 1e-9

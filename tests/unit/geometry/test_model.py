@@ -78,6 +78,24 @@ def test_a_clear_way_is_clear_everywhere_and_a_blocked_one_is_not(shape: MujocoG
     assert 20 < blocked < 100
 
 
+def test_what_was_measured_before_lets_no_step_pass_that_measuring_would_stop(
+    shape: MujocoGeometry, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    random = np.random.default_rng(8)
+    measuring = MujocoGeometry(KIND, UR5 / KIND.scene)
+    monkeypatch.setattr(measuring, "_surely_clear", lambda _: False)
+    counts = {True: 0, False: 0}
+    for start in free(shape, 25, 4):
+        heading = random.uniform(-0.06, 0.06, len(start))
+        for _ in range(20):
+            path = [start, start + heading, start + 4 * heading]
+            found = shape.sweep(path)
+            assert found == measuring.sweep(path)
+            counts[found.clearance is None] += 1
+            start = start + heading  # noqa: PLW2901 (a walk)
+    assert min(counts.values()) > 50
+
+
 def test_who_is_too_near_may_leave_but_not_go_on(shape: MujocoGeometry) -> None:
     low = [0.0, -0.86, *HOME[2:]]
     assert shape.clearance(low).room_m < 0
