@@ -219,7 +219,8 @@ def _spec(scene: Path, standing: Standing | None) -> Any:
     if standing is None:
         return robot
     room = mujoco.MjSpec.from_file(str(standing.room))
-    robot.compiler.conflict = mujoco.mjtConflict.mjCONFLICT_MERGE  # options do not matter: nothing is stepped here
+    _agree(room.option, robot.option)
+    _agree(room.visual, robot.visual)
     position, quaternion = np.empty(3), np.empty(4)
     half_rad = standing.yaw_rad / 2
     mujoco.mju_negPose(
@@ -230,3 +231,17 @@ def _spec(scene: Path, standing: Standing | None) -> Any:
     )
     robot.attach(room, prefix=ROOM_PREFIX, frame=robot.worldbody.add_frame(pos=position, quat=quaternion))
     return robot
+
+
+def _agree(child: Any, parent: Any) -> None:
+    """Give one part of a model the options of another: MuJoCo warns, aloud, of each that differs."""
+    for name in dir(parent):
+        value = getattr(parent, name)
+        if name.startswith("_") or callable(value):
+            continue
+        if isinstance(value, np.ndarray):
+            getattr(child, name)[:] = value
+        elif isinstance(value, int | float):
+            setattr(child, name, value)
+        else:
+            _agree(getattr(child, name), value)

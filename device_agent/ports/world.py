@@ -1,7 +1,7 @@
 """The simulated room that several devices of one process share. Real rooms have none.
 
-Robots' drivers move in it, sensors look at it, and processes (a person who walks, air that warms) go on in it. It has one
-thread, and nobody else writes to its state.
+Robots' drivers move in it, sensors look at it, and processes (a person who walks, air that warms) go on in it. It has
+one thread, and nobody else writes to its state.
 """
 
 from collections.abc import Mapping

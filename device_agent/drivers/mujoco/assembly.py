@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Any
 
 import mujoco
+import numpy as np
 
 from device_agent.ports.driver import DriverError
 
@@ -39,15 +40,17 @@ def assemble(scene: Path, robots: Sequence[Placement]) -> Any:
     """
     try:
         spec = mujoco.MjSpec.from_file(str(scene))
-        spec.compiler.conflict = mujoco.mjtConflict.mjCONFLICT_MERGE
-        for robot in robots:
-            frame = spec.worldbody.add_frame(pos=robot.position_m, quat=robot.quaternion)
-            spec.attach(mujoco.MjSpec.from_file(str(robot.model)), prefix=robot.prefix, frame=frame)
         # One world has one time step and one integrator; the robots' servos are tuned for this pair.
         spec.option.timestep = TIMESTEP_S
         spec.option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
         # A diverged world must stop and say so. MuJoCo's own answer is to jump back to the start.
         spec.option.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_AUTORESET)
+        for robot in robots:
+            frame = spec.worldbody.add_frame(pos=robot.position_m, quat=robot.quaternion)
+            model = mujoco.MjSpec.from_file(str(robot.model))
+            _agree(model.option, spec.option)
+            _agree(model.visual, spec.visual)
+            spec.attach(model, prefix=robot.prefix, frame=frame)
         return spec.compile()
     except (ValueError, OSError, mujoco.FatalError) as error:
         raise DriverError(f"{scene}: MuJoCo cannot build this world: {error}") from error
@@ -78,3 +81,17 @@ def at_home(model: Any, home: Mapping[str, float], *, scene: Path) -> Any:
             data.ctrl[actuator] = data.qpos[model.jnt_qposadr[joint]]
     mujoco.mj_forward(model, data)
     return data
+
+
+def _agree(child: Any, parent: Any) -> None:
+    """Give one part of a model the options of another: MuJoCo warns, aloud, of each that differs."""
+    for name in dir(parent):
+        value = getattr(parent, name)
+        if name.startswith("_") or callable(value):
+            continue
+        if isinstance(value, np.ndarray):
+            getattr(child, name)[:] = value
+        elif isinstance(value, int | float):
+            setattr(child, name, value)
+        else:
+            _agree(getattr(child, name), value)
