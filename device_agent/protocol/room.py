@@ -68,6 +68,7 @@ class RoomDevice(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
         label: For people.
         driver: One of ``device_agent.sensors.names()``.
         streams: What it measures, and how often when nobody asks for another rate.
+        cameras: What it films, and how many pictures a second.
         captures: What raw data can be had of it: ``image``, ``scan`` …
         controls: What can be set.
         position_m: Where it is in the room [m].
@@ -79,6 +80,7 @@ class RoomDevice(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     label: Label
     driver: Id
     streams: Annotated[tuple[Stream, ...], Meta(max_length=16)] = ()
+    cameras: Annotated[tuple[Stream, ...], Meta(max_length=4)] = ()
     captures: Annotated[tuple[Id, ...], Meta(max_length=16)] = ()
     controls: Annotated[tuple[Control, ...], Meta(max_length=16)] = ()
     position_m: Vector3 = (0.0, 0.0, 0.0)
@@ -86,7 +88,7 @@ class RoomDevice(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
 
     def robot_type(self) -> RobotType:
         """It as the type of a device without joints, so that leases, Stop, actions and interlocks hold for it too."""
-        does = (("streams", self.streams), ("captures", self.captures), ("controls", self.controls))
+        does = ("streams", "cameras", "captures", "controls")
         return RobotType(
             type=self.kind,
             label=self.label,
@@ -101,7 +103,7 @@ class RoomDevice(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
             frames=(),
             home_rad={},
             braking_rad_s2=_NO_BRAKING_RAD_S2,
-            capabilities=tuple(name for name, things in does if things),
+            capabilities=tuple(name for name in does if getattr(self, name)),
             streams=self.streams,
         )
 
@@ -254,9 +256,10 @@ def _check_device(device: RoomDevice) -> None:
     where = f"device '{device.name}'"
     _check_finite(where, device.position_m)
     _check_names(f"streams of {where}", [stream.name for stream in device.streams])
+    _check_names(f"cameras of {where}", [camera.name for camera in device.cameras])
     _check_names(f"captures of {where}", device.captures)
     _check_names(f"controls of {where}", [control.name for control in device.controls])
-    for stream in device.streams:
+    for stream in (*device.streams, *device.cameras):
         if not 0 < stream.rate_hz <= MAX_RATE_HZ:
             raise ProtocolError(
                 f"rate_hz of stream '{stream.name}' of {where} must be above 0, {MAX_RATE_HZ:g} at most"

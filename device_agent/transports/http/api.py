@@ -67,7 +67,8 @@ class CloudApi:
     """
 
     def __init__(self, server: str, key: Ed25519PrivateKey, clock: CloudClock) -> None:
-        self._base = server.rstrip("/") + "/api/v1"
+        self.server = server.rstrip("/") + "/"
+        self._base = self.server + "api/v1"
         self._key = key
         self._clock = clock
         self._http = Session()
@@ -177,6 +178,15 @@ class CloudApi:
             OSError: Not reached.
         """
         return self._call("POST", "/xmpp/credentials", json={"purpose": "agent"})
+
+    def post(self, path: str, body: dict[str, Any]) -> dict[str, Any]:
+        """Any other call of an agent's, below ``/api/v1``.
+
+        Raises:
+            CloudError: Refused.
+            OSError: Not reached.
+        """
+        return self._call("POST", path, json=body)
 
     def _call(self, method: str, path: str, *, timeout: float = _TIMEOUT_S, **request: Any) -> dict[str, Any]:
         sent = tick_ms()

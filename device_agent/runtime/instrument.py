@@ -1,0 +1,157 @@
+"""A room device as its loop and its actions meet it: what it has, how often it is read, what may be asked of it."""
+
+import math
+import threading
+import time
+from collections.abc import Collection, Iterable, Mapping
+
+from device_agent.ports.clock import wall_ms
+from device_agent.ports.sensor import Camera, Capture, Movable, RoomDriver, SensorError, Values
+from device_agent.ports.uploads import UploadError, Uploads
+from device_agent.protocol.room import Control, RoomDevice
+from device_agent.runtime.lease import Refused
+
+_SUFFIXES = {"image/png": "png", "image/jpeg": "jpg", "application/json": "json"}
+_LEAST_RATE_HZ = 0.001
+
+
+class Instrument:
+    """One room device. Thread-safe as far as its driver is.
+
+    Args:
+        driver: Not yet connected.
+        manifest: What it has.
+        uploads: Where its captures go; ``None`` where the agent has no such place.
+
+    Attributes:
+        changed: Set whenever a rate has changed; whoever heeds it clears it.
+    """
+
+    def __init__(self, driver: RoomDriver, manifest: RoomDevice, uploads: Uploads | None) -> None:
+        self._driver = driver
+        self._manifest = manifest
+        self._uploads = uploads
+        self._gathering: Mapping[str, float] = {}
+        self.changed = threading.Event()
+        self.streams = tuple(stream.name for stream in manifest.streams)
+        self.cameras = tuple(camera.name for camera in manifest.cameras) if isinstance(driver, Camera) else ()
+
+    # ------------------------------------------------------------ rates
+
+    def rate_hz(self, name: str) -> float:
+        """How often a stream or camera is to be read now [Hz]."""
+        asked = self._gathering.get(name)
+        if asked is not None:
+            return asked
+        every = (*self._manifest.streams, *self._manifest.cameras)
+        return max(_LEAST_RATE_HZ, next(each.rate_hz for each in every if each.name == name))
+
+    def gather(self, streams: Collection[str], rate_hz: float) -> tuple[str, ...]:
+        """Read these streams so often, from now until ``rest``; empty: all.
+
+        Raises:
+            Refused: There is no such stream.
+        """
+        chosen = tuple(self._known(streams))
+        self._gathering = dict.fromkeys(chosen, rate_hz)
+        self.changed.set()
+        return chosen
+
+    def rest(self) -> None:
+        """Read every stream as often as the manifest says."""
+        self._gathering = {}
+        self.changed.set()
+
+    def _known(self, streams: Collection[str]) -> Iterable[str]:
+        if not self.streams:
+            raise Refused("no_streams", f"'{self._manifest.name}' has no streams")
+        for stream in streams:
+            if stream not in self.streams:
+                raise Refused("unknown_stream", f"no stream '{stream}'; there are {', '.join(self.streams)}")
+        return streams or self.streams
+
+    # ------------------------------------------------------------ what is done with it
+
+    def read(self, stream: str) -> Values:
+        """The newest values of one of its streams, but for numbers that are none.
+
+        Raises:
+            SensorError: As the driver's ``read``.
+        """
+        return {name: value for name, value in self._driver.read(stream).items() if math.isfinite(value)}
+
+    def shoot(self, streams: Collection[str]) -> dict[str, dict[str, float | bool]]:
+        """One measurement now, of these streams or of all.
+
+        Raises:
+            Refused: There is no such stream, or the device does not answer.
+        """
+        try:
+            return {stream: dict(self.read(stream)) for stream in self._known(streams)}
+        except SensorError as error:
+            raise Refused("sensor_failed", str(error)) from error
+
+    def set(self, name: str, value: float) -> float:
+        """Set a control; gives what was applied.
+
+        Raises:
+            Refused: There is no such control, the value is none or beyond its limits, or it failed.
+        """
+        control = self._control(name)
+        if not math.isfinite(value):
+            raise Refused("not_finite", f"{name} must be a finite number")
+        if not control.lower <= value <= control.upper:
+            limits = f"{control.lower:g} to {control.upper:g} {control.unit}".rstrip()
+            raise Refused("out_of_range", f"{name} can be {limits}, not {value:g}")
+        try:
+            return self._driver.set(name, value)
+        except SensorError as error:
+            raise Refused("sensor_failed", str(error)) from error
+
+    def _control(self, name: str) -> Control:
+        found = next((each for each in self._manifest.controls if each.name == name), None)
+        if found is None:
+            known = ", ".join(each.name for each in self._manifest.controls) or "none"
+            raise Refused("unknown_control", f"no control '{name}'; there are: {known}")
+        return found
+
+    def capture(self, name: str) -> dict[str, object]:
+        """Take something raw and store it; gives the upload, as results show it.
+
+        Raises:
+            Refused: There is no such capture, it failed, or it could not be stored.
+        """
+        if name not in self._manifest.captures:
+            known = ", ".join(self._manifest.captures) or "none"
+            raise Refused("unknown_capture", f"no capture '{name}'; there are: {known}")
+        if self._uploads is None:
+            raise Refused("no_store", "this agent has nowhere to store captures")
+        try:
+            at_ms, taken = wall_ms(), self._driver.capture(name)
+            upload = self._uploads.store(
+                self._manifest.name,
+                stream=name,
+                name=_file_name(self._manifest.name, name, taken),
+                media_type=taken.media_type,
+                content=taken.content,
+                at_ms=at_ms,
+            )
+        except SensorError as error:
+            raise Refused("sensor_failed", str(error)) from error
+        except UploadError as error:
+            raise Refused("not_stored", str(error)) from error
+        return {"upload": upload, "media_type": taken.media_type, "length": len(taken.content)}
+
+    def hold(self) -> None:
+        """What moves stays where it is.
+
+        Raises:
+            SensorError: It failed.
+        """
+        if isinstance(self._driver, Movable):
+            self._driver.hold()
+
+
+def _file_name(device: str, capture: str, taken: Capture) -> str:
+    stamp = time.strftime("%Y%m%d-%H%M%S", time.gmtime())
+    return f"{device}-{capture}-{stamp}.{_SUFFIXES.get(taken.media_type, 'bin')}"

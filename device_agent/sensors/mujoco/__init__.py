@@ -1,0 +1,47 @@
+"""Room devices in a simulated room: they look at the world that its robots move in, and err as real sensors do."""
+
+from collections.abc import Callable, Mapping
+from functools import partial
+from pathlib import Path
+
+from device_agent.ports.sensor import RoomDriver, SensorError, Surroundings
+from device_agent.ports.world import SimulatedWorld
+from device_agent.protocol.room import RoomDevice
+from device_agent.sensors.mujoco.cameras import ColourCamera, DepthCamera
+from device_agent.sensors.mujoco.lidar import Lidar
+from device_agent.sensors.mujoco.meters import Contact, Meter
+from device_agent.sensors.mujoco.part import Part
+from device_agent.sensors.mujoco.pir import Pir
+
+__all__ = ["KINDS", "create"]
+
+KINDS: Mapping[str, Callable[[RoomDevice, SimulatedWorld], Part]] = {
+    "camera": ColourCamera,
+    "depth_camera": DepthCamera,
+    "lidar": Lidar,
+    "pir": Pir,
+    "thermometer": partial(Meter, quantity="temperature_c"),
+    "hygrometer": partial(Meter, quantity="humidity_percent"),
+    "co2_meter": partial(Meter, quantity="co2_ppm"),
+    "light_meter": partial(Meter, quantity="light_lux"),
+    "sound_meter": partial(Meter, quantity="sound_db"),
+    "door_contact": Contact,
+    "lamp": Part,
+    "door": Part,
+    "blinds": Part,
+    "thermostat": Part,
+}
+"""What ``kind`` may be, and what does it."""
+
+
+def create(device: RoomDevice, folder: Path, surroundings: Surroundings) -> RoomDriver:  # noqa: ARG001 (a ``Factory``)
+    """The driver of one device: the factory that ``sensors.load("mujoco")`` gives.
+
+    Raises:
+        SensorError: An unknown kind or option, or the room is not simulated.
+    """
+    if surroundings.world is None:
+        raise SensorError(f"'{device.name}' is a simulated device, and its room has no model")
+    if device.kind not in KINDS:
+        raise SensorError(f"driver 'mujoco' has no kind '{device.kind}'; it has: {', '.join(KINDS)}")
+    return KINDS[device.kind](device, surroundings.world)

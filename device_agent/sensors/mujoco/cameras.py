@@ -1,0 +1,169 @@
+"""Cameras of a simulated room: colour and depth, fixed or on a pan-tilt head."""
+
+import math
+import time
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+import simplejpeg
+
+from device_agent.ports.sensor import Bytes, Capture, Frame, Image, SensorError
+from device_agent.ports.world import SimulatedWorld
+from device_agent.protocol.room import RoomDevice
+from device_agent.sensors import png
+from device_agent.sensors.mujoco.noise import generator
+from device_agent.sensors.mujoco.part import Part
+from device_agent.sensors.mujoco.studio import Shot, Studio, studio_of
+
+FRESH_S = 0.1
+"""What ``raw`` gives is no older than this."""
+_WIDTH, _HEIGHT = 320, 240
+_QUALITY = 75
+_GRAIN = 1.5
+"""Standard deviation of a colour's value from picture to picture, of 255: a small sensor in a lit room, approximate."""
+_TILES = 64
+"""Grain is made once, by so much larger than the picture in each direction, and shifted at random for each picture."""
+_NEAREST_M, _FURTHEST_M = 0.3, 8.0
+_MILLIMETRE = 0.001
+_FAR_MM = 65_535
+
+
+class Camera(Part):
+    """What both kinds share.
+
+    Options: ``camera``, its name in the room's model (the device's own name); ``width`` and ``height`` of the picture.
+    """
+
+    OPTIONS: Mapping[str, type | tuple[type, ...]] = {"camera": str, "width": int, "height": int}
+    DEPTH = False
+
+    def __init__(self, device: RoomDevice, world: SimulatedWorld) -> None:
+        super().__init__(device, world)
+        self._name: str = self.option("camera", device.name)
+        self._width: int = self.option("width", _WIDTH)
+        self._height: int = self.option("height", _HEIGHT)
+        if not (0 < self._width <= 1920 and 0 < self._height <= 1080):  # noqa: PLR2004 (1080p)
+            raise SensorError(
+                f"pictures of '{device.name}' are at most 1920 x 1080, not {self._width} x {self._height}"
+            )
+        self._chance = generator(device.name, self.option("seed", 0))
+        self._studio: Studio | None = None
+        self._camera = 0
+        self._fovy_rad = 0.0
+        self._newest: Image | None = None
+
+    def begin(self, model: Any) -> None:
+        """See ``Part``."""
+        self._camera = self.find(model, "camera", self._name)
+        self._fovy_rad = math.radians(float(model.cam_fovy[self._camera]))
+        self._studio = studio_of(self._world)
+        self._studio.open()
+
+    def end(self) -> None:
+        """See ``Part``."""
+        if self._studio is not None:
+            self._studio.close()
+            self._studio = None
+        self._newest = None
+
+    def raw(self) -> Image:
+        """See ``RoomDriver``."""
+        newest = self._newest
+        if newest is None or time.monotonic() - newest.taken_s > FRESH_S:
+            newest = self._take()
+        return newest
+
+    def _take(self) -> Image:
+        self.require()
+        studio = self._studio
+        if studio is None:
+            raise SensorError(f"'{self._device.name}' is not connected")
+        shot = studio.shoot(self._camera, width=self._width, height=self._height, depth=self.DEPTH)
+        self._newest = image = self._image(shot)
+        return image
+
+    def _image(self, shot: Shot) -> Image:
+        raise NotImplementedError
+
+
+class ColourCamera(Camera):
+    """Pictures at ``cam/{name}``; capture ``image``: a PNG without loss."""
+
+    def __init__(self, device: RoomDevice, world: SimulatedWorld) -> None:
+        super().__init__(device, world)
+        grain = self._chance.normal(0.0, _GRAIN, (self._height + _TILES, self._width + _TILES, 3))
+        self._grain = np.rint(grain).astype(np.int16)
+
+    def frame(self, camera: str) -> Frame:
+        """See ``ports.sensor.Camera``."""
+        cameras = [each.name for each in self._device.cameras]
+        if camera not in cameras:
+            self._lacks("camera", camera, cameras)
+        image = self._take()
+        content = simplejpeg.encode_jpeg(image.rgb, quality=_QUALITY, colorsubsampling="420")
+        return Frame(self._width, self._height, content, image.taken_s)
+
+    def capture(self, name: str) -> Capture:
+        """See ``RoomDriver``."""
+        if name not in self._device.captures:
+            return super().capture(name)
+        return Capture("image/png", png.encode(self._take().rgb))
+
+    def _image(self, shot: Shot) -> Image:
+        down, right = self._chance.integers(0, _TILES, 2).tolist()
+        noise = self._grain[down : down + self._height, right : right + self._width]
+        rgb: Bytes = np.clip(shot.pixels.astype(np.int16) + noise, 0, 255).astype(np.uint8)
+        return Image(
+            taken_s=shot.taken_s,
+            position_m=shot.position_m,
+            rotation=shot.rotation,
+            fovy_rad=self._fovy_rad,
+            rgb=rgb,
+        )
+
+
+class DepthCamera(Camera):
+    """Distances for ``raw``; capture ``depth``: a PNG of 16 bits, in millimetres, 0 where nothing is within reach.
+
+    Errs as structured light does: standard deviation 1.2 mm + 1.9 mm/m² (z - 0.4 m)², from Nguyen, Izadi and Lovell,
+    "Modeling Kinect Sensor Noise for Improved 3D Reconstruction and Tracking", 2012.
+
+    Options besides those of ``Camera``: ``nearest_m``, ``furthest_m``.
+    """
+
+    OPTIONS: Mapping[str, type | tuple[type, ...]] = {
+        **Camera.OPTIONS,
+        "nearest_m": (int, float),
+        "furthest_m": (int, float),
+    }
+    DEPTH = True
+
+    def __init__(self, device: RoomDevice, world: SimulatedWorld) -> None:
+        super().__init__(device, world)
+        self._nearest_m = float(self.option("nearest_m", _NEAREST_M))
+        self._furthest_m = float(self.option("furthest_m", _FURTHEST_M))
+        noise = self._chance.normal(0.0, 1.0, (self._height + _TILES, self._width + _TILES))
+        self._noise = noise.astype(np.float32)
+
+    def capture(self, name: str) -> Capture:
+        """See ``RoomDriver``."""
+        if name not in self._device.captures:
+            return super().capture(name)
+        depth_m = np.nan_to_num(np.asarray(self._take().depth_m), posinf=0.0)
+        millimetres = np.rint(depth_m / _MILLIMETRE)
+        return Capture("image/png", png.encode(np.clip(millimetres, 0, _FAR_MM).astype(np.uint16)))
+
+    def _image(self, shot: Shot) -> Image:
+        down, right = self._chance.integers(0, _TILES, 2).tolist()
+        noise = self._noise[down : down + self._height, right : right + self._width]
+        true_m = shot.pixels
+        depth_m = true_m + noise * (np.float32(0.0012) + np.float32(0.0019) * np.square(true_m - np.float32(0.4)))
+        depth_m[(true_m < self._nearest_m) | (true_m > self._furthest_m)] = np.inf
+        return Image(
+            taken_s=shot.taken_s,
+            position_m=shot.position_m,
+            rotation=shot.rotation,
+            fovy_rad=self._fovy_rad,
+            depth_m=depth_m,
+        )

@@ -1,0 +1,108 @@
+"""A lidar of one plane, as a small spinning one sees a room."""
+
+import json
+import math
+from collections.abc import Mapping
+from typing import Any
+
+import mujoco
+import numpy as np
+
+from device_agent.ports.clock import wall_ms
+from device_agent.ports.sensor import Capture, Floats, Scan, Values
+from device_agent.ports.world import SimulatedWorld
+from device_agent.protocol.room import RoomDevice
+from device_agent.sensors.mujoco.noise import generator
+from device_agent.sensors.mujoco.part import Part
+
+STREAM = "range"
+_BEAMS = 360
+_NEAREST_M, _FURTHEST_M = 0.15, 12.0
+_LEAST_M, _SHARE = 0.005, 0.01
+"""Standard deviation: 1 % of the distance, 5 mm at least (SLAMTEC RPLIDAR A1: "below 1 %"; approximate)."""
+_SECTORS = 8
+
+
+class Lidar(Part):
+    """Beams in the x-y plane of a site.
+
+    Stream ``range``: the nearest thing in each of eight sectors, ``range_m.0`` from the site's x axis on to the left;
+    a sector in which nothing is met says ``furthest_m``. Capture ``scan``: all beams, JSON. Its own body is not seen.
+
+    Options: ``site``, its name in the room's model (the device's own name); ``beams``; ``nearest_m``, ``furthest_m``.
+    """
+
+    OPTIONS: Mapping[str, type | tuple[type, ...]] = {
+        "site": str,
+        "beams": int,
+        "nearest_m": (int, float),
+        "furthest_m": (int, float),
+    }
+
+    def __init__(self, device: RoomDevice, world: SimulatedWorld) -> None:
+        super().__init__(device, world)
+        self._name: str = self.option("site", device.name)
+        self._nearest_m = float(self.option("nearest_m", _NEAREST_M))
+        self._furthest_m = float(self.option("furthest_m", _FURTHEST_M))
+        self._chance = generator(device.name, self.option("seed", 0))
+        beams = max(_SECTORS, self.option("beams", _BEAMS))
+        self._angle_rad: Floats = np.arange(beams) * (2 * math.pi / beams)
+        self._beams: Floats = np.stack((np.cos(self._angle_rad), np.sin(self._angle_rad), np.zeros(beams)), axis=1)
+        self._site = 0
+        self._body = -1
+
+    def begin(self, model: Any) -> None:
+        """See ``Part``."""
+        self._site = self.find(model, "site", self._name)
+        body = int(model.site_bodyid[self._site])
+        # Without a body of its own nothing is left out: the walls belong to the world's body.
+        self._body = body or -1
+
+    def raw(self) -> Scan:
+        """See ``RoomDriver``."""
+        self.require()
+        count = len(self._angle_rad)
+        distance_m, geoms = np.empty(count), np.empty(count, dtype=np.int32)
+        with self.view.look() as (data, taken_s):
+            position_m = data.site_xpos[self._site].copy()
+            rotation = data.site_xmat[self._site].reshape(3, 3).copy()
+            beams = np.ascontiguousarray(self._beams @ rotation.T).ravel()
+            mujoco.mj_multiRay(
+                self._world.model, data, position_m, beams, None, True, self._body, geoms, distance_m, None, count,
+                self._furthest_m,
+            )  # fmt: skip
+            noise = self._chance.normal(0.0, 1.0, count)
+        seen = (geoms >= 0) & (distance_m >= self._nearest_m) & (distance_m <= self._furthest_m)
+        told = distance_m + noise * np.maximum(_LEAST_M, _SHARE * distance_m)
+        return Scan(
+            taken_s=taken_s,
+            position_m=position_m,
+            rotation=rotation,
+            angle_rad=self._angle_rad.copy(),
+            range_m=np.where(seen, np.maximum(told, self._nearest_m), np.inf),
+            nearest_m=self._nearest_m,
+            furthest_m=self._furthest_m,
+        )
+
+    def read(self, stream: str) -> Values:
+        """See ``RoomDriver``."""
+        if stream != STREAM:
+            return super().read(stream)
+        nearest = (float(sector.min()) for sector in np.array_split(self.raw().range_m, _SECTORS))
+        return {f"range_m.{index}": round(min(each, self._furthest_m), 4) for index, each in enumerate(nearest)}
+
+    def capture(self, name: str) -> Capture:
+        """See ``RoomDriver``."""
+        if name not in self._device.captures:
+            return super().capture(name)
+        scan = self.raw()
+        content = {
+            "at_ms": wall_ms(),
+            "position_m": [round(value, 4) for value in scan.position_m.tolist()],
+            "rotation": [[round(value, 6) for value in row] for row in scan.rotation.tolist()],
+            "angle_rad": [round(value, 6) for value in scan.angle_rad.tolist()],
+            "range_m": [round(value, 4) if math.isfinite(value) else None for value in scan.range_m.tolist()],
+            "nearest_m": scan.nearest_m,
+            "furthest_m": scan.furthest_m,
+        }
+        return Capture("application/json", json.dumps(content).encode())

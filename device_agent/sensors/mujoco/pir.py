@@ -1,0 +1,100 @@
+"""A passive infrared detector: it sees something warm that moves across its view, nothing that stands or is cold."""
+
+import math
+from collections.abc import Mapping
+from typing import Any
+
+import mujoco
+import numpy as np
+
+from device_agent.ports.sensor import Floats, Values
+from device_agent.ports.world import SimulatedWorld
+from device_agent.protocol.room import RoomDevice
+from device_agent.sensors.mujoco.part import Part
+
+STREAM = "motion"
+_FURTHEST_M = 7.0
+_CONE_RAD = math.radians(110)
+_HOLD_S = 2.0
+_ACROSS_RAD_S = math.radians(4)
+"""Slower than this across its view, or the same in share of the distance towards it, is not noticed."""
+_LOOKS_S = 0.2
+"""Motion is judged over at least this time."""
+
+
+class Pir(Part):
+    """Looks along the x axis of a site. Stream ``motion``: ``present``, for a while after each motion.
+
+    Typical of small modules (HC-SR501: 7 m, 110°; the hold time is set by a screw), approximate. What is warm is named:
+    people are, furniture and robots hardly are. What stands behind a wall or table is not seen.
+
+    Options: ``site``, its name in the room's model (the device's own name); ``warm``, how names of warm bodies begin
+    (``["person"]``); ``furthest_m``, ``cone_rad``, ``hold_s``.
+    """
+
+    OPTIONS: Mapping[str, type | tuple[type, ...]] = {
+        "site": str,
+        "warm": list,
+        "furthest_m": (int, float),
+        "cone_rad": (int, float),
+        "hold_s": (int, float),
+    }
+
+    def __init__(self, device: RoomDevice, world: SimulatedWorld) -> None:
+        super().__init__(device, world)
+        self._name: str = self.option("site", device.name)
+        self._warm: tuple[str, ...] = tuple(map(str, self.option("warm", ["person"])))
+        self._furthest_m = float(self.option("furthest_m", _FURTHEST_M))
+        self._least_cosine = math.cos(float(self.option("cone_rad", _CONE_RAD)) / 2)
+        self._hold_s = float(self.option("hold_s", _HOLD_S))
+        self._site = 0
+        self._own = -1
+        self._bodies: list[int] = []
+        self._before: dict[int, tuple[float, Floats]] = {}
+        self._moved_s = -math.inf
+
+    def begin(self, model: Any) -> None:
+        """See ``Part``."""
+        self._site = self.find(model, "site", self._name)
+        self._own = int(model.site_bodyid[self._site]) or -1
+        names = (model.body(index).name for index in range(model.nbody))
+        self._bodies = [index for index, name in enumerate(names) if name.startswith(self._warm)]
+        self._before.clear()
+        self._moved_s = -math.inf
+
+    def read(self, stream: str) -> Values:
+        """See ``RoomDriver``."""
+        if stream != STREAM:
+            return super().read(stream)
+        self.require()
+        with self.view.look() as (data, _):
+            now_s = float(data.time)
+            for body in self._bodies:
+                seen = self._look(data, body)
+                if seen is None:
+                    self._before.pop(body, None)
+                elif self._moves(body, seen, now_s):
+                    self._moved_s = now_s
+        return {"present": now_s - self._moved_s < self._hold_s}
+
+    def _look(self, data: Any, body: int) -> Floats | None:
+        """Where it sees a body's middle, from itself [m]."""
+        origin, matrix = data.site_xpos[self._site], data.site_xmat[self._site].reshape(3, 3)
+        way: Floats = data.xipos[body] - origin
+        distance_m = float(np.linalg.norm(way))
+        if not 0 < distance_m <= self._furthest_m or float(way @ matrix[:, 0]) < self._least_cosine * distance_m:
+            return None
+        met = np.full(1, -1, dtype=np.int32)
+        mujoco.mj_ray(self._world.model, data, origin, way / distance_m, None, True, self._own, met, None)
+        model = self._world.model
+        if met[0] >= 0 and model.body_rootid[model.geom_bodyid[met[0]]] != model.body_rootid[body]:
+            return None
+        return way
+
+    def _moves(self, body: int, way: Floats, now_s: float) -> bool:
+        before_s, before = self._before.setdefault(body, (now_s, way))
+        passed_s = now_s - before_s
+        if passed_s < _LOOKS_S:
+            return False
+        self._before[body] = (now_s, way)
+        return float(np.linalg.norm(way - before)) > _ACROSS_RAD_S * passed_s * float(np.linalg.norm(way))
