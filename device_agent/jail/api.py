@@ -112,7 +112,8 @@ class Robot:
     def state(self) -> dict[str, Any]:
         """Measured ``position_rad``, ``velocity_rad_s``, ``effort_nm`` by joint name, ``frames`` by name, ``mode``.
 
-        A frame is x, y, z [m] and quaternion w, x, y, z in the robot's base frame.
+        A frame is x, y, z [m] and quaternion w, x, y, z in the robot's base frame. ``streams`` has what else the robot
+        measures, by stream: ``values`` by name and their age, ``age_s`` [s].
         """
         state: dict[str, Any] = self._ask("state")
         return state

@@ -1,6 +1,6 @@
 """What a driver does for one device. This page is the implementer's manual."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple, Protocol, runtime_checkable
 
@@ -94,4 +94,22 @@ class MobileDriver(Driver, Protocol):
 
         Raises:
             DriverError: As for ``observe``.
+        """
+
+
+@runtime_checkable
+class Reporting(Protocol):
+    """A driver that measures more than joints: what its robot type's ``streams`` name besides ``joints``."""
+
+    def report(self, stream: str) -> Mapping[str, float | bool]:
+        """The newest values of one stream, by quantity with its unit, a dot and the part where there are several.
+
+        Called at the stream's rate, from one thread that is not the control loop and may run beside it; also before
+        ``connect`` has succeeded, and while the device does not answer. What is not finite is left out.
+
+        Returns:
+            ``{"distance_m.left": 0.81}``; empty where there is nothing to tell just now.
+
+        Raises:
+            DriverError: It cannot be measured now; it is asked again when the stream is next due.
         """

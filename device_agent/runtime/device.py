@@ -1,7 +1,8 @@
 """One device at work: puts its control loop, office, executor and voice together, and routes what arrives.
 
 Two threads a device: the control loop (``loop``), which never waits for disk or network, and the ``office``, which
-does. Setpoints and Stop go from the transport's thread straight into the controller.
+does; a third, the ``reporter``, where its driver measures more than joints. Setpoints and Stop go from the transport's
+thread straight into the controller.
 """
 
 import logging
@@ -11,14 +12,14 @@ from collections.abc import Mapping, Sequence
 from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PublicKey
 
 from device_agent.ports.clock import CloudClock, tick_ms, wall_ms
-from device_agent.ports.driver import Driver
+from device_agent.ports.driver import Driver, Reporting
 from device_agent.ports.geometry import Geometry
 from device_agent.ports.jail import Jail
 from device_agent.ports.skills import Skills
 from device_agent.protocol import codec, topics
 from device_agent.protocol.errors import ProtocolError
 from device_agent.protocol.events import EventKind
-from device_agent.protocol.messages import JointTelemetry, Setpoint, Stop, StopLatch
+from device_agent.protocol.messages import JointTelemetry, Measurements, Setpoint, Stop, StopLatch
 from device_agent.protocol.robot_type import RobotType
 from device_agent.runtime.actions import Executor
 from device_agent.runtime.audit import Audit, Happened
@@ -29,6 +30,7 @@ from device_agent.runtime.lease import LeaseGate, Refused
 from device_agent.runtime.loop import ControlLoop
 from device_agent.runtime.office import Office
 from device_agent.runtime.outbox import Outbox, Publish
+from device_agent.runtime.reporter import Reporter
 from device_agent.runtime.robot import Body
 from device_agent.runtime.room import Room
 from device_agent.runtime.trust import Trust
@@ -113,7 +115,15 @@ class Device:
             note=lambda happened, code, now_s: self._audit.refused(happened, code=code, now_s=now_s),
         )
         self._loop = ControlLoop(
-            robot_type, driver, self._controller, name=name, tell=self._measured, watch=self._interlocks.step
+            robot_type,
+            driver,
+            self._controller,
+            name=name,
+            tell=lambda telemetry: self._measured(topics.JOINTS, telemetry),
+            watch=self._interlocks.step,
+        )
+        self._reporter = Reporter(
+            robot_type.streams, driver if isinstance(driver, Reporting) else None, name=name, tell=self._measured
         )
         body = Body(
             robot_type=robot_type,
@@ -122,6 +132,7 @@ class Device:
             geometry=geometry,
             skills=driver if isinstance(driver, Skills) else None,
             room=room,
+            reported=self._reporter.latest,
         )
         trust = Trust(device=name, robot_type=robot_type.type, owner=owner, keys=keys, journal=journal)
         self._executor = Executor(body, trust=trust, jail=jail, report=self.voice.report)
@@ -145,6 +156,7 @@ class Device:
             DriverError: The device is not there.
         """
         self._loop.start()
+        self._reporter.start()
         epoch, _ = self._controller.epochs
         data = {"epoch": epoch, "stopped": self._controller.latch is not None}
         self._audit.note(Happened(EventKind.AGENT_STARTED, "the agent started; leases of before have ended", data=data))
@@ -158,6 +170,7 @@ class Device:
         self._controller.lost(Refused("agent_stopping", "the agent was shut down"))
         self._executor.close()
         self._loop.stop()
+        self._reporter.stop()
         self._audit.note(Happened(EventKind.AGENT_STOPPED, "the agent was shut down"))
         self._office.stop()
         self._driver.close()
@@ -167,9 +180,9 @@ class Device:
         """Whether nothing would be disturbed by a short break of the link."""
         return not self._controller.moving and self._executor.current() is None
 
-    def _measured(self, telemetry: JointTelemetry) -> None:
-        self._room.note(self.name, topics.JOINTS, telemetry)
-        self.voice.tell(telemetry)
+    def _measured(self, stream: str, telemetry: JointTelemetry | Measurements) -> None:
+        self._room.note(self.name, stream, telemetry)
+        self.voice.tell(stream, telemetry)
 
     # ------------------------------------------------------------ what arrives (transport's thread)
 

@@ -17,7 +17,7 @@ from device_agent.runtime.authority import Tenure
 from device_agent.runtime.controller import Controller
 from device_agent.runtime.courses import Course, Outcome
 from device_agent.runtime.lease import Refused
-from device_agent.runtime.room import Room
+from device_agent.runtime.room import Reading, Room
 
 CARTESIAN = "cartesian"
 """A capability that a manifest may name, besides those of ``ports.skills``."""
@@ -35,6 +35,7 @@ class Body:
         geometry: Its shape, where its type has a model.
         skills: What its driver can besides.
         room: What the space's other devices have measured last.
+        reported: The newest of each of its own streams besides ``joints``.
     """
 
     robot_type: RobotType
@@ -43,6 +44,7 @@ class Body:
     geometry: Geometry | None
     skills: Skills | None
     room: Room
+    reported: Callable[[], Mapping[str, Reading]] = dict
 
     def seen(self) -> Observation:
         """The newest measurement.
@@ -193,11 +195,12 @@ class ScriptRobot:
             "effort_nm": by_name(kind, seen.effort_nm),
             "frames": dict(zip(kind.frames, seen.frames, strict=False)),
             "mode": str(self._body.controller.mode),
+            "streams": {stream: _shown(reading) for stream, reading in self._body.reported().items()},
         }
 
     def _latest(self, device: str, stream: str) -> dict[str, Any] | None:
         reading = self._body.room.latest(device, stream)
-        return None if reading is None else {"values": dict(reading.values), "age_s": reading.age_s}
+        return None if reading is None else _shown(reading)
 
     def _perform(self, skill: Skill) -> None:
         if self._body.skills is None:
@@ -246,6 +249,10 @@ def _skill(call: calls.Say | calls.Stiffness | calls.Express | calls.Behaviour) 
             _check_share("strength", strength)
             return skills.Express(name, strength)
     return skills.Behave(call.name)
+
+
+def _shown(reading: Reading) -> dict[str, Any]:
+    return {"values": dict(reading.values), "age_s": reading.age_s}
 
 
 def _check_share(name: str, value: float, *, least: float = 0.0) -> None:

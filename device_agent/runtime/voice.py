@@ -19,6 +19,7 @@ from device_agent.protocol.messages import (
     InterlockRule,
     JointTelemetry,
     LeaseState,
+    Measurements,
     Mode,
     OpenRequest,
     Restriction,
@@ -196,11 +197,11 @@ class Voice:
         if self._retain(self._topic(topics.STATE), state):
             self._shown, self._shown_at_s = shown, now_s
 
-    def tell(self, telemetry: JointTelemetry) -> None:
-        """Publish a measurement; called by the control loop, must not block."""
+    def tell(self, stream: str, telemetry: JointTelemetry | Measurements) -> None:
+        """Publish a measurement; called by the control loop too, must not block."""
         payload = codec.encode(telemetry)
-        sent = self._publish(self._topic(topics.TELE, topics.JOINTS), payload, qos=0)
-        late = self._topic(topics.LATE, topics.JOINTS)
+        sent = self._publish(self._topic(topics.TELE, stream), payload, qos=0)
+        late = self._topic(topics.LATE, stream)
         self._outbox.measured(late, payload, at_ms=telemetry.at_ms, sent=sent, now_s=time.monotonic())
 
     def event(self, happened: Happened) -> None:
