@@ -28,8 +28,8 @@ WALL_RAD = 1.4
 REST_WITHIN_S = 0.3
 EVENTS = 120
 CLIPPED = BRAKING * 0.04**2 / 8
-"""A braking way is looked at by straight lines between knots 40 ms apart (``Motion.propose``): the way itself bends by so
-much at most, and may cut a corner of something by it. Real margins are wider."""
+"""A braking way is looked at by straight lines between knots 40 ms apart (``Motion.propose``): the way itself bends by
+so much at most, and may cut a corner of something by it. Real margins are wider."""
 JERK_PERIODS = 20
 """What speeds up when the room slows it needs a tenth of a second to turn."""
 
