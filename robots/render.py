@@ -1,17 +1,22 @@
-"""Draw a robot type's scene at home: ``python robots/render.py ur5 docs/pictures/ur5.png``.
+"""Draw a robot type's scene: ``python robots/render.py ur5 docs/pictures/ur5.png``.
 
-With ``joint=position`` behind it [rad], elsewhere: ``… ur5 docs/pictures/held.png shoulder_lift=-0.881``.
+At home, unless told otherwise: ``joint=position`` [rad], ``--expression happy``, ``--posture Sit``, ``--viseme aa``.
+Looks through the scene's camera ``picture``, unless ``--camera`` names another.
 
-Looks through the scene's camera ``picture``. Needs a software renderer (Debian: ``libosmesa6``), no display.
+Sheets of several pictures: ``--turntable`` goes round the robot, ``--all expressions`` shows all that the manifest has.
+
+Needs a software renderer (Debian: ``libosmesa6``), no display.
 """  # noqa: INP001 - a script beside the folders it draws, not a package
 
 import argparse
+import math
 import os
 import struct
 import sys
 import zlib
+from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, Self
 
 ROBOTS = Path(__file__).parent
 sys.path.insert(0, str(ROBOTS.parent))
@@ -19,29 +24,83 @@ os.environ.setdefault("MUJOCO_GL", "osmesa")
 os.environ.setdefault("PYOPENGL_PLATFORM", "osmesa")
 
 import mujoco  # noqa: E402 - reads MUJOCO_GL when imported
+import numpy as np  # noqa: E402
 
+from device_agent.mjcf.ties import Ties  # noqa: E402
 from device_agent.protocol import robot_type  # noqa: E402
 
 WIDTH, HEIGHT, CAMERA = 800, 600, "picture"
+TILE = 300
+COLUMNS = 4
+VIEWS = 8
+POSES = ("expressions", "postures", "visemes")
 
 
-def render(name: str, position_rad: dict[str, float]) -> Any:
-    """The picture of a robot type, shape (height, width, 3), 8 bits a colour; joints not named are at home."""
-    manifest = robot_type.load(ROBOTS / name)
-    model = mujoco.MjModel.from_xml_path(str(ROBOTS / name / manifest.scene))
-    data = mujoco.MjData(model)
-    for joint, position in (manifest.home_rad | position_rad).items():
-        data.joint(joint).qpos[0] = position
-    mujoco.mj_forward(model, data)
-    with mujoco.Renderer(model, HEIGHT, WIDTH) as renderer:
-        renderer.update_scene(data, CAMERA)
-        return renderer.render()
+class Studio:
+    """One robot type's scene, and a renderer. Use as ``with Studio(folder, size) as studio``.
+
+    Args:
+        folder: The robot type's folder.
+        width: Of a picture; ``height`` likewise.
+    """
+
+    def __init__(self, folder: Path, width: int, height: int) -> None:
+        self.manifest = robot_type.load(folder)
+        self.model = mujoco.MjModel.from_xml_path(str(folder / self.manifest.scene))
+        self.data = mujoco.MjData(self.model)
+        self._ties = Ties(self.model)
+        self._renderer = mujoco.Renderer(self.model, height, width)
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._renderer.close()
+
+    def named(self, kind: str, name: str) -> dict[str, float]:
+        """The joints [rad] of an expression, posture or viseme."""
+        known: Mapping[str, Mapping[str, float]] = getattr(self.manifest, kind, {})
+        if name not in known:
+            sys.exit(f"{self.manifest.type} has no '{name}' in its {kind}; it has: {', '.join(known) or 'none'}")
+        return dict(known[name])
+
+    def pose(self, position_rad: Mapping[str, float]) -> None:
+        """Put the robot somewhere; joints not named are at home."""
+        for joint, position in (self.manifest.home_rad | dict(position_rad)).items():
+            self.data.joint(joint).qpos[0] = position
+        self._ties.settle(self.data.qpos)
+        mujoco.mj_forward(self.model, self.data)
+
+    def picture(self, camera: Any) -> Any:
+        """What a camera sees, shape (height, width, 3), 8 bits a colour."""
+        self._renderer.update_scene(self.data, camera)
+        return self._renderer.render()
+
+    def round(self, azimuth_rad: float) -> Any:
+        """A camera somewhere around the robot, as far away as the scene says."""
+        camera = mujoco.MjvCamera()
+        camera.lookat[:] = self.model.stat.center
+        camera.distance = 2.2 * self.model.stat.extent
+        camera.azimuth, camera.elevation = math.degrees(azimuth_rad), -12
+        return camera
+
+
+def sheet(pictures: Sequence[Any], columns: int = COLUMNS) -> Any:
+    """Pictures of one size side by side, in rows."""
+    blank = np.full_like(pictures[0], 255)
+    filled = [*pictures, *[blank] * (-len(pictures) % columns)]
+    rows = [np.concatenate(filled[start : start + columns], axis=1) for start in range(0, len(filled), columns)]
+    return np.concatenate(rows, axis=0)
 
 
 def png(image: Any) -> bytes:
-    """An image as PNG: signature, header, one compressed block of rows without filter, end."""
+    """An image as PNG: signature, header, one compressed block of rows, end.
+
+    Each row is written as what it differs from the one above (filter 2), which is little in a drawing.
+    """
     height, width, _ = image.shape
-    rows = b"".join(b"\0" + row.tobytes() for row in image)
+    above = np.vstack([np.zeros_like(image[:1]), image[:-1]])
+    rows = b"".join(b"\2" + row.tobytes() for row in (image - above))
     header = struct.pack(">IIBBBBB", width, height, 8, 2, 0, 0, 0)
     parts = ((b"IHDR", header), (b"IDAT", zlib.compress(rows, 9)), (b"IEND", b""))
     return b"\x89PNG\r\n\x1a\n" + b"".join(
@@ -51,14 +110,37 @@ def png(image: Any) -> bytes:
 
 def main() -> None:
     """Command line."""
-    parser = argparse.ArgumentParser(description="Draw a robot type's scene at home.")
+    parser = argparse.ArgumentParser(description="Draw a robot type's scene.")
     parser.add_argument("type", choices=sorted(path.parent.name for path in ROBOTS.glob("*/robot.toml")))
     parser.add_argument("file", type=Path)
-    parser.add_argument("position", nargs="*", metavar="joint=position")
+    parser.add_argument("position", nargs="*", metavar="joint=position", help="[rad]; the others are at home")
+    parser.add_argument("--expression", help="one of the manifest's")
+    parser.add_argument("--posture", help="one of the manifest's")
+    parser.add_argument("--viseme", help="one of the manifest's")
+    parser.add_argument("--camera", default=CAMERA, help="of the scene (default: %(default)s)")
+    parser.add_argument("--turntable", action="store_true", help="eight views, from all around")
+    parser.add_argument("--all", choices=POSES, help="a picture of each that the manifest has, in its order")
     arguments = parser.parse_args()
-    named = (text.partition("=") for text in arguments.position)
-    position_rad = {joint: float(position) for joint, _, position in named}
-    arguments.file.write_bytes(png(render(arguments.type, position_rad)))
+    single = not (arguments.turntable or arguments.all)
+    width, height = (WIDTH, HEIGHT) if single else (TILE, TILE)
+    with Studio(ROBOTS / arguments.type, width, height) as studio:
+        position_rad: dict[str, float] = {}
+        for kind in POSES:
+            name = getattr(arguments, kind.removesuffix("s"))
+            position_rad |= studio.named(kind, name) if name else {}
+        position_rad |= {joint: float(at) for joint, _, at in (text.partition("=") for text in arguments.position)}
+        studio.pose(position_rad)
+        if arguments.turntable:
+            image = sheet([studio.picture(studio.round(2 * math.pi * view / VIEWS)) for view in range(VIEWS)])
+        elif arguments.all:
+            pictures = []
+            for name in getattr(studio.manifest, arguments.all):
+                studio.pose(studio.named(arguments.all, name) | position_rad)
+                pictures.append(studio.picture(arguments.camera))
+            image = sheet(pictures)
+        else:
+            image = studio.picture(arguments.camera)
+    arguments.file.write_bytes(png(image))
 
 
 if __name__ == "__main__":

@@ -7,6 +7,8 @@ import mujoco
 import numpy as np
 import numpy.typing as npt
 
+from device_agent.mjcf.ties import Ties
+
 Floats = npt.NDArray[np.float64]
 
 _ROUND = frozenset(
@@ -18,24 +20,35 @@ _SAME = 1e-6
 class Levers:
     """Upper bounds of metres per radian (or per metre, for a slide), joint by joint.
 
+    A joint that is tied to others counts for those, by as much as it moves with them.
+
     Args:
         model: ``MjModel``.
         joints: The joints' indices in the model.
+        ties: Which joints go with these.
     """
 
-    def __init__(self, model: Any, joints: Sequence[int]) -> None:
+    def __init__(self, model: Any, joints: Sequence[int], ties: Ties) -> None:
         self._model = model
-        self._joints = list(joints)
+        tied = [tie.joint for tie in ties.all if tie.joint not in joints]
+        self._joints = [*joints, *tied]
+        self._share = np.zeros((len(self._joints), len(joints)))
+        self._share[: len(joints)] = np.eye(len(joints))
+        for row, joint in enumerate(tied, len(joints)):
+            for other, factor in ties.of(joint).items():
+                if other in joints:
+                    self._share[row, self._joints.index(other)] = abs(factor)
 
     def of_geoms(self, geoms: Sequence[int]) -> Floats:
         """Of every point of each shape, shape (geoms, joints)."""
-        return np.array([self._of_ball(int(geom)) for geom in dict.fromkeys(geoms)]).reshape(-1, len(self._joints))
+        levers = np.array([self._of_ball(int(geom)) for geom in dict.fromkeys(geoms)])
+        return levers.reshape(-1, len(self._joints)) @ self._share
 
     def of_frame(self, is_site: bool, index: int) -> Floats:
         """Of the origin of a site or body, shape (joints,)."""
         model = self._model
         body = int(model.site_bodyid[index]) if is_site else index
-        return self._of_point(body, model.site_pos[index] if is_site else np.zeros(3), 0.0)
+        return self._of_point(body, model.site_pos[index] if is_site else np.zeros(3), 0.0) @ self._share
 
     def reach_m(self, geom: int, base: int) -> float:
         """How far any point of a shape can come from the origin of the robot's base, whatever its joints do [m]."""
@@ -56,7 +69,7 @@ class Levers:
         """How fast two shapes can near each other, shape (joints,): joints that carry both do not count."""
         first, second = self._of_geom(a), self._of_geom(b)
         both = np.array([self._carries(joint, a) and self._carries(joint, b) for joint in self._joints], dtype=bool)
-        lever: Floats = np.where(both, 0.0, first + second)
+        lever: Floats = np.where(both, 0.0, first + second) @ self._share
         return lever
 
     def _of_geom(self, geom: int) -> Floats:

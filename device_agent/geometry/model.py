@@ -13,6 +13,7 @@ import numpy.typing as npt
 from device_agent.geometry.pairs import ROOM_PREFIX, Pairs
 from device_agent.geometry.solver import Solver
 from device_agent.geometry.standing import Standing
+from device_agent.mjcf.ties import Ties
 from device_agent.ports.geometry import Clearance, GeometryError, Sweep
 from device_agent.protocol.messages import Pose
 from device_agent.protocol.robot_type import RobotType
@@ -29,7 +30,7 @@ _SAME_M = 1e-7
 
 
 class MujocoGeometry:
-    """The robot of one type in its scene.
+    """The robot of one type in its scene. Joints without a motor of their own go with those that they are tied to.
 
     Distances are between collision shapes (``mj_geomDistance``), so what the picture shows may be smaller, not larger.
 
@@ -52,6 +53,7 @@ class MujocoGeometry:
         self._data = mujoco.MjData(self._model)
         self._lock = threading.Lock()
         self._type = robot_type
+        self._ties = Ties(self._model)
         joints = [self._find(mujoco.mjtObj.mjOBJ_JOINT, "joint", joint.name) for joint in robot_type.joints]
         self._qpos = np.array([self._model.jnt_qposadr[joint] for joint in joints], dtype=np.intp)
         self._base = int(self._model.body_rootid[self._model.jnt_bodyid[joints[0]]]) if joints else 0
@@ -60,7 +62,7 @@ class MujocoGeometry:
         lower = np.array([joint.lower_rad for joint in robot_type.joints])
         upper = np.array([joint.upper_rad for joint in robot_type.joints])
         self._place(self._home)
-        self._pairs = Pairs(self._model, robot_type, joints, self._frames, base=self._base)
+        self._pairs = Pairs(self._model, robot_type, joints, self._frames, base=self._base, ties=self._ties)
         self._pairs.calibrate(self._data, self._place, home=self._home, lower=lower, upper=upper)
         self._place(self._home)
         self._measured = self._home, self._pairs.rooms_at_least(self._data)
@@ -174,6 +176,7 @@ class MujocoGeometry:
 
     def _place(self, position_rad: Sequence[float] | Floats) -> None:
         self._data.qpos[self._qpos] = position_rad
+        self._ties.settle(self._data.qpos)
         mujoco.mj_kinematics(self._model, self._data)
 
     def _pose(self, is_site: bool, index: int) -> Pose:

@@ -13,6 +13,7 @@ import numpy as np
 import numpy.typing as npt
 
 from device_agent.geometry.levers import Levers
+from device_agent.mjcf.ties import Ties
 from device_agent.ports.geometry import Clearance, GeometryError
 from device_agent.protocol.robot_type import RobotType
 
@@ -50,6 +51,7 @@ class Pairs:
         joints: The joints' indices in the model.
         frames: Name → whether it is a site, and its index.
         base: The robot's root body.
+        ties: Which joints of the model go with these.
     """
 
     def __init__(
@@ -60,10 +62,11 @@ class Pairs:
         frames: dict[str, tuple[bool, int]],
         *,
         base: int,
+        ties: Ties,
     ) -> None:
         self._model = model
         self._base = base
-        levers = Levers(model, joints)
+        levers = Levers(model, joints, ties)
         scenery_m = None if robot_type.base is not None else robot_type.margin_m + _BEYOND_M
         found = _pairs(model, base, levers, scenery_m=scenery_m)
         self._a = np.array([a for a, _ in found], dtype=np.intp)

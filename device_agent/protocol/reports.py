@@ -108,13 +108,17 @@ class Geometry(Struct, frozen=True, kw_only=True):
 
 
 class TwinJoint(Struct, frozen=True, kw_only=True):
-    """The joint by which a body turns or slides: axis and anchor in the body's own frame."""
+    """The joint by which a body turns or slides: axis and anchor in the body's own frame.
+
+    One that ``follows`` others has no motor of its own: its position is the sum of factor times position of those.
+    """
 
     name: Label
     kind: Literal["hinge", "slide"]
     axis: Vector3
     anchor_m: Vector3
     reference_rad: float = 0.0
+    follows: dict[Label, float] = {}
 
 
 class Body(Struct, frozen=True, kw_only=True):

@@ -1,5 +1,5 @@
 import { describe, expect, it } from "vitest";
-import { forward, multiply, placed, rollPitchYaw, rotate } from "../src/core/kinematics";
+import { forward, multiply, placed, rollPitchYaw, rotate, standing } from "../src/core/kinematics";
 import type { Quaternion, Vector3 } from "../src/core/vectors";
 import { readTwin, type KnownBody } from "../src/core/messages";
 import fixture from "./fixtures/ur5.json";
@@ -14,7 +14,7 @@ function body(joint: Partial<KnownBody["joint"]>, rest: Partial<KnownBody> = {})
     parent: -1,
     position_m: [0, 0, 0],
     quaternion: [1, 0, 0, 0],
-    joint: { name: "j", kind: "hinge", axis: [0, 0, 1], anchor_m: [0, 0, 0], reference_rad: 0, ...joint },
+    joint: { name: "j", kind: "hinge", axis: [0, 0, 1], anchor_m: [0, 0, 0], reference_rad: 0, follows: {}, ...joint },
     geometries: [],
     ...rest,
   };
@@ -57,6 +57,12 @@ describe("forward kinematics of a twin", () => {
   it("slides along its axis in the body's own frame", () => {
     const turned = body({ kind: "slide", axis: [2, 0, 0] }, { quaternion: [HALF, 0, 0, HALF], position_m: [0, 0, 1] });
     near(placed(turned, 0.25).position_m, [0, 0.25, 1]);
+  });
+
+  it("has a joint without a motor go with those that it follows", () => {
+    const { joint } = body({ follows: { left: 0.25, right: -0.5 } });
+    expect(standing(joint, { left: 1, right: 2, j: 9 })).toBeCloseTo(-0.75, 12);
+    expect(standing(joint, { left: 1 })).toBeCloseTo(0.25, 12);
   });
 
   it("leaves joints without a position at their reference", () => {

@@ -8,6 +8,7 @@ from typing import Any, Literal, cast
 import mujoco
 import numpy as np
 
+from device_agent.mjcf.ties import Ties
 from device_agent.ports.driver import DriverError
 from device_agent.protocol.messages import Body, Geometry, Quaternion, Twin, TwinJoint, Vector3
 
@@ -32,7 +33,8 @@ def draw(model: Any, *, base: int, device: str, prefix: str = "", scenery: bool 
     """The drawing of one robot, in the frame of its base.
 
     A pose follows from it thus: start at the parent's; move by ``position_m`` and ``quaternion``; where there is a
-    joint, turn about its axis through its anchor (or slide along it) by position minus ``reference_rad``.
+    joint, turn about its axis through its anchor (or slide along it) by position minus ``reference_rad``. A joint
+    that ``follows`` others stands at the sum of factor times position of those.
 
     Args:
         model: The compiled ``MjModel``.
@@ -46,6 +48,7 @@ def draw(model: Any, *, base: int, device: str, prefix: str = "", scenery: bool 
     """
     bodies: list[Body] = []
     index_of: dict[int, int] = {}
+    ties = Ties(model)
     if scenery and model.body_weldid[base] == 0:
         bodies.append(_scene(model, base))
     for body in range(base, model.nbody):
@@ -53,14 +56,14 @@ def draw(model: Any, *, base: int, device: str, prefix: str = "", scenery: bool 
             bodies.append(Body(name=_name(model, body, prefix), parent=-1, position_m=_ORIGIN, quaternion=_IDENTITY,
                                geometries=_shapes(model, body)))  # fmt: skip
         elif model.body_parentid[body] in index_of:
-            bodies.extend(_moving(model, body, index_of[model.body_parentid[body]], len(bodies), prefix))
+            bodies.extend(_moving(model, body, index_of[model.body_parentid[body]], len(bodies), prefix, ties=ties))
         else:
             continue
         index_of[body] = len(bodies) - 1
     return Twin(device=device, bodies=tuple(bodies))
 
 
-def _moving(model: Any, body: int, parent: int, first: int, prefix: str) -> list[Body]:
+def _moving(model: Any, body: int, parent: int, first: int, prefix: str, *, ties: Ties) -> list[Body]:
     """One body of the model: one in the drawing, or a chain of them where it has several joints."""
     joints = range(model.body_jntadr[body], model.body_jntadr[body] + model.body_jntnum[body])
     name = _name(model, body, prefix)
@@ -75,14 +78,14 @@ def _moving(model: Any, body: int, parent: int, first: int, prefix: str) -> list
             parent=parent if step == 0 else first + step - 1,
             position_m=position if step == 0 else _ORIGIN,
             quaternion=quaternion if step == 0 else _IDENTITY,
-            joint=_joint(model, joint, prefix),
+            joint=_joint(model, joint, prefix, ties),
             geometries=geometries if step == last else (),
         )
         for step, joint in enumerate(joints)
     ]
 
 
-def _joint(model: Any, joint: int, prefix: str) -> TwinJoint:
+def _joint(model: Any, joint: int, prefix: str, ties: Ties) -> TwinJoint:
     kinds: dict[int, Literal["hinge", "slide"]] = {
         int(mujoco.mjtJoint.mjJNT_HINGE): "hinge",
         int(mujoco.mjtJoint.mjJNT_SLIDE): "slide",
@@ -96,7 +99,10 @@ def _joint(model: Any, joint: int, prefix: str) -> TwinJoint:
         kind=kind,
         axis=_vector(model.jnt_axis[joint]),
         anchor_m=_vector(model.jnt_pos[joint]),
-        reference_rad=_round(model.qpos0[model.jnt_qposadr[joint]]),
+        reference_rad=_round(model.qpos0[model.jnt_qposadr[joint]] - ties.offset(joint)),
+        follows={
+            model.joint(other).name.removeprefix(prefix): _round(factor) for other, factor in ties.of(joint).items()
+        },
     )
 
 

@@ -9,6 +9,7 @@ import numpy.typing as npt
 import pytest
 
 from device_agent.drivers.mujoco import draw
+from device_agent.mjcf.ties import Ties
 from device_agent.ports.driver import DriverError
 from device_agent.protocol import codec, robot_type
 from device_agent.protocol.messages import Twin
@@ -43,7 +44,10 @@ def geometry_poses(twin: Twin, position_rad: dict[str, float]) -> list[Matrix]:
         pose = bodies[body.parent] if body.parent >= 0 else np.eye(4)
         pose = pose @ transform(rotation(body.quaternion), body.position_m)
         if body.joint is not None:
-            moved = position_rad.get(body.joint.name, body.joint.reference_rad) - body.joint.reference_rad
+            at = position_rad.get(body.joint.name, body.joint.reference_rad)
+            if body.joint.follows:
+                at = sum(factor * position_rad.get(name, 0.0) for name, factor in body.joint.follows.items())
+            moved = at - body.joint.reference_rad
             axis, anchor = np.array(body.joint.axis), np.array(body.joint.anchor_m)
             if body.joint.kind == "slide":
                 pose = pose @ transform(np.eye(3), axis * moved)
@@ -69,7 +73,7 @@ def drawn_geoms(model: Any, base: int, *, scenery: bool) -> list[int]:
 
 def assert_same_poses(model: Any, twin: Twin, base: int, *, scenery: bool) -> None:
     data = mujoco.MjData(model)
-    random = np.random.default_rng(11)
+    random, ties = np.random.default_rng(11), Ties(model)
     for _ in range(100):
         position = {}
         for joint in range(model.njnt):
@@ -77,6 +81,7 @@ def assert_same_poses(model: Any, twin: Twin, base: int, *, scenery: bool) -> No
                 value = random.uniform(-2, 2)
                 data.qpos[model.jnt_qposadr[joint]] = value
                 position[model.joint(joint).name] = value
+        ties.settle(data.qpos)
         mujoco.mj_kinematics(model, data)
         want = simulated_poses(data, base, drawn_geoms(model, base, scenery=scenery))
         got = geometry_poses(twin, position)

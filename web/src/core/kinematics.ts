@@ -1,5 +1,6 @@
 /** Forward kinematics of a twin, as MuJoCo does it: where each body is when its joint stands at a position. */
 import type { KnownBody, KnownTwin } from "./messages";
+import type { TwinJoint } from "./protocol";
 import type { Quaternion, Vector3 } from "./vectors";
 
 export interface Placement {
@@ -43,6 +44,14 @@ function about(axis: Vector3, angle: number): Quaternion {
   return [Math.cos(angle / 2), axis[0] * s, axis[1] * s, axis[2] * s];
 }
 
+/** Where a joint stands [rad or m]: one without a motor follows others; one that is not named stands at its reference. */
+export function standing(joint: TwinJoint | null, positions: Readonly<Record<string, number>>): number {
+  if (joint === null) return 0;
+  const followed = Object.entries(joint.follows ?? {});
+  if (followed.length === 0) return positions[joint.name] ?? joint.reference_rad ?? 0;
+  return followed.reduce((sum, [name, factor]) => sum + factor * (positions[name] ?? 0), 0);
+}
+
 /** A body in its parent's frame when its joint stands at `position` [rad or m]. */
 export function placed(body: KnownBody, position: number): Placement {
   const quaternion = unit(body.quaternion);
@@ -65,8 +74,7 @@ export function placed(body: KnownBody, position: number): Placement {
 export function forward(twin: KnownTwin, positions: Readonly<Record<string, number>>): Placement[] {
   const world: Placement[] = [];
   for (const body of twin.bodies) {
-    const { joint } = body;
-    const own = placed(body, joint === null ? 0 : (positions[joint.name] ?? joint.reference_rad ?? 0));
+    const own = placed(body, standing(body.joint, positions));
     const parent = world[body.parent];
     world.push(
       parent === undefined

@@ -73,6 +73,13 @@ function list<T>(item: Check<T>, longest: number): Check<T[]> {
   };
 }
 
+/** Numbers by name, of which none is taken for a part of what every object has. */
+const byName: Check<Record<string, number>> = (value, at) => {
+  const entries = Object.entries(anything(value, at));
+  if (entries.length > MAX_JOINTS) fail(at, `at most ${MAX_JOINTS} numbers`);
+  return Object.fromEntries(entries.map(([name, entry]) => [name, number(entry, `${at}.${name}`)]));
+};
+
 function numbers<T extends number[]>(length: T["length"]): Check<T> {
   return (value, at) => {
     if (!Array.isArray(value) || value.length !== length) fail(at, `${length} numbers`);
@@ -156,6 +163,7 @@ const twinJoint = object<Required<TwinJoint>>({
   axis: vector3,
   anchor_m: vector3,
   reference_rad: optional(number, 0),
+  follows: optional(byName, {}),
 });
 
 const body = object<Required<Body>>({

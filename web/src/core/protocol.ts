@@ -90,13 +90,18 @@ export interface Body {
   geometries?: Geometry[];
 }
 
-/** The joint by which a body turns or slides: axis and anchor in the body's own frame. */
+/**
+ * The joint by which a body turns or slides: axis and anchor in the body's own frame.
+ *
+ * One that `follows` others has no motor of its own: its position is the sum of factor times position of those.
+ */
 export interface TwinJoint {
   name: string;
   kind: "hinge" | "slide";
   axis: [number, number, number];
   anchor_m: [number, number, number];
   reference_rad?: number;
+  follows?: Record<string, number>;
 }
 
 /**

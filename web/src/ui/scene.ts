@@ -24,7 +24,7 @@ import {
 } from "three";
 import { OrbitControls } from "three/examples/jsm/controls/OrbitControls.js";
 import { now } from "../core/clock";
-import { forward, placed } from "../core/kinematics";
+import { forward, placed, standing } from "../core/kinematics";
 import type { KnownTwin } from "../core/messages";
 import type { Geometry } from "../core/protocol";
 import type { Targets } from "../core/streamer";
@@ -221,9 +221,7 @@ function shape({ shape: kind, size_m: [a, b, c] }: Geometry): BufferGeometry {
 
 function pose(robot: Robot, twin: KnownTwin, positions: Targets): void {
   twin.bodies.forEach((body, index) => {
-    const { joint } = body;
-    const at = joint === null ? 0 : (positions[joint.name] ?? joint.reference_rad ?? 0);
-    const { position_m, quaternion } = placed(body, at);
+    const { position_m, quaternion } = placed(body, standing(body.joint, positions));
     const [w, x, y, z] = quaternion;
     robot[index]?.position.set(...position_m);
     robot[index]?.quaternion.set(x, y, z, w);

@@ -1,0 +1,1 @@
+"""What can be read from a robot's MuJoCo model, for drivers and for geometry alike."""
