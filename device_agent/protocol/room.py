@@ -148,6 +148,7 @@ class Climate(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
         daylight_lux: Inside, in the middle of the room, with the blinds open [lx].
         lamp_lux: Of the lamp at its brightest, in the same place [lx].
         quiet_db: Sound level of the empty room, A-weighted [dB].
+        start_c: Temperature when the simulation begins [°C]; ``start_humidity_percent``, ``start_co2_ppm``: the same.
     """
 
     ventilation_per_h: float = 1.0
@@ -163,6 +164,9 @@ class Climate(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     daylight_lux: float = 450.0
     lamp_lux: float = 380.0
     quiet_db: float = 34.0
+    start_c: float = 20.5
+    start_humidity_percent: float = 42.0
+    start_co2_ppm: float = 620.0
 
 
 class Room(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -178,6 +182,8 @@ class Room(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
         zones: Named boxes.
         people: Who walks about in its simulation.
         climate: Its air and light in simulation.
+        start: What its simulation is set to in the beginning: the position of an actuator of its model, in its joint's
+            own unit, or one of ``lamp`` (0…1) and ``thermostat`` [°C].
     """
 
     room: Id
@@ -191,6 +197,7 @@ class Room(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     zones: Annotated[tuple[Zone, ...], Meta(max_length=32)] = ()
     people: Annotated[tuple[Person, ...], Meta(max_length=8)] = ()
     climate: Climate = Climate()
+    start: dict[Id, float] = {}
 
     def robot(self, name: str) -> RoomRobot | None:
         """The robot of that name, if there is one."""
@@ -249,6 +256,7 @@ def parse(text: str) -> Room:
     for person in room.people:
         _check_person(person, room.plan)
     _check_climate(room.climate)
+    _check_finite("start", room.start.values())
     return room
 
 
@@ -286,8 +294,7 @@ def _check_person(person: Person, plan: Plan) -> None:
 
 def _check_climate(climate: Climate) -> None:
     _check_finite("climate", [getattr(climate, field) for field in Climate.__struct_fields__])
-    for field in ("capacity_j_k",):
-        _check_positive(f"{field} of climate", getattr(climate, field))
+    _check_positive("capacity_j_k of climate", climate.capacity_j_k)
     for field in ("ventilation_per_h", "door_m3_h", "loss_w_k", "heater_w", "daylight_lux", "lamp_lux"):
         if getattr(climate, field) < 0:
             raise ProtocolError(f"{field} of climate must be at least 0")

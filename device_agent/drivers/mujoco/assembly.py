@@ -56,12 +56,13 @@ def assemble(scene: Path, robots: Sequence[Placement]) -> Any:
         raise DriverError(f"{scene}: MuJoCo cannot build this world: {error}") from error
 
 
-def at_home(model: Any, home: Mapping[str, float], *, scene: Path) -> Any:
+def at_home(model: Any, home: Mapping[str, float], settings: Mapping[str, float], *, scene: Path) -> Any:
     """A fresh state: joints at home, every position servo holding where its joint starts.
 
     Args:
         model: ``MjModel``.
         home: Full joint name → position [rad or m]; others start at the model's reference.
+        settings: Actuator's name → where its joint starts [rad or m]; other names are left alone.
         scene: For the error's text.
 
     Raises:
@@ -74,6 +75,11 @@ def at_home(model: Any, home: Mapping[str, float], *, scene: Path) -> Any:
             known = ", ".join(model.joint(index).name for index in range(model.njnt))
             raise DriverError(f"{scene}: no joint '{name}'; the model has: {known}")
         data.qpos[model.jnt_qposadr[joint]] = position
+    for name, position in settings.items():
+        actuator = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_ACTUATOR, name)
+        if actuator >= 0:
+            data.qpos[model.jnt_qposadr[model.actuator_trnid[actuator, 0]]] = position
+    _couple(model, data)
     for actuator in range(model.nu):
         joint = model.actuator_trnid[actuator, 0]
         by_joint = model.actuator_trntype[actuator] == int(mujoco.mjtTrn.mjTRN_JOINT)
@@ -81,6 +87,16 @@ def at_home(model: Any, home: Mapping[str, float], *, scene: Path) -> Any:
             data.ctrl[actuator] = data.qpos[model.jnt_qposadr[joint]]
     mujoco.mj_forward(model, data)
     return data
+
+
+def _couple(model: Any, data: Any) -> None:
+    """Put joints that the model couples to others where those have them: y - y0 = polynomial of (x - x0)."""
+    for equality in range(model.neq):
+        if model.eq_type[equality] != int(mujoco.mjtEq.mjEQ_JOINT) or model.eq_obj2id[equality] < 0:
+            continue
+        y, x = (model.jnt_qposadr[index[equality]] for index in (model.eq_obj1id, model.eq_obj2id))
+        powers = (data.qpos[x] - model.qpos0[x]) ** np.arange(5)
+        data.qpos[y] = model.qpos0[y] + model.eq_data[equality, :5] @ powers
 
 
 def _agree(child: Any, parent: Any) -> None:

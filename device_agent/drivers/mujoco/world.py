@@ -67,6 +67,7 @@ class World:
         *,
         robots: Sequence[Placement] = (),
         home: Mapping[str, float] | None = None,
+        settings: Mapping[str, float] | None = None,
         trace: Path | None = None,
     ) -> None:
         """Describe a world; nothing is read before ``build`` or ``open``.
@@ -75,6 +76,7 @@ class World:
             scene: MJCF file. It may hold a robot already.
             robots: Robots to put into it.
             home: Full joint name → position [rad or m] at the start; others start at the model's reference.
+            settings: What the room is set to at the start.
             trace: File to append the truth to, see ``Trace``.
         """
         self._scene = scene
@@ -84,7 +86,8 @@ class World:
         self._traces: tuple[Trace, ...] = ()
         self._processes: tuple[Process, ...] = ()
         self._quantities: Mapping[str, float] = {}
-        self._settings: dict[str, float] = {}
+        self._start = dict(settings or {})
+        self._settings = dict(self._start)
         self._sounds: dict[str, tuple[float, float]] = {}
         self._users = 0
         self._life = threading.Lock()  # guards starting and stopping only
@@ -132,7 +135,7 @@ class World:
         # Else MuJoCo writes its warnings into a file in whatever folder the agent was started.
         mujoco.set_mju_user_warning(_warn)
         model = assemble(self._scene, self._robots)
-        data = at_home(model, self._home, scene=self._scene)
+        data = at_home(model, self._home, self._start, scene=self._scene)
         self._addresses = {
             model.joint(index).name: int(model.jnt_qposadr[index])
             for index in range(model.njnt)
@@ -157,7 +160,8 @@ class World:
             time_s = self.snapshot().time_s
             self._commands.clear()
             self._ramps.clear()
-            self._data = at_home(self._model, self._home, scene=self._scene)
+            self._settings = dict(self._start)
+            self._data = at_home(self._model, self._home, self._start, scene=self._scene)
             self._data.time = time_s  # time only ever rises
             self._fault = ""
             self._publish()

@@ -3,9 +3,13 @@
 import math
 import threading
 from pathlib import Path
-from weakref import WeakValueDictionary
+from weakref import WeakValueDictionary, proxy
 
 from device_agent.drivers.mujoco.assembly import Placement
+from device_agent.drivers.mujoco.climate import Climate
+from device_agent.drivers.mujoco.light import Light
+from device_agent.drivers.mujoco.person import Walker
+from device_agent.drivers.mujoco.sound import Sound
 from device_agent.drivers.mujoco.world import World
 from device_agent.ports.driver import DriverError
 from device_agent.protocol import robot_type, room
@@ -59,17 +63,28 @@ def make(manifest: Room, folder: Path, types: dict[str, robot_type.RobotType]) -
         folder: Where its model is; robot types are in ``folder/../..``.
         types: The robot types that it names.
     """
-    return World(
+    home = {
+        prefix(robot.name) + joint: position
+        for robot in manifest.robots
+        for joint, position in types[robot.type].home_rad.items()
+    }
+    world = World(
         folder / manifest.model,
         robots=[
             _placement(robot, folder.parents[1] / robot.type / types[robot.type].model) for robot in manifest.robots
         ],
-        home={
-            prefix(robot.name) + joint: position
-            for robot in manifest.robots
-            for joint, position in types[robot.type].home_rad.items()
-        },
+        home=home,
+        settings=manifest.start,
     )
+    # What goes on in it does not keep it alive: it ends when nobody who takes part is left.
+    its = proxy(world)
+    people = [Walker(person) for person in manifest.people]
+    for person in people:
+        world.add(person)
+    world.add(Climate(manifest, its, people))
+    world.add(Light(manifest, its))
+    world.add(Sound(manifest, its, people))
+    return world
 
 
 def _placement(robot: RoomRobot, model: Path) -> Placement:
