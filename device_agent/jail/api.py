@@ -105,6 +105,10 @@ class Robot:
         """Show an expression, ``strength`` 0 to 1."""
         self._ask("express", name=str(name), strength=float(strength))
 
+    def posture(self, name: str, speed: float = 0.5) -> None:
+        """Move to one of the robot type's postures and wait until there; ``speed`` as for ``move_joints``."""
+        self._ask("posture", name=str(name), speed=float(speed))
+
     def behaviour(self, name: str) -> None:
         """Run a behaviour that the robot has of its own, and wait for its end."""
         self._ask("behaviour", name=str(name))

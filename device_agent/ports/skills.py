@@ -1,13 +1,17 @@
 """What some robots can do besides moving joints and base: speak, show, stiffen. The implementer's manual.
 
-A driver that also has ``perform`` is asked for what its robot type's ``capabilities`` name. It is called in the thread
-of the action, never in the control loop, and returns when the thing is done.
+Most of it needs no driver: expressions, postures, behaviours and mouth shapes stand in the robot type's manifest, and
+the runtime moves the joints. A driver that also has ``perform`` goes first, for what both its ``performs`` and its
+robot type's ``capabilities`` name. It is called in the thread of the action, never in the control loop, and returns
+when the thing is done.
 """
 
+from collections.abc import Collection
 from dataclasses import dataclass
 from typing import Protocol, runtime_checkable
 
 SPEECH, STIFFNESS, GAZE, EXPRESSIONS, BEHAVIOURS = "speech", "stiffness", "gaze", "expressions", "behaviours"
+POSTURES = "postures"
 """Capabilities that a manifest may name, each with the skill below."""
 
 
@@ -54,7 +58,15 @@ class Behave:
     name: str
 
 
-Skill = Say | Stiffen | LookAt | Express | Behave
+@dataclass(frozen=True, slots=True)
+class Pose:
+    """Take the posture ``name``; ``speed`` is the share of each joint's velocity limit."""
+
+    name: str
+    speed: float = 0.5
+
+
+Skill = Say | Stiffen | LookAt | Express | Behave | Pose
 
 
 class Stage(Protocol):
@@ -78,6 +90,10 @@ class Stage(Protocol):
 @runtime_checkable
 class Skills(Protocol):
     """A driver with skills."""
+
+    @property
+    def performs(self) -> Collection[str]:
+        """The capabilities that ``perform`` is for."""
 
     def perform(self, skill: Skill, stage: Stage) -> None:
         """Do it, to its end, or until ``stage`` has ended.

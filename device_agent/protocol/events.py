@@ -26,6 +26,8 @@ class EventKind(StrEnum):
     """Something that moved was brought to rest. ``code``, ``epoch``."""
     ACTION_LOST = "action-lost"
     """A running action lost the device. ``code``, ``epoch``."""
+    SAID = "said"
+    """The device began to speak. ``text``, ``language``."""
     SCRIPTS_REFUSED = "scripts-refused"
     """The agent started on a machine that cannot lock movement scripts in: none runs. ``why``."""
     SCRIPTS_TRUSTED = "scripts-trusted"

@@ -7,7 +7,10 @@ from typing import Annotated, Any
 
 from msgspec import Meta, Struct
 
-from device_agent.protocol.fields import Count, Id, JointPositions, Label, Milliseconds, Text
+from device_agent.protocol.fields import Count, Id, JointPositions, Label, Milliseconds, Text, Vector3
+
+LANGUAGE_PATTERN = r"([A-Za-z]{2,3}(-[A-Za-z0-9]{2,8})*)?"
+"""As in BCP 47: ``en``, ``sk``, ``en-GB``; or nothing."""
 
 
 class _Order(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True, tag_field="kind"):
@@ -67,11 +70,69 @@ class RunMovement(_Order, frozen=True, kw_only=True, tag="run_movement"):
     timeout_ms: Annotated[int, Meta(ge=1, le=86_400_000)] = 600_000
 
 
+Speed = Annotated[float, Meta(gt=0, le=1, description="share of each joint's velocity limit")]
+Share = Annotated[float, Meta(ge=0, le=1)]
+
+
 class MoveJoints(_Order, frozen=True, kw_only=True, tag="move_joints"):
     """Move to joint positions and end there."""
 
     position_rad: JointPositions
-    speed: Annotated[float, Meta(gt=0, le=1, description="share of each joint's velocity limit")] = 0.5
+    speed: Speed = 0.5
+
+
+class Say(_Order, frozen=True, kw_only=True, tag="say"):
+    """Speak ``text``, and end when it is said; ``language`` as ``en`` or ``sk``, or empty for the robot's own."""
+
+    text: Annotated[str, Meta(min_length=1, max_length=2000)]
+    language: Annotated[str, Meta(pattern=f"^{LANGUAGE_PATTERN}$")] = ""
+
+
+class Express(_Order, frozen=True, kw_only=True, tag="express"):
+    """Show one of the device's expressions; ``strength`` 0 is home."""
+
+    name: Id
+    strength: Share = 1.0
+
+
+class TakePosture(_Order, frozen=True, kw_only=True, tag="take_posture"):
+    """Move to one of the device's postures."""
+
+    name: Id
+    speed: Speed = 0.5
+
+
+class RunBehaviour(_Order, frozen=True, kw_only=True, tag="run_behaviour"):
+    """Run one of the device's behaviours to its end."""
+
+    name: Id
+
+
+class SetStiffness(_Order, frozen=True, kw_only=True, tag="set_stiffness"):
+    """Let joints hold with ``value`` of their strength, 0: limp; no joints: all. It lasts beyond the action."""
+
+    value: Share
+    joints: Annotated[tuple[Label, ...], Meta(max_length=128)] = ()
+
+
+class LookAt(_Order, frozen=True, kw_only=True, tag="look_at"):
+    """Turn the gaze to a point x, y, z in the robot's base frame [m]."""
+
+    position_m: Vector3
+    speed: Speed = 0.5
+
+
+class Drive(_Order, frozen=True, kw_only=True, tag="drive"):
+    """Move the base at a velocity for a time, then stand; ``turn_rad_s`` is counter-clockwise."""
+
+    forward_m_s: float = 0.0
+    left_m_s: float = 0.0
+    turn_rad_s: float = 0.0
+    duration_s: Annotated[float, Meta(gt=0, le=60)] = 1.0
+
+
+Task = MoveJoints | Say | Express | TakePosture | RunBehaviour | SetStiffness | LookAt | Drive
+"""Orders that are actions and reach a device just as they were asked of the API."""
 
 
 class CancelAction(_Order, frozen=True, kw_only=True, tag="cancel_action"):
@@ -95,15 +156,7 @@ class ResetStop(_Order, frozen=True, kw_only=True, tag="reset_stop"):
 
 
 Request = (
-    GrantLease
-    | ReleaseLease
-    | AskLease
-    | DropRequest
-    | RunMovement
-    | MoveJoints
-    | CancelAction
-    | StopDevice
-    | ResetStop
+    GrantLease | ReleaseLease | AskLease | DropRequest | RunMovement | Task | CancelAction | StopDevice | ResetStop
 )
 
 

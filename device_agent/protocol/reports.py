@@ -72,6 +72,9 @@ class Description(Struct, frozen=True, kw_only=True):
     ``limits`` names what the agent itself holds, whoever moves the device: ``clearance`` and ``workspace`` are missing
     where nobody knows the robot's shape.
 
+    ``actions`` names the kinds of action that it takes; ``postures``, ``expressions`` and ``behaviours`` what those of
+    these kinds may name. An agent that names no actions is an older one.
+
     ``scripts``: movement scripts run in the jail, run with less (``trusted``, as the agent's owner wants it), or are
     refused; ``scripts_note`` says why, and what to do.
     """
@@ -83,6 +86,10 @@ class Description(Struct, frozen=True, kw_only=True):
     joints: tuple[Joint, ...] = ()
     frames: tuple[Label, ...] = ()
     capabilities: tuple[Label, ...] = ()
+    actions: tuple[Label, ...] = ()
+    postures: tuple[Label, ...] = ()
+    expressions: tuple[Label, ...] = ()
+    behaviours: tuple[Label, ...] = ()
     streams: tuple[Stream, ...] = ()
     watchdog_ms: Milliseconds = 0
     max_loop_age_ms: Milliseconds = 0
@@ -209,7 +216,8 @@ class State(Struct, frozen=True, kw_only=True):
     """``state``: the current condition. Retained; on change and every 30 s, at most once a second.
 
     ``ended_epoch`` is the highest epoch that the device will never obey again. It only rises, so even an old message
-    tells the truth: a lease of such an epoch is nobody's any more.
+    tells the truth: a lease of such an epoch is nobody's any more. ``stiffness`` names the joints that hold with less
+    than all their strength, and with which share of it.
     """
 
     device: Id
@@ -223,6 +231,7 @@ class State(Struct, frozen=True, kw_only=True):
     action: ActionState | None = None
     faults: tuple[Fault, ...] = ()
     restrictions: tuple[Restriction, ...] = ()
+    stiffness: dict[str, float] = {}
 
 
 class JointTelemetry(Struct, frozen=True, kw_only=True):

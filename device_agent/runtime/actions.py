@@ -7,7 +7,8 @@ from collections.abc import Callable
 from typing import Any, Protocol
 
 from device_agent.ports.jail import Jail
-from device_agent.protocol.messages import AckStatus, ActionState, Command, MoveJoints, Reason, RunMovement
+from device_agent.protocol.messages import AckStatus, ActionState, Command, Reason, RunMovement, Task
+from device_agent.runtime import tasks
 from device_agent.runtime.lease import Refused
 from device_agent.runtime.movements import MAX_OUTPUT, Cell, Script, ScriptFailed
 from device_agent.runtime.robot import Body, ScriptRobot
@@ -15,7 +16,7 @@ from device_agent.runtime.trust import Trust
 
 Report = Callable[..., None]
 """``report(command_id, status, reason=…, progress=…, output=…, result=…)``: journal and publish one ack."""
-Order = RunMovement | MoveJoints
+Order = RunMovement | Task
 """What is an action."""
 
 _TELL_EVERY_S = 0.2
@@ -56,7 +57,7 @@ class Executor:
                 run.begin(_Playing(order, run, cell))
                 self._trust.remember(order)
             else:
-                run.begin(_Moving(order, run.robot))
+                run.begin(tasks.Deed(order, run.robot))
             self._run = run
         threading.Thread(target=self._follow, args=(run,), name=f"action-{command.id}", daemon=True).start()
 
@@ -112,22 +113,6 @@ class _Activity(Protocol):
 
     def kill(self) -> None:
         """End it, from any thread; never blocks. May be called twice."""
-
-
-class _Moving:
-    """An action that is one move; losing the device ends it."""
-
-    def __init__(self, order: MoveJoints, robot: ScriptRobot) -> None:
-        self._order = order
-        self._robot = robot
-
-    def run(self) -> dict[str, Any]:
-        """See ``_Activity``."""
-        limited = self._robot.move_joints(self._order.position_rad, self._order.speed)
-        return {"limited": limited} if limited else {}
-
-    def kill(self) -> None:
-        """See ``_Activity``."""
 
 
 class _Playing:

@@ -115,6 +115,13 @@ class Behaviour(_Message, frozen=True, kw_only=True, tag="behaviour"):
     name: _Name
 
 
+class Posture(_Message, frozen=True, kw_only=True, tag="posture"):
+    """``robot.posture``."""
+
+    name: _Name
+    speed: float
+
+
 class AskState(_Message, frozen=True, kw_only=True, tag="state"):
     """``robot.state``."""
 
@@ -126,7 +133,9 @@ class AskLatest(_Message, frozen=True, kw_only=True, tag="latest"):
     stream: _Name
 
 
-Call = MoveJoints | MoveTo | Home | Drive | Look | Say | Stiffness | Express | Behaviour | AskState | AskLatest
+Show = Say | Stiffness | Express | Posture | Behaviour
+"""Calls for what a robot shows, by its manifest or by its driver."""
+Call = MoveJoints | MoveTo | Home | Drive | Look | Show | AskState | AskLatest
 """What the process waits for an answer to."""
 Message = Ready | Unfit | Output | Progress | Ended | Call
 

@@ -21,6 +21,7 @@ from device_agent.protocol.errors import ProtocolError
 from device_agent.protocol.events import EventKind
 from device_agent.protocol.messages import JointTelemetry, Measurements, Setpoint, Stop, StopLatch
 from device_agent.protocol.robot_type import RobotType
+from device_agent.runtime import tasks
 from device_agent.runtime.actions import Executor
 from device_agent.runtime.audit import Audit, Happened
 from device_agent.runtime.controller import Controller
@@ -95,12 +96,22 @@ class Device:
         self._audit = Audit()
         self._controller = Controller(robot_type, gate, latch=record.latch, geometry=geometry, tell=self._audit.note)
         self._controller.changed.set()
+        body = Body(
+            robot_type=robot_type,
+            controller=self._controller,
+            observe=lambda: self._loop.seen,
+            geometry=geometry,
+            skills=driver if isinstance(driver, Skills) else None,
+            room=room,
+            reported=lambda stream: self._reporter.latest(stream),
+        )
         self.voice = Voice(
             address=(space, agent, name),
             label=label,
             robot_type=robot_type,
             simulated=driver.simulated,
             limits=self._controller.limits,
+            actions=tasks.kinds(body.can()),
             interlocks=[rule.shown for rule in interlocks],
             journal=journal,
             publish=publish,
@@ -124,15 +135,6 @@ class Device:
         )
         self._reporter = Reporter(
             robot_type.streams, driver if isinstance(driver, Reporting) else None, name=name, tell=self._measured
-        )
-        body = Body(
-            robot_type=robot_type,
-            controller=self._controller,
-            observe=lambda: self._loop.seen,
-            geometry=geometry,
-            skills=driver if isinstance(driver, Skills) else None,
-            room=room,
-            reported=self._reporter.latest,
         )
         trust = Trust(device=name, robot_type=robot_type.type, owner=owner, keys=keys, journal=journal)
         self._executor = Executor(body, trust=trust, jail=jail, report=self.voice.report)

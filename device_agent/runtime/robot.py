@@ -12,7 +12,7 @@ from device_agent.ports.geometry import Geometry, GeometryError
 from device_agent.ports.skills import Skill, SkillError, Skills
 from device_agent.protocol.messages import Quaternion, Vector3
 from device_agent.protocol.robot_type import RobotType
-from device_agent.runtime import calls, gaze
+from device_agent.runtime import calls, gaze, shows
 from device_agent.runtime.authority import Tenure
 from device_agent.runtime.controller import Controller
 from device_agent.runtime.courses import Course, Outcome
@@ -65,7 +65,7 @@ class Body:
     def can(self) -> tuple[str, ...]:
         """Names of the calls that scripts have on this robot."""
         kind, named = self.robot_type, set(self.robot_type.capabilities)
-        by_skill = named if self.skills is not None else set()
+        by_skill = named & set(() if self.skills is None else self.skills.performs)
         has = {
             "move_joints": bool(kind.joints),
             "home": bool(kind.joints),
@@ -74,7 +74,8 @@ class Body:
             "look": skills.GAZE in by_skill or (kind.gaze is not None and self.geometry is not None),
             "say": skills.SPEECH in by_skill,
             "stiffness": skills.STIFFNESS in by_skill,
-            "express": skills.EXPRESSIONS in by_skill,
+            "express": skills.EXPRESSIONS in by_skill or bool(kind.expressions),
+            "posture": skills.POSTURES in by_skill or bool(kind.postures),
             "behaviour": skills.BEHAVIOURS in by_skill,
             "state": True,
             "latest": True,
@@ -87,6 +88,9 @@ class ScriptRobot:
 
     Args:
         body: The device.
+
+    Attributes:
+        limited: What limited its motion so far, as telemetry names it.
     """
 
     def __init__(self, body: Body) -> None:
@@ -96,6 +100,7 @@ class ScriptRobot:
         self.joints = tuple(joint.name for joint in body.robot_type.joints)
         self.frames = () if body.geometry is None else tuple(body.geometry.frames)
         self.can = body.can()
+        self.limited: tuple[str, ...] = ()
 
     def begin(self, epoch: int, on_lost: Callable[[Refused], None]) -> None:
         """Take the device. ``on_lost`` is called when somebody takes it away, with the controller locked.
@@ -135,20 +140,34 @@ class ScriptRobot:
             case calls.AskLatest(device=device, stream=stream):
                 return self._latest(device, stream)
             case _:
-                self._perform(_skill(call))
+                self._show(call)
         return None
 
-    def move_joints(self, position_rad: Mapping[str, float], speed: float) -> tuple[str, ...]:
-        """Move and wait until there [rad].
+    def _show(self, call: calls.Show) -> None:
+        """By what the manifest says, or by what the driver can."""
+        kind = self._body.robot_type
+        match call:
+            case calls.Express(name=name, strength=strength) if self._by_data(skills.EXPRESSIONS):
+                _check_share("strength", strength)
+                self.move_joints(shows.expression(kind, name, strength), shows.EXPRESSION_SPEED)
+            case calls.Posture(name=name, speed=speed) if self._by_data(skills.POSTURES):
+                self.move_joints(shows.posture(kind, name), speed)
+            case _:
+                self._perform(_skill(call))
 
-        Returns:
-            What limited it on its way.
+    def _by_data(self, capability: str) -> bool:
+        """Whether the manifest says how; else the driver knows."""
+        able = self._body.skills
+        return able is None or capability not in self._body.robot_type.capabilities or capability not in able.performs
+
+    def move_joints(self, position_rad: Mapping[str, float], speed: float) -> None:
+        """Move and wait until there [rad].
 
         Raises:
             Refused: It did not get there.
         """
         _check_share("speed", speed, least=math.nextafter(0, 1))
-        return _follow(self._body.controller.move(self._tenure, dict(position_rad), speed=speed))
+        self._follow(self._body.controller.move(self._tenure, dict(position_rad), speed=speed))
 
     def _move_to(self, call: calls.MoveTo) -> None:
         geometry, start = self._shape(), self._body.seen().position_rad
@@ -172,7 +191,14 @@ class ScriptRobot:
 
     def _drive(self, call: calls.Drive) -> None:
         twist = Twist(call.forward_m_s, call.left_m_s, call.turn_rad_s)
-        _follow(self._body.controller.drive(self._tenure, twist, duration_s=call.duration_s))
+        self._follow(self._body.controller.drive(self._tenure, twist, duration_s=call.duration_s))
+
+    def _follow(self, course: Course) -> None:
+        """Wait for its end."""
+        course.finished.wait()
+        self.limited += tuple(one for one in course.limited if one not in self.limited)
+        if course.outcome is not Outcome.REACHED:
+            raise course.why or Refused("interrupted", "the move was interrupted")
 
     def _look(self, position_m: Vector3, speed: float) -> None:
         _check_share("speed", speed, least=math.nextafter(0, 1))
@@ -238,7 +264,7 @@ class _Stage:
             raise SkillError(refused.message) from refused
 
 
-def _skill(call: calls.Say | calls.Stiffness | calls.Express | calls.Behaviour) -> Skill:
+def _skill(call: calls.Show) -> Skill:
     match call:
         case calls.Say(text=text, language=language):
             return skills.Say(text, language)
@@ -248,6 +274,9 @@ def _skill(call: calls.Say | calls.Stiffness | calls.Express | calls.Behaviour) 
         case calls.Express(name=name, strength=strength):
             _check_share("strength", strength)
             return skills.Express(name, strength)
+        case calls.Posture(name=name, speed=speed):
+            _check_share("speed", speed, least=math.nextafter(0, 1))
+            return skills.Pose(name, speed)
     return skills.Behave(call.name)
 
 
@@ -258,14 +287,6 @@ def _shown(reading: Reading) -> dict[str, Any]:
 def _check_share(name: str, value: float, *, least: float = 0.0) -> None:
     if not least <= value <= 1:  # false for NaN
         raise Refused(f"bad_{name}", f"{name} must be {'above ' if least else ''}0 and at most 1, not {value}")
-
-
-def _follow(course: Course) -> tuple[str, ...]:
-    """Wait for its end; what limited it."""
-    course.finished.wait()
-    if course.outcome is not Outcome.REACHED:
-        raise course.why or Refused("interrupted", "the move was interrupted")
-    return course.limited
 
 
 def _from_rpy(rpy_rad: Vector3) -> Quaternion:

@@ -77,6 +77,7 @@ class Voice:
         robot_type: Joints, limits, streams.
         simulated: Whether no real metal moves.
         limits: What the agent itself holds, whoever moves it.
+        actions: The kinds of action that it takes.
         interlocks: How the room slows or holds it.
         journal: Open.
         publish: Sends a message.
@@ -95,6 +96,7 @@ class Voice:
         robot_type: RobotType,
         simulated: bool,
         limits: Sequence[str],
+        actions: Sequence[str],
         interlocks: Sequence[InterlockRule],
         journal: Journal,
         publish: Publish,
@@ -106,6 +108,7 @@ class Voice:
         self._robot_type = robot_type
         self._simulated = simulated
         self._limits = tuple(limits)
+        self._actions = tuple(actions)
         self._interlocks = tuple(interlocks)
         self._journal = journal
         self._publish = publish
@@ -226,6 +229,10 @@ class Voice:
             joints=kind.joints,
             frames=kind.frames,
             capabilities=kind.capabilities,
+            actions=self._actions,
+            postures=tuple(kind.postures),
+            expressions=tuple(kind.expressions),
+            behaviours=tuple(kind.behaviours),
             streams=kind.streams,
             watchdog_ms=round(WATCHDOG_S * 1000),
             max_loop_age_ms=round(MAX_LOOP_AGE_S * 1000),

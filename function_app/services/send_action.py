@@ -1,6 +1,8 @@
 """From an action's row to its device: the same row always makes the same command, so the device drops doubles."""
 
-from device_agent.protocol.messages import MoveJoints, RunMovement
+import msgspec
+
+from device_agent.protocol.messages import RunMovement, Task
 from function_app.domain.accounts import Identity
 from function_app.domain.actions import Action, mark_published
 from function_app.domain.devices import Agent, Device
@@ -62,9 +64,10 @@ class SendAction:
         now_ms = self._clock.now_ms()
         await self._rows.change(action.id, lambda known: mark_published(known, now_ms), known=found)
 
-    async def _command(self, action: Action) -> MoveJoints | RunMovement:
-        if action.request["kind"] == "move_joints":
-            return MoveJoints(position_rad=action.request["position_rad"], speed=action.request["speed"])
+    async def _command(self, action: Action) -> Task | RunMovement:
+        if action.request["kind"] != "run_movement":
+            task: Task = msgspec.convert(action.request, Task)
+            return task
         owner = Identity(action.account, action.who, "")
         source = await self._movements.pinned_source(owner, action.request["name"], action.pinned)
         if source is None:

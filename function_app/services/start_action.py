@@ -4,12 +4,12 @@ import hashlib
 from collections.abc import AsyncIterator
 from contextlib import AbstractAsyncContextManager, AsyncExitStack, nullcontext
 from dataclasses import dataclass, field
-from typing import Annotated, Any, Literal
+from typing import Any, Literal
 
 import msgspec
-from msgspec import Meta, Struct
+from msgspec import Struct
 
-from device_agent.protocol.messages import Ack, Id, JointPositions, MoveJoints, RunMovement
+from device_agent.protocol.messages import Ack, Id, RunMovement, Task
 from function_app.domain import lease as rules
 from function_app.domain.accounts import Identity
 from function_app.domain.actions import REPEAT_MS, Action, Status, reached
@@ -20,7 +20,7 @@ from function_app.domain.problems import Problem, busy_store
 from function_app.ports.clock import Clock
 from function_app.ports.command_bus import BusUnavailable
 from function_app.ports.tables import Row, Tables, Write
-from function_app.services import parameters, store
+from function_app.services import abilities, parameters, store
 from function_app.services.action_acks import ActionAcks
 from function_app.services.action_rows import ActionRows, Found, new_row
 from function_app.services.audit import Audit, lease_change
@@ -47,14 +47,7 @@ class AskMovement(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True,
     parameters: dict[str, Any] = {}
 
 
-class AskJoints(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True, tag_field="kind", tag="move_joints"):
-    """Move to joint positions and end there."""
-
-    position_rad: JointPositions
-    speed: Annotated[float, Meta(gt=0, le=1)] = 0.5
-
-
-Asked = AskMovement | AskJoints
+Asked = AskMovement | Task
 
 
 @dataclass(frozen=True, slots=True)
@@ -103,7 +96,7 @@ class _Plan:
     action: str
     created_ms: int
     request: dict[str, Any]
-    command: RunMovement | MoveJoints
+    command: RunMovement | Task
     pinned: dict[str, Any] = field(default_factory=dict)
 
 
@@ -163,7 +156,7 @@ class StartAction:
         Raises:
             Problem: ``device-unknown``, ``forbidden``, ``movement-unknown``, ``device-offline``, ``device-busy``,
                 ``queue-full``, ``lease-held``, ``lease-lost``, ``idempotency-key-reused``, ``busy``,
-                ``parameters-invalid``, ``invalid``.
+                ``parameters-invalid``, ``unable``, ``invalid``.
         """
         wanted = Status(start.wait_for)
         async with AsyncExitStack() as listening:
@@ -219,9 +212,9 @@ class StartAction:
         asked, now_ms = start.asked, self._clock.now_ms()
         request: dict[str, Any] = msgspec.to_builtins(asked)
         action = command_id(device.id, now_ms)
-        if isinstance(asked, AskJoints):
-            joints = MoveJoints(position_rad=asked.position_rad, speed=asked.speed)
-            plan = _Plan(device, action, now_ms, request, joints)
+        if isinstance(asked, Task):
+            await abilities.check(self._tables, device, asked)
+            plan = _Plan(device, action, now_ms, request, asked)
         else:
             movement, source = await self._movements.get(who, device.robot_type, asked.name)
             command = RunMovement(

@@ -25,12 +25,12 @@ from device_agent.protocol.messages import (
     Ack,
     AckStatus,
     Command,
-    MoveJoints,
     Presence,
     Reason,
     RunMovement,
     State,
     Stop,
+    Task,
 )
 from function_app import bootstrap
 from function_app.domain.ids import agent_id
@@ -369,7 +369,7 @@ class Robot:
         self.commands.append(command)
         if self.silent or self.link is None:
             return
-        action = isinstance(command.request, MoveJoints | RunMovement)
+        action = isinstance(command.request, Task | RunMovement)
         for each in self.reports(command) if action else (AckStatus.RECEIVED, AckStatus.DONE):
             ack = each if isinstance(each, Ack) else self.ack(command.id, each)
             self._said[command.id] = codec.encode(ack)

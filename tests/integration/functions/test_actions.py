@@ -4,7 +4,16 @@ from typing import Any
 
 import pytest
 
-from device_agent.protocol.messages import AckStatus, CancelAction, MoveJoints, RunMovement
+from device_agent.protocol import topics
+from device_agent.protocol.messages import (
+    AckStatus,
+    CancelAction,
+    Description,
+    MoveJoints,
+    RunMovement,
+    Say,
+    TakePosture,
+)
 from tests.support.brokers import BROKERS, wait_until
 from tests.support.cloud import API, MOVE, Cloud, Person, Robot, paired, problem
 
@@ -303,3 +312,26 @@ def test_progress_and_output_are_shown_while_it_runs(pair: Pair) -> None:
     robot.report(action, AckStatus.STARTED, progress=0.5, output="half\n")
     wait_until(lambda: anna.action(action)["progress"] == 0.5, "progress")
     assert anna.action(action)["output"] == "half\n"
+
+
+def test_what_the_device_says_it_cannot_is_refused_at_once_with_what_it_can(pair: Pair) -> None:
+    anna, robot = pair
+    asked = {"kind": "take_posture", "name": "Sit", "speed": 0.5}
+    assert anna.start(robot.device, request=asked, wait_ms=10_000).status_code == 200, "nobody knows yet"
+    robot.report(robot.heard(TakePosture)[0].id, AckStatus.DONE)
+    description = Description(
+        device="arm",
+        kind="arm",
+        robot_type="ur5",
+        label="Arm",
+        actions=("move_joints", "take_posture"),
+        postures=("Stand", "Crouch"),
+    )
+    robot.say(robot.topic(topics.DESC), description, retain=True)
+    wait_until(lambda: anna.start(robot.device, request=asked).status_code == 422, "the description")
+    refusal = problem(anna.start(robot.device, request=asked), 422, "unable")
+    assert "no posture 'Sit'; it has: Stand, Crouch." in refusal["detail"]
+    assert refusal["names"] == ["Stand", "Crouch"]
+    spoken = anna.start(robot.device, request={"kind": "say", "text": "hello"})
+    assert problem(spoken, 422, "unable")["names"] == ["move_joints", "take_posture"]
+    assert robot.heard(Say) == []

@@ -11,13 +11,13 @@ from typing import Any, cast
 import pytest
 
 from device_agent.protocol import codec, topics
-from device_agent.protocol.messages import Ack, AckStatus
+from device_agent.protocol.messages import Ack, AckStatus, MoveJoints
 from function_app.bootstrap import Functions
 from function_app.domain.accounts import Identity
 from function_app.domain.problems import Problem
 from function_app.services import store
 from function_app.services.pending import SHARDS
-from function_app.services.start_action import AskJoints, Start
+from function_app.services.start_action import Start
 from function_app.services.sweep import ORPHAN_MS
 from tests.support.processes import (
     Place,
@@ -32,7 +32,7 @@ from tests.support.processes import (
 )
 
 TTL_S, TIMEOUT_S, QUEUE_S = 2, 6, 10
-MOVE = AskJoints(position_rad={"elbow": 1.0})
+MOVE = MoveJoints(position_rad={"elbow": 1.0})
 TERMINAL = {"done", "failed", "expired", "cancelled"}
 MOST_STEPS = 30
 

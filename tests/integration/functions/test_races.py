@@ -8,17 +8,18 @@ from typing import Any
 
 import pytest
 
+from device_agent.protocol.messages import MoveJoints
 from function_app.bootstrap import Functions
 from function_app.domain.accounts import Identity
 from function_app.domain.problems import Problem
-from function_app.services.start_action import AskJoints, Start
+from function_app.services.start_action import Start
 from tests.support.processes import PATIENCE_S, PROCESSES, Place, begin, killed, run_here, show_code
 
 RACERS = 8
 DEVICES_OF_AGENT = 20
 WRONG_TRIES = 4
 """So many codes one account may race for; five wrong ones would lock it out."""
-START = Start(asked=AskJoints(position_rad={"elbow": 1.0}), timeout_ms=60_000)
+START = Start(asked=MoveJoints(position_rad={"elbow": 1.0}), timeout_ms=60_000)
 LOST = {
     "slot": "device-busy",
     "lease": "lease-held",

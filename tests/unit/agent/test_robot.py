@@ -19,11 +19,19 @@ from device_agent.protocol.messages import (
     AckStatus,
     CancelAction,
     Description,
+    Drive,
     Event,
+    Express,
+    LookAt,
     Measurements,
     MoveJoints,
     Pose,
+    RunBehaviour,
+    Say,
+    SetStiffness,
     Stop,
+    TakePosture,
+    Task,
 )
 from device_agent.protocol.robot_type import Base, Gaze, RobotType
 from device_agent.runtime import calls, gaze
@@ -38,6 +46,8 @@ from tests.unit.agent.test_device import Bench, ToyDriver, eventually
 
 class AbleDriver(ToyDriver):
     """Does at once whatever it is asked, and remembers it."""
+
+    performs = ("speech", "stiffness", "gaze", "expressions", "behaviours", "postures")
 
     def __init__(self) -> None:
         super().__init__()
@@ -109,7 +119,7 @@ def able_type() -> RobotType:
     )
     return msgspec.structs.replace(
         robot_type(),
-        capabilities=("cartesian", "speech", "stiffness", "expressions", "behaviours"),
+        capabilities=("cartesian", "speech", "stiffness", "expressions", "behaviours", "postures"),
         frames=("face",),
         model="toy.xml",
         base=base,
@@ -144,6 +154,7 @@ def test_a_robot_that_can_all_of_it_does_all_of_it(bench: Bench) -> None:
         "robot.say('hello', language='en')\n"
         "robot.stiffness(0.4, ['elbow'])\n"
         "robot.express('smile', 0.7)\n"
+        "robot.posture('Sit', 0.9)\n"
         "robot.behaviour('nod')\n"
         "robot.drive(0.1, turn_rad_s=0.2, duration_s=0.05)\n"
         "robot.move_joints({'elbow': 0.2}, speed=1)\n"
@@ -156,6 +167,7 @@ def test_a_robot_that_can_all_of_it_does_all_of_it(bench: Bench) -> None:
         skills.Say("hello", "en"),
         skills.Stiffen(0.4, ("elbow",)),
         skills.Express("smile", 0.7),
+        skills.Pose("Sit", 0.9),
         skills.Behave("nod"),
     ]
     assert max(twist.forward_m_s for twist in driver_of(bench).twists) > 0
@@ -170,6 +182,7 @@ def test_what_a_robot_cannot_do_is_refused_with_what_it_can(tmp_path: Path) -> N
         "robot.say('x')",
         "robot.express('x')",
         "robot.behaviour('x')",
+        "robot.posture('x')",
         "robot.stiffness(1)",
         "robot.drive(1)",
         "robot.look((1, 0, 0))",
@@ -386,3 +399,87 @@ def test_nothing_is_left_of_a_tenure_that_nobody_has() -> None:
     robot._tenure.on_lost(Refused("x", "y"))
     robot.give_back()
     assert robot._over.is_set()
+
+
+def showing_type() -> RobotType:
+    return msgspec.structs.replace(
+        robot_type(),
+        home_rad={"shoulder": 0.0, "elbow": 0.1},
+        expressions={"glad": {"elbow": 0.3}, "shy": {"shoulder": -0.2}},
+        postures={"Bow": {"elbow": 0.25}},
+    )
+
+
+@pytest.mark.parametrize(
+    ("request_", "there"),
+    [
+        (Express(name="glad"), {"shoulder": 0.0, "elbow": 0.3}),
+        (Express(name="glad", strength=0.5), {"shoulder": 0.0, "elbow": 0.2}),
+        (Express(name="shy", strength=0.25), {"shoulder": -0.05, "elbow": 0.1}),
+        (TakePosture(name="Bow", speed=1.0), {"shoulder": 0.0, "elbow": 0.25}),
+    ],
+)
+def test_what_the_manifest_says_is_shown_without_a_driver_that_could(
+    tmp_path: Path, request_: Express | TakePosture, there: dict[str, float]
+) -> None:
+    bench = Bench(tmp_path, kind=showing_type())
+    bench.device.start()
+    ack = bench.end(bench.command(request_, epoch=1))
+    assert ack.status is AckStatus.DONE, ack.reason
+    assert bench.driver.position == pytest.approx([there["shoulder"], there["elbow"]], abs=2e-4)
+    bench.stop()
+
+
+@pytest.mark.parametrize(
+    ("request_", "says"),
+    [
+        (Express(name="sad"), "no expression 'sad'; there are glad, shy"),
+        (TakePosture(name="Sit"), "no posture 'Sit'; there are Bow"),
+        (RunBehaviour(name="dance"), "this robot has no behaviour; it has move_joints, home, express, posture, state"),
+        (SetStiffness(value=0.0), "this robot has no stiffness"),
+        (LookAt(position_m=(1.0, 0.0, 0.0)), "this robot has no look"),
+        (Drive(forward_m_s=0.1), "this robot has no drive"),
+        (Say(text="hello"), "this robot has no say"),
+    ],
+)
+def test_an_order_that_the_robot_cannot_do_fails_with_what_it_can(tmp_path: Path, request_: Task, says: str) -> None:
+    bench = Bench(tmp_path, kind=showing_type())
+    bench.device.start()
+    reason = bench.end(bench.command(request_, epoch=1)).reason
+    assert reason is not None
+    assert says in reason.message
+    bench.stop()
+
+
+def test_orders_reach_the_skills_that_scripts_reach(bench: Bench) -> None:
+    orders: tuple[Task, ...] = (
+        Say(text="ahoj", language="sk"),
+        SetStiffness(value=0.5, joints=("elbow",)),
+        Express(name="smile", strength=0.7),
+        TakePosture(name="Sit"),
+        RunBehaviour(name="nod"),
+        LookAt(position_m=(1.0, 1.0, 1.0), speed=1.0),
+        Drive(forward_m_s=0.1, duration_s=0.05),
+    )
+    for order in orders:
+        ack = bench.end(bench.command(order, epoch=1))
+        assert ack.status is AckStatus.DONE, ack.reason
+    assert driver_of(bench).performed == [
+        skills.Say("ahoj", "sk"),
+        skills.Stiffen(0.5, ("elbow",)),
+        skills.Express("smile", 0.7),
+        skills.Pose("Sit", 0.5),
+        skills.Behave("nod"),
+    ]
+    assert max(twist.forward_m_s for twist in driver_of(bench).twists) > 0
+    described: Description = eventually(lambda: bench.heard(topics.DESC, Description))[0]
+    assert described.actions == (
+        "move_joints",
+        "say",
+        "express",
+        "take_posture",
+        "run_behaviour",
+        "set_stiffness",
+        "look_at",
+        "drive",
+    )

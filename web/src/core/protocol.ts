@@ -19,6 +19,9 @@ export interface Presence {
  * `limits` names what the agent itself holds, whoever moves the device: `clearance` and `workspace` are missing
  * where nobody knows the robot's shape.
  *
+ * `actions` names the kinds of action that it takes; `postures`, `expressions` and `behaviours` what those of
+ * these kinds may name. An agent that names no actions is an older one.
+ *
  * `scripts`: movement scripts run in the jail, run with less (`trusted`, as the agent's owner wants it), or are
  * refused; `scripts_note` says why, and what to do.
  */
@@ -32,6 +35,10 @@ export interface Description {
   joints?: Joint[];
   frames?: string[];
   capabilities?: string[];
+  actions?: string[];
+  postures?: string[];
+  expressions?: string[];
+  behaviours?: string[];
   streams?: Stream[];
   watchdog_ms?: number;
   max_loop_age_ms?: number;
@@ -122,7 +129,8 @@ export interface Geometry {
  * `state`: the current condition. Retained; on change and every 30 s, at most once a second.
  *
  * `ended_epoch` is the highest epoch that the device will never obey again. It only rises, so even an old message
- * tells the truth: a lease of such an epoch is nobody's any more.
+ * tells the truth: a lease of such an epoch is nobody's any more. `stiffness` names the joints that hold with less
+ * than all their strength, and with which share of it.
  */
 export interface State {
   /** letters, digits, _ and -, 1 to 64 of them */
@@ -137,6 +145,7 @@ export interface State {
   action?: ActionState | null;
   faults?: Fault[];
   restrictions?: Restriction[];
+  stiffness?: Record<string, number>;
 }
 
 /** What the device is doing at this moment. */
@@ -288,7 +297,7 @@ export interface Command {
   ttl_ms: number;
   who: string;
   epoch: number;
-  request: GrantLease | ReleaseLease | AskLease | DropRequest | RunMovement | MoveJoints | CancelAction | StopDevice | ResetStop;
+  request: GrantLease | ReleaseLease | AskLease | DropRequest | RunMovement | MoveJoints | Say | Express | TakePosture | RunBehaviour | SetStiffness | LookAt | Drive | CancelAction | StopDevice | ResetStop;
 }
 
 /**
@@ -354,6 +363,61 @@ export interface MoveJoints {
   position_rad: Record<string, number>;
   /** share of each joint's velocity limit */
   speed?: number;
+}
+
+/** Speak `text`, and end when it is said; `language` as `en` or `sk`, or empty for the robot's own. */
+export interface Say {
+  kind: "say";
+  text: string;
+  language?: string;
+}
+
+/** Show one of the device's expressions; `strength` 0 is home. */
+export interface Express {
+  kind: "express";
+  /** letters, digits, _ and -, 1 to 64 of them */
+  name: string;
+  strength?: number;
+}
+
+/** Move to one of the device's postures. */
+export interface TakePosture {
+  kind: "take_posture";
+  /** letters, digits, _ and -, 1 to 64 of them */
+  name: string;
+  /** share of each joint's velocity limit */
+  speed?: number;
+}
+
+/** Run one of the device's behaviours to its end. */
+export interface RunBehaviour {
+  kind: "run_behaviour";
+  /** letters, digits, _ and -, 1 to 64 of them */
+  name: string;
+}
+
+/** Let joints hold with `value` of their strength, 0: limp; no joints: all. It lasts beyond the action. */
+export interface SetStiffness {
+  kind: "set_stiffness";
+  value: number;
+  joints?: string[];
+}
+
+/** Turn the gaze to a point x, y, z in the robot's base frame [m]. */
+export interface LookAt {
+  kind: "look_at";
+  position_m: [number, number, number];
+  /** share of each joint's velocity limit */
+  speed?: number;
+}
+
+/** Move the base at a velocity for a time, then stand; `turn_rad_s` is counter-clockwise. */
+export interface Drive {
+  kind: "drive";
+  forward_m_s?: number;
+  left_m_s?: number;
+  turn_rad_s?: number;
+  duration_s?: number;
 }
 
 /** End the named action; the device holds where it is. */

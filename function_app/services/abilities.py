@@ -1,0 +1,40 @@
+"""What a device says that it can do, asked before an action takes its slot."""
+
+from collections.abc import Sequence
+
+from device_agent.protocol.messages import Description, Express, MoveJoints, RunBehaviour, TakePosture, Task
+from function_app.domain.devices import Device
+from function_app.domain.problems import Problem
+from function_app.ports.tables import Tables
+from function_app.services import store
+
+
+async def check(tables: Tables, device: Device, asked: Task) -> None:
+    """Refuse what the device's own description lacks. Who has not described itself, or not its actions, decides itself.
+
+    Raises:
+        Problem: ``unable``; the text lists what there is.
+    """
+    if isinstance(asked, MoveJoints):
+        return  # asked of nearly every device, many times: it costs no reading of the description
+    row = await tables.get(store.DESCRIPTIONS, device.agent, device.name)
+    if row is None:
+        return
+    described = store.read(row, Description)
+    if not described.actions:
+        return
+    kind = str(type(asked).__struct_config__.tag)
+    _among("kind of action", kind, described.actions)
+    match asked:
+        case Express(name=name):
+            _among("expression", name, described.expressions)
+        case TakePosture(name=name):
+            _among("posture", name, described.postures)
+        case RunBehaviour(name=name):
+            _among("behaviour", name, described.behaviours)
+
+
+def _among(word: str, name: str, there: Sequence[str]) -> None:
+    if name not in there:
+        detail = f"This device has no {word} '{name}'; it has: {', '.join(there) or 'none'}."
+        raise Problem("unable", 422, "The device cannot do this", detail, extras={"names": list(there)})
