@@ -96,6 +96,9 @@ class Device:
         self._audit = Audit()
         self._controller = Controller(robot_type, gate, latch=record.latch, geometry=geometry, tell=self._audit.note)
         self._controller.changed.set()
+        self._reporter = Reporter(
+            robot_type.streams, driver if isinstance(driver, Reporting) else None, name=name, tell=self._measured
+        )
         body = Body(
             robot_type=robot_type,
             controller=self._controller,
@@ -103,7 +106,7 @@ class Device:
             geometry=geometry,
             skills=driver if isinstance(driver, Skills) else None,
             room=room,
-            reported=lambda stream: self._reporter.latest(stream),
+            reported=self._reporter.latest,
         )
         self.voice = Voice(
             address=(space, agent, name),
@@ -132,9 +135,6 @@ class Device:
             name=name,
             tell=lambda telemetry: self._measured(topics.JOINTS, telemetry),
             watch=self._interlocks.step,
-        )
-        self._reporter = Reporter(
-            robot_type.streams, driver if isinstance(driver, Reporting) else None, name=name, tell=self._measured
         )
         trust = Trust(device=name, robot_type=robot_type.type, owner=owner, keys=keys, journal=journal)
         self._executor = Executor(body, trust=trust, jail=jail, report=self.voice.report)
