@@ -100,11 +100,27 @@ class Walk(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     support: Label
 
 
+class Battery(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """What a robot without a cable lives on.
+
+    Attributes:
+        capacity_wh: When it is new [Wh].
+        full_v: Voltage when it is full; ``empty_v``: when it is empty [V].
+        idle_w: What the robot takes while nothing moves [W].
+    """
+
+    capacity_wh: float
+    full_v: float
+    empty_v: float
+    idle_w: float
+
+
 class Simulation(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """What only a simulation needs to know. No limit stands here: those hold for real metal too."""
 
     wheels: Wheels | None = None
     walk: Walk | None = None
+    battery: Battery | None = None
 
 
 class Abilities(Struct, frozen=True, kw_only=True):
@@ -151,11 +167,21 @@ def check(abilities: Abilities, joints: Sequence[Joint], home_rad: Mapping[str, 
             allowed.check(f"{word} '{name}'", position_rad)
     for name, keyframes in abilities.behaviours.items():
         _check_keyframes(f"behaviour '{name}'", keyframes, allowed)
-    if abilities.simulation is not None and abilities.simulation.wheels is not None:
-        for field in ("radius_m", "track_m"):
-            value = getattr(abilities.simulation.wheels, field)
+    if abilities.simulation is not None:
+        _check_simulation(abilities.simulation)
+
+
+def _check_simulation(simulation: Simulation) -> None:
+    for part, holder, fields in (
+        ("wheels", simulation.wheels, ("radius_m", "track_m")),
+        ("battery", simulation.battery, Battery.__struct_fields__),
+    ):
+        for field in () if holder is None else fields:
+            value = getattr(holder, field)
             if not 0 < value < math.inf:
-                raise ProtocolError(f"simulation.wheels: {field} is {value}; it must be above 0 and finite")
+                raise ProtocolError(f"simulation.{part}: {field} is {value}; it must be above 0 and finite")
+    if simulation.battery is not None and simulation.battery.empty_v > simulation.battery.full_v:
+        raise ProtocolError("simulation.battery: empty_v must not be above full_v")
 
 
 def _check_mirrors(mirrors: Sequence[Mirror], known: Mapping[str, Joint]) -> None:

@@ -8,13 +8,14 @@ from device_agent.drivers.mujoco.assembly import Placement
 from device_agent.drivers.mujoco.driver import MujocoDriver
 from device_agent.drivers.mujoco.snapshot import Snapshot
 from device_agent.drivers.mujoco.twin import draw
+from device_agent.drivers.mujoco.wheels import WheeledDriver
 from device_agent.drivers.mujoco.world import World
 from device_agent.ports.driver import DriverError
 from device_agent.protocol.robot_type import RobotType
 
-__all__ = ["MujocoDriver", "Placement", "Snapshot", "World", "create", "draw", "worlds"]
+__all__ = ["MujocoDriver", "Placement", "Snapshot", "WheeledDriver", "World", "create", "draw", "worlds"]
 
-_OPTIONS = ("room", "scene", "trace")
+_OPTIONS = ("faults", "room", "scene", "trace")
 
 
 def create(robot_type: RobotType, folder: Path, options: Mapping[str, object], device: str) -> MujocoDriver:
@@ -23,7 +24,8 @@ def create(robot_type: RobotType, folder: Path, options: Mapping[str, object], d
     Options (text): ``room``, a room's folder, relative to the robot's: the robot is the one of its manifest with the
     device's name, and all that is in the room shares one world; without it the robot has a world of its own, with
     ``scene``, an MJCF file instead of the manifest's, relative to the robot's folder; ``trace``, a file to which the
-    world appends the robot's true state at 100 Hz (see ``trace.Trace``).
+    world appends the robot's true state at 100 Hz (see ``trace.Trace``); ``faults``, a file with faults to put into the
+    robot, which may come and go while it runs (see ``ailments``).
 
     Raises:
         DriverError: An option is unknown or not text, or the room cannot be used.
@@ -33,14 +35,21 @@ def create(robot_type: RobotType, folder: Path, options: Mapping[str, object], d
             raise DriverError(f"driver 'mujoco' has no option '{name}'; it has: {', '.join(_OPTIONS)}")
         if not isinstance(value, str) or not value:
             raise DriverError(f"option '{name}' of driver 'mujoco' must be the path of a file or folder, not {value!r}")
-    trace = Path(str(options["trace"])) if "trace" in options else None
+    trace, faults = (Path(str(options[name])) if name in options else None for name in ("trace", "faults"))
     if "room" not in options:
         scene = folder / str(options.get("scene", robot_type.scene))
         world = World(scene, home=robot_type.home_rad, trace=trace)
-        return MujocoDriver(robot_type=robot_type, world=world, device=device)
+        return _kind(robot_type)(robot_type=robot_type, world=world, device=device, faults=faults)
     if "scene" in options:
         raise DriverError("driver 'mujoco' takes a room or a scene, not both")
     world = worlds.of(folder / str(options["room"]))
     if trace is not None:
         world.trace(trace, prefix=worlds.prefix(device))
-    return MujocoDriver(robot_type=robot_type, world=world, device=device, prefix=worlds.prefix(device))
+    prefix = worlds.prefix(device)
+    return _kind(robot_type)(robot_type=robot_type, world=world, device=device, prefix=prefix, faults=faults)
+
+
+def _kind(robot_type: RobotType) -> type[MujocoDriver]:
+    """What drives robots of this type: by how they get about."""
+    simulation = robot_type.simulation
+    return WheeledDriver if simulation is not None and simulation.wheels is not None else MujocoDriver

@@ -1,20 +1,29 @@
 """One robot in a ``World``: the ``Driver`` of any robot type whose joints are position servos on hinges or slides."""
 
+import logging
 import math
 import time
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from pathlib import Path
 from typing import Any
 
 import mujoco
 import numpy as np
 
 from device_agent.drivers.mujoco import twin
+from device_agent.drivers.mujoco.ailments import WELL, Ailments, Infliction, Sickbed
 from device_agent.drivers.mujoco.assembly import SCALAR_JOINTS
+from device_agent.drivers.mujoco.health import HEALTH, Health
 from device_agent.drivers.mujoco.snapshot import Floats, Ints, Snapshot
 from device_agent.drivers.mujoco.world import STALE_S, World
 from device_agent.ports.driver import DriverError, Observation
 from device_agent.protocol.messages import Pose, Twin
 from device_agent.protocol.robot_type import RobotType
+
+log = logging.getLogger(__name__)
+
+_LOOKED_S = 0.1
+"""What lies further back than this nobody has seen: a motor may have moved meanwhile."""
 
 RAMP_PERIODS = 1.5
 """Control periods over which a target is approached. Targets arrive up to half a period late on a busy machine; a ramp
@@ -26,9 +35,21 @@ class MujocoDriver:
 
     The robot's base is its model's top-level body; frames and the twin are given in it. The model's joints, actuators
     and sites carry the manifest's names, after ``prefix`` where the world was put together from several robots.
+
+    It is ``Reporting`` too: stream ``health``. A motor that does not move though it gives all it can is an error, as it
+    is to a real arm's controller; connecting again forgives it.
+
+    Args:
+        robot_type: Its manifest.
+        world: Where it is.
+        device: Its name.
+        prefix: Before its names in the world.
+        faults: A file with faults to put into it, see ``ailments``; it need not be there.
     """
 
-    def __init__(self, *, robot_type: RobotType, world: World, device: str, prefix: str = "") -> None:
+    def __init__(
+        self, *, robot_type: RobotType, world: World, device: str, prefix: str = "", faults: Path | None = None
+    ) -> None:
         self._type = robot_type
         self._world = world
         self._device = device
@@ -41,6 +62,12 @@ class MujocoDriver:
         self._lower: Floats = np.zeros(0)
         self._upper: Floats = np.zeros(0)
         self._frames: list[tuple[bool, int]] = []  # (is a site, index)
+        self._ramp_s = RAMP_PERIODS * robot_type.period_ms / 1000
+        battery = None if robot_type.simulation is None else robot_type.simulation.battery
+        self._health = Health(robot_type.joints, battery, seed=device)
+        self._sickbed = Sickbed(faults, [joint.name for joint in robot_type.joints])
+        self._infliction: Infliction | None = None
+        self._noted_s = math.inf
 
     @property
     def simulated(self) -> bool:
@@ -55,6 +82,7 @@ class MujocoDriver:
         Raises:
             DriverError: The model cannot be built, or lacks a joint, actuator or frame of the manifest.
         """
+        self._health.forgive()
         if self._connected:
             self._world.recover()
             return
@@ -79,9 +107,10 @@ class MujocoDriver:
         ``effort_nm`` is what the motors give, with the torque that holds the arm against gravity [N m].
 
         Raises:
-            DriverError: Not connected, or the simulation has stopped; the text says why.
+            DriverError: Not connected, the simulation has stopped, or a joint is stuck; the text says why.
         """
         snapshot = self._live()
+        self._note(snapshot)
         return Observation(
             position_rad=tuple(snapshot.qpos[self._qpos].tolist()),
             velocity_rad_s=tuple(snapshot.qvel[self._dof].tolist()),
@@ -101,15 +130,52 @@ class MujocoDriver:
         if not all(map(math.isfinite, position_rad)):
             raise DriverError("a commanded position is not finite")
         applied = np.minimum(np.maximum(position_rad, self._lower), self._upper)
-        ramp_s = RAMP_PERIODS * self._type.period_ms / 1000
-        self._world.command(self._device, self._actuators, applied, ramp_s=ramp_s)
+        self._world.command(self._device, self._actuators, applied, ramp_s=self._ramp_s)
         return tuple(applied.tolist())
+
+    def report(self, stream: str) -> Mapping[str, float | bool]:
+        """``health``: temperature and load of its joints, and its battery."""
+        if stream != HEALTH:
+            return {}
+        news = self._sickbed.news()
+        if news is not None:
+            self._suffer(news)
+        return self._health.values()
 
     def close(self) -> None:
         """Leave the world; it stands still when nobody is left in it."""
         if self._connected:
             self._connected = False
             self._world.close()
+
+    def _note(self, snapshot: Snapshot) -> None:
+        """What each measurement says about how the robot is.
+
+        Raises:
+            DriverError: A joint is stuck.
+        """
+        effort, velocity = snapshot.effort[self._dof], snapshot.qvel[self._dof]
+        elapsed_s = min(max(0.0, snapshot.time_s - self._noted_s), _LOOKED_S)
+        self._noted_s = snapshot.time_s
+        self._health.observe(snapshot.time_s, effort, velocity, power_w=self._power_w(snapshot))
+        behind = snapshot.ctrl[self._actuators] - snapshot.qpos[self._qpos]
+        stuck = self._health.stuck(elapsed_s, behind, effort, velocity)
+        if stuck:
+            raise DriverError(
+                f"{', '.join(stuck)} does not move though the motor gives all it can; free it, then move it again"
+            )
+
+    def _power_w(self, snapshot: Snapshot) -> float:
+        """What motors take that are no joints."""
+        del snapshot
+        return 0.0
+
+    def _suffer(self, ailments: Ailments) -> None:
+        if ailments != WELL:
+            log.warning("%s now suffers from %s", self._device, ailments)
+        self._health.suffer(ailments)
+        if self._infliction is not None:
+            self._infliction.want(ailments)
 
     def _require(self) -> None:
         if not self._connected:
@@ -170,6 +236,9 @@ class MujocoDriver:
         self._upper = np.where(limited, ranges[:, 1], np.inf)
         self._base = int(model.body_rootid[model.jnt_bodyid[joints[0]]]) if joints else 0
         self._frames = [self._frame(model, name) for name in self._type.frames]
+        if self._infliction is None:
+            self._infliction = Infliction(model, dict(zip(names, self._actuators.tolist(), strict=True)))
+            self._world.add(self._infliction)
 
     def _frame(self, model: Any, name: str) -> tuple[bool, int]:
         site = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_SITE, self._prefix + name)

@@ -51,7 +51,7 @@ def test_third_party_driver_that_cannot_be_imported_is_one_clear_error(monkeypat
 
 def test_unknown_option_error_lists_the_valid_ones():
     folder = ROBOTS / "ur5"
-    with pytest.raises(DriverError, match=r"no option 'sceen'; it has: room, scene, trace"):
+    with pytest.raises(DriverError, match=r"no option 'sceen'; it has: faults, room, scene, trace"):
         drivers.load("mujoco")(robot_type.load(folder), folder, {"sceen": "x.xml"}, "arm")
 
 

@@ -96,7 +96,8 @@ def test_forward_kinematics_of_the_twin_equals_the_simulation(folder: Path):
     base = int(model.body_rootid[model.jnt_bodyid[model.joint(manifest.joints[0].name).id]])
     twin = draw(model, base=base, device="arm", scenery=True)
     read_back = codec.decode(codec.encode(twin, limit=codec.MAX_RETAINED_BYTES), Twin)
-    assert_same_poses(model, read_back, base, scenery=True)
+    # What stands around a robot that goes away from it is not drawn in its own frame.
+    assert_same_poses(model, read_back, base, scenery=bool(model.body_weldid[base] == 0))
 
 
 MANY = """

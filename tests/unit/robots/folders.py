@@ -48,3 +48,9 @@ class Bench:
             for contact in self.data.contact[: self.data.ncon]
         ]
         return {(first, second) for first, second in names}
+
+
+def heard(kind: robot_type.RobotType) -> dict[str, Any]:
+    """What a robot with sonars hears in an empty hall; its own tests have walls."""
+    sonar = {"values": {"distance_m.left": 4.0, "distance_m.right": 4.0}, "age_s": 0.0}
+    return {"sonar": sonar} if any(stream.name == "sonar" for stream in kind.streams) else {}

@@ -8,11 +8,13 @@ import numpy as np
 import pytest
 
 from device_agent import geometry
+from device_agent.ports.driver import Twist
 from device_agent.protocol import robot_type
+from device_agent.runtime import gaze
 from device_agent.runtime.controller import Controller
-from device_agent.runtime.courses import Outcome
+from device_agent.runtime.courses import Course, Outcome
 from device_agent.runtime.lease import LeaseGate, Refused
-from tests.unit.robots.folders import MOVEMENTS, ROBOTS
+from tests.unit.robots.folders import MOVEMENTS, ROBOTS, heard
 
 LONGEST_S = 60.0
 
@@ -28,6 +30,7 @@ class LimitedRobot:
         self.controller.start_at(self.position)
         self.tenure = self.controller.begin_action(epoch=1, on_lost=lambda _: None)
         self.joints = tuple(joint.name for joint in self.type.joints)
+        self.can = ("say",)
         self.now_s = 0.0
         self.tightest_m = 1.0
         self.limited: set[str] = set()
@@ -35,7 +38,23 @@ class LimitedRobot:
     def move_joints(self, position_rad: Mapping[str, float] | Sequence[float], speed: float = 0.5) -> None:
         if not isinstance(position_rad, Mapping):
             position_rad = dict(zip(self.joints, position_rad, strict=True))
-        move = self.controller.move(self.tenure, position_rad, speed=speed)
+        self.follow(self.controller.move(self.tenure, position_rad, speed=speed))
+
+    def drive(
+        self, forward_m_s: float = 0.0, left_m_s: float = 0.0, turn_rad_s: float = 0.0, *, duration_s: float = 1.0
+    ) -> None:
+        twist = Twist(forward_m_s, left_m_s, turn_rad_s)
+        self.follow(self.controller.drive(self.tenure, twist, duration_s=duration_s))
+
+    def look(self, position_m: tuple[float, float, float], speed: float = 0.5) -> None:
+        assert self.shape is not None
+        self.move_joints(gaze.aim(self.type, self.shape, self.position, position_m), speed=speed)
+
+    def say(self, text: str, language: str = "") -> None:
+        assert text
+        assert len(language) <= 5
+
+    def follow(self, move: Course) -> None:
         end_s = self.now_s + LONGEST_S
         while not move.finished.is_set():
             self.now_s += self.type.period_ms / 1000
@@ -51,7 +70,10 @@ class LimitedRobot:
         self.move_joints(self.type.home_rad, speed=speed)
 
     def state(self) -> dict[str, Any]:
-        return {"position_rad": dict(zip(self.joints, self.position, strict=True))}
+        return {
+            "position_rad": dict(zip(self.joints, self.position, strict=True)),
+            "streams": heard(self.type),
+        }
 
 
 def play(path: Path, parameters: dict[str, Any]) -> LimitedRobot:

@@ -9,7 +9,9 @@ import mujoco
 import numpy as np
 import pytest
 
-from tests.unit.robots.folders import MOVEMENTS, ROBOTS, Bench
+from device_agent.drivers.mujoco.wheels import wheel_speeds
+from device_agent.ports.driver import Twist
+from tests.unit.robots.folders import MOVEMENTS, ROBOTS, Bench, heard
 
 STEPS = 4  # of 2 ms: one control period
 
@@ -22,6 +24,8 @@ class PlayedRobot:
         self.allowed = bench.touching()
         self.target = bench.home.copy()
         self.joints = tuple(bench.names)
+        self.can = ("say",)
+        self.home_rad = bench.type.home_rad
         self.moves = 0
         self.touched: set[tuple[str, str]] = set()
         self.fastest = 0.0  # share of the velocity limits
@@ -54,7 +58,38 @@ class PlayedRobot:
 
     def state(self) -> dict[str, Any]:
         bench = self.bench
-        return {"position_rad": dict(zip(bench.names, bench.data.qpos[bench.qpos].tolist(), strict=True))}
+        position_rad = dict(zip(bench.names, bench.data.qpos[bench.qpos].tolist(), strict=True))
+        return {"position_rad": position_rad, "streams": heard(bench.type)}
+
+    def look(self, position_m: Sequence[float], speed: float = 0.5) -> None:
+        assert len(position_m) == 3
+        assert self.bench.type.gaze is not None
+        self.move_joints(self.home_rad | dict.fromkeys(self.bench.type.gaze.joints, 0.0), speed=speed)
+
+    def say(self, text: str, language: str = "") -> None:
+        assert text
+        assert len(language) <= 5
+
+    def drive(
+        self, forward_m_s: float = 0.0, left_m_s: float = 0.0, turn_rad_s: float = 0.0, *, duration_s: float = 1.0
+    ) -> None:
+        bench = self.bench
+        assert bench.type.base is not None
+        assert bench.type.simulation is not None
+        assert bench.type.simulation.wheels is not None
+        assert abs(forward_m_s) <= bench.type.base.max_linear_m_s
+        assert abs(turn_rad_s) <= bench.type.base.max_angular_rad_s
+        assert left_m_s == 0
+        wheels = bench.type.simulation.wheels
+        actuators = [bench.model.actuator(name).id for name in (wheels.left, wheels.right)]
+        speeds, _ = wheel_speeds(wheels, Twist(forward_m_s, 0.0, turn_rad_s), fastest_rad_s=math.inf)
+        periods = math.ceil(duration_s / 0.008)
+        for period in range(periods):
+            bench.data.ctrl[actuators] = speeds * min(1.0, (period + 1) / 40)
+            self._hold(self.target, 1)
+        bench.data.ctrl[actuators] = 0.0
+        self._hold(self.target, 40)
+        self.moves += 1
 
     def wait(self, seconds: float) -> None:
         assert seconds >= 0

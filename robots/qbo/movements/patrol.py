@@ -1,0 +1,63 @@
+"""Drive round a square, look to both sides at each corner, and come back to where it began."""
+
+import math
+
+PARAMETERS = {
+    "side_m": {
+        "type": "number",
+        "minimum": 0.2,
+        "maximum": 2,
+        "default": 0.6,
+        "unit": "m",
+        "description": "Of the square",
+    },
+    "speed_m_s": {
+        "type": "number",
+        "minimum": 0.05,
+        "maximum": 0.3,
+        "default": 0.2,
+        "unit": "m/s",
+        "description": "How fast",
+    },
+    "keep_m": {
+        "type": "number",
+        "minimum": 0.15,
+        "maximum": 1,
+        "default": 0.35,
+        "unit": "m",
+        "description": "It stops this far from what its sonars hear",
+    },
+}
+
+STEP_M = 0.1
+TURN_RAD_S = 0.8
+
+side_m = min(2.0, max(0.2, float(parameters.get("side_m", 0.6))))
+speed_m_s = min(0.3, max(0.05, float(parameters.get("speed_m_s", 0.2))))
+keep_m = min(1.0, max(0.15, float(parameters.get("keep_m", 0.35))))
+
+
+def room_ahead():
+    """The nearer of what both sonars hear [m]; none is heard of without them."""
+    sonar = robot.state()["streams"].get("sonar")
+    if sonar is None or sonar["age_s"] > 1.0:
+        raise RobotError("the sonars tell nothing; the patrol ends here")
+    return min(sonar["values"]["distance_m.left"], sonar["values"]["distance_m.right"])
+
+
+def along(way_m):
+    """Drive ahead in short steps, as long as there is room."""
+    steps = max(1, round(way_m / STEP_M))
+    for _ in range(steps):
+        if room_ahead() < keep_m + STEP_M:
+            print("something is in the way; turning here")
+            return
+        robot.drive(forward_m_s=speed_m_s, duration_s=way_m / steps / speed_m_s)
+
+
+for corner in range(4):
+    along(side_m)
+    for pan in (0.7, -0.7, 0.0):
+        robot.move_joints({"head_pan": pan}, speed=0.4)
+    robot.drive(turn_rad_s=TURN_RAD_S, duration_s=math.pi / 2 / TURN_RAD_S)
+    progress((corner + 1) / 4)

@@ -1,0 +1,238 @@
+"""Qbo in its scene, driven by its driver, step by step: how well it drives, and what it notices."""
+
+import math
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from device_agent.drivers import load
+from device_agent.drivers.mujoco import WheeledDriver
+from device_agent.ports.driver import REST, DriverError, MobileDriver, Reporting, Twist
+from device_agent.protocol import robot_type
+from device_agent.runtime.base import BaseMotion
+from tests.unit.robots.folders import ROBOTS
+
+FOLDER = ROBOTS / "qbo"
+
+
+class Track:
+    """The robot in its scene, stepped by hand, its twist shaped as the agent shapes it."""
+
+    def __init__(self) -> None:
+        self.type = robot_type.load(FOLDER)
+        driver = load("mujoco")(self.type, FOLDER, {}, "qbo")
+        assert isinstance(driver, WheeledDriver)
+        self.driver = driver
+        self.world = driver._world
+        self.world.build()
+        driver._resolve(self.world.model)
+        driver._connected = True
+        assert self.type.base is not None
+        self.motion = BaseMotion(self.type.base, self.type.period_ms / 1000)
+        self.steps = self.type.period_ms // 2
+        driver.observe()
+
+    def period(self) -> None:
+        self.driver.drive(self.motion.update())
+        self.world.step(self.steps)
+        self.driver.observe()
+
+    def go(self, twist: Twist, duration_s: float) -> None:
+        for _ in range(round(duration_s * 1000 / self.type.period_ms)):
+            self.motion.follow(twist)
+            self.period()
+
+    def rest(self, duration_s: float = 0.6) -> None:
+        for _ in range(round(duration_s * 1000 / self.type.period_ms)):
+            self.motion.brake()
+            self.period()
+
+    @property
+    def truth(self) -> tuple[float, float, float]:
+        """x, y [m], yaw [rad]."""
+        snapshot = self.world.snapshot()
+        x, y, _ = snapshot.body_position_m[self.driver._base].tolist()
+        w, _, _, k = snapshot.body_quaternion[self.driver._base].tolist()
+        return x, y, math.remainder(2 * math.atan2(k, w), 2 * math.pi)
+
+    @property
+    def speed(self) -> tuple[float, float]:
+        """Over the floor [m/s], of turning [rad/s]."""
+        velocity = self.world.snapshot().qvel[:6]
+        return float(np.linalg.norm(velocity[:2])), float(velocity[5])
+
+    def told(self) -> dict[str, Any]:
+        return dict(self.driver.report("odometry"))
+
+
+@pytest.fixture
+def track() -> Track:
+    return Track()
+
+
+def test_it_drives_straight(track: Track) -> None:
+    track.go(Twist(0.3), 5.0)
+    track.rest()
+    x, y, yaw = track.truth
+    assert x == pytest.approx(0.3 * 5.0, abs=0.1)
+    assert abs(y) < 0.005
+    assert abs(yaw) < 0.005
+    told = track.told()
+    assert told["x_m"] == pytest.approx(x, abs=0.01)
+    assert told["y_m"] == pytest.approx(y, abs=0.005)
+    assert told["forward_m_s"] == pytest.approx(0.0, abs=0.002)
+
+
+@pytest.mark.parametrize("side", [1, -1])
+def test_it_turns_on_the_spot(track: Track, side: int) -> None:
+    track.go(Twist(0.0, 0.0, side * 1.0), 3.0)
+    track.rest()
+    x, y, yaw = track.truth
+    assert math.hypot(x, y) < 0.005
+    assert side * yaw == pytest.approx(3.0, abs=0.25)
+    assert track.told()["yaw_rad"] == pytest.approx(yaw, abs=0.03)
+
+
+def test_odometry_follows_a_long_way_and_drifts_a_little(track: Track) -> None:
+    for twist in (
+        Twist(0.3),
+        Twist(0.0, 0.0, 0.8),
+        Twist(0.2, 0.0, 0.6),
+        Twist(-0.2, 0.0, 0.3),
+        Twist(0.25, 0.0, -0.7),
+    ):
+        track.go(twist, 3.0)
+    track.rest()
+    x, y, yaw = track.truth
+    told = track.told()
+    off_m = math.hypot(told["x_m"] - x, told["y_m"] - y)
+    assert 0 < off_m < 0.05, "wheels slip: it is not the truth, and near to it"
+    assert abs(math.remainder(told["yaw_rad"] - yaw, 2 * math.pi)) < 0.08
+
+
+def test_wheels_that_slip_are_believed(track: Track) -> None:
+    """Odometry is what wheels say: held in the air it goes on."""
+    track.world._data.qpos[2] = 0.5
+    track.world.model.opt.gravity[2] = 0.0
+    before = track.truth
+    track.go(Twist(0.3), 1.0)
+    assert track.truth[0] == pytest.approx(before[0], abs=0.02)
+    assert track.told()["x_m"] > 0.15
+
+
+@pytest.mark.parametrize("twist", [Twist(0.3), Twist(-0.3), Twist(0.0, 0.0, 1.5), Twist(0.2, 0.0, -1.0)])
+def test_it_stops_within_its_braking_limits(track: Track, twist: Twist) -> None:
+    track.go(twist, 2.0)
+    linear, angular = track.speed
+    assert max(linear / 0.3, abs(angular) / 1.5) > 0.6
+    place = track.truth
+    periods = 0
+    while track.motion.moving:
+        track.motion.brake()
+        track.period()
+        periods += 1
+    assert periods * track.type.period_ms <= 180, "0.15 s at full speed, and the generator's ramps"
+    for _ in range(2):
+        track.period()
+    linear, angular = track.speed
+    assert linear < 0.03
+    assert abs(angular) < 0.05
+    assert math.dist(place[:2], track.truth[:2]) < 0.04
+
+
+def test_it_never_tips_over_whatever_is_asked_of_it(track: Track) -> None:
+    chance = np.random.default_rng(4)
+    upright = 1.0
+    for _ in range(40):
+        track.go(Twist(chance.uniform(-0.3, 0.3), 0.0, chance.uniform(-1.5, 1.5)), 0.25)
+        if chance.random() < 0.3:
+            track.rest(0.2)
+        w, i, j, k = track.world.snapshot().body_quaternion[track.driver._base].tolist()
+        assert math.isclose(math.hypot(w, i, j, k), 1.0, abs_tol=1e-6)
+        upright = min(upright, 1 - 2 * (i * i + j * j))
+    assert upright > math.cos(0.06)
+    assert not track.world._data.warning.number.any()
+
+
+def test_sideways_it_does_not_go_and_too_fast_keeps_its_curve(track: Track) -> None:
+    assert track.driver.drive(Twist(0.1, 0.2, 0.0)) == Twist(0.1, 0.0, 0.0)
+    fast = track.driver.drive(Twist(2.0, 0.0, 4.0))
+    assert fast.turn_rad_s / fast.forward_m_s == pytest.approx(2.0)
+    assert fast.forward_m_s < 0.5
+    with pytest.raises(DriverError, match="not finite"):
+        track.driver.drive(Twist(math.nan))
+    track.driver.drive(REST)
+
+
+def test_its_sonars_hear_the_wall_it_comes_to(track: Track) -> None:
+    """The wall's face is at x = 2.0 m; the sonars sit 0.156 m before the axle."""
+    heard = [track.driver.report("sonar")]
+    while track.truth[0] < 1.0:
+        track.go(Twist(0.3), 0.4)
+        heard.append(track.driver.report("sonar"))
+    track.rest()
+    heard.append(track.driver.report("sonar"))
+    room_m = 2.0 - 0.156 - track.truth[0]
+    for part in ("left", "right"):
+        told = [float(values[f"distance_m.{part}"]) for values in heard]
+        assert told[0] == pytest.approx(2.0 - 0.156, abs=0.05)
+        assert told == sorted(told, reverse=True)
+        assert told[-1] == pytest.approx(room_m, abs=0.05)
+        assert (told[-1] * 100) == pytest.approx(round(told[-1] * 100), abs=1e-6), "steps of 10 mm"
+
+
+def test_an_empty_hall_is_silent_and_a_floor_is_a_floor(track: Track) -> None:
+    model, data = track.world.model, track.world._data
+    data.qpos[:2] = (0.0, 0.0)
+    data.qpos[3:7] = (math.cos(math.pi / 4), 0.0, 0.0, math.sin(math.pi / 4))  # to the left: no wall
+    track.world.step(2)
+    values = track.driver.report("sonar")
+    assert values["distance_m.left"] == values["distance_m.right"] == 4.0
+    assert values["distance_m.front"] == pytest.approx(0.04, abs=0.005)
+    data.qpos[2] += 1.0  # as over the edge of a stair
+    track.world.step(2)
+    assert track.driver.report("sonar")["distance_m.front"] == 0.3
+    assert model.nq == len(data.qpos)
+
+
+def test_odometry_begins_where_the_robot_was_put() -> None:
+    track = Track()
+    track.world._data.qpos[:7] = (0.7, -0.4, 0.0, math.cos(0.5), 0.0, 0.0, math.sin(0.5))
+    track.world.step(2)
+    track.driver._resolve(track.world.model)
+    track.driver.observe()
+    told = track.told()
+    assert (told["x_m"], told["y_m"], told["yaw_rad"]) == pytest.approx((0.7, -0.4, 1.0), abs=0.01)
+
+
+@pytest.fixture
+def connected(tmp_path: Path) -> Iterator[WheeledDriver]:
+    driver = load("mujoco")(robot_type.load(FOLDER), FOLDER, {"faults": str(tmp_path / "qbo.toml")}, "qbo")
+    assert isinstance(driver, WheeledDriver)
+    assert isinstance(driver, MobileDriver)
+    assert isinstance(driver, Reporting)
+    yield driver
+    driver.close()
+
+
+def test_before_connect_nothing_is_told_but_how_it_is(connected: WheeledDriver) -> None:
+    with pytest.raises(DriverError, match="not connected"):
+        connected.report("odometry")
+    with pytest.raises(DriverError, match="not connected"):
+        connected.report("sonar")
+    with pytest.raises(DriverError, match="not connected"):
+        connected.drive(REST)
+    assert connected.report("smell") == {}
+    assert connected.report("health")["battery_percent"] == 100.0
+
+
+def test_every_stream_of_its_manifest_is_told(connected: WheeledDriver) -> None:
+    connected.connect()
+    connected.observe()
+    streams = [stream.name for stream in robot_type.load(FOLDER).streams]
+    assert streams == ["joints", "odometry", "sonar", "health"]
+    for stream in streams[1:]:
+        assert connected.report(stream)
