@@ -26,6 +26,8 @@ from device_agent.runtime.stream import Stream
 
 _CREEP_RAD_S = 0.02
 """Slower than this, setpoints that end are a slider let go at its target, not an operator lost in mid-motion."""
+_REMEMBERED = 0.998
+"""Of how late the control loop was called, from one period to the next: half of it after three seconds."""
 _LONGEST_DRIVE_S = 60.0
 _SAME_RAD = 1e-6
 
@@ -78,6 +80,7 @@ class Controller:
         self._lock = threading.Lock()
         self._mode = Mode.IDLE
         self._due_s = math.inf
+        self._late_s = 0.0
         self._course: Course | None = None
         self._driver_limits: tuple[str, ...] = ()
 
@@ -312,6 +315,7 @@ class Controller:
         """
         with self._lock:
             late_s, self._due_s = now_s - self._due_s, now_s + self._period_s
+            self._late_s = max(late_s, _REMEMBERED * self._late_s)
             self._authority.expire(now_s)
             self._mode = self._decide(now_s)
             try:
@@ -375,7 +379,7 @@ class Controller:
         if self._authority.tenure is not None:
             self._follow_course()
             return Mode.ACTION
-        if self._stream.fresh(now_s, self._motion):
+        if self._stream.fresh(now_s, self._motion, late_s=self._late_s):
             self._stream.follow(self._motion, allowed=self._authority.restrictions.speed)
             return Mode.STREAMING
         if self._mode is Mode.STREAMING and self._motion.fastest_rad_s > _CREEP_RAD_S:

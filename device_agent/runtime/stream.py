@@ -69,14 +69,17 @@ class Stream:
     def take(self, setpoint: Setpoint, *, now_s: float, tick_ms: int) -> None:
         """Take in a setpoint that was checked.
 
+        One that took longer than they have lately, on its way or in this process, is as old as the others would be: what
+        comes late does not move the device for longer.
+
         Raises:
             Refused: Unknown joints, or numbers that are none.
         """
         self._envelope.check(setpoint.target.position_rad)
         self._setpoint = setpoint
-        self._at_s = now_s
         self.loop_age_ms = float(tick_ms - setpoint.echo_tick_ms)
         self._pace.heard(self.loop_age_ms / 1000)
+        self._at_s = now_s - max(0.0, self.loop_age_ms / 1000 - self._pace.age_s)
 
     def drop(self) -> None:
         """Follow no setpoint until the next one."""
@@ -87,9 +90,15 @@ class Stream:
         """Whether a setpoint may still be followed."""
         return self._at_s > -math.inf
 
-    def fresh(self, now_s: float, motion: Motion) -> bool:
-        """Whether the newest setpoint is to be followed still: braking then ends in time."""
-        return now_s - self._at_s < max(_SOONEST_BRAKING_S, WATCHDOG_S - motion.braking_time_s())
+    def fresh(self, now_s: float, motion: Motion, *, late_s: float) -> bool:
+        """Whether the newest setpoint is to be followed still: braking then ends in time.
+
+        Args:
+            now_s: Monotonic clock [s].
+            motion: The joints', which says how long they would brake.
+            late_s: How late the control loop may be called next [s].
+        """
+        return now_s - self._at_s < max(_SOONEST_BRAKING_S, WATCHDOG_S - motion.braking_time_s() - late_s)
 
     def follow(self, motion: Motion, *, allowed: float) -> None:
         """Set the joints in motion towards the newest setpoint.

@@ -35,6 +35,34 @@ def test_a_loop_that_is_late_every_time_is_at_rest_at_most_one_call_later(rig: R
     assert rest_after(rig, gap_s) <= LIMIT_S + gap_s
 
 
+@pytest.mark.parametrize("gap_s", [0.016, 0.024, 0.04, 0.06])
+def test_a_loop_that_has_been_late_begins_to_brake_the_sooner(rig: Rig, gap_s: float) -> None:
+    for _ in range(20):
+        rig.offer(1, 2.9)
+        rig.now_s += gap_s
+        rig.elbow = rig.controller.step(rig.now_s).position_rad[1]
+    rig.offer(1, 2.9)
+    assert rest_after(rig, gap_s) <= LIMIT_S
+
+
+def test_what_a_loop_was_late_is_forgotten(rig: Rig) -> None:
+    rig.now_s += 0.1
+    rig.offer(1, 2.9)
+    rig.controller.step(rig.now_s)
+    rig.offer(1, -2.9)
+    sooner_s = rest_after(rig, PERIOD_S)
+    rig.take(2)
+    rig.stream(2, 20.0, elbow=-2.9)
+    rig.stream(2, 1.0, elbow=2.9)
+    assert sooner_s + 0.05 < rest_after(rig, PERIOD_S) <= LIMIT_S
+
+
+def test_a_setpoint_that_comes_late_moves_it_no_longer_than_one_in_time(rig: Rig) -> None:
+    rig.now_s += 0.12
+    rig.offer(1, 2.9, age_ms=140)
+    assert rest_after(rig, PERIOD_S) <= LIMIT_S - 0.09
+
+
 @pytest.mark.parametrize("gap_s", [0.05, 0.1, 0.28])
 def test_a_loop_that_hangs_once_is_at_rest_soon_after(rig: Rig, gap_s: float) -> None:
     assert rest_after(rig, gap_s, *[PERIOD_S] * 200) <= LIMIT_S + PERIOD_S
