@@ -69,8 +69,8 @@ class Stream:
     def take(self, setpoint: Setpoint, *, now_s: float, tick_ms: int) -> None:
         """Take in a setpoint that was checked.
 
-        One that took longer than they have lately, on its way or in this process, is as old as the others would be: what
-        comes late does not move the device for longer.
+        One that took longer than they have lately, on its way or in this process, is as old as the others would be:
+        what comes late does not move the device for longer.
 
         Raises:
             Refused: Unknown joints, or numbers that are none.

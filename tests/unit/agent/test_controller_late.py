@@ -58,7 +58,7 @@ def test_what_a_loop_was_late_is_forgotten(rig: Rig) -> None:
 
 
 def test_a_setpoint_that_comes_late_moves_it_no_longer_than_one_in_time(rig: Rig) -> None:
-    rig.now_s += 0.12
+    rig.run(0.12)
     rig.offer(1, 2.9, age_ms=140)
     assert rest_after(rig, PERIOD_S) <= LIMIT_S - 0.09
 
