@@ -139,6 +139,20 @@ class OccupancyGrid:
         places = origin + (ways / np.maximum(length, 1e-9)[:, None])[ray] * steps[step, None]
         self.see_places(sensor, taken_m=ends_m[hit], clear_m=places)
 
+    def see_points(self, sensor: str, points_m: Floats, taken: Bools) -> None:
+        """Take in points: a cell is taken when more of its points say so than not.
+
+        Args:
+            sensor: Whose layer it is.
+            points_m: Shape (n, 2) [m]; what lies outside of the grid is let go.
+            taken: Whether something is there, shape (n,); else the floor was seen.
+        """
+        cells, inside = self._cells(points_m)
+        size = self.shape[0] * self.shape[1]
+        votes = np.bincount(cells, np.where(taken[inside], 1.0, -1.0), size)
+        seen = np.bincount(cells, minlength=size) > 0
+        self._learn(sensor, (seen & (votes > 0)).reshape(self.shape), (seen & (votes <= 0)).reshape(self.shape))
+
     def see_places(self, sensor: str, *, taken_m: Floats, clear_m: Floats) -> None:
         """Take in places that are taken, or free. A cell with both is taken.
 
@@ -148,7 +162,9 @@ class OccupancyGrid:
             clear_m: Shape (m, 2) [m].
         """
         taken, clear = self._mask(taken_m), self._mask(clear_m)
-        clear &= ~taken
+        self._learn(sensor, taken, clear & ~taken)
+
+    def _learn(self, sensor: str, taken: Bools, clear: Bools) -> None:
         with self._lock:
             layer = self._layer(sensor)
             layer.recent[taken] = np.minimum(layer.recent[taken] + TAKEN, MOST)
@@ -225,14 +241,19 @@ class OccupancyGrid:
             return recent, _together([layer.lasting for layer in self._layers.values()])
 
     def _mask(self, places_m: Floats) -> Bools:
-        rows, columns = self.shape
-        mask = np.zeros((rows, columns), dtype=bool)
-        if places_m.size:
-            across, up = ((places_m - self.lower_m) / self.resolution_m).T
-            # What is no number is not inside either.
-            inside = (across >= 0) & (across < columns) & (up >= 0) & (up < rows)
-            mask[up[inside].astype(np.int64), across[inside].astype(np.int64)] = True
+        mask = np.zeros(self.shape, dtype=bool)
+        mask.ravel()[self._cells(places_m)[0]] = True
         return mask
+
+    def _cells(self, places_m: Floats) -> tuple[NDArray[np.int64], Bools]:
+        """Flat index of the cells of places, and which places lie in the grid, shape (n,).
+
+        What is no number does not.
+        """
+        rows, columns = self.shape
+        across, up = ((places_m - self.lower_m) / self.resolution_m).T
+        inside: Bools = (across >= 0) & (across < columns) & (up >= 0) & (up < rows)
+        return up[inside].astype(np.int64) * columns + across[inside].astype(np.int64), inside
 
     def _circle(self, x_m: float, y_m: float, radius_m: float) -> Bools:
         rows, columns = self.shape

@@ -1,0 +1,18 @@
+"""What a room knows, as a room device: it looks with the agent's other devices, and measures nothing itself."""
+
+from pathlib import Path
+
+from device_agent.ports.sensor import Surroundings
+from device_agent.protocol.room import RoomDevice
+from device_agent.sensors.perception.driver import PerceptionDriver
+
+__all__ = ["PerceptionDriver", "create"]
+
+
+def create(device: RoomDevice, folder: Path, surroundings: Surroundings) -> PerceptionDriver:
+    """The driver of one device: the factory that ``sensors.load("perception")`` gives.
+
+    Raises:
+        SensorError: An option is unknown or has the wrong type.
+    """
+    return PerceptionDriver(device, folder, surroundings.neighbours)

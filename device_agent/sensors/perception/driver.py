@@ -1,0 +1,324 @@
+"""Looks at the room with the agent's lidars and cameras, several times a second, in a thread of its own."""
+
+import logging
+import threading
+import time
+from collections.abc import Mapping
+from pathlib import Path
+from typing import NoReturn
+
+import msgspec
+import numpy as np
+from msgspec import Struct
+
+from device_agent.perception import picture
+from device_agent.perception.grid import OccupancyGrid
+from device_agent.perception.kinds import Kind, Mount, Place
+from device_agent.perception.sight import Sight, Zone
+from device_agent.perception.survey import Survey, SurveyError
+from device_agent.perception.tracks import Box
+from device_agent.ports.sensor import Capture, Image, RoomDriver, Scan, SensorError, Values
+from device_agent.protocol import room as rooms
+from device_agent.protocol.errors import ProtocolError
+from device_agent.protocol.room import Room, RoomDevice
+from device_agent.sensors import png
+
+log = logging.getLogger(__name__)
+
+POSITIONS, PRESENCE, LIGHT = "positions", "presence", "light"
+STREAMS = (POSITIONS, PRESENCE, LIGHT)
+OCCUPANCY, MAP, SURVEY = "occupancy", "map", "survey"
+CAPTURES = (OCCUPANCY, MAP, SURVEY)
+SURVEY_LOOKS, SURVEY_EVERY_S = 20, 0.5
+"""How long a survey takes: people who walk through it disappear."""
+COLOURS_EVERY_S = 1.0
+"""How often it looks at colours: they tell how bright it is, and no more [s]."""
+OLDEST_S = 30.0
+"""Whom no sensor has seen for that long is not told of any more [s]."""
+SILENT_S = 3.0
+"""After that long without a look it says that it sees nothing [s]."""
+_EDGE_M = 0.2
+"""The grid reaches that far into the walls [m]."""
+_STOP_TIMEOUT_S = 5.0
+_DIGITS = 3
+
+
+class _Mount(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """A ``Mount`` without the place, which is the robot's in the room's manifest."""
+
+    name: str
+    lowest_m: float
+    highest_m: float
+    radius_m: float
+    reach_m: float
+
+
+class Options(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """What the manifest says.
+
+    Attributes:
+        lidars: Names of the devices to look with; level ones.
+        cameras: The same of depth and colour cameras.
+        light: Name of the room's light meter; empty for none.
+        survey: File of the empty room, in the room's folder. It is read at the start, where it is there.
+        kinds: Who may come into the room.
+        mounts: Which of the room's robots are fixed to something.
+        quiet: Boxes (lowest x, y, highest x, y [m]) in which nobody appears from nothing.
+        look_hz: How often it looks.
+        resolution_m: Side of a cell of the grid [m].
+    """
+
+    lidars: tuple[str, ...] = ()
+    cameras: tuple[str, ...] = ()
+    light: str = ""
+    survey: str = ""
+    kinds: tuple[Kind, ...] = ()
+    mounts: tuple[_Mount, ...] = ()
+    quiet: tuple[Box, ...] = ()
+    look_hz: float = 6.0
+    resolution_m: float = 0.05
+
+    def __post_init__(self) -> None:
+        if not 0 < self.look_hz <= 50:  # noqa: PLR2004 - as for streams
+            raise ValueError("look_hz is above 0, and 50 at most")
+        if not 0.01 <= self.resolution_m <= 1:  # noqa: PLR2004 - cells of a useful size
+            raise ValueError("resolution_m lies between 0.01 and 1")
+
+
+class PerceptionDriver:
+    """A ``RoomDriver`` (see ``ports.sensor``) over the others of its agent.
+
+    Streams ``positions`` (``x_m.{who}``, ``y_m.{who}``, ``age_s.{who}``, ``speed_m_s.{who}``, and ``yaw_rad.{who}``
+    once it has gone somewhere), ``presence`` (``people``, ``people.{zone}``, ``present.{zone}``), ``light``
+    (``light_lux``, ``brightness.{zone}``); captures ``occupancy`` (a picture), ``map`` (the grid as numbers, JSON), and
+    ``survey``: the room as it is now, for the option of that name. Clear the room before.
+    """
+
+    def __init__(self, device: RoomDevice, folder: Path, neighbours: Mapping[str, RoomDriver]) -> None:
+        self._device = device
+        self._folder = folder
+        self._neighbours = neighbours
+        try:
+            self._options = msgspec.convert(device.options, Options)
+        except msgspec.ValidationError as error:
+            known = ", ".join(Options.__struct_fields__)
+            raise SensorError(f"options of '{device.name}': {error}; there are: {known}") from error
+        self._sight: Sight | None = None
+        self._thread: threading.Thread | None = None
+        self._stopping = threading.Event()
+        self._life = threading.Lock()
+        self._looked_s = -np.inf
+        self._coloured_s: dict[str, float] = {}
+        self._blind: dict[str, str] = {}
+
+    # ------------------------------------------------------------ RoomDriver
+
+    @property
+    def simulated(self) -> bool:
+        """See ``RoomDriver``: as what it looks with."""
+        return any(self._neighbours[name].simulated for name in self._eyes if name in self._neighbours)
+
+    def connect(self) -> None:
+        """See ``RoomDriver``."""
+        with self._life:
+            if self._thread is not None:
+                return
+            for name in filter(None, (*self._eyes, self._options.light)):
+                if name not in self._neighbours:
+                    known = ", ".join(sorted(self._neighbours)) or "none"
+                    raise SensorError(f"'{self._device.name}' is to look with '{name}'; this agent's devices: {known}")
+            self._sight = self._sight or self._make()
+            self._looked_s = time.monotonic()
+            self._stopping.clear()
+            self._thread = threading.Thread(target=self._run, args=(self._sight,), name="perception", daemon=True)
+            self._thread.start()
+
+    def read(self, stream: str) -> Values:
+        """See ``RoomDriver``."""
+        sight = self._require()
+        now_s = time.monotonic()
+        if stream == POSITIONS:
+            return _flat(sight.places(now_s))
+        if stream == PRESENCE:
+            return sight.presence(now_s)
+        if stream == LIGHT:
+            return {**self._light(), **{name: round(value, _DIGITS) for name, value in sight.brightness().items()}}
+        return self._lacks("stream", stream, STREAMS)
+
+    def capture(self, name: str) -> Capture:
+        """See ``RoomDriver``."""
+        sight = self._require()
+        now_s = time.monotonic()
+        if name == OCCUPANCY:
+            return Capture("image/png", png.encode(picture.draw(sight.grid, sight.places(now_s))))
+        if name == MAP:
+            return Capture("application/json", msgspec.json.encode(_map(sight.grid, sight.places(now_s))))
+        if name == SURVEY:
+            return Capture("application/octet-stream", self._take_survey().content())
+        return self._lacks("capture", name, CAPTURES)
+
+    def set(self, control: str, value: float) -> float:  # noqa: ARG002 (it has none)
+        """See ``RoomDriver``."""
+        return self._lacks("control", control, ())
+
+    def raw(self) -> Scan | Image | None:
+        """See ``RoomDriver``."""
+        return None
+
+    def close(self) -> None:
+        """See ``RoomDriver``."""
+        with self._life:
+            if self._thread is not None:
+                self._stopping.set()
+                self._thread.join(timeout=_STOP_TIMEOUT_S)
+                self._thread = None
+
+    # ------------------------------------------------------------ for who plans ways
+
+    @property
+    def grid(self) -> OccupancyGrid:
+        """Which places are taken. The same one as long as the driver lives.
+
+        Raises:
+            SensorError: Not connected yet.
+        """
+        return self._require().grid
+
+    # ------------------------------------------------------------ inside
+
+    @property
+    def _eyes(self) -> tuple[str, ...]:
+        return (*self._options.lidars, *self._options.cameras)
+
+    def _require(self) -> Sight:
+        sight = self._sight
+        if sight is None or self._thread is None:
+            raise SensorError(f"'{self._device.name}' is not connected")
+        if time.monotonic() - self._looked_s > SILENT_S:
+            why = "; ".join(sorted(self._blind.values())) or "its sensors say nothing"
+            raise SensorError(f"'{self._device.name}' sees nothing: {why}")
+        return sight
+
+    def _make(self) -> Sight:
+        try:
+            room = rooms.load(self._folder)
+        except ProtocolError as error:
+            raise SensorError(str(error)) from error
+        (low_x, low_y), (high_x, high_y) = room.plan.lower_m, room.plan.upper_m
+        return Sight(
+            grid=OccupancyGrid(
+                (low_x - _EDGE_M, low_y - _EDGE_M), (high_x + _EDGE_M, high_y + _EDGE_M), self._options.resolution_m
+            ),
+            survey=self._survey(),
+            kinds=self._options.kinds,
+            mounts=self._mounts(room),
+            zones=[Zone(zone.name, (*zone.lower_m[:2], *zone.upper_m[:2])) for zone in room.zones],
+            quiet=self._options.quiet,
+            inside=(low_x, low_y, high_x, high_y),
+        )
+
+    def _mounts(self, room: Room) -> list[Mount]:
+        found = []
+        for mount in self._options.mounts:
+            robot = room.robot(mount.name)
+            if robot is None:
+                known = ", ".join(one.name for one in room.robots) or "none"
+                raise SensorError(f"mounts of '{self._device.name}': no robot '{mount.name}'; the room has: {known}")
+            found.append(Mount(**msgspec.structs.asdict(mount), near_m=(robot.position_m[0], robot.position_m[1])))
+        return found
+
+    def _survey(self) -> Survey:
+        if not self._options.survey:
+            return Survey()
+        path = self._folder / self._options.survey
+        try:
+            return Survey.read(path.read_bytes())
+        except (OSError, SurveyError) as error:
+            raise SensorError(
+                f"{path}: {error}; clear the room, capture '{SURVEY}' of '{self._device.name}', and put it there"
+            ) from error
+
+    def _take_survey(self) -> Survey:
+        found = Survey()
+        for _ in range(SURVEY_LOOKS):
+            for name in self._eyes:
+                raw = self._neighbours[name].raw()
+                if isinstance(raw, Scan) or (isinstance(raw, Image) and raw.depth_m is not None):
+                    found.look(name, raw)
+            if self._stopping.wait(SURVEY_EVERY_S):
+                raise SensorError(f"'{self._device.name}' was closed before the survey was done")
+        try:
+            found.settle()
+        except SurveyError as error:
+            raise SensorError(str(error)) from error
+        return found
+
+    def _light(self) -> dict[str, float]:
+        if not self._options.light:
+            return {}
+        read = self._neighbours[self._options.light].read("light")
+        return {name: float(value) for name, value in read.items() if name == "light_lux"}
+
+    def _run(self, sight: Sight) -> None:
+        period_s = 1.0 / self._options.look_hz
+        due_s = time.monotonic()
+        while not self._stopping.is_set():
+            for name in self._eyes:
+                self._look(sight, name)
+            now_s = time.monotonic()
+            sight.settle(now_s)
+            # What was missed is not made up for: the next look sees all there is to see.
+            due_s = max(due_s + period_s, now_s)
+            self._stopping.wait(due_s - now_s)
+
+    def _look(self, sight: Sight, name: str) -> None:
+        if time.monotonic() - self._coloured_s.get(name, -np.inf) < COLOURS_EVERY_S:
+            return
+        try:
+            raw = self._neighbours[name].raw()
+            if raw is None:
+                raise SensorError(f"'{name}' takes neither scans nor pictures")  # noqa: TRY301 (as when it is silent)
+            sight.see(name, raw)
+        except SensorError as error:
+            if name not in self._blind:
+                log.warning("perception: %s", error)
+            self._blind[name] = str(error)
+        except Exception as error:  # nothing may end this thread: who asks would be told of what is long gone
+            if name not in self._blind:
+                log.exception("perception")
+            self._blind[name] = f"'{name}': {error}"
+        else:
+            self._blind.pop(name, None)
+            self._looked_s = time.monotonic()
+            if isinstance(raw, Image) and raw.depth_m is None:
+                self._coloured_s[name] = self._looked_s
+
+    def _lacks(self, what: str, name: str, known: tuple[str, ...]) -> NoReturn:
+        there = ", ".join(known) or "none"
+        raise SensorError(f"'{self._device.name}' has no {what} '{name[:80]}'; it has: {there}")
+
+
+def _flat(places: Mapping[str, Place]) -> dict[str, float]:
+    """Places as measurements carry them."""
+    found = {}
+    for name, place in sorted(places.items()):
+        if place.age_s > OLDEST_S:
+            continue
+        found[f"x_m.{name}"] = round(place.x_m, _DIGITS)
+        found[f"y_m.{name}"] = round(place.y_m, _DIGITS)
+        found[f"age_s.{name}"] = round(place.age_s, _DIGITS)
+        found[f"speed_m_s.{name}"] = round(place.speed_m_s, _DIGITS)
+        if place.yaw_rad is not None:
+            found[f"yaw_rad.{name}"] = round(place.yaw_rad, _DIGITS)
+    return found
+
+
+def _map(grid: OccupancyGrid, places: Mapping[str, Place]) -> dict[str, object]:
+    """The grid for programs: rows from the lowest y, each cell in per cent, 50 where nothing is known."""
+    return {
+        "lower_m": grid.lower_m,
+        "resolution_m": grid.resolution_m,
+        "shape": grid.shape,
+        "taken_percent": np.rint(grid.probability() * 100).astype(int).tolist(),
+        "places": _flat(places),
+    }
