@@ -21,7 +21,7 @@ from infra.local.processes import Child, StartError
 _NEEDS = ("fastapi", "uvicorn", "msgspec", "jwt", "paho", "amqtt", "mujoco", "ruckig", "requests", "numpy")
 _START_WITHIN_S = 60.0
 _ACCOUNT = "demo"
-_DEVICE = "ur5=ur5"
+_ARM = ("--device", "ur5=ur5")
 
 
 class Machine:
@@ -35,7 +35,7 @@ class Machine:
         self._chosen = chosen
         self._environment = chosen.environment()
         self._logs = chosen.home / "logs"
-        self._agent_home = chosen.home / "agents" / "ur5"
+        self._agent_home = chosen.home / "agents" / "this-machine"
         self._children: list[Child] = []
 
     def start(self) -> None:
@@ -99,6 +99,9 @@ class Machine:
                 )
         try:
             self._logs.mkdir(parents=True, exist_ok=True, mode=0o700)
+            former = self._agent_home.with_name("ur5")  # its name before there were rooms; its devices keep their ids
+            if former.exists() and not self._agent_home.exists():
+                former.rename(self._agent_home)
         except OSError as error:
             raise StartError(f"{self._logs} cannot be made ({error.strerror}); set TELESCOPE_HOME") from error
 
@@ -166,9 +169,10 @@ class Machine:
 
     def _pair(self, link: str) -> None:
         """Enroll the agent, and redeem its claim code for the demo account, as a person would."""
+        devices = ("--room", self._chosen.room) if self._chosen.room else _ARM
         said = self._once(
             "-m", "device_agent", "enroll", "--home", str(self._agent_home), "--server", self._chosen.url,
-            "--name", "This machine", "--device", _DEVICE, "--no-wait",
+            "--name", "This machine", *devices, "--no-wait",
         )  # fmt: skip
         words = said.split()
         if "code" not in words:
@@ -177,7 +181,7 @@ class Machine:
             signed_in = self._call("POST", "/auth/sign-in", {"link": link.partition("#sign-in=")[2]})
             self._call("POST", "/agents/claim", {"code": words[words.index("code") + 1]}, signed_in["access_token"])
         except (OSError, ValueError, KeyError) as error:
-            raise StartError(f"the demo robot could not be paired: {error}") from error
+            raise StartError(f"the demo robots could not be paired: {error}") from error
 
     def _await_device(self) -> None:
         """Wait until the agent's link stands: the broker then knows its presence."""

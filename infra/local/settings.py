@@ -8,6 +8,8 @@ from typing import Literal, cast
 
 XMPP_DOMAIN = "telescope.localhost"
 """Of one machine: no name that anybody could look up."""
+ROOMS = Path(__file__).resolve().parents[2] / "robots" / "rooms"
+NO_ROOM = "none"
 
 
 class SettingsError(Exception):
@@ -16,13 +18,17 @@ class SettingsError(Exception):
 
 @dataclass(frozen=True, slots=True)
 class Settings:
-    """Where things are. Ports follow ``port``: MQTT is the next one, MQTT over WebSocket the one after, then XMPP."""
+    """Where things are. Ports follow ``port``: MQTT is the next one, MQTT over WebSocket the one after, then XMPP.
+
+    ``room``: the simulated room whose robots and devices are started; empty for an arm alone.
+    """
 
     home: Path
     port: int
     broker: Literal["amqtt", "mosquitto"]
     host: str = "127.0.0.1"
     xmpp: bool = False
+    room: str = "lab"
 
     @property
     def mqtt_port(self) -> int:
@@ -75,5 +81,15 @@ def read(environment: Mapping[str, str]) -> Settings:
     xmpp = environment.get("TELESCOPE_XMPP", "0")
     if xmpp not in ("0", "1"):
         raise SettingsError(f"TELESCOPE_XMPP is '{xmpp}'; it must be 1, for an XMPP server too, or 0")
+    room = environment.get("TELESCOPE_ROOM", "lab")
+    known = sorted(path.parent.name for path in ROOMS.glob("*/room.toml"))
+    if room not in (*known, NO_ROOM):
+        raise SettingsError(f"TELESCOPE_ROOM is '{room}'; it must be {', '.join(known)}, or {NO_ROOM} for an arm alone")
     home = Path(environment.get("TELESCOPE_HOME", ".telescope")).expanduser().resolve()
-    return Settings(home=home, port=int(port), broker=cast("Literal['amqtt', 'mosquitto']", broker), xmpp=xmpp == "1")
+    return Settings(
+        home=home,
+        port=int(port),
+        broker=cast("Literal['amqtt', 'mosquitto']", broker),
+        xmpp=xmpp == "1",
+        room="" if room == NO_ROOM else room,
+    )

@@ -15,3 +15,13 @@ def test_an_xmpp_server_is_started_only_when_asked_for() -> None:
 def test_a_wrong_wish_is_named(value: str) -> None:
     with pytest.raises(settings.SettingsError, match="TELESCOPE_XMPP is"):
         settings.read({"TELESCOPE_XMPP": value})
+
+
+def test_the_lab_is_started_unless_another_room_or_none_is_wanted() -> None:
+    assert settings.read({}).room == "lab"
+    assert settings.read({"TELESCOPE_ROOM": "none"}).room == ""
+
+
+def test_an_unknown_room_is_named_with_those_that_there_are() -> None:
+    with pytest.raises(settings.SettingsError, match="TELESCOPE_ROOM is 'attic'; it must be lab, or none"):
+        settings.read({"TELESCOPE_ROOM": "attic"})
