@@ -32,7 +32,7 @@ _STEP_S = 0.2
 _LONGEST_STEP_S = 60.0
 _NOISE_C = 0.1
 
-STALLED_S = 1.0
+STALLED_S = 0.5
 """A motor at its limit that has not moved for so long is stuck;"""
 _STILL_RAD_S = 0.02
 _AT_LIMIT = 0.97
@@ -153,7 +153,7 @@ class Health:
             self._heat_2, self._work_j, self._open_s = np.zeros(len(self._names)), 0.0, 0.0
 
     def stuck(self, elapsed_s: float, behind_rad: Floats, effort_nm: Floats, velocity_rad_s: Floats) -> list[str]:
-        """Names of joints whose motors give all they can and have not moved for a second, though they should.
+        """Names of joints whose motors give all they can and have not moved for half a second, though they should.
 
         Args:
             elapsed_s: Since last time [s].

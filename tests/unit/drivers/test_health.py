@@ -122,11 +122,11 @@ def test_a_battery_can_be_set_and_kept_from_its_charger() -> None:
     assert life.live(720)["battery_percent"] == pytest.approx(10.0, abs=0.5)
 
 
-def test_a_motor_that_strains_and_does_not_move_is_stuck_after_a_second() -> None:
+def test_a_motor_that_strains_and_does_not_move_is_stuck_after_half_a_second() -> None:
     health = Life().health
     behind = np.array([0.0, 0.0, 0.3, 0.0, 0.0, 0.0])
     effort = np.where(behind > 0, MOST, 0.0)
-    assert [name for _ in range(9) for name in health.stuck(0.1, behind, effort, STILL)] == []
+    assert [name for _ in range(4) for name in health.stuck(0.1, behind, effort, STILL)] == []
     assert health.stuck(0.1, behind, effort, STILL) == ["elbow"]
     health.forgive()
     assert health.stuck(0.1, behind, effort, STILL) == []
