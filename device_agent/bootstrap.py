@@ -137,13 +137,16 @@ def geometry_of(entry: DeviceEntry, kind: robot_type.RobotType) -> Geometry | No
     return geometry.load(kind, ROBOTS / kind.type, scene=scene, standing=standing)
 
 
-def driver_of(entry: DeviceEntry, kind: robot_type.RobotType, *, trace: Path | None = None) -> Driver:
+def driver_of(
+    entry: DeviceEntry, kind: robot_type.RobotType, *, trace: Path | None = None, faults: Path | None = None
+) -> Driver:
     """The driver of a configured device, not connected.
 
     Args:
         entry: The device.
         kind: Its robot type.
         trace: A folder for what really happened, where it is simulated.
+        faults: A folder for faults to put into simulated robots, ``{device}.toml`` each.
 
     Raises:
         DriverError: Unknown, or an option is.
@@ -154,6 +157,8 @@ def driver_of(entry: DeviceEntry, kind: robot_type.RobotType, *, trace: Path | N
     if name == "mujoco":
         if trace is not None:
             options["trace"] = str(trace / f"{entry.name}.ndjson")
+        if faults is not None:
+            options.setdefault("faults", str(faults / f"{entry.name}.toml"))
         if entry.room:
             options["room"] = str(ROOMS / entry.room)
     return drivers.load(name)(kind, folder, options, entry.name)
@@ -231,6 +236,7 @@ def build(home: Home, *, trace: Path | None = None) -> Cell:
             room=room,
             jail=jail,
             trace=trace,
+            faults=home.faults,
         )
     agent = Agent(devices, transport, outbox=outbox, room=room, address=(pairing.space, pairing.agent))
     return Cell(agent, journal, membership, jail)
@@ -266,6 +272,7 @@ def _device(
     room: Room,
     jail: Jail,
     trace: Path | None,
+    faults: Path,
 ) -> Device:
     kind = type_of(entry)
     return Device(
@@ -274,7 +281,7 @@ def _device(
         space=pairing.space,
         agent=pairing.agent,
         robot_type=kind,
-        driver=driver_of(entry, kind, trace=trace),
+        driver=driver_of(entry, kind, trace=trace, faults=faults),
         journal=journal,
         cloud_clock=clock,
         keys=pairing.public_keys(),

@@ -147,6 +147,7 @@ class Home:
         self.folder = folder
         self.journal = folder / "journal.db"
         self.outbox = folder / "outbox.db"
+        self.faults = folder / "faults"
 
     def identity(self, *, create: bool = False) -> Ed25519PrivateKey:
         """The agent's private key.

@@ -1,0 +1,45 @@
+"""A whole device: Qbo's driver in real time, its scripts in the jail, its sonars' readings on the way to both."""
+
+import math
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from device_agent import geometry
+from device_agent.drivers import load
+from device_agent.drivers.mujoco import WheeledDriver
+from device_agent.protocol import robot_type, topics
+from device_agent.protocol.messages import AckStatus, Measurements
+from tests.unit.agent.test_device import Bench, eventually
+from tests.unit.robots.folders import ROBOTS
+
+FOLDER = ROBOTS / "qbo"
+QBO = robot_type.load(FOLDER)
+
+
+@pytest.fixture
+def bench(tmp_path: Path) -> Iterator[Bench]:
+    driver = load("mujoco")(QBO, FOLDER, {}, "qbo")
+    assert isinstance(driver, WheeledDriver)
+    bench = Bench(tmp_path, kind=QBO, driver=driver, geometry=geometry.load(QBO, FOLDER))  # type: ignore[arg-type]
+    bench.device.start()
+    yield bench
+    bench.stop()
+
+
+def test_it_comes_forward_until_its_sonars_say_near(bench: Bench) -> None:
+    source = (FOLDER / "movements" / "come_near.py").read_text(encoding="utf-8")
+    eventually(lambda: bench.heard(topics.TELE, Measurements, "sonar"))
+    ack = bench.end(bench.command(bench.script("parameters = {'near_m': 1.5, 'speed_m_s': 0.2}\n" + source), epoch=1))
+    assert ack.status is AckStatus.DONE, ack.reason
+    assert ack.output.startswith("stands 1.")
+    sonar = bench.heard(topics.TELE, Measurements, "sonar")
+    nearest_m = min(float(told.values["distance_m.left"]) for told in sonar)
+    assert 1.2 < nearest_m <= 1.5
+    odometry = bench.heard(topics.TELE, Measurements, "odometry")
+    farthest_m = max(float(told.values["x_m"]) for told in odometry)
+    assert farthest_m == pytest.approx(2.0 - 0.156 - nearest_m, abs=0.06)
+    assert float(odometry[-1].values["x_m"]) < farthest_m, "it went back a little"
+    assert math.isclose(float(odometry[-1].values["y_m"]), 0.0, abs_tol=0.01)
+    assert bench.heard(topics.TELE, Measurements, "health")
