@@ -30,8 +30,7 @@ from device_agent.mjcf.ties import Ties  # noqa: E402
 from device_agent.protocol import robot_type  # noqa: E402
 
 WIDTH, HEIGHT, CAMERA = 800, 600, "picture"
-TILE = 300
-COLUMNS = 4
+TILE = 190
 VIEWS = 8
 POSES = ("expressions", "postures", "visemes")
 
@@ -85,8 +84,9 @@ class Studio:
         return camera
 
 
-def sheet(pictures: Sequence[Any], columns: int = COLUMNS) -> Any:
-    """Pictures of one size side by side, in rows."""
+def sheet(pictures: Sequence[Any]) -> Any:
+    """Pictures of one size side by side, in about as many rows as columns."""
+    columns = math.ceil(math.sqrt(len(pictures)))
     blank = np.full_like(pictures[0], 255)
     filled = [*pictures, *[blank] * (-len(pictures) % columns)]
     rows = [np.concatenate(filled[start : start + columns], axis=1) for start in range(0, len(filled), columns)]

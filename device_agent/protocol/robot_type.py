@@ -86,11 +86,13 @@ class Gaze(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
 
     Attributes:
         frame: One of the type's ``frames``: of a camera, of a face.
-        axis: The direction in which it looks, in that frame.
+        also: More such frames, that look at the same point: the other eye. Each needs a joint of its own.
+        axis: The direction in which it looks, in each of these frames.
         joints: Those that turn it.
     """
 
     frame: Label
+    also: Annotated[tuple[Label, ...], Meta(max_length=3)] = ()
     axis: Vector3 = (1.0, 0.0, 0.0)
     joints: Annotated[tuple[Label, ...], Meta(min_length=1)]
 
@@ -226,7 +228,7 @@ def _check_workspace(box: Workspace, robot_type: RobotType) -> None:
 
 def _check_gaze(gaze: Gaze, robot_type: RobotType) -> None:
     for what, named, known in (
-        ("frame", (gaze.frame,), robot_type.frames),
+        ("frame", (gaze.frame, *gaze.also), robot_type.frames),
         ("joint", gaze.joints, tuple(joint.name for joint in robot_type.joints)),
     ):
         unknown = sorted(set(named) - set(known))

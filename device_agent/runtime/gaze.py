@@ -12,7 +12,7 @@ from device_agent.runtime.lease import Refused
 
 _ROUNDS = 60
 _NUDGE_RAD = 1e-5
-_NEAR_RAD = 2e-3
+_NEAR_RAD = 5e-4
 _DAMPING = 1e-3
 _LONGEST_STEP_RAD = 0.3
 _NEAREST_M = 1e-3
@@ -42,15 +42,11 @@ def aim(robot_type: RobotType, geometry: Geometry, start_rad: Sequence[float], p
     axis = np.array(gaze.axis) / np.linalg.norm(gaze.axis)
 
     def error(joints: Array) -> Array:
-        """From where it looks to where it should, as unit vectors."""
+        """From where it looks to where it should, as unit vectors, one frame after the other."""
         position = np.array(start_rad, dtype=float)
         position[turning] = joints
-        pose = geometry.poses(position.tolist())[gaze.frame]
-        way = np.array(point_m) - np.array(pose[:3])
-        far = float(np.linalg.norm(way))
-        if far < _NEAREST_M:
-            raise Refused("out_of_reach", "the point is inside of what it looks with")
-        return np.asarray(way / far - _turned(pose, axis))
+        poses = geometry.poses(position.tolist())
+        return np.concatenate([_beside(poses[frame], axis, point_m) for frame in (gaze.frame, *gaze.also)])
 
     joints = np.clip(np.array(start_rad, dtype=float)[turning], lower, upper)
     for _ in range(_ROUNDS):
@@ -60,12 +56,22 @@ def aim(robot_type: RobotType, geometry: Geometry, start_rad: Sequence[float], p
         slopes = np.column_stack(
             [(error(joints + step) - now) / _NUDGE_RAD for step in np.eye(len(turning)) * _NUDGE_RAD]
         )
-        square = slopes @ slopes.T + _DAMPING * np.eye(3)
+        # Far from the point much damping: else eyes and neck turn against one another, which changes next to nothing.
+        square = slopes @ slopes.T + (_DAMPING + float(now @ now)) * np.eye(len(now))
         step = -slopes.T @ np.linalg.solve(square, now)
         joints = np.clip(
             joints + step * min(1.0, _LONGEST_STEP_RAD / max(float(np.abs(step).max()), 1e-12)), lower, upper
         )
     raise Refused("out_of_reach", f"{', '.join(gaze.joints)} cannot turn far enough to look there")
+
+
+def _beside(pose: Pose, axis: Array, point_m: Vector3) -> Array:
+    """From where a frame looks to where it should, as unit vectors."""
+    way = np.array(point_m) - np.array(pose[:3])
+    far = float(np.linalg.norm(way))
+    if far < _NEAREST_M:
+        raise Refused("out_of_reach", "the point is inside of what it looks with")
+    return np.asarray(way / far - _turned(pose, axis))
 
 
 def _turned(pose: Pose, axis: Array) -> Array:

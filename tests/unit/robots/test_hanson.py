@@ -1,0 +1,74 @@
+"""The Hanson-style head: rods and threads, a gaze of two eyes, and faces that differ."""
+
+import math
+from itertools import combinations
+
+import mujoco
+import numpy as np
+import pytest
+
+from device_agent import geometry
+from device_agent.mjcf.ties import Ties
+from device_agent.runtime import gaze
+from tests.unit.robots.folders import ROBOTS, Bench
+
+FOLDER = ROBOTS / "hanson"
+SIX = {"happy", "sad", "angry", "surprised", "afraid", "disgusted"}
+"""Ekman's basic emotions."""
+
+
+@pytest.fixture
+def bench() -> Bench:
+    return Bench(FOLDER)
+
+
+def test_rods_and_threads_pull_the_skin_where_the_ties_say(bench: Bench):
+    ties = Ties(bench.model)
+    assert len(ties.all) == 21
+    random = np.random.default_rng(2)
+    bench.data.ctrl[bench.ctrl] = random.uniform(bench.lower, bench.upper)
+    mujoco.mj_step(bench.model, bench.data, nstep=1500)
+    assert bench.data.qpos[bench.qpos] == pytest.approx(bench.data.ctrl[bench.ctrl], abs=1e-3)
+    settled = bench.data.qpos.copy()
+    ties.settle(settled)
+    assert settled == pytest.approx(bench.data.qpos, abs=1e-3)
+
+
+def test_it_moves_its_head_less_than_its_motors(bench: Bench):
+    pitch = bench.model.joint("head_pitch").qposadr[0]
+    bench.data.ctrl[[bench.model.actuator(name).id for name in ("Upper-Gimbal-L", "Upper-Gimbal-R")]] = 1.9, -2.0
+    mujoco.mj_step(bench.model, bench.data, nstep=1500)
+    assert bench.data.qpos[pitch] == pytest.approx(0.15 * 3.9, abs=0.01)
+
+
+@pytest.mark.parametrize("point_m", [(1.0, 0.0, 0.4), (0.45, 0.1, 0.3), (0.3, -0.25, 0.5), (1.0, 1.0, 0.3)])
+def test_both_eyes_look_at_a_point_and_the_neck_helps(bench: Bench, point_m: tuple[float, float, float]):
+    shape = geometry.load(bench.type, FOLDER)
+    assert shape is not None
+    position = dict(zip(bench.names, bench.home.tolist(), strict=True))
+    position |= gaze.aim(bench.type, shape, bench.home.tolist(), point_m)
+    poses = shape.poses([position[name] for name in bench.names])
+    for eye in ("eye_left", "eye_right"):
+        x, y, z, *quaternion = poses[eye]
+        ahead = np.empty(3)
+        mujoco.mju_rotVecQuat(ahead, np.array([1.0, 0.0, 0.0]), np.array(quaternion))
+        way = np.array(point_m) - (x, y, z)
+        assert math.acos(min(1.0, float(ahead @ way / np.linalg.norm(way)))) < 0.005
+    assert abs(position["EyeTurn-L"]) < 0.5, "the neck takes its share"
+
+
+def test_it_can_show_the_basic_emotions_and_no_two_expressions_are_alike(bench: Bench):
+    shown = bench.type.expressions
+    assert set(shown) >= SIX | {"neutral", "thinking", "sleepy"}
+    faces = {
+        name: np.array([pose.get(joint, 0.0) for joint in bench.names]) / (bench.upper - bench.lower)
+        for name, pose in shown.items()
+    }
+    for (one, first), (other, second) in combinations(faces.items(), 2):
+        assert np.abs(first - second).max() > 0.2, f"{one} and {other}"
+
+
+def test_its_mouth_has_a_dozen_shapes(bench: Bench):
+    assert len(bench.type.visemes) >= 12
+    mouth = ("Jaw", "Lip", "EE-oo", "Smile", "Frown")
+    assert all(joint.startswith(mouth) for pose in bench.type.visemes.values() for joint in pose)
