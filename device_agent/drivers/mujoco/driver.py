@@ -28,6 +28,8 @@ _LOOKED_S = 0.1
 RAMP_PERIODS = 1.5
 """Control periods over which a target is approached. Targets arrive up to half a period late on a busy machine; a ramp
 of one and a half then never runs dry between two of them, so the motion has no steps (cost: half a period of delay)."""
+_NEAR_M = 0.95
+"""Of a room so much is drawn around a robot that stands still in it: the table under it, the floor under that."""
 
 
 class MujocoDriver:
@@ -95,10 +97,14 @@ class MujocoDriver:
         self._connected = True
 
     def twin(self) -> Twin | None:
-        """The drawing: the robot, and the still parts of the scene when the robot has the world for itself."""
+        """The drawing: the robot, and what stands still around it; of a room only what is near."""
         self._require()
         return twin.draw(
-            self._world.model, base=self._base, device=self._device, prefix=self._prefix, scenery=not self._world.shared
+            self._world.model,
+            base=self._base,
+            device=self._device,
+            prefix=self._prefix,
+            scenery_m=_NEAR_M if self._world.shared else math.inf,
         )
 
     def observe(self) -> Observation:

@@ -29,7 +29,7 @@ _SHAPES: dict[int, Shape] = {
 }
 
 
-def draw(model: Any, *, base: int, device: str, prefix: str = "", scenery: bool = False) -> Twin:
+def draw(model: Any, *, base: int, device: str, prefix: str = "", scenery_m: float = 0.0) -> Twin:
     """The drawing of one robot, in the frame of its base.
 
     A pose follows from it thus: start at the parent's; move by ``position_m`` and ``quaternion``; where there is a
@@ -41,7 +41,8 @@ def draw(model: Any, *, base: int, device: str, prefix: str = "", scenery: bool 
         base: Index of the robot's top-level body.
         device: Id of the device.
         prefix: Taken off the names.
-        scenery: Whether to add what is fixed to the world, as a body ``scene`` of its own. The base must be fixed too.
+        scenery_m: How near something must be to the base that is fixed to the world, as the base then must be too, to
+            be drawn with it, as a body ``scene`` of its own [m]; 0 for none of it.
 
     Raises:
         DriverError: A body turns about a ball joint, or floats free below the base.
@@ -49,8 +50,8 @@ def draw(model: Any, *, base: int, device: str, prefix: str = "", scenery: bool 
     bodies: list[Body] = []
     index_of: dict[int, int] = {}
     ties = Ties(model)
-    if scenery and model.body_weldid[base] == 0:
-        bodies.append(_scene(model, base))
+    if scenery_m > 0 and model.body_weldid[base] == 0:
+        bodies.append(_scene(model, base, scenery_m))
     for body in range(base, model.nbody):
         if body == base:
             bodies.append(Body(name=_name(model, body, prefix), parent=-1, position_m=_ORIGIN, quaternion=_IDENTITY,
@@ -106,16 +107,18 @@ def _joint(model: Any, joint: int, prefix: str, ties: Ties) -> TwinJoint:
     )
 
 
-def _scene(model: Any, base: int) -> Body:
-    """The world body's geoms and those of bodies fixed to it, seen from the base."""
+def _scene(model: Any, base: int, within_m: float) -> Body:
+    """The world body's geoms and those of bodies fixed to it, as far as they are near, seen from the base."""
     data = mujoco.MjData(model)
     mujoco.mj_kinematics(model, data)
     inverse_position, inverse_quaternion = np.empty(3), np.empty(4)
     mujoco.mju_negPose(inverse_position, inverse_quaternion, data.xpos[base], data.xquat[base])
     geometries: list[Geometry] = []
     for body in range(model.nbody):
-        if model.body_weldid[body] == 0 and model.body_rootid[body] != base:
+        if model.body_weldid[body] == 0 and model.body_mocapid[body] < 0 and model.body_rootid[body] != base:
             for geom in _visible(model, body):
+                if _away_m(model, data, geom, data.xpos[base]) > within_m:
+                    continue
                 in_world = np.empty(4)
                 mujoco.mju_mat2Quat(in_world, data.geom_xmat[geom])
                 position, quaternion = np.empty(3), np.empty(4)
@@ -124,6 +127,15 @@ def _scene(model: Any, base: int) -> Body:
                 )
                 geometries.append(_geometry(model, geom, position, quaternion))
     return Body(name="scene", parent=-1, position_m=_ORIGIN, quaternion=_IDENTITY, geometries=tuple(geometries))
+
+
+def _away_m(model: Any, data: Any, geom: int, place: Any) -> float:
+    """How far the box around a geom is from a place; of a plane the plane itself [m]."""
+    offset = data.geom_xmat[geom].reshape(3, 3).T @ (place - data.geom_xpos[geom])
+    if model.geom_type[geom] == int(mujoco.mjtGeom.mjGEOM_PLANE):
+        return abs(float(offset[2]))
+    box = model.geom_aabb[geom]
+    return float(np.linalg.norm(np.maximum(np.abs(offset - box[:3]) - box[3:], 0.0)))
 
 
 def _shapes(model: Any, body: int) -> tuple[Geometry, ...]:

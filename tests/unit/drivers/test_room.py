@@ -97,6 +97,22 @@ def test_a_driver_in_a_room_is_the_robot_of_its_name():
         stranger.connect()
 
 
+def test_the_drawing_of_an_arm_in_a_room_has_its_table_and_not_the_whole_room():
+    world = lab()
+    kind = robot_type.load(ROBOTS / "ur5")
+    arm = driver.MujocoDriver(robot_type=kind, world=world, device="ur5", prefix="ur5/")
+    arm._resolve(world.model)
+    arm._connected = True
+    twin = arm.twin()
+    assert twin is not None
+    assert twin.bodies[0].name == "scene"
+    assert 7 <= len(twin.bodies[0].geometries) < 20
+    assert len(msgspec.json.encode(twin)) < 64_000
+    assert [1.65 - 1.95, 0.0, -0.02] in [
+        pytest.approx(list(shape.position_m), abs=1e-9) for shape in twin.bodies[0].geometries
+    ]
+
+
 def test_a_copy_is_of_one_moment_and_shows_poses():
     world = lab()
     snapshot = world.step(500)

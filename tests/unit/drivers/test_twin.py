@@ -1,5 +1,6 @@
 """The twin moves as the simulation does: the page computes exactly this."""
 
+import math
 from pathlib import Path
 from typing import Any
 
@@ -94,7 +95,7 @@ def test_forward_kinematics_of_the_twin_equals_the_simulation(folder: Path):
     manifest = robot_type.load(folder)
     model = mujoco.MjModel.from_xml_path(str(folder / manifest.scene))
     base = int(model.body_rootid[model.jnt_bodyid[model.joint(manifest.joints[0].name).id]])
-    twin = draw(model, base=base, device="arm", scenery=True)
+    twin = draw(model, base=base, device="arm", scenery_m=math.inf)
     read_back = codec.decode(codec.encode(twin, limit=codec.MAX_RETAINED_BYTES), Twin)
     # What stands around a robot that goes away from it is not drawn in its own frame.
     assert_same_poses(model, read_back, base, scenery=bool(model.body_weldid[base] == 0))
@@ -125,7 +126,7 @@ MANY = """
 def test_several_joints_on_a_body_slides_anchors_and_references(scenery: bool):
     model = mujoco.MjModel.from_xml_string(MANY)
     base = model.body("base").id
-    twin = draw(model, base=base, device="x", scenery=scenery)
+    twin = draw(model, base=base, device="x", scenery_m=math.inf if scenery else 0.0)
     assert_same_poses(model, twin, base, scenery=scenery)
     names = [body.name for body in twin.bodies]
     assert names == ["scene"] * scenery + ["base", "gimbal#0", "gimbal#1", "gimbal", "plate", "tip"]
@@ -135,7 +136,7 @@ def test_base_that_moves_is_still_the_origin():
     floating = MANY.replace('<body name="base" pos="1 2 3" euler="20 30 40">', '<body name="base"><freejoint/>')
     model = mujoco.MjModel.from_xml_string(floating)
     base = model.body("base").id
-    twin = draw(model, base=base, device="x", scenery=True)
+    twin = draw(model, base=base, device="x", scenery_m=math.inf)
     assert "scene" not in [body.name for body in twin.bodies], "what stands still would move with the robot"
     assert_same_poses(model, twin, base, scenery=False)
 
