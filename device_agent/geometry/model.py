@@ -11,6 +11,8 @@ import numpy as np
 import numpy.typing as npt
 
 from device_agent.geometry.pairs import ROOM_PREFIX, Pairs
+from device_agent.geometry.planner import Planner
+from device_agent.geometry.probe import Probe
 from device_agent.geometry.solver import Solver
 from device_agent.geometry.standing import Standing
 from device_agent.mjcf.ties import Ties
@@ -19,14 +21,6 @@ from device_agent.protocol.messages import Pose
 from device_agent.protocol.robot_type import RobotType
 
 Floats = npt.NDArray[np.float64]
-
-_STEP_M = 0.01
-"""What comes nearer by less than this, and goes away again, may be missed: half of the usual margin."""
-_GLANCES = 6
-_CLOSER = 3
-"""How often the place is halved in which a glance finds a way to end."""
-_SAME_M = 1e-7
-"""Less than this is no change of a distance: far above rounding, far below what creeping could add up to."""
 
 
 class MujocoGeometry:
@@ -50,7 +44,6 @@ class MujocoGeometry:
         except (ValueError, OSError, mujoco.FatalError) as error:
             where = scene if standing is None else f"{scene} in {standing.room}"
             raise GeometryError(f"{where}: MuJoCo cannot build this model: {error}") from error
-        self._data = mujoco.MjData(self._model)
         self._lock = threading.Lock()
         self._type = robot_type
         self._ties = Ties(self._model)
@@ -61,12 +54,12 @@ class MujocoGeometry:
         self._home = np.array([robot_type.home_rad[joint.name] for joint in robot_type.joints])
         lower = np.array([joint.lower_rad for joint in robot_type.joints])
         upper = np.array([joint.upper_rad for joint in robot_type.joints])
-        self._place(self._home)
         self._pairs = Pairs(self._model, robot_type, joints, self._frames, base=self._base, ties=self._ties)
-        self._pairs.calibrate(self._data, self._place, home=self._home, lower=lower, upper=upper)
-        self._place(self._home)
-        self._measured = self._home, self._pairs.rooms_at_least(self._data)
+        self._probe = Probe(self._model, self._qpos, self._pairs, self._ties, self._home)
+        self._pairs.calibrate(self._probe.data, self._probe.place, home=self._home, lower=lower, upper=upper)
+        self._probe = Probe(self._model, self._qpos, self._pairs, self._ties, self._home)
         self._solver = Solver(self._model, self._qpos, self._frames, lower=lower, upper=upper)
+        self._planner = Planner(self._model, joints, self._pairs, self._ties, lower=lower, upper=upper)
 
     @property
     def frames(self) -> tuple[str, ...]:
@@ -76,72 +69,23 @@ class MujocoGeometry:
     def poses(self, position_rad: Sequence[float]) -> Mapping[str, Pose]:
         """Pose of each frame in the robot's base frame."""
         with self._lock:
-            self._place(position_rad)
+            self._probe.place(position_rad)
             return {name: self._pose(is_site, index) for name, (is_site, index) in self._frames.items()}
 
     def clearance(self, position_rad: Sequence[float]) -> Clearance:
         """The tightest place of the robot in one position."""
         with self._lock:
-            self._place(position_rad)
-            return self._pairs.tightest(self._data)
+            return self._probe.clearance(position_rad)
 
     def sweep(self, path_rad: Sequence[Sequence[float]]) -> Sweep:
         """Go from one joint position straight to the next until something is too near, or nearer than it was."""
-        path = np.asarray(path_rad, dtype=np.float64)
-        legs = np.diff(path, axis=0)
         with self._lock:
-            if self._surely_clear(path):
-                return Sweep(1.0)
-            self._place(path[0])
-            near = self._pairs.near(self._data, np.abs(legs))
-            for index, leg in enumerate(legs):
-                share = 0.0
-                while share < 1.0 and near.any:
-                    gone = share
-                    share = min(1.0, share + near.safe_share(index, _STEP_M))
-                    self._place(path[index] + share * leg)
-                    near.look(self._data, index, share)
-                    if near.broken(_SAME_M):
-                        return Sweep((index + gone) / len(legs), near.tightest())
-            return Sweep(1.0)
-
-    def _surely_clear(self, path: Floats) -> bool:
-        """Whether nothing can come too near, by the room there was where it was last measured: most ways, cheaply.
-
-        How near a pair may have come grows with each joint's distance from there, so the corners of a path tell it all.
-        Measured anew where that does not suffice.
-        """
-        if self._within(path):
-            return True
-        self._place(path[0])
-        self._measured = path[0], self._pairs.rooms_at_least(self._data)
-        return self._within(path)
-
-    def _within(self, path: Floats) -> bool:
-        origin, room_m = self._measured
-        return bool(np.all(self._pairs.closing(np.abs(path - origin)) <= room_m))
+            return self._probe.sweep(path_rad)
 
     def glance(self, start_rad: Sequence[float], end_rad: Sequence[float]) -> float:
         """The share of a straight way that seems clear, by six places on it, and three where it ends."""
-        start, way = np.asarray(start_rad, dtype=np.float64), np.subtract(end_rad, start_rad)
         with self._lock:
-            self._place(start)
-            before = self._pairs.too_near(self._data)
-
-            def clear(share: float) -> bool:
-                there = start + share * way
-                if self._within(there[np.newaxis]):
-                    return True
-                self._place(there)
-                return self._pairs.too_near(self._data) <= before
-
-            for index in range(_GLANCES):
-                if not clear((index + 1) / _GLANCES):
-                    low, half = index / _GLANCES, 0.5 / _GLANCES
-                    for _ in range(_CLOSER):
-                        low, half = (low + half if clear(low + half) else low), half / 2
-                    return low
-            return 1.0
+            return self._probe.glance(start_rad, end_rad)
 
     def speed_m_s(self, velocity_rad_s: Sequence[float]) -> float:
         """A speed that no point of the robot exceeds [m/s]."""
@@ -172,15 +116,20 @@ class MujocoGeometry:
             f"{math.degrees(miss_rad):.0f} degrees away"
         )
 
+    def plan(
+        self, start_rad: Sequence[float], goal_rad: Sequence[float], *, seed: int = 0, within_s: float = 5.0
+    ) -> tuple[tuple[float, ...], ...]:
+        """A way around what is near.
+
+        Raises:
+            GeometryError: None was found in time, or there is no room at its end.
+        """
+        return self._planner.plan(start_rad, goal_rad, seed=seed, within_s=within_s)
+
     # ------------------------------------------------------------ positions and names
 
-    def _place(self, position_rad: Sequence[float] | Floats) -> None:
-        self._data.qpos[self._qpos] = position_rad
-        self._ties.settle(self._data.qpos)
-        mujoco.mj_kinematics(self._model, self._data)
-
     def _pose(self, is_site: bool, index: int) -> Pose:
-        data = self._data
+        data = self._probe.data
         back = data.xmat[self._base].reshape(3, 3).T
         position = data.site_xpos[index] if is_site else data.xpos[index]
         matrix = (data.site_xmat[index] if is_site else data.xmat[index]).reshape(3, 3)
@@ -196,8 +145,9 @@ class MujocoGeometry:
         size = math.hypot(*pose[3:])
         if size <= 0:
             raise GeometryError("a quaternion must not be all zeros")
+        data = self._probe.data
         with self._lock:
-            base_position, base_quaternion = self._data.xpos[self._base].copy(), self._data.xquat[self._base].copy()
+            base_position, base_quaternion = data.xpos[self._base].copy(), data.xquat[self._base].copy()
         position, quaternion = np.empty(3), np.empty(4)
         mujoco.mju_rotVecQuat(position, np.array(pose[:3]), base_quaternion)
         mujoco.mju_mulQuat(quaternion, base_quaternion, np.array(pose[3:]) / size)

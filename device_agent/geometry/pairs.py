@@ -4,6 +4,7 @@ Distances are exact where it matters (``mj_geomDistance``) and bounded where it 
 its bounding boxes say that it could be the one that counts.
 """
 
+import copy
 import math
 from collections.abc import Callable, Sequence
 from typing import Any
@@ -122,6 +123,15 @@ class Pairs:
                 f"the home position has no room ({clearance.text}, {clearance.room_m * 1000:.1f} mm); "
                 "change home_rad, margin_m or workspace, or <exclude> the pair in the model"
             )
+
+    def widened(self, share: float) -> "Pairs":
+        """The same with margins wider by a share of themselves, and as much less of the workspace."""
+        wider = copy.copy(self)
+        wider._margin = self._margin * (1 + share)  # noqa: SLF001 (its own kind)
+        wider._line = np.zeros(6)  # noqa: SLF001
+        held_m = share * float(np.max(self._margin, initial=0.0))
+        wider._lower, wider._upper = self._lower + held_m, self._upper - held_m  # noqa: SLF001
+        return wider
 
     def tightest(self, data: Any) -> Clearance:
         """Where there is least room."""

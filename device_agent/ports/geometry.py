@@ -93,3 +93,21 @@ class Geometry(Protocol):
         Raises:
             GeometryError: No such frame, or out of reach; the text says how near the robot can come.
         """
+
+    def plan(
+        self, start_rad: Sequence[float], goal_rad: Sequence[float], *, seed: int = 0, within_s: float = 5.0
+    ) -> tuple[tuple[float, ...], ...]:
+        """Positions from ``start_rad`` to ``goal_rad``, with a straight way between each and the next that is clear.
+
+        With more room than ``sweep`` asks for, where there is that much, so that the way may be rounded off. Joints of
+        limbs that need not move stay. May take seconds: never call it from the control loop.
+
+        Args:
+            start_rad: Where the device is.
+            goal_rad: Where it shall be.
+            seed: The same seed finds the same way.
+            within_s: How long to look for one [s].
+
+        Raises:
+            GeometryError: None was found in time, or there is no room at its end; the text says so.
+        """

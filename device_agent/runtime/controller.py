@@ -16,19 +16,19 @@ from device_agent.protocol.messages import Mode, Setpoint, StopLatch
 from device_agent.protocol.robot_type import RobotType
 from device_agent.runtime.audit import Tell, to_nobody
 from device_agent.runtime.authority import Authority, Tenure
-from device_agent.runtime.base import BaseMotion
-from device_agent.runtime.courses import Course, Drive, Move, Outcome
+from device_agent.runtime.courses import Drive, Move, Passage
 from device_agent.runtime.envelope import Envelope
+from device_agent.runtime.helm import Helm
 from device_agent.runtime.lease import Lease, LeaseGate, Refused
-from device_agent.runtime.motion import Motion, MotionError
+from device_agent.runtime.motion import MotionError
 from device_agent.runtime.restrictions import Restriction
 from device_agent.runtime.stream import Stream
+from device_agent.runtime.way import Way
 
 _CREEP_RAD_S = 0.02
 """Slower than this, setpoints that end are a slider let go at its target, not an operator lost in mid-motion."""
 _REMEMBERED = 0.998
 """Of how late the control loop was called, from one period to the next: half of it after three seconds."""
-_LONGEST_DRIVE_S = 60.0
 _SAME_RAD = 1e-6
 
 
@@ -71,9 +71,9 @@ class Controller:
     ) -> None:
         self._joints = robot_type.joints
         self._period_s = robot_type.period_ms / 1000
-        self._motion = Motion(robot_type)
-        self._base = None if robot_type.base is None else BaseMotion(robot_type.base, self._period_s)
         self._envelope = Envelope(robot_type, geometry)
+        self._helm = Helm(robot_type, self._envelope)
+        self._motion = self._helm.motion
         self._stream = Stream(robot_type, self._envelope, geometry)
         self._authority = Authority(gate, latch, hold=self._hold, tell=tell)
         self.changed = self._authority.changed
@@ -81,7 +81,6 @@ class Controller:
         self._mode = Mode.IDLE
         self._due_s = math.inf
         self._late_s = 0.0
-        self._course: Course | None = None
         self._driver_limits: tuple[str, ...] = ()
 
     # ------------------------------------------------------------ what other threads ask
@@ -155,7 +154,7 @@ class Controller:
         """The action is over; what still moves is held."""
         with self._lock:
             if self._authority.tenure is tenure:
-                self._interrupt(Refused("ended", "the action ended"))
+                self._helm.interrupt(Refused("ended", "the action ended"))
                 self._authority.tenure = None
 
     def move(self, tenure: Tenure, position_rad: Mapping[str, float], *, speed: float) -> Move:
@@ -167,13 +166,18 @@ class Controller:
         """
         with self._lock:
             self._check_course(tenure)
-            if not 0 < speed <= 1:
-                raise Refused("bad_speed", f"speed must be above 0 and at most 1, not {speed}")
-            target = self._envelope.target(position_rad, self._motion.position_rad)
-            self._interrupt(Refused("replaced", "another course took its place"))
-            move = Move(target_rad=target, speed=speed)
-            self._course = move
-            return move
+            return self._helm.move(position_rad, speed)
+
+    def go_along(self, tenure: Tenure, way: Way) -> Passage:
+        """Start along a way that was planned, as part of an action. It begins where the device rests.
+
+        Raises:
+            Refused: The action no longer has the device, stopped, faulty, held by the room, it begins elsewhere, or it
+                leads a joint out of its range.
+        """
+        with self._lock:
+            self._check_course(tenure)
+            return self._helm.go_along(way)
 
     def drive(self, tenure: Tenure, twist: Twist, *, duration_s: float) -> Drive:
         """Move the base as part of an action, for ``duration_s`` [s]; then it brakes by itself.
@@ -184,19 +188,7 @@ class Controller:
         """
         with self._lock:
             self._check_course(tenure)
-            if self._base is None:
-                raise Refused("no_base", "this robot does not drive")
-            if not 0 < duration_s <= _LONGEST_DRIVE_S:
-                raise Refused(
-                    "bad_duration", f"a drive lasts more than 0 and at most {_LONGEST_DRIVE_S:.0f} s, not {duration_s}"
-                )
-            for asked, limit, name in zip(twist, self._base.limits, Twist._fields, strict=True):
-                if not abs(asked) <= limit:
-                    raise Refused("out_of_range", f"{name} can be up to {limit:.3f}, not {asked}")
-            self._interrupt(Refused("replaced", "another course took its place"))
-            drive = Drive(twist=twist, periods=math.ceil(duration_s / self._period_s))
-            self._course = drive
-            return drive
+            return self._helm.drive(twist, duration_s)
 
     def restrict(self, source: str, speed: float, why: str) -> None:
         """The room slows the device, or holds it with a speed of 0; of several sources the strictest counts.
@@ -249,9 +241,7 @@ class Controller:
         """The driver answers again, at rest at ``position_rad``, shape (n,) [rad]."""
         with self._lock:
             if self._authority.recover():
-                self._motion.start_at(position_rad)
-                if self._base is not None:
-                    self._base.start()
+                self._helm.start_at(position_rad)
 
     def applied(self, position_rad: Sequence[float]) -> None:
         """What the driver made of the last command, shape (n,) [rad]; where it differs, ``limited`` says so."""
@@ -303,7 +293,13 @@ class Controller:
     @property
     def moving(self) -> bool:
         """Whether any commanded velocity is not zero."""
-        return self._motion.moving or (self._base is not None and self._base.moving)
+        return self._helm.moving
+
+    @property
+    def commanded_rad(self) -> list[float]:
+        """Where the joints were told to be in the last period, shape (n,)."""
+        with self._lock:
+            return list(self._motion.position_rad)
 
     # ------------------------------------------------------------ the control loop
 
@@ -319,13 +315,16 @@ class Controller:
             self._authority.expire(now_s)
             self._mode = self._decide(now_s)
             try:
-                self._go(late_s)
+                obstacle = self._helm.look(late_s)
+                if obstacle is not None:
+                    self._block(obstacle)
+                self._helm.update()
             except MotionError as error:
                 self._authority.end(Refused("fault", str(error)))
                 self._mode = Mode.HOLDING
-                self._give_up()
+                self._helm.give_up()
             limited = self._limits()
-            self._advance(limited)
+            self._helm.settle(limited)
             lease = self._authority.lease(now_s)
             return Tick(
                 list(self._motion.position_rad),
@@ -335,49 +334,31 @@ class Controller:
                 self._stream.sent_ms,
                 self._stream.loop_age_ms,
                 limited,
-                REST if self._base is None else self._base.twist,
+                self._helm.twist,
             )
 
-    def _go(self, late_s: float) -> None:
-        """Advance one period, if from there on the device could still come to rest with room around it."""
-        if self._motion.braking and self._motion.moving and late_s > self._period_s / 2:
-            self._motion.make_up(late_s)  # a busy machine must not stretch a hold
-        if not self._motion.braking:
-            obstacle = self._envelope.blocked(self._motion.propose())
-            if obstacle is not None:
-                self._block(obstacle)
-        self._motion.update()
-        if self._base is not None:
-            self._base.update()
-
-    def _give_up(self) -> None:
-        """Brake; where even that cannot be planned, stand still at once."""
-        self._brake()
-        try:
-            self._motion.update()
-        except MotionError:
-            self._motion.start_at(self._motion.position_rad)
-
     def _block(self, obstacle: Clearance) -> None:
-        if self._course is None:
+        course = self._helm.course
+        if course is None:
             self._stream.block(obstacle)
             self._motion.brake()
         else:
-            self._course.note((obstacle.text,))
-            self._interrupt(Refused("no_room", f"something is in the way: {obstacle.text}; the device holds before it"))
+            course.note((obstacle.text,))
+            why = f"something is in the way: {obstacle.text}; the device holds before it"
+            self._helm.interrupt(Refused("no_room", why))
 
     def _decide(self, now_s: float) -> Mode:
         if self._authority.fault is not None:
-            self._brake()
+            self._helm.brake()
             return Mode.FAULT
         if self._authority.latch is not None:
-            self._brake()
+            self._helm.brake()
             return Mode.STOPPED
         if self._authority.restrictions.speed <= 0:
-            self._brake()
+            self._helm.brake()
             return Mode.HOLDING
         if self._authority.tenure is not None:
-            self._follow_course()
+            self._helm.follow(self._authority.restrictions.speed)
             return Mode.ACTION
         if self._stream.fresh(now_s, self._motion, late_s=self._late_s):
             self._stream.follow(self._motion, allowed=self._authority.restrictions.speed)
@@ -385,33 +366,9 @@ class Controller:
         if self._mode is Mode.STREAMING and self._motion.fastest_rad_s > _CREEP_RAD_S:
             self._authority.end(Refused("watchdog", "setpoints stopped coming"))
         self._stream.drop()
-        self._brake()
+        self._helm.brake()
         held = self._mode is Mode.HOLDING and (self.moving or self._authority.burned)
         return Mode.HOLDING if held else Mode.IDLE
-
-    def _follow_course(self) -> None:
-        speed = self._authority.restrictions.speed
-        if isinstance(self._course, Move):
-            self._motion.follow(self._course.target_rad, speed=self._course.speed * speed, together=True)
-        elif isinstance(self._course, Drive) and self._base is not None:
-            if self._course.periods > 0:
-                self._base.follow(Twist(*(part * speed for part in self._course.twist)))
-            else:
-                self._base.brake()
-            self._course.periods -= 1
-
-    def _advance(self, limited: tuple[str, ...]) -> None:
-        """See whether the course has come to its end."""
-        course = self._course
-        if course is None:
-            return
-        course.note(limited)
-        if self._motion.reached if isinstance(course, Move) else self._driven(course):
-            self._course = None
-            course.end(Outcome.REACHED)
-
-    def _driven(self, course: Course) -> bool:
-        return isinstance(course, Drive) and course.periods <= 0 and not self.moving
 
     def _limits(self) -> tuple[str, ...]:
         """What makes the motion other than asked, for telemetry."""
@@ -432,19 +389,8 @@ class Controller:
             if self._mode in {Mode.STREAMING, Mode.ACTION}:  # told once, not for each order to hold while it brakes
                 self._authority.note(EventKind.HELD, why.message, self._authority.said(why), "warning")
             self._mode = Mode.HOLDING
-        self._interrupt(why)
-        self._brake()
-
-    def _interrupt(self, why: Refused) -> None:
-        if self._course is not None:
-            interrupted, self._course = self._course, None
-            interrupted.end(Outcome.INTERRUPTED, why)
-            self._brake()
-
-    def _brake(self) -> None:
-        self._motion.brake()
-        if self._base is not None:
-            self._base.brake()
+        self._helm.interrupt(why)
+        self._helm.brake()
 
     def _check_course(self, tenure: Tenure) -> None:
         self._authority.check_free()

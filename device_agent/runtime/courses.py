@@ -6,6 +6,7 @@ from enum import Enum
 
 from device_agent.ports.driver import Twist
 from device_agent.runtime.lease import Refused
+from device_agent.runtime.way import Way
 
 
 class Outcome(Enum):
@@ -44,6 +45,13 @@ class Move(Course):
 
     target_rad: list[float]
     speed: float
+
+
+@dataclass(eq=False, kw_only=True)
+class Passage(Course):
+    """Along a way that was planned; then at rest at its end."""
+
+    way: Way
 
 
 @dataclass(eq=False, kw_only=True)

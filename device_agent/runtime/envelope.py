@@ -3,9 +3,16 @@
 import math
 from collections.abc import Mapping, Sequence
 
+import numpy as np
+import numpy.typing as npt
+
 from device_agent.ports.geometry import Clearance, Geometry
 from device_agent.protocol.robot_type import RobotType
 from device_agent.runtime.lease import Refused
+
+Floats = npt.NDArray[np.float64]
+
+_SAME_RAD = 1e-9
 
 
 class Envelope:
@@ -78,6 +85,19 @@ class Envelope:
                 short_mm = math.ceil(-there.room_m * 1000)
                 raise Refused("no_room", f"no room there: {there.text}, {short_mm} mm too near; choose another")
         return target
+
+    def check_way(self, position_rad: Floats) -> None:
+        """All of a way is inside the joints' ranges, shape (places, n) [rad].
+
+        Raises:
+            Refused: It is not.
+        """
+        lower = np.array([joint.lower_rad for joint in self._joints]) - _SAME_RAD
+        upper = np.array([joint.upper_rad for joint in self._joints]) + _SAME_RAD
+        outside = ~np.all((position_rad >= lower) & (position_rad <= upper), axis=0)  # true for NaN
+        if np.any(outside):
+            joint = self._joints[int(np.argmax(outside))]
+            raise Refused("out_of_range", f"the way there leads {joint.name} out of its range")
 
     def blocked(self, path_rad: Sequence[Sequence[float]]) -> Clearance | None:
         """What is in the way, if anything is."""

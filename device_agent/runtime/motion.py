@@ -16,6 +16,8 @@ from ruckig import (
 )
 
 from device_agent.protocol.robot_type import RobotType
+from device_agent.runtime.ride import Ride
+from device_agent.runtime.way import Way
 
 _BRAKING_RAMP_S = 0.01
 """Time in which braking reaches its full deceleration: short against the 50 ms in which a hold must be complete."""
@@ -67,6 +69,7 @@ class Motion:
         self._plan = Trajectory(len(joints))
         self._plan_input = InputParameter(len(joints))
         self._proposed = False
+        self._ride: Ride | None = None
         self.braking = True
         self.position_rad: list[float] = [0.0] * len(joints)
         self.velocity_rad_s: list[float] = [0.0] * len(joints)
@@ -80,6 +83,7 @@ class Motion:
         self._input.current_velocity = self._zeros
         self._input.current_acceleration = self._zeros
         self._proposed = False
+        self._ride = None
         self.brake()
 
     def follow(
@@ -93,7 +97,7 @@ class Motion:
         """Head for ``target_rad``, shape (n,) [rad], already inside the joints' ranges.
 
         What still brakes harder than it may speed up goes on braking: with ordinary jerk it would take so long to
-        leave that deceleration that it ran backwards.
+        leave that deceleration that it ran backwards. What is on a way comes to rest on it first.
 
         Args:
             target_rad: Where to come to rest.
@@ -102,6 +106,9 @@ class Motion:
             together: Whether all joints arrive at the same time (a move) or each as fast as it can (a slider).
         """
         self._target = list(target_rad)
+        if self._ride is not None:
+            self.brake()
+            return
         if any(
             abs(now) > limit + _SAME_RAD_S2
             for now, limit in zip(self._input.current_acceleration, self._acceleration_limits, strict=True)
@@ -117,11 +124,35 @@ class Motion:
         self._input.target_velocity = self._zeros
         self._input.target_acceleration = self._zeros
 
+    def ride(self, way: Way, *, share: float) -> None:
+        """Go along a way that begins where the device rests.
+
+        Args:
+            way: Inside the joints' ranges.
+            share: Of the way's speed, above 0 and at most 1.
+        """
+        self._target = way.position_rad[-1].tolist()
+        if self._ride is None and not self.moving:
+            self._ride = Ride(
+                way,
+                period_s=self._period_s,
+                acceleration_rad_s2=self._acceleration_limits,
+                jerk_rad_s3=self._jerk_limits,
+                braking_rad_s2=self._braking,
+            )
+        if self._ride is None or self._ride.way is not way:
+            self.brake()
+            return
+        self.braking = False
+        self._ride.go(share)
+
     def brake(self) -> None:
-        """Come to rest as fast as the robot type allows, and stay there."""
+        """Come to rest as fast as the robot type allows, and stay there; what is on a way stays on it."""
         if not self.braking:
             self._proposed = False
         self.braking = True
+        if self._ride is not None:
+            self._ride.brake()
         self._brake(self._input)
 
     def _brake(self, order: InputParameter) -> None:
@@ -145,6 +176,8 @@ class Motion:
         Raises:
             MotionError: The generator found no trajectory.
         """
+        if self._ride is not None:
+            return self._ride.propose()
         plan(self._generator.update, self._input, self._output)
         self._proposed = True
         order = self._plan_input
@@ -166,12 +199,21 @@ class Motion:
         Raises:
             MotionError: The generator found no trajectory; position and velocity are as they were.
         """
+        if self._ride is not None:
+            return self._update_ride(self._ride)
         if not self._proposed:
             plan(self._generator.update, self._input, self._output)
         self._proposed = False
         self._output.pass_to_input(self._input)
         self.position_rad = list(self._output.new_position)
         self.velocity_rad_s = list(self._output.new_velocity)
+        return self.position_rad
+
+    def _update_ride(self, ride: Ride) -> list[float]:
+        ride.update()
+        self.position_rad, self.velocity_rad_s = ride.position_rad.tolist(), ride.velocity_rad_s.tolist()
+        if ride.resting:
+            self.start_at(self.position_rad)
         return self.position_rad
 
     def make_up(self, lost_s: float) -> None:
@@ -185,6 +227,10 @@ class Motion:
         Raises:
             MotionError: The generator found no trajectory.
         """
+        if self._ride is not None:
+            self._ride.make_up(lost_s)
+            self.velocity_rad_s = self._ride.velocity_rad_s.tolist()
+            return
         order = self._plan_input
         order.current_position = self._input.current_position
         order.current_velocity = self._input.current_velocity

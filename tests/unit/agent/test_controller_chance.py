@@ -235,7 +235,7 @@ class Chance:
         self.position = tick.position_rad
         if self.shape is not None:
             assert self.shape.clearance(self.position).room_m >= -CLIPPED
-        for speed, limit in zip(tick.twist, self.controller._base.limits, strict=True):  # type: ignore[union-attr]
+        for speed, limit in zip(tick.twist, self.controller._helm.base.limits, strict=True):  # type: ignore[union-attr]
             assert abs(speed) <= limit + 1e-6
         allowed = self.tenure is not None or self.now_s <= self.may_move_until_s + 1e-9
         # What speeds up when the hold begins does so for four milliseconds more: the brakes have a ramp.

@@ -53,6 +53,11 @@ class Wall:
     def solve(self, frame: str, pose: Pose, start_rad: Sequence[float]) -> tuple[float, ...]:
         raise NotImplementedError
 
+    def plan(
+        self, start_rad: Sequence[float], goal_rad: Sequence[float], *, seed: int = 0, within_s: float = 5.0
+    ) -> tuple[tuple[float, ...], ...]:
+        raise NotImplementedError
+
 
 def test_a_streamed_arm_stops_before_the_wall_and_says_so() -> None:
     rig = Rig(geometry=Wall())

