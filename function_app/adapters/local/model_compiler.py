@@ -65,8 +65,10 @@ class MujocoCompiler:
     def _task(self, robot_type: RobotType) -> bytes:
         told = msgspec.to_builtins(robot_type)
         names = ("model", "scene", "joints", "frames", "home_rad")
+        wheels = (told["simulation"] or {}).get("wheels") or {}
         limits = {"cpu_s": self._cpu_s, "wall_s": self._wall_s + 5, "memory_mb": MEMORY_MB}
-        return json.dumps({**{name: told[name] for name in names}, **limits}).encode()
+        sides = [wheels[side] for side in ("left", "right") if side in wheels]
+        return json.dumps({**{name: told[name] for name in names}, "wheels": sides, **limits}).encode()
 
     async def _run(self, folder: Path, task: bytes) -> tuple[int, bytes]:
         process = await asyncio.create_subprocess_exec(

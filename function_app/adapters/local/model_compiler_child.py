@@ -104,6 +104,8 @@ class Check:
                 yield f"no actuator '{name}'; the model has: {self._names(model, kinds.mjOBJ_ACTUATOR, model.nu)}"
             else:
                 yield from self._compare_actuator(model, actuator, index, joint)
+        for name in self._task["wheels"]:
+            yield from self._compare_wheel(model, name)
         for frame in self._task["frames"]:
             if max(self._find(model, kind, frame) for kind in (kinds.mjOBJ_SITE, kinds.mjOBJ_BODY)) < 0:
                 known = self._names(model, kinds.mjOBJ_SITE, model.nsite)
@@ -133,6 +135,24 @@ class Check:
             yield f"actuator '{name}' is not a position servo on joint '{name}' with gear 1"
         elif model.actuator_ctrllimited[actuator]:
             yield from _inside(f"the control range of actuator '{name}'", model.actuator_ctrlrange[actuator], joint)
+
+    def _compare_wheel(self, model: Any, name: str) -> Iterator[str]:
+        mujoco = self._mujoco
+        actuator = self._find(model, mujoco.mjtObj.mjOBJ_ACTUATOR, name)
+        if actuator < 0:
+            yield f"no actuator '{name}'; the model has: {self._names(model, mujoco.mjtObj.mjOBJ_ACTUATOR, model.nu)}"
+            return
+        gain = model.actuator_gainprm[actuator, 0]
+        servo = (
+            model.actuator_trntype[actuator] == int(mujoco.mjtTrn.mjTRN_JOINT)
+            and model.jnt_type[model.actuator_trnid[actuator, 0]] == int(mujoco.mjtJoint.mjJNT_HINGE)
+            and model.actuator_ctrllimited[actuator]
+            and model.actuator_biastype[actuator] == int(mujoco.mjtBias.mjBIAS_AFFINE)
+            and gain > 0
+            and model.actuator_biasprm[actuator, 2] == -gain
+        )
+        if not servo:
+            yield f"actuator '{name}' is not a velocity servo on a hinge, with a control range"
 
     def _compare_tree(self, model: Any, base: int) -> Iterator[str]:
         """Below its base a robot turns and slides only: nothing else can be drawn."""

@@ -537,6 +537,14 @@ class TestHostileUploads:
             assert word in text
         assert "/tmp" not in text
 
+    def test_wheels_that_its_model_does_not_have_are_refused(self, bert: Person) -> None:
+        wheels = '[simulation.wheels]\nleft = "shoulder"\nright = "wheel"\nradius_m = 0.05\ntrack_m = 0.3\n'
+        refused = problem(add(bert, text=manifest() + wheels), 422, "robot-type-refused")
+        assert refused["errors"] == [
+            "lever.xml: actuator 'shoulder' is not a velocity servo on a hinge, with a control range.",
+            "lever.xml: no actuator 'wheel'; the model has: shoulder.",
+        ]
+
     @pytest.mark.parametrize(
         "inside",
         [
