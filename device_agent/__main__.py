@@ -17,7 +17,6 @@ from device_agent import bootstrap, doctor, drivers, links, service
 from device_agent.ports.clock import CloudClock
 from device_agent.ports.driver import DriverError
 from device_agent.ports.transport import TransportError
-from device_agent.protocol import robot_type
 from device_agent.protocol import room as rooms
 from device_agent.protocol.topics import ID_PATTERN, is_id
 from device_agent.runtime.home import Configuration, DeviceEntry, Home, HomeError, HttpPolling, Pairing
@@ -301,8 +300,8 @@ def _devices(options: argparse.Namespace) -> int:
             print(f"device  {device.name}: {device.type}, {device.driver or bootstrap.type_of(device).driver}")
     except HomeError as error:
         print(error)
-    for path in sorted(bootstrap.ROBOTS.glob(f"*/{robot_type.MANIFEST}")):
-        print(f"type    {path.parent.name}: {bootstrap.load_type(path.parent.name).label}")
+    for name in bootstrap.types():
+        print(f"type    {name}: {bootstrap.load_type(name).label}")
     for path in sorted(bootstrap.ROOMS.glob(f"*/{rooms.MANIFEST}")):
         print(f"room    {path.parent.name}: {bootstrap.load_room(path.parent.name).label}")
     for name in drivers.names():

@@ -1,5 +1,6 @@
 """Puts an agent together: the one place that picks drivers; ``links`` picks the transport."""
 
+import os
 from collections.abc import Callable
 from pathlib import Path
 
@@ -24,6 +25,8 @@ from device_agent.transports.http.api import CloudApi
 
 ROBOTS = Path(__file__).resolve().parent.parent / "robots"
 ROOMS = ROBOTS / "rooms"
+ROBOTS_PATH = "TELESCOPE_ROBOTS_PATH"
+"""Environment: folders of other people's robot types, separated as those of ``PATH``."""
 
 
 class Cell:
@@ -57,20 +60,51 @@ class Cell:
         self._journal.close()
 
 
+def places() -> tuple[Path, ...]:
+    """The folders that hold robot types: this installation's first, then those of ``TELESCOPE_ROBOTS_PATH``."""
+    more = os.environ.get(ROBOTS_PATH, "").split(os.pathsep)
+    return (ROBOTS, *(Path(place).expanduser().resolve() for place in more if place))
+
+
+def types() -> dict[str, Path]:
+    """Every robot type and its folder; of two with one name that of the earlier place."""
+    found: dict[str, Path] = {}
+    for place in places():
+        for path in sorted(place.glob(f"*/{robot_type.MANIFEST}")):
+            found.setdefault(path.parent.name, path.parent)
+    return found
+
+
+def folder_of(name: str) -> Path:
+    """The folder of a robot type.
+
+    Raises:
+        HomeError: Unknown; the text lists the known ones.
+    """
+    known = types()
+    if name not in known:
+        raise HomeError(
+            f"no robot type '{name}'; there are: {', '.join(known)}. Name the folder that holds yours in {ROBOTS_PATH}"
+        )
+    return known[name]
+
+
 def load_type(name: str) -> robot_type.RobotType:
-    """A robot type of this installation.
+    """A robot type by its name.
 
     Raises:
         HomeError: Unknown, or its manifest is wrong; the text lists the known ones.
     """
-    folder = ROBOTS / name
-    if not (folder / robot_type.MANIFEST).is_file():
-        known = sorted(path.parent.name for path in ROBOTS.glob(f"*/{robot_type.MANIFEST}"))
-        raise HomeError(f"no robot type '{name}'; there are: {', '.join(known)}")
+    folder = folder_of(name)
     try:
         return robot_type.load(folder)
     except ProtocolError as error:
         raise HomeError(str(error)) from error
+
+
+def _folder(kind: robot_type.RobotType) -> Path:
+    """Where its files are. What a room's manifest describes has none."""
+    return types().get(kind.type, ROBOTS / kind.type)
 
 
 def load_room(name: str) -> rooms.Room:
@@ -134,7 +168,7 @@ def geometry_of(entry: DeviceEntry, kind: robot_type.RobotType) -> Geometry | No
             standing = geometry.Standing(
                 room=ROOMS / room.room / room.model, position_m=robot.position_m, yaw_rad=robot.yaw_rad
             )
-    return geometry.load(kind, ROBOTS / kind.type, scene=scene, standing=standing)
+    return geometry.load(kind, _folder(kind), scene=scene, standing=standing)
 
 
 def driver_of(
@@ -153,7 +187,7 @@ def driver_of(
     """
     options: dict[str, object] = dict(entry.options)
     name = entry.driver or kind.driver
-    folder = ROBOTS / kind.type
+    folder = _folder(kind)
     if name == "mujoco":
         if trace is not None:
             options["trace"] = str(trace / f"{entry.name}.ndjson")

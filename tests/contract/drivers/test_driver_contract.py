@@ -14,6 +14,7 @@ from device_agent.protocol import codec, robot_type
 from device_agent.protocol.robot_type import RobotType
 
 ROBOTS = Path(__file__).parents[3] / "robots"
+TYPES = sorted(path.parent.name for path in ROBOTS.glob("*/robot.toml"))
 DEADLINE_S = 20.0
 
 
@@ -82,7 +83,8 @@ class DriverContract:
     def test_it_holds_still_after_connect(self, connected: Driver) -> None:
         before = connected.observe().position_rad
         time.sleep(0.1)
-        assert connected.observe().position_rad == pytest.approx(before, abs=1e-3)
+        # What stands on wheels or feet comes down on them by a millimetre, and its head nods by as little.
+        assert connected.observe().position_rad == pytest.approx(before, abs=5e-3)
 
     def test_it_goes_where_it_is_sent(self, connected: Driver, robot_type: RobotType) -> None:
         target = self.nudged(robot_type, connected.observe().position_rad)
@@ -139,15 +141,15 @@ class DriverContract:
 
 
 class TestMujocoAlone(DriverContract):
-    """A UR5 in its own scene, as the agent loads it."""
+    """Each shipped type in its own scene, as the agent loads it."""
 
-    @pytest.fixture
-    def robot_type(self) -> RobotType:
-        return robot_type.load(ROBOTS / "ur5")
+    @pytest.fixture(params=TYPES)
+    def robot_type(self, request: pytest.FixtureRequest) -> RobotType:
+        return robot_type.load(ROBOTS / request.param)
 
     @pytest.fixture
     def driver(self, robot_type: RobotType) -> Iterator[Driver]:
-        driver = load("mujoco")(robot_type, ROBOTS / "ur5", {}, "arm")
+        driver = load("mujoco")(robot_type, ROBOTS / robot_type.type, {}, "arm")
         yield driver
         driver.close()
 

@@ -1,4 +1,7 @@
-"""Every robot folder of the project, so that a new one is tested without a new line of code."""
+"""Every robot folder of the project, so that a new one is tested without a new line of code.
+
+Those in the folders that ``TELESCOPE_ROBOTS_PATH`` names are tested as well: somebody else's can be held to the same.
+"""
 
 from pathlib import Path
 from typing import Any
@@ -7,10 +10,12 @@ import mujoco
 import numpy as np
 import numpy.typing as npt
 
+from device_agent import bootstrap
 from device_agent.protocol import robot_type
 
-ROBOTS = Path(__file__).parents[3] / "robots"
-FOLDERS = sorted(path.parent for path in ROBOTS.glob("*/robot.toml"))
+ROBOTS = bootstrap.ROBOTS
+FOLDERS = sorted(path.parent for place in bootstrap.places() for path in place.glob("*/robot.toml"))
+SHIPPED = [folder for folder in FOLDERS if folder.parent == ROBOTS]
 MOVEMENTS = sorted(path for folder in FOLDERS for path in (folder / robot_type.MOVEMENTS).glob("*.py"))
 
 

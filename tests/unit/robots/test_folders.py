@@ -2,13 +2,15 @@
 
 import ast
 from pathlib import Path
+from xml.etree import ElementTree as ET
 
 import mujoco
 import numpy as np
 import pytest
 
+from device_agent import geometry
 from device_agent.protocol import robot_type, topics
-from tests.unit.robots.folders import FOLDERS, MOVEMENTS, Bench
+from tests.unit.robots.folders import FOLDERS, MOVEMENTS, SHIPPED, Bench
 
 pytestmark = pytest.mark.filterwarnings("error")
 folders = pytest.mark.parametrize("folder", FOLDERS, ids=lambda folder: folder.name)
@@ -98,6 +100,28 @@ def test_noise_on_every_actuator_gives_no_warning(folder: Path, seed: int):
     assert not bench.data.warning.number.any()
     assert np.isfinite(bench.data.qpos).all()
     assert np.isfinite(bench.data.qvel).all()
+
+
+@pytest.mark.parametrize("folder", SHIPPED, ids=lambda folder: folder.name)
+def test_names_that_robots_of_one_world_share_begin_with_the_type(folder: Path):
+    manifest = robot_type.load(folder)
+    tree = ET.parse(folder / manifest.model).getroot()  # noqa: S314 - our own file
+    named = [each.get("class", "") for each in tree.iter("default")]
+    named += [each.get("name", "") for kind in ("material", "texture") for each in tree.iter(kind)]
+    assert [name for name in named if name and not name.startswith(folder.name)] == []
+
+
+@folders
+def test_what_it_can_show_keeps_off_itself_and_what_stands_around(folder: Path):
+    manifest = robot_type.load(folder)
+    shape = geometry.load(manifest, folder)
+    if shape is None:
+        return
+    for kind in ("expressions", "visemes"):
+        for name, pose in getattr(manifest, kind).items():
+            position = manifest.home_rad | pose
+            room = shape.clearance([position[joint.name] for joint in manifest.joints])
+            assert room.room_m >= 0, f"{kind} {name}: {room.text}"
 
 
 @folders
