@@ -156,6 +156,21 @@ def test_the_person_walks_its_way_and_keeps_its_feet_on_the_floor():
     assert np.abs(lowest).max() < 0.03
 
 
+def test_the_persons_way_is_free_of_furniture_and_of_where_robots_begin():
+    world = lab()
+    data = mujoco.MjData(world.model)
+    world.copy(data)
+    people = shapes_of_the_person(world)
+    hit = np.full(1, -1, dtype=np.int32)
+    corners = np.array(MANIFEST.people[0].path_m)
+    for here, there in zip(corners, np.roll(corners, -1, axis=0), strict=True):
+        for side_m in (-0.25, 0.0, 0.25):  # at its hips, elbows included
+            way = (there - here) / np.linalg.norm(there - here)
+            start = np.array((*(here + side_m * np.array((-way[1], way[0]))), 0.3))
+            away_m = mujoco.mj_ray(world.model, data, start, np.array((*way, 0.0)), None, True, -1, hit, None)
+            assert away_m < 0 or away_m > np.linalg.norm(there - here) or hit[0] in people, (here, there, int(hit[0]))
+
+
 def test_the_person_pushes_nothing():
     world = lab()
     person = [
