@@ -376,7 +376,7 @@ class Controller:
         limited: tuple[str, ...] = () if strictest is None else (strictest.text,)
         if self._mode is Mode.STREAMING:
             limited += self._stream.limited
-        return limited + self._driver_limits
+        return limited + self._motion.waits + self._driver_limits
 
     def _fence(self, epoch: int) -> None:
         if self._authority.fence(epoch):

@@ -8,6 +8,7 @@ import numpy.typing as npt
 
 from device_agent.ports.geometry import Clearance, Geometry
 from device_agent.protocol.robot_type import RobotType
+from device_agent.runtime.couplings import Couplings
 from device_agent.runtime.lease import Refused
 
 Floats = npt.NDArray[np.float64]
@@ -29,6 +30,7 @@ class Envelope:
     def __init__(self, robot_type: RobotType, geometry: Geometry | None) -> None:
         self._joints = robot_type.joints
         self._index = {joint.name: index for index, joint in enumerate(robot_type.joints)}
+        self._couplings = Couplings(robot_type)
         self._geometry = geometry
         shape = (
             () if geometry is None else ("clearance",) if robot_type.workspace is None else ("clearance", "workspace")
@@ -53,24 +55,34 @@ class Envelope:
         Returns:
             The joints that were asked beyond it, as ``limited`` names them.
         """
-        limited = []
-        for name, value in position_rad.items():
+        led, differing = self._couplings.lead(position_rad)
+        limited = [f"{name}: mirror" for name in differing]
+        for name, value in led.items():
             index = self._index[name]
             joint = self._joints[index]
             target_rad[index] = min(max(value, joint.lower_rad), joint.upper_rad)
             if target_rad[index] != value:
                 limited.append(f"{name}: range")
+        self._couplings.tie(target_rad)
+        for index, lower, upper, by in self._couplings.narrowed(target_rad):
+            target_rad[index] = min(max(target_rad[index], lower), upper)
+            limited.append(f"{self._joints[index].name}: range at {by}")
         return tuple(limited)
 
     def target(self, position_rad: Mapping[str, float], now_rad: Sequence[float]) -> list[float]:
-        """Where a move to these positions ends; joints not named stay, shape (n,) [rad].
+        """Where a move to these positions ends, shape (n,) [rad].
+
+        Joints not named stay, but for those to which the others leave no room where they are.
 
         Raises:
             Refused: Unknown joint, a number that is none, outside a joint's range, or no room there.
         """
         self.check(position_rad)
+        led, differing = self._couplings.lead(position_rad)
+        if differing:
+            raise Refused("mirrored", f"one motor moves {differing[0]} and another joint; ask for one of the two")
         target = list(now_rad)
-        for name, value in position_rad.items():
+        for name, value in led.items():
             joint = self._joints[self._index[name]]
             if not joint.lower_rad <= value <= joint.upper_rad:
                 raise Refused(
@@ -78,6 +90,15 @@ class Envelope:
                     f"{name} can go from {joint.lower_rad:.4f} to {joint.upper_rad:.4f} rad, not to {value:.4f}",
                 )
             target[self._index[name]] = value
+        self._couplings.tie(target)
+        for index, lower, upper, by in self._couplings.narrowed(target):
+            name = self._joints[index].name
+            if name in led:
+                raise Refused(
+                    "out_of_range",
+                    f"{name} can go from {lower:.4f} to {upper:.4f} rad where {by} is then, not to {target[index]:.4f}",
+                )
+            target[index] = min(max(target[index], lower), upper)
         if self._geometry is not None:
             there = self._geometry.clearance(target)
             # Whoever is too near something already may go to where there is more room.
@@ -98,6 +119,9 @@ class Envelope:
         if np.any(outside):
             joint = self._joints[int(np.argmax(outside))]
             raise Refused("out_of_range", f"the way there leads {joint.name} out of its range")
+        parted = self._couplings.parted(position_rad)
+        if parted:
+            raise Refused("out_of_range", f"the way there {parted}")
 
     def blocked(self, path_rad: Sequence[Sequence[float]]) -> Clearance | None:
         """What is in the way, if anything is."""

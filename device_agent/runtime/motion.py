@@ -16,6 +16,7 @@ from ruckig import (
 )
 
 from device_agent.protocol.robot_type import RobotType
+from device_agent.runtime.couplings import Couplings
 from device_agent.runtime.ride import Ride
 from device_agent.runtime.way import Way
 
@@ -23,6 +24,8 @@ _BRAKING_RAMP_S = 0.01
 """Time in which braking reaches its full deceleration: short against the 50 ms in which a hold must be complete."""
 _KNOT_S = 0.04
 """Between knots this far apart in time a braking path is straight to within 4 mm at any speed in use."""
+_LOOKS = 4
+"""Parts of a slowing down after which is looked where it has led: what turns on its way is between two of them."""
 _REST_RAD_S = 1e-6
 _REACHED_RAD = 1e-4
 _SAME_RAD_S2 = 1e-3
@@ -51,6 +54,9 @@ class Motion:
 
     Args:
         robot_type: Limits of each joint and the braking deceleration.
+
+    Attributes:
+        waits: Which joints wait for which, as ``limited`` names it.
     """
 
     def __init__(self, robot_type: RobotType) -> None:
@@ -70,6 +76,9 @@ class Motion:
         self._plan_input = InputParameter(len(joints))
         self._proposed = False
         self._ride: Ride | None = None
+        self._couplings = Couplings(robot_type)
+        self._limp: dict[int, float] = {}
+        self.waits: tuple[str, ...] = ()
         self.braking = True
         self.position_rad: list[float] = [0.0] * len(joints)
         self.velocity_rad_s: list[float] = [0.0] * len(joints)
@@ -106,6 +115,8 @@ class Motion:
             together: Whether all joints arrive at the same time (a move) or each as fast as it can (a slider).
         """
         self._target = list(target_rad)
+        for index, measured in self._limp.items():
+            self._target[index] = measured
         if self._ride is not None:
             self.brake()
             return
@@ -120,7 +131,7 @@ class Motion:
         self._input.max_velocity = [min(limit * speed, cap_rad_s) for limit in self._velocity_limits]
         self._input.max_acceleration = self._acceleration_limits
         self._input.max_jerk = self._jerk_limits
-        self._input.target_position = self._target
+        self._input.target_position = self._heading()
         self._input.target_velocity = self._zeros
         self._input.target_acceleration = self._zeros
 
@@ -146,22 +157,41 @@ class Motion:
         self.braking = False
         self._ride.go(share)
 
+    def _heading(self) -> list[float]:
+        """The target for this period: joints that leave each other no room wait for each other."""
+        if not self._couplings:
+            return self._target
+        order = self._plan_input
+        order.current_position = self._input.current_position
+        order.current_velocity = self._input.current_velocity
+        order.current_acceleration = self._input.current_acceleration
+        self._slow_down(order, self._acceleration_limits, self._jerk_limits)
+        plan(self._planner.calculate, order, self._plan)
+        places = [self._plan.at_time(self._plan.duration * part / _LOOKS)[0] for part in range(_LOOKS + 1)]
+        swing = [(min(of_joint), max(of_joint)) for of_joint in zip(*places, strict=True)]
+        heading, self.waits = self._couplings.steer(self._target, self.position_rad, swing)
+        return heading
+
     def brake(self) -> None:
         """Come to rest as fast as the robot type allows, and stay there; what is on a way stays on it."""
         if not self.braking:
             self._proposed = False
         self.braking = True
+        self.waits = ()
         if self._ride is not None:
             self._ride.brake()
         self._brake(self._input)
 
     def _brake(self, order: InputParameter) -> None:
         count = len(self._zeros)
+        self._slow_down(order, [self._braking] * count, [self._braking / _BRAKING_RAMP_S] * count)
+
+    def _slow_down(self, order: InputParameter, acceleration: list[float], jerk: list[float]) -> None:
         order.control_interface = ControlInterface.Velocity
         order.synchronization = Synchronization.No
         order.max_velocity = self._velocity_limits
-        order.max_acceleration = [self._braking] * count
-        order.max_jerk = [self._braking / _BRAKING_RAMP_S] * count
+        order.max_acceleration = acceleration
+        order.max_jerk = jerk
         order.target_velocity = self._zeros
         order.target_acceleration = self._zeros
 
@@ -205,16 +235,43 @@ class Motion:
             plan(self._generator.update, self._input, self._output)
         self._proposed = False
         self._output.pass_to_input(self._input)
+        before = self.position_rad
         self.position_rad = list(self._output.new_position)
         self.velocity_rad_s = list(self._output.new_velocity)
+        self._hold_together(before)
         return self.position_rad
 
     def _update_ride(self, ride: Ride) -> list[float]:
         ride.update()
+        before = self.position_rad
         self.position_rad, self.velocity_rad_s = ride.position_rad.tolist(), ride.velocity_rad_s.tolist()
+        self._hold_together(before)
         if ride.resting:
             self.start_at(self.position_rad)
         return self.position_rad
+
+    def _hold_together(self, before_rad: Sequence[float]) -> None:
+        """What the generator does not know: joints that hang together, and joints that are limp."""
+        if not self._couplings and not self._limp:
+            return
+        acceleration = list(self._input.current_acceleration)
+        for index, measured in self._limp.items():
+            self.position_rad[index] = measured
+            self.velocity_rad_s[index] = acceleration[index] = 0.0
+        self._couplings.keep(self.position_rad, before_rad)
+        for values in (self.position_rad, self.velocity_rad_s, acceleration):
+            self._couplings.tie(values)
+        self._input.current_position = self.position_rad
+        self._input.current_velocity = self.velocity_rad_s
+        self._input.current_acceleration = acceleration
+
+    def loosen(self, measured_rad: dict[int, float]) -> None:
+        """Command some joints to where they are measured: they are limp, and must not jump once they no longer are.
+
+        Args:
+            measured_rad: Index of each such joint → its position, inside its range [rad].
+        """
+        self._limp = measured_rad
 
     def make_up(self, lost_s: float) -> None:
         """Count time in which no period was commanded as braked: the device was left standing where it is.
