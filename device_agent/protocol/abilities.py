@@ -17,6 +17,7 @@ from device_agent.protocol.reports import Joint
 
 Positions = Annotated[dict[str, float], Meta(min_length=1, max_length=128)]
 """Joint name → position [rad]."""
+Leg = tuple[Label, Label, Label, Label, Label, Label]
 LONGEST_TEXT = 500
 _LONGEST_BEHAVIOUR_S = 300.0
 _SAME = 1e-9
@@ -91,13 +92,24 @@ class Wheels(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
 
 
 class Walk(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """An assisted walk on two legs.
+    """An assisted walk on two legs, from home.
 
     Attributes:
-        support: The equality constraint of the model that helps the torso keep its balance.
+        left: Joints of the left leg: hip yaw, hip roll, hip pitch, knee, ankle pitch, ankle roll; ``right``: the same.
+        soles: Sites under the left and the right ankle, on the sole.
+        step_s: Time of one step of one foot [s].
+        lift_m: How high a foot goes [m].
+        support_n: The most that draws the torso along its course [N].
+        support_nm: The most that holds it upright [N m].
     """
 
-    support: Label
+    left: Leg
+    right: Leg
+    soles: tuple[Label, Label]
+    step_s: float
+    lift_m: float
+    support_n: float
+    support_nm: float
 
 
 class Battery(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -168,18 +180,24 @@ def check(abilities: Abilities, joints: Sequence[Joint], home_rad: Mapping[str, 
     for name, keyframes in abilities.behaviours.items():
         _check_keyframes(f"behaviour '{name}'", keyframes, allowed)
     if abilities.simulation is not None:
-        _check_simulation(abilities.simulation)
+        _check_simulation(abilities.simulation, known)
 
 
-def _check_simulation(simulation: Simulation) -> None:
+def _check_simulation(simulation: Simulation, known: Mapping[str, Joint]) -> None:
     for part, holder, fields in (
         ("wheels", simulation.wheels, ("radius_m", "track_m")),
+        ("walk", simulation.walk, ("step_s", "lift_m", "support_n", "support_nm")),
         ("battery", simulation.battery, Battery.__struct_fields__),
     ):
         for field in () if holder is None else fields:
             value = getattr(holder, field)
             if not 0 < value < math.inf:
                 raise ProtocolError(f"simulation.{part}: {field} is {value}; it must be above 0 and finite")
+    if simulation.walk is not None:
+        legs = (*simulation.walk.left, *simulation.walk.right)
+        _check_names("simulation.walk", legs, known)
+        if len(set(legs)) < len(legs):
+            raise ProtocolError("simulation.walk: no joint can be named twice")
     if simulation.battery is not None and simulation.battery.empty_v > simulation.battery.full_v:
         raise ProtocolError("simulation.battery: empty_v must not be above full_v")
 

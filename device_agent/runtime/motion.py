@@ -27,6 +27,7 @@ _KNOT_S = 0.04
 _LOOKS = 4
 """Parts of a slowing down after which is looked where it has led: what turns on its way is between two of them."""
 _REST_RAD_S = 1e-6
+_ROUNDING = 1e-12
 _REACHED_RAD = 1e-4
 _SAME_RAD_S2 = 1e-3
 
@@ -237,7 +238,9 @@ class Motion:
         self._output.pass_to_input(self._input)
         before = self.position_rad
         self.position_rad = list(self._output.new_position)
-        self.velocity_rad_s = list(self._output.new_velocity)
+        # What is left by rounding is rest: from there, ``ruckig`` may find no way back.
+        self.velocity_rad_s = [0.0 if abs(left) < _ROUNDING else left for left in self._output.new_velocity]
+        self._input.current_velocity = self.velocity_rad_s
         self._hold_together(before)
         return self.position_rad
 

@@ -8,12 +8,23 @@ from device_agent.drivers.mujoco.assembly import Placement
 from device_agent.drivers.mujoco.driver import MujocoDriver
 from device_agent.drivers.mujoco.snapshot import Snapshot
 from device_agent.drivers.mujoco.twin import draw
+from device_agent.drivers.mujoco.walking import WalkingDriver
 from device_agent.drivers.mujoco.wheels import WheeledDriver
 from device_agent.drivers.mujoco.world import World
 from device_agent.ports.driver import DriverError
 from device_agent.protocol.robot_type import RobotType
 
-__all__ = ["MujocoDriver", "Placement", "Snapshot", "WheeledDriver", "World", "create", "draw", "worlds"]
+__all__ = [
+    "MujocoDriver",
+    "Placement",
+    "Snapshot",
+    "WalkingDriver",
+    "WheeledDriver",
+    "World",
+    "create",
+    "draw",
+    "worlds",
+]
 
 _OPTIONS = ("faults", "room", "scene", "trace")
 
@@ -52,4 +63,8 @@ def create(robot_type: RobotType, folder: Path, options: Mapping[str, object], d
 def _kind(robot_type: RobotType) -> type[MujocoDriver]:
     """What drives robots of this type: by how they get about."""
     simulation = robot_type.simulation
-    return WheeledDriver if simulation is not None and simulation.wheels is not None else MujocoDriver
+    if simulation is not None and simulation.wheels is not None:
+        return WheeledDriver
+    if simulation is not None and simulation.walk is not None:
+        return WalkingDriver
+    return MujocoDriver

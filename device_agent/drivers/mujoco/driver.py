@@ -131,11 +131,7 @@ class MujocoDriver:
             DriverError: Wrong number of values, one is not finite, not connected, or the simulation has stopped.
         """
         self._live()
-        if len(position_rad) != len(self._actuators):
-            raise DriverError(f"{len(position_rad)} positions for {len(self._actuators)} joints")
-        if not all(map(math.isfinite, position_rad)):
-            raise DriverError("a commanded position is not finite")
-        applied = np.minimum(np.maximum(position_rad, self._lower), self._upper)
+        applied = self._checked(position_rad)
         self._world.command(self._device, self._actuators, applied, ramp_s=self._ramp_s)
         return tuple(applied.tolist())
 
@@ -182,6 +178,19 @@ class MujocoDriver:
         self._health.suffer(ailments)
         if self._infliction is not None:
             self._infliction.want(ailments)
+
+    def _checked(self, position_rad: Sequence[float]) -> Floats:
+        """A command inside the actuators' ranges, shape (n,) [rad].
+
+        Raises:
+            DriverError: Wrong number of values, or one is not finite.
+        """
+        if len(position_rad) != len(self._actuators):
+            raise DriverError(f"{len(position_rad)} positions for {len(self._actuators)} joints")
+        if not all(map(math.isfinite, position_rad)):
+            raise DriverError("a commanded position is not finite")
+        applied: Floats = np.minimum(np.maximum(position_rad, self._lower), self._upper)
+        return applied
 
     def _require(self) -> None:
         if not self._connected:

@@ -1,5 +1,7 @@
 """What a manifest says beside limits: read as it stands, refused with what is wrong where it contradicts itself."""
 
+from pathlib import Path
+
 import pytest
 
 from device_agent.protocol.abilities import Narrowing
@@ -77,9 +79,6 @@ left = "left_wheel"
 right = "right_wheel"
 radius_m = 0.09
 track_m = 0.2
-
-[simulation.walk]
-support = "balance"
 """
 ALL = HEAD + JOINTS + MIRRORS + NARROWING + SHOWN
 
@@ -144,7 +143,7 @@ def test_a_narrowed_range_is_linear_between_the_rows(by_rad: float, there: tuple
         ("time_s = 1.5", "time_s = nan", "time_s of keyframe 2 is nan"),
         ("time_s = 1.5", "time_s = 301.0", "to 300 at most"),
         ("track_m = 0.2", "track_m = 0.0", "simulation.wheels: track_m is 0.0"),
-        ('support = "balance"', 'support = "balance"\nspeed = 1.0', "speed"),
+        ("track_m = 0.2", "track_m = 0.2\nspeed = 1.0", "speed"),
     ],
 )
 def test_what_contradicts_itself_is_refused(was: str, now: str, says: str) -> None:
@@ -161,3 +160,19 @@ def test_a_mirror_that_is_too_slow_is_refused() -> None:
     slow = JOINTS.rpartition("max_velocity_rad_s = 3.0")
     with pytest.raises(ProtocolError, match="max_velocity_rad_s is too low to follow 'left'"):
         read(HEAD + slow[0] + "max_velocity_rad_s = 2.0" + slow[2] + MIRRORS)
+
+
+@pytest.mark.parametrize(
+    ("was", "now", "says"),
+    [
+        ('left = ["LHip', 'left = ["Hip', "simulation.walk: no joint 'HipYawPitch'; there are: HeadYaw"),
+        ('"LHipRoll", ', '"LHipPitch", ', "simulation.walk: no joint can be named twice"),
+        ("step_s = ", "step_s = 0 #", "simulation.walk: step_s is 0"),
+        ("support_nm = ", "support_nm = nan #", "simulation.walk: support_nm is nan"),
+    ],
+)
+def test_a_walk_on_legs_that_are_not_there_is_refused(was: str, now: str, says: str) -> None:
+    text = (Path(__file__).parents[3] / "robots" / "nao" / "robot.toml").read_text(encoding="utf-8")
+    assert was in text
+    with pytest.raises(ProtocolError, match=says):
+        read(text.replace(was, now, 1))
