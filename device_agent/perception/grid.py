@@ -29,10 +29,15 @@ MOST = 4.0
 FADE_S = 4.0
 """Time constant in which what is not looked at falls back to the lasting memory [s]."""
 LASTING_S = 60.0
-"""Time constant of the lasting memory [s]; in the first minute it is the mean of what has been seen."""
+"""Time constant of the lasting memory [s]; in the first minute it is the mean of what has been seen,"""
+YOUNG_S = 10.0
+"""but never of less than this [s]: who stands about when it begins is no furniture."""
+HIDDEN_S = 120.0
+"""Time constant in which it forgets what is not looked at [s]: where people are seen and the floor behind them is not,
+they would else be all that was ever seen."""
 SURE = 0.4
 """Log odds from which on a place counts as taken, or below whose negative as free."""
-STATIC = 1.5
+STATIC = 1.0
 """Log odds of the lasting memory from which on a thing belongs to the room."""
 
 
@@ -95,11 +100,13 @@ class OccupancyGrid:
         lower_m: Lowest corner x, y in the room [m].
         upper_m: Highest corner [m].
         resolution_m: Side of a cell [m].
+        plan: Lowest x, y and highest x, y between the walls, where that is known [m]: nobody plans a way beyond.
     """
 
     lower_m: tuple[float, float]
     upper_m: tuple[float, float]
     resolution_m: float = RESOLUTION_M
+    plan: tuple[float, float, float, float] | None = None
     _layers: dict[str, _Layer] = field(default_factory=dict, init=False, repr=False)
     _lock: threading.Lock = field(default_factory=threading.Lock, init=False, repr=False)
 
@@ -176,11 +183,14 @@ class OccupancyGrid:
         with self._lock:
             for layer in self._layers.values():
                 layer.age_s += elapsed_s
-                learn = min(1.0, elapsed_s / max(min(LASTING_S, layer.age_s), 1e-3))
+                learn = min(1.0, elapsed_s / min(LASTING_S, max(YOUNG_S, layer.age_s)))
                 layer.lasting[layer.seen] += learn * (layer.recent - layer.lasting)[layer.seen]
                 unseen = ~layer.seen
+                layer.lasting[unseen] *= math.exp(-elapsed_s / HIDDEN_S)
+                # What was there only for a while is not there for sure any more, nor is nothing.
+                usual = np.where(np.abs(layer.lasting) > STATIC, layer.lasting, np.minimum(layer.lasting, 0.0))
                 keep = math.exp(-elapsed_s / FADE_S)
-                layer.recent[unseen] = (layer.lasting + keep * (layer.recent - layer.lasting))[unseen]
+                layer.recent[unseen] = (usual + keep * (layer.recent - usual))[unseen]
                 layer.seen[:] = False
 
     # ------------------------------------------------------------ what is known
@@ -219,6 +229,7 @@ class OccupancyGrid:
             circle = self._circle(x_m, y_m, apart_m)
             taken &= ~circle
             free |= circle
+        taken |= self._walls()
         blocked = _spread(taken, radius_m / self.resolution_m)
         if unknown:
             blocked |= ~(taken | _spread(free, 1.0))
@@ -255,10 +266,25 @@ class OccupancyGrid:
         inside: Bools = (across >= 0) & (across < columns) & (up >= 0) & (up < rows)
         return up[inside].astype(np.int64) * columns + across[inside].astype(np.int64), inside
 
-    def _circle(self, x_m: float, y_m: float, radius_m: float) -> Bools:
+    def _walls(self) -> Bools:
+        """What lies outside of the plan, shape (rows, columns)."""
+        walls = np.zeros(self.shape, dtype=bool)
+        if self.plan is not None:
+            across, up = self._middles()
+            low_x, low_y, high_x, high_y = self.plan
+            walls |= ((across < low_x) | (across > high_x))[None, :] | ((up < low_y) | (up > high_y))[:, None]
+        return walls
+
+    def _middles(self) -> tuple[Floats, Floats]:
+        """Middle of each column along x, and of each row along y [m]."""
         rows, columns = self.shape
-        across = self.lower_m[0] + (np.arange(columns) + 0.5) * self.resolution_m - x_m
-        up = self.lower_m[1] + (np.arange(rows) + 0.5) * self.resolution_m - y_m
+        across: Floats = self.lower_m[0] + (np.arange(columns, dtype=np.float64) + 0.5) * self.resolution_m
+        up: Floats = self.lower_m[1] + (np.arange(rows, dtype=np.float64) + 0.5) * self.resolution_m
+        return across, up
+
+    def _circle(self, x_m: float, y_m: float, radius_m: float) -> Bools:
+        across, up = self._middles()
+        across, up = across - x_m, up - y_m
         found: Bools = up[:, None] ** 2 + across[None, :] ** 2 <= radius_m**2
         return found
 

@@ -17,7 +17,6 @@ UNKNOWN, FREE, STATIC, MOVING = (205, 205, 205), (255, 255, 255), (45, 52, 64), 
 MARKS = ((208, 40, 40), (30, 110, 200), (30, 150, 90), (140, 70, 180), (190, 120, 20), (0, 140, 150))
 """Colours of those who are somewhere, in the order of their names."""
 _MARK_M = 0.12
-_SURE = 0.4
 
 
 def draw(grid: OccupancyGrid, places: Mapping[str, Place] | None = None) -> Pixels:
@@ -26,9 +25,8 @@ def draw(grid: OccupancyGrid, places: Mapping[str, Place] | None = None) -> Pixe
     White is free, grey unknown, dark what belongs to the room, orange what is there now. A disc is somebody, with a
     line to where he goes.
     """
-    probability = grid.probability()
     cells = np.full((*grid.shape, 3), UNKNOWN, dtype=np.uint8)
-    cells[probability < _SURE] = FREE
+    cells[~grid.blocked(0.0).blocked] = FREE
     cells[grid.moving()] = MOVING
     cells[grid.static()] = STATIC
     picture = np.ascontiguousarray(np.kron(cells[::-1], np.ones((SCALE, SCALE, 1), dtype=np.uint8)))

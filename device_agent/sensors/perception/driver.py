@@ -127,7 +127,7 @@ class PerceptionDriver:
                 if name not in self._neighbours:
                     known = ", ".join(sorted(self._neighbours)) or "none"
                     raise SensorError(f"'{self._device.name}' is to look with '{name}'; this agent's devices: {known}")
-            self._sight = self._sight or self._make()
+            self._sight = self._sight or self.make()
             self._looked_s = time.monotonic()
             self._stopping.clear()
             self._thread = threading.Thread(target=self._run, args=(self._sight,), name="perception", daemon=True)
@@ -184,6 +184,32 @@ class PerceptionDriver:
         """
         return self._require().grid
 
+    def make(self) -> Sight:
+        """What it will look with, before anything is seen: for its own thread, and for who drives time by hand.
+
+        Raises:
+            SensorError: The room's manifest or survey cannot be used.
+        """
+        try:
+            room = rooms.load(self._folder)
+        except ProtocolError as error:
+            raise SensorError(str(error)) from error
+        (low_x, low_y), (high_x, high_y) = room.plan.lower_m, room.plan.upper_m
+        return Sight(
+            grid=OccupancyGrid(
+                (low_x - _EDGE_M, low_y - _EDGE_M),
+                (high_x + _EDGE_M, high_y + _EDGE_M),
+                self._options.resolution_m,
+                plan=(low_x, low_y, high_x, high_y),
+            ),
+            survey=self._survey(),
+            kinds=self._options.kinds,
+            mounts=self._mounts(room),
+            zones=[Zone(zone.name, (*zone.lower_m[:2], *zone.upper_m[:2])) for zone in room.zones],
+            quiet=self._options.quiet,
+            inside=(low_x, low_y, high_x, high_y),
+        )
+
     # ------------------------------------------------------------ inside
 
     @property
@@ -198,24 +224,6 @@ class PerceptionDriver:
             why = "; ".join(sorted(self._blind.values())) or "its sensors say nothing"
             raise SensorError(f"'{self._device.name}' sees nothing: {why}")
         return sight
-
-    def _make(self) -> Sight:
-        try:
-            room = rooms.load(self._folder)
-        except ProtocolError as error:
-            raise SensorError(str(error)) from error
-        (low_x, low_y), (high_x, high_y) = room.plan.lower_m, room.plan.upper_m
-        return Sight(
-            grid=OccupancyGrid(
-                (low_x - _EDGE_M, low_y - _EDGE_M), (high_x + _EDGE_M, high_y + _EDGE_M), self._options.resolution_m
-            ),
-            survey=self._survey(),
-            kinds=self._options.kinds,
-            mounts=self._mounts(room),
-            zones=[Zone(zone.name, (*zone.lower_m[:2], *zone.upper_m[:2])) for zone in room.zones],
-            quiet=self._options.quiet,
-            inside=(low_x, low_y, high_x, high_y),
-        )
 
     def _mounts(self, room: Room) -> list[Mount]:
         found = []

@@ -35,7 +35,7 @@ def cell(grid, x, y):
 
 def test_walls_are_found_within_a_cell():
     grid = OccupancyGrid((-0.5, -0.5), (4.5, 3.5))
-    look(grid, room(), times=10)
+    look(grid, room(), times=50)
     rows, columns = np.nonzero(grid.static())
     x = -0.5 + (columns + 0.5) * 0.05
     y = -0.5 + (rows + 0.5) * 0.05
@@ -121,3 +121,25 @@ def test_what_is_no_number_is_let_go():
 def test_a_grid_without_size_is_refused():
     with pytest.raises(ValueError, match="upper corner"):
         OccupancyGrid((0, 0), (0, 3))
+
+
+def test_somebody_seen_again_and_again_where_the_floor_is_hidden_is_no_furniture():
+    grid = OccupancyGrid((0, 0), (4, 3))
+    for _ in range(10):
+        for _ in range(10):  # two seconds there, eighteen not
+            grid.see_places("depth", taken_m=np.array([[1.0, 1.0]]), clear_m=EMPTY)
+            grid.settle(0.2)
+        for _ in range(90):
+            grid.settle(0.2)
+        assert not grid.taken()[cell(grid, 1.0, 1.0)]
+        assert not grid.static()[cell(grid, 1.0, 1.0)]
+
+
+def test_nobody_plans_a_way_through_the_walls_of_the_plan():
+    grid = OccupancyGrid((-0.5, -0.5), (4.5, 3.5), plan=(0.0, 0.0, 4.0, 3.0))
+    for unknown in (True, False):
+        grid.see_places("depth", taken_m=EMPTY, clear_m=np.array([[0.3, 1.0], [0.15, 1.0], [-0.2, 1.0]]))
+        floor = grid.blocked(0.2, unknown=unknown)
+        assert not floor.at(0.3, 1.0)
+        assert floor.at(0.15, 1.0)
+        assert floor.at(-0.2, 1.0)
