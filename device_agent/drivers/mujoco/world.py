@@ -10,7 +10,6 @@ import math
 import threading
 import time
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -18,6 +17,7 @@ import mujoco
 import numpy as np
 
 from device_agent.drivers.mujoco.assembly import SCALAR_JOINTS, TIMESTEP_S, Placement, assemble, at_home
+from device_agent.drivers.mujoco.ramps import Ramps, follow
 from device_agent.drivers.mujoco.snapshot import Floats, Ints, Snapshot
 from device_agent.drivers.mujoco.trace import Trace
 from device_agent.ports.driver import DriverError
@@ -36,21 +36,6 @@ _STOP_TIMEOUT_S = 5.0
 _SET_S = 3.0
 """Time in which something of the room goes through the whole of its range: a door, blinds, a camera that turns."""
 _DIVERGED = ("mjWARN_BADQPOS", "mjWARN_BADQVEL", "mjWARN_BADQACC", "mjWARN_BADCTRL")
-
-
-@dataclass(frozen=True, slots=True)
-class _Command:
-    """A target [rad] for some actuators, to be reached in a straight line within ``ramp_s``."""
-
-    actuators: Ints
-    target: Floats
-    ramp_s: float
-
-
-@dataclass(slots=True)
-class _Ramp:
-    command: _Command
-    remaining_s: float
 
 
 class World:
@@ -96,8 +81,7 @@ class World:
         self._model: Any = None
         self._data: Any = None
         self._snapshot: Snapshot | None = None
-        self._commands: dict[str, _Command] = {}
-        self._ramps: dict[str, _Ramp] = {}
+        self._ramps = Ramps()
         self._addresses: dict[str, int] = {}
         self._passive_gravity = np.zeros(0)
         self._lag_s = 0.0
@@ -158,7 +142,6 @@ class World:
             running = self._thread is not None
             self._end()
             time_s = self.snapshot().time_s
-            self._commands.clear()
             self._ramps.clear()
             self._settings = dict(self._start)
             self._data = at_home(self._model, self._home, self._start, scene=self._scene)
@@ -206,7 +189,7 @@ class World:
             ramp_s: Time in which to get there in a straight line, so that a target every control period gives an
                 even motion rather than steps [s].
         """
-        self._commands[who] = _Command(actuators, np.array(target, dtype=np.float64), ramp_s)
+        self._ramps.command(who, actuators, target, ramp_s)
 
     def trace(self, path: Path, *, prefix: str) -> None:
         """Append the truth of one robot to a file while the world runs; its joints are those with this prefix.
@@ -327,16 +310,12 @@ class World:
 
     def _advance(self, count: int) -> None:
         model, data = self._model, self._data
-        for who, command in list(self._commands.items()):
-            ramp = self._ramps.get(who)
-            if ramp is None or ramp.command is not command:
-                self._ramps[who] = _Ramp(command, max(command.ramp_s, TIMESTEP_S))
-        active = [ramp for ramp in self._ramps.values() if ramp.remaining_s > 0]
+        active = self._ramps.take()
         for process in self._processes:
             process.step(model, data, data.time)
         for _ in range(count):
             for ramp in active:
-                _follow(ramp, data.ctrl)
+                follow(ramp, data.ctrl)
             mujoco.mj_step(model, data)
         mujoco.mj_kinematics(model, data)  # poses of the positions just reached, not of those a step ago
         for name in _DIVERGED:
@@ -383,16 +362,9 @@ class World:
         )
 
     def _write_traces(self) -> None:
-        snapshot, targets = self.snapshot(), self._targets()
+        snapshot, targets = self.snapshot(), self._ramps.targets(self._data.ctrl)
         for trace in self._traces:
             trace.write(snapshot, targets)
-
-    def _targets(self) -> Floats:
-        """The newest command of each actuator, shape (nu,)."""
-        target: Floats = self._data.ctrl.copy()
-        for command in list(self._commands.values()):
-            target[command.actuators] = command.target
-        return target
 
     def _run(self) -> None:
         try:
@@ -426,17 +398,6 @@ class World:
                     warned = now
                     log.warning("the simulation cannot keep up: %.0f ms lost so far", self._lag_s * 1000)
             self._stopping.wait(max(0.0, due - now))
-
-
-def _follow(ramp: _Ramp, ctrl: Floats) -> None:
-    """Move the controls of one command one step further along its ramp."""
-    if ramp.remaining_s <= 0:
-        return
-    command = ramp.command
-    share = min(1.0, TIMESTEP_S / ramp.remaining_s)
-    now = ctrl[command.actuators]
-    ctrl[command.actuators] = command.target if share > 1 - 1e-9 else now + (command.target - now) * share
-    ramp.remaining_s = 0.0 if share > 1 - 1e-9 else ramp.remaining_s - TIMESTEP_S
 
 
 def _warn(text: str) -> None:
