@@ -333,3 +333,51 @@ def test_another_scene_can_be_named(tmp_path: Path) -> None:
     swept = shape.sweep([HOME, turned])
     assert swept.clearance is not None
     assert "post" in swept.clearance.text
+
+
+def room_with(tmp_path: Path, *things: str) -> Path:
+    room = tmp_path / "room.xml"
+    room.write_text(
+        '<mujoco><compiler angle="radian"/><option timestep="0.01" integrator="RK4"/><visual><map zfar="9"/></visual>'
+        f'<worldbody><geom name="floor" type="plane" size="5 5 1"/>{"".join(things)}</worldbody></mujoco>'
+    )
+    return room
+
+
+def standing(room: Path, yaw_rad: float = 0.7) -> MujocoGeometry:
+    there = geometry.Standing(room=room, position_m=(2.0, -1.0, 0.75), yaw_rad=yaw_rad)
+    return MujocoGeometry(KIND, UR5 / KIND.model, standing=there)
+
+
+def test_in_a_room_poses_stay_in_the_robots_base(shape: MujocoGeometry, tmp_path: Path):
+    there = standing(room_with(tmp_path))
+    for name, pose in shape.poses(HOME).items():
+        assert there.poses(HOME)[name] == pytest.approx(pose, abs=1e-9)
+    target = shape.poses(HOME)["flange"]
+    assert there.solve("flange", target, HOME) == pytest.approx(HOME, abs=1e-2)
+
+
+@pytest.mark.parametrize("yaw_rad", [0.0, 0.7, -2.2])
+def test_in_a_room_a_thing_is_where_the_robots_place_and_turn_have_it(tmp_path: Path, yaw_rad: float):
+    # As far from the base as the flange; the arm turns there about its base.
+    x, y = -0.36, -0.36
+    place = (2.0 + x * math.cos(yaw_rad) - y * math.sin(yaw_rad), -1.0 + x * math.sin(yaw_rad) + y * math.cos(yaw_rad))
+    post = f'<geom name="post" type="cylinder" size="0.05 0.6" pos="{place[0]} {place[1]} 1.3"/>'
+    there = standing(room_with(tmp_path, post), yaw_rad=yaw_rad)
+    towards = [HOME[0] + 1.0, *HOME[1:]]
+    swept = there.sweep([HOME, towards])
+    assert swept.clearance is not None
+    assert swept.clearance.between[0] == "post"
+    assert swept.share == pytest.approx(0.4, abs=0.1)
+    assert there.sweep([HOME, [HOME[0] - 1.0, *HOME[1:]]]).share == 1.0
+
+
+def test_what_moves_in_a_room_or_is_out_of_reach_is_left_out(tmp_path: Path):
+    gate = '<geom name="gate" type="box" size="0.05 0.4 0.4"/>'
+    swinging = f'<body pos="1.5 -1 1"><joint name="swing" type="hinge"/>{gate}</body>'
+    far = '<geom name="far" type="box" size="0.1 0.1 0.1" pos="-3 3 1"/>'
+    with_both = standing(room_with(tmp_path, swinging, far))
+    names = {name for pair in with_both._pairs._names for name in pair}
+    assert "gate" not in names
+    assert "far" not in names
+    assert "floor" in names
