@@ -1,27 +1,33 @@
 """Puts an agent together: the one place that picks drivers; ``links`` picks the transport."""
 
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
 
-from device_agent import drivers, geometry, links
+import msgspec
+
+from device_agent import drivers, geometry, links, sensors
 from device_agent.jail.warm import WarmJail
 from device_agent.ports.clock import CloudClock, tick_ms, wall_ms
-from device_agent.ports.driver import Driver
+from device_agent.ports.driver import Driver, DriverError
 from device_agent.ports.geometry import Geometry, GeometryError
 from device_agent.ports.jail import Jail
+from device_agent.ports.sensor import RoomDriver, SensorError, Surroundings
 from device_agent.ports.transport import Transport
+from device_agent.ports.uploads import Uploads
 from device_agent.protocol import robot_type, topics
 from device_agent.protocol import room as rooms
 from device_agent.protocol.errors import ProtocolError
 from device_agent.runtime.agent import Agent
 from device_agent.runtime.device import Device
 from device_agent.runtime.home import Configuration, DeviceEntry, Home, HomeError, Pairing
+from device_agent.runtime.instrument import Instrument
 from device_agent.runtime.journal import Journal
 from device_agent.runtime.outbox import Outbox, Publish
 from device_agent.runtime.room import Room
 from device_agent.runtime.shelf import Shelf
 from device_agent.transports.http.api import CloudApi
+from device_agent.transports.http.uploads import HttpUploads
 
 ROBOTS = Path(__file__).resolve().parent.parent / "robots"
 ROOMS = ROBOTS / "rooms"
@@ -147,10 +153,12 @@ def entries_of(name: str) -> list[DeviceEntry]:
         HomeError: The room, or the type of a robot in it, is unknown.
     """
     room = load_room(name)
-    return [
+    robots = (
         DeviceEntry(name=robot.name, type=robot.type, room=name, label=robot.label or load_type(robot.type).label)
         for robot in room.robots
-    ]
+    )
+    devices = (DeviceEntry(name=each.name, type=each.kind, room=name, label=each.label) for each in room.devices)
+    return [*robots, *devices]
 
 
 def geometry_of(entry: DeviceEntry, kind: robot_type.RobotType) -> Geometry | None:
@@ -196,6 +204,42 @@ def driver_of(
         if entry.room:
             options["room"] = str(ROOMS / entry.room)
     return drivers.load(name)(kind, folder, options, entry.name)
+
+
+def instrument_of(entry: DeviceEntry, neighbours: Mapping[str, RoomDriver], uploads: Uploads) -> Instrument | None:
+    """A configured device as a room's, not connected; ``None`` where it is a robot.
+
+    Args:
+        entry: The device; its options stand before those of the room's manifest.
+        neighbours: The agent's room drivers by name, filled while they are made.
+        uploads: Where its captures go.
+
+    Raises:
+        HomeError: The room is unknown, or its driver or an option.
+    """
+    device = load_room(entry.room).device(entry.name) if entry.room else None
+    if device is None:
+        return None
+    driver = entry.driver or device.driver
+    manifest = msgspec.structs.replace(
+        device, label=entry.label or device.label, driver=driver, options={**device.options, **entry.options}
+    )
+    try:
+        made = sensors.load(driver)(manifest, ROOMS / entry.room, _surroundings(entry.room, neighbours))
+        return Instrument(made, manifest, uploads)
+    except SensorError as error:
+        raise HomeError(str(error)) from error
+
+
+def _surroundings(room: str, neighbours: Mapping[str, RoomDriver]) -> Surroundings:
+    if not load_room(room).model:
+        return Surroundings(neighbours=neighbours)
+    from device_agent.drivers.mujoco import worlds  # noqa: PLC0415 (a real room needs no simulation)
+
+    try:
+        return Surroundings(neighbours=neighbours, world=worlds.of(ROOMS / room))
+    except DriverError as error:
+        raise HomeError(str(error)) from error
 
 
 def api_of(home: Home, configuration: Configuration, clock: CloudClock, *, create: bool = False) -> CloudApi:
@@ -258,11 +302,17 @@ def build(home: Home, *, trace: Path | None = None) -> Cell:
     )
     outbox = _outbox(home, configuration, pairing, publish=transport.publish, quiet=lambda: agent.quiet)
     jail = WarmJail(trusted=configuration.trusted_scripts)
-    devices = {}
+    uploads = HttpUploads(pairing.agent, lambda: api_of(home, configuration, clock))
+    devices: dict[str, Device] = {}
+    neighbours: dict[str, RoomDriver] = {}
     for entry in configuration.devices:
+        instrument = instrument_of(entry, neighbours, uploads)
+        if instrument is not None:
+            neighbours[entry.name] = instrument.driver
         devices[entry.name] = _device(
             entry,
             pairing,
+            instrument=instrument,
             journal=journal,
             clock=clock,
             transport=transport,
@@ -299,6 +349,7 @@ def _device(
     entry: DeviceEntry,
     pairing: Pairing,
     *,
+    instrument: Instrument | None,
     journal: Journal,
     clock: CloudClock,
     transport: Transport,
@@ -315,7 +366,7 @@ def _device(
         space=pairing.space,
         agent=pairing.agent,
         robot_type=kind,
-        driver=driver_of(entry, kind, trace=trace, faults=faults),
+        driver=driver_of(entry, kind, trace=trace, faults=faults) if instrument is None else instrument,
         journal=journal,
         cloud_clock=clock,
         keys=pairing.public_keys(),

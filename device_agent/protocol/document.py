@@ -3,11 +3,12 @@
 ``python -m device_agent.protocol.document`` prints it; ``make contract`` keeps ``docs/asyncapi.json`` equal to it.
 """
 
+import inspect
 import json
 import sys
 from typing import Any, NamedTuple
 
-from device_agent.protocol import codec, messages, topics
+from device_agent.protocol import codec, frames, messages, topics
 
 
 class _Channel(NamedTuple):
@@ -57,6 +58,7 @@ _CHANNELS = (
         False,
         "As `late_joints`; every stream but `joints`.",
     ),
+    _Channel("camera", f"{_DEVICE}/cam/{{camera}}", "CameraFrame", 0, False, "A picture: header, then JPEG."),
     _Channel("event", f"{_DEVICE}/event", "Event", 1, False, "A fact that happened; stored."),
     _Channel("ack", f"{_DEVICE}/ack", "Ack", 1, False, "The answer to one command."),
     _Channel("command", f"{_DEVICE}/cmd", "Signed", 1, False, "A signed request; `body` is a Command.", to_agent=True),
@@ -83,6 +85,7 @@ _PARAMETERS = {
     "space": "Id of the space, the room and its people's data.",
     "agent": "Id of the agent; also its MQTT client id.",
     "device": "The device's name at its agent.",
+    "camera": "Name of the camera.",
     "stream": "Name of the stream, any but `joints`.",
     "epoch": "Epoch of the lease under which the setpoints are sent.",
 }
@@ -104,6 +107,8 @@ def document() -> dict[str, Any]:
         "required": ["key", "signature", "body"],
         "additionalProperties": False,
     }
+    picture = inspect.cleandoc(frames.__doc__ or "")
+    references["CameraFrame"] = {"type": "string", "format": "binary", "description": picture}
     return {
         "asyncapi": "3.0.0",
         "info": {
@@ -121,7 +126,11 @@ def document() -> dict[str, Any]:
         "components": {
             "schemas": schemas,
             "messages": {
-                channel.message: {"name": channel.message, "payload": references[channel.message]}
+                channel.message: {
+                    "name": channel.message,
+                    "payload": references[channel.message],
+                    **({"contentType": "application/octet-stream"} if channel.message == "CameraFrame" else {}),
+                }
                 for channel in _CHANNELS
             },
         },

@@ -131,7 +131,36 @@ class Drive(_Order, frozen=True, kw_only=True, tag="drive"):
     duration_s: Annotated[float, Meta(gt=0, le=60)] = 1.0
 
 
-Task = MoveJoints | Say | Express | TakePosture | RunBehaviour | SetStiffness | LookAt | Drive
+class Gather(_Order, frozen=True, kw_only=True, tag="gather"):
+    """Measure these streams of a room device at this rate for a time, then again as before; no streams: all."""
+
+    streams: Annotated[tuple[Id, ...], Meta(max_length=16)] = ()
+    rate_hz: Annotated[float, Meta(ge=0.001, le=50)]
+    duration_s: Annotated[float, Meta(gt=0, le=86_400)]
+
+
+class Shoot(_Order, frozen=True, kw_only=True, tag="shoot"):
+    """Measure these streams of a room device once, now; no streams: all. The result has the ``values``."""
+
+    streams: Annotated[tuple[Id, ...], Meta(max_length=16)] = ()
+
+
+class CaptureRaw(_Order, frozen=True, kw_only=True, tag="capture"):
+    """Take a raw picture or scan and store it; the result names the ``upload``."""
+
+    name: Id
+
+
+class SetControl(_Order, frozen=True, kw_only=True, tag="set_control"):
+    """Set a control of a room device, within its limits and in its unit; the result says what was ``applied``."""
+
+    control: Id
+    value: float
+
+
+RoomTask = Gather | Shoot | CaptureRaw | SetControl
+"""What is done with devices of a room."""
+Task = MoveJoints | Say | Express | TakePosture | RunBehaviour | SetStiffness | LookAt | Drive | RoomTask
 """Orders that are actions and reach a device just as they were asked of the API."""
 
 

@@ -54,6 +54,16 @@ class Stream(Struct, frozen=True, kw_only=True):
     rate_hz: float
 
 
+class Control(Struct, frozen=True, kw_only=True):
+    """One thing that can be set, within ``lower`` and ``upper`` [``unit``]."""
+
+    name: Id
+    label: Label
+    unit: Annotated[str, Meta(max_length=20)] = ""
+    lower: float
+    upper: float
+
+
 class InterlockRule(Struct, frozen=True, kw_only=True):
     """When the room slows or holds the device: on its condition, and when its sensor was silent for ``stale_ms``.
 
@@ -74,6 +84,7 @@ class Description(Struct, frozen=True, kw_only=True):
 
     ``actions`` names the kinds of action that it takes; ``postures``, ``expressions`` and ``behaviours`` what those of
     these kinds may name. An agent that names no actions is an older one.
+    ``cameras``: what ``cam/{name}`` shows; ``captures``: what raw data can be had; ``controls``: what can be set.
 
     ``scripts``: movement scripts run in the jail, run with less (``trusted``, as the agent's owner wants it), or are
     refused; ``scripts_note`` says why, and what to do.
@@ -91,6 +102,9 @@ class Description(Struct, frozen=True, kw_only=True):
     expressions: tuple[Label, ...] = ()
     behaviours: tuple[Label, ...] = ()
     streams: tuple[Stream, ...] = ()
+    cameras: tuple[Stream, ...] = ()
+    captures: tuple[Label, ...] = ()
+    controls: tuple[Control, ...] = ()
     watchdog_ms: Milliseconds = 0
     max_loop_age_ms: Milliseconds = 0
     simulated: bool = False

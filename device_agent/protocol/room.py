@@ -8,6 +8,7 @@ from typing import Annotated, Any
 import msgspec
 from msgspec import Meta, Struct
 
+from device_agent.protocol import reports
 from device_agent.protocol.errors import ProtocolError
 from device_agent.protocol.messages import Id, Label, Stream, Text, Vector3
 from device_agent.protocol.robot_type import RobotType
@@ -49,14 +50,8 @@ class RoomRobot(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     yaw_rad: float = 0.0
 
 
-class Control(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+class Control(reports.Control, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """One thing that can be set at a room device, within ``lower`` and ``upper`` [``unit``]."""
-
-    name: Id
-    label: Label
-    unit: Annotated[str, Meta(max_length=20)] = ""
-    lower: float
-    upper: float
 
 
 class RoomDevice(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):

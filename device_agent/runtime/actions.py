@@ -7,8 +7,8 @@ from collections.abc import Callable
 from typing import Any, Protocol
 
 from device_agent.ports.jail import Jail
-from device_agent.protocol.messages import AckStatus, ActionState, Command, Reason, RunMovement, Task
-from device_agent.runtime import tasks
+from device_agent.protocol.messages import AckStatus, ActionState, Command, Reason, RoomTask, RunMovement, Task
+from device_agent.runtime import room_tasks, tasks
 from device_agent.runtime.lease import Refused
 from device_agent.runtime.movements import MAX_OUTPUT, Cell, Script, ScriptFailed
 from device_agent.runtime.robot import Body, ScriptRobot
@@ -56,6 +56,8 @@ class Executor:
                 cell = self._cell(order)
                 run.begin(_Playing(order, run, cell))
                 self._trust.remember(order)
+            elif isinstance(order, RoomTask):
+                run.begin(room_tasks.activity(order, self._body.instrument, run.tell))
             else:
                 run.begin(tasks.Deed(order, run.robot))
             self._run = run

@@ -25,6 +25,7 @@ from device_agent.runtime import tasks
 from device_agent.runtime.actions import Executor
 from device_agent.runtime.audit import Audit, Happened
 from device_agent.runtime.controller import Controller
+from device_agent.runtime.instrument import Instrument
 from device_agent.runtime.interlocks import Interlock, Interlocks
 from device_agent.runtime.journal import Journal
 from device_agent.runtime.lease import LeaseGate, Refused
@@ -34,6 +35,7 @@ from device_agent.runtime.outbox import Outbox, Publish
 from device_agent.runtime.reporter import Reporter
 from device_agent.runtime.robot import Body
 from device_agent.runtime.room import Room
+from device_agent.runtime.sensing import SensorLoop
 from device_agent.runtime.trust import Trust
 from device_agent.runtime.voice import Voice
 
@@ -55,7 +57,7 @@ class Device:
         space: Id of the space.
         agent: Id of the agent.
         robot_type: Joints, limits, period.
-        driver: Not yet connected.
+        driver: Not yet connected; an ``Instrument`` for a device of a room.
         journal: Open.
         cloud_clock: For ``ttl_ms``.
         keys: The cloud's pinned public keys by key id.
@@ -76,7 +78,7 @@ class Device:
         space: str,
         agent: str,
         robot_type: RobotType,
-        driver: Driver,
+        driver: Driver | Instrument,
         journal: Journal,
         cloud_clock: CloudClock,
         keys: Mapping[str, Ed25519PublicKey],
@@ -96,6 +98,7 @@ class Device:
         self._audit = Audit()
         self._controller = Controller(robot_type, gate, latch=record.latch, geometry=geometry, tell=self._audit.note)
         self._controller.changed.set()
+        instrument = driver if isinstance(driver, Instrument) else None
         self._reporter = Reporter(
             robot_type.streams, driver if isinstance(driver, Reporting) else None, name=name, tell=self._measured
         )
@@ -107,14 +110,16 @@ class Device:
             skills=driver if isinstance(driver, Skills) else None,
             room=room,
             reported=self._reporter.latest,
+            instrument=instrument,
         )
         self.voice = Voice(
             address=(space, agent, name),
             label=label,
             robot_type=robot_type,
+            room_device=None if instrument is None else instrument.manifest,
             simulated=driver.simulated,
-            limits=self._controller.limits,
-            actions=tasks.kinds(body.can()),
+            limits=self._controller.limits if robot_type.joints else (),
+            actions=tasks.kinds(body.can()) if instrument is None else instrument.actions,
             interlocks=[rule.shown for rule in interlocks],
             journal=journal,
             publish=publish,
@@ -128,14 +133,7 @@ class Device:
             lift=self._controller.lift,
             note=lambda happened, code, now_s: self._audit.refused(happened, code=code, now_s=now_s),
         )
-        self._loop = ControlLoop(
-            robot_type,
-            driver,
-            self._controller,
-            name=name,
-            tell=lambda telemetry: self._measured(topics.JOINTS, telemetry),
-            watch=self._interlocks.step,
-        )
+        self._loop = self._loop_of(driver, robot_type)
         trust = Trust(device=name, robot_type=robot_type.type, owner=owner, keys=keys, journal=journal)
         self._executor = Executor(body, trust=trust, jail=jail, report=self.voice.report)
         self._office = Office(
@@ -147,6 +145,21 @@ class Device:
             journal=journal,
             cloud_clock=cloud_clock,
             keys=keys,
+        )
+
+    def _loop_of(self, driver: Driver | Instrument, robot_type: RobotType) -> ControlLoop | SensorLoop:
+        watch = self._interlocks.step
+        if isinstance(driver, Instrument):
+            return SensorLoop(
+                driver, self._controller, name=self.name, tell=self._measured, film=self.voice.film, watch=watch
+            )
+        return ControlLoop(
+            robot_type,
+            driver,
+            self._controller,
+            name=self.name,
+            tell=lambda telemetry: self._measured(topics.JOINTS, telemetry),
+            watch=watch,
         )
 
     # ------------------------------------------------------------ life
@@ -165,7 +178,7 @@ class Device:
         self.voice.scripts = scripts = self._jail.standing()
         if scripts.how != "jailed":
             self._audit.note(Happened(_SCRIPTS[scripts.how], scripts.why, "warning", {"why": scripts.why}))
-        self._office.start(self._driver.twin())
+        self._office.start(None if isinstance(self._driver, Instrument) else self._driver.twin())
 
     def stop(self) -> None:
         """End what runs, hold, and let the driver go. May be called twice."""

@@ -3,11 +3,13 @@
 import math
 import threading
 import time
+from collections import Counter
 from collections.abc import Collection, Iterable, Mapping
 
 from device_agent.ports.clock import wall_ms
 from device_agent.ports.sensor import Camera, Capture, Movable, RoomDriver, SensorError, Values
 from device_agent.ports.uploads import UploadError, Uploads
+from device_agent.protocol.orders import CaptureRaw, Gather, SetControl, Shoot
 from device_agent.protocol.room import Control, RoomDevice
 from device_agent.runtime.lease import Refused
 
@@ -24,17 +26,41 @@ class Instrument:
         uploads: Where its captures go; ``None`` where the agent has no such place.
 
     Attributes:
+        driver: As given; the loop connects it.
+        manifest: As given.
+        streams: Names of what it measures; ``cameras``: of what it films.
         changed: Set whenever a rate has changed; whoever heeds it clears it.
     """
 
     def __init__(self, driver: RoomDriver, manifest: RoomDevice, uploads: Uploads | None) -> None:
-        self._driver = driver
-        self._manifest = manifest
+        self.driver = driver
+        self.manifest = manifest
         self._uploads = uploads
         self._gathering: Mapping[str, float] = {}
+        self._counts: Counter[str] = Counter()
         self.changed = threading.Event()
         self.streams = tuple(stream.name for stream in manifest.streams)
         self.cameras = tuple(camera.name for camera in manifest.cameras) if isinstance(driver, Camera) else ()
+
+    @property
+    def simulated(self) -> bool:
+        """Whether it is no real sensor."""
+        return self.driver.simulated
+
+    def close(self) -> None:
+        """Let the driver go."""
+        self.driver.close()
+
+    @property
+    def actions(self) -> tuple[str, ...]:
+        """The kinds of action that it takes."""
+        takes = (
+            (Gather, self.streams),
+            (Shoot, self.streams),
+            (CaptureRaw, self.manifest.captures),
+            (SetControl, self.manifest.controls),
+        )
+        return tuple(str(order.__struct_config__.tag) for order, things in takes if things)
 
     # ------------------------------------------------------------ rates
 
@@ -43,7 +69,7 @@ class Instrument:
         asked = self._gathering.get(name)
         if asked is not None:
             return asked
-        every = (*self._manifest.streams, *self._manifest.cameras)
+        every = (*self.manifest.streams, *self.manifest.cameras)
         return max(_LEAST_RATE_HZ, next(each.rate_hz for each in every if each.name == name))
 
     def gather(self, streams: Collection[str], rate_hz: float) -> tuple[str, ...]:
@@ -53,18 +79,20 @@ class Instrument:
             Refused: There is no such stream.
         """
         chosen = tuple(self._known(streams))
+        self._counts = Counter()
         self._gathering = dict.fromkeys(chosen, rate_hz)
         self.changed.set()
         return chosen
 
-    def rest(self) -> None:
-        """Read every stream as often as the manifest says."""
+    def rest(self) -> Mapping[str, int]:
+        """Read every stream as often as the manifest says; gives how many measurements were gathered of each."""
         self._gathering = {}
         self.changed.set()
+        return self._counts
 
     def _known(self, streams: Collection[str]) -> Iterable[str]:
         if not self.streams:
-            raise Refused("no_streams", f"'{self._manifest.name}' has no streams")
+            raise Refused("no_streams", f"'{self.manifest.name}' has no streams")
         for stream in streams:
             if stream not in self.streams:
                 raise Refused("unknown_stream", f"no stream '{stream}'; there are {', '.join(self.streams)}")
@@ -78,7 +106,10 @@ class Instrument:
         Raises:
             SensorError: As the driver's ``read``.
         """
-        return {name: value for name, value in self._driver.read(stream).items() if math.isfinite(value)}
+        values = {name: value for name, value in self.driver.read(stream).items() if math.isfinite(value)}
+        if values and stream in self._gathering:
+            self._counts[stream] += 1
+        return values
 
     def shoot(self, streams: Collection[str]) -> dict[str, dict[str, float | bool]]:
         """One measurement now, of these streams or of all.
@@ -104,14 +135,14 @@ class Instrument:
             limits = f"{control.lower:g} to {control.upper:g} {control.unit}".rstrip()
             raise Refused("out_of_range", f"{name} can be {limits}, not {value:g}")
         try:
-            return self._driver.set(name, value)
+            return self.driver.set(name, value)
         except SensorError as error:
             raise Refused("sensor_failed", str(error)) from error
 
     def _control(self, name: str) -> Control:
-        found = next((each for each in self._manifest.controls if each.name == name), None)
+        found = next((each for each in self.manifest.controls if each.name == name), None)
         if found is None:
-            known = ", ".join(each.name for each in self._manifest.controls) or "none"
+            known = ", ".join(each.name for each in self.manifest.controls) or "none"
             raise Refused("unknown_control", f"no control '{name}'; there are: {known}")
         return found
 
@@ -121,17 +152,17 @@ class Instrument:
         Raises:
             Refused: There is no such capture, it failed, or it could not be stored.
         """
-        if name not in self._manifest.captures:
-            known = ", ".join(self._manifest.captures) or "none"
+        if name not in self.manifest.captures:
+            known = ", ".join(self.manifest.captures) or "none"
             raise Refused("unknown_capture", f"no capture '{name}'; there are: {known}")
         if self._uploads is None:
             raise Refused("no_store", "this agent has nowhere to store captures")
         try:
-            at_ms, taken = wall_ms(), self._driver.capture(name)
+            at_ms, taken = wall_ms(), self.driver.capture(name)
             upload = self._uploads.store(
-                self._manifest.name,
+                self.manifest.name,
                 stream=name,
-                name=_file_name(self._manifest.name, name, taken),
+                name=_file_name(self.manifest.name, name, taken),
                 media_type=taken.media_type,
                 content=taken.content,
                 at_ms=at_ms,
@@ -148,8 +179,8 @@ class Instrument:
         Raises:
             SensorError: It failed.
         """
-        if isinstance(self._driver, Movable):
-            self._driver.hold()
+        if isinstance(self.driver, Movable):
+            self.driver.hold()
 
 
 def _file_name(device: str, capture: str, taken: Capture) -> str:

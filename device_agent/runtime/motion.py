@@ -209,6 +209,8 @@ class Motion:
         """
         if self._ride is not None:
             return self._ride.propose()
+        if not self._zeros:  # ``ruckig`` cannot plan for nothing
+            return [[], []]
         plan(self._generator.update, self._input, self._output)
         self._proposed = True
         order = self._plan_input
@@ -232,6 +234,8 @@ class Motion:
         """
         if self._ride is not None:
             return self._update_ride(self._ride)
+        if not self._zeros:
+            return self.position_rad
         if not self._proposed:
             plan(self._generator.update, self._input, self._output)
         self._proposed = False

@@ -16,6 +16,7 @@ from device_agent.runtime import calls, gaze, shows
 from device_agent.runtime.authority import Tenure
 from device_agent.runtime.controller import Controller
 from device_agent.runtime.courses import Course, Outcome
+from device_agent.runtime.instrument import Instrument
 from device_agent.runtime.lease import Refused
 from device_agent.runtime.room import Reading, Room
 
@@ -36,6 +37,7 @@ class Body:
         skills: What its driver can besides.
         room: What the space's other devices have measured last.
         reported: The newest of each of its own streams besides ``joints``.
+        instrument: The device as a room's, where it is one.
     """
 
     robot_type: RobotType
@@ -45,6 +47,7 @@ class Body:
     skills: Skills | None
     room: Room
     reported: Callable[[], Mapping[str, Reading]] = dict
+    instrument: Instrument | None = None
 
     def seen(self) -> Observation:
         """The newest measurement.
@@ -58,9 +61,11 @@ class Body:
         return seen
 
     def measured(self) -> dict[str, Any]:
-        """Where it is, as results show it; empty before the first measurement."""
+        """Where it is, as results show it; empty before the first measurement, and without joints."""
         seen = self.observe()
-        return {} if seen is None else {"position_rad": by_name(self.robot_type, seen.position_rad)}
+        if seen is None or not self.robot_type.joints:
+            return {}
+        return {"position_rad": by_name(self.robot_type, seen.position_rad)}
 
     def can(self) -> tuple[str, ...]:
         """Names of the calls that scripts have on this robot."""

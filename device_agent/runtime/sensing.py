@@ -12,7 +12,8 @@ from dataclasses import dataclass
 
 from device_agent.ports.clock import tick_ms, wall_ms
 from device_agent.ports.driver import Observation
-from device_agent.ports.sensor import Camera, RoomDriver, SensorError
+from device_agent.ports.sensor import Camera, SensorError
+from device_agent.protocol.errors import ProtocolError
 from device_agent.protocol.frames import CameraFrame
 from device_agent.protocol.messages import MAX_VALUES, Measurements, Mode
 from device_agent.runtime.controller import Controller
@@ -41,8 +42,7 @@ class SensorLoop:
     """One thread, which reads what is due.
 
     Args:
-        driver: Not yet connected.
-        instrument: The same device as its actions meet it.
+        instrument: Its driver is not yet connected.
         controller: Who may use it.
         name: The device's name.
         tell: Called with a stream's name and its measurement; must not block.
@@ -52,7 +52,6 @@ class SensorLoop:
 
     def __init__(
         self,
-        driver: RoomDriver,
         instrument: Instrument,
         controller: Controller,
         *,
@@ -61,8 +60,8 @@ class SensorLoop:
         film: Callable[[str, CameraFrame], None],
         watch: Callable[[float], None],
     ) -> None:
-        self._driver = driver
-        self._camera = driver if isinstance(driver, Camera) else None
+        self._driver = instrument.driver
+        self._camera = instrument.driver if isinstance(instrument.driver, Camera) else None
         self._instrument = instrument
         self._controller = controller
         self._name = name
@@ -136,10 +135,7 @@ class SensorLoop:
         if source.due_s < now_s:
             source.due_s = now_s + period_s
         if source.film and self._camera is not None:
-            frame = self._camera.frame(source.name)
-            source.sequence += 1
-            taken_ms = round(frame.taken_s * 1000)
-            self._film(source.name, CameraFrame(source.sequence, taken_ms, frame.width, frame.height, frame.content))
+            self._shoot(source, self._camera)
             return
         values = self._instrument.read(source.name)
         if not values:
@@ -148,8 +144,17 @@ class SensorLoop:
         told = dict(list(values.items())[:MAX_VALUES])
         self._tell(source.name, Measurements(tick_ms=tick_ms(), at_ms=wall_ms(), sequence=source.sequence, values=told))
 
+    def _shoot(self, source: _Source, camera: Camera) -> None:
+        taken = camera.frame(source.name)
+        source.sequence += 1
+        tick = round(taken.taken_s * 1000)
+        try:
+            self._film(source.name, CameraFrame(source.sequence, tick, taken.width, taken.height, taken.content))
+        except ProtocolError as error:
+            raise SensorError(f"{source.name}: {error}; have it take smaller pictures") from error
+
     def _failed(self, message: str) -> None:
         _log.error("%s: %s", self._name, message)
         self._controller.fail(message)
         with contextlib.suppress(SensorError):
-            self._heed(Mode.FAULT)
+            self._heed(self._controller.step(time.monotonic()).mode)

@@ -9,7 +9,8 @@ from functools import partial
 
 from device_agent.ports.clock import tick_ms, wall_ms
 from device_agent.ports.jail import Standing
-from device_agent.protocol import codec, topics
+from device_agent.protocol import codec, frames, topics
+from device_agent.protocol.frames import CameraFrame
 from device_agent.protocol.messages import (
     Ack,
     AckStatus,
@@ -28,6 +29,7 @@ from device_agent.protocol.messages import (
     Twin,
 )
 from device_agent.protocol.robot_type import RobotType
+from device_agent.protocol.room import RoomDevice
 from device_agent.runtime.audit import Happened, event_of
 from device_agent.runtime.handover import Asked
 from device_agent.runtime.journal import Journal
@@ -75,6 +77,7 @@ class Voice:
         address: Space, agent and name.
         label: Its name for people.
         robot_type: Joints, limits, streams.
+        room_device: What it has where it is a device of a room.
         simulated: Whether no real metal moves.
         limits: What the agent itself holds, whoever moves it.
         actions: The kinds of action that it takes.
@@ -94,6 +97,7 @@ class Voice:
         address: tuple[str, str, str],
         label: str,
         robot_type: RobotType,
+        room_device: RoomDevice | None = None,
         simulated: bool,
         limits: Sequence[str],
         actions: Sequence[str],
@@ -106,6 +110,7 @@ class Voice:
         self._name = address[2]
         self._label = label
         self._robot_type = robot_type
+        self._room_device = room_device
         self._simulated = simulated
         self._limits = tuple(limits)
         self._actions = tuple(actions)
@@ -207,6 +212,10 @@ class Voice:
         late = self._topic(topics.LATE, stream)
         self._outbox.measured(late, payload, at_ms=telemetry.at_ms, sent=sent, now_s=time.monotonic())
 
+    def film(self, camera: str, frame: CameraFrame) -> None:
+        """Publish a picture; one that cannot go out at once is let go."""
+        self._publish(self._topic(topics.CAM, camera), frames.encode(frame), qos=0)
+
     def event(self, happened: Happened) -> None:
         """Tell a fact that happened, as soon as it can be."""
         event = event_of(self._name, happened)
@@ -220,7 +229,7 @@ class Voice:
         return self._publish(topic, codec.encode(message, limit=codec.MAX_RETAINED_BYTES), qos=1, retain=True)
 
     def _description(self) -> Description:
-        kind = self._robot_type
+        kind, fitted = self._robot_type, self._room_device
         return Description(
             device=self._name,
             kind=kind.kind,
@@ -234,6 +243,9 @@ class Voice:
             expressions=tuple(kind.expressions),
             behaviours=tuple(kind.behaviours),
             streams=kind.streams,
+            cameras=() if fitted is None else fitted.cameras,
+            captures=() if fitted is None else fitted.captures,
+            controls=() if fitted is None else fitted.controls,
             watchdog_ms=round(WATCHDOG_S * 1000),
             max_loop_age_ms=round(MAX_LOOP_AGE_S * 1000),
             simulated=self._simulated,

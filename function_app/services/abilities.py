@@ -1,8 +1,19 @@
 """What a device says that it can do, asked before an action takes its slot."""
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 
-from device_agent.protocol.messages import Description, Express, MoveJoints, RunBehaviour, TakePosture, Task
+from device_agent.protocol.messages import (
+    CaptureRaw,
+    Description,
+    Express,
+    Gather,
+    MoveJoints,
+    RunBehaviour,
+    SetControl,
+    Shoot,
+    TakePosture,
+    Task,
+)
 from function_app.domain.devices import Device
 from function_app.domain.problems import Problem
 from function_app.ports.tables import Tables
@@ -25,13 +36,26 @@ async def check(tables: Tables, device: Device, asked: Task) -> None:
         return
     kind = str(type(asked).__struct_config__.tag)
     _among("kind of action", kind, described.actions)
+    for word, name, there in _named(asked, described):
+        _among(word, name, there)
+
+
+def _named(asked: Task, described: Description) -> Iterable[tuple[str, str, Sequence[str]]]:
+    """What is asked for by name: the word for it, the name, and the names there are."""
     match asked:
         case Express(name=name):
-            _among("expression", name, described.expressions)
+            yield "expression", name, described.expressions
         case TakePosture(name=name):
-            _among("posture", name, described.postures)
+            yield "posture", name, described.postures
         case RunBehaviour(name=name):
-            _among("behaviour", name, described.behaviours)
+            yield "behaviour", name, described.behaviours
+        case Gather(streams=streams) | Shoot(streams=streams):
+            for stream in streams:
+                yield "stream", stream, [each.name for each in described.streams]
+        case CaptureRaw(name=name):
+            yield "capture", name, described.captures
+        case SetControl(control=control):
+            yield "control", control, [each.name for each in described.controls]
 
 
 def _among(word: str, name: str, there: Sequence[str]) -> None:

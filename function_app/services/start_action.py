@@ -9,14 +9,14 @@ from typing import Any, Literal
 import msgspec
 from msgspec import Struct
 
-from device_agent.protocol.messages import Ack, Id, RunMovement, Task
+from device_agent.protocol.messages import Ack, Gather, Id, RunMovement, Task
 from function_app.domain import lease as rules
 from function_app.domain.accounts import Identity
 from function_app.domain.actions import REPEAT_MS, Action, Status, reached
 from function_app.domain.devices import Device, Link
 from function_app.domain.ids import command_id
 from function_app.domain.lease import Lease
-from function_app.domain.problems import Problem, busy_store
+from function_app.domain.problems import Problem, busy_store, invalid
 from function_app.ports.clock import Clock
 from function_app.ports.command_bus import BusUnavailable
 from function_app.ports.tables import Row, Tables, Write
@@ -213,6 +213,8 @@ class StartAction:
         request: dict[str, Any] = msgspec.to_builtins(asked)
         action = command_id(device.id, now_ms)
         if isinstance(asked, Task):
+            if isinstance(asked, Gather) and asked.duration_s * 1000 > start.timeout_ms:
+                raise invalid("A gathering cannot last longer than the action: raise timeout_ms, or lower duration_s.")
             await abilities.check(self._tables, device, asked)
             plan = _Plan(device, action, now_ms, request, asked)
         else:

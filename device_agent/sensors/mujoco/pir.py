@@ -18,6 +18,8 @@ _CONE_RAD = math.radians(110)
 _HOLD_S = 2.0
 _ACROSS_RAD_S = math.radians(4)
 """Slower than this across its view, or the same in share of the distance towards it, is not noticed."""
+_HOUSING_M = 0.1
+"""It does not see itself and what it is fixed to."""
 _LOOKS_S = 0.2
 """Motion is judged over at least this time."""
 
@@ -84,10 +86,10 @@ class Pir(Part):
         distance_m = float(np.linalg.norm(way))
         if not 0 < distance_m <= self._furthest_m or float(way @ matrix[:, 0]) < self._least_cosine * distance_m:
             return None
-        met = np.full(1, -1, dtype=np.int32)
-        mujoco.mj_ray(self._world.model, data, origin, way / distance_m, None, True, self._own, met, None)
-        model = self._world.model
-        if met[0] >= 0 and model.body_rootid[model.geom_bodyid[met[0]]] != model.body_rootid[body]:
+        direction, met = way / distance_m, np.full(1, -1, dtype=np.int32)
+        start = origin + direction * _HOUSING_M
+        mujoco.mj_ray(self._world.model, data, start, direction, None, True, self._own, met, None)
+        if met[0] >= 0 and int(self._world.model.geom_bodyid[met[0]]) not in self._bodies:
             return None
         return way
 

@@ -8,6 +8,7 @@ import type {
   AckStatus,
   ActionState,
   Body,
+  Control,
   Description,
   Event,
   Fault,
@@ -128,6 +129,16 @@ const joint = object<Joint>({
   max_effort_nm: number,
 });
 
+const stream = object<Stream>({ name: text, rate_hz: number });
+
+const control = object<Required<Control>>({
+  name: text,
+  label: text,
+  unit: optional(text, ""),
+  lower: number,
+  upper: number,
+});
+
 const description = object<Required<Description>>({
   device: text,
   kind: text,
@@ -136,7 +147,14 @@ const description = object<Required<Description>>({
   joints: optional(list(joint, MAX_JOINTS), []),
   frames: optional(list(text, MAX_JOINTS), []),
   capabilities: optional(list(text, MAX_JOINTS), []),
-  streams: optional(list(object<Stream>({ name: text, rate_hz: number }), MAX_JOINTS), []),
+  actions: optional(list(text, MAX_JOINTS), []),
+  postures: optional(list(text, MAX_JOINTS), []),
+  expressions: optional(list(text, MAX_JOINTS), []),
+  behaviours: optional(list(text, MAX_JOINTS), []),
+  streams: optional(list(stream, MAX_JOINTS), []),
+  cameras: optional(list(stream, MAX_JOINTS), []),
+  captures: optional(list(text, MAX_JOINTS), []),
+  controls: optional(list(control, MAX_JOINTS), []),
   watchdog_ms: optional(count, 0),
   max_loop_age_ms: optional(count, 0),
   simulated: optional(flag, false),
@@ -204,6 +222,7 @@ const state = object<Required<State>>({
   ),
   faults: optional(list(object<Fault>({ code: text, message: text, since_ms: count }), MAX_JOINTS), []),
   restrictions: optional(list(object<Restriction>({ source: text, speed: number, why: text }), MAX_JOINTS), []),
+  stiffness: optional(byName, {}),
 });
 
 const measured = list(number, MAX_JOINTS);

@@ -21,6 +21,7 @@ export interface Presence {
  *
  * `actions` names the kinds of action that it takes; `postures`, `expressions` and `behaviours` what those of
  * these kinds may name. An agent that names no actions is an older one.
+ * `cameras`: what `cam/{name}` shows; `captures`: what raw data can be had; `controls`: what can be set.
  *
  * `scripts`: movement scripts run in the jail, run with less (`trusted`, as the agent's owner wants it), or are
  * refused; `scripts_note` says why, and what to do.
@@ -40,6 +41,9 @@ export interface Description {
   expressions?: string[];
   behaviours?: string[];
   streams?: Stream[];
+  cameras?: Stream[];
+  captures?: string[];
+  controls?: Control[];
   watchdog_ms?: number;
   max_loop_age_ms?: number;
   simulated?: boolean;
@@ -66,6 +70,16 @@ export interface Stream {
   /** letters, digits, _ and -, 1 to 64 of them */
   name: string;
   rate_hz: number;
+}
+
+/** One thing that can be set, within `lower` and `upper` [`unit`]. */
+export interface Control {
+  /** letters, digits, _ and -, 1 to 64 of them */
+  name: string;
+  label: string;
+  unit?: string;
+  lower: number;
+  upper: number;
 }
 
 /**
@@ -297,7 +311,7 @@ export interface Command {
   ttl_ms: number;
   who: string;
   epoch: number;
-  request: GrantLease | ReleaseLease | AskLease | DropRequest | RunMovement | MoveJoints | Say | Express | TakePosture | RunBehaviour | SetStiffness | LookAt | Drive | CancelAction | StopDevice | ResetStop;
+  request: GrantLease | ReleaseLease | AskLease | DropRequest | RunMovement | MoveJoints | Say | Express | TakePosture | RunBehaviour | SetStiffness | LookAt | Drive | Gather | Shoot | CaptureRaw | SetControl | CancelAction | StopDevice | ResetStop;
 }
 
 /**
@@ -418,6 +432,35 @@ export interface Drive {
   left_m_s?: number;
   turn_rad_s?: number;
   duration_s?: number;
+}
+
+/** Measure these streams of a room device at this rate for a time, then again as before; no streams: all. */
+export interface Gather {
+  kind: "gather";
+  streams?: string[];
+  rate_hz: number;
+  duration_s: number;
+}
+
+/** Measure these streams of a room device once, now; no streams: all. The result has the `values`. */
+export interface Shoot {
+  kind: "shoot";
+  streams?: string[];
+}
+
+/** Take a raw picture or scan and store it; the result names the `upload`. */
+export interface CaptureRaw {
+  kind: "capture";
+  /** letters, digits, _ and -, 1 to 64 of them */
+  name: string;
+}
+
+/** Set a control of a room device, within its limits and in its unit; the result says what was `applied`. */
+export interface SetControl {
+  kind: "set_control";
+  /** letters, digits, _ and -, 1 to 64 of them */
+  control: string;
+  value: number;
 }
 
 /** End the named action; the device holds where it is. */

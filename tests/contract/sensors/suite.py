@@ -1,0 +1,137 @@
+"""What every driver of a room device must do. A third party inherits the suite and supplies its two fixtures."""
+
+import json
+import math
+import re
+from collections.abc import Callable
+from functools import partial
+
+import numpy as np
+import pytest
+import simplejpeg
+
+from device_agent.ports.sensor import Camera, Image, Movable, RoomDriver, Scan, SensorError
+from device_agent.protocol import codec, frames
+from device_agent.protocol.frames import CameraFrame
+from device_agent.protocol.messages import FIELD_PATTERN, MAX_VALUES, Measurements
+from device_agent.protocol.room import RoomDevice
+
+PNG = b"\x89PNG\r\n\x1a\n"
+
+
+class RoomDriverContract:
+    """The suite. ``driver`` gives one that is not connected, and closes it afterwards."""
+
+    @pytest.fixture
+    def entry(self) -> RoomDevice:
+        raise NotImplementedError
+
+    @pytest.fixture
+    def driver(self, entry: RoomDevice) -> RoomDriver:
+        raise NotImplementedError
+
+    @pytest.fixture
+    def connected(self, driver: RoomDriver) -> RoomDriver:
+        driver.connect()
+        return driver
+
+    def test_it_is_a_room_driver_and_says_before_connect_whether_it_is_simulated(self, driver: RoomDriver) -> None:
+        assert isinstance(driver, RoomDriver)
+        assert isinstance(driver.simulated, bool)
+
+    def test_nothing_works_before_connect(self, driver: RoomDriver, entry: RoomDevice) -> None:
+        for call in everything(driver, entry):
+            with pytest.raises(SensorError):
+                call()
+
+    def test_each_stream_gives_finite_values_with_names_that_may_travel(
+        self, connected: RoomDriver, entry: RoomDevice
+    ) -> None:
+        for stream in entry.streams:
+            values = connected.read(stream.name)
+            assert len(values) <= MAX_VALUES
+            assert all(re.fullmatch(FIELD_PATTERN, name) for name in values)
+            assert all(math.isfinite(value) for value in values.values())
+            if values:
+                codec.encode(Measurements(tick_ms=1, at_ms=1, sequence=1, values=dict(values)))
+
+    def test_each_capture_is_a_file_of_the_type_that_it_says(self, connected: RoomDriver, entry: RoomDevice) -> None:
+        for name in entry.captures:
+            taken = connected.capture(name)
+            assert taken.content
+            match taken.media_type:
+                case "image/png":
+                    assert taken.content.startswith(PNG)
+                case "application/json":
+                    json.loads(taken.content)
+
+    def test_each_camera_gives_a_jpeg_of_the_size_that_it_says_and_small_enough_to_travel(
+        self, connected: RoomDriver, entry: RoomDevice
+    ) -> None:
+        if entry.cameras:
+            assert isinstance(connected, Camera)
+            for camera in entry.cameras:
+                frame = connected.frame(camera.name)
+                assert simplejpeg.decode_jpeg(frame.content).shape == (frame.height, frame.width, 3)
+                frames.encode(CameraFrame(1, 1, frame.width, frame.height, frame.content))
+
+    def test_each_control_applies_what_it_says_within_its_limits(
+        self, connected: RoomDriver, entry: RoomDevice
+    ) -> None:
+        for control in entry.controls:
+            middle = (control.lower + control.upper) / 2
+            for value in (control.lower, control.upper, middle):
+                assert math.isclose(connected.set(control.name, value), value, abs_tol=1e-6)
+        if isinstance(connected, Movable):
+            connected.hold()
+
+    def test_raw_gives_arrays_that_fit_each_other(self, connected: RoomDriver) -> None:
+        raw = connected.raw()
+        if raw is None:
+            return
+        assert np.allclose(raw.rotation @ raw.rotation.T, np.eye(3), atol=1e-6)
+        assert np.isfinite(raw.position_m).all()
+        if isinstance(raw, Scan):
+            assert raw.range_m.shape == raw.angle_rad.shape
+            met = raw.range_m[np.isfinite(raw.range_m)]
+            assert ((met >= raw.nearest_m) & (met <= raw.furthest_m * 1.2)).all()
+            assert not np.isnan(raw.range_m).any()
+        else:
+            assert isinstance(raw, Image)
+            assert raw.rgb is not None or raw.depth_m is not None
+            assert 0 < raw.fovy_rad < math.pi
+            if raw.rgb is not None:
+                assert raw.rgb.dtype == np.uint8
+            if raw.depth_m is not None:
+                assert (raw.depth_m > 0).all()
+
+    def test_what_it_has_not_is_refused_by_name_with_a_list_of_what_there_is(
+        self, connected: RoomDriver, entry: RoomDevice
+    ) -> None:
+        asked: list[tuple[Callable[[], object], list[str]]] = [
+            (partial(connected.read, "nonsense"), [stream.name for stream in entry.streams]),
+            (partial(connected.set, "nonsense", 0.0), [control.name for control in entry.controls]),
+            (partial(connected.capture, "nonsense"), list(entry.captures)),
+        ]
+        for call, there in asked:
+            with pytest.raises(SensorError, match="nonsense") as refused:
+                call()
+            assert all(name in str(refused.value) for name in there)
+
+    def test_it_may_be_connected_and_closed_twice(self, connected: RoomDriver, entry: RoomDevice) -> None:
+        connected.connect()
+        connected.close()
+        connected.close()
+        for call in everything(connected, entry):
+            with pytest.raises(SensorError):
+                call()
+
+
+def everything(driver: RoomDriver, entry: RoomDevice) -> list[Callable[[], object]]:
+    """All that may be asked of it."""
+    calls: list[Callable[[], object]] = [partial(driver.read, each.name) for each in entry.streams]
+    calls += [partial(driver.capture, each) for each in entry.captures]
+    calls += [partial(driver.set, each.name, each.lower) for each in entry.controls]
+    if isinstance(driver, Camera):
+        calls += [partial(driver.frame, each.name) for each in entry.cameras]
+    return calls
