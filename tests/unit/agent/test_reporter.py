@@ -6,6 +6,7 @@ import threading
 import time
 from collections.abc import Callable, Mapping
 from pathlib import Path
+from typing import Any
 
 import msgspec
 import pytest
@@ -13,9 +14,10 @@ import pytest
 from device_agent.ports.driver import DriverError
 from device_agent.protocol import codec, topics
 from device_agent.protocol.messages import Measurements, Stream
+from device_agent.runtime.interlocks import Interlock
 from device_agent.runtime.reporter import Reporter
 from tests.unit.agent.test_controller import robot_type
-from tests.unit.agent.test_device import Bench, ToyDriver
+from tests.unit.agent.test_device import Bench, ToyDriver, eventually
 from tests.unit.agent.test_robot import play
 
 WITHIN_S = 15.0
@@ -127,7 +129,7 @@ def test_a_driver_that_measures_only_joints_is_asked_for_nothing() -> None:
     assert bell.told == []
 
 
-def test_a_device_tells_its_streams_and_keeps_them_for_its_scripts_and_interlocks(tmp_path: Path) -> None:
+def test_a_device_tells_its_streams(tmp_path: Path) -> None:
     kind = msgspec.structs.replace(robot_type(), streams=(SONAR,))
     bench = Bench(tmp_path, kind=kind, driver=Gauge(sonar=lambda: {"distance_m": 0.8}))
     bench.device.start()
@@ -153,4 +155,42 @@ def test_a_script_reads_what_its_own_robot_measures(tmp_path: Path) -> None:
         "print(sonar['values'], sonar['age_s'] >= 0)\n"
     )
     assert play(bench, lines) == "{'distance_m': 0.8} True\n"
+    bench.stop()
+
+
+def test_an_interlock_holds_a_robot_by_what_it_measures_itself(tmp_path: Path) -> None:
+    kind = msgspec.structs.replace(robot_type(), streams=(SONAR,))
+    near = Interlock(device="arm", stream="sonar", field="distance_m", below=0.5)
+    away_m = [0.8]
+    bench = Bench(tmp_path, kind=kind, driver=Gauge(sonar=lambda: {"distance_m": away_m[0]}), interlocks=[near])
+    bench.device.start()
+    eventually(lambda: not bench.device._controller.restrictions)
+    away_m[0] = 0.2
+    (held,) = eventually(lambda: bench.device._controller.restrictions)
+    assert "distance_m" in held.why
+    bench.stop()
+
+
+class Island(Bench):
+    """A device whose link takes no measurement while it is down."""
+
+    down = True
+
+    def publish(self, topic: str, payload: bytes, **more: Any) -> bool:
+        if self.down:
+            return False
+        return super().publish(topic, payload, **more)
+
+
+def test_what_was_measured_while_the_link_was_down_is_told_late(tmp_path: Path) -> None:
+    kind = msgspec.structs.replace(robot_type(), streams=(SONAR,))
+    gauge = Gauge(sonar=lambda: {"distance_m": 0.8})
+    bench = Island(tmp_path, kind=kind, driver=gauge)
+    bench.outbox.link_changed(False)
+    bench.device.start()
+    eventually(lambda: gauge.asked.count("sonar") > 5)
+    bench.down = False
+    bench.outbox.link_changed(True)
+    late = eventually(lambda: bench.heard(topics.LATE, Measurements, "sonar"))
+    assert late[0].values == {"distance_m": 0.8}
     bench.stop()
