@@ -7,7 +7,7 @@ PARAMETERS = {
         "type": "number",
         "minimum": 0.2,
         "maximum": 2,
-        "default": 0.6,
+        "default": 0.5,
         "unit": "m",
         "description": "Of the square",
     },
@@ -32,7 +32,7 @@ PARAMETERS = {
 STEP_M = 0.1
 TURN_RAD_S = 0.8
 
-side_m = min(2.0, max(0.2, float(parameters.get("side_m", 0.6))))
+side_m = min(2.0, max(0.2, float(parameters.get("side_m", 0.5))))
 speed_m_s = min(0.3, max(0.05, float(parameters.get("speed_m_s", 0.2))))
 keep_m = min(1.0, max(0.15, float(parameters.get("keep_m", 0.35))))
 

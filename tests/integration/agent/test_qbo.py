@@ -31,12 +31,12 @@ def bench(tmp_path: Path) -> Iterator[Bench]:
 def test_it_comes_forward_until_its_sonars_say_near(bench: Bench) -> None:
     source = (FOLDER / "movements" / "come_near.py").read_text(encoding="utf-8")
     eventually(lambda: bench.heard(topics.TELE, Measurements, "sonar"))
-    ack = bench.end(bench.command(bench.script("parameters = {'near_m': 1.5, 'speed_m_s': 0.2}\n" + source), epoch=1))
+    ack = bench.end(bench.command(bench.script("parameters = {'near_m': 1.65, 'speed_m_s': 0.2}\n" + source), epoch=1))
     assert ack.status is AckStatus.DONE, ack.reason
     assert ack.output.startswith("stands 1.")
     sonar = bench.heard(topics.TELE, Measurements, "sonar")
     nearest_m = min(float(told.values["distance_m.left"]) for told in sonar)
-    assert 1.2 < nearest_m <= 1.5
+    assert 1.4 < nearest_m <= 1.65
     odometry = bench.heard(topics.TELE, Measurements, "odometry")
     farthest_m = max(float(told.values["x_m"]) for told in odometry)
     assert farthest_m == pytest.approx(2.0 - 0.156 - nearest_m, abs=0.06)

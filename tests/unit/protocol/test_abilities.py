@@ -79,6 +79,12 @@ left = "left_wheel"
 right = "right_wheel"
 radius_m = 0.09
 track_m = 0.2
+
+[simulation.battery]
+capacity_wh = 48.6
+full_v = 24.9
+empty_v = 18.6
+idle_w = 27.0
 """
 ALL = HEAD + JOINTS + MIRRORS + NARROWING + SHOWN
 
@@ -96,6 +102,8 @@ def test_abilities_are_read() -> None:
     assert kind.simulation is not None
     assert kind.simulation.wheels is not None
     assert kind.simulation.wheels.track_m == 0.2
+    assert kind.simulation.battery is not None
+    assert kind.simulation.battery.idle_w == 27.0
 
 
 def test_a_manifest_without_them_has_none() -> None:
@@ -144,6 +152,8 @@ def test_a_narrowed_range_is_linear_between_the_rows(by_rad: float, there: tuple
         ("time_s = 1.5", "time_s = 301.0", "to 300 at most"),
         ("track_m = 0.2", "track_m = 0.0", "simulation.wheels: track_m is 0.0"),
         ("track_m = 0.2", "track_m = 0.2\nspeed = 1.0", "speed"),
+        ("idle_w = 27.0", "idle_w = inf", "simulation.battery: idle_w is inf"),
+        ("empty_v = 18.6", "empty_v = 28.6", "simulation.battery: empty_v must not be above full_v"),
     ],
 )
 def test_what_contradicts_itself_is_refused(was: str, now: str, says: str) -> None:
