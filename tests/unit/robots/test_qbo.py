@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from device_agent.drivers import load
-from device_agent.drivers.mujoco import WheeledDriver
+from device_agent.drivers.mujoco import WheeledDriver, worlds
 from device_agent.ports.driver import REST, DriverError, MobileDriver, Reporting, Twist
 from device_agent.protocol import robot_type
 from device_agent.runtime.base import BaseMotion
@@ -236,3 +236,23 @@ def test_every_stream_of_its_manifest_is_told(connected: WheeledDriver) -> None:
     assert streams == ["joints", "odometry", "sonar", "health"]
     for stream in streams[1:]:
         assert connected.report(stream)
+
+
+def test_in_the_laboratory_its_sonars_hear_a_person_who_steps_before_it() -> None:
+    world = worlds.of(ROBOTS / "rooms" / "lab")
+    world.build()
+    world._processes = ()  # nobody walks by himself
+    driver = WheeledDriver(robot_type=robot_type.load(FOLDER), world=world, device="qbo", prefix=worlds.prefix("qbo"))
+    driver._resolve(world.model)
+    driver._connected = True
+    driver.observe()
+    before = driver.report("sonar")
+    placed = driver.report("odometry")
+    x, y, yaw = (float(placed[name]) for name in ("x_m", "y_m", "yaw_rad"))
+    person = world._data.mocap_pos
+    person[:, :2] += np.array([x + 0.8 * math.cos(yaw), y + 0.8 * math.sin(yaw)]) - person[0, :2]
+    world.step(2)
+    after = driver.report("sonar")
+    nearest_m = min(float(after["distance_m.left"]), float(after["distance_m.right"]))
+    assert 0.4 < nearest_m < 0.8
+    assert nearest_m < min(float(before["distance_m.left"]), float(before["distance_m.right"])) - 0.5
