@@ -18,16 +18,16 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, Self
 
-ROBOTS = Path(__file__).parent
-sys.path.insert(0, str(ROBOTS.parent))
+sys.path.insert(0, str(Path(__file__).parent.parent))
 os.environ.setdefault("MUJOCO_GL", "osmesa")
 os.environ.setdefault("PYOPENGL_PLATFORM", "osmesa")
 
-import mujoco  # noqa: E402 - reads MUJOCO_GL when imported
-import numpy as np  # noqa: E402
+import mujoco
+import numpy as np
 
-from device_agent.mjcf.ties import Ties  # noqa: E402
-from device_agent.protocol import robot_type  # noqa: E402
+from device_agent import bootstrap
+from device_agent.mjcf.ties import Ties
+from device_agent.protocol import robot_type
 
 WIDTH, HEIGHT, CAMERA = 800, 600, "picture"
 TILE = 190
@@ -48,6 +48,8 @@ class Studio:
         self.model = mujoco.MjModel.from_xml_path(str(folder / self.manifest.scene))
         self.data = mujoco.MjData(self.model)
         self._ties = Ties(self.model)
+        drawing = self.model.vis.global_
+        drawing.offwidth, drawing.offheight = max(drawing.offwidth, width), max(drawing.offheight, height)
         self._renderer = mujoco.Renderer(self.model, height, width)
 
     def __enter__(self) -> Self:
@@ -110,8 +112,9 @@ def png(image: Any) -> bytes:
 
 def main() -> None:
     """Command line."""
+    types = bootstrap.types()
     parser = argparse.ArgumentParser(description="Draw a robot type's scene.")
-    parser.add_argument("type", choices=sorted(path.parent.name for path in ROBOTS.glob("*/robot.toml")))
+    parser.add_argument("type", choices=sorted(types))
     parser.add_argument("file", type=Path)
     parser.add_argument("position", nargs="*", metavar="joint=position", help="[rad]; the others are at home")
     parser.add_argument("--expression", help="one of the manifest's")
@@ -123,7 +126,7 @@ def main() -> None:
     arguments = parser.parse_args()
     single = not (arguments.turntable or arguments.all)
     width, height = (WIDTH, HEIGHT) if single else (TILE, TILE)
-    with Studio(ROBOTS / arguments.type, width, height) as studio:
+    with Studio(types[arguments.type], width, height) as studio:
         position_rad: dict[str, float] = {}
         for kind in POSES:
             name = getattr(arguments, kind.removesuffix("s"))

@@ -77,7 +77,7 @@ class LimitedRobot:
 
 
 def play(path: Path, parameters: dict[str, Any]) -> LimitedRobot:
-    robot = LimitedRobot(ROBOTS / path.parent.parent.name)
+    robot = LimitedRobot(path.parent.parent)
     given = {
         "robot": robot,
         "wait": lambda _: None,

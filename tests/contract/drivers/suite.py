@@ -1,0 +1,135 @@
+"""What every driver must do. A third party inherits ``DriverContract`` and supplies ``robot_type`` and ``driver``."""
+
+import math
+import time
+from collections.abc import Callable
+
+import pytest
+
+from device_agent.ports.driver import Driver, DriverError, Observation
+from device_agent.protocol import codec
+from device_agent.protocol.robot_type import RobotType
+
+DEADLINE_S = 20.0
+
+
+def until(condition: Callable[[], bool]) -> None:
+    end = time.monotonic() + DEADLINE_S
+    while not condition():
+        assert time.monotonic() < end, f"not within {DEADLINE_S:.0f} s"
+        time.sleep(0.005)
+
+
+class DriverContract:
+    """The suite. ``driver`` gives one that is not connected; the fixture closes it afterwards."""
+
+    @pytest.fixture
+    def robot_type(self) -> RobotType:
+        raise NotImplementedError
+
+    @pytest.fixture
+    def driver(self, robot_type: RobotType) -> Driver:
+        raise NotImplementedError
+
+    @pytest.fixture
+    def connected(self, driver: Driver) -> Driver:
+        driver.connect()
+        return driver
+
+    @staticmethod
+    def near(observation: Observation, target: tuple[float, ...]) -> bool:
+        return all(math.isclose(a, b, abs_tol=0.02) for a, b in zip(observation.position_rad, target, strict=True))
+
+    def nudged(self, robot_type: RobotType, position: tuple[float, ...]) -> tuple[float, ...]:
+        """A target 0.1 rad from ``position`` in each joint, inside the limits."""
+        limits = robot_type.joints
+        return tuple(
+            value + 0.1 if value + 0.1 <= joint.upper_rad else value - 0.1
+            for value, joint in zip(position, limits, strict=True)
+        )
+
+    def test_it_says_before_connect_whether_metal_moves(self, driver: Driver) -> None:
+        assert isinstance(driver.simulated, bool)
+
+    def test_nothing_works_before_connect(self, driver: Driver, robot_type: RobotType) -> None:
+        with pytest.raises(DriverError):
+            driver.observe()
+        with pytest.raises(DriverError):
+            driver.send([robot_type.home_rad[joint.name] for joint in robot_type.joints])
+
+    def test_close_needs_no_connect_and_may_be_called_twice(self, driver: Driver) -> None:
+        driver.close()
+        driver.connect()
+        driver.close()
+        driver.close()
+        with pytest.raises(DriverError):
+            driver.observe()
+
+    def test_observation_has_every_joint_and_frame(self, connected: Driver, robot_type: RobotType) -> None:
+        observation = connected.observe()
+        for values in (observation.position_rad, observation.velocity_rad_s, observation.effort_nm):
+            assert len(values) == len(robot_type.joints)
+            assert all(type(value) is float and math.isfinite(value) for value in values)
+        assert len(observation.frames) == len(robot_type.frames)
+        for pose in observation.frames:
+            assert all(type(value) is float for value in pose)
+            assert math.isclose(math.hypot(*pose[3:]), 1.0, abs_tol=1e-6)
+
+    def test_it_holds_still_after_connect(self, connected: Driver) -> None:
+        before = connected.observe().position_rad
+        time.sleep(0.1)
+        # What stands on wheels or feet comes down on them by a millimetre, and its head nods by as little.
+        assert connected.observe().position_rad == pytest.approx(before, abs=5e-3)
+
+    def test_it_goes_where_it_is_sent(self, connected: Driver, robot_type: RobotType) -> None:
+        target = self.nudged(robot_type, connected.observe().position_rad)
+        assert connected.send(target) == pytest.approx(target)
+        until(lambda: self.near(connected.observe(), target))
+
+    def test_send_clamps_to_the_range_and_says_so(self, connected: Driver, robot_type: RobotType) -> None:
+        now = list(connected.observe().position_rad)
+        now[0] = robot_type.joints[0].upper_rad + 100
+        applied = connected.send(now)
+        assert applied[0] <= robot_type.joints[0].upper_rad
+        assert applied[1:] == pytest.approx(tuple(now[1:]))
+        connected.send(connected.observe().position_rad)
+
+    @pytest.mark.parametrize("bad", [math.nan, math.inf, -math.inf])
+    def test_a_number_that_is_not_finite_is_refused(self, connected: Driver, bad: float) -> None:
+        before = connected.observe().position_rad
+        with pytest.raises(DriverError, match="finite"):
+            connected.send([bad, *before[1:]])
+        time.sleep(0.05)
+        assert connected.observe().position_rad == pytest.approx(before, abs=1e-2)
+
+    def test_a_wrong_number_of_positions_is_refused(self, connected: Driver) -> None:
+        with pytest.raises(DriverError, match="positions"):
+            connected.send([*connected.observe().position_rad, 0.0])
+
+    def test_it_may_be_connected_again_and_stands_where_it_was_left(
+        self, connected: Driver, robot_type: RobotType
+    ) -> None:
+        target = self.nudged(robot_type, connected.observe().position_rad)
+        connected.send(target)
+        until(lambda: self.near(connected.observe(), target))
+        connected.close()
+        connected.connect()
+        assert self.near(connected.observe(), target)
+
+    def test_connect_twice_is_connect_once(self, connected: Driver) -> None:
+        connected.connect()
+        connected.observe()
+        connected.close()
+        with pytest.raises(DriverError):
+            connected.observe()
+
+    def test_twin_is_a_tree_that_fits_a_retained_message(self, connected: Driver, robot_type: RobotType) -> None:
+        twin = connected.twin()
+        if twin is None:
+            return
+        codec.encode(twin, limit=codec.MAX_RETAINED_BYTES)
+        for index, body in enumerate(twin.bodies):
+            assert -1 <= body.parent < index
+        moved = [body.joint.name for body in twin.bodies if body.joint]
+        assert len(moved) == len(set(moved))
+        assert {joint.name for joint in robot_type.joints} <= set(moved)
