@@ -1,4 +1,4 @@
-"""``python -m device_agent enroll|run|doctor|devices``: the agent's command line."""
+"""``python -m device_agent enroll|run|doctor|devices|import-model``: the agent's command line."""
 
 import argparse
 import gc
@@ -16,6 +16,7 @@ import msgspec
 from device_agent import bootstrap, doctor, drivers, links, service
 from device_agent.ports.clock import CloudClock
 from device_agent.ports.driver import DriverError
+from device_agent.ports.geometry import GeometryError
 from device_agent.ports.transport import TransportError
 from device_agent.protocol import room as rooms
 from device_agent.protocol.topics import ID_PATTERN, is_id
@@ -94,6 +95,21 @@ def _parser() -> argparse.ArgumentParser:
 
     devices = commands.add_parser("devices", help="list this agent's devices, and known robot types, rooms and drivers")
     devices.set_defaults(command=_devices)
+
+    take_over = commands.add_parser("import-model", help="make a robot type folder from a MuJoCo model")
+    take_over.add_argument("model", type=Path, help="MJCF file of the robot, alone or in a scene")
+    take_over.add_argument("--name", required=True, help="of the new robot type")
+    take_over.add_argument(
+        "--into", type=Path, default=Path(), metavar="FOLDER", help="where it is put (default: the current folder)"
+    )
+    take_over.add_argument(
+        "--without",
+        action="append",
+        default=[],
+        metavar="ACTUATOR",
+        help="leave it out; may be given several times",
+    )
+    take_over.set_defaults(command=_import_model)
 
     for command in (enroll, run, examine, devices):
         command.add_argument("--home", type=Path, default=default, help="the agent's folder (default: %(default)s)")
@@ -306,6 +322,27 @@ def _devices(options: argparse.Namespace) -> int:
         print(f"room    {path.parent.name}: {bootstrap.load_room(path.parent.name).label}")
     for name in drivers.names():
         print(f"driver  {name}")
+    return 0
+
+
+# ------------------------------------------------------------ import-model
+
+
+def _import_model(options: argparse.Namespace) -> int:
+    # Read here: whoever only runs real robots may have no MuJoCo.
+    from device_agent.mjcf.adopt import AdoptError, adopt  # noqa: PLC0415
+
+    try:
+        folder = adopt(options.model, options.name, options.into, without=options.without)
+    except AdoptError as error:
+        raise HomeError(str(error)) from error
+    print(f"made {folder.resolve()}; look at what its robot.toml calls guessed")
+    try:
+        bootstrap.try_type(folder)
+    except (HomeError, DriverError, GeometryError) as error:
+        print(f"it does not run yet: {error}", file=sys.stderr)
+        return _EXIT_FAILED
+    print(f"it runs; name {folder.resolve().parent} in {bootstrap.ROBOTS_PATH} to use it")
     return 0
 
 

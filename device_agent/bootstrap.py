@@ -108,6 +108,24 @@ def load_type(name: str) -> robot_type.RobotType:
         raise HomeError(str(error)) from error
 
 
+def try_type(folder: Path) -> None:
+    """Load all of a robot type in a folder, and connect its driver, a simulated one, for a moment.
+
+    Raises:
+        HomeError: The manifest is wrong.
+        GeometryError: The model cannot be used, or the home position has no room.
+        DriverError: The driver refuses it.
+    """
+    try:
+        kind = robot_type.load(folder)
+    except ProtocolError as error:
+        raise HomeError(str(error)) from error
+    geometry.load(kind, folder)
+    driver = drivers.load("mujoco")(kind, folder, {}, kind.type)
+    driver.connect()
+    driver.close()
+
+
 def _folder(kind: robot_type.RobotType) -> Path:
     """Where its files are. What a room's manifest describes has none."""
     return types().get(kind.type, ROBOTS / kind.type)
