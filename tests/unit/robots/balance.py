@@ -1,6 +1,7 @@
 """A robot on two legs on the bench: the agent's controller, its driver and the physics, stepped by hand."""
 
-from collections.abc import Mapping
+import math
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -17,6 +18,8 @@ from device_agent.runtime.lease import LeaseGate
 
 STEP_S = 0.002
 LONGEST_S = 30.0
+FALLEN = 0.9
+"""Cosine of the torso's tilt."""
 START_RAD, SHAKE_RAD, PUSH_N = 0.02, 0.001, 1.0
 """How much each joint begins off; how much each motor shakes; how hard the torso is pushed about."""
 
@@ -83,6 +86,7 @@ class Walking:
         self.body = self.model.body("torso").id
         self.actuators = np.array([self.model.actuator(name).id for name in self.names])
         self.qpos = np.array([self.model.joint(name).qposadr[0] for name in self.names])
+        self.dof = np.array([self.model.joint(name).dofadr[0] for name in self.names])
         self.controller = Controller(self.type, LeaseGate())
         self.controller.start_at(self.home)
         self.tenure = self.controller.begin_action(epoch=1, on_lost=lambda _: None)
@@ -147,3 +151,84 @@ class Walking:
         """Height of both soles [m]."""
         sites = [self.model.site(name).id for name in ("LLeg", "RLeg")]
         return np.array(self.world.snapshot().site_position_m[sites][:, 2])
+
+
+class WalkedRobot:
+    """The script's ``robot`` where that goes on two legs: the controller moves it, and it must not fall.
+
+    Attributes:
+        joints: As scripts know them; ``can``: calls besides those that every robot has.
+        moves: How often it moved.
+        touched: Pairs of its own bodies that came to touch.
+        fastest: The highest share of a joint's velocity limit.
+    """
+
+    def __init__(self, folder: Path) -> None:
+        self._walking = Walking(folder)
+        self.joints = tuple(self._walking.names)
+        self.can = ("say",)
+        self.moves = 0
+        self.touched: set[tuple[str, str]] = set()
+        self.fastest = 0.0
+        self._limits = np.array([joint.max_velocity_rad_s for joint in self._walking.type.joints])
+
+    def move_joints(self, position_rad: Mapping[str, float] | Sequence[float], speed: float = 0.5) -> None:
+        if not isinstance(position_rad, Mapping):
+            position_rad = dict(zip(self.joints, position_rad, strict=True))
+        walking = self._walking
+        self._follow(walking.controller.move(walking.tenure, position_rad, speed=speed))
+
+    def home(self, speed: float = 0.5) -> None:
+        self.move_joints(self._walking.type.home_rad, speed=speed)
+
+    def posture(self, name: str, speed: float = 0.5) -> None:
+        self.move_joints(self._walking.type.postures[name], speed=speed)
+
+    def look(self, position_m: Sequence[float], speed: float = 0.5) -> None:
+        assert len(position_m) == 3
+        gaze = self._walking.type.gaze
+        assert gaze is not None
+        self.move_joints(dict.fromkeys(gaze.joints, 0.0), speed=speed)
+
+    def say(self, text: str, language: str = "") -> None:
+        assert text
+        assert len(language) <= 5
+
+    def drive(
+        self, forward_m_s: float = 0.0, left_m_s: float = 0.0, turn_rad_s: float = 0.0, *, duration_s: float = 1.0
+    ) -> None:
+        walking, twist = self._walking, Twist(forward_m_s, left_m_s, turn_rad_s)
+        self._follow(walking.controller.drive(walking.tenure, twist, duration_s=duration_s))
+
+    def wait(self, seconds: float) -> None:
+        assert seconds >= 0
+        for _ in range(math.ceil(seconds / self._walking.period_s)):
+            self._period()
+
+    def progress(self, share: float) -> None:
+        assert 0 <= share <= 1
+
+    @property
+    def warned(self) -> bool:
+        """Whether MuJoCo had something to warn of."""
+        return bool(self._walking.world._data.warning.number.any())
+
+    def _follow(self, course: Course) -> None:
+        while not course.finished.is_set():
+            self._period()
+        assert course.outcome is Outcome.REACHED, course.why
+        self.moves += 1
+
+    def _period(self) -> None:
+        walking = self._walking
+        walking.period()
+        assert walking.upright > FALLEN, "it fell"
+        model, data = walking.model, walking.world._data
+        roots = {int(model.body_rootid[walking.body])}
+        for contact in data.contact[: data.ncon]:
+            bodies = [int(model.geom_bodyid[geom]) for geom in (contact.geom1, contact.geom2)]
+            if {int(model.body_rootid[body]) for body in bodies} == roots:
+                first, second = sorted(model.body(body).name for body in bodies)
+                self.touched.add((first, second))
+        moved = np.abs([walking.world.snapshot().qvel[walking.dof]]) / self._limits
+        self.fastest = max(self.fastest, float(moved.max()))

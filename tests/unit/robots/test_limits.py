@@ -69,6 +69,9 @@ class LimitedRobot:
     def home(self, speed: float = 0.5) -> None:
         self.move_joints(self.type.home_rad, speed=speed)
 
+    def posture(self, name: str, speed: float = 0.5) -> None:
+        self.move_joints(self.type.postures[name], speed=speed)
+
     def state(self) -> dict[str, Any]:
         return {
             "position_rad": dict(zip(self.joints, self.position, strict=True)),

@@ -11,6 +11,7 @@ import pytest
 
 from device_agent.drivers.mujoco.wheels import wheel_speeds
 from device_agent.ports.driver import Twist
+from tests.unit.robots.balance import WalkedRobot
 from tests.unit.robots.folders import MOVEMENTS, ROBOTS, Bench, heard
 
 STEPS = 4  # of 2 ms: one control period
@@ -98,6 +99,10 @@ class PlayedRobot:
     def progress(self, share: float) -> None:
         assert 0 <= share <= 1
 
+    @property
+    def warned(self) -> bool:
+        return bool(self.bench.data.warning.number.any())
+
     def _hold(self, target: Any, periods: int) -> None:
         bench = self.bench
         for _ in range(periods):
@@ -107,8 +112,10 @@ class PlayedRobot:
             self.fastest = max(self.fastest, float((np.abs(bench.data.qvel[bench.dof]) / bench.speed).max()))
 
 
-def play(path: Path, parameters: dict[str, Any]) -> PlayedRobot:
-    robot = PlayedRobot(Bench(path.parent.parent))
+def play(path: Path, parameters: dict[str, Any]) -> PlayedRobot | WalkedRobot:
+    bench = Bench(path.parent.parent)
+    on_legs = bench.type.simulation is not None and bench.type.simulation.walk is not None
+    robot = WalkedRobot(path.parent.parent) if on_legs else PlayedRobot(bench)
     given = {
         "robot": robot,
         "wait": robot.wait,
@@ -122,11 +129,11 @@ def play(path: Path, parameters: dict[str, Any]) -> PlayedRobot:
     return robot
 
 
-def check(robot: PlayedRobot) -> None:
+def check(robot: PlayedRobot | WalkedRobot) -> None:
     assert robot.moves > 0
     assert robot.touched == set()
     assert robot.fastest <= 1.02
-    assert not robot.bench.data.warning.number.any()
+    assert not robot.warned
 
 
 @pytest.mark.parametrize("path", MOVEMENTS, ids=lambda path: f"{path.parent.parent.name}-{path.stem}")
