@@ -1,7 +1,7 @@
 """Puts an agent together: the one place that picks drivers; ``links`` picks the transport."""
 
 import os
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 
 import msgspec
@@ -305,7 +305,7 @@ def build(home: Home, *, trace: Path | None = None) -> Cell:
         space=pairing.space,
         agent=pairing.agent,
         own=[entry.name for entry in configuration.devices],
-        named=configuration.sources,
+        named=(*configuration.sources, *_own_streams(configuration)),
     )
     transport = links.make(
         links.Wiring(
@@ -342,6 +342,14 @@ def build(home: Home, *, trace: Path | None = None) -> Cell:
         )
     agent = Agent(devices, transport, outbox=outbox, room=room, address=(pairing.space, pairing.agent))
     return Cell(agent, journal, membership, jail)
+
+
+def _own_streams(configuration: Configuration) -> Iterator[tuple[str, str]]:
+    """Device and stream of all that the agent's own room devices measure: its scripts need not name them."""
+    for entry in configuration.devices:
+        device = load_room(entry.room).device(entry.name) if entry.room else None
+        for stream in () if device is None else device.streams:
+            yield entry.name, stream.name
 
 
 def _outbox(

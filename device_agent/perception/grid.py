@@ -22,7 +22,7 @@ Circle = tuple[float, float, float]
 """x, y, radius in the room [m]."""
 
 RESOLUTION_M = 0.05
-TAKEN, CLEAR = 0.9, -0.45
+TAKEN, CLEAR = 0.9, -0.6
 """Log odds that one look adds: a hit tells more than a ray that passes, as thin things are often missed."""
 MOST = 4.0
 """Bound of the log odds: 0.98 sure. More would have to be unlearned when things change."""

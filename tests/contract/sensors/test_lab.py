@@ -7,6 +7,7 @@ import pytest
 from device_agent.ports.sensor import RoomDriver
 from device_agent.protocol import room
 from device_agent.protocol.room import RoomDevice
+from device_agent.sensors.perception import driver as perception
 from tests.contract.sensors.suite import RoomDriverContract
 from tests.support.rooms import LAB, StillWorld
 
@@ -18,6 +19,17 @@ def world() -> StillWorld:
     return StillWorld()
 
 
+@pytest.fixture(scope="module")
+def neighbours(world: StillWorld) -> Iterator[dict[str, RoomDriver]]:
+    """What others look with, connected."""
+    found = {name: world.driver(name) for name, device in DEVICES.items() if device.driver != "perception"}
+    for driver in found.values():
+        driver.connect()
+    yield found
+    for driver in found.values():
+        driver.close()
+
+
 @pytest.mark.parametrize("name", DEVICES)
 class TestLab(RoomDriverContract):
     @pytest.fixture
@@ -25,8 +37,14 @@ class TestLab(RoomDriverContract):
         return DEVICES[name]
 
     @pytest.fixture
-    def driver(self, entry: RoomDevice, world: StillWorld) -> Iterator[RoomDriver]:
-        neighbours: dict[str, RoomDriver] = {}
+    def driver(
+        self,
+        entry: RoomDevice,
+        world: StillWorld,
+        neighbours: dict[str, RoomDriver],
+        monkeypatch: pytest.MonkeyPatch,
+    ) -> Iterator[RoomDriver]:
+        monkeypatch.setattr(perception, "SURVEY_EVERY_S", 0.0)
         world.go_on(0.02)
         driver = world.driver(entry, neighbours)
         yield driver
