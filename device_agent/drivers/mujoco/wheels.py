@@ -30,6 +30,8 @@ _NOISE_M = 0.004
 FLOOR_MAX_M = 0.3
 """Farthest that a floor sensor sees: at the edge of a stair it reads this."""
 _ALL_GROUPS = np.ones(6, dtype=np.uint8)
+_SILENT_S = 0.3
+"""Wheels that nobody has driven for so long stop, as those of real bases do: whoever drove may be gone."""
 
 
 @dataclass(slots=True)
@@ -89,6 +91,30 @@ def wheel_speeds(wheels: Wheels, twist: Twist, *, fastest_rad_s: float) -> tuple
     return np.array([left, right]) * share, Twist(twist.forward_m_s * share, 0.0, twist.turn_rad_s * share)
 
 
+class Brake:
+    """Stops wheels that nobody drives any more. A ``Process`` of the world.
+
+    Args:
+        actuators: The wheels'.
+        braking_rad_s2: How hard.
+    """
+
+    def __init__(self, actuators: Ints, braking_rad_s2: float) -> None:
+        self._actuators = actuators
+        self._braking_rad_s2 = braking_rad_s2
+        self._now_s = 0.0
+        self.driven_s = -math.inf
+
+    def step(self, model: Any, data: Any, time_s: float) -> None:
+        """See ``Process``."""
+        del model
+        elapsed_s, self._now_s = time_s - self._now_s, time_s
+        if time_s - self.driven_s > _SILENT_S:
+            speeds = data.ctrl[self._actuators]
+            left = np.maximum(np.abs(speeds) - self._braking_rad_s2 * elapsed_s, 0.0)
+            data.ctrl[self._actuators] = np.copysign(left, speeds)
+
+
 class WheeledDriver(MujocoDriver):
     """A ``MobileDriver`` for robot types with ``[simulation.wheels]``.
 
@@ -100,7 +126,11 @@ class WheeledDriver(MujocoDriver):
         super().__init__(robot_type=robot_type, world=world, device=device, prefix=prefix, **more)
         if robot_type.simulation is None or robot_type.simulation.wheels is None:
             raise DriverError(f"robot type '{robot_type.type}' has no [simulation.wheels]; it cannot be driven so")
+        if robot_type.base is None:
+            raise DriverError(f"robot type '{robot_type.type}' has no [base]; nobody knows how hard it may brake")
         self._wheels = robot_type.simulation.wheels
+        self._braking_rad_s2 = robot_type.base.braking_linear_m_s2 / self._wheels.radius_m
+        self._brake: Brake | None = None
         self._wheel_actuators: Ints = np.zeros(2, dtype=np.intp)
         self._wheel_qpos: Ints = np.zeros(2, dtype=np.intp)
         self._wheel_dof: Ints = np.zeros(2, dtype=np.intp)
@@ -118,10 +148,12 @@ class WheeledDriver(MujocoDriver):
         Raises:
             DriverError: A number is not finite, not connected, or the simulation has stopped.
         """
-        self._live()
+        snapshot = self._live()
         if not all(map(math.isfinite, twist)):
             raise DriverError("a commanded twist is not finite")
         speeds, applied = wheel_speeds(self._wheels, twist, fastest_rad_s=self._fastest_rad_s)
+        if self._brake is not None:
+            self._brake.driven_s = snapshot.time_s
         self._world.command(f"{self._device}/wheels", self._wheel_actuators, speeds, ramp_s=self._ramp_s)
         return applied
 
@@ -212,6 +244,9 @@ class WheeledDriver(MujocoDriver):
             self._wheel_actuators[index] = actuator
             self._wheel_qpos[index] = model.jnt_qposadr[joint]
             self._wheel_dof[index] = model.jnt_dofadr[joint]
+        if self._brake is None:
+            self._brake = Brake(self._wheel_actuators, self._braking_rad_s2)
+            self._world.add(self._brake)
         self._fastest_rad_s = float(model.actuator_ctrlrange[self._wheel_actuators, 1].min())
         self._eyes = mujoco.MjData(model)
         self._sites = {}

@@ -167,6 +167,21 @@ def test_sideways_it_does_not_go_and_too_fast_keeps_its_curve(track: Track) -> N
     track.driver.drive(REST)
 
 
+def test_wheels_that_nobody_drives_any_more_stop_by_themselves(track: Track) -> None:
+    """As when the control loop has found a fault and waits: nothing is commanded any more, and it was going."""
+    track.go(Twist(0.3), 2.0)
+    place = track.truth
+    assert track.speed[0] > 0.25
+    track.world.step(500)
+    assert track.speed[0] < 0.01
+    assert 0.3 * 0.25 < track.truth[0] - place[0] < 0.3 * 0.3 + 0.3**2 / 2 / 2.0 + 0.02
+    track.world.step(500)
+    assert track.speed[0] < 0.002
+    track.motion.start()
+    track.go(Twist(0.3), 2.0)
+    assert track.speed[0] > 0.25, "who drives again is obeyed"
+
+
 def test_its_sonars_hear_the_wall_it_comes_to(track: Track) -> None:
     """The wall's face is at x = 2.0 m; the sonars sit 0.156 m before the axle."""
     heard = [track.driver.report("sonar")]
