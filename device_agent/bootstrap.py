@@ -224,13 +224,15 @@ def driver_of(
     return drivers.load(name)(kind, folder, options, entry.name)
 
 
-def instrument_of(entry: DeviceEntry, neighbours: Mapping[str, RoomDriver], uploads: Uploads) -> Instrument | None:
+def instrument_of(
+    entry: DeviceEntry, neighbours: Mapping[str, RoomDriver], uploads: Uploads | None = None
+) -> Instrument | None:
     """A configured device as a room's, not connected; ``None`` where it is a robot.
 
     Args:
         entry: The device; its options stand before those of the room's manifest.
         neighbours: The agent's room drivers by name, filled while they are made.
-        uploads: Where its captures go.
+        uploads: Where its captures go, if anywhere.
 
     Raises:
         HomeError: The room is unknown, or its driver or an option.

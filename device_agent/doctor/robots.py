@@ -10,7 +10,9 @@ from device_agent import bootstrap
 from device_agent.doctor.finding import Finding, ok, problem, warning
 from device_agent.ports.driver import DriverError
 from device_agent.ports.geometry import GeometryError
+from device_agent.ports.sensor import SensorError
 from device_agent.runtime.home import Configuration, DeviceEntry, HomeError
+from device_agent.runtime.instrument import Instrument
 
 _RENDER_S = 60.0
 _RENDER = """
@@ -30,6 +32,10 @@ def device(entry: DeviceEntry) -> Iterator[Finding]:
     name = f"device {entry.name}"
     try:
         kind = bootstrap.type_of(entry)
+        instrument = bootstrap.instrument_of(entry, {})
+        if instrument is not None:
+            yield _instrument(name, kind.type, instrument)
+            return
         shape = bootstrap.geometry_of(entry, kind)
         driver = bootstrap.driver_of(entry, kind)
         if driver.simulated:
@@ -44,6 +50,19 @@ def device(entry: DeviceEntry) -> Iterator[Finding]:
     known = "its shape is known" if shape is not None else "its shape is not known, so it is not kept from itself"
     seen = "simulated; its model compiles" if driver.simulated else "real; not touched by this check"
     yield ok(name, f"{entry.type}, driver '{entry.driver or kind.driver}': {seen}, {known}")
+
+
+def _instrument(name: str, kind: str, instrument: Instrument) -> Finding:
+    """A room device; one that looks with others is only made, for here it is alone."""
+    driver, said = instrument.driver, f"{kind}, driver '{instrument.manifest.driver}'"
+    if not driver.simulated:
+        return ok(name, f"{said}: real; not touched by this check")
+    try:
+        driver.connect()
+        driver.close()
+    except SensorError as error:
+        return problem(name, str(error), "Correct the device in the room's manifest, or in agent.toml.")
+    return ok(name, f"{said}: simulated; its room has what it needs")
 
 
 def room(configuration: Configuration) -> Iterator[Finding]:

@@ -6,6 +6,7 @@ import pytest
 
 from device_agent import bootstrap
 from device_agent.__main__ import main
+from device_agent.doctor import robots
 from device_agent.runtime.home import Configuration, DeviceEntry, Home, HomeError
 
 ARM = DeviceEntry(name="ur5", type="ur5", room="lab")
@@ -55,3 +56,13 @@ def test_in_its_room_the_arm_keeps_clear_of_what_stands_there():
     assert onto_table.clearance is not None
     assert "table_top" in onto_table.clearance.text
     assert shape.clearance(home).room_m > 0
+
+
+def test_the_doctor_looks_at_a_rooms_device_by_its_own_driver():
+    (good,) = robots.device(DeviceEntry(name="door", type="door", room="lab"))
+    assert (good.level, good.message) == ("ok", "door, driver 'mujoco': simulated; its room has what it needs")
+    (wrong,) = robots.device(DeviceEntry(name="lidar", type="lidar", room="lab", options={"site": "nowhere"}))
+    assert wrong.level == "problem"
+    assert "no site 'nowhere'; it has: " in wrong.message
+    (unknown,) = robots.device(DeviceEntry(name="lidar", type="lidar", room="lab", options={"range": 3}))
+    assert "no option 'range'" in unknown.message
