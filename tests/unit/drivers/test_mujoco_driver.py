@@ -192,7 +192,7 @@ def test_two_drivers_move_their_own_robot_only(tmp_path: Path):
         assert second.observe().position_rad == pytest.approx(home, abs=1e-3)
         twin = second.twin()
         assert twin is not None
-        assert twin.bodies[0].name == "base"
+        assert [body.name for body in twin.bodies[:2]] == ["scene", "base"]
         first.close()
         before = world.snapshot().time_s
         while world.snapshot().time_s == before:
