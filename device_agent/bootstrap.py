@@ -26,6 +26,7 @@ from device_agent.runtime.journal import Journal
 from device_agent.runtime.outbox import Outbox, Publish
 from device_agent.runtime.room import Room
 from device_agent.runtime.shelf import Shelf
+from device_agent.speech import Espeak
 from device_agent.transports.http.api import CloudApi
 from device_agent.transports.http.uploads import HttpUploads
 
@@ -341,6 +342,7 @@ def build(home: Home, *, trace: Path | None = None) -> Cell:
             jail=jail,
             trace=trace,
             faults=home.faults,
+            uploads=uploads,
         )
     agent = Agent(devices, transport, outbox=outbox, room=room, address=(pairing.space, pairing.agent))
     return Cell(agent, journal, membership, jail)
@@ -386,6 +388,7 @@ def _device(
     jail: Jail,
     trace: Path | None,
     faults: Path,
+    uploads: Uploads,
 ) -> Device:
     kind = type_of(entry)
     return Device(
@@ -405,6 +408,8 @@ def _device(
         geometry=_geometry(entry, kind),
         jail=jail,
         owner=pairing.owner,
+        speech=Espeak(),
+        uploads=uploads,
     )
 
 

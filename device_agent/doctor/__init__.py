@@ -21,6 +21,7 @@ def examine(home: Home) -> Iterator[Finding]:
     yield from _run("user", machine.user)
     yield from _run("folder", partial(machine.folder, home))
     yield from _run("disk", partial(machine.disk, home))
+    yield from _run("voice", machine.voice)
     try:
         configuration = home.configuration()
     except HomeError as error:

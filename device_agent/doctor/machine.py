@@ -13,6 +13,7 @@ from pathlib import Path
 from device_agent.doctor.finding import Finding, ok, problem, warning
 from device_agent.jail.warm import WarmJail
 from device_agent.runtime.home import Home
+from device_agent.speech.espeak import PROGRAM
 
 _OLDEST = (3, 11)
 _LITTLE_BYTES = 500_000_000
@@ -136,3 +137,15 @@ def scripts(*, trusted: bool) -> Iterator[Finding]:
         yield warning("scripts", f"movement scripts are refused: {refusal}", "Without scripts everything else works.")
     if strangers is not None:
         yield warning("scripts", strangers, "Scripts of the robot's own account run without it.")
+
+
+def voice() -> Iterator[Finding]:
+    """Whether robots without a voice of their own can be heard."""
+    if shutil.which(PROGRAM) is not None:
+        yield ok("voice", f"{PROGRAM} turns what robots say into sound")
+    else:
+        yield warning(
+            "voice",
+            f"there is no {PROGRAM}: what robots say is shown as text alone",
+            f"Install {PROGRAM} for sound (Debian: apt-get install {PROGRAM}).",
+        )

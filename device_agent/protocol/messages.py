@@ -23,6 +23,7 @@ from device_agent.protocol.fields import (
     Vector3,
 )
 from device_agent.protocol.orders import (
+    LANGUAGE_PATTERN,
     SHIPPED,
     AskLease,
     CancelAction,
@@ -82,6 +83,7 @@ from device_agent.protocol.reports import (
 
 __all__ = [
     "FIELD_PATTERN",
+    "LANGUAGE_PATTERN",
     "MAX_VALUES",
     "SHIPPED",
     "TERMINAL",

@@ -9,9 +9,10 @@ from typing import Any, Protocol
 from device_agent.ports.jail import Jail
 from device_agent.protocol.messages import AckStatus, ActionState, Command, Reason, RoomTask, RunMovement, Task
 from device_agent.runtime import room_tasks, tasks
+from device_agent.runtime.body import Body
 from device_agent.runtime.lease import Refused
 from device_agent.runtime.movements import MAX_OUTPUT, Cell, Script, ScriptFailed
-from device_agent.runtime.robot import Body, ScriptRobot
+from device_agent.runtime.robot import ScriptRobot
 from device_agent.runtime.trust import Trust
 
 Report = Callable[..., None]

@@ -9,6 +9,8 @@ import threading
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
+import numpy as np
+
 from device_agent.ports.driver import REST, Twist
 from device_agent.ports.geometry import Clearance, Geometry
 from device_agent.protocol.events import EventKind
@@ -22,6 +24,7 @@ from device_agent.runtime.helm import Helm
 from device_agent.runtime.lease import Lease, LeaseGate, Refused
 from device_agent.runtime.motion import MotionError
 from device_agent.runtime.restrictions import Restriction
+from device_agent.runtime.slack import Slack
 from device_agent.runtime.stream import Stream
 from device_agent.runtime.way import Way
 
@@ -75,6 +78,7 @@ class Controller:
         self._helm = Helm(robot_type, self._envelope)
         self._motion = self._helm.motion
         self._stream = Stream(robot_type, self._envelope, geometry)
+        self._slack = Slack(robot_type)
         self._authority = Authority(gate, latch, hold=self._hold, tell=tell)
         self.changed = self._authority.changed
         self._lock = threading.Lock()
@@ -156,6 +160,7 @@ class Controller:
             if self._authority.tenure is tenure:
                 self._helm.interrupt(Refused("ended", "the action ended"))
                 self._authority.tenure = None
+                self._stream.stand(self._motion.position_rad)
 
     def move(self, tenure: Tenure, position_rad: Mapping[str, float], *, speed: float) -> Move:
         """Start a move to joint positions [rad] as part of an action; joints not named stay.
@@ -166,7 +171,32 @@ class Controller:
         """
         with self._lock:
             self._check_course(tenure)
+            self._slack.check(position_rad)
             return self._helm.move(position_rad, speed)
+
+    def stiffness(self, joints: Sequence[str]) -> dict[str, float]:
+        """How firmly joints hold, 0…1; all of them where none is named.
+
+        Raises:
+            Refused: There is no such joint.
+        """
+        with self._lock:
+            return {name: self._slack.values.get(name, 1.0) for name in self._slack.named(joints)}
+
+    def stiffened(self, values: Mapping[str, float]) -> None:
+        """How firmly joints really hold from now on, 0…1; whoever has the device."""
+        with self._lock:
+            self._slack.set(values)
+
+    def stiffen(self, tenure: Tenure, values: Mapping[str, float]) -> None:
+        """As part of an action, take in how firmly joints are to hold, 0…1; who calls tells the driver.
+
+        Raises:
+            Refused: The action no longer has the device, stopped, faulty, or held by the room.
+        """
+        with self._lock:
+            self._check_course(tenure)
+            self._slack.set(values)
 
     def go_along(self, tenure: Tenure, way: Way) -> Passage:
         """Start along a way that was planned, as part of an action. It begins where the device rests.
@@ -177,6 +207,8 @@ class Controller:
         """
         with self._lock:
             self._check_course(tenure)
+            moved = np.any(way.position_rad != way.position_rad[0], axis=0)
+            self._slack.check(joint.name for joint, moves in zip(self._joints, moved, strict=True) if moves)
             return self._helm.go_along(way)
 
     def drive(self, tenure: Tenure, twist: Twist, *, duration_s: float) -> Drive:
@@ -276,6 +308,12 @@ class Controller:
             return self._authority.restrictions.all
 
     @property
+    def slack(self) -> dict[str, float]:
+        """Joint → share of its strength, of those that do not hold with all of it."""
+        with self._lock:
+            return dict(self._slack.values)
+
+    @property
     def mode(self) -> Mode:
         """What the last ``step`` did."""
         return self._mode
@@ -303,13 +341,16 @@ class Controller:
 
     # ------------------------------------------------------------ the control loop
 
-    def step(self, now_s: float) -> Tick:
+    def step(self, now_s: float, measured_rad: Sequence[float] | None = None) -> Tick:
         """Decide this period's command.
 
         Args:
             now_s: Monotonic clock [s].
+            measured_rad: Where the joints are, shape (n,); limp ones are commanded there.
         """
         with self._lock:
+            if measured_rad is not None:
+                self._motion.loosen(self._slack.feel(measured_rad))
             late_s, self._due_s = now_s - self._due_s, now_s + self._period_s
             self._late_s = max(late_s, _REMEMBERED * self._late_s)
             self._authority.expire(now_s)
@@ -376,7 +417,7 @@ class Controller:
         limited: tuple[str, ...] = () if strictest is None else (strictest.text,)
         if self._mode is Mode.STREAMING:
             limited += self._stream.limited
-        return limited + self._motion.waits + self._driver_limits
+        return limited + self._motion.waits + self._slack.limited + self._driver_limits
 
     def _fence(self, epoch: int) -> None:
         if self._authority.fence(epoch):

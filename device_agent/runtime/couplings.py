@@ -109,6 +109,15 @@ class Couplings:
                 found.append((one.joint, lower, upper, one.says.by))
         return found
 
+    def confine(self, position_rad: Floats) -> None:
+        """Bring a way, shape (places, n) [rad], to where joints hang together, in place."""
+        for one in self._narrowed:
+            by, lower, upper = np.array(one.says.table).T
+            there, place = position_rad[:, one.by], position_rad[:, one.joint]
+            place[:] = np.clip(place, np.interp(there, by, lower), np.interp(there, by, upper))
+        for joint, of, factor in self._mirrors:
+            position_rad[:, joint] = position_rad[:, of] * factor
+
     def parted(self, position_rad: Floats) -> str:
         """Where a way, shape (places, n) [rad], would part joints that hang together; empty where it does not."""
         for joint, of, factor in self._mirrors:

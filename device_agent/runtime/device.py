@@ -16,6 +16,8 @@ from device_agent.ports.driver import Driver, Reporting
 from device_agent.ports.geometry import Geometry
 from device_agent.ports.jail import Jail
 from device_agent.ports.skills import Skills
+from device_agent.ports.speech import Speech
+from device_agent.ports.uploads import Uploads
 from device_agent.protocol import codec, topics
 from device_agent.protocol.errors import ProtocolError
 from device_agent.protocol.events import EventKind
@@ -24,6 +26,7 @@ from device_agent.protocol.robot_type import RobotType
 from device_agent.runtime import tasks
 from device_agent.runtime.actions import Executor
 from device_agent.runtime.audit import Audit, Happened
+from device_agent.runtime.body import Body
 from device_agent.runtime.controller import Controller
 from device_agent.runtime.instrument import Instrument
 from device_agent.runtime.interlocks import Interlock, Interlocks
@@ -33,9 +36,9 @@ from device_agent.runtime.loop import ControlLoop
 from device_agent.runtime.office import Office
 from device_agent.runtime.outbox import Outbox, Publish
 from device_agent.runtime.reporter import Reporter
-from device_agent.runtime.robot import Body
 from device_agent.runtime.room import Room
 from device_agent.runtime.sensing import SensorLoop
+from device_agent.runtime.speaker import Speaker
 from device_agent.runtime.trust import Trust
 from device_agent.runtime.voice import Voice
 
@@ -68,6 +71,8 @@ class Device:
         jail: Where movement scripts run.
         owner: Id of the account that the agent is paired with.
         geometry: The robot's shape, ``None`` where its type has no model.
+        speech: The machine's voice, if it has one.
+        uploads: Where sounds go.
     """
 
     def __init__(
@@ -89,6 +94,8 @@ class Device:
         owner: str = "",
         interlocks: Sequence[Interlock] = (),
         geometry: Geometry | None = None,
+        speech: Speech | None = None,
+        uploads: Uploads | None = None,
     ) -> None:
         self.name = name
         self._driver = driver
@@ -111,6 +118,7 @@ class Device:
             room=room,
             reported=self._reporter.latest,
             instrument=instrument,
+            speaker=Speaker(name, speech=speech, uploads=uploads, tell=self._audit.note),
         )
         self.voice = Voice(
             address=(space, agent, name),

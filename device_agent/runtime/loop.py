@@ -84,7 +84,7 @@ class ControlLoop:
             try:
                 self.seen = self._driver.observe()
                 self._watch(now_s)
-                tick = self._controller.step(now_s)
+                tick = self._controller.step(now_s, self.seen.position_rad)
                 applied = self._driver.send(tick.position_rad)
                 self._controller.applied(applied)
                 if self._base is not None:

@@ -284,4 +284,5 @@ class Office:
             restrictions=tuple(
                 Restriction(source=one.source, speed=one.speed, why=one.why) for one in self._controller.restrictions
             ),
+            stiffness=self._controller.slack,
         )

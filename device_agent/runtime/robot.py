@@ -2,90 +2,22 @@
 
 import math
 import threading
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping
 from typing import Any
 
 from device_agent.ports import skills
-from device_agent.ports.driver import Observation, Twist
+from device_agent.ports.driver import Twist
 from device_agent.ports.geometry import Geometry, GeometryError
-from device_agent.ports.skills import Skill, SkillError, Skills
 from device_agent.protocol.messages import Quaternion, Vector3
-from device_agent.protocol.robot_type import RobotType
-from device_agent.runtime import calls, gaze, shows
+from device_agent.runtime import calls, gaze
 from device_agent.runtime.authority import Tenure
-from device_agent.runtime.controller import Controller
+from device_agent.runtime.body import Body, by_name
 from device_agent.runtime.courses import Course, Outcome
-from device_agent.runtime.instrument import Instrument
 from device_agent.runtime.lease import Refused
-from device_agent.runtime.room import Reading, Room
+from device_agent.runtime.performer import Performer, check_share
+from device_agent.runtime.room import Reading
 
-CARTESIAN = "cartesian"
-"""A capability that a manifest may name, besides those of ``ports.skills``."""
 _SHORTEST = 1e-6
-
-
-@dataclass(frozen=True, slots=True)
-class Body:
-    """A device as its scripts meet it.
-
-    Attributes:
-        robot_type: Joints, frames, capabilities, home.
-        controller: What moves it.
-        observe: The newest measurement, or ``None`` before the first.
-        geometry: Its shape, where its type has a model.
-        skills: What its driver can besides.
-        room: What the space's other devices have measured last.
-        reported: The newest of each of its own streams besides ``joints``.
-        instrument: The device as a room's, where it is one.
-    """
-
-    robot_type: RobotType
-    controller: Controller
-    observe: Callable[[], Observation | None]
-    geometry: Geometry | None
-    skills: Skills | None
-    room: Room
-    reported: Callable[[], Mapping[str, Reading]] = dict
-    instrument: Instrument | None = None
-
-    def seen(self) -> Observation:
-        """The newest measurement.
-
-        Raises:
-            Refused: There is none yet.
-        """
-        seen = self.observe()
-        if seen is None:
-            raise Refused("no_measurement", "the robot has not been measured yet")
-        return seen
-
-    def measured(self) -> dict[str, Any]:
-        """Where it is, as results show it; empty before the first measurement, and without joints."""
-        seen = self.observe()
-        if seen is None or not self.robot_type.joints:
-            return {}
-        return {"position_rad": by_name(self.robot_type, seen.position_rad)}
-
-    def can(self) -> tuple[str, ...]:
-        """Names of the calls that scripts have on this robot."""
-        kind, named = self.robot_type, set(self.robot_type.capabilities)
-        by_skill = named & set(() if self.skills is None else self.skills.performs)
-        has = {
-            "move_joints": bool(kind.joints),
-            "home": bool(kind.joints),
-            "move_to": CARTESIAN in named and self.geometry is not None,
-            "drive": kind.base is not None,
-            "look": skills.GAZE in by_skill or (kind.gaze is not None and self.geometry is not None),
-            "say": skills.SPEECH in by_skill,
-            "stiffness": skills.STIFFNESS in by_skill,
-            "express": skills.EXPRESSIONS in by_skill or bool(kind.expressions),
-            "posture": skills.POSTURES in by_skill or bool(kind.postures),
-            "behaviour": skills.BEHAVIOURS in by_skill,
-            "state": True,
-            "latest": True,
-        }
-        return tuple(name for name, there in has.items() if there)
 
 
 class ScriptRobot:
@@ -96,16 +28,20 @@ class ScriptRobot:
 
     Attributes:
         limited: What limited its motion so far, as telemetry names it.
+        performer: Does what it shows.
+        tenure: Its right to the device.
+        over: Set once the action is over, or has lost the device.
     """
 
     def __init__(self, body: Body) -> None:
         self._body = body
-        self._tenure = Tenure(epoch=-1, on_lost=_nobody)  # of nothing, until ``begin``
-        self._over = threading.Event()
+        self.tenure = Tenure(epoch=-1, on_lost=_nobody)  # of nothing, until ``begin``
+        self.over = threading.Event()
         self.joints = tuple(joint.name for joint in body.robot_type.joints)
         self.frames = () if body.geometry is None else tuple(body.geometry.frames)
         self.can = body.can()
         self.limited: tuple[str, ...] = ()
+        self.performer = Performer(body, self)
 
     def begin(self, epoch: int, on_lost: Callable[[Refused], None]) -> None:
         """Take the device. ``on_lost`` is called when somebody takes it away, with the controller locked.
@@ -113,16 +49,16 @@ class ScriptRobot:
         Raises:
             Refused: It cannot be taken.
         """
-        self._tenure = self._body.controller.begin_action(epoch=epoch, on_lost=on_lost)
+        self.tenure = self._body.controller.begin_action(epoch=epoch, on_lost=on_lost)
 
     def end(self) -> None:
         """The action is over, or has lost the device: no skill goes on. Never blocks."""
-        self._over.set()
+        self.over.set()
 
     def give_back(self) -> None:
         """Leave the device; what still moves is held."""
         self.end()
-        self._body.controller.end_action(self._tenure)
+        self._body.controller.end_action(self.tenure)
 
     def do(self, call: calls.Call) -> Any:
         """See ``Reach``."""
@@ -145,25 +81,8 @@ class ScriptRobot:
             case calls.AskLatest(device=device, stream=stream):
                 return self._latest(device, stream)
             case _:
-                self._show(call)
+                self.performer.show(call)
         return None
-
-    def _show(self, call: calls.Show) -> None:
-        """By what the manifest says, or by what the driver can."""
-        kind = self._body.robot_type
-        match call:
-            case calls.Express(name=name, strength=strength) if self._by_data(skills.EXPRESSIONS):
-                _check_share("strength", strength)
-                self.move_joints(shows.expression(kind, name, strength), shows.EXPRESSION_SPEED)
-            case calls.Posture(name=name, speed=speed) if self._by_data(skills.POSTURES):
-                self.move_joints(shows.posture(kind, name), speed)
-            case _:
-                self._perform(_skill(call))
-
-    def _by_data(self, capability: str) -> bool:
-        """Whether the manifest says how; else the driver knows."""
-        able = self._body.skills
-        return able is None or capability not in self._body.robot_type.capabilities or capability not in able.performs
 
     def move_joints(self, position_rad: Mapping[str, float], speed: float) -> None:
         """Move and wait until there [rad].
@@ -171,8 +90,8 @@ class ScriptRobot:
         Raises:
             Refused: It did not get there.
         """
-        _check_share("speed", speed, least=math.nextafter(0, 1))
-        self._follow(self._body.controller.move(self._tenure, dict(position_rad), speed=speed))
+        check_share("speed", speed, above_zero=True)
+        self.follow(self._body.controller.move(self.tenure, dict(position_rad), speed=speed))
 
     def _move_to(self, call: calls.MoveTo) -> None:
         geometry, start = self._shape(), self._body.seen().position_rad
@@ -196,9 +115,9 @@ class ScriptRobot:
 
     def _drive(self, call: calls.Drive) -> None:
         twist = Twist(call.forward_m_s, call.left_m_s, call.turn_rad_s)
-        self._follow(self._body.controller.drive(self._tenure, twist, duration_s=call.duration_s))
+        self.follow(self._body.controller.drive(self.tenure, twist, duration_s=call.duration_s))
 
-    def _follow(self, course: Course) -> None:
+    def follow(self, course: Course) -> None:
         """Wait for its end."""
         course.finished.wait()
         self.limited += tuple(one for one in course.limited if one not in self.limited)
@@ -206,9 +125,9 @@ class ScriptRobot:
             raise course.why or Refused("interrupted", "the move was interrupted")
 
     def _look(self, position_m: Vector3, speed: float) -> None:
-        _check_share("speed", speed, least=math.nextafter(0, 1))
+        check_share("speed", speed, above_zero=True)
         if self._body.robot_type.gaze is None:
-            self._perform(skills.LookAt(position_m, speed))
+            self.performer.perform(skills.LookAt(position_m, speed))
         else:
             start = self._body.seen().position_rad
             self.move_joints(gaze.aim(self._body.robot_type, self._shape(), start, position_m), speed)
@@ -233,65 +152,9 @@ class ScriptRobot:
         reading = self._body.room.latest(device, stream)
         return None if reading is None else _shown(reading)
 
-    def _perform(self, skill: Skill) -> None:
-        if self._body.skills is None:
-            raise Refused("cannot", "this robot's driver has no skills")
-        if not self._over.is_set():
-            try:
-                self._body.skills.perform(skill, _Stage(self, self._over))
-            except SkillError as error:
-                raise self._tenure.why or Refused("skill_failed", str(error)) from error
-        if self._over.is_set():
-            raise self._tenure.why or Refused("ended", "the action ended")
-
-
-class _Stage:
-    """``Stage`` of one skill."""
-
-    def __init__(self, robot: ScriptRobot, over: threading.Event) -> None:
-        self._robot = robot
-        self._over = over
-
-    @property
-    def ended(self) -> bool:
-        """See ``Stage``."""
-        return self._over.is_set()
-
-    def wait(self, timeout_s: float) -> bool:
-        """See ``Stage``."""
-        return self._over.wait(timeout_s)
-
-    def move_joints(self, position_rad: dict[str, float], speed: float) -> None:
-        """See ``Stage``."""
-        try:
-            self._robot.move_joints(position_rad, speed)
-        except Refused as refused:
-            raise SkillError(refused.message) from refused
-
-
-def _skill(call: calls.Show) -> Skill:
-    match call:
-        case calls.Say(text=text, language=language):
-            return skills.Say(text, language)
-        case calls.Stiffness(value=value, joints=joints):
-            _check_share("stiffness", value)
-            return skills.Stiffen(value, joints)
-        case calls.Express(name=name, strength=strength):
-            _check_share("strength", strength)
-            return skills.Express(name, strength)
-        case calls.Posture(name=name, speed=speed):
-            _check_share("speed", speed, least=math.nextafter(0, 1))
-            return skills.Pose(name, speed)
-    return skills.Behave(call.name)
-
 
 def _shown(reading: Reading) -> dict[str, Any]:
     return {"values": dict(reading.values), "age_s": reading.age_s}
-
-
-def _check_share(name: str, value: float, *, least: float = 0.0) -> None:
-    if not least <= value <= 1:  # false for NaN
-        raise Refused(f"bad_{name}", f"{name} must be {'above ' if least else ''}0 and at most 1, not {value}")
 
 
 def _from_rpy(rpy_rad: Vector3) -> Quaternion:
@@ -307,8 +170,3 @@ def _from_rpy(rpy_rad: Vector3) -> Quaternion:
 
 def _nobody(_: Refused) -> None:
     """Nobody is told."""
-
-
-def by_name(robot_type: RobotType, values: Sequence[float]) -> dict[str, float]:
-    """Values in joint order as joint name → value."""
-    return dict(zip((joint.name for joint in robot_type.joints), values, strict=True))

@@ -81,6 +81,10 @@ class Stream:
         self._pace.heard(self.loop_age_ms / 1000)
         self._at_s = now_s - max(0.0, self.loop_age_ms / 1000 - self._pace.age_s)
 
+    def stand(self, position_rad: Sequence[float]) -> None:
+        """Something else has moved the device here, shape (n,) [rad]: joints that the next setpoint leaves out stay."""
+        self._target = list(position_rad)
+
     def drop(self) -> None:
         """Follow no setpoint until the next one."""
         self._at_s = -math.inf

@@ -3,7 +3,7 @@
 import queue
 import threading
 import time
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 
@@ -54,6 +54,7 @@ class Condition:
     fault: str | None
     action: ActionState | None
     restrictions: tuple[Restriction, ...]
+    stiffness: Mapping[str, float]
 
     def shown(self) -> tuple[object, ...]:
         """What makes a new ``state`` worth sending: progress alone does not."""
@@ -67,6 +68,7 @@ class Condition:
             self.fault,
             self.action and self.action.id,
             self.restrictions,
+            self.stiffness,
         )
 
 
@@ -201,6 +203,7 @@ class Voice:
             action=now.action,
             faults=(Fault(code="driver", message=now.fault[:2000], since_ms=at_ms),) if now.fault else (),
             restrictions=now.restrictions,
+            stiffness=dict(now.stiffness),
         )
         if self._retain(self._topic(topics.STATE), state):
             self._shown, self._shown_at_s = shown, now_s

@@ -15,8 +15,11 @@ from device_agent.drivers.mujoco.ailments import WELL, Ailments, Infliction, Sic
 from device_agent.drivers.mujoco.assembly import SCALAR_JOINTS
 from device_agent.drivers.mujoco.health import HEALTH, Health
 from device_agent.drivers.mujoco.snapshot import Floats, Ints, Snapshot
+from device_agent.drivers.mujoco.stiffness import Stiffness
 from device_agent.drivers.mujoco.world import STALE_S, World
+from device_agent.ports import skills
 from device_agent.ports.driver import DriverError, Observation
+from device_agent.ports.skills import Skill, SkillError, Stage
 from device_agent.protocol.messages import Pose, Twin
 from device_agent.protocol.robot_type import RobotType
 
@@ -69,6 +72,7 @@ class MujocoDriver:
         self._health = Health(robot_type.joints, battery, seed=device)
         self._sickbed = Sickbed(faults, [joint.name for joint in robot_type.joints])
         self._infliction: Infliction | None = None
+        self._stiffness: Stiffness | None = None
         self._noted_s = math.inf
 
     @property
@@ -143,6 +147,19 @@ class MujocoDriver:
         if news is not None:
             self._suffer(news)
         return self._health.values()
+
+    performs = (skills.STIFFNESS,)
+
+    def perform(self, skill: Skill, stage: Stage) -> None:
+        """Stiffen joints, from the next group of steps on.
+
+        Raises:
+            SkillError: Another skill, or not connected.
+        """
+        del stage
+        if not isinstance(skill, skills.Stiffen) or self._stiffness is None:
+            raise SkillError(f"the simulation of '{self._device}' cannot do this now")
+        self._stiffness.want(skill.value, skill.joints or [joint.name for joint in self._type.joints])
 
     def close(self) -> None:
         """Leave the world; it stands still when nobody is left in it."""
@@ -254,6 +271,9 @@ class MujocoDriver:
         if self._infliction is None:
             self._infliction = Infliction(model, dict(zip(names, self._actuators.tolist(), strict=True)))
             self._world.add(self._infliction)
+        if self._stiffness is None:
+            self._stiffness = Stiffness(model, dict(zip(names, self._actuators.tolist(), strict=True)))
+            self._world.add(self._stiffness)
 
     def _frame(self, model: Any, name: str) -> tuple[bool, int]:
         site = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_SITE, self._prefix + name)

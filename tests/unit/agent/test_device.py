@@ -16,6 +16,8 @@ from device_agent.ports.clock import CloudClock, tick_ms, wall_ms
 from device_agent.ports.driver import DriverError, Observation
 from device_agent.ports.geometry import Geometry
 from device_agent.ports.jail import Jail
+from device_agent.ports.speech import Speech
+from device_agent.ports.uploads import Uploads
 from device_agent.protocol import codec, signing, topics
 from device_agent.protocol.messages import (
     SHIPPED,
@@ -96,6 +98,8 @@ class Bench:
         kind: RobotType | None = None,
         geometry: Geometry | None = None,
         jail: Jail | None = None,
+        speech: Speech | None = None,
+        uploads: Uploads | None = None,
     ) -> None:
         self.key = signing.generate()
         self.kind = kind or robot_type()
@@ -128,6 +132,8 @@ class Bench:
             geometry=geometry,
             jail=jail or warm_jail(),
             owner=OWNER,
+            speech=speech,
+            uploads=uploads,
         )
 
     def stop(self) -> None:

@@ -100,6 +100,13 @@ class TestMachine:
         assert "with this agent's rights" in text(machine.scripts(trusted=True))
         assert levels(machine.python()) == ["warning"]
 
+    def test_a_machine_without_a_voice_is_told_how_to_get_one(
+        self, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+    ) -> None:
+        assert levels(machine.voice()) == ["ok"]
+        monkeypatch.setenv("PATH", str(tmp_path))
+        assert "apt-get install espeak-ng" in text(machine.voice())
+
 
 class TestRobots:
     def test_a_device_that_is_well_is_built(self) -> None:

@@ -35,9 +35,10 @@ from device_agent.protocol.messages import (
 )
 from device_agent.protocol.robot_type import Base, Gaze, RobotType
 from device_agent.runtime import calls, gaze
+from device_agent.runtime.body import Body
 from device_agent.runtime.controller import Controller
 from device_agent.runtime.lease import LeaseGate, Refused
-from device_agent.runtime.robot import Body, ScriptRobot
+from device_agent.runtime.robot import ScriptRobot
 from device_agent.runtime.room import Room
 from tests.support.jail import LACK, NoJail
 from tests.unit.agent.test_controller import robot_type
@@ -374,7 +375,7 @@ def test_a_robot_that_has_ended_performs_nothing_more() -> None:
     assert able.performed == [skills.LookAt((1.0, 0.0, 0.0), 0.5)]
     robot.end()
     with pytest.raises(Refused, match="the action ended"):
-        robot._perform(skills.Say("x"))
+        robot.performer.perform(skills.Say("x"))
     assert len(able.performed) == 1
 
 
@@ -383,7 +384,7 @@ def test_without_model_or_skills_nothing_is_guessed() -> None:
     with pytest.raises(Refused, match="no model"):
         robot._shape()
     with pytest.raises(Refused, match="no skills"):
-        robot._perform(skills.Say("x"))
+        robot.performer.perform(skills.Say("x"))
     with pytest.raises(Refused, match="no gaze"):
         gaze.aim(robot_type(), Head(), (0.0, 0.0), (1.0, 0.0, 0.0))
 
@@ -405,9 +406,9 @@ def test_a_gaze_that_cannot_turn_far_enough_says_so() -> None:
 
 def test_nothing_is_left_of_a_tenure_that_nobody_has() -> None:
     robot = ScriptRobot(body_of(robot_type()))
-    robot._tenure.on_lost(Refused("x", "y"))
+    robot.tenure.on_lost(Refused("x", "y"))
     robot.give_back()
-    assert robot._over.is_set()
+    assert robot.over.is_set()
 
 
 def showing_type() -> RobotType:
