@@ -152,7 +152,8 @@ def live(neck: Neck, life: list[tuple[str, dict[str, float], int]]) -> None:
                 neck.controller.end_action(tenure)
         for number in range(periods):
             if act == "stream" and position_rad:
-                neck.offer(position_rad)
+                with suppress(Refused):  # the watchdog may have ended the lease, where periods came late
+                    neck.offer(position_rad)
             neck.tick(late_s=PERIOD_S * (number % 3) if act == "late" else 0.0)
         if neck.controller.latch is not None:
             neck.controller.reset_stop(epoch=max(neck.controller.epochs) + 1)
