@@ -30,7 +30,7 @@ from device_agent.mjcf.ties import Ties
 from device_agent.protocol import robot_type
 
 WIDTH, HEIGHT, CAMERA = 800, 600, "picture"
-TILE = 190
+TILE = 180
 VIEWS = 8
 POSES = ("expressions", "postures", "visemes")
 

@@ -8,6 +8,7 @@ from typing import Any
 import mujoco
 import numpy as np
 
+from device_agent.mjcf.ties import Ties
 from device_agent.ports.driver import DriverError
 
 TIMESTEP_S = 0.002
@@ -79,7 +80,7 @@ def at_home(model: Any, home: Mapping[str, float], settings: Mapping[str, float]
         actuator = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_ACTUATOR, name)
         if actuator >= 0:
             data.qpos[model.jnt_qposadr[model.actuator_trnid[actuator, 0]]] = position
-    _couple(model, data)
+    Ties(model).settle(data.qpos)
     for actuator in range(model.nu):
         joint = model.actuator_trnid[actuator, 0]
         by_joint = model.actuator_trntype[actuator] == int(mujoco.mjtTrn.mjTRN_JOINT)
@@ -87,16 +88,6 @@ def at_home(model: Any, home: Mapping[str, float], settings: Mapping[str, float]
             data.ctrl[actuator] = data.qpos[model.jnt_qposadr[joint]]
     mujoco.mj_forward(model, data)
     return data
-
-
-def _couple(model: Any, data: Any) -> None:
-    """Put joints that the model couples to others where those have them: y - y0 = polynomial of (x - x0)."""
-    for equality in range(model.neq):
-        if model.eq_type[equality] != int(mujoco.mjtEq.mjEQ_JOINT) or model.eq_obj2id[equality] < 0:
-            continue
-        y, x = (model.jnt_qposadr[index[equality]] for index in (model.eq_obj1id, model.eq_obj2id))
-        powers = (data.qpos[x] - model.qpos0[x]) ** np.arange(5)
-        data.qpos[y] = model.qpos0[y] + model.eq_data[equality, :5] @ powers
 
 
 def _agree(child: Any, parent: Any) -> None:

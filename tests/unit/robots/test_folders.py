@@ -103,6 +103,11 @@ def test_noise_on_every_actuator_gives_no_warning(folder: Path, seed: int):
 
 
 @pytest.mark.parametrize("folder", SHIPPED, ids=lambda folder: folder.name)
+def test_a_shipped_type_has_at_least_five_movements(folder: Path):
+    assert sum(path.parent.parent == folder for path in MOVEMENTS) >= 5
+
+
+@pytest.mark.parametrize("folder", SHIPPED, ids=lambda folder: folder.name)
 def test_names_that_robots_of_one_world_share_begin_with_the_type(folder: Path):
     manifest = robot_type.load(folder)
     tree = ET.parse(folder / manifest.model).getroot()  # noqa: S314 - our own file
