@@ -2,7 +2,7 @@
 
 import math
 import threading
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +16,7 @@ from device_agent.geometry.probe import Probe
 from device_agent.geometry.solver import Solver
 from device_agent.geometry.standing import Standing
 from device_agent.mjcf.ties import Ties
-from device_agent.ports.geometry import Clearance, GeometryError, Sweep
+from device_agent.ports.geometry import Clearance, GeometryError, Sweep, never
 from device_agent.protocol.messages import Pose
 from device_agent.protocol.robot_type import RobotType
 
@@ -117,14 +117,20 @@ class MujocoGeometry:
         )
 
     def plan(
-        self, start_rad: Sequence[float], goal_rad: Sequence[float], *, seed: int = 0, within_s: float = 5.0
+        self,
+        start_rad: Sequence[float],
+        goal_rad: Sequence[float],
+        *,
+        seed: int = 0,
+        within_s: float = 5.0,
+        ended: Callable[[], bool] = never,
     ) -> tuple[tuple[float, ...], ...]:
         """A way around what is near.
 
         Raises:
             GeometryError: None was found in time, or there is no room at its end.
         """
-        return self._planner.plan(start_rad, goal_rad, seed=seed, within_s=within_s)
+        return self._planner.plan(start_rad, goal_rad, seed=seed, within_s=within_s, ended=ended)
 
     # ------------------------------------------------------------ positions and names
 

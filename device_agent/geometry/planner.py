@@ -1,7 +1,7 @@
 """Finds a way around things: RRT-Connect (``ompl``), with the shapes and margins of the gate in the control loop."""
 
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
@@ -53,7 +53,13 @@ class Planner:
         self._lower, self._upper = lower, upper
 
     def plan(
-        self, start_rad: Sequence[float], goal_rad: Sequence[float], *, seed: int, within_s: float
+        self,
+        start_rad: Sequence[float],
+        goal_rad: Sequence[float],
+        *,
+        seed: int,
+        within_s: float,
+        ended: Callable[[], bool],
     ) -> tuple[tuple[float, ...], ...]:
         """See ``Geometry.plan``."""
         start, goal = np.array(start_rad, dtype=np.float64), np.array(goal_rad, dtype=np.float64)
@@ -72,9 +78,12 @@ class Planner:
                 np.maximum(np.minimum(start, goal) - detour_rad, self._lower),
                 np.minimum(np.maximum(start, goal) + detour_rad, self._upper),
             )
-            found = search.run(seed, max(0.0, deadline_s - time.monotonic()) * share)
+            until_s = time.monotonic() + share * (deadline_s - time.monotonic())
+            found = search.run(seed, lambda: ended() or time.monotonic() > until_s)  # noqa: B023 (asked before the next)
             if found is not None:
                 return _tuples(found)
+        if ended():
+            raise GeometryError("nobody waits for a way any more")
         raise GeometryError(
             f"found no way there in {within_s:.0f} s: something is in between; move to a place beside it first"
         )
@@ -123,8 +132,8 @@ class _Search:
         bounds.low, bounds.high = lower[self._moving].tolist(), upper[self._moving].tolist()
         self._space.setBounds(bounds)
 
-    def run(self, seed: int, within_s: float) -> list[Floats] | None:
-        """The corners of a way; ``None`` when none was found in time [s]."""
+    def run(self, seed: int, over: Callable[[], bool]) -> list[Floats] | None:
+        """The corners of a way; ``None`` when none was found until it was ``over``."""
         base, geometric = self._base, self._geometric
         self._random.setSeed(seed + 1)  # it has no seed 0
         space = base.SpaceInformation(self._space)
@@ -139,7 +148,7 @@ class _Search:
             planner.setRange(_STRETCH_RAD)
             planner.setProblemDefinition(problem)
             planner.setup()
-            planner.solve(base.timedPlannerTerminationCondition(within_s))
+            planner.solve(base.PlannerTerminationCondition(over))
             if not problem.hasExactSolution():
                 return None
             path = problem.getSolutionPath()

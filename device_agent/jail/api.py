@@ -35,14 +35,17 @@ class Robot:
         self.frames = tuple(frames)
         self.can = tuple(can)
 
-    def move_joints(self, position_rad: Mapping[str, float] | Sequence[float], speed: float = 0.5) -> None:
+    def move_joints(
+        self, position_rad: Mapping[str, float] | Sequence[float], speed: float = 0.5, *, plan: bool = False
+    ) -> None:
         """Move joints and wait until they are there.
 
         Args:
             position_rad: Joint name → position [rad] (the others stay), or a list in the order of ``robot.joints``.
             speed: Share of each joint's velocity limit, above 0, up to 1.
+            plan: Look for a way around what is in between first.
         """
-        self._ask("move_joints", position_rad=self._by_name(position_rad), speed=float(speed))
+        self._ask("move_joints", position_rad=self._by_name(position_rad), speed=float(speed), plan=bool(plan))
 
     def move_to(
         self,
@@ -52,6 +55,8 @@ class Robot:
         rpy_rad: Sequence[float] | None = None,
         frame: str = "",
         speed: float = 0.5,
+        straight: bool = False,
+        plan: bool = False,
     ) -> None:
         """Bring a frame of the robot to a pose, and wait until it is there.
 
@@ -61,6 +66,8 @@ class Robot:
             rpy_rad: roll, pitch, yaw about the base's x, y, z [rad]. With neither the frame keeps its orientation.
             frame: One of ``robot.frames``; the last of them, an arm's flange, when it is not named.
             speed: Share of each joint's velocity limit, above 0, up to 1.
+            straight: Bring it there on a straight line.
+            plan: Look for a way around what is in between first.
         """
         if quaternion is not None and rpy_rad is not None:
             raise RobotError("give a quaternion or rpy_rad, not both")
@@ -71,6 +78,8 @@ class Robot:
             quaternion=None if quaternion is None else _numbers(quaternion, 4, "quaternion"),
             rpy_rad=None if rpy_rad is None else _numbers(rpy_rad, 3, "rpy_rad"),
             speed=float(speed),
+            straight=bool(straight),
+            plan=bool(plan),
         )
 
     def home(self, speed: float = 0.5) -> None:

@@ -4,7 +4,7 @@ It comes from the robot type's model, not from the driver: the same checks hold 
 robot type without a model has no geometry; then only what stands in its manifest limits it, and ``desc`` says so.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Protocol
 
@@ -13,6 +13,11 @@ from device_agent.protocol.messages import Pose
 
 class GeometryError(Exception):
     """The model cannot be used, or has no answer. Its text is fit for an operator."""
+
+
+def never() -> bool:
+    """It is always wanted."""
+    return False
 
 
 @dataclass(frozen=True, slots=True)
@@ -95,7 +100,13 @@ class Geometry(Protocol):
         """
 
     def plan(
-        self, start_rad: Sequence[float], goal_rad: Sequence[float], *, seed: int = 0, within_s: float = 5.0
+        self,
+        start_rad: Sequence[float],
+        goal_rad: Sequence[float],
+        *,
+        seed: int = 0,
+        within_s: float = 5.0,
+        ended: Callable[[], bool] = never,
     ) -> tuple[tuple[float, ...], ...]:
         """Positions from ``start_rad`` to ``goal_rad``, with a straight way between each and the next that is clear.
 
@@ -107,6 +118,7 @@ class Geometry(Protocol):
             goal_rad: Where it shall be.
             seed: The same seed finds the same way.
             within_s: How long to look for one [s].
+            ended: Whether nobody wants it any more; asked all the time.
 
         Raises:
             GeometryError: None was found in time, or there is no room at its end; the text says so.

@@ -7,7 +7,7 @@ from typing import Annotated, Any
 
 from msgspec import Meta, Struct
 
-from device_agent.protocol.fields import Count, Id, JointPositions, Label, Milliseconds, Text, Vector3
+from device_agent.protocol.fields import Count, Id, JointPositions, Label, Milliseconds, Quaternion, Text, Vector3
 
 LANGUAGE_PATTERN = r"([A-Za-z]{2,3}(-[A-Za-z0-9]{2,8})*)?"
 """As in BCP 47: ``en``, ``sk``, ``en-GB``; or nothing."""
@@ -75,10 +75,27 @@ Share = Annotated[float, Meta(ge=0, le=1)]
 
 
 class MoveJoints(_Order, frozen=True, kw_only=True, tag="move_joints"):
-    """Move to joint positions and end there."""
+    """Move to joint positions and end there; ``plan``: around what is in between."""
 
     position_rad: JointPositions
     speed: Speed = 0.5
+    plan: bool = False
+
+
+class MovePose(_Order, frozen=True, kw_only=True, tag="move_pose"):
+    """Bring a frame to a pose in the robot's base frame and end there; no frame: the last of the device's.
+
+    The orientation is a quaternion (w, x, y, z), or roll, pitch and yaw about the base's axes; with neither the frame
+    keeps its own. ``straight``: on a straight line. ``plan``: around what is in between.
+    """
+
+    position_m: Vector3
+    quaternion: Quaternion | None = None
+    rpy_rad: Vector3 | None = None
+    frame: Label = ""
+    speed: Speed = 0.5
+    straight: bool = False
+    plan: bool = False
 
 
 class Say(_Order, frozen=True, kw_only=True, tag="say"):
@@ -160,7 +177,7 @@ class SetControl(_Order, frozen=True, kw_only=True, tag="set_control"):
 
 RoomTask = Gather | Shoot | CaptureRaw | SetControl
 """What is done with devices of a room."""
-Task = MoveJoints | Say | Express | TakePosture | RunBehaviour | SetStiffness | LookAt | Drive | RoomTask
+Task = MoveJoints | MovePose | Say | Express | TakePosture | RunBehaviour | SetStiffness | LookAt | Drive | RoomTask
 """Orders that are actions and reach a device just as they were asked of the API."""
 
 

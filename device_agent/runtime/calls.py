@@ -54,16 +54,19 @@ class MoveJoints(_Message, frozen=True, kw_only=True, tag="move_joints"):
 
     position_rad: JointPositions
     speed: float
+    plan: bool = False
 
 
 class MoveTo(_Message, frozen=True, kw_only=True, tag="move_to"):
-    """``robot.move_to``; with neither orientation the frame keeps its own."""
+    """``robot.move_to``; with neither orientation the frame keeps its own, with no frame it is the last."""
 
     frame: _Name
     position_m: Vector3
     quaternion: Quaternion | None = None
     rpy_rad: Vector3 | None = None
     speed: float
+    straight: bool = False
+    plan: bool = False
 
 
 class Home(_Message, frozen=True, kw_only=True, tag="home"):

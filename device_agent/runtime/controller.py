@@ -198,6 +198,16 @@ class Controller:
             self._check_course(tenure)
             self._slack.set(values)
 
+    def target(self, tenure: Tenure, position_rad: Mapping[str, float]) -> list[float]:
+        """Where a move to these positions would end, shape (n,) [rad].
+
+        Raises:
+            Refused: As ``move`` does.
+        """
+        with self._lock:
+            self._check_course(tenure)
+            return self._envelope.target(position_rad, self._motion.position_rad)
+
     def go_along(self, tenure: Tenure, way: Way) -> Passage:
         """Start along a way that was planned, as part of an action. It begins where the device rests.
 

@@ -13,6 +13,8 @@ _KNOT_S = 0.04
 """As for braking off a way: between knots this far apart it is straight to within 4 mm."""
 _SLACK = 1.5
 """How much longer than at full braking a way may need that bends or slows down meanwhile."""
+_CAUTION = 0.95
+"""What a way asks between two periods differs by so much from what it asks at their beginning."""
 _REST = 1e-6
 _NOTHING = 1e-9
 
@@ -41,7 +43,7 @@ class Ride:
         self._period_s = period_s
         self._easy = np.array(acceleration_rad_s2)
         self._jerk = np.array(jerk_rad_s3)
-        self._hard = np.maximum(braking_rad_s2, self._easy)
+        self._hard = np.maximum(_CAUTION * braking_rad_s2, self._easy)
         self._time_s, self._share, self._change = 0.0, -1.0, 0.0
         self._aim, self._braking = 0.0, False
         self._next: tuple[float, float, float] | None = None

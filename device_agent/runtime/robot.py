@@ -1,6 +1,5 @@
 """What a script's calls reach on its own device, for as long as its action has it."""
 
-import math
 import threading
 from collections.abc import Callable, Mapping
 from typing import Any
@@ -8,7 +7,7 @@ from typing import Any
 from device_agent.ports import skills
 from device_agent.ports.driver import Twist
 from device_agent.ports.geometry import Geometry, GeometryError
-from device_agent.protocol.messages import Quaternion, Vector3
+from device_agent.protocol.messages import Vector3
 from device_agent.runtime import calls, gaze
 from device_agent.runtime.authority import Tenure
 from device_agent.runtime.body import Body, by_name
@@ -16,8 +15,7 @@ from device_agent.runtime.courses import Course, Outcome
 from device_agent.runtime.lease import Refused
 from device_agent.runtime.performer import Performer, check_share
 from device_agent.runtime.room import Reading
-
-_SHORTEST = 1e-6
+from device_agent.runtime.routes import Routes, quaternion_of
 
 
 class ScriptRobot:
@@ -66,8 +64,8 @@ class ScriptRobot:
         if kind not in self.can:
             raise Refused("cannot", f"this robot has no {kind}; it has {', '.join(self.can)}")
         match call:
-            case calls.MoveJoints(position_rad=position_rad, speed=speed):
-                self.move_joints(position_rad, speed)
+            case calls.MoveJoints(position_rad=position_rad, speed=speed, plan=plan):
+                self.move_joints(position_rad, speed, plan=plan)
             case calls.Home(speed=speed):
                 self.move_joints(self._body.robot_type.home_rad, speed)
             case calls.MoveTo():
@@ -84,34 +82,40 @@ class ScriptRobot:
                 self.performer.show(call)
         return None
 
-    def move_joints(self, position_rad: Mapping[str, float], speed: float) -> None:
-        """Move and wait until there [rad].
+    def move_joints(self, position_rad: Mapping[str, float], speed: float, *, plan: bool = False) -> None:
+        """Move and wait until there [rad], around what is in between if ``plan``.
 
         Raises:
             Refused: It did not get there.
         """
         check_share("speed", speed, above_zero=True)
-        self.follow(self._body.controller.move(self.tenure, dict(position_rad), speed=speed))
+        controller = self._body.controller
+        if plan:
+            routes = Routes(self._body.robot_type, self._shape())
+            goal_rad = controller.target(self.tenure, position_rad)
+            way = routes.around(controller.commanded_rad, goal_rad, speed=speed, ended=self.over.is_set)
+            self.follow(controller.go_along(self.tenure, way))
+        else:
+            self.follow(controller.move(self.tenure, dict(position_rad), speed=speed))
 
     def _move_to(self, call: calls.MoveTo) -> None:
-        geometry, start = self._shape(), self._body.seen().position_rad
-        if call.frame not in geometry.frames:
-            raise Refused("unknown_frame", f"no frame '{call.frame[:80]}'; there are {', '.join(geometry.frames)}")
-        quaternion = call.quaternion
-        if call.rpy_rad is not None:
-            quaternion = _from_rpy(call.rpy_rad)
-        if quaternion is None:
-            w, x, y, z = geometry.poses(start)[call.frame][3:]
-            quaternion = (w, x, y, z)
-        length = math.hypot(*quaternion)
-        if not _SHORTEST < length < math.inf:
-            raise Refused("bad_quaternion", "the quaternion (w, x, y, z) has no direction")
-        w, x, y, z = (part / length for part in quaternion)
+        check_share("speed", call.speed, above_zero=True)
+        if call.straight and call.plan:
+            raise Refused("bad_way", "a way is straight or planned, not both")
+        controller, geometry = self._body.controller, self._shape()
+        start = controller.commanded_rad
+        frame = call.frame or geometry.frames[-1]
+        w, x, y, z = quaternion_of(geometry.poses(start), frame, call.quaternion, call.rpy_rad)
+        pose = (*call.position_m, w, x, y, z)
+        if call.straight:
+            way = Routes(self._body.robot_type, geometry).straight(start, frame, pose, speed=call.speed)
+            self.follow(controller.go_along(self.tenure, way))
+            return
         try:
-            solved = geometry.solve(call.frame, (*call.position_m, w, x, y, z), start)
+            solved = geometry.solve(frame, pose, start)
         except GeometryError as error:
             raise Refused("out_of_reach", str(error)) from error
-        self.move_joints(by_name(self._body.robot_type, solved), call.speed)
+        self.move_joints(by_name(self._body.robot_type, solved), call.speed, plan=call.plan)
 
     def _drive(self, call: calls.Drive) -> None:
         twist = Twist(call.forward_m_s, call.left_m_s, call.turn_rad_s)
@@ -155,17 +159,6 @@ class ScriptRobot:
 
 def _shown(reading: Reading) -> dict[str, Any]:
     return {"values": dict(reading.values), "age_s": reading.age_s}
-
-
-def _from_rpy(rpy_rad: Vector3) -> Quaternion:
-    """Roll, pitch, yaw about the fixed x, y, z [rad]."""
-    (cr, sr), (cp, sp), (cy, sy) = ((math.cos(angle / 2), math.sin(angle / 2)) for angle in rpy_rad)
-    return (
-        cr * cp * cy + sr * sp * sy,
-        sr * cp * cy - cr * sp * sy,
-        cr * sp * cy + sr * cp * sy,
-        cr * cp * sy - sr * sp * cy,
-    )
 
 
 def _nobody(_: Refused) -> None:

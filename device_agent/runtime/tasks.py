@@ -12,6 +12,7 @@ from device_agent.runtime.robot import ScriptRobot
 
 _CALLS: dict[type[Struct], type[calls.Call]] = {
     messages.MoveJoints: calls.MoveJoints,
+    messages.MovePose: calls.MoveTo,
     messages.Say: calls.Say,
     messages.Express: calls.Express,
     messages.TakePosture: calls.Posture,

@@ -2,7 +2,6 @@
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from itertools import pairwise
 
 import numpy as np
 import numpy.typing as npt
@@ -73,17 +72,26 @@ def smooth(corners: Sequence[Sequence[float]], clear: Callable[[Floats], bool]) 
     Returns:
         The points, shape (points, n); ``None`` when not even the narrowest is clear.
     """
-    path = [np.array(corner, dtype=np.float64) for corner in corners]
+    path = np.array(corners, dtype=np.float64)
     for rounding_rad in _ROUNDING_RAD:
-        points = [path[0]]
-        for begin, end in pairwise(path):
-            parts = max(1, int(np.ceil(np.linalg.norm(end - begin) / rounding_rad)))
-            points += [begin + (end - begin) * (part + 1) / parts for part in range(parts)]
-        spline = np.array(points)
-        places = _along(spline, _LOOKS)[0]
+        points = even(path, rounding_rad)
+        places = _along(points, _LOOKS)[0]
         if all(clear(places[index : index + _LEGS + 1]) for index in range(0, len(places) - 1, _LEGS)):
-            return spline
+            return points
     return None
+
+
+def even(path: Floats, apart_rad: float) -> Floats:
+    """Points on a path from corner to corner that are equally far apart, no further than ``apart_rad``.
+
+    A spline through points that are here near and there far apart would hurry and hesitate.
+    """
+    lengths = np.concatenate(([0.0], np.cumsum(np.linalg.norm(np.diff(path, axis=0), axis=1))))
+    count = max(1, int(np.ceil(lengths[-1] / apart_rad)))
+    places = np.linspace(0.0, lengths[-1], count + 1)
+    points: Floats = np.stack([np.interp(places, lengths, joint) for joint in path.T], axis=1)
+    points[0], points[-1] = path[0], path[-1]
+    return points
 
 
 def timed(points: Floats, joints: Sequence[Joint], *, speed: float, step_s: float) -> Way:

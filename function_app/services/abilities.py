@@ -8,6 +8,7 @@ from device_agent.protocol.messages import (
     Express,
     Gather,
     MoveJoints,
+    MovePose,
     RunBehaviour,
     SetControl,
     Shoot,
@@ -45,6 +46,8 @@ def _named(asked: Task, described: Description) -> Iterable[tuple[str, str, Sequ
     match asked:
         case Express(name=name):
             yield "expression", name, described.expressions
+        case MovePose(frame=frame) if frame:
+            yield "frame", frame, described.frames
         case TakePosture(name=name):
             yield "posture", name, described.postures
         case RunBehaviour(name=name):

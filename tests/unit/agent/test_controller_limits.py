@@ -1,14 +1,14 @@
 """Limits for every source: nothing comes nearer than it may, and whoever is too near can still leave."""
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from itertools import pairwise
 
 import msgspec
 import pytest
 from ruckig import Result
 
-from device_agent.ports.geometry import Clearance, Sweep
+from device_agent.ports.geometry import Clearance, Sweep, never
 from device_agent.protocol.messages import Mode, Pose
 from device_agent.protocol.robot_type import Workspace
 from device_agent.runtime.courses import Outcome
@@ -54,7 +54,13 @@ class Wall:
         raise NotImplementedError
 
     def plan(
-        self, start_rad: Sequence[float], goal_rad: Sequence[float], *, seed: int = 0, within_s: float = 5.0
+        self,
+        start_rad: Sequence[float],
+        goal_rad: Sequence[float],
+        *,
+        seed: int = 0,
+        within_s: float = 5.0,
+        ended: Callable[[], bool] = never,
     ) -> tuple[tuple[float, ...], ...]:
         raise NotImplementedError
 

@@ -2,7 +2,7 @@
 
 import math
 import threading
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Literal
@@ -12,7 +12,7 @@ import pytest
 
 from device_agent.ports import skills
 from device_agent.ports.driver import Observation, Twist
-from device_agent.ports.geometry import Clearance, GeometryError, Sweep
+from device_agent.ports.geometry import Clearance, GeometryError, Sweep, never
 from device_agent.ports.skills import Skill, SkillError, Stage
 from device_agent.protocol import codec, topics
 from device_agent.protocol.messages import (
@@ -109,9 +109,15 @@ class Head:
         return (pose[0], pose[6])
 
     def plan(
-        self, start_rad: Sequence[float], goal_rad: Sequence[float], *, seed: int = 0, within_s: float = 5.0
+        self,
+        start_rad: Sequence[float],
+        goal_rad: Sequence[float],
+        *,
+        seed: int = 0,
+        within_s: float = 5.0,
+        ended: Callable[[], bool] = never,
     ) -> tuple[tuple[float, ...], ...]:
-        del seed, within_s
+        del seed, within_s, ended
         if goal_rad[1] > 1:
             raise GeometryError("found no way there")
         return (tuple(start_rad), (0.0, 0.2), tuple(goal_rad))
@@ -168,6 +174,7 @@ def test_a_robot_that_can_all_of_it_does_all_of_it(bench: Bench) -> None:
         "robot.drive(0.1, turn_rad_s=0.2, duration_s=0.05)\n"
         "robot.move_joints({'elbow': 0.2}, speed=1)\n"
         "robot.move_to((0.1, 0, 0), rpy_rad=(0, 0, 0.6), speed=1)\n"
+        "robot.move_joints({'elbow': 0.1}, speed=1, plan=True)\n"
         "robot.look((1, 1, 1), speed=1)\n"
         "state = robot.state()\n"
         "print(round(state['position_rad']['shoulder'], 2), state['mode'], robot.can)\n",
@@ -182,6 +189,18 @@ def test_a_robot_that_can_all_of_it_does_all_of_it(bench: Bench) -> None:
     assert max(twist.forward_m_s for twist in driver_of(bench).twists) > 0
     assert printed.startswith(f"{math.pi / 4:.2f} action (")
     assert all(call in printed for call in ("move_to", "look", "say", "drive", "behaviour"))
+
+
+def test_a_frame_goes_straight_to_a_pose_and_says_where_it_cannot(bench: Bench) -> None:
+    printed = play(
+        bench,
+        "robot.move_to((0.1, 0, 0), rpy_rad=(0, 0, 0.6), speed=1, straight=True)\n"
+        "print(round(robot.state()['position_rad']['shoulder'], 2))\n"
+        "try: robot.move_to((2, 0, 0), straight=True)\n"
+        "except RobotError as error: print(error)\n",
+    ).splitlines()
+    assert printed[0] == "0.1"
+    assert "of the way there: face cannot come nearer than 0.5 m" in printed[1]
 
 
 def test_what_a_robot_cannot_do_is_refused_with_what_it_can(tmp_path: Path) -> None:
@@ -217,6 +236,9 @@ def test_what_a_robot_cannot_do_is_refused_with_what_it_can(tmp_path: Path) -> N
         ("robot.move_to((0, 0, 0), frame='foot')", "no frame 'foot'; there are face"),
         ("robot.move_to((2, 0, 0))", "face cannot come nearer than 0.5 m"),
         ("robot.move_to((0, 0, 0), quaternion=(0, 0, 0, 0))", "has no direction"),
+        ("robot.move_to((0, 0, 0), straight=True, plan=True)", "straight or planned, not both"),
+        ("robot.move_joints({'elbow': 1.5}, plan=True)", "found no way there"),
+        ("robot.move_joints({'elbow': 99}, plan=True)", "elbow can go from"),
         ("robot.look((0, 0, 1))", "inside of what it looks with"),
         ("robot.look((-1, -0.1, 0.9), speed=9)", "speed must be above 0"),
         ("robot.drive(99)", "forward_m_s can be up to 0.500"),
@@ -485,6 +507,7 @@ def test_orders_reach_the_skills_that_scripts_reach(bench: Bench) -> None:
     described: Description = eventually(lambda: bench.heard(topics.DESC, Description))[0]
     assert described.actions == (
         "move_joints",
+        "move_pose",
         "say",
         "express",
         "take_posture",

@@ -311,7 +311,7 @@ export interface Command {
   ttl_ms: number;
   who: string;
   epoch: number;
-  request: GrantLease | ReleaseLease | AskLease | DropRequest | RunMovement | MoveJoints | Say | Express | TakePosture | RunBehaviour | SetStiffness | LookAt | Drive | Gather | Shoot | CaptureRaw | SetControl | CancelAction | StopDevice | ResetStop;
+  request: GrantLease | ReleaseLease | AskLease | DropRequest | RunMovement | MoveJoints | MovePose | Say | Express | TakePosture | RunBehaviour | SetStiffness | LookAt | Drive | Gather | Shoot | CaptureRaw | SetControl | CancelAction | StopDevice | ResetStop;
 }
 
 /**
@@ -370,13 +370,32 @@ export interface RunMovement {
   timeout_ms?: number;
 }
 
-/** Move to joint positions and end there. */
+/** Move to joint positions and end there; `plan`: around what is in between. */
 export interface MoveJoints {
   kind: "move_joints";
   /** joint name → position [rad]; joints not named keep their target */
   position_rad: Record<string, number>;
   /** share of each joint's velocity limit */
   speed?: number;
+  plan?: boolean;
+}
+
+/**
+ * Bring a frame to a pose in the robot's base frame and end there; no frame: the last of the device's.
+ *
+ * The orientation is a quaternion (w, x, y, z), or roll, pitch and yaw about the base's axes; with neither the frame
+ * keeps its own. `straight`: on a straight line. `plan`: around what is in between.
+ */
+export interface MovePose {
+  kind: "move_pose";
+  position_m: [number, number, number];
+  quaternion?: [number, number, number, number] | null;
+  rpy_rad?: [number, number, number] | null;
+  frame?: string;
+  /** share of each joint's velocity limit */
+  speed?: number;
+  straight?: boolean;
+  plan?: boolean;
 }
 
 /** Speak `text`, and end when it is said; `language` as `en` or `sk`, or empty for the robot's own. */
