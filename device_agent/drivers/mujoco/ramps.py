@@ -47,12 +47,13 @@ class Ramps:
             target[command.actuators] = command.target
         return target
 
-    def take(self) -> list[_Ramp]:
+    def take(self, ctrl: Floats) -> list[_Ramp]:
         """Begin with what is new; those that are not there yet."""
         for who, command in list(self._commands.items()):
             ramp = self._ramps.get(who)
             if ramp is None or ramp.command is not command:
-                self._ramps[who] = _Ramp(command, max(command.ramp_s, TIMESTEP_S))
+                there = np.array_equal(ctrl[command.actuators], command.target)
+                self._ramps[who] = _Ramp(command, 0.0 if there else max(command.ramp_s, TIMESTEP_S))
         return [ramp for ramp in self._ramps.values() if ramp.remaining_s > 0]
 
 

@@ -310,13 +310,14 @@ class World:
 
     def _advance(self, count: int) -> None:
         model, data = self._model, self._data
-        active = self._ramps.take()
+        active = self._ramps.take(data.ctrl)
         for process in self._processes:
             process.step(model, data, data.time)
-        for _ in range(count):
+        # Each call of MuJoCo hands the interpreter on, and may have to wait for it: as few as there can be.
+        for _ in range(count if active else 1):
             for ramp in active:
                 follow(ramp, data.ctrl)
-            mujoco.mj_step(model, data)
+            mujoco.mj_step(model, data, nstep=1 if active else count)
         mujoco.mj_kinematics(model, data)  # poses of the positions just reached, not of those a step ago
         for name in _DIVERGED:
             if not self._fault and data.warning[int(getattr(mujoco.mjtWarning, name))].number:
