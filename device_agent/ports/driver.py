@@ -113,3 +113,11 @@ class Reporting(Protocol):
         Raises:
             DriverError: It cannot be measured now; it is asked again when the stream is next due.
         """
+
+
+@runtime_checkable
+class Audible(Driver, Protocol):
+    """A driver whose robot is heard by others when it speaks: of a simulated robot, by what listens in its room."""
+
+    def speaks(self, for_s: float) -> None:
+        """It speaks from now on for so long [s]. Never blocks; only for what listens, the words go elsewhere."""

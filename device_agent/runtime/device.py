@@ -12,7 +12,7 @@ from collections.abc import Mapping, Sequence
 from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PublicKey
 
 from device_agent.ports.clock import CloudClock, tick_ms, wall_ms
-from device_agent.ports.driver import Driver, Reporting
+from device_agent.ports.driver import Audible, Driver, Reporting
 from device_agent.ports.geometry import Geometry
 from device_agent.ports.jail import Jail
 from device_agent.ports.skills import Skills
@@ -118,7 +118,13 @@ class Device:
             room=room,
             reported=self._reporter.latest,
             instrument=instrument,
-            speaker=Speaker(name, speech=speech, uploads=uploads, tell=self._audit.note),
+            speaker=Speaker(
+                name,
+                speech=speech,
+                uploads=uploads,
+                tell=self._audit.note,
+                heard=driver.speaks if isinstance(driver, Audible) else None,
+            ),
         )
         self.voice = Voice(
             address=(space, agent, name),

@@ -49,6 +49,7 @@ class Speaker:
         speech: The machine's voice; ``None``: none.
         uploads: Where sounds go, for pages to fetch; ``None``: nowhere.
         tell: Called with what is said, when it begins.
+        heard: Called with how long that is [s], at the same time.
     """
 
     def __init__(
@@ -58,11 +59,13 @@ class Speaker:
         speech: Speech | None = None,
         uploads: Uploads | None = None,
         tell: Callable[[Happened], None] | None = None,
+        heard: Callable[[float], None] | None = None,
     ) -> None:
         self._device = device
         self._speech = speech
         self._uploads = uploads
         self._tell = tell
+        self._heard = heard
 
     def prepare(self, text: str, language: str) -> Utterance:
         """Make the sound, and begin to store it. Takes some tenths of a second.
@@ -92,6 +95,8 @@ class Speaker:
         }
         if utterance.upload:
             data["upload"] = utterance.upload
+        if self._heard is not None:
+            self._heard(utterance.duration_s)
         if self._tell is not None:
             self._tell(Happened(EventKind.SAID, utterance.text, data=data))
 

@@ -31,6 +31,8 @@ _LOOKED_S = 0.1
 RAMP_PERIODS = 1.5
 """Control periods over which a target is approached. Targets arrive up to half a period late on a busy machine; a ramp
 of one and a half then never runs dry between two of them, so the motion has no steps (cost: half a period of delay)."""
+SPEECH_DB = 60.0
+"""Of normal speech a metre away, A-weighted (ISO 9921)."""
 _NEAR_M = 0.95
 """Of a room so much is drawn around a robot that stands still in it: the table under it, the floor under that."""
 
@@ -160,6 +162,11 @@ class MujocoDriver:
         if not isinstance(skill, skills.Stiffen) or self._stiffness is None:
             raise SkillError(f"the simulation of '{self._device}' cannot do this now")
         self._stiffness.want(skill.value, skill.joints or [joint.name for joint in self._type.joints])
+
+    def speaks(self, for_s: float) -> None:
+        """What listens in its room hears it."""
+        if self._connected:
+            self._world.sound(self._device, SPEECH_DB, for_s=for_s)
 
     def close(self) -> None:
         """Leave the world; it stands still when nobody is left in it."""

@@ -222,6 +222,15 @@ def test_a_speaker_whom_nobody_hears_begins_all_the_same() -> None:
     speaker.begin(speaker.prepare("hello", ""))
 
 
+def test_who_stands_around_hears_for_how_long_something_is_said() -> None:
+    heard: list[float] = []
+    speaker = Speaker(heard=heard.append)
+    said = speaker.prepare("hello, how are you today", "")
+    assert heard == []
+    speaker.begin(said)
+    assert heard == [said.duration_s]
+
+
 # ---------------------------------------------------------------- behaviours
 
 

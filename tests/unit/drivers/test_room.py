@@ -347,7 +347,9 @@ def test_footsteps_speech_and_motors_are_heard():
     world = lab(changed(quiet_db=20.0))
     world.step(300)
     before = world.quantities["sound_db"]
-    world.sound("ur5", 60.0, for_s=0.5)
+    mouth = driver.MujocoDriver(robot_type=robot_type.load(ROBOTS / "ur5"), world=world, device="ur5", prefix="ur5/")
+    mouth._connected = True
+    mouth.speaks(0.5)
     world.step(100)
     assert world.quantities["sound_db"] > before + 5
     world.step(300)
