@@ -46,8 +46,8 @@ class Transport(Protocol):
             delivered: With ``qos`` 1, called once the other side has confirmed the message; never if that is unknown.
 
         Returns:
-            False when the link is down or its queue full and the message was dropped: measurements are then lost on
-            purpose, and the caller keeps what must not be.
+            False when the message was dropped: the link is down or its queue full, or a picture of the same camera
+            still waits to be sent. Measurements are then lost on purpose, and the caller keeps what must not be.
         """
 
     def stop(self) -> None:

@@ -214,8 +214,13 @@ class World:
         """The newest snapshot as an ``MjData`` of the caller's own, with the poses of all that can be seen.
 
         Contacts and sensors are not computed.
+
+        Raises:
+            DriverError: Not built yet, or the simulation has stopped; the text says why.
         """
         snapshot = self.snapshot()
+        if snapshot.fault:
+            raise DriverError(snapshot.fault)
         into.time = snapshot.time_s
         into.qpos[:], into.qvel[:], into.ctrl[:] = snapshot.qpos, snapshot.qvel, snapshot.ctrl
         into.mocap_pos[:], into.mocap_quat[:] = snapshot.mocap_position_m, snapshot.mocap_quaternion

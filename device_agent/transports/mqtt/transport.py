@@ -16,7 +16,7 @@ from paho.mqtt.reasoncodes import ReasonCode
 
 from device_agent.ports.clock import wall_ms
 from device_agent.ports.transport import LinkChanged, Receive
-from device_agent.protocol import codec
+from device_agent.protocol import codec, topics
 from device_agent.protocol.messages import Presence
 from device_agent.transports.back_off import BackOff
 
@@ -82,6 +82,7 @@ class MqttTransport:
         self._delivery_lock = threading.Lock()
         self._delivered: dict[int, Callable[[], None]] = {}
         self._early: set[int] = set()
+        self._pictures: dict[str, mqtt.MQTTMessageInfo] = {}
         self._session = 0
         self._orders: int | None = None
         self._gone = threading.Event()
@@ -106,10 +107,15 @@ class MqttTransport:
         client = self._client
         if client is None or not self._up:
             return False
+        picture = f"/{topics.CAM}/" in topic
+        if picture and (before := self._pictures.get(topic)) is not None and not before.is_published():
+            return False  # on a slow link pictures would wait in a queue, and all that is live behind them
         # No lock of ours is held here: paho holds its own while it calls ``_on_publish``, which takes ours.
         sent = client.publish(topic, payload, qos=qos, retain=retain)
         if sent.rc != mqtt.MQTT_ERR_SUCCESS:
             return False
+        if picture:
+            self._pictures[topic] = sent
         if qos and self._confirmed(sent.mid, delivered or _nothing) and delivered is not None:
             delivered()
         return True
@@ -141,6 +147,7 @@ class MqttTransport:
     def _connect_once(self) -> None:
         access = self._access()
         self._session = self._next_session()
+        self._pictures = {}
         client = self._client = self._new_client(access)
         self._gone.clear()
         client.connect(access.host, access.port, keepalive=KEEP_ALIVE_S)

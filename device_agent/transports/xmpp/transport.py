@@ -102,7 +102,9 @@ class XmppTransport:
         retain: bool = False,  # noqa: ARG002 (who speaks for the cloud knows what is kept)
         delivered: Callable[[], None] | None = None,
     ) -> bool:
-        """See ``Transport.publish``."""
+        """See ``Transport.publish``. What is not JSON, as pictures, has no way here and is dropped."""
+        if not payload.startswith(b"{"):
+            return False
         link = self._link
         return link is not None and link.publish(topic, payload, qos=qos, delivered=delivered)
 

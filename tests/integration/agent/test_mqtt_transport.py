@@ -16,6 +16,7 @@ from device_agent.protocol import codec, grants, topics
 from device_agent.protocol.messages import Presence
 from device_agent.transports.mqtt import BrokerAccess, MqttTransport
 from tests.support.brokers import BROKERS, HOST, ROOT, Client, RunningBroker, start_broker, wait_until
+from tests.support.proxy import start_proxy
 
 CONN = topics.conn("lab", "arm1")
 ACK = topics.device("lab", "arm1", "arm", topics.ACK)
@@ -129,3 +130,25 @@ def test_small_messages_never_wait_for_nagle(broker: RunningBroker) -> None:
     client: Any = link.transport._client
     assert client.socket().getsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY) != 0
     link.transport.stop()
+
+
+def test_on_a_link_that_takes_nothing_one_picture_waits_and_no_queue_of_them(broker: RunningBroker) -> None:
+    picture, other = (topics.device("lab", "arm1", "eye", topics.CAM, name) for name in ("left", "right"))
+    with start_proxy(broker.tcp_port) as proxy:
+        link = Link(broker, port=proxy.port)
+        link.up()
+        wait_until(lambda: link.transport.publish(picture, bytes(1000), qos=0), "a first picture to be taken")
+        wait_until(lambda: link.transport.publish(picture, bytes(1000), qos=0), "a second one")
+        proxy.freeze()
+        taken = 0
+        for _ in range(400):  # 40 MB: more than the sockets hold
+            taken += link.transport.publish(picture, bytes(100_000), qos=0)
+            time.sleep(0.001)
+        assert taken < 350
+        before = taken
+        for _ in range(20):
+            taken += link.transport.publish(picture, bytes(100_000), qos=0)
+        assert taken == before, "a picture waits already"
+        assert link.transport.publish(other, bytes(1000), qos=0), "another camera is another matter"
+        proxy.thaw()
+        wait_until(lambda: link.transport.publish(picture, bytes(1000), qos=0), "pictures to go on")

@@ -1,0 +1,151 @@
+"""The laboratory as people reach its devices: by HTTP and over the broker, with agent, functions and broker running."""
+
+import contextlib
+import hashlib
+from collections.abc import Iterator
+from typing import Any
+
+import httpx
+import pytest
+
+from device_agent.protocol import codec, frames, topics
+from device_agent.protocol.messages import Measurements
+from function_app.ports.broker_access import Credentials
+from tests.support.brokers import Client, wait_until
+from tests.support.machine import Api, Machine, start_machine
+
+RATE_HZ, FOR_S = 20.0, 3.0
+
+
+@pytest.fixture(scope="module")
+def lab(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Machine]:
+    with start_machine(tmp_path_factory.mktemp("lab"), TELESCOPE_ROOM="lab") as machine:
+        assert machine.process.poll() is None, "".join(machine.lines)
+        yield machine
+
+
+@pytest.fixture(scope="module")
+def api(lab: Machine) -> Iterator[Api]:
+    with lab.api() as api:
+        yield api
+
+
+@contextlib.contextmanager
+def watching(api: Api, device: dict[str, Any], *names: str) -> Iterator[Client]:
+    """Somebody who may see the account's devices, listening to a class and name of one."""
+    given = api.post("/mqtt/credentials", {"purpose": "watch"})
+    login = Credentials(given["username"], given["password"])
+    client = Client(given["client_id"], login, port=given["tcp"]["port"]).open()
+    try:
+        wanted = [pattern for pattern in given["subscribe"] if f"/{device['name']}/" in pattern]
+        assert client.subscribe(*(each for each in wanted if each.split("/")[-2] in names), qos=0)
+        yield client
+    finally:
+        client.close()
+
+
+def act(api: Api, device: dict[str, Any], wait_for: str = "done", **request: Any) -> dict[str, Any]:
+    body = {"request": request, "wait_ms": 20_000, "wait_for": wait_for}
+    done: dict[str, Any] = api.post(f"/devices/{device['id']}/actions", body)
+    return done
+
+
+def measured(client: Client) -> list[Measurements]:
+    return [codec.decode(each.payload, Measurements) for each in client.heard() if f"/{topics.TELE}/" in each.topic]
+
+
+def refused(api: Api, device: dict[str, Any], **request: Any) -> httpx.Response:
+    return api.http.post(f"/devices/{device['id']}/actions", json={"request": request})
+
+
+def test_one_shot_measures_now(api: Api) -> None:
+    done = act(api, api.device("thermometer"), kind="shoot")
+    assert done["status"] == "done", done
+    assert 10 < done["result"]["values"]["temperature"]["temperature_c"] < 35
+
+
+def test_one_gathers_and_any_number_reads_it(api: Api) -> None:
+    lidar = api.device("lidar")
+    seen: dict[int, int] = {}
+    with watching(api, lidar, topics.TELE) as one, watching(api, lidar, topics.TELE) as other:
+        begun = act(api, lidar, "started", kind="gather", streams=["range"], rate_hz=RATE_HZ, duration_s=FOR_S)
+        again = refused(api, lidar, kind="gather", rate_hz=1.0, duration_s=1.0)
+        assert again.status_code == 409
+        assert again.json()["type"].endswith("/device-busy")
+
+        def ended() -> bool:
+            for number, client in enumerate((one, other)):
+                seen[number] = seen.get(number, 0) + len(measured(client))
+            return bool(api.get(f"/actions/{begun['id']}")["status"] == "done")
+
+        wait_until(ended, "the end of the gathering", 60)
+    done = api.get(f"/actions/{begun['id']}")
+    gathered = done["result"]["samples"]["range"]
+    # How fast a busy machine is, is not the question; that it is faster than its own 5 Hz, and that all hear it, is.
+    assert gathered > 7 * FOR_S
+    assert min(seen.values()) >= gathered - 2
+    with contextlib.ExitStack() as stack:
+        readers = [stack.enter_context(contextlib.closing(httpx.Client(headers=api.http.headers))) for _ in range(4)]
+        base = f"{api.http.base_url}devices/{lidar['id']}/data"
+
+        def stored(reader: httpx.Client) -> int:
+            answer = reader.get(f"{base}/range", params={"resolution": "raw"})
+            return len(answer.json()["at_ms"]) if answer.is_success else 0
+
+        wait_until(lambda: all(stored(reader) >= gathered for reader in readers), "all of it to be stored", 30)
+
+
+def test_a_capture_is_in_the_blob_store_as_it_was_taken(api: Api) -> None:
+    for name, capture, media_type in (("camera", "image", "image/png"), ("lidar", "scan", "application/json")):
+        device = api.device(name)
+        done = act(api, device, kind="capture", name=capture)
+        assert done["status"] == "done", done
+        found = api.get(f"/devices/{device['id']}/uploads/{done['result']['upload']}")
+        assert (found["stream"], found["content_type"], found["verified"]) == (capture, media_type, True)
+        content = httpx.get(found["url"]).content
+        assert len(content) == done["result"]["length"]
+        assert hashlib.sha256(content).hexdigest() == found["sha256"]
+
+
+def test_what_is_set_is_measured_by_others_and_stop_refuses_it(api: Api) -> None:
+    door, contact = api.device("door"), api.device("door_contact")
+    with watching(api, contact, topics.TELE) as watcher:
+        done = act(api, door, kind="set_control", control="opening", value=0.5)
+        assert done["result"]["applied"]["opening"] == pytest.approx(0.5)
+        wait_until(lambda: any(each.values["open"] for each in measured(watcher)), "the door to be open", 30)
+
+        beyond = act(api, door, kind="set_control", control="opening", value=1.5)
+        assert (beyond["status"], beyond["reason"]["code"]) == ("failed", "out_of_range")
+        unknown = refused(api, door, kind="set_control", control="colour", value=1.0)
+        assert (unknown.status_code, unknown.json()["names"]) == (422, ["opening"])
+        unable = refused(api, contact, kind="set_control", control="opening", value=1.0)
+        assert (unable.status_code, unable.json()["names"]) == (422, ["gather", "shoot"])
+
+        api.post(f"/devices/{door['id']}/stop")
+        stopped = act(api, door, kind="set_control", control="opening", value=0.0)
+        assert (stopped["status"], stopped["reason"]["code"]) == ("failed", "stopped")
+        assert api.http.post(f"/devices/{door['id']}/stop/reset").is_success
+        assert act(api, door, kind="set_control", control="opening", value=0.0)["status"] == "done"
+        wait_until(lambda: any(not each.values["open"] for each in measured(watcher)), "the door to be shut", 30)
+
+
+def test_pictures_come_to_who_may_see_them(api: Api) -> None:
+    camera = api.device("camera")
+    with watching(api, camera, topics.CAM) as watcher:
+        pictures: list[bytes] = []
+
+        def enough() -> bool:
+            pictures.extend(each.payload for each in watcher.heard())
+            return len(pictures) >= 5
+
+        wait_until(enough, "pictures", 30)
+    told = [frames.decode(each) for each in pictures]
+    assert {(each.width, each.height) for each in told} == {(320, 240)}
+    assert [each.sequence for each in told] == sorted({each.sequence for each in told})
+    assert all(each.jpeg.startswith(b"\xff\xd8") for each in told)
+
+
+def test_a_gathering_longer_than_its_action_is_refused(api: Api) -> None:
+    answer = refused(api, api.device("lidar"), kind="gather", rate_hz=1.0, duration_s=4000.0)
+    assert answer.status_code == 422
+    assert "timeout_ms" in answer.json()["detail"]
