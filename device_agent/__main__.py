@@ -13,12 +13,11 @@ from pathlib import Path
 
 import msgspec
 
-from device_agent import bootstrap, doctor, drivers, links, service
+from device_agent import bootstrap, doctor, drivers, links, sensors, service
 from device_agent.ports.clock import CloudClock
 from device_agent.ports.driver import DriverError
 from device_agent.ports.geometry import GeometryError
 from device_agent.ports.transport import TransportError
-from device_agent.protocol import room as rooms
 from device_agent.protocol.topics import ID_PATTERN, is_id
 from device_agent.runtime.home import Configuration, DeviceEntry, Home, HomeError, HttpPolling, Pairing
 from device_agent.runtime.journal import JournalError
@@ -318,10 +317,12 @@ def _devices(options: argparse.Namespace) -> int:
         print(error)
     for name in bootstrap.types():
         print(f"type    {name}: {bootstrap.load_type(name).label}")
-    for path in sorted(bootstrap.ROOMS.glob(f"*/{rooms.MANIFEST}")):
-        print(f"room    {path.parent.name}: {bootstrap.load_room(path.parent.name).label}")
+    for name in bootstrap.room_folders():
+        print(f"room    {name}: {bootstrap.load_room(name).label}")
     for name in drivers.names():
         print(f"driver  {name}")
+    for name in sensors.names():
+        print(f"sensor  {name}")
     return 0
 
 

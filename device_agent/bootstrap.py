@@ -31,7 +31,6 @@ from device_agent.transports.http.api import CloudApi
 from device_agent.transports.http.uploads import HttpUploads
 
 ROBOTS = Path(__file__).resolve().parent.parent / "robots"
-ROOMS = ROBOTS / "rooms"
 ROBOTS_PATH = "TELESCOPE_ROBOTS_PATH"
 """Environment: folders of other people's robot types, separated as those of ``PATH``."""
 
@@ -132,17 +131,39 @@ def _folder(kind: robot_type.RobotType) -> Path:
     return types().get(kind.type, ROBOTS / kind.type)
 
 
+def room_folders() -> dict[str, Path]:
+    """Every room and its folder, ``rooms/<room>`` of the places of robot types; the earlier place first."""
+    found: dict[str, Path] = {}
+    for place in places():
+        for path in sorted(place.glob(f"rooms/*/{rooms.MANIFEST}")):
+            found.setdefault(path.parent.name, path.parent)
+    return found
+
+
+def folder_of_room(name: str) -> Path:
+    """The folder of a room.
+
+    Raises:
+        HomeError: Unknown; the text lists the known ones.
+    """
+    known = room_folders()
+    if name not in known:
+        raise HomeError(
+            f"no room '{name}'; there are: {', '.join(known)}. Name the folder that holds yours in {ROBOTS_PATH}, "
+            f"as rooms/{name}/{rooms.MANIFEST}"
+        )
+    return known[name]
+
+
 def load_room(name: str) -> rooms.Room:
-    """A room of this installation.
+    """A room by its name.
 
     Raises:
         HomeError: Unknown, or its manifest is wrong; the text lists the known ones.
     """
-    if not (ROOMS / name / rooms.MANIFEST).is_file():
-        known = sorted(path.parent.name for path in ROOMS.glob(f"*/{rooms.MANIFEST}"))
-        raise HomeError(f"no room '{name}'; there are: {', '.join(known)}")
+    folder = folder_of_room(name)
     try:
-        return rooms.load(ROOMS / name)
+        return rooms.load(folder)
     except ProtocolError as error:
         raise HomeError(str(error)) from error
 
@@ -193,7 +214,7 @@ def geometry_of(entry: DeviceEntry, kind: robot_type.RobotType) -> Geometry | No
         robot = room.robot(entry.name)
         if robot is not None and room.model:
             standing = geometry.Standing(
-                room=ROOMS / room.room / room.model, position_m=robot.position_m, yaw_rad=robot.yaw_rad
+                room=folder_of_room(room.room) / room.model, position_m=robot.position_m, yaw_rad=robot.yaw_rad
             )
     return geometry.load(kind, _folder(kind), scene=scene, standing=standing)
 
@@ -221,7 +242,7 @@ def driver_of(
         if faults is not None:
             options.setdefault("faults", str(faults / f"{entry.name}.toml"))
         if entry.room:
-            options["room"] = str(ROOMS / entry.room)
+            options["room"] = str(folder_of_room(entry.room))
     return drivers.load(name)(kind, folder, options, entry.name)
 
 
@@ -246,7 +267,7 @@ def instrument_of(
         device, label=entry.label or device.label, driver=driver, options={**device.options, **entry.options}
     )
     try:
-        made = sensors.load(driver)(manifest, ROOMS / entry.room, _surroundings(entry.room, neighbours))
+        made = sensors.load(driver)(manifest, folder_of_room(entry.room), _surroundings(entry.room, neighbours))
         return Instrument(made, manifest, uploads)
     except SensorError as error:
         raise HomeError(str(error)) from error
@@ -258,7 +279,7 @@ def _surroundings(room: str, neighbours: Mapping[str, RoomDriver]) -> Surroundin
     from device_agent.drivers.mujoco import worlds  # noqa: PLC0415 (a real room needs no simulation)
 
     try:
-        return Surroundings(neighbours=neighbours, world=worlds.of(ROOMS / room))
+        return Surroundings(neighbours=neighbours, world=worlds.of(folder_of_room(room)))
     except DriverError as error:
         raise HomeError(str(error)) from error
 

@@ -5,7 +5,7 @@ import time
 from collections.abc import Callable
 from typing import Any
 
-from device_agent.protocol.messages import CaptureRaw, Gather, RoomTask, SetControl, Shoot
+from device_agent.protocol.messages import CaptureRaw, Gather, RoomTask, Shoot
 from device_agent.runtime.instrument import Instrument
 from device_agent.runtime.lease import Refused
 
@@ -76,5 +76,4 @@ def activity(order: RoomTask, instrument: Instrument | None, tell: Tell) -> Gath
             return Once(lambda: {"values": instrument.shoot(streams)})
         case CaptureRaw(name=name):
             return Once(lambda: instrument.capture(name))
-        case SetControl(control=control, value=value):
-            return Once(lambda: {"applied": {control: instrument.set(control, value)}})
+    return Once(lambda: {"applied": {order.control: instrument.set(order.control, order.value)}})

@@ -66,15 +66,15 @@ def test_it_gets_ready_ends_cleanly_and_keeps_its_data(tmp_path: Path, broker: s
         assert "mine" in [each["name"] for each in api.get("/robot-types/ur5/movements")["items"]]
 
 
-def test_the_lab_starts_with_everything_that_stands_in_it(tmp_path: Path) -> None:
+def test_the_lab_starts_with_everything_that_stands_in_it(laboratory: Machine) -> None:
     room = rooms.load(ROOT / "robots" / "rooms" / "lab")
-    with start_machine(tmp_path, TELESCOPE_ROOM="lab") as machine, machine.api() as api:
+    with laboratory.api() as api:
         for name in room.names:
             api.device(name)
         devices = api.get("/devices", limit=100)["items"]
         assert sorted(each["name"] for each in devices) == sorted(room.names)
         wait_until(lambda: _moves(api, api.device("ur5")["id"]), "the arm on its table to move", 60)
-        assert machine.trace("ur5").now()["qpos"]["wrist_3"] == pytest.approx(0.2, abs=0.02)
+        assert laboratory.trace("ur5").now()["qpos"]["wrist_3"] == pytest.approx(0.2, abs=0.02)
 
 
 def test_every_part_that_is_killed_comes_back(tmp_path: Path) -> None:

@@ -12,21 +12,14 @@ from device_agent.protocol import codec, frames, topics
 from device_agent.protocol.messages import Measurements
 from function_app.ports.broker_access import Credentials
 from tests.support.brokers import Client, wait_until
-from tests.support.machine import Api, Machine, start_machine
+from tests.support.machine import Api, Machine
 
 RATE_HZ, FOR_S = 20.0, 3.0
 
 
 @pytest.fixture(scope="module")
-def lab(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Machine]:
-    with start_machine(tmp_path_factory.mktemp("lab"), TELESCOPE_ROOM="lab") as machine:
-        assert machine.process.poll() is None, "".join(machine.lines)
-        yield machine
-
-
-@pytest.fixture(scope="module")
-def api(lab: Machine) -> Iterator[Api]:
-    with lab.api() as api:
+def api(laboratory: Machine) -> Iterator[Api]:
+    with laboratory.api() as api:
         yield api
 
 

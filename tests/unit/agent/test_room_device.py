@@ -410,7 +410,36 @@ def test_stop_by_message_latches(bench: RoomBench) -> None:
     assert Stop(id="x", by="ann").by == shown(bench, lambda state: state.stop).stop.by  # type: ignore[union-attr]
 
 
-def test_it_lets_the_driver_go_at_the_end(tmp_path: Path) -> None:
+def test_it_lets_the_driver_go_at_the_end_also_when_it_is_ended_twice(tmp_path: Path) -> None:
     bench = RoomBench(tmp_path)
+    bench.device.stop()
     bench.stop()
     assert bench.sensor.closed
+
+
+class ToyThermometer:
+    """Has nothing that moves, and is read by nobody."""
+
+    simulated = False
+
+    def connect(self) -> None: ...
+
+    def read(self, stream: str) -> dict[str, float | bool]:
+        return {stream: 1.0}
+
+    def capture(self, name: str) -> Capture:
+        raise SensorError(name)
+
+    def set(self, control: str, value: float) -> float:
+        raise SensorError(f"{control} {value}")
+
+    def raw(self) -> None: ...
+
+    def close(self) -> None: ...
+
+
+def test_what_cannot_move_need_not_be_held_and_what_is_no_camera_films_nothing() -> None:
+    instrument = Instrument(ToyThermometer(), ENTRY, None)
+    instrument.hold()
+    assert instrument.cameras == ()
+    assert not instrument.simulated

@@ -42,7 +42,7 @@ def test_what_the_room_does_not_have_is_named_with_what_it_has(entry: DeviceEntr
 def test_an_unknown_room_is_one_clear_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
     arguments = ["enroll", "--home", str(tmp_path), "--server", "http://127.0.0.1:9", "--room", "attic"]
     assert main(arguments) == 1
-    assert capsys.readouterr().err.strip().endswith("no room 'attic'; there are: lab")
+    assert "no room 'attic'; there are: lab. Name the folder that holds yours" in capsys.readouterr().err
 
 
 def test_in_its_room_the_arm_keeps_clear_of_what_stands_there():
