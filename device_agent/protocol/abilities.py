@@ -143,9 +143,9 @@ class Abilities(Struct, frozen=True, kw_only=True):
         narrowing: Joints whose range depends on another's position.
         postures: Name → joint positions [rad]; joints not named stay.
         expressions: Name → joint positions [rad] at strength 1; less is so much of the way from home.
-        visemes: Name → joint positions of a mouth shape [rad], for speech. Of these names it uses those there are,
-            for another sound the nearest: ``rest``, ``a``, ``e``, ``i``, ``o``, ``u``, ``m`` (also b, p), ``f`` (v),
-            ``l`` (d, n, t), ``s`` (c, z), ``sh`` (ch, j), ``r``, ``k`` (g, h, q, x), ``w``.
+        visemes: Name → joint positions of a mouth shape [rad], for speech, by the names of ``runtime/mouth.py``:
+            ``sil``, ``PP``, ``FF``, ``TH``, ``DD``, ``kk``, ``CH``, ``SS``, ``nn``, ``RR``, ``aa``, ``E``, ``ih``,
+            ``oh``, ``ou``. For one that is missing the nearest serves.
         behaviours: Name → keyframes, in the order of their times.
         simulation: What only a simulation needs to know.
     """

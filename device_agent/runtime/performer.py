@@ -196,12 +196,10 @@ def check_share(name: str, value: float, *, above_zero: bool = False) -> None:
         raise Refused(f"bad_{name}", f"{name} must be {'above ' if above_zero else ''}0 and at most 1, not {value}")
 
 
-def _skill(call: calls.Show) -> Skill:
+def _skill(call: calls.Say | calls.Express | calls.Posture | calls.Behaviour) -> Skill:
     match call:
         case calls.Say(text=text, language=language):
             return skills.Say(text, language)
-        case calls.Stiffness(value=value, joints=joints):
-            return skills.Stiffen(value, joints)
         case calls.Express(name=name, strength=strength):
             check_share("strength", strength)
             return skills.Express(name, strength)

@@ -316,7 +316,7 @@ def test_after_an_action_a_setpoint_leaves_the_other_joints_where_they_are(bench
 def test_servos_that_do_not_change_are_not_taken_for_limp(bench: Bench) -> None:
     servos(bench).fails = True
     assert "the servos do not answer" in why(bench, SetStiffness(value=0.0))
-    assert bench.telemetry().limited == ()
+    assert eventually(lambda: bench.telemetry().limited == ())
     ends(bench, MoveJoints(position_rad={"elbow": 0.1}, speed=1.0))
 
 

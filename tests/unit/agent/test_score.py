@@ -136,6 +136,16 @@ def test_a_mouth_goes_on_where_the_keyframes_had_it_and_they_go_on_after() -> No
     assert at(way, way.duration_s)[1] == pytest.approx(0.1)
 
 
+def test_words_that_begin_before_others_have_ended_wait_for_the_mouth() -> None:
+    score = Score(talking(), HOME)
+    score.speak(Line(0.0, "mama", 3.0))
+    score.speak(Line(2.9, "mama", 3.0))
+    way = score.way()
+    check_limits(way, talking())
+    assert way.duration_s == pytest.approx(5.9 + 0.2, abs=0.03)
+    assert at(way, way.duration_s)[1] == pytest.approx(0.0)
+
+
 # ---------------------------------------------------------------- letters
 
 
