@@ -9,7 +9,7 @@ from msgspec import Meta, Struct
 
 from device_agent.protocol.fields import Count, Id, JointPositions, Label, Milliseconds, Quaternion, Text, Vector3
 
-LANGUAGE_PATTERN = r"([A-Za-z]{2,3}(-[A-Za-z0-9]{2,8})*)?"
+LANGUAGE_PATTERN = r"([A-Za-z]{1,8}(-[A-Za-z0-9]{1,8})*)?"
 """As in BCP 47: ``en``, ``sk``, ``en-GB``; or nothing."""
 
 

@@ -47,6 +47,8 @@ def _of(kind: inspect.Type, depth: int) -> Iterator[Any]:  # noqa: C901, PLR0912
             yield max(least or 0.0, 1.0 if above is not None or most is None else 0.0)
         case inspect.StrType(pattern=pattern, min_length=shortest):
             yield "0" * 64 if pattern and "{64}" in pattern else "a" * max(1, shortest or 0)
+        case inspect.Metadata(type=described):
+            yield from _of(described, depth)
         case inspect.NoneType():
             yield None
         case inspect.DictType(key_type=key, value_type=value):
