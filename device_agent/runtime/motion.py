@@ -28,6 +28,7 @@ _LOOKS = 4
 """Parts of a slowing down after which is looked where it has led: what turns on its way is between two of them."""
 _REST_RAD_S = 1e-6
 _ROUNDING = 1e-12
+_LITTLE_LESS = 0.999
 _REACHED_RAD = 1e-4
 _SAME_RAD_S2 = 1e-3
 
@@ -39,13 +40,23 @@ class MotionError(Exception):
 def plan(generate: Callable[[Any, Any], Result], order: InputParameter, answer: Any) -> None:
     """Have ``ruckig`` answer an order.
 
+    Where a joint would meet its greatest speed and acceleration at one moment, and at once leave them, rounding can
+    hide every way from it. With a little less speed there is one.
+
     Raises:
         MotionError: It found nothing.
     """
     try:
         result = generate(order, answer)
-    except RuckigError as error:
-        raise MotionError(f"no way to go on from here: {error}") from error
+    except RuckigError:
+        fastest = order.max_velocity
+        order.max_velocity = [_LITTLE_LESS * limit for limit in fastest]
+        try:
+            result = generate(order, answer)
+        except RuckigError as error:
+            raise MotionError(f"no way to go on from here: {error}") from error
+        finally:
+            order.max_velocity = fastest
     if result not in (Result.Working, Result.Finished):
         raise MotionError(f"no way to go on from here ({result})")
 

@@ -6,7 +6,7 @@ from itertools import pairwise
 
 import msgspec
 import pytest
-from ruckig import Result
+from ruckig import InputParameter, Result, Ruckig, RuckigError, Trajectory
 
 from device_agent.ports.geometry import Clearance, Sweep, never
 from device_agent.protocol.messages import Mode, Pose
@@ -258,6 +258,19 @@ def test_a_motion_without_a_way_to_brake_is_an_error() -> None:
 def test_a_planner_that_finds_nothing_is_an_error() -> None:
     with pytest.raises(MotionError):
         plan(lambda _order, _answer: Result.ErrorExecutionTimeCalculation, None, None)
+
+
+def test_a_way_that_rounding_hides_from_the_planner_is_found_with_a_little_less_speed() -> None:
+    order = InputParameter(1)
+    # A joint that would meet both limits, and leave them again, at one moment.
+    order.current_position, order.target_position = [0.8000000000000002], [0.5]
+    order.max_velocity, order.max_acceleration, order.max_jerk = [3.0], [60.0], [1200.0]
+    with pytest.raises(RuckigError):
+        Ruckig(1).calculate(order, Trajectory(1))
+    found = Trajectory(1)
+    plan(Ruckig(1).calculate, order, found)
+    assert found.at_time(found.duration)[0] == pytest.approx([0.5])
+    assert order.max_velocity == [3.0]
 
 
 def test_a_motion_that_cannot_be_planned_holds_and_ends_the_lease() -> None:

@@ -10,7 +10,7 @@ import pytest
 from device_agent import geometry
 from device_agent.ports.driver import Twist
 from device_agent.protocol import robot_type
-from device_agent.runtime import gaze
+from device_agent.runtime import gaze, shows
 from device_agent.runtime.controller import Controller
 from device_agent.runtime.courses import Course, Outcome
 from device_agent.runtime.lease import LeaseGate, Refused
@@ -49,6 +49,9 @@ class LimitedRobot:
     def look(self, position_m: tuple[float, float, float], speed: float = 0.5) -> None:
         assert self.shape is not None
         self.move_joints(gaze.aim(self.type, self.shape, self.position, position_m), speed=speed)
+
+    def express(self, name: str, strength: float = 1.0) -> None:
+        self.move_joints(shows.expression(self.type, name, strength), speed=shows.EXPRESSION_SPEED)
 
     def say(self, text: str, language: str = "") -> None:
         assert text

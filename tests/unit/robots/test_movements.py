@@ -11,6 +11,7 @@ import pytest
 
 from device_agent.drivers.mujoco.wheels import wheel_speeds
 from device_agent.ports.driver import Twist
+from device_agent.runtime import shows
 from tests.unit.robots.balance import WalkedRobot
 from tests.unit.robots.folders import MOVEMENTS, ROBOTS, Bench, heard
 
@@ -66,6 +67,9 @@ class PlayedRobot:
         assert len(position_m) == 3
         assert self.bench.type.gaze is not None
         self.move_joints(self.home_rad | dict.fromkeys(self.bench.type.gaze.joints, 0.0), speed=speed)
+
+    def express(self, name: str, strength: float = 1.0) -> None:
+        self.move_joints(shows.expression(self.bench.type, name, strength), speed=shows.EXPRESSION_SPEED)
 
     def say(self, text: str, language: str = "") -> None:
         assert text
