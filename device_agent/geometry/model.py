@@ -91,6 +91,14 @@ class MujocoGeometry:
         """A speed that no point of the robot exceeds [m/s]."""
         return self._pairs.speed_m_s(np.abs(np.asarray(velocity_rad_s, dtype=np.float64)))
 
+    def rates(
+        self, frame: str, twist: Sequence[float], position_rad: Sequence[float], *, tool: bool
+    ) -> tuple[float, ...]:
+        """Joint velocities that move a frame: damped least squares, damped where the robot is near a singularity."""
+        is_site, index = self._frames[frame]
+        with self._lock:
+            return self._probe.rates(self._base, is_site, index, np.array(twist), position_rad, tool=tool)
+
     def solve(self, frame: str, pose: Pose, start_rad: Sequence[float]) -> tuple[float, ...]:
         """Joint positions that bring a frame to a pose in the robot's base frame.
 

@@ -22,6 +22,11 @@ _CLOSER = 3
 _SAME_M = 1e-7
 """Less than this is no change of a distance: far above rounding, far below what creeping could add up to."""
 
+_SINGULAR = 0.08
+"""Below this least singular value a jog is damped: a UR5 at home has 0.2, with its wrist or elbow stretched 0."""
+_DAMPING = 0.08
+_NOTHING = 1e-9
+
 
 class Probe:
     """One ``MjData`` to look with. Not thread-safe: whoever looks has one of its own, or locks.
@@ -39,6 +44,8 @@ class Probe:
         self._qpos = qpos
         self._pairs = pairs
         self._ties = ties
+        joints = [int(np.flatnonzero(model.jnt_qposadr == at)[0]) for at in qpos]
+        self._dofs = np.array([model.jnt_dofadr[joint] for joint in joints], dtype=np.intp)
         self.data: Any = mujoco.MjData(model)
         self.place(at_rad)
         self._measured = np.asarray(at_rad, dtype=np.float64), pairs.rooms_at_least(self.data)
@@ -100,6 +107,26 @@ class Probe:
                     low, half = (low + half if clear(low + half) else low), half / 2
                 return low
         return 1.0
+
+    def rates(
+        self, base: int, is_site: bool, index: int, twist: Floats, position_rad: Sequence[float], *, tool: bool
+    ) -> tuple[float, ...]:
+        """See ``Geometry.rates``."""
+        self.place(position_rad)
+        data, model = self.data, self._model
+        mujoco.mj_comPos(model, data)
+        whole = np.empty((6, model.nv))
+        jacobian_of = mujoco.mj_jacSite if is_site else mujoco.mj_jacBody
+        jacobian_of(model, data, whole[:3], whole[3:], index)
+        own = data.site_xmat[index] if is_site else data.xmat[index]
+        axes = (own if tool else data.xmat[base]).reshape(3, 3)
+        asked = np.concatenate((axes @ twist[:3], axes @ twist[3:]))
+        jacobian = whole[:, self._dofs]
+        # The nearer to a singularity, the more damping: joints then follow slowly instead of jumping.
+        left, sizes, right = np.linalg.svd(jacobian, full_matrices=False)
+        near = np.clip(1.0 - sizes[-1] / _SINGULAR, 0.0, 1.0)
+        found = right.T @ (sizes / (sizes**2 + (near * _DAMPING) ** 2 + _NOTHING) * (left.T @ asked))
+        return tuple(found.tolist())
 
     def _surely_clear(self, path: Floats) -> bool:
         """Whether nothing can come too near, by the room there was where it was last measured: most ways, cheaply.

@@ -90,6 +90,20 @@ class Geometry(Protocol):
     def speed_m_s(self, velocity_rad_s: Sequence[float]) -> float:
         """A speed that no point of the robot exceeds, in whatever position, by the lever arms of its joints [m/s]."""
 
+    def rates(
+        self, frame: str, twist: Sequence[float], position_rad: Sequence[float], *, tool: bool
+    ) -> tuple[float, ...]:
+        """Joint velocities that move a frame, shape (n,) [rad/s]; less where they would have to be very high.
+
+        Quick enough for the control loop.
+
+        Args:
+            frame: One of ``frames``.
+            twist: Linear x, y, z [m/s], then angular [rad/s].
+            position_rad: Where the joints are, shape (n,) [rad].
+            tool: Whether the twist is along the frame's own axes, not the base's.
+        """
+
     def solve(self, frame: str, pose: Pose, start_rad: Sequence[float]) -> tuple[float, ...]:
         """Joint positions that bring a frame to a pose in the robot's base frame, near ``start_rad`` where possible.
 

@@ -231,6 +231,26 @@ class JointTarget(_Order, frozen=True, kw_only=True, tag="joints"):
     position_rad: JointPositions
 
 
+class JogTarget(_Order, frozen=True, kw_only=True, tag="jog"):
+    """Move a frame at this velocity while setpoints are fresh; no frame: the last of the device's.
+
+    Along and about the axes of the robot's base, or with ``tool`` those of the frame itself.
+    """
+
+    linear_m_s: Vector3 = (0.0, 0.0, 0.0)
+    angular_rad_s: Vector3 = (0.0, 0.0, 0.0)
+    frame: Label = ""
+    tool: bool = False
+
+
+class DriveTarget(_Order, frozen=True, kw_only=True, tag="drive"):
+    """Move the base at this velocity while setpoints are fresh; ``turn_rad_s`` is counter-clockwise."""
+
+    forward_m_s: float = 0.0
+    left_m_s: float = 0.0
+    turn_rad_s: float = 0.0
+
+
 class Setpoint(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """``ctl/{epoch}``: one streamed setpoint. The newest wins; ``sequence`` starts at 1 in each lease.
 
@@ -242,7 +262,7 @@ class Setpoint(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     sequence: Annotated[int, Meta(ge=1, le=2**53)]
     echo_tick_ms: Milliseconds
     sent_ms: float
-    target: JointTarget
+    target: JointTarget | JogTarget | DriveTarget
 
 
 class Stop(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):

@@ -73,6 +73,11 @@ class BaseMotion:
         """Whether the commanded twist is not zero."""
         return any(abs(part) > _REST for part in self.twist)
 
+    def braking_time_s(self) -> float:
+        """How long ``brake`` would take from the present twist [s], rounded up by the ramps at both ends."""
+        times = [abs(part) / limit for part, limit in zip(self.twist, self._braking, strict=True)]
+        return max(times) + 3 * _BRAKING_RAMP_S if self.moving else 0.0
+
     def _aim(self, twist: Twist, acceleration: list[float], ramp_s: float) -> None:
         self._input.target_velocity = list(twist)
         self._input.target_acceleration = list(REST)

@@ -411,10 +411,13 @@ class Controller:
         if self._authority.tenure is not None:
             self._helm.follow(self._authority.restrictions.speed)
             return Mode.ACTION
-        if self._stream.fresh(now_s, self._motion, late_s=self._late_s):
-            self._stream.follow(self._motion, allowed=self._authority.restrictions.speed)
+        if self._stream.fresh(now_s, self._helm.braking_time_s(), late_s=self._late_s):
+            allowed = self._authority.restrictions.speed
+            self._stream.follow(self._motion, allowed=allowed)
+            if self._helm.base is not None:
+                self._stream.steer(self._helm.base, now_s, late_s=self._late_s, allowed=allowed)
             return Mode.STREAMING
-        if self._mode is Mode.STREAMING and self._motion.fastest_rad_s > _CREEP_RAD_S:
+        if self._mode is Mode.STREAMING and self._helm.faster_than(_CREEP_RAD_S):
             self._authority.end(Refused("watchdog", "setpoints stopped coming"))
         self._stream.drop()
         self._helm.brake()

@@ -106,6 +106,8 @@ class Helm:
                 else:
                     self.base.brake()
                 drive.periods -= 1
+            case None:
+                self.brake()  # what setpoints have begun does not go on beside an action
 
     def look(self, late_s: float) -> Clearance | None:
         """What is in the way of the period that comes, if anything is.
@@ -178,6 +180,14 @@ class Helm:
     def moving(self) -> bool:
         """Whether any commanded velocity is not zero."""
         return self.motion.moving or (self.base is not None and self.base.moving)
+
+    def faster_than(self, creep_rad_s: float) -> bool:
+        """Whether it is more than creeping at its target [rad/s]; a base that moves at all is."""
+        return self.motion.fastest_rad_s > creep_rad_s or (self.base is not None and self.base.moving)
+
+    def braking_time_s(self) -> float:
+        """How long ``brake`` would take [s]."""
+        return max(self.motion.braking_time_s(), 0.0 if self.base is None else self.base.braking_time_s())
 
     @property
     def twist(self) -> Twist:

@@ -113,6 +113,7 @@ class Motion:
         *,
         speed: float = 1.0,
         cap_rad_s: float = math.inf,
+        most_rad_s: Sequence[float] | None = None,
         together: bool = False,
     ) -> None:
         """Head for ``target_rad``, shape (n,) [rad], already inside the joints' ranges.
@@ -124,6 +125,7 @@ class Motion:
             target_rad: Where to come to rest.
             speed: Share of each joint's velocity limit, above 0 and at most 1.
             cap_rad_s: What no joint exceeds.
+            most_rad_s: What each joint does not exceed besides, shape (n,), above 0.
             together: Whether all joints arrive at the same time (a move) or each as fast as it can (a slider).
         """
         self._target = list(target_rad)
@@ -140,7 +142,10 @@ class Motion:
         self.braking = False
         self._input.control_interface = ControlInterface.Position
         self._input.synchronization = Synchronization.Time if together else Synchronization.No
-        self._input.max_velocity = [min(limit * speed, cap_rad_s) for limit in self._velocity_limits]
+        fastest = [min(limit * speed, cap_rad_s) for limit in self._velocity_limits]
+        if most_rad_s is not None:
+            fastest = [min(pair) for pair in zip(fastest, most_rad_s, strict=True)]
+        self._input.max_velocity = fastest
         self._input.max_acceleration = self._acceleration_limits
         self._input.max_jerk = self._jerk_limits
         self._input.target_position = self._heading()

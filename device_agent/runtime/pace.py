@@ -59,7 +59,11 @@ class Pace:
 
     def share(self) -> float:
         """What age alone leaves of the speed where nobody knows what the robot could touch, 0…1."""
-        if self._geometry is not None or self.age_s <= _EASY_S:
+        return 1.0 if self._geometry is not None else self.blind_share()
+
+    def blind_share(self) -> float:
+        """What age alone leaves of the speed of what nobody looks ahead for, as a base, 0…1."""
+        if self.age_s <= _EASY_S:
             return 1.0
         return max(_LEAST_SHARE, (self._oldest_s - self.age_s) / (self._oldest_s - _EASY_S))
 

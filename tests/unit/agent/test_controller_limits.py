@@ -53,6 +53,11 @@ class Wall:
     def solve(self, frame: str, pose: Pose, start_rad: Sequence[float]) -> tuple[float, ...]:
         raise NotImplementedError
 
+    def rates(
+        self, frame: str, twist: Sequence[float], position_rad: Sequence[float], *, tool: bool
+    ) -> tuple[float, ...]:
+        raise NotImplementedError
+
     def plan(
         self,
         start_rad: Sequence[float],

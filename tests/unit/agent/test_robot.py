@@ -108,6 +108,11 @@ class Head:
             raise GeometryError("face cannot come nearer than 0.5 m")
         return (pose[0], pose[6])
 
+    def rates(
+        self, frame: str, twist: Sequence[float], position_rad: Sequence[float], *, tool: bool
+    ) -> tuple[float, ...]:
+        raise NotImplementedError
+
     def plan(
         self,
         start_rad: Sequence[float],

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 from device_agent.protocol import codec, document, signing
 from device_agent.protocol.errors import ProtocolError, SignatureError
-from device_agent.protocol.messages import Command, JointTelemetry, MoveJoints, Setpoint, State
+from device_agent.protocol.messages import Command, JointTarget, JointTelemetry, MoveJoints, Setpoint, State
 
 SETPOINT: dict[str, Any] = {
     "epoch": 3,
@@ -41,7 +41,7 @@ def changed(**fields: Any) -> bytes:
 
 
 def test_a_setpoint_is_read() -> None:
-    assert codec.decode(changed(), Setpoint).target.position_rad == {"elbow": 0.5}
+    assert codec.decode(changed(), Setpoint).target == JointTarget(position_rad={"elbow": 0.5})
 
 
 @pytest.mark.parametrize(

@@ -516,7 +516,7 @@ export interface Setpoint {
   sequence: number;
   echo_tick_ms: number;
   sent_ms: number;
-  target: JointTarget;
+  target: JointTarget | JogTarget | DriveTarget;
 }
 
 /** Go to these joint positions, as fast as limits allow. */
@@ -524,6 +524,27 @@ export interface JointTarget {
   kind: "joints";
   /** joint name → position [rad]; joints not named keep their target */
   position_rad: Record<string, number>;
+}
+
+/**
+ * Move a frame at this velocity while setpoints are fresh; no frame: the last of the device's.
+ *
+ * Along and about the axes of the robot's base, or with `tool` those of the frame itself.
+ */
+export interface JogTarget {
+  kind: "jog";
+  linear_m_s?: [number, number, number];
+  angular_rad_s?: [number, number, number];
+  frame?: string;
+  tool?: boolean;
+}
+
+/** Move the base at this velocity while setpoints are fresh; `turn_rad_s` is counter-clockwise. */
+export interface DriveTarget {
+  kind: "drive";
+  forward_m_s?: number;
+  left_m_s?: number;
+  turn_rad_s?: number;
 }
 
 /** `stop`: latch Stop now. Needs no lease and no signature: the broker lets only those publish it who may. */
