@@ -3,7 +3,8 @@
 While it walks, two things are not as on real metal. The legs are the gait's, a script: what the agent commands for them
 waits. And the torso is helped, by a spring that holds it upright and draws it along the course, no harder than the
 manifest says (``[simulation.walk]``); nothing carries its weight but the legs. Standing, sitting and all that the
-agent's own commands do has no help: a robot that loses its balance falls.
+agent's own commands do has no help: a robot that loses its balance falls. It then lies, until it is carried back to
+where it began, as a person in a real room would.
 """
 
 import math
@@ -36,6 +37,8 @@ _CATCH_UP_RAD_S = 1.0
 """How fast the legs go to where the agent has commanded them meanwhile, after a walk."""
 _STILL = 1e-4
 """A twist of less [m/s, rad/s] is none: nobody makes steps for it."""
+_LIES_S = 10.0
+"""Simulated time that it lies until somebody comes."""
 _UPRIGHT = 0.8
 """Cosine of the torso's tilt: less is a fall, and nobody walks lying."""
 
@@ -48,12 +51,14 @@ class _Order(NamedTuple):
 
 
 class Walker:
-    """``Process`` that moves one robot's legs while it walks, and helps its torso.
+    """``Process`` that moves one robot's legs while it walks, helps its torso, and carries it back when it has fallen.
 
     Args:
         walk: From the manifest.
         model: ``MjModel``.
         base: The robot's root body, on a free joint.
+        soles: Sites of the left and the right sole.
+        servos: Index of each of its actuators → where its joint is in ``qpos``.
         actuators: Of both legs, the left one's first, shape (12,).
         measures: Both legs.
         gait: How it steps.
@@ -66,11 +71,25 @@ class Walker:
     """
 
     def __init__(
-        self, walk: Walk, model: Any, *, base: int, actuators: Ints, measures: Legs, gait: Gait, height_m: float
+        self,
+        walk: Walk,
+        model: Any,
+        *,
+        base: int,
+        soles: tuple[int, int],
+        servos: Mapping[int, int],
+        actuators: Ints,
+        measures: Legs,
+        gait: Gait,
+        height_m: float,
     ) -> None:
         self._walk = walk
         self._base = base
         self._free = int(model.body_dofadr[base])
+        self._free_qpos = int(model.jnt_qposadr[model.body_jntadr[base]])
+        self._soles = list(soles)
+        self._servos = dict(servos)
+        self._fell_s: float | None = None
         self._actuators = actuators
         self._legs = measures
         self._gait = gait
@@ -91,11 +110,11 @@ class Walker:
 
     def step(self, model: Any, data: Any, time_s: float) -> None:
         """One group of steps further."""
-        del model
         elapsed_s, self._last_s = time_s - self._last_s, time_s
         if data is not self._data:  # a world that began anew
             self._data, self.busy, self._gait.walking = data, False, False
             return
+        self._look_after(model, data, time_s)
         order = self._order
         twist = order.twist if time_s - order.said_s <= _SILENT_S else REST
         if self.busy and (not self._gait.walking or upright(data.xquat[self._base]) < _UPRIGHT):
@@ -109,6 +128,24 @@ class Walker:
         self._move_legs(data, share)
         self._help(data, share)
         self._believe()
+
+    def _look_after(self, model: Any, data: Any, time_s: float) -> None:
+        """Stand it where it began, joints as commanded, when it has lain for a while."""
+        if upright(data.xquat[self._base]) >= _UPRIGHT:
+            self._fell_s = None
+        elif self._fell_s is None:
+            self._fell_s = time_s
+        elif time_s - self._fell_s >= _LIES_S:
+            self._fell_s, self.walked = None, Place(0.0, 0.0, 0.0)
+            at = self._free_qpos
+            data.qpos[at : at + 7] = model.qpos0[at : at + 7]
+            data.qvel[self._free : self._free + 6 + len(self._servos)] = 0.0
+            for actuator, joint in self._servos.items():
+                data.qpos[joint] = data.ctrl[actuator]
+            mujoco.mj_kinematics(model, data)
+            floor_m = float(model.qpos0[at + 2]) - self._height_m
+            data.qpos[at + 2] += floor_m - float(data.site_xpos[self._soles][:, 2].min())
+            mujoco.mj_kinematics(model, data)
 
     def _begin(self, data: Any, twist: Twist, time_s: float) -> None:
         x, y = data.xpos[self._base][:2].tolist()
@@ -296,6 +333,8 @@ class WalkingDriver(MujocoDriver):
             self._walk,
             model,
             base=self._base,
+            soles=(self._site(model, self._walk.soles[0]), self._site(model, self._walk.soles[1])),
+            servos=dict(zip(self._actuators.tolist(), self._qpos.tolist(), strict=True)),
             actuators=self._actuators[self._leg_joints],
             measures=legs(left, right, (feet[0][0], feet[0][1], feet[0][2])),
             gait=Gait(

@@ -102,6 +102,7 @@ class Walking:
     def period(self) -> None:
         """One control period: what the loop does, then the physics."""
         self.now_s += self.period_s
+        self.driver.observe()
         tick = self.controller.step(self.now_s)
         self.applied = self.driver.send(tick.position_rad)
         self.controller.applied(self.applied)

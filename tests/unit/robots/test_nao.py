@@ -277,6 +277,20 @@ def test_it_falls_when_it_is_pushed_hard_and_then_lies() -> None:
     assert not walking.world._data.xfrc_applied[walking.body].any()
 
 
+def test_who_has_fallen_is_carried_back_to_where_it_began_and_can_walk_again() -> None:
+    walking = Walking(FOLDER)
+    walking.world._data.qvel[:2] = (0.0, 3.0)  # a kick
+    walking.world.step(1000)
+    assert walking.upright < 0.5
+    walking.world.step(5500)
+    assert walking.upright > UPRIGHT
+    assert walking.torso_m == pytest.approx([0.0, 0.0, walking.model.body("torso").pos[2]], abs=0.01)
+    told = walking.driver.report("odometry")
+    assert (told["x_m"], told["y_m"], told["yaw_rad"]) == (0.0, 0.0, 0.0)
+    walking.drive(FORWARD, duration_s=2.0)
+    assert walking.torso_m[0] > 0.1
+
+
 @pytest.mark.parametrize(
     ("change", "says"),
     [({"base": None}, r"has no \[base\]"), ({"simulation": None}, r"no \[simulation.walk\]")],
