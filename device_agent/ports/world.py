@@ -14,8 +14,8 @@ class Process(Protocol):
     def step(self, model: Any, data: Any, time_s: float) -> None:
         """Go on until ``time_s``. Called in the world's thread before each group of steps (4 ms): be quick.
 
-        May write mocap poses, and of its own actuators, joints and bodies the controls, positions and outer forces; nothing
-        else.
+        May write mocap poses, and the controls, positions and outer forces of its own actuators, joints and bodies, and
+        nothing else.
 
         Args:
             model: ``MjModel``; of it only colours and lights may change.

@@ -107,8 +107,7 @@ class Walking:
         self.applied = self.driver.send(tick.position_rad)
         self.controller.applied(self.applied)
         self.twist = self.driver.drive(tick.twist)
-        for _ in range(round(self.period_s / STEP_S) // 2):
-            self.world.step(2)
+        self.world.step(round(self.period_s / STEP_S))
         self.least_upright = min(self.least_upright, self.upright)
 
     def wait(self, duration_s: float) -> None:
