@@ -33,6 +33,7 @@ _CREEP_RAD_S = 0.02
 _REMEMBERED = 0.998
 """Of how late the control loop was called, from one period to the next: half of it after three seconds."""
 _SAME_RAD = 1e-6
+_SAME_TWIST = 1e-3
 
 
 @dataclass(frozen=True, slots=True)
@@ -86,6 +87,7 @@ class Controller:
         self._due_s = math.inf
         self._late_s = 0.0
         self._driver_limits: tuple[str, ...] = ()
+        self._base_limits: tuple[str, ...] = ()
 
     # ------------------------------------------------------------ what other threads ask
 
@@ -294,6 +296,12 @@ class Controller:
                 if abs(asked - done) > _SAME_RAD
             )
 
+    def driven(self, asked: Twist, done: Twist) -> None:
+        """What the driver made of the last twist; where it differs, ``limited`` says so: who sits does not walk."""
+        with self._lock:
+            differs = any(abs(wanted - applied) > _SAME_TWIST for wanted, applied in zip(asked, done, strict=True))
+            self._base_limits = ("base: driver",) if differs else ()
+
     # ------------------------------------------------------------ what others may know
 
     @property
@@ -430,7 +438,7 @@ class Controller:
         limited: tuple[str, ...] = () if strictest is None else (strictest.text,)
         if self._mode is Mode.STREAMING:
             limited += self._stream.limited
-        return limited + self._motion.waits + self._slack.limited + self._driver_limits
+        return limited + self._motion.waits + self._slack.limited + self._driver_limits + self._base_limits
 
     def _fence(self, epoch: int) -> None:
         if self._authority.fence(epoch):

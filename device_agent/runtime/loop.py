@@ -88,7 +88,7 @@ class ControlLoop:
                 applied = self._driver.send(tick.position_rad)
                 self._controller.applied(applied)
                 if self._base is not None:
-                    self._base.drive(tick.twist)
+                    self._controller.driven(tick.twist, self._base.drive(tick.twist))
                 self._measure(now_s, self.seen, tick, applied)
             except DriverError as error:
                 self._fail(str(error))

@@ -123,6 +123,7 @@ class Walker:
             if twist == REST or upright(data.xquat[self._base]) < _UPRIGHT:
                 return
             self._begin(data, twist, time_s)
+        self.velocity = twist
         self._gait.advance(elapsed_s, twist)
         share = min(1.0, (time_s - self._began_s) / _FADE_S)
         self._move_legs(data, share)
@@ -195,7 +196,6 @@ class Walker:
             gone = self._gait.course.seen_from(began)
             there = believed.beside(gone.x_m, gone.y_m)
             self.walked = Place(there.x_m, there.y_m, math.remainder(believed.yaw_rad + gone.yaw_rad, 2 * math.pi))
-            self.velocity = self._gait.velocity
 
 
 class WalkingDriver(MujocoDriver):

@@ -4,7 +4,7 @@ import threading
 
 import pytest
 
-from device_agent.ports.driver import DriverError, Twist
+from device_agent.ports.driver import REST, DriverError, Twist
 from device_agent.protocol.messages import JointTelemetry
 from device_agent.runtime.controller import Controller
 from device_agent.runtime.courses import Outcome
@@ -32,6 +32,14 @@ class Cart(ToyDriver):
         return twist
 
 
+class Sitting(Cart):
+    """A toy that could drive, but sits."""
+
+    def drive(self, twist: Twist) -> Twist:
+        super().drive(twist)
+        return REST
+
+
 def ignore(_telemetry: JointTelemetry) -> None:
     pass
 
@@ -55,6 +63,21 @@ def test_the_driver_is_told_the_twist_until_the_drive_has_ended() -> None:
         loop.stop()
     assert 0 < max(twist.forward_m_s for twist in cart.twists) <= 0.2 + 1e-9
     assert cart.twists[-1] == pytest.approx(Twist(), abs=1e-6)
+
+
+@pytest.mark.parametrize(("cart", "limited"), [(Cart(), ()), (Sitting(), ("base: driver",))])
+def test_a_drive_that_the_driver_does_not_follow_says_so(cart: Cart, limited: tuple[str, ...]) -> None:
+    kind = robot_type(BASE)
+    controller = Controller(kind, LeaseGate())
+    loop = ControlLoop(kind, cart, controller, name="cart", tell=ignore, watch=unwatched)
+    loop.start()
+    try:
+        tenure = controller.begin_action(epoch=1, on_lost=lost)
+        drive = controller.drive(tenure, Twist(0.2), duration_s=0.5)
+        assert drive.finished.wait(WITHIN_S)
+        assert drive.limited == limited
+    finally:
+        loop.stop()
 
 
 def test_a_driver_that_cannot_drive_does_not_start_with_a_type_that_has_a_base() -> None:
