@@ -26,7 +26,7 @@ TAKEN, CLEAR = 0.9, -0.6
 """Log odds that one look adds: a hit tells more than a ray that passes, as thin things are often missed."""
 MOST = 4.0
 """Bound of the log odds: 0.98 sure. More would have to be unlearned when things change."""
-FADE_S = 4.0
+FADE_S = 2.0
 """Time constant in which what is not looked at falls back to the lasting memory [s]."""
 LASTING_S = 60.0
 """Time constant of the lasting memory [s]; in the first minute it is the mean of what has been seen,"""
@@ -206,14 +206,17 @@ class OccupancyGrid:
         return self._known()[0] > SURE
 
     def static(self) -> Bools:
-        """Where something has been for long and is now: walls, furniture, shape (rows, columns)."""
+        """Where something has been for long and is now: walls, furniture, shape (rows, columns).
+
+        Their edges are in it, where a look hits them or not.
+        """
         recent, lasting = self._known()
-        return (recent > SURE) & (lasting > STATIC)
+        taken = recent > SURE
+        return taken & _spread(taken & (lasting > STATIC), 1.0)
 
     def moving(self) -> Bools:
         """Where something is now that was not there before, shape (rows, columns)."""
-        recent, lasting = self._known()
-        return (recent > SURE) & (lasting <= STATIC)
+        return self.taken() & ~self.static()
 
     def blocked(self, radius_m: float, *, apart: Sequence[Circle] = (), unknown: bool = True) -> Floor:
         """Where the middle of something round with this radius would touch what is there.

@@ -39,6 +39,8 @@ TRAVEL_M = 0.4
 """How far it must go to count when only a lidar sees it: what the room's survey missed stands still [m]."""
 WALKING_M_S = 0.12
 """From this speed on its way says where it looks [m/s]."""
+WALKED_M = 0.15
+"""So far it must have gone before: who is first seen half hidden seems to move [m]."""
 LOWEST_M = 0.2
 """Whoever is lower is not looked for [m]."""
 HEAD_M = 0.35
@@ -116,8 +118,12 @@ class Track:
     @property
     def confirmed(self) -> bool:
         """Whether it is somebody, rather than a flaw in a scan."""
-        travelled = float(np.hypot(*(self.state[:2] - self.born_m)))
-        return self.looks >= LOOKS and (self.heights > 0 or travelled > TRAVEL_M)
+        return self.looks >= LOOKS and (self.heights > 0 or self.travelled_m > TRAVEL_M)
+
+    @property
+    def travelled_m(self) -> float:
+        """How far it is from where it was first seen [m]."""
+        return float(np.hypot(*(self.state[:2] - self.born_m)))
 
     @property
     def gate_m(self) -> float:
@@ -156,7 +162,7 @@ class Track:
         if speed_m_s > self.fastest_m_s:
             self.state[2:] *= self.fastest_m_s / speed_m_s
         self.seen_s, self.looks = self.at_s, self.looks + 1
-        if speed_m_s > WALKING_M_S and self.looks > LOOKS:
+        if speed_m_s > WALKING_M_S and self.travelled_m > WALKED_M:
             self.yaw_rad = math.atan2(self.state[3], self.state[2])
 
     def measure(self, height_m: float) -> None:

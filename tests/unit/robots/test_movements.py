@@ -116,12 +116,32 @@ class PlayedRobot:
             self.fastest = max(self.fastest, float((np.abs(bench.data.qvel[bench.dof]) / bench.speed).max()))
 
 
+class PlayedRoom:
+    """The script's ``room``: sees the robot where it is, and somebody who stands before it."""
+
+    PERSON_M = (1.9, 0.35)
+
+    def __init__(self, robot: PlayedRobot | WalkedRobot) -> None:
+        self.robot = robot
+
+    def latest(self, device: str, stream: str) -> dict[str, Any]:
+        assert (device, stream) == ("perception", "positions")
+        assert isinstance(self.robot, PlayedRobot)
+        base = self.robot.bench.data.body(1)
+        values = {"age_s.person": 0.1, "x_m.person": self.PERSON_M[0], "y_m.person": self.PERSON_M[1]}
+        name = self.robot.bench.type.type
+        values |= {f"age_s.{name}": 0.1, f"x_m.{name}": base.xpos[0], f"y_m.{name}": base.xpos[1]}
+        values[f"yaw_rad.{name}"] = math.atan2(base.xmat[3], base.xmat[0])
+        return {"values": values, "age_s": 0.1}
+
+
 def play(path: Path, parameters: dict[str, Any]) -> PlayedRobot | WalkedRobot:
     bench = Bench(path.parent.parent)
     on_legs = bench.type.simulation is not None and bench.type.simulation.walk is not None
     robot = WalkedRobot(path.parent.parent) if on_legs else PlayedRobot(bench)
     given = {
         "robot": robot,
+        "room": PlayedRoom(robot),
         "wait": robot.wait,
         "parameters": parameters,
         "progress": robot.progress,
