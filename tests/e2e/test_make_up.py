@@ -21,6 +21,8 @@ from tests.support.machine import Api, Machine, free_ports, ready_link, start_ma
 def clear_line(machine: Machine) -> str:
     """The one line with which it ended; anything like a traceback fails."""
     assert machine.process.wait(30) != 0
+    # Its last words may still be on their way when it has gone.
+    wait_until(lambda: any(line.strip() and line != "telescope: starting\n" for line in machine.lines), "a word", 10)
     text = "".join(machine.lines)
     assert "Traceback" not in text
     lines = [line for line in machine.lines if line.strip() and line != "telescope: starting\n"]
