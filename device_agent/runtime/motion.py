@@ -160,7 +160,7 @@ class Motion:
             share: Of the way's speed, above 0 and at most 1.
         """
         self._target = way.position_rad[-1].tolist()
-        if self._ride is None and not self.moving:
+        if self._ride is None and not self.moving and self._rests_at(way.position_rad[0].tolist()):
             self._ride = Ride(
                 way,
                 period_s=self._period_s,
@@ -173,6 +173,11 @@ class Motion:
             return
         self.braking = False
         self._ride.go(share)
+
+    def _rests_at(self, position_rad: Sequence[float]) -> bool:
+        """Whether a way that begins there begins here: on another one the first period would be a jump."""
+        pairs = zip(self.position_rad, position_rad, strict=True)
+        return all(abs(a - b) <= _REACHED_RAD or index in self._limp for index, (a, b) in enumerate(pairs))
 
     def _heading(self) -> list[float]:
         """The target for this period: joints that leave each other no room wait for each other."""
