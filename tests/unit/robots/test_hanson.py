@@ -34,6 +34,22 @@ def test_rods_and_threads_pull_the_skin_where_the_ties_say(bench: Bench):
     assert settled == pytest.approx(bench.data.qpos, abs=1e-3)
 
 
+def test_the_agents_limits_know_where_the_rods_carry_the_head(bench: Bench):
+    shape = geometry.load(bench.type, FOLDER)
+    assert shape is not None
+    random = np.random.default_rng(5)
+    target = random.uniform(bench.lower, bench.upper)
+    bench.data.ctrl[bench.ctrl] = target
+    mujoco.mj_step(bench.model, bench.data, nstep=1500)
+    for frame, pose in shape.poses(target.tolist()).items():
+        assert pose[:3] == pytest.approx(bench.data.site(frame).xpos, abs=1e-4)
+    upright = bench.home.tolist()
+    leaning = dict(zip(bench.names, upright, strict=True)) | {"Lower-Gimbal-L": -1.2, "Lower-Gimbal-R": 1.4}
+    assert shape.clearance(list(leaning.values())).room_m < shape.clearance(upright).room_m - 0.01
+    one = [1.0 if name == "Lower-Gimbal-R" else 0.0 for name in bench.names]
+    assert shape.speed_m_s(one) > 0.03, "a motor is known to carry what its rod carries"
+
+
 def test_it_moves_its_head_less_than_its_motors(bench: Bench):
     pitch = bench.model.joint("head_pitch").qposadr[0]
     bench.data.ctrl[[bench.model.actuator(name).id for name in ("Upper-Gimbal-L", "Upper-Gimbal-R")]] = 1.9, -2.0
