@@ -1,5 +1,6 @@
 """Puts an agent together: the one place that picks drivers; ``links`` picks the transport."""
 
+import contextlib
 import os
 from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
@@ -11,6 +12,7 @@ from device_agent.jail.warm import WarmJail
 from device_agent.ports.clock import CloudClock, tick_ms, wall_ms
 from device_agent.ports.driver import Driver, DriverError
 from device_agent.ports.geometry import Geometry, GeometryError
+from device_agent.ports.ground import Ground
 from device_agent.ports.jail import Jail
 from device_agent.ports.sensor import RoomDriver, SensorError, Surroundings
 from device_agent.ports.transport import Transport
@@ -355,6 +357,7 @@ def build(home: Home, *, trace: Path | None = None) -> Cell:
             entry,
             pairing,
             instrument=instrument,
+            ground=(lambda: _ground(neighbours)) if entry.room else None,
             journal=journal,
             clock=clock,
             transport=transport,
@@ -375,6 +378,17 @@ def _own_streams(configuration: Configuration) -> Iterator[tuple[str, str]]:
         device = load_room(entry.room).device(entry.name) if entry.room else None
         for stream in () if device is None else device.streams:
             yield entry.name, stream.name
+
+
+def _ground(neighbours: Mapping[str, RoomDriver]) -> Ground | None:
+    """What stands in the room, where a device of this agent sees it now."""
+    from device_agent.sensors.perception.driver import PerceptionDriver  # noqa: PLC0415 (for who goes somewhere only)
+
+    for driver in neighbours.values():
+        if isinstance(driver, PerceptionDriver):
+            with contextlib.suppress(SensorError):
+                return driver.grid
+    return None
 
 
 def _outbox(
@@ -401,6 +415,7 @@ def _device(
     pairing: Pairing,
     *,
     instrument: Instrument | None,
+    ground: Callable[[], Ground | None] | None,
     journal: Journal,
     clock: CloudClock,
     transport: Transport,
@@ -418,6 +433,7 @@ def _device(
         space=pairing.space,
         agent=pairing.agent,
         robot_type=kind,
+        ground=ground,
         driver=driver_of(entry, kind, trace=trace, faults=faults) if instrument is None else instrument,
         journal=journal,
         cloud_clock=clock,

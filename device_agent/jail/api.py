@@ -98,6 +98,16 @@ class Robot:
             duration_s=float(duration_s),
         )
 
+    def go_to(self, x_m: float, y_m: float, yaw_rad: float | None = None) -> None:
+        """Go to a place in the room, around what stands there, and wait until there.
+
+        Args:
+            x_m: In the room's frame [m].
+            y_m: The same.
+            yaw_rad: How to stand there, counter-clockwise from the room's x axis; without it as it comes.
+        """
+        self._ask("go_to", x_m=float(x_m), y_m=float(y_m), yaw_rad=None if yaw_rad is None else float(yaw_rad))
+
     def look(self, position_m: Sequence[float], speed: float = 0.5) -> None:
         """Turn the gaze to a point x, y, z in the robot's base frame [m]."""
         self._ask("look", position_m=_numbers(position_m, 3, "position_m"), speed=float(speed))

@@ -148,6 +148,14 @@ class Drive(_Order, frozen=True, kw_only=True, tag="drive"):
     duration_s: Annotated[float, Meta(gt=0, le=60)] = 1.0
 
 
+class GoTo(_Order, frozen=True, kw_only=True, tag="go_to"):
+    """Go to a place in the room, around what stands there now; ``yaw_rad``: how to stand, counter-clockwise from x."""
+
+    x_m: float
+    y_m: float
+    yaw_rad: float | None = None
+
+
 class Gather(_Order, frozen=True, kw_only=True, tag="gather"):
     """Measure these streams of a room device at this rate for a time, then again as before; no streams: all."""
 
@@ -177,7 +185,9 @@ class SetControl(_Order, frozen=True, kw_only=True, tag="set_control"):
 
 RoomTask = Gather | Shoot | CaptureRaw | SetControl
 """What is done with devices of a room."""
-Task = MoveJoints | MovePose | Say | Express | TakePosture | RunBehaviour | SetStiffness | LookAt | Drive | RoomTask
+Task = (
+    MoveJoints | MovePose | Say | Express | TakePosture | RunBehaviour | SetStiffness | LookAt | Drive | GoTo | RoomTask
+)
 """Orders that are actions and reach a device just as they were asked of the API."""
 
 

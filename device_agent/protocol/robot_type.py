@@ -69,6 +69,7 @@ class Base(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
         max_angular_rad_s: Turning [rad/s].
         max_linear_acceleration_m_s2: When speeding up [m/s²]; ``max_angular_acceleration_rad_s2``: the same of turning.
         braking_linear_m_s2: For a hold or a Stop [m/s²]; ``braking_angular_rad_s2``: the same of turning.
+        radius_m: How far it reaches from its middle, with the room it wants to keep on its way [m].
         sideways: Whether it goes sideways, as legs and some wheels do.
     """
 
@@ -78,6 +79,7 @@ class Base(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     max_angular_acceleration_rad_s2: float
     braking_linear_m_s2: float
     braking_angular_rad_s2: float
+    radius_m: float = 0.25
     sideways: bool = False
 
 

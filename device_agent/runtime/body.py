@@ -7,6 +7,7 @@ from typing import Any
 from device_agent.ports import skills
 from device_agent.ports.driver import Observation
 from device_agent.ports.geometry import Geometry
+from device_agent.ports.ground import Ground
 from device_agent.ports.skills import Skills
 from device_agent.protocol.robot_type import RobotType
 from device_agent.runtime.controller import Controller
@@ -32,6 +33,8 @@ class Body:
         room: What the space's other devices have measured last.
         reported: The newest of each of its own streams besides ``joints``.
         instrument: The device as a room's, where it is one.
+        name: As the room's positions name it.
+        ground: What stands in its room, while somebody sees that; without it, it goes nowhere by itself.
         speaker: Who says what it is to say.
     """
 
@@ -43,6 +46,8 @@ class Body:
     room: Room
     reported: Callable[[], Mapping[str, Reading]] = dict
     instrument: Instrument | None = None
+    name: str = ""
+    ground: Callable[[], Ground | None] | None = None
     speaker: Speaker = field(default_factory=Speaker)
 
     def seen(self) -> Observation:
@@ -72,6 +77,7 @@ class Body:
             "home": bool(kind.joints),
             "move_to": CARTESIAN in named and self.geometry is not None,
             "drive": kind.base is not None,
+            "go_to": kind.base is not None and self.ground is not None,
             "look": skills.GAZE in by_skill or (kind.gaze is not None and self.geometry is not None),
             "say": skills.SPEECH in named,
             "stiffness": skills.STIFFNESS in by_skill,

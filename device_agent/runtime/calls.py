@@ -84,6 +84,14 @@ class Drive(_Message, frozen=True, kw_only=True, tag="drive"):
     duration_s: float
 
 
+class GoTo(_Message, frozen=True, kw_only=True, tag="go_to"):
+    """``robot.go_to``; without a heading it stands as it comes."""
+
+    x_m: float
+    y_m: float
+    yaw_rad: float | None = None
+
+
 class Look(_Message, frozen=True, kw_only=True, tag="look"):
     """``robot.look``."""
 
@@ -138,7 +146,7 @@ class AskLatest(_Message, frozen=True, kw_only=True, tag="latest"):
 
 Show = Say | Stiffness | Express | Posture | Behaviour
 """Calls for what a robot shows, by its manifest or by its driver."""
-Call = MoveJoints | MoveTo | Home | Drive | Look | Show | AskState | AskLatest
+Call = MoveJoints | MoveTo | Home | Drive | GoTo | Look | Show | AskState | AskLatest
 """What the process waits for an answer to."""
 Message = Ready | Unfit | Output | Progress | Ended | Call
 

@@ -7,13 +7,14 @@ thread straight into the controller.
 
 import logging
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 
 from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PublicKey
 
 from device_agent.ports.clock import CloudClock, tick_ms, wall_ms
 from device_agent.ports.driver import Audible, Driver, Reporting
 from device_agent.ports.geometry import Geometry
+from device_agent.ports.ground import Ground
 from device_agent.ports.jail import Jail
 from device_agent.ports.skills import Skills
 from device_agent.ports.speech import Speech
@@ -71,6 +72,7 @@ class Device:
         jail: Where movement scripts run.
         owner: Id of the account that the agent is paired with.
         geometry: The robot's shape, ``None`` where its type has no model.
+        ground: What stands in its room, while somebody sees that.
         speech: The machine's voice, if it has one.
         uploads: Where sounds go.
     """
@@ -94,6 +96,7 @@ class Device:
         owner: str = "",
         interlocks: Sequence[Interlock] = (),
         geometry: Geometry | None = None,
+        ground: Callable[[], Ground | None] | None = None,
         speech: Speech | None = None,
         uploads: Uploads | None = None,
     ) -> None:
@@ -118,6 +121,8 @@ class Device:
             room=room,
             reported=self._reporter.latest,
             instrument=instrument,
+            name=name,
+            ground=ground,
             speaker=Speaker(
                 name,
                 speech=speech,

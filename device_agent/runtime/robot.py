@@ -5,13 +5,14 @@ from collections.abc import Callable, Mapping
 from typing import Any
 
 from device_agent.ports import skills
-from device_agent.ports.driver import Twist
+from device_agent.ports.driver import REST, Twist
 from device_agent.ports.geometry import Geometry, GeometryError
 from device_agent.protocol.messages import Vector3
 from device_agent.runtime import calls, gaze
 from device_agent.runtime.authority import Tenure
 from device_agent.runtime.body import Body, by_name
 from device_agent.runtime.courses import Course, Outcome
+from device_agent.runtime.errand import EVERY_S, ODOMETRY, PATIENCE_S, POSITIONS, WAITS_FOR, Errand, Whereabouts
 from device_agent.runtime.lease import Refused
 from device_agent.runtime.performer import Performer, check_share
 from device_agent.runtime.room import Reading
@@ -72,6 +73,8 @@ class ScriptRobot:
                 self._move_to(call)
             case calls.Drive():
                 self._drive(call)
+            case calls.GoTo():
+                self._go_to(call)
             case calls.Look(position_m=position_m, speed=speed):
                 self._look(position_m, speed)
             case calls.AskState():
@@ -120,6 +123,30 @@ class ScriptRobot:
     def _drive(self, call: calls.Drive) -> None:
         twist = Twist(call.forward_m_s, call.left_m_s, call.turn_rad_s)
         self.follow(self._body.controller.drive(self.tenure, twist, duration_s=call.duration_s))
+
+    def _go_to(self, call: calls.GoTo) -> None:
+        """A short drive after the other, each of which ends by itself: who stops deciding stands."""
+        body, controller = self._body, self._body.controller
+        errand, where = Errand.of(call.x_m, call.y_m, call.yaw_rad, body.robot_type), Whereabouts(body.name)
+        waited_s = 0.0
+        while not self.over.is_set():
+            ground = None if body.ground is None else body.ground()
+            if ground is None:
+                raise Refused("no_ground", "nobody sees what stands in the room now; drive by hand")
+            place = where.place(body.reported().get(ODOMETRY), body.room.newest(POSITIONS, f"x_m.{body.name}"))
+            try:
+                twist, waited_s = errand.twist(place, ground), 0.0
+            except Refused as refused:
+                waited_s += EVERY_S
+                if refused.code not in WAITS_FOR or waited_s > PATIENCE_S:
+                    raise
+                twist = REST
+            if twist is None:
+                break
+            drive = controller.drive(self.tenure, twist, duration_s=3 * EVERY_S)
+            if drive.finished.wait(EVERY_S):
+                self.follow(drive)
+        self.follow(controller.drive(self.tenure, REST, duration_s=EVERY_S))
 
     def follow(self, course: Course) -> None:
         """Wait for its end."""

@@ -110,6 +110,12 @@ class Room:
             )
         return self.read(source)
 
+    def newest(self, stream: str, value: str) -> Reading | None:
+        """The newest reading of any device's stream of this name that has this value."""
+        found = [self.read(source) for source in self.sources if source.stream == stream]
+        having = [reading for reading in found if reading is not None and value in reading.values]
+        return min(having, key=lambda reading: reading.age_s, default=None)
+
     def read(self, source: Source) -> Reading | None:
         """As ``latest``, of a source that is listened to."""
         now_s = self._clock_s()

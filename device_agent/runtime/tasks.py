@@ -20,6 +20,7 @@ _CALLS: dict[type[Struct], type[calls.Call]] = {
     messages.SetStiffness: calls.Stiffness,
     messages.LookAt: calls.Look,
     messages.Drive: calls.Drive,
+    messages.GoTo: calls.GoTo,
 }
 """Order → the call of a script that asks the same, with fields of the same names."""
 

@@ -311,7 +311,7 @@ export interface Command {
   ttl_ms: number;
   who: string;
   epoch: number;
-  request: GrantLease | ReleaseLease | AskLease | DropRequest | RunMovement | MoveJoints | MovePose | Say | Express | TakePosture | RunBehaviour | SetStiffness | LookAt | Drive | Gather | Shoot | CaptureRaw | SetControl | CancelAction | StopDevice | ResetStop;
+  request: GrantLease | ReleaseLease | AskLease | DropRequest | RunMovement | MoveJoints | MovePose | Say | Express | TakePosture | RunBehaviour | SetStiffness | LookAt | Drive | GoTo | Gather | Shoot | CaptureRaw | SetControl | CancelAction | StopDevice | ResetStop;
 }
 
 /**
@@ -451,6 +451,14 @@ export interface Drive {
   left_m_s?: number;
   turn_rad_s?: number;
   duration_s?: number;
+}
+
+/** Go to a place in the room, around what stands there now; `yaw_rad`: how to stand, counter-clockwise from x. */
+export interface GoTo {
+  kind: "go_to";
+  x_m: number;
+  y_m: number;
+  yaw_rad?: number | null;
 }
 
 /** Measure these streams of a room device at this rate for a time, then again as before; no streams: all. */
