@@ -25,7 +25,7 @@ from pathlib import Path
 from typing import Any
 
 from device_agent import __main__ as agent
-from device_agent.bootstrap import ROOMS
+from device_agent.bootstrap import folder_of_room
 from device_agent.drivers.mujoco import worlds
 from device_agent.runtime import loop
 from device_agent.runtime.controller import Controller, Tick
@@ -64,14 +64,14 @@ def run_agent(report: Path, for_s: float, arguments: Sequence[str]) -> int:
     last: dict[str, float] = {}
     step = Controller.step
 
-    def timed(controller: Controller, now_s: float) -> Tick:
+    def timed(controller: Controller, now_s: float, *seen: Sequence[float] | None) -> Tick:
         name, at_s = threading.current_thread().name, time.monotonic()
         if name in last:
             gaps.setdefault(name, []).append(at_s - last[name])
         last[name] = at_s
-        return step(controller, now_s)
+        return step(controller, now_s, *seen)
 
-    Controller.step = timed  # type: ignore[method-assign]
+    Controller.step = timed  # type: ignore[method-assign,assignment]
     loop.IDLE_RATE_HZ = TELEMETRY_HZ
     threading.Thread(target=_watch, args=(report, for_s, gaps), name="bench", daemon=True).start()
     return agent.main(arguments)
@@ -79,7 +79,7 @@ def run_agent(report: Path, for_s: float, arguments: Sequence[str]) -> int:
 
 def _watch(report: Path, for_s: float, gaps: dict[str, list[float]]) -> None:
     time.sleep(WARM_UP_S)
-    world = worlds.of(ROOMS / ROOM)
+    world = worlds.of(folder_of_room(ROOM))
     gaps.clear()
     before, busy, began_s = _threads(), _busy_s(), time.monotonic()
     first, process_s = world.snapshot(), time.process_time()
