@@ -2,7 +2,13 @@
 
 import contextlib
 import hashlib
+import json
+import os
+import socket
+import subprocess
+import sys
 from collections.abc import Iterator
+from pathlib import Path
 from typing import Any
 
 import httpx
@@ -11,7 +17,8 @@ import pytest
 from device_agent.protocol import codec, frames, topics
 from device_agent.protocol.messages import Measurements
 from function_app.ports.broker_access import Credentials
-from tests.support.brokers import Client, wait_until
+from infra.mosquitto.configuration import binary
+from tests.support.brokers import ROOT, Client, wait_until
 from tests.support.machine import Api, Machine
 
 RATE_HZ, FOR_S = 20.0, 3.0
@@ -142,3 +149,58 @@ def test_a_gathering_longer_than_its_action_is_refused(api: Api) -> None:
     answer = refused(api, api.device("lidar"), kind="gather", rate_hz=1.0, duration_s=4000.0)
     assert answer.status_code == 422
     assert "timeout_ms" in answer.json()["detail"]
+
+
+@pytest.fixture
+def home_assistants_broker(tmp_path: Path) -> Iterator[int]:
+    """A broker of somebody else's, as Home Assistant has one; its port."""
+    with contextlib.closing(socket.socket()) as taken:
+        taken.bind(("127.0.0.1", 0))
+        port: int = taken.getsockname()[1]
+    configuration = tmp_path / "mosquitto.conf"
+    configuration.write_text(f"listener {port} 127.0.0.1\nallow_anonymous true\n")
+    broker = subprocess.Popen([binary(), "-c", str(configuration)])
+    try:
+        yield port
+    finally:
+        broker.terminate()
+        broker.wait(20)
+
+
+def test_home_assistant_is_shown_the_room_and_moves_its_door(
+    laboratory: Machine, api: Api, home_assistants_broker: int
+) -> None:
+    door = api.device("door")
+    command = [sys.executable, "-m", "infra.home_assistant", "--server", laboratory.url]
+    bridge = subprocess.Popen(
+        [*command, "--port", str(home_assistants_broker)],
+        cwd=ROOT,
+        env=os.environ | {"TELESCOPE_LINK": laboratory.sign_in_link()},
+    )
+    shown: dict[str, bytes] = {}
+    try:
+        client = Client("home", None, port=home_assistants_broker)
+        wait_until(lambda: bool(client.open().connected.is_set()), "the other broker", 30)
+        client.subscribe("homeassistant/#", "telescope/#")
+
+        def there(topic: str) -> bool:
+            shown.update((each.topic, each.payload) for each in client.heard())
+            return topic in shown
+
+        slider = f"homeassistant/number/{door['id']}/set-opening/config"
+        wait_until(lambda: there(slider), "the door's slider", 30)
+        content = json.loads(shown[slider])
+        client.publish(content["command_topic"], b"0.5")
+
+        def opens() -> bool:
+            return (
+                there(content["state_topic"]) and json.loads(shown[content["state_topic"]])["values"]["opening"] > 0.3
+            )
+
+        wait_until(opens, "the door to open", 30)
+        wait_until(lambda: there(f"telescope/{api.device('camera')['id']}/cam/colour"), "a picture", 30)
+        client.close()
+    finally:
+        bridge.terminate()
+        assert bridge.wait(30) == 0
+        act(api, door, kind="set_control", control="opening", value=0.0)
