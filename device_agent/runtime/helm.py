@@ -106,7 +106,7 @@ class Helm:
                 else:
                     self.base.brake()
                 drive.periods -= 1
-            case None:
+            case _:
                 self.brake()  # what setpoints have begun does not go on beside an action
 
     def look(self, late_s: float) -> Clearance | None:

@@ -88,10 +88,9 @@ class Ride:
 
     def make_up(self, lost_s: float) -> None:
         """Count time in which no period was commanded as braked; it stays where it is, only the speed falls."""
-        if self._braking:
-            least, _ = self._changes(self._hard)
-            self._share, self._next = max(0.0, self._share + least * lost_s), None
-            self.velocity_rad_s = self.way.at(self._time_s)[1] * self._share
+        least, _ = self._changes(self._hard)
+        self._share, self._next = max(0.0, self._share + least * lost_s), None
+        self.velocity_rad_s = self.way.at(self._time_s)[1] * self._share
 
     def _step(self) -> tuple[float, float, float]:
         """Time on the way, share and its change a period on."""

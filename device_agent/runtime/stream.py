@@ -109,13 +109,13 @@ class Stream:
                 if not self._drives:
                     raise Refused("no_base", "this robot does not drive")
                 parts: tuple[float, ...] = (forward, left, turn)
-            case JogTarget(linear_m_s=linear, angular_rad_s=angular, frame=frame):
+            case _:
                 if self._geometry is None:
                     raise Refused("no_model", "this robot's type has no model; move its joints")
-                if frame and frame not in self._geometry.frames:
+                if target.frame and target.frame not in self._geometry.frames:
                     there = ", ".join(self._geometry.frames)
-                    raise Refused("unknown_frame", f"no frame '{frame[:80]}'; there are {there}")
-                parts = (*linear, *angular)
+                    raise Refused("unknown_frame", f"no frame '{target.frame[:80]}'; there are {there}")
+                parts = (*target.linear_m_s, *target.angular_rad_s)
         if not all(map(math.isfinite, parts)):
             raise Refused("not_finite", "a velocity must be a finite number")
 

@@ -1,6 +1,7 @@
 """Ways: inside every limit, gone along to their end, and never left, not even to brake."""
 
 import math
+from collections.abc import Callable, Mapping, Sequence
 from itertools import pairwise
 
 import numpy as np
@@ -8,11 +9,12 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from device_agent.protocol.messages import Mode
+from device_agent.ports.geometry import Clearance, Sweep, never
+from device_agent.protocol.messages import Mode, Pose
 from device_agent.runtime import way
 from device_agent.runtime.courses import Outcome
 from device_agent.runtime.lease import Refused
-from device_agent.runtime.routes import quaternion_of
+from device_agent.runtime.routes import Routes, quaternion_of
 from device_agent.runtime.way import Floats, Way
 from tests.unit.agent.test_controller import PERIOD_S, Rig, interruptions, lost, robot_type
 from tests.unit.agent.test_controller_limits import Wall
@@ -234,3 +236,48 @@ def test_samples_of_a_way_are_joined_smoothly() -> None:
     steps = [float(np.linalg.norm(b - a)) for a, b in pairwise(fine)]
     assert max(steps) <= math.hypot(3.0, 3.0) * 0.001 * 1.02
     assert max(abs(b - a) for a, b in pairwise(steps)) <= math.hypot(8.0, 8.0) * 1e-6 * 1.5
+
+
+def test_after_its_last_try_a_way_is_taken_as_it_is(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(way, "_TRIES", 1)
+    assert along(CORNER).position_rad[-1] == pytest.approx([1.2, 1.0], abs=1e-9)
+
+
+class Narrow(Wall):
+    """Plans a corner, and calls every way that has one too narrow to go along."""
+
+    def plan(
+        self,
+        start_rad: Sequence[float],
+        goal_rad: Sequence[float],
+        *,
+        seed: int = 0,
+        within_s: float = 5.0,
+        ended: Callable[[], bool] = never,
+    ) -> tuple[tuple[float, ...], ...]:
+        del seed, within_s, ended
+        return (tuple(start_rad), (1.0, 0.0), tuple(goal_rad))
+
+    def sweep(self, path_rad: Sequence[Sequence[float]]) -> Sweep:
+        del path_rad
+        return Sweep(0.0, Clearance(-0.01, ("hand", "wall")))
+
+
+class Sliding(Narrow):
+    """Its hand is where its first joint says."""
+
+    frames = ("hand",)
+
+    def poses(self, position_rad: Sequence[float]) -> Mapping[str, Pose]:
+        return {"hand": (position_rad[0], 0.0, 0.0, 1.0, 0.0, 0.0, 0.0)}
+
+    def solve(self, frame: str, pose: Pose, start_rad: Sequence[float]) -> tuple[float, ...]:
+        del frame, start_rad
+        return (pose[0], 0.0)
+
+
+def test_a_way_that_is_too_narrow_is_refused() -> None:
+    with pytest.raises(Refused, match="too narrow"):
+        Routes(robot_type(), Narrow()).around([0.0, 0.0], [1.0, 1.0], speed=1.0, ended=never)
+    with pytest.raises(Refused, match="something is in the way: clearance: hand"):
+        Routes(robot_type(), Sliding()).straight([0.0, 0.0], "hand", (0.1, 0, 0, 1, 0, 0, 0), speed=1.0)
