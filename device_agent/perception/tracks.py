@@ -279,6 +279,11 @@ class Tracks:
             return now_s - track.seen_s <= (LOST_S if track.confirmed else DOUBT_S)
 
         self.all = [track for track in self.all if stays(track)]
+        for kind in [kind for kind in self.kinds if kind.several]:
+            # Whoever is left alone is the first: a script that asks for a person gets one when there is one.
+            same = [track for track in self.all if track.kind == kind]
+            if same and all(track.number > 1 for track in same):
+                min(same, key=lambda track: track.number).number = 1
 
     def _name(self, now_s: float) -> None:
         """Give a name to whoever has been seen well enough: the kind that fits its height best."""
