@@ -73,12 +73,18 @@ class Bench {
     };
   }
 
+  /** The joint positions [rad] that were asked for last. */
+  newest(): Record<string, number> | undefined {
+    const target = this.sent.at(-1)?.target;
+    return target?.kind === "joints" ? target.position_rad : undefined;
+  }
+
   async run(ms: number): Promise<void> {
     for (let passed = 0; passed < ms; passed += 20) {
       await vi.advanceTimersByTimeAsync(20);
       this.tick += 20;
       if (this.mute) continue;
-      const target = this.sent.at(-1)?.target.position_rad;
+      const target = this.newest();
       const moved = this.position.map((position, index) => {
         const wanted = target?.[index === 0 ? "a" : "b"] ?? position;
         const streaming = this.streamer.state.value !== "idle";
@@ -142,7 +148,7 @@ describe("a stream of setpoints", () => {
     bench.streamer.setTarget("a", 0.9);
     bench.streamer.setTarget("b", 0.5);
     await bench.run(60);
-    expect(bench.sent.at(-1)?.target.position_rad).toEqual({ a: 0.9, b: 0.5 });
+    expect(bench.newest()).toEqual({ a: 0.9, b: 0.5 });
   });
 
   it("keeps targets inside the joint's range and refuses what is no number", () => {

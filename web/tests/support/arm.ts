@@ -64,8 +64,10 @@ export class Arm {
     if (setpoint.epoch !== this.epoch || setpoint.sequence <= (this.#setpoint?.sequence ?? 0) || !fresh) return;
     if (this.stop !== null || this.action !== null) return;
     this.#setpoint = { sequence: setpoint.sequence, sentMs: setpoint.sent_ms, at: this.#tick, loopAgeMs };
+    const { target } = setpoint;
+    if (target.kind !== "joints") return;
     description.joints.forEach((joint, index) => {
-      this.#target[index] = setpoint.target.position_rad[joint.name] ?? this.#target[index] ?? 0;
+      this.#target[index] = target.position_rad[joint.name] ?? this.#target[index] ?? 0;
     });
   }
 
