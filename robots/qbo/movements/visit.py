@@ -95,7 +95,7 @@ for step in range(STEPS):
     yaw_rad = towards_rad
     if left_m < THERE_M:
         print("stands", round(left_m + near_m, 2), "m before", who)
-        robot.look([0.9, 0.0, 1.2], speed=0.4)
+        robot.look([0.9, 0.0, 0.9], speed=0.4)
         robot.say("Hello!")
         break
     progress(step / STEPS)

@@ -59,3 +59,11 @@ def heard(kind: robot_type.RobotType) -> dict[str, Any]:
     """What a robot with sonars hears in an empty hall; its own tests have walls."""
     sonar = {"values": {"distance_m.left": 4.0, "distance_m.right": 4.0}, "age_s": 0.0}
     return {"sonar": sonar} if any(stream.name == "sonar" for stream in kind.streams) else {}
+
+
+def whereabouts(kind: robot_type.RobotType, x_m: float, y_m: float, yaw_rad: float) -> dict[str, Any]:
+    """What a room tells of a robot where it is, and of somebody who stands before its place."""
+    values = {"age_s.person": 0.1, "x_m.person": 1.9, "y_m.person": 0.35}
+    name = kind.type
+    values |= {f"age_s.{name}": 0.1, f"x_m.{name}": x_m, f"y_m.{name}": y_m, f"yaw_rad.{name}": yaw_rad}
+    return {"values": values, "age_s": 0.1}

@@ -1,5 +1,6 @@
 """Every movement, under the control of the agent's own limits: what ships is not held before anything."""
 
+import math
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -14,7 +15,7 @@ from device_agent.runtime import gaze, shows
 from device_agent.runtime.controller import Controller
 from device_agent.runtime.courses import Course, Outcome
 from device_agent.runtime.lease import LeaseGate, Refused
-from tests.unit.robots.folders import MOVEMENTS, ROBOTS, heard
+from tests.unit.robots.folders import MOVEMENTS, ROBOTS, heard, whereabouts
 
 LONGEST_S = 60.0
 
@@ -32,6 +33,7 @@ class LimitedRobot:
         self.joints = tuple(joint.name for joint in self.type.joints)
         self.can = ("say",)
         self.now_s = 0.0
+        self.place = (0.0, 0.0, 0.0)  # x, y [m] and yaw [rad] of a base that does as it is told
         self.tightest_m = 1.0
         self.limited: set[str] = set()
 
@@ -61,13 +63,26 @@ class LimitedRobot:
         end_s = self.now_s + LONGEST_S
         while not move.finished.is_set():
             self.now_s += self.type.period_ms / 1000
-            self.position = self.controller.step(self.now_s).position_rad
+            tick = self.controller.step(self.now_s)
+            self.position = tick.position_rad
+            self.go(tick.twist)
             assert self.now_s < end_s, "did not arrive"
             if self.shape is not None and round(self.now_s * 1000) % 40 == 0:
                 self.tightest_m = min(self.tightest_m, self.shape.clearance(self.position).room_m)
         self.limited |= set(move.limited)
         if move.outcome is not Outcome.REACHED:
             raise move.why or AssertionError("no reason")
+
+    def go(self, twist: Twist) -> None:
+        (x_m, y_m, yaw_rad), period_s = self.place, self.type.period_ms / 1000
+        x_m += (twist.forward_m_s * math.cos(yaw_rad) - twist.left_m_s * math.sin(yaw_rad)) * period_s
+        y_m += (twist.forward_m_s * math.sin(yaw_rad) + twist.left_m_s * math.cos(yaw_rad)) * period_s
+        self.place = (x_m, y_m, yaw_rad + twist.turn_rad_s * period_s)
+
+    def latest(self, device: str, stream: str) -> dict[str, Any]:
+        """The script's ``room.latest``."""
+        assert (device, stream) == ("perception", "positions")
+        return whereabouts(self.type, *self.place)
 
     def home(self, speed: float = 0.5) -> None:
         self.move_joints(self.type.home_rad, speed=speed)
@@ -86,6 +101,7 @@ def play(path: Path, parameters: dict[str, Any]) -> LimitedRobot:
     robot = LimitedRobot(path.parent.parent)
     given = {
         "robot": robot,
+        "room": robot,
         "wait": lambda _: None,
         "parameters": parameters,
         "progress": lambda _: None,

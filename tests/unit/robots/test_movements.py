@@ -13,7 +13,7 @@ from device_agent.drivers.mujoco.wheels import wheel_speeds
 from device_agent.ports.driver import Twist
 from device_agent.runtime import shows
 from tests.unit.robots.balance import WalkedRobot
-from tests.unit.robots.folders import MOVEMENTS, ROBOTS, Bench, heard
+from tests.unit.robots.folders import MOVEMENTS, ROBOTS, Bench, heard, whereabouts
 
 STEPS = 4  # of 2 ms: one control period
 
@@ -119,8 +119,6 @@ class PlayedRobot:
 class PlayedRoom:
     """The script's ``room``: sees the robot where it is, and somebody who stands before it."""
 
-    PERSON_M = (1.9, 0.35)
-
     def __init__(self, robot: PlayedRobot | WalkedRobot) -> None:
         self.robot = robot
 
@@ -128,11 +126,8 @@ class PlayedRoom:
         assert (device, stream) == ("perception", "positions")
         assert isinstance(self.robot, PlayedRobot)
         base = self.robot.bench.data.body(1)
-        values = {"age_s.person": 0.1, "x_m.person": self.PERSON_M[0], "y_m.person": self.PERSON_M[1]}
-        name = self.robot.bench.type.type
-        values |= {f"age_s.{name}": 0.1, f"x_m.{name}": base.xpos[0], f"y_m.{name}": base.xpos[1]}
-        values[f"yaw_rad.{name}"] = math.atan2(base.xmat[3], base.xmat[0])
-        return {"values": values, "age_s": 0.1}
+        yaw_rad = math.atan2(base.xmat[3], base.xmat[0])
+        return whereabouts(self.robot.bench.type, base.xpos[0], base.xpos[1], yaw_rad)
 
 
 def play(path: Path, parameters: dict[str, Any]) -> PlayedRobot | WalkedRobot:
