@@ -16,7 +16,7 @@ from dataclasses import dataclass, field
 import httpx
 
 from infra.local.processes import Child
-from tests.faults.judge import Record, Verdict, judge, share
+from tests.faults.judge import MOST_MS, Record, Verdict, judge, share
 from tests.faults.stack import MOVEMENT, PATIENCE_S, Console, Stack, now_ms
 
 Mend = Callable[[], None]
@@ -69,6 +69,11 @@ class Tally:
     @property
     def broken(self) -> list[Result]:
         return [each for each in self.results if not each.verdict.kept]
+
+    @property
+    def late(self) -> list[Result]:
+        """Those that took too long, whoever's fault it was."""
+        return [each for each in self.results if each.verdict.rest_ms > MOST_MS]
 
     @property
     def count(self) -> int:
