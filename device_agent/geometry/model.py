@@ -15,6 +15,7 @@ from device_agent.geometry.planner import Planner
 from device_agent.geometry.probe import Probe
 from device_agent.geometry.solver import Solver
 from device_agent.geometry.standing import Standing
+from device_agent.mjcf.options import agree
 from device_agent.mjcf.ties import Ties
 from device_agent.ports.geometry import Clearance, GeometryError, Sweep, never
 from device_agent.protocol.messages import Pose
@@ -186,8 +187,8 @@ def _spec(scene: Path, standing: Standing | None) -> Any:
     if standing is None:
         return robot
     room = mujoco.MjSpec.from_file(str(standing.room))
-    _agree(room.option, robot.option)
-    _agree(room.visual, robot.visual)
+    agree(room.option, robot.option)
+    agree(room.visual, robot.visual)
     position, quaternion = np.empty(3), np.empty(4)
     half_rad = standing.yaw_rad / 2
     mujoco.mju_negPose(
@@ -198,17 +199,3 @@ def _spec(scene: Path, standing: Standing | None) -> Any:
     )
     robot.attach(room, prefix=ROOM_PREFIX, frame=robot.worldbody.add_frame(pos=position, quat=quaternion))
     return robot
-
-
-def _agree(child: Any, parent: Any) -> None:
-    """Give one part of a model the options of another: MuJoCo warns, aloud, of each that differs."""
-    for name in dir(parent):
-        value = getattr(parent, name)
-        if name.startswith("_") or callable(value):
-            continue
-        if isinstance(value, np.ndarray):
-            getattr(child, name)[:] = value
-        elif isinstance(value, int | float):
-            setattr(child, name, value)
-        else:
-            _agree(getattr(child, name), value)

@@ -6,8 +6,8 @@ from pathlib import Path
 from typing import Any
 
 import mujoco
-import numpy as np
 
+from device_agent.mjcf.options import agree
 from device_agent.mjcf.ties import Ties
 from device_agent.ports.driver import DriverError
 
@@ -49,8 +49,8 @@ def assemble(scene: Path, robots: Sequence[Placement]) -> Any:
         for robot in robots:
             frame = spec.worldbody.add_frame(pos=robot.position_m, quat=robot.quaternion)
             model = mujoco.MjSpec.from_file(str(robot.model))
-            _agree(model.option, spec.option)
-            _agree(model.visual, spec.visual)
+            agree(model.option, spec.option)
+            agree(model.visual, spec.visual)
             spec.attach(model, prefix=robot.prefix, frame=frame)
         return spec.compile()
     except (ValueError, OSError, mujoco.FatalError) as error:
@@ -88,17 +88,3 @@ def at_home(model: Any, home: Mapping[str, float], settings: Mapping[str, float]
             data.ctrl[actuator] = data.qpos[model.jnt_qposadr[joint]]
     mujoco.mj_forward(model, data)
     return data
-
-
-def _agree(child: Any, parent: Any) -> None:
-    """Give one part of a model the options of another: MuJoCo warns, aloud, of each that differs."""
-    for name in dir(parent):
-        value = getattr(parent, name)
-        if name.startswith("_") or callable(value):
-            continue
-        if isinstance(value, np.ndarray):
-            getattr(child, name)[:] = value
-        elif isinstance(value, int | float):
-            setattr(child, name, value)
-        else:
-            _agree(getattr(child, name), value)
