@@ -100,6 +100,9 @@ export const texts = {
     missing: "There is no such device, or you may not see it.",
     simulated: "simulated",
     unreadable: (what: string): string => `A message of this device could not be read: ${what}.`,
+    still:
+      "This device has no joints. What it measures, and what can be asked of it, is reached over HTTP and MQTT; " +
+      "here are its state, its Stop and its events.",
     lastWord: (age: string): string => `last word ${age}`,
   },
 
@@ -151,7 +154,6 @@ export const texts = {
     busy: "A movement is running.",
     stopped: "The robot is stopped.",
     limited: (what: string): string => `Limited by the robot: ${what}`,
-    none: "This device has no joints.",
     noDescription: "Waiting for the robot's description …",
     ended: {
       reached: "Target reached",

@@ -46,7 +46,7 @@ export function DevicePage({ api, fleet, id, account }: DevicePageProps) {
   return <Operate key={device.id} api={api} fleet={fleet} device={device} account={account} />;
 }
 
-interface Desk {
+interface Tools {
   control: Control;
   stop: StopSwitch;
   actions: ActionRunner;
@@ -60,7 +60,7 @@ interface OperateProps {
 }
 
 function Operate({ api, fleet, device, account }: OperateProps) {
-  const [desk, setDesk] = useState<Desk | null>(null);
+  const [desk, setDesk] = useState<Tools | null>(null);
 
   useEffect(() => {
     const unwatch = device.watchClosely();
@@ -102,21 +102,35 @@ function Operate({ api, fleet, device, account }: OperateProps) {
       <main class="page operate" id="content">
         <Heading device={device} fleet={fleet} />
         <StopBanner device={device} stop={stop} />
-        <div class="desk">
-          <div class="column">
-            <View3D device={device} control={control} />
-            <Plot device={device} />
-            <PoseTable device={device} />
-          </div>
-          <div class="column">
-            <JointSliders device={device} control={control} />
-            <Movements api={api} device={device} control={control} actions={actions} />
-            <Latency device={device} control={control} />
+        {device.description.value?.joints.length === 0 ? (
+          <>
+            <p class="quiet">{texts.device.still}</p>
             <Events device={device} />
-          </div>
-        </div>
+          </>
+        ) : (
+          <Desk api={api} device={device} control={control} actions={actions} />
+        )}
       </main>
     </>
+  );
+}
+
+/** What moves joints, and shows how they move. */
+function Desk({ api, device, control, actions }: Omit<Tools, "stop"> & { api: Api; device: DeviceStore }) {
+  return (
+    <div class="desk">
+      <div class="column">
+        <View3D device={device} control={control} />
+        <Plot device={device} />
+        <PoseTable device={device} />
+      </div>
+      <div class="column">
+        <JointSliders device={device} control={control} />
+        <Movements api={api} device={device} control={control} actions={actions} />
+        <Latency device={device} control={control} />
+        <Events device={device} />
+      </div>
+    </div>
   );
 }
 

@@ -24,7 +24,6 @@ export function JointSliders({ device, control }: JointSlidersProps) {
       aside={<StreamNote device={device} streamer={streamer} blocked={blocked} />}
     >
       {description === null && <p class="quiet">{texts.joints.noDescription}</p>}
-      {description !== null && joints.length === 0 && <p class="quiet">{texts.joints.none}</p>}
       {joints.length > 0 && (
         <>
           <div class="joint-head" aria-hidden="true">

@@ -251,9 +251,11 @@ function frame(twin: KnownTwin): Frame {
     .map(({ position_m }) => new Vector3(...position_m));
   const base = points[0] ?? new Vector3();
   const reach = Math.max(0.2, ...points.map((point) => point.distanceTo(base)));
+  // A robot on legs has its base in the middle: what hangs below it is to be seen as well.
+  const below = Math.min(0, ...points.map((point) => point.z - base.z));
   const planes = twin.bodies.flatMap((body) => body.geometries.filter(({ shape: kind }) => kind === "plane"));
   return {
-    centre: base.clone().add(new Vector3(0, 0, reach * 0.32)),
+    centre: base.clone().add(new Vector3(0, 0, reach * 0.32 + below * 0.6)),
     radius: reach * 0.95,
     floor: planes[0]?.position_m[2] ?? 0,
   };
