@@ -28,7 +28,8 @@ from device_agent import __main__ as agent
 from device_agent.bootstrap import folder_of_room
 from device_agent.drivers.mujoco import worlds
 from device_agent.runtime import loop
-from device_agent.runtime.controller import Controller, Tick
+from device_agent.runtime.controller import Controller
+from device_agent.runtime.pilot import Tick
 from infra.local import __main__ as local
 from infra.local import settings
 

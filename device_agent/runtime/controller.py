@@ -1,53 +1,25 @@
-"""Decides, once per control period, what the motors of one device are told. When in doubt: hold.
+"""What may be asked of one device, by whom and from which thread; what the motors are told of it ``pilot`` decides.
 
-Pure but for ``ruckig``: no thread, no clock, no I/O of its own, so that every path can be tested tick by tick. The
-control loop calls ``step``; other threads offer setpoints, moves and stops through the methods, which lock.
+No thread, no clock, no I/O of its own. The control loop calls ``step``; other threads offer setpoints, moves and stops
+through the methods, which lock.
 """
 
-import math
 import threading
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
 
 import numpy as np
 
-from device_agent.ports.driver import REST, Twist
-from device_agent.ports.geometry import Clearance, Geometry
-from device_agent.protocol.events import EventKind
+from device_agent.ports.driver import Twist
+from device_agent.ports.geometry import Geometry
 from device_agent.protocol.messages import Mode, Setpoint, StopLatch
 from device_agent.protocol.robot_type import RobotType
 from device_agent.runtime.audit import Tell, to_nobody
-from device_agent.runtime.authority import Authority, Tenure
+from device_agent.runtime.authority import Tenure
 from device_agent.runtime.courses import Drive, Move, Passage
-from device_agent.runtime.envelope import Envelope
-from device_agent.runtime.helm import Helm
 from device_agent.runtime.lease import Lease, LeaseGate, Refused
-from device_agent.runtime.motion import MotionError
+from device_agent.runtime.pilot import Pilot, Tick
 from device_agent.runtime.restrictions import Restriction
-from device_agent.runtime.slack import Slack
-from device_agent.runtime.stream import Stream
 from device_agent.runtime.way import Way
-
-_CREEP_RAD_S = 0.02
-"""Slower than this, setpoints that end are a slider let go at its target, not an operator lost in mid-motion."""
-_REMEMBERED = 0.998
-"""Of how late the control loop was called, from one period to the next: half of it after three seconds."""
-_SAME_RAD = 1e-6
-_SAME_TWIST = 1e-3
-
-
-@dataclass(frozen=True, slots=True)
-class Tick:
-    """What one ``step`` decided. ``position_rad`` and ``twist`` are for the motors; the rest is for telemetry."""
-
-    position_rad: list[float]
-    mode: Mode
-    epoch: int
-    setpoint_sequence: int
-    setpoint_sent_ms: float
-    loop_age_ms: float
-    limited: tuple[str, ...]
-    twist: Twist = REST
 
 
 class Controller:
@@ -74,20 +46,11 @@ class Controller:
         tell: Tell = to_nobody,
     ) -> None:
         self._joints = robot_type.joints
-        self._period_s = robot_type.period_ms / 1000
-        self._envelope = Envelope(robot_type, geometry)
-        self._helm = Helm(robot_type, self._envelope)
-        self._motion = self._helm.motion
-        self._stream = Stream(robot_type, self._envelope, geometry)
-        self._slack = Slack(robot_type)
-        self._authority = Authority(gate, latch, hold=self._hold, tell=tell)
+        self._pilot = Pilot(robot_type, gate, latch=latch, geometry=geometry, tell=tell)
+        self._envelope, self._helm, self._stream = self._pilot.envelope, self._pilot.helm, self._pilot.stream
+        self._motion, self._slack, self._authority = self._helm.motion, self._pilot.slack, self._pilot.authority
         self.changed = self._authority.changed
         self._lock = threading.Lock()
-        self._mode = Mode.IDLE
-        self._due_s = math.inf
-        self._late_s = 0.0
-        self._driver_limits: tuple[str, ...] = ()
-        self._base_limits: tuple[str, ...] = ()
 
     # ------------------------------------------------------------ what other threads ask
 
@@ -290,17 +253,12 @@ class Controller:
     def applied(self, position_rad: Sequence[float]) -> None:
         """What the driver made of the last command, shape (n,) [rad]; where it differs, ``limited`` says so."""
         with self._lock:
-            self._driver_limits = tuple(
-                f"{joint.name}: driver"
-                for joint, asked, done in zip(self._joints, self._motion.position_rad, position_rad, strict=True)
-                if abs(asked - done) > _SAME_RAD
-            )
+            self._pilot.applied(position_rad)
 
     def driven(self, asked: Twist, done: Twist) -> None:
         """What the driver made of the last twist; where it differs, ``limited`` says so: who sits does not walk."""
         with self._lock:
-            differs = any(abs(wanted - applied) > _SAME_TWIST for wanted, applied in zip(asked, done, strict=True))
-            self._base_limits = ("base: driver",) if differs else ()
+            self._pilot.driven(asked, done)
 
     # ------------------------------------------------------------ what others may know
 
@@ -334,7 +292,7 @@ class Controller:
     @property
     def mode(self) -> Mode:
         """What the last ``step`` did."""
-        return self._mode
+        return self._pilot.mode
 
     @property
     def epochs(self) -> tuple[int, int]:
@@ -367,92 +325,11 @@ class Controller:
             measured_rad: Where the joints are, shape (n,); limp ones are commanded there.
         """
         with self._lock:
-            if measured_rad is not None:
-                self._motion.loosen(self._slack.feel(measured_rad))
-            late_s, self._due_s = now_s - self._due_s, now_s + self._period_s
-            self._late_s = max(late_s, _REMEMBERED * self._late_s)
-            self._authority.expire(now_s)
-            self._mode = self._decide(now_s)
-            try:
-                obstacle = self._helm.look(late_s)
-                if obstacle is not None:
-                    self._block(obstacle)
-                self._helm.update()
-            except MotionError as error:
-                self._authority.end(Refused("fault", str(error)))
-                self._mode = Mode.HOLDING
-                self._helm.give_up()
-            limited = self._limits()
-            self._helm.settle(limited)
-            lease = self._authority.lease(now_s)
-            return Tick(
-                list(self._motion.position_rad),
-                self._mode,
-                lease.epoch if lease else 0,
-                self._stream.taken,
-                self._stream.sent_ms,
-                self._stream.loop_age_ms,
-                limited,
-                self._helm.twist,
-            )
-
-    def _block(self, obstacle: Clearance) -> None:
-        course = self._helm.course
-        if course is None:
-            self._stream.block(obstacle)
-            self._motion.brake()
-        else:
-            course.note((obstacle.text,))
-            why = f"something is in the way: {obstacle.text}; the device holds before it"
-            self._helm.interrupt(Refused("no_room", why))
-
-    def _decide(self, now_s: float) -> Mode:
-        if self._authority.fault is not None:
-            self._helm.brake()
-            return Mode.FAULT
-        if self._authority.latch is not None:
-            self._helm.brake()
-            return Mode.STOPPED
-        if self._authority.restrictions.speed <= 0:
-            self._helm.brake()
-            return Mode.HOLDING
-        if self._authority.tenure is not None:
-            self._helm.follow(self._authority.restrictions.speed)
-            return Mode.ACTION
-        if self._stream.fresh(now_s, self._helm.braking_time_s(), late_s=self._late_s):
-            allowed = self._authority.restrictions.speed
-            self._stream.follow(self._motion, allowed=allowed)
-            if self._helm.base is not None:
-                self._stream.steer(self._helm.base, now_s, late_s=self._late_s, allowed=allowed)
-            return Mode.STREAMING
-        if self._mode is Mode.STREAMING and self._helm.faster_than(_CREEP_RAD_S):
-            self._authority.end(Refused("watchdog", "setpoints stopped coming"))
-        self._stream.drop()
-        self._helm.brake()
-        held = self._mode is Mode.HOLDING and (self.moving or self._authority.burned)
-        return Mode.HOLDING if held else Mode.IDLE
-
-    def _limits(self) -> tuple[str, ...]:
-        """What makes the motion other than asked, for telemetry."""
-        strictest = self._authority.restrictions.strictest
-        limited: tuple[str, ...] = () if strictest is None else (strictest.text,)
-        if self._mode is Mode.STREAMING:
-            limited += self._stream.limited
-        return limited + self._motion.waits + self._slack.limited + self._driver_limits + self._base_limits
+            return self._pilot.step(now_s, measured_rad)
 
     def _fence(self, epoch: int) -> None:
         if self._authority.fence(epoch):
             self._stream.begin(self._motion.position_rad)
-
-    def _hold(self, why: Refused) -> None:
-        """Bring the device to rest; whoever moved it no longer does."""
-        self._stream.drop()
-        if self.moving:
-            if self._mode in {Mode.STREAMING, Mode.ACTION}:  # told once, not for each order to hold while it brakes
-                self._authority.note(EventKind.HELD, why.message, self._authority.said(why), "warning")
-            self._mode = Mode.HOLDING
-        self._helm.interrupt(why)
-        self._helm.brake()
 
     def _check_course(self, tenure: Tenure) -> None:
         self._authority.check_free()

@@ -10,7 +10,8 @@ from device_agent.ports.clock import tick_ms, wall_ms
 from device_agent.ports.driver import Driver, DriverError, MobileDriver, Observation
 from device_agent.protocol.messages import JointTelemetry, Mode
 from device_agent.protocol.robot_type import RobotType
-from device_agent.runtime.controller import Controller, Tick
+from device_agent.runtime.controller import Controller
+from device_agent.runtime.pilot import Tick
 
 IDLE_RATE_HZ = 20.0
 MOVING_RATE_HZ = 50.0
