@@ -5,12 +5,11 @@ of the drivers it uses. Third parties add theirs by the entry point group ``tele
 ``Factory``.
 """
 
-import importlib
 from collections.abc import Mapping
-from importlib.metadata import entry_points
 from pathlib import Path
-from typing import Protocol, cast
+from typing import Protocol
 
+from device_agent.plug_ins import PlugIns
 from device_agent.ports.driver import Driver, DriverError
 from device_agent.protocol.robot_type import RobotType
 
@@ -40,7 +39,7 @@ class Factory(Protocol):
 
 def names() -> tuple[str, ...]:
     """All names that ``load`` takes, sorted."""
-    return tuple(sorted({*_BUILT_IN, *(point.name for point in entry_points(group=GROUP))}))
+    return _KNOWN.names()
 
 
 def load(name: str) -> Factory:
@@ -49,14 +48,7 @@ def load(name: str) -> Factory:
     Raises:
         DriverError: There is no such driver, or a library that it needs is not installed.
     """
-    try:
-        if name in _BUILT_IN:
-            return cast("Factory", importlib.import_module(_BUILT_IN[name]).create)
-        for point in entry_points(group=GROUP):
-            if point.name == name:
-                return cast("Factory", point.load())
-    except (ImportError, AttributeError) as error:
-        raise DriverError(
-            f"driver '{name}' cannot be loaded: {error}; is the package that it needs installed?"
-        ) from error
-    raise DriverError(f"no driver '{name}'; there are: {', '.join(names())}")
+    return _KNOWN.load(name)
+
+
+_KNOWN: PlugIns[Factory] = PlugIns(what="driver", group=GROUP, built_in=_BUILT_IN, error=DriverError)

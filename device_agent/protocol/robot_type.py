@@ -3,12 +3,11 @@
 import math
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Literal
 
-import msgspec
 from msgspec import Meta, Struct
 
-from device_agent.protocol import abilities
+from device_agent.protocol import abilities, manifest
 from device_agent.protocol.errors import ProtocolError
 from device_agent.protocol.messages import Id, Joint, Label, Stream, Text, Vector3
 
@@ -150,14 +149,7 @@ def load(folder: Path) -> RobotType:
     Raises:
         ProtocolError: Missing, not TOML, or a field is wrong; the text names file and field.
     """
-    path = folder / MANIFEST
-    try:
-        robot_type = parse(path.read_text(encoding="utf-8"))
-    except (OSError, ProtocolError) as error:
-        raise ProtocolError(f"{path}: {error}") from error
-    if robot_type.type != folder.name:
-        raise ProtocolError(f"{path}: type '{robot_type.type}' must equal the folder's name '{folder.name}'")
-    return robot_type
+    return manifest.load(folder / MANIFEST, parse, named="type")
 
 
 def parse(text: str) -> RobotType:
@@ -166,13 +158,7 @@ def parse(text: str) -> RobotType:
     Raises:
         ProtocolError: Not TOML, a field is wrong, or fields contradict each other.
     """
-    import tomllib  # noqa: PLC0415 (15 ms of regular expressions, for who reads a manifest only)
-
-    try:
-        raw: dict[str, Any] = tomllib.loads(text)
-        robot_type = msgspec.convert(raw, RobotType, strict=False)
-    except (tomllib.TOMLDecodeError, msgspec.ValidationError) as error:
-        raise ProtocolError(str(error)) from error
+    robot_type = manifest.convert(text, RobotType)
     _check_figures(robot_type)
     names = [joint.name for joint in robot_type.joints]
     if len(set(names)) != len(names):

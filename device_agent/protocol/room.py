@@ -5,10 +5,9 @@ from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Annotated, Any
 
-import msgspec
 from msgspec import Meta, Struct
 
-from device_agent.protocol import reports
+from device_agent.protocol import manifest, reports
 from device_agent.protocol.errors import ProtocolError
 from device_agent.protocol.messages import Id, Label, Stream, Text, Vector3
 from device_agent.protocol.robot_type import RobotType
@@ -214,14 +213,7 @@ def load(folder: Path) -> Room:
     Raises:
         ProtocolError: Missing, not TOML, or a field is wrong; the text names file and field.
     """
-    path = folder / MANIFEST
-    try:
-        room = parse(path.read_text(encoding="utf-8"))
-    except (OSError, ProtocolError) as error:
-        raise ProtocolError(f"{path}: {error}") from error
-    if room.room != folder.name:
-        raise ProtocolError(f"{path}: room '{room.room}' must equal the folder's name '{folder.name}'")
-    return room
+    return manifest.load(folder / MANIFEST, parse, named="room")
 
 
 def parse(text: str) -> Room:
@@ -230,13 +222,7 @@ def parse(text: str) -> Room:
     Raises:
         ProtocolError: Not TOML, a field is wrong, or fields contradict each other.
     """
-    import tomllib  # noqa: PLC0415 (15 ms of regular expressions, for who reads a manifest only)
-
-    try:
-        raw: dict[str, Any] = tomllib.loads(text)
-        room = msgspec.convert(raw, Room, strict=False)
-    except (tomllib.TOMLDecodeError, msgspec.ValidationError) as error:
-        raise ProtocolError(str(error)) from error
+    room = manifest.convert(text, Room)
     _check_box("plan", room.plan.lower_m, room.plan.upper_m)
     _check_positive("height_m of the plan", room.plan.height_m)
     _check_names("robots and devices", room.names)

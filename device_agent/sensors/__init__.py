@@ -4,12 +4,11 @@ As with robots' drivers: built-in ones stand in a table of import paths and are 
 add theirs by the entry point group ``telescope.sensors``; the entry point is a ``Factory``.
 """
 
-import importlib
 from collections.abc import Mapping
-from importlib.metadata import entry_points
 from pathlib import Path
-from typing import Protocol, cast
+from typing import Protocol
 
+from device_agent.plug_ins import PlugIns
 from device_agent.ports.sensor import RoomDriver, SensorError, Surroundings
 from device_agent.protocol.room import RoomDevice
 
@@ -41,7 +40,7 @@ class Factory(Protocol):
 
 def names() -> tuple[str, ...]:
     """All names that ``load`` takes, sorted."""
-    return tuple(sorted({*_BUILT_IN, *(point.name for point in entry_points(group=GROUP))}))
+    return _KNOWN.names()
 
 
 def load(name: str) -> Factory:
@@ -50,14 +49,7 @@ def load(name: str) -> Factory:
     Raises:
         SensorError: There is no such driver, or a library that it needs is not installed.
     """
-    try:
-        if name in _BUILT_IN:
-            return cast("Factory", importlib.import_module(_BUILT_IN[name]).create)
-        for point in entry_points(group=GROUP):
-            if point.name == name:
-                return cast("Factory", point.load())
-    except (ImportError, AttributeError) as error:
-        raise SensorError(
-            f"sensor driver '{name}' cannot be loaded: {error}; is the package that it needs installed?"
-        ) from error
-    raise SensorError(f"no sensor driver '{name}'; there are: {', '.join(names())}")
+    return _KNOWN.load(name)
+
+
+_KNOWN: PlugIns[Factory] = PlugIns(what="sensor driver", group=GROUP, built_in=_BUILT_IN, error=SensorError)

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from device_agent import drivers
+from device_agent import drivers, plug_ins
 from device_agent.drivers import mujoco as mujoco_driver
 from device_agent.ports.driver import DriverError
 from device_agent.protocol import robot_type
@@ -19,7 +19,7 @@ ROBOTS = Path(__file__).parents[3] / "robots"
 def third_party(monkeypatch: pytest.MonkeyPatch, **points: str) -> None:
     """Let installed packages offer these entry points."""
     offered = EntryPoints(EntryPoint(name, value, drivers.GROUP) for name, value in points.items())
-    monkeypatch.setattr(drivers, "entry_points", lambda *, group: offered.select(group=group))
+    monkeypatch.setattr(plug_ins, "entry_points", lambda *, group: offered.select(group=group))
 
 
 def test_built_in_driver_is_found():
@@ -83,7 +83,7 @@ def test_missing_scene_is_one_clear_error_at_connect(tmp_path: Path):
 def test_importing_a_driver_needs_no_display_and_listing_needs_no_simulator():
     script = """
 import sys
-from device_agent import drivers
+from device_agent import drivers, plug_ins
 assert "mujoco" in drivers.names() and "mujoco" not in sys.modules
 drivers.load("mujoco")
 assert "mujoco" in sys.modules

@@ -103,6 +103,12 @@ def test_a_room_must_have_its_folders_name(tmp_path: Path):
         room.load(tmp_path)
 
 
+def test_a_room_that_is_no_text_names_the_file(tmp_path: Path):
+    (tmp_path / "room.toml").write_bytes(b"label = '\xff'")
+    with pytest.raises(ProtocolError, match=r"room\.toml: .*utf-8"):
+        room.load(tmp_path)
+
+
 def test_a_room_that_is_not_there_names_the_file(tmp_path: Path):
     with pytest.raises(ProtocolError, match=r"room\.toml"):
         room.load(tmp_path / "nowhere")
