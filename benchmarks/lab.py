@@ -25,7 +25,7 @@ from pathlib import Path
 from typing import Any
 
 from device_agent import __main__ as agent
-from device_agent.bootstrap import folder_of_room
+from device_agent.catalogue import ROOMS
 from device_agent.drivers.mujoco import worlds
 from device_agent.runtime import loop
 from device_agent.runtime.controller import Controller
@@ -80,7 +80,7 @@ def run_agent(report: Path, for_s: float, arguments: Sequence[str]) -> int:
 
 def _watch(report: Path, for_s: float, gaps: dict[str, list[float]]) -> None:
     time.sleep(WARM_UP_S)
-    world = worlds.of(folder_of_room(ROOM))
+    world = worlds.of(ROOMS.folder(ROOM))
     gaps.clear()
     before, busy, began_s = _threads(), _busy_s(), time.monotonic()
     first, process_s = world.snapshot(), time.process_time()

@@ -13,7 +13,7 @@ from pathlib import Path
 
 import msgspec
 
-from device_agent import bootstrap, doctor, drivers, links, sensors, service
+from device_agent import bootstrap, catalogue, doctor, drivers, links, sensors, service
 from device_agent.ports.clock import CloudClock
 from device_agent.ports.driver import DriverError
 from device_agent.ports.geometry import GeometryError
@@ -164,7 +164,7 @@ def _polling(options: argparse.Namespace, before: HttpPolling) -> HttpPolling:
 def _entries(options: argparse.Namespace) -> tuple[DeviceEntry, ...]:
     entries = [_entry(text) for text in options.device]
     for name in options.room:
-        entries += bootstrap.entries_of(name)
+        entries += catalogue.entries_of(name)
     return tuple(entries)
 
 
@@ -173,7 +173,7 @@ def _entry(text: str) -> DeviceEntry:
     kind, _, driver = rest.partition(":")
     if not equals or not is_id(name):
         raise HomeError(f"'{text}' is not NAME=TYPE; a name is {ID_PATTERN}")
-    label = bootstrap.load_type(kind).label
+    label = catalogue.TYPES.load(kind).label
     if driver:
         drivers.load(driver)
     return DeviceEntry(name=name, type=kind, driver=driver, label=label)
@@ -184,7 +184,7 @@ def _announce(api: CloudApi, configuration: Configuration) -> Claim:
         name=configuration.name,
         software=links.SOFTWARE,
         transport=configuration.transport,
-        devices=bootstrap.enrolled_devices(configuration),
+        devices=catalogue.enrolled_devices(configuration),
     )
     if claim.code is not None:
         print(f"claim code {claim.code}  (valid for {claim.expires_in_s or 0:.0f} s)", flush=True)
@@ -312,13 +312,13 @@ def _devices(options: argparse.Namespace) -> int:
     home = Home(options.home)
     try:
         for device in home.configuration().devices:
-            print(f"device  {device.name}: {device.type}, {device.driver or bootstrap.type_of(device).driver}")
+            print(f"device  {device.name}: {device.type}, {device.driver or catalogue.type_of(device).driver}")
     except HomeError as error:
         print(error)
-    for name in bootstrap.types():
-        print(f"type    {name}: {bootstrap.load_type(name).label}")
-    for name in bootstrap.room_folders():
-        print(f"room    {name}: {bootstrap.load_room(name).label}")
+    for name in catalogue.TYPES.folders():
+        print(f"type    {name}: {catalogue.TYPES.load(name).label}")
+    for name in catalogue.ROOMS.folders():
+        print(f"room    {name}: {catalogue.ROOMS.load(name).label}")
     for name in drivers.names():
         print(f"driver  {name}")
     for name in sensors.names():
@@ -343,7 +343,7 @@ def _import_model(options: argparse.Namespace) -> int:
     except (HomeError, DriverError, GeometryError) as error:
         print(f"it does not run yet: {error}", file=sys.stderr)
         return _EXIT_FAILED
-    print(f"it runs; name {folder.resolve().parent} in {bootstrap.ROBOTS_PATH} to use it")
+    print(f"it runs; name {folder.resolve().parent} in {catalogue.ROBOTS_PATH} to use it")
     return 0
 
 

@@ -1,13 +1,13 @@
 """Puts an agent together: the one place that picks drivers; ``links`` picks the transport."""
 
 import contextlib
-import os
 from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 
 import msgspec
 
 from device_agent import drivers, geometry, links, sensors
+from device_agent.catalogue import ROBOTS, ROOMS, TYPES, enrolled_devices, room_device_of, type_of
 from device_agent.jail.warm import WarmJail
 from device_agent.ports.clock import CloudClock, tick_ms, wall_ms
 from device_agent.ports.driver import Driver, DriverError
@@ -17,9 +17,8 @@ from device_agent.ports.jail import Jail
 from device_agent.ports.sensor import RoomDriver, SensorError, Surroundings
 from device_agent.ports.transport import Transport
 from device_agent.ports.uploads import Uploads
-from device_agent.protocol import robot_type, topics
-from device_agent.protocol import room as rooms
-from device_agent.protocol.errors import ProtocolError
+from device_agent.protocol import topics
+from device_agent.protocol.robot_type import RobotType
 from device_agent.runtime.agent import Agent
 from device_agent.runtime.device import Device
 from device_agent.runtime.home import Configuration, DeviceEntry, Home, HomeError, Pairing
@@ -31,10 +30,6 @@ from device_agent.runtime.shelf import Shelf
 from device_agent.speech import Espeak
 from device_agent.transports.http.api import CloudApi
 from device_agent.transports.http.uploads import HttpUploads
-
-ROBOTS = Path(__file__).resolve().parent.parent / "robots"
-ROBOTS_PATH = "TELESCOPE_ROBOTS_PATH"
-"""Environment: folders of other people's robot types, separated as those of ``PATH``."""
 
 
 class Cell:
@@ -68,48 +63,6 @@ class Cell:
         self._journal.close()
 
 
-def places() -> tuple[Path, ...]:
-    """The folders that hold robot types: this installation's first, then those of ``TELESCOPE_ROBOTS_PATH``."""
-    more = os.environ.get(ROBOTS_PATH, "").split(os.pathsep)
-    return (ROBOTS, *(Path(place).expanduser().resolve() for place in more if place))
-
-
-def types() -> dict[str, Path]:
-    """Every robot type and its folder; of two with one name that of the earlier place."""
-    found: dict[str, Path] = {}
-    for place in places():
-        for path in sorted(place.glob(f"*/{robot_type.MANIFEST}")):
-            found.setdefault(path.parent.name, path.parent)
-    return found
-
-
-def folder_of(name: str) -> Path:
-    """The folder of a robot type.
-
-    Raises:
-        HomeError: Unknown; the text lists the known ones.
-    """
-    known = types()
-    if name not in known:
-        raise HomeError(
-            f"no robot type '{name}'; there are: {', '.join(known)}. Name the folder that holds yours in {ROBOTS_PATH}"
-        )
-    return known[name]
-
-
-def load_type(name: str) -> robot_type.RobotType:
-    """A robot type by its name.
-
-    Raises:
-        HomeError: Unknown, or its manifest is wrong; the text lists the known ones.
-    """
-    folder = folder_of(name)
-    try:
-        return robot_type.load(folder)
-    except ProtocolError as error:
-        raise HomeError(str(error)) from error
-
-
 def try_type(folder: Path) -> None:
     """Load all of a robot type in a folder, and connect its driver, a simulated one, for a moment.
 
@@ -118,92 +71,19 @@ def try_type(folder: Path) -> None:
         GeometryError: The model cannot be used, or the home position has no room.
         DriverError: The driver refuses it.
     """
-    try:
-        kind = robot_type.load(folder)
-    except ProtocolError as error:
-        raise HomeError(str(error)) from error
+    kind = TYPES.load_from(folder)
     geometry.load(kind, folder)
     driver = drivers.load("mujoco")(kind, folder, {}, kind.type)
     driver.connect()
     driver.close()
 
 
-def _folder(kind: robot_type.RobotType) -> Path:
+def _folder(kind: RobotType) -> Path:
     """Where its files are. What a room's manifest describes has none."""
-    return types().get(kind.type, ROBOTS / kind.type)
+    return TYPES.folders().get(kind.type, ROBOTS / kind.type)
 
 
-def room_folders() -> dict[str, Path]:
-    """Every room and its folder, ``rooms/<room>`` of the places of robot types; the earlier place first."""
-    found: dict[str, Path] = {}
-    for place in places():
-        for path in sorted(place.glob(f"rooms/*/{rooms.MANIFEST}")):
-            found.setdefault(path.parent.name, path.parent)
-    return found
-
-
-def folder_of_room(name: str) -> Path:
-    """The folder of a room.
-
-    Raises:
-        HomeError: Unknown; the text lists the known ones.
-    """
-    known = room_folders()
-    if name not in known:
-        raise HomeError(
-            f"no room '{name}'; there are: {', '.join(known)}. Name the folder that holds yours in {ROBOTS_PATH}, "
-            f"as rooms/{name}/{rooms.MANIFEST}"
-        )
-    return known[name]
-
-
-def load_room(name: str) -> rooms.Room:
-    """A room by its name.
-
-    Raises:
-        HomeError: Unknown, or its manifest is wrong; the text lists the known ones.
-    """
-    folder = folder_of_room(name)
-    try:
-        return rooms.load(folder)
-    except ProtocolError as error:
-        raise HomeError(str(error)) from error
-
-
-def type_of(entry: DeviceEntry) -> robot_type.RobotType:
-    """The robot type of a configured device; of a room's device, what the room's manifest says of it.
-
-    Raises:
-        HomeError: The type or room is unknown, or the room has nothing of that name and type.
-    """
-    if not entry.room:
-        return load_type(entry.type)
-    room = load_room(entry.room)
-    device, robot = room.device(entry.name), room.robot(entry.name)
-    if device is None and robot is None:
-        raise HomeError(f"room '{entry.room}' has no '{entry.name}'; it has: {', '.join(room.names)}")
-    kind = load_type(robot.type) if robot is not None else device.robot_type()  # type: ignore[union-attr]
-    if kind.type != entry.type:
-        raise HomeError(f"'{entry.name}' of room '{entry.room}' is a {kind.type}, not a {entry.type}")
-    return kind
-
-
-def entries_of(name: str) -> list[DeviceEntry]:
-    """What ``agent.toml`` says of all that is in a room.
-
-    Raises:
-        HomeError: The room, or the type of a robot in it, is unknown.
-    """
-    room = load_room(name)
-    robots = (
-        DeviceEntry(name=robot.name, type=robot.type, room=name, label=robot.label or load_type(robot.type).label)
-        for robot in room.robots
-    )
-    devices = (DeviceEntry(name=each.name, type=each.kind, room=name, label=each.label) for each in room.devices)
-    return [*robots, *devices]
-
-
-def geometry_of(entry: DeviceEntry, kind: robot_type.RobotType) -> Geometry | None:
+def geometry_of(entry: DeviceEntry, kind: RobotType) -> Geometry | None:
     """The shape of a configured device in the scene or room that it stands in.
 
     Raises:
@@ -212,18 +92,16 @@ def geometry_of(entry: DeviceEntry, kind: robot_type.RobotType) -> Geometry | No
     """
     scene, standing = str(entry.options.get("scene", "")), None
     if entry.room:
-        room = load_room(entry.room)
+        room = ROOMS.load(entry.room)
         robot = room.robot(entry.name)
         if robot is not None and room.model:
             standing = geometry.Standing(
-                room=folder_of_room(room.room) / room.model, position_m=robot.position_m, yaw_rad=robot.yaw_rad
+                room=ROOMS.folder(room.room) / room.model, position_m=robot.position_m, yaw_rad=robot.yaw_rad
             )
     return geometry.load(kind, _folder(kind), scene=scene, standing=standing)
 
 
-def driver_of(
-    entry: DeviceEntry, kind: robot_type.RobotType, *, trace: Path | None = None, faults: Path | None = None
-) -> Driver:
+def driver_of(entry: DeviceEntry, kind: RobotType, *, trace: Path | None = None, faults: Path | None = None) -> Driver:
     """The driver of a configured device, not connected.
 
     Args:
@@ -244,7 +122,7 @@ def driver_of(
         if faults is not None:
             options.setdefault("faults", str(faults / f"{entry.name}.toml"))
         if entry.room:
-            options["room"] = str(folder_of_room(entry.room))
+            options["room"] = str(ROOMS.folder(entry.room))
     return drivers.load(name)(kind, folder, options, entry.name)
 
 
@@ -261,7 +139,7 @@ def instrument_of(
     Raises:
         HomeError: The room is unknown, or its driver or an option.
     """
-    device = load_room(entry.room).device(entry.name) if entry.room else None
+    device = room_device_of(entry)
     if device is None:
         return None
     driver = entry.driver or device.driver
@@ -269,19 +147,19 @@ def instrument_of(
         device, label=entry.label or device.label, driver=driver, options={**device.options, **entry.options}
     )
     try:
-        made = sensors.load(driver)(manifest, folder_of_room(entry.room), _surroundings(entry.room, neighbours))
+        made = sensors.load(driver)(manifest, ROOMS.folder(entry.room), _surroundings(entry.room, neighbours))
         return Instrument(made, manifest, uploads)
     except SensorError as error:
         raise HomeError(str(error)) from error
 
 
 def _surroundings(room: str, neighbours: Mapping[str, RoomDriver]) -> Surroundings:
-    if not load_room(room).model:
+    if not ROOMS.load(room).model:
         return Surroundings(neighbours=neighbours)
     from device_agent.drivers.mujoco import worlds  # noqa: PLC0415 (a real room needs no simulation)
 
     try:
-        return Surroundings(neighbours=neighbours, world=worlds.of(folder_of_room(room)))
+        return Surroundings(neighbours=neighbours, world=worlds.of(ROOMS.folder(room)))
     except DriverError as error:
         raise HomeError(str(error)) from error
 
@@ -293,17 +171,6 @@ def api_of(home: Home, configuration: Configuration, clock: CloudClock, *, creat
         HomeError: There is no identity.
     """
     return CloudApi(configuration.server, home.identity(create=create), clock)
-
-
-def enrolled_devices(configuration: Configuration) -> list[dict[str, str]]:
-    """The devices as the cloud is told of them."""
-    entries = []
-    for device in configuration.devices:
-        kind = type_of(device)
-        entries.append(
-            {"name": device.name, "kind": kind.kind, "robot_type": kind.type, "label": device.label or kind.label}
-        )
-    return entries
 
 
 def build(home: Home, *, trace: Path | None = None) -> Cell:
@@ -375,7 +242,7 @@ def build(home: Home, *, trace: Path | None = None) -> Cell:
 def _own_streams(configuration: Configuration) -> Iterator[tuple[str, str]]:
     """Device and stream of all that the agent's own room devices measure: its scripts need not name them."""
     for entry in configuration.devices:
-        device = load_room(entry.room).device(entry.name) if entry.room else None
+        device = room_device_of(entry)
         for stream in () if device is None else device.streams:
             yield entry.name, stream.name
 
@@ -450,7 +317,7 @@ def _device(
     )
 
 
-def _geometry(entry: DeviceEntry, kind: robot_type.RobotType) -> Geometry | None:
+def _geometry(entry: DeviceEntry, kind: RobotType) -> Geometry | None:
     try:
         return geometry_of(entry, kind)
     except GeometryError as error:

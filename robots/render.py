@@ -25,7 +25,7 @@ os.environ.setdefault("PYOPENGL_PLATFORM", "osmesa")
 import mujoco
 import numpy as np
 
-from device_agent import bootstrap
+from device_agent import catalogue
 from device_agent.mjcf.ties import Ties
 from device_agent.protocol import robot_type
 
@@ -112,7 +112,7 @@ def png(image: Any) -> bytes:
 
 def main() -> None:
     """Command line."""
-    types = bootstrap.types()
+    types = catalogue.TYPES.folders()
     parser = argparse.ArgumentParser(description="Draw a robot type's scene.")
     parser.add_argument("type", choices=sorted(types))
     parser.add_argument("file", type=Path)

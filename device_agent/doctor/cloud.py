@@ -6,7 +6,7 @@ import time
 from collections.abc import Generator, Iterator
 from typing import Any, Self
 
-from device_agent import bootstrap, links
+from device_agent import bootstrap, catalogue, links
 from device_agent.doctor.finding import Finding, ok, problem, warning
 from device_agent.ports.clock import CloudClock, tick_ms, wall_ms
 from device_agent.runtime.home import Configuration, Home, HomeError, Pairing
@@ -103,7 +103,7 @@ def _link(home: Home, configuration: Configuration, pairing: Pairing, clock: Clo
 def _connect(home: Home, configuration: Configuration, pairing: Pairing, clock: CloudClock) -> Iterator[Finding]:
     journal = Journal(home.journal)
     journal.open(now_ms=wall_ms())
-    membership = links.Membership(pairing, configuration, bootstrap.enrolled_devices(configuration))
+    membership = links.Membership(pairing, configuration, catalogue.enrolled_devices(configuration))
     transport = links.make(
         links.Wiring(
             configuration=configuration,

@@ -6,7 +6,7 @@ import subprocess
 import sys
 from collections.abc import Iterator, Mapping
 
-from device_agent import bootstrap
+from device_agent import bootstrap, catalogue
 from device_agent.doctor.finding import Finding, ok, problem, warning
 from device_agent.ports.driver import DriverError
 from device_agent.ports.geometry import GeometryError
@@ -31,7 +31,7 @@ def device(entry: DeviceEntry) -> Iterator[Finding]:
     """Its type, model and driver. A simulated one is built; a real one is left alone, for it may be at work."""
     name = f"device {entry.name}"
     try:
-        kind = bootstrap.type_of(entry)
+        kind = catalogue.type_of(entry)
         instrument = bootstrap.instrument_of(entry, {})
         if instrument is not None:
             yield _instrument(name, kind.type, instrument)
@@ -100,7 +100,7 @@ def renderer(configuration: Configuration) -> Iterator[Finding]:
 
 def _driver_of(entry: DeviceEntry) -> str:
     try:
-        return bootstrap.type_of(entry).driver
+        return catalogue.type_of(entry).driver
     except HomeError:
         return ""
 

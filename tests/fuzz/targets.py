@@ -20,7 +20,7 @@ import msgspec
 import requests
 from amqtt.mqtt.packet import CONNECT, PUBACK, PUBLISH, SUBSCRIBE, UNSUBSCRIBE
 
-from device_agent.bootstrap import ROBOTS
+from device_agent.catalogue import ROBOTS
 from device_agent.ports.clock import CloudClock
 from device_agent.protocol import codec, grants, robot_type, signing, stanzas, topics
 from device_agent.protocol.errors import ProtocolError

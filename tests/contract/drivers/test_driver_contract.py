@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from device_agent import bootstrap
+from device_agent import catalogue
 from device_agent.drivers import load
 from device_agent.drivers.mujoco import MujocoDriver, Placement, World
 from device_agent.ports.driver import Driver
@@ -13,7 +13,7 @@ from device_agent.protocol import robot_type
 from device_agent.protocol.robot_type import RobotType
 from tests.contract.drivers.suite import DriverContract
 
-ROBOTS = bootstrap.ROBOTS
+ROBOTS = catalogue.ROBOTS
 TYPES = sorted(path.parent.name for path in ROBOTS.glob("*/robot.toml"))
 
 

@@ -11,7 +11,7 @@ from typing import Any
 
 import pytest
 
-from device_agent import bootstrap
+from device_agent import bootstrap, catalogue
 from device_agent.links import SOFTWARE
 from device_agent.ports.clock import CloudClock
 from device_agent.protocol import codec, signing, topics
@@ -46,7 +46,7 @@ class Resident:
         self.home.save_configuration(told)
         api = CloudApi(ground.url, key, CloudClock())
         claim = api.enroll(
-            name="lab", software=SOFTWARE, transport=told.transport, devices=bootstrap.enrolled_devices(told)
+            name="lab", software=SOFTWARE, transport=told.transport, devices=catalogue.enrolled_devices(told)
         )
         claimed = ground.anna.post("/agents/claim", {"code": claim.code}).json()
         found = api.enrollment()
@@ -242,7 +242,7 @@ class AgentSuite:
         lost_s = resident.lost_s[before]
         wait_until(lambda: not resident.device._controller.moving, "rest")
         moving = resident.moved_since(lost_s)
-        assert len(moving) * bootstrap.load_type("ur5").period_ms <= HELD_WITHIN_MS, moving
+        assert len(moving) * catalogue.TYPES.load("ur5").period_ms <= HELD_WITHIN_MS, moving
         ground.endpoints[spoken.endpoint].revive()
         back_s = time.monotonic()
         wait_until(lambda: resident.links == [True, False, True], "the agent to be back", PATIENCE_S)

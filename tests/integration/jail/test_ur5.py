@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from device_agent import drivers, geometry
-from device_agent.bootstrap import ROBOTS, load_type
+from device_agent.catalogue import ROBOTS, TYPES
 from device_agent.protocol.messages import AckStatus
 from tests.unit.agent.test_device import Bench
 
@@ -17,7 +17,7 @@ UR5 = ROBOTS / "ur5"
 
 @pytest.fixture
 def arm(tmp_path: Path) -> Iterator[Bench]:
-    kind = load_type("ur5")
+    kind = TYPES.load("ur5")
     driver = drivers.load(kind.driver)(kind, UR5, {}, "arm")
     bench = Bench(tmp_path, driver=driver, kind=kind, geometry=geometry.load(kind, UR5))  # type: ignore[arg-type]
     bench.device.start()

@@ -4,7 +4,7 @@ from pathlib import Path
 
 import pytest
 
-from device_agent import bootstrap
+from device_agent import bootstrap, catalogue
 from device_agent.__main__ import main
 from device_agent.doctor import robots
 from device_agent.runtime.home import Configuration, DeviceEntry, Home, HomeError
@@ -13,11 +13,11 @@ ARM = DeviceEntry(name="ur5", type="ur5", room="lab")
 
 
 def test_a_room_gives_an_entry_for_each_thing_in_it():
-    entries = bootstrap.entries_of("lab")
-    assert [entry.name for entry in entries] == list(bootstrap.load_room("lab").names)
+    entries = catalogue.entries_of("lab")
+    assert [entry.name for entry in entries] == list(catalogue.ROOMS.load("lab").names)
     assert all(entry.room == "lab" and entry.label for entry in entries)
     for entry in entries:
-        assert bootstrap.type_of(entry).type == entry.type
+        assert catalogue.type_of(entry).type == entry.type
 
 
 def test_the_room_of_a_device_is_kept_in_its_file(tmp_path: Path):
@@ -36,7 +36,7 @@ def test_the_room_of_a_device_is_kept_in_its_file(tmp_path: Path):
 )
 def test_what_the_room_does_not_have_is_named_with_what_it_has(entry: DeviceEntry, says: str):
     with pytest.raises(HomeError, match=says):
-        bootstrap.type_of(entry)
+        catalogue.type_of(entry)
 
 
 def test_an_unknown_room_is_one_clear_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
@@ -46,7 +46,7 @@ def test_an_unknown_room_is_one_clear_line(tmp_path: Path, capsys: pytest.Captur
 
 
 def test_in_its_room_the_arm_keeps_clear_of_what_stands_there():
-    kind = bootstrap.type_of(ARM)
+    kind = catalogue.type_of(ARM)
     shape = bootstrap.geometry_of(ARM, kind)
     assert shape is not None
     home = [kind.home_rad[joint.name] for joint in kind.joints]

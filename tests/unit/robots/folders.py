@@ -10,11 +10,11 @@ import mujoco
 import numpy as np
 import numpy.typing as npt
 
-from device_agent import bootstrap
+from device_agent import catalogue
 from device_agent.protocol import robot_type
 
-ROBOTS = bootstrap.ROBOTS
-FOLDERS = sorted(path.parent for place in bootstrap.places() for path in place.glob("*/robot.toml"))
+ROBOTS = catalogue.ROBOTS
+FOLDERS = sorted(path.parent for place in catalogue.places() for path in place.glob("*/robot.toml"))
 SHIPPED = [folder for folder in FOLDERS if folder.parent == ROBOTS]
 MOVEMENTS = sorted(path for folder in FOLDERS for path in (folder / robot_type.MOVEMENTS).glob("*.py"))
 
