@@ -127,7 +127,11 @@ def driver_of(entry: DeviceEntry, kind: RobotType, *, trace: Path | None = None,
 
 
 def instrument_of(
-    entry: DeviceEntry, neighbours: Mapping[str, RoomDriver], uploads: Uploads | None = None
+    entry: DeviceEntry,
+    neighbours: Mapping[str, RoomDriver],
+    uploads: Uploads | None = None,
+    *,
+    faults: Path | None = None,
 ) -> Instrument | None:
     """A configured device as a room's, not connected; ``None`` where it is a robot.
 
@@ -135,6 +139,7 @@ def instrument_of(
         entry: The device; its options stand before those of the room's manifest.
         neighbours: The agent's room drivers by name, filled while they are made.
         uploads: Where its captures go, if anywhere.
+        faults: A folder for faults to put into simulated devices, ``{device}.toml`` each.
 
     Raises:
         HomeError: The room is unknown, or its driver or an option.
@@ -143,9 +148,10 @@ def instrument_of(
     if device is None:
         return None
     driver = entry.driver or device.driver
-    manifest = msgspec.structs.replace(
-        device, label=entry.label or device.label, driver=driver, options={**device.options, **entry.options}
-    )
+    options = {**device.options, **entry.options}
+    if driver == "mujoco" and faults is not None:
+        options.setdefault("faults", str(faults / f"{entry.name}.toml"))
+    manifest = msgspec.structs.replace(device, label=entry.label or device.label, driver=driver, options=options)
     try:
         made = sensors.load(driver)(manifest, ROOMS.folder(entry.room), _surroundings(entry.room, neighbours))
         return Instrument(made, manifest, uploads)
@@ -217,7 +223,7 @@ def build(home: Home, *, trace: Path | None = None) -> Cell:
     devices: dict[str, Device] = {}
     neighbours: dict[str, RoomDriver] = {}
     for entry in configuration.devices:
-        instrument = instrument_of(entry, neighbours, uploads)
+        instrument = instrument_of(entry, neighbours, uploads, faults=home.faults)
         if instrument is not None:
             neighbours[entry.name] = instrument.driver
         devices[entry.name] = _device(

@@ -159,8 +159,8 @@ class RoomDriver(Protocol):
 class Camera(RoomDriver, Protocol):
     """A room driver with cameras: pictures for people, beside what ``raw`` gives."""
 
-    def frame(self, camera: str) -> Frame:
-        """A picture taken now.
+    def frame(self, camera: str) -> Frame | None:
+        """A picture taken now; ``None`` where it has none at this moment.
 
         Raises:
             SensorError: No such camera; or it failed.

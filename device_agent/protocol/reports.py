@@ -64,6 +64,35 @@ class Control(Struct, frozen=True, kw_only=True):
     upper: float
 
 
+class Diagnostic(Struct, frozen=True, kw_only=True):
+    """How some measurements of a device are to be judged. Values in the measurement's own unit.
+
+    Attributes:
+        stream: The stream that carries them.
+        fields: Their names; ``*`` stands for any text: ``temperature_c.*``.
+        label: What is measured, for people; ``unit``: of the values.
+        advice: What to do when something is wrong.
+        low: Below this something breaks; ``high``: above.
+        warning_low: Below this somebody should look; ``warning_high``: above.
+        change: A lasting shift that is worth a word; without it half of the room to the limits.
+        horizon_s: How long before a limit a trend towards it is told [s].
+        questions: What to look for: ``level``, ``trend``, ``change``, ``outlier``; none: nothing there is unusual.
+    """
+
+    stream: Id = "health"
+    fields: Annotated[str, Meta(min_length=1, max_length=200)]
+    label: Label
+    unit: Annotated[str, Meta(max_length=20)] = ""
+    advice: Annotated[str, Meta(max_length=500)] = ""
+    low: float | None = None
+    high: float | None = None
+    warning_low: float | None = None
+    warning_high: float | None = None
+    change: Annotated[float, Meta(gt=0)] | None = None
+    horizon_s: Annotated[float, Meta(ge=60, le=86_400)] = 2_700.0
+    questions: tuple[Label, ...] = ("level", "trend", "change", "outlier")
+
+
 class InterlockRule(Struct, frozen=True, kw_only=True):
     """When the room slows or holds the device: on its condition, and when its sensor was silent for ``stale_ms``.
 
@@ -85,6 +114,8 @@ class Description(Struct, frozen=True, kw_only=True):
     ``actions`` names the kinds of action that it takes; ``postures``, ``expressions`` and ``behaviours`` what those of
     these kinds may name. An agent that names no actions is an older one.
     ``cameras``: what ``cam/{name}`` shows; ``captures``: what raw data can be had; ``controls``: what can be set.
+
+    ``diagnostics``: how what it measures is to be judged, where that is said by no robot type, but by its room.
 
     ``scripts``: movement scripts run in the jail, run with less (``trusted``, as the agent's owner wants it), or are
     refused; ``scripts_note`` says why, and what to do.
@@ -110,6 +141,7 @@ class Description(Struct, frozen=True, kw_only=True):
     simulated: bool = False
     limits: tuple[Label, ...] = ()
     interlocks: tuple[InterlockRule, ...] = ()
+    diagnostics: Annotated[tuple[Diagnostic, ...], Meta(max_length=100)] = ()
     scripts: Literal["jailed", "trusted", "refused"] = "refused"
     scripts_note: Text = ""
 

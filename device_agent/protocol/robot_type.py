@@ -7,7 +7,7 @@ from typing import Annotated, Literal
 
 from msgspec import Meta, Struct
 
-from device_agent.protocol import abilities, manifest
+from device_agent.protocol import abilities, manifest, reports
 from device_agent.protocol.errors import ProtocolError
 from device_agent.protocol.messages import Id, Joint, Label, Stream, Text, Vector3
 
@@ -18,32 +18,9 @@ MAX_JOINTS = 128
 """Most that a ``JointPositions`` names."""
 
 
-class Diagnostic(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """How some measurements of a robot type are to be judged. Values in the measurement's own unit.
+class Diagnostic(reports.Diagnostic, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """How some measurements are to be judged, as a manifest says it."""
 
-    Attributes:
-        stream: The stream that carries them.
-        fields: Their names; ``*`` stands for any text: ``temperature_c.*``.
-        label: What is measured, for people; ``unit``: of the values.
-        advice: What to do when something is wrong.
-        low: Below this something breaks; ``high``: above.
-        warning_low: Below this somebody should look; ``warning_high``: above.
-        change: A lasting shift that is worth a word; without it half of the room to the limits.
-        horizon_s: How long before a limit a trend towards it is told [s].
-        questions: What to look for.
-    """
-
-    stream: Id = "health"
-    fields: Annotated[str, Meta(min_length=1, max_length=200)]
-    label: Label
-    unit: Annotated[str, Meta(max_length=20)] = ""
-    advice: Annotated[str, Meta(max_length=500)] = ""
-    low: float | None = None
-    high: float | None = None
-    warning_low: float | None = None
-    warning_high: float | None = None
-    change: Annotated[float, Meta(gt=0)] | None = None
-    horizon_s: Annotated[float, Meta(ge=60, le=86_400)] = 2_700.0
     questions: tuple[Literal["level", "trend", "change", "outlier"], ...] = ("level", "trend", "change", "outlier")
 
 
@@ -171,12 +148,21 @@ def parse(text: str) -> RobotType:
     abilities.check(robot_type, robot_type.joints, robot_type.home_rad)
     if robot_type.gaze is not None:
         _check_gaze(robot_type.gaze, robot_type)
-    for diagnostic in robot_type.diagnostics:
+    check_diagnostics(robot_type.diagnostics)
+    return robot_type
+
+
+def check_diagnostics(diagnostics: Sequence[Diagnostic]) -> None:
+    """Refuse limits that contradict each other.
+
+    Raises:
+        ProtocolError: They are not finite, or do not rise; the text names the fields.
+    """
+    for diagnostic in diagnostics:
         given = (diagnostic.low, diagnostic.warning_low, diagnostic.warning_high, diagnostic.high)
         limits = [limit for limit in given if limit is not None]
         if not all(math.isfinite(limit) for limit in limits) or limits != sorted(limits):
             raise ProtocolError(f"diagnostics of '{diagnostic.fields}': low, warning_low, warning_high, high must rise")
-    return robot_type
 
 
 def _check_figures(robot_type: RobotType) -> None:

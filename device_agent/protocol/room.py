@@ -10,7 +10,7 @@ from msgspec import Meta, Struct
 from device_agent.protocol import manifest, reports
 from device_agent.protocol.errors import ProtocolError
 from device_agent.protocol.messages import Id, Label, Stream, Text, Vector3
-from device_agent.protocol.robot_type import RobotType
+from device_agent.protocol.robot_type import Diagnostic, RobotType, check_diagnostics
 
 MANIFEST = "room.toml"
 MAX_RATE_HZ = 50.0
@@ -53,6 +53,21 @@ class Control(reports.Control, frozen=True, kw_only=True, forbid_unknown_fields=
     """One thing that can be set at a room device, within ``lower`` and ``upper`` [``unit``]."""
 
 
+class Watch(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """When a stream or camera of a room device is not well though its driver says nothing of it.
+
+    Attributes:
+        source: The stream or camera.
+        silent_s: It has given nothing for so long [s]; ``None``: it may be silent.
+        stuck_s: What it gave has been exactly the same for so long [s]; ``None``: it may stay the same. Only for what
+            has noise: a door that is shut stays so, a thermometer that shows the same hundredths for minutes is broken.
+    """
+
+    source: Id
+    silent_s: Annotated[float, Meta(gt=0, le=86_400)] | None = None
+    stuck_s: Annotated[float, Meta(gt=0, le=86_400)] | None = None
+
+
 class RoomDevice(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """One sensor or switch of the room.
 
@@ -65,6 +80,8 @@ class RoomDevice(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
         cameras: What it films, and how many pictures a second.
         captures: What raw data can be had of it: ``image``, ``scan`` …
         controls: What can be set.
+        diagnostics: How what it measures is to be judged; the first that fits a field counts.
+        watch: When its streams and cameras are silent or stuck.
         position_m: Where it is in the room [m].
         options: For its driver.
     """
@@ -77,6 +94,8 @@ class RoomDevice(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     cameras: Annotated[tuple[Stream, ...], Meta(max_length=4)] = ()
     captures: Annotated[tuple[Id, ...], Meta(max_length=16)] = ()
     controls: Annotated[tuple[Control, ...], Meta(max_length=16)] = ()
+    diagnostics: Annotated[tuple[Diagnostic, ...], Meta(max_length=32)] = ()
+    watch: Annotated[tuple[Watch, ...], Meta(max_length=20)] = ()
     position_m: Vector3 = (0.0, 0.0, 0.0)
     options: dict[str, Any] = {}
 
@@ -99,6 +118,7 @@ class RoomDevice(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
             braking_rad_s2=_NO_BRAKING_RAD_S2,
             capabilities=tuple(name for name in does if getattr(self, name)),
             streams=self.streams,
+            diagnostics=self.diagnostics,
         )
 
 
@@ -258,6 +278,22 @@ def _check_device(device: RoomDevice) -> None:
             raise ProtocolError(
                 f"control '{control.name}' of {where}: lower must be below upper, and both of them finite"
             )
+    _check_judgements(device, where)
+
+
+def _check_judgements(device: RoomDevice, where: str) -> None:
+    """Refuse diagnostics and watches of what the device has not, or that contradict themselves."""
+    try:
+        check_diagnostics(device.diagnostics)
+    except ProtocolError as error:
+        raise ProtocolError(f"{where}: {error}") from error
+    streams = [stream.name for stream in device.streams]
+    sources = [*streams, *(camera.name for camera in device.cameras)]
+    asked = [("diagnostics", each.stream, streams) for each in device.diagnostics]
+    asked += [("watch", each.source, sources) for each in device.watch]
+    for what, name, known in asked:
+        if name not in known:
+            raise ProtocolError(f"{what} of {where}: it has no '{name}'; it has: {', '.join(known) or 'none'}")
 
 
 def _check_person(person: Person, plan: Plan) -> None:

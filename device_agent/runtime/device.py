@@ -164,6 +164,7 @@ class Device:
             journal=journal,
             cloud_clock=cloud_clock,
             keys=keys,
+            ailing=tuple if instrument is None else instrument.vigil.faults,
         )
 
     def _loop_of(self, driver: Driver | Instrument, robot_type: RobotType) -> ControlLoop | SensorLoop:

@@ -12,6 +12,7 @@ from device_agent.ports.uploads import UploadError, Uploads
 from device_agent.protocol.orders import CaptureRaw, Gather, SetControl, Shoot
 from device_agent.protocol.room import Control, RoomDevice
 from device_agent.runtime.lease import Refused
+from device_agent.runtime.vigil import Vigil
 
 _SUFFIXES = {"image/png": "png", "image/jpeg": "jpg", "application/json": "json"}
 _LEAST_RATE_HZ = 0.001
@@ -29,6 +30,7 @@ class Instrument:
         driver: As given; the loop connects it.
         manifest: As given.
         streams: Names of what it measures; ``cameras``: of what it films.
+        vigil: Over streams and cameras that are silent or stuck; the loop tells it what they gave.
         changed: Set whenever a rate has changed; whoever heeds it clears it.
     """
 
@@ -38,6 +40,7 @@ class Instrument:
         self._uploads = uploads
         self._gathering: Mapping[str, float] = {}
         self._counts: Counter[str] = Counter()
+        self.vigil = Vigil(manifest.watch, self.rate_hz)
         self.changed = threading.Event()
         self.streams = tuple(stream.name for stream in manifest.streams)
         self.cameras = tuple(camera.name for camera in manifest.cameras) if isinstance(driver, Camera) else ()

@@ -23,6 +23,7 @@ from device_agent.protocol.messages import (
     CancelAction,
     Command,
     DropRequest,
+    Fault,
     GrantLease,
     Reason,
     ReleaseLease,
@@ -58,6 +59,7 @@ class Office:
         journal: Open.
         cloud_clock: For ``ttl_ms``.
         keys: The cloud's pinned public keys by key id.
+        ailing: What is wrong with the device though its driver raises no error.
     """
 
     def __init__(
@@ -71,6 +73,7 @@ class Office:
         journal: Journal,
         cloud_clock: CloudClock,
         keys: Mapping[str, Ed25519PublicKey],
+        ailing: Callable[[], tuple[Fault, ...]] = tuple,
     ) -> None:
         self._address = address
         self._name = address[2]
@@ -81,6 +84,7 @@ class Office:
         self._journal = journal
         self._cloud_clock = cloud_clock
         self._keys = keys
+        self._ailing = ailing
         self._handover = Handover()
         self._twin: Twin | None = None
         self._commands: queue.Queue[bytes] = queue.Queue(maxsize=_MOST_WAITING)
@@ -268,6 +272,13 @@ class Office:
                 self._controller.changed.set()  # still to be written, as soon as that goes again
                 raise
 
+    def _faults(self) -> tuple[Fault, ...]:
+        """What lasts: an error of the driver, or else what it does not tell of itself."""
+        fault = self._controller.fault
+        if fault is not None:
+            return (Fault(code="driver", message=fault[:2000], since_ms=wall_ms()),)
+        return self._ailing()
+
     def _condition(self) -> Condition:
         now_s = time.monotonic()
         epoch, ended = self._controller.epochs
@@ -279,7 +290,7 @@ class Office:
             lease=lease,
             asked=self._handover.current(lease, now_s),
             latch=self._controller.latch,
-            fault=self._controller.fault,
+            faults=self._faults(),
             action=self._executor.current(),
             restrictions=tuple(
                 Restriction(source=one.source, speed=one.speed, why=one.why) for one in self._controller.restrictions

@@ -83,6 +83,7 @@ class SensorLoop:
             self._driver.connect()
         except SensorError as error:
             self._failed(str(error))
+        self._instrument.vigil.begin()
         self._thread.start()
 
     def stop(self) -> None:
@@ -98,6 +99,7 @@ class SensorLoop:
             try:
                 if self._controller.fault is not None:
                     self._driver.connect()
+                    self._instrument.vigil.begin()
                     self._controller.recover(())
                 self._watch(now_s)
                 self._heed(self._controller.step(now_s).mode)
@@ -140,12 +142,16 @@ class SensorLoop:
         values = self._instrument.read(source.name)
         if not values:
             return
+        self._instrument.vigil.note(source.name, values)
         source.sequence += 1
         told = dict(list(values.items())[:MAX_VALUES])
         self._tell(source.name, Measurements(tick_ms=tick_ms(), at_ms=wall_ms(), sequence=source.sequence, values=told))
 
     def _shoot(self, source: _Source, camera: Camera) -> None:
         taken = camera.frame(source.name)
+        if taken is None:
+            return
+        self._instrument.vigil.note(source.name, taken.content)
         source.sequence += 1
         tick = round(taken.taken_s * 1000)
         try:

@@ -51,7 +51,7 @@ class Condition:
     lease: Lease | None
     asked: Asked | None
     latch: StopLatch | None
-    fault: str | None
+    faults: tuple[Fault, ...]
     action: ActionState | None
     restrictions: tuple[Restriction, ...]
     stiffness: Mapping[str, float]
@@ -65,7 +65,7 @@ class Condition:
             self.lease,
             self.asked,
             self.latch,
-            self.fault,
+            tuple((fault.code, fault.message) for fault in self.faults),
             self.action and self.action.id,
             self.restrictions,
             self.stiffness,
@@ -201,7 +201,7 @@ class Voice:
             stop=now.latch,
             lease=_lease_state(now.lease, now.asked, now_s),
             action=now.action,
-            faults=(Fault(code="driver", message=now.fault[:2000], since_ms=at_ms),) if now.fault else (),
+            faults=now.faults,
             restrictions=now.restrictions,
             stiffness=dict(now.stiffness),
         )
@@ -254,6 +254,7 @@ class Voice:
             simulated=self._simulated,
             limits=self._limits,
             interlocks=self._interlocks,
+            diagnostics=() if fitted is None else fitted.diagnostics,
             scripts=self.scripts.how,
             scripts_note=self.scripts.why[:2000],
         )

@@ -12,7 +12,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
 from device_agent.protocol import topics
-from device_agent.protocol.robot_type import Diagnostic
+from device_agent.protocol.messages import Description, Diagnostic
 from function_app.domain import detectors, diagnosis
 from function_app.domain.accounts import Identity
 from function_app.domain.detectors import MINUTE_MS, WINDOW_MS, Limits, Watch
@@ -170,25 +170,31 @@ class Diagnostics:
         return Summary(view, diagnosis.health(faults, online=view.online), faults)
 
     async def _listed(self, device: Device) -> tuple[Diagnostic, ...]:
-        """What the device's robot type says about its measurements."""
+        """What is said about its measurements: by itself, as a room's devices do, or else by its robot type."""
         now_ms = self._clock.now_ms()
         key = (device.id, device.pairing)
         known = self._rules.get(key)
         if known is not None and 0 <= now_ms - known[0] < RULES_MS:
             return known[1]
-        row = await self._tables.get(store.AGENTS, device.agent, "agent")
-        agent = None if row is None else store.read(row, Agent)
-        found: tuple[Diagnostic, ...] = ()
-        if agent is not None and agent.account is not None:
-            try:
-                robot_type = await self._robot_types.get(Identity(agent.account, "", ""), device.robot_type)
-                found = robot_type.diagnostics
-            except Problem as problem:
-                _log.debug("%s is watched without limits: %s", device.id, problem.detail)
+        row = await self._tables.get(store.DESCRIPTIONS, device.agent, device.name)
+        found = () if row is None else store.read(row, Description).diagnostics
+        found = found or await self._of_type(device)
         if len(self._rules) >= _RULES_KEPT:
             self._rules.clear()
         self._rules[key] = (now_ms, found)
         return found
+
+    async def _of_type(self, device: Device) -> tuple[Diagnostic, ...]:
+        row = await self._tables.get(store.AGENTS, device.agent, "agent")
+        agent = None if row is None else store.read(row, Agent)
+        if agent is None or agent.account is None:
+            return ()
+        try:
+            robot_type = await self._robot_types.get(Identity(agent.account, "", ""), device.robot_type)
+        except Problem as problem:
+            _log.debug("%s is watched without limits: %s", device.id, problem.detail)
+            return ()
+        return robot_type.diagnostics
 
 
 def _rules(listed: Sequence[Diagnostic], stream: str, names: set[str]) -> dict[str, Rule]:

@@ -12,9 +12,9 @@ charging = true                 # on its charger, or false: not, however empty
 ```
 """
 
-import logging
 import tomllib
 from collections.abc import Mapping, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -22,12 +22,12 @@ import msgspec
 import numpy as np
 from msgspec import Meta, Struct
 
+from device_agent.ports.faults import FaultFile
 from device_agent.protocol.errors import ProtocolError
 
 _CREEP_RAD_S = 1e-4
 """A stuck joint moves no faster with all the torque of its motor: it stands in something thicker than honey, for dry
 friction gives way in MuJoCo."""
-_log = logging.getLogger(__name__)
 
 
 class Ailments(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -67,8 +67,8 @@ def read(text: str, joints: Sequence[str]) -> Ailments:
     return ailments
 
 
-class Sickbed:
-    """The file, looked at again and again.
+class Sickbed(FaultFile[Ailments]):
+    """The file of one robot.
 
     Args:
         path: Where it may be; ``None``: nowhere.
@@ -76,32 +76,7 @@ class Sickbed:
     """
 
     def __init__(self, path: Path | None, joints: Sequence[str]) -> None:
-        self._path = path
-        self._joints = tuple(joints)
-        self._seen = (0, 0)
-
-    def news(self) -> Ailments | None:
-        """What the robot suffers from now, when that has changed; a wrong file changes nothing, and is logged."""
-        if self._path is None:
-            return None
-        try:
-            stat = self._path.stat()
-            seen, text = (stat.st_mtime_ns, stat.st_size), ""
-            if seen != self._seen:
-                text = self._path.read_text(encoding="utf-8")
-        except FileNotFoundError:
-            seen, text = (0, 0), ""
-        except (OSError, UnicodeDecodeError) as error:
-            _log.warning("%s: %s", self._path, error)
-            return None
-        if seen == self._seen:
-            return None
-        self._seen = seen
-        try:
-            return read(text, self._joints)
-        except ProtocolError as error:
-            _log.warning("%s: %s", self._path, error)
-            return None
+        super().__init__(path, partial(read, joints=tuple(joints)))
 
 
 class Infliction:

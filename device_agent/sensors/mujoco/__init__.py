@@ -4,16 +4,21 @@ from collections.abc import Callable, Mapping
 from functools import partial
 from pathlib import Path
 
+import msgspec
+
 from device_agent.ports.sensor import RoomDriver, SensorError, Surroundings
 from device_agent.ports.world import SimulatedWorld
 from device_agent.protocol.room import RoomDevice
+from device_agent.sensors.mujoco.ailments import patient
 from device_agent.sensors.mujoco.cameras import ColourCamera, DepthCamera
 from device_agent.sensors.mujoco.lidar import Lidar
 from device_agent.sensors.mujoco.meters import Contact, Meter
 from device_agent.sensors.mujoco.part import Part
 from device_agent.sensors.mujoco.pir import Pir
 
-__all__ = ["KINDS", "create"]
+__all__ = ["FAULTS", "KINDS", "create"]
+
+FAULTS = "faults"
 
 KINDS: Mapping[str, Callable[[RoomDevice, SimulatedWorld], Part]] = {
     "camera": ColourCamera,
@@ -34,8 +39,11 @@ KINDS: Mapping[str, Callable[[RoomDevice, SimulatedWorld], Part]] = {
 """What ``kind`` may be, and what does it."""
 
 
-def create(device: RoomDevice, folder: Path, surroundings: Surroundings) -> RoomDriver:  # noqa: ARG001 (a ``Factory``)
+def create(device: RoomDevice, folder: Path, surroundings: Surroundings) -> RoomDriver:
     """The driver of one device: the factory that ``sensors.load("mujoco")`` gives.
+
+    Every kind has the option ``faults``: a file, relative to the room's folder, with faults to put into it, which may
+    come and go while it runs (see ``ailments``).
 
     Raises:
         SensorError: An unknown kind or option, or the room is not simulated.
@@ -44,4 +52,11 @@ def create(device: RoomDevice, folder: Path, surroundings: Surroundings) -> Room
         raise SensorError(f"'{device.name}' is a simulated device, and its room has no model")
     if device.kind not in KINDS:
         raise SensorError(f"driver 'mujoco' has no kind '{device.kind}'; it has: {', '.join(KINDS)}")
-    return KINDS[device.kind](device, surroundings.world)
+    faults = device.options.get(FAULTS)
+    if faults is None:
+        return KINDS[device.kind](device, surroundings.world)
+    if not isinstance(faults, str):
+        raise SensorError(f"option '{FAULTS}' of '{device.name}' is {faults!r}; it must be the path of a file")
+    options = {name: value for name, value in device.options.items() if name != FAULTS}
+    healthy = KINDS[device.kind](msgspec.structs.replace(device, options=options), surroundings.world)
+    return patient(healthy, device, folder / faults)

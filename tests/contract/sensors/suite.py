@@ -72,6 +72,7 @@ class RoomDriverContract:
             assert isinstance(connected, Camera)
             for camera in entry.cameras:
                 frame = connected.frame(camera.name)
+                assert frame is not None
                 assert simplejpeg.decode_jpeg(frame.content).shape == (frame.height, frame.width, 3)
                 frames.encode(CameraFrame(1, 1, frame.width, frame.height, frame.content))
 

@@ -139,7 +139,7 @@ const control = object<Required<Control>>({
   upper: number,
 });
 
-const description = object<Required<Description>>({
+const description = object<KnownDescription>({
   device: text,
   kind: text,
   robot_type: text,
@@ -279,7 +279,8 @@ function read<T>(payload: Uint8Array, check: Check<T>, name: string): T {
   return check(value, name);
 }
 
-export type KnownDescription = Required<Description>;
+/** Without what only the cloud goes by. */
+export type KnownDescription = Required<Omit<Description, "diagnostics">>;
 export type KnownBody = Required<Body>;
 export interface KnownTwin {
   device: string;

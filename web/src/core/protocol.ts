@@ -23,6 +23,8 @@ export interface Presence {
  * these kinds may name. An agent that names no actions is an older one.
  * `cameras`: what `cam/{name}` shows; `captures`: what raw data can be had; `controls`: what can be set.
  *
+ * `diagnostics`: how what it measures is to be judged, where that is said by no robot type, but by its room.
+ *
  * `scripts`: movement scripts run in the jail, run with less (`trusted`, as the agent's owner wants it), or are
  * refused; `scripts_note` says why, and what to do.
  */
@@ -49,6 +51,7 @@ export interface Description {
   simulated?: boolean;
   limits?: string[];
   interlocks?: InterlockRule[];
+  diagnostics?: Diagnostic[];
   scripts?: "jailed" | "refused" | "trusted";
   scripts_note?: string;
 }
@@ -92,6 +95,36 @@ export interface InterlockRule {
   action: "hold" | "slow";
   speed: number;
   stale_ms: number;
+}
+
+/**
+ * How some measurements of a device are to be judged. Values in the measurement's own unit.
+ *
+ * Attributes:
+ * stream: The stream that carries them.
+ * fields: Their names; `*` stands for any text: `temperature_c.*`.
+ * label: What is measured, for people; `unit`: of the values.
+ * advice: What to do when something is wrong.
+ * low: Below this something breaks; `high`: above.
+ * warning_low: Below this somebody should look; `warning_high`: above.
+ * change: A lasting shift that is worth a word; without it half of the room to the limits.
+ * horizon_s: How long before a limit a trend towards it is told [s].
+ * questions: What to look for: `level`, `trend`, `change`, `outlier`; none: nothing there is unusual.
+ */
+export interface Diagnostic {
+  /** letters, digits, _ and -, 1 to 64 of them */
+  stream?: string;
+  fields: string;
+  label: string;
+  unit?: string;
+  advice?: string;
+  low?: number | null;
+  high?: number | null;
+  warning_low?: number | null;
+  warning_high?: number | null;
+  change?: number | null;
+  horizon_s?: number;
+  questions?: string[];
 }
 
 /** `desc/twin`: the drawing from which a page builds its live view. Retained. */
