@@ -20,9 +20,11 @@ STALE_S = 1.0
 """A position that is older is none: the robot stands."""
 PATIENCE_S = 15.0
 """How long it waits for somebody to go out of the way."""
+SHORT_PATIENCE_S = 3.0
+"""The same before it has set out: a place that is taken then is likelier to be furniture than somebody who goes on."""
 ODOMETRY, POSITIONS = "odometry", "positions"
 """Streams that tell where a robot is: its own, and a room device's."""
-WAITS_FOR = frozenset({"no_way", "taken"})
+_WAITS_FOR = frozenset({"no_way", "taken"})
 """What may be otherwise in a moment."""
 _AHEAD_M = 0.2
 _LOOK_EVERY = 4
@@ -35,6 +37,10 @@ _FACING_RAD = 0.5
 """It turns on the spot until it looks along its way that well."""
 _TRUST = 0.1
 """Weight of each new place that the room sees it at, against where its own wheels say that it is."""
+_SPREADS = 16
+"""Cells by which what is reached grows before it is looked whether it has grown."""
+_FREE_M = 0.4
+"""A robot that stands too near to something leaves it straight for a free place no further away than this."""
 _STEPS = [(row, column, math.hypot(row, column)) for row in (-1, 0, 1) for column in (-1, 0, 1) if row or column]
 
 
@@ -106,6 +112,7 @@ class Errand:
         self._radius_m = radius_m
         self._there = False
         self._looked = 0
+        self._set_out = False
         self._path: list[tuple[float, float]] = []
 
     @classmethod
@@ -122,6 +129,12 @@ class Errand:
             raise Refused("not_finite", "a place must be made of finite numbers")
         limits = Twist(base.max_linear_m_s, 0.0, base.max_angular_rad_s)
         return cls((x_m, y_m), yaw_rad, limits=limits, radius_m=base.radius_m)
+
+    def patience_s(self, refused: Refused) -> float:
+        """How long to wait for what is refused to become possible [s]."""
+        if refused.code not in _WAITS_FOR:
+            return 0.0
+        return SHORT_PATIENCE_S if refused.code == "taken" and not self._set_out else PATIENCE_S
 
     def twist(self, place: Place, ground: Ground) -> Twist | None:
         """How to go on from here; ``None`` when it is there.
@@ -141,6 +154,7 @@ class Errand:
         if self._looked % _LOOK_EVERY == 0 or not self._path:
             self._path = []  # where none is found now, the next look is for one again
             self._path = way(ground.blocked(self._radius_m, apart=apart), here, self._goal)
+            self._set_out = True
         self._looked += 1
         gone = min(range(len(self._path)), key=lambda index: math.dist(self._path[index], here))
         x, y = next((spot for spot in self._path[gone:] if math.dist(spot, here) >= _AHEAD_M), self._goal)
@@ -159,33 +173,80 @@ def way(floor: Floor, start: tuple[float, float], goal: tuple[float, float]) -> 
     """The shortest way over free cells (A*), as places in the room; the last is the goal.
 
     Raises:
-        Refused: The goal is taken or outside, or there is no way.
+        Refused: The goal is taken or outside, or there is no way; the text names the nearest place that has one.
     """
-    blocked, begin, end = floor.blocked, floor.cell(*start), floor.cell(*goal)
+    free, begin, end = ~floor.blocked, floor.cell(*start), floor.cell(*goal)
     for name, cell in (("The robot", begin), ("The place", end)):
-        if not all(0 <= at < size for at, size in zip(cell, blocked.shape, strict=True)):
+        if not all(0 <= at < size for at, size in zip(cell, free.shape, strict=True)):
             raise Refused("out_of_room", f"{name} is outside of what is known of the room")
-    if blocked[end]:
-        raise Refused("taken", "something stands at that place, or nobody has seen it; choose another")
+    begin = _freed(floor, free, begin, start)
+    reached = _reached(free, begin)
+    if not reached[end]:
+        taken = not free[end]
+        why = "something stands there or too near, or nobody has seen it" if taken else "there is no free way to it"
+        near = (
+            ""
+            if not reached.any()
+            else "; the nearest place to go to is x_m {:.2f}, y_m {:.2f}".format(
+                *floor.centre(*_nearest(floor, reached, goal))
+            )
+        )
+        raise Refused("taken" if taken else "no_way", f"no going to that place: {why}{near}")
     came: dict[tuple[int, int], tuple[int, int]] = {begin: begin}
     cost = {begin: 0.0}
     heap = [(math.dist(begin, end), begin)]
-    while heap:
+    while True:
         _, cell = heapq.heappop(heap)
         if cell == end:
             return [*_back(floor, came, end), goal]
         for row, column, length in _STEPS:
             other = cell[0] + row, cell[1] + column
             far = cost[cell] + length
-            if _free(blocked, other) and far < cost.get(other, math.inf):
+            if _free(free, other) and far < cost.get(other, math.inf):
                 cost[other], came[other] = far, cell
                 heapq.heappush(heap, (far + math.dist(other, end), other))
-    raise Refused("no_way", "there is no free way to that place")
 
 
-def _free(blocked: NDArray[np.bool_], cell: tuple[int, int]) -> bool:
-    inside = 0 <= cell[0] < blocked.shape[0] and 0 <= cell[1] < blocked.shape[1]
-    return inside and not blocked[cell]
+def _freed(
+    floor: Floor, free: NDArray[np.bool_], begin: tuple[int, int], start: tuple[float, float]
+) -> tuple[int, int]:
+    """Where a way begins: where the robot is, or the nearest free place where it stands too near to something."""
+    if free[begin] or not free.any():
+        return begin
+    nearest = _nearest(floor, free, start)
+    return nearest if math.dist(floor.centre(*nearest), start) <= _FREE_M else begin
+
+
+def _nearest(floor: Floor, cells: NDArray[np.bool_], place: tuple[float, float]) -> tuple[int, int]:
+    """Which of some cells is nearest to a place."""
+    rows, columns = np.nonzero(cells)
+    row, column = floor.cell(*place)
+    index = int(np.argmin((rows - row) ** 2 + (columns - column) ** 2))
+    return int(rows[index]), int(columns[index])
+
+
+def _reached(free: NDArray[np.bool_], begin: tuple[int, int]) -> NDArray[np.bool_]:
+    """The free cells to which a way leads from one, shape (rows, columns)."""
+    reached = np.zeros_like(free)
+    reached[begin] = True
+    count = 0
+    while count != (now := int(reached.sum())):
+        count = now
+        for _ in range(_SPREADS):
+            wider = reached.copy()
+            wider[1:] |= reached[:-1]
+            wider[:-1] |= reached[1:]
+            across = wider.copy()
+            across[:, 1:] |= wider[:, :-1]
+            across[:, :-1] |= wider[:, 1:]
+            reached |= across & free
+    reached &= free
+    return reached
+
+
+def _free(free: NDArray[np.bool_], cell: tuple[int, int]) -> bool:
+    inside = 0 <= cell[0] < free.shape[0] and 0 <= cell[1] < free.shape[1]
+    return inside and bool(free[cell])
 
 
 def _back(

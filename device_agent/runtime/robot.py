@@ -12,7 +12,7 @@ from device_agent.runtime import calls, gaze
 from device_agent.runtime.authority import Tenure
 from device_agent.runtime.body import Body, by_name
 from device_agent.runtime.courses import Course, Outcome
-from device_agent.runtime.errand import EVERY_S, ODOMETRY, PATIENCE_S, POSITIONS, WAITS_FOR, Errand, Whereabouts
+from device_agent.runtime.errand import EVERY_S, ODOMETRY, POSITIONS, Errand, Whereabouts
 from device_agent.runtime.lease import Refused
 from device_agent.runtime.performer import Performer, check_share
 from device_agent.runtime.room import Reading
@@ -138,7 +138,7 @@ class ScriptRobot:
                 twist, waited_s = errand.twist(place, ground), 0.0
             except Refused as refused:
                 waited_s += EVERY_S
-                if refused.code not in WAITS_FOR or waited_s > PATIENCE_S:
+                if waited_s > errand.patience_s(refused):
                     raise
                 twist = REST
             if twist is None:

@@ -1,4 +1,4 @@
-"""Go to somebody whom the room sees, stop before them, and greet: the room tells where they are."""
+"""Go to somebody whom the room sees, around what stands between, stop before them, and greet."""
 
 import math
 
@@ -6,65 +6,70 @@ PARAMETERS = {
     "who": {"type": "string", "default": "person", "description": "As the room's positions call them"},
     "near_m": {
         "type": "number",
-        "minimum": 0.6,
+        "minimum": 0.7,
         "maximum": 2,
         "default": 0.9,
         "unit": "m",
         "description": "It stops this far from them",
     },
-    "speed_m_s": {
-        "type": "number",
-        "minimum": 0.15,
-        "maximum": 0.3,
-        "default": 0.2,
-        "unit": "m/s",
-        "description": "How fast",
-    },
-    "keep_m": {
-        "type": "number",
-        "minimum": 0.15,
-        "maximum": 1,
-        "default": 0.35,
-        "unit": "m",
-        "description": "It stops this far from what its sonars hear",
+    "tries": {
+        "type": "integer",
+        "minimum": 1,
+        "maximum": 20,
+        "default": 4,
+        "description": "How often it goes after somebody who has gone on meanwhile",
     },
 }
 
-STEP_M = 0.3
-STEPS = 20
-TURN_RAD_S = 0.6
-STRAIGHT_RAD, THERE_M = 0.05, 0.1
-TELLING_M = 0.2  # so far it must go for the room to know where it looks
-SETTLE_S = 0.3
+SIDES_RAD = (0.0, 0.7, -0.7, 1.4, -1.4)  # where to stand around them, from the side where it is
+NEAR_M = 0.3  # so much further than asked is near enough to greet somebody who moves
+TURN_RAD_S, STRAIGHT_RAD = 0.6, 0.1
+LOOK_S, PATIENCE_S = 0.3, 20.0  # it waits so long for them to come by
 OLD_S = 2.0
 
 who = str(parameters.get("who", "person"))
-near_m = min(2.0, max(0.6, float(parameters.get("near_m", 0.9))))
-speed_m_s = min(0.3, max(0.15, float(parameters.get("speed_m_s", 0.2))))
-keep_m = min(1.0, max(0.15, float(parameters.get("keep_m", 0.35))))
+near_m = min(2.0, max(0.7, float(parameters.get("near_m", 0.9))))
+tries = min(20, max(1, int(parameters.get("tries", 4))))
 
 
-def places():
-    """What the room says of where everybody is; the script ends where that is old."""
+def apart():
+    """How far they are [m], and which way [rad]; where they are, x, y [m]. The script ends where nobody knows."""
     found = room.latest("perception", "positions")
     if found is None or found["age_s"] > OLD_S:
         raise RobotError("the room does not say where anybody is")
+    seen = found["values"]
     for name in ("qbo", who):
-        known = sorted(field[4:] for field in found["values"] if field.startswith("x_m."))
-        if f"x_m.{name}" not in found["values"] or found["values"][f"age_s.{name}"] > OLD_S:
+        known = sorted(field[4:] for field in seen if field.startswith("x_m."))
+        if f"x_m.{name}" not in seen or seen[f"age_s.{name}"] > OLD_S:
             raise RobotError(f"the room does not see '{name}'; it sees: {', '.join(known) or 'nobody'}")
-    return found["values"]
+    x_m, y_m = seen[f"x_m.{who}"], seen[f"y_m.{who}"]
+    across_m, up_m = x_m - seen["x_m.qbo"], y_m - seen["y_m.qbo"]
+    return math.hypot(across_m, up_m), math.atan2(up_m, across_m), (x_m, y_m)
 
 
-def forward(way_m):
-    """Drive ahead, if the sonars hear room for it; whether they did."""
-    sonar = robot.state()["streams"].get("sonar")
-    if sonar is None or sonar["age_s"] > 1.0:
-        raise RobotError("the sonars tell nothing; it stays where it is")
-    if min(sonar["values"]["distance_m.left"], sonar["values"]["distance_m.right"]) < keep_m + way_m:
-        return False
-    robot.drive(forward_m_s=speed_m_s, duration_s=way_m / speed_m_s)
+def near():
+    """Whether they are before it now, or come there while it waits."""
+    waited_s = 0.0
+    while apart()[0] > near_m + NEAR_M:
+        if waited_s >= PATIENCE_S:
+            return False
+        wait(LOOK_S)
+        waited_s += LOOK_S
     return True
+
+
+def approach():
+    """Go to a place before them, on whichever side there is room; whether there was any."""
+    _, towards_rad, (x_m, y_m) = apart()
+    for side_rad in SIDES_RAD:
+        facing_rad = towards_rad + side_rad
+        try:
+            robot.go_to(x_m - near_m * math.cos(facing_rad), y_m - near_m * math.sin(facing_rad), facing_rad)
+        except RobotError as error:
+            why = error
+        else:
+            return
+    raise why
 
 
 def turn(angle_rad):
@@ -74,36 +79,17 @@ def turn(angle_rad):
         robot.drive(turn_rad_s=math.copysign(TURN_RAD_S, angle_rad), duration_s=abs(angle_rad) / TURN_RAD_S)
 
 
-def looks():
-    """Where it looks, as the room saw it go [rad]."""
-    wait(SETTLE_S)
-    seen = places()
-    if "yaw_rad.qbo" not in seen:
-        raise RobotError("the room has not seen it drive")
-    return seen["yaw_rad.qbo"]
-
-
-if not forward(STEP_M):
-    raise RobotError("there is no room ahead to begin with")
-yaw_rad = looks()
-for step in range(STEPS):
-    seen = places()
-    across_m, up_m = seen[f"x_m.{who}"] - seen["x_m.qbo"], seen[f"y_m.{who}"] - seen["y_m.qbo"]
-    left_m = math.hypot(across_m, up_m) - near_m
-    towards_rad = math.atan2(up_m, across_m)
-    turn(towards_rad - yaw_rad)
-    yaw_rad = towards_rad
-    if left_m < THERE_M:
-        print("stands", round(left_m + near_m, 2), "m before", who)
-        robot.look([0.9, 0.0, 0.9], speed=0.4)
-        robot.say("Hello!")
+for attempt in range(tries):
+    progress(attempt / tries)
+    approach()
+    if near():
         break
-    progress(step / STEPS)
-    if not forward(min(STEP_M, left_m)):
-        print("something is in the way,", round(left_m + near_m, 2), "m before", who)
-        break
-    if left_m > TELLING_M:
-        yaw_rad = looks()
+left_m, facing_rad, _ = apart()
+if left_m <= near_m + NEAR_M:
+    print("stands", round(left_m, 2), "m before", who)
+    robot.say("Hello!")
 else:
-    print("did not get there; they keep going")
+    print("did not reach", who, "who keeps going;", round(left_m, 2), "m are left")
+turn(facing_rad - robot.state()["streams"]["odometry"]["values"]["yaw_rad"])
+robot.look([0.9, 0.0, 0.9], speed=0.4)
 robot.home(speed=0.4)

@@ -11,9 +11,9 @@ from device_agent.perception.grid import Floor, OccupancyGrid
 from device_agent.ports.driver import REST, Twist
 from device_agent.protocol.messages import StopLatch
 from device_agent.runtime import calls
-from device_agent.runtime import robot as robot_module
+from device_agent.runtime import errand as errand_module
 from device_agent.runtime.body import Body
-from device_agent.runtime.errand import EVERY_S, Errand, Place, Whereabouts, way
+from device_agent.runtime.errand import EVERY_S, PATIENCE_S, SHORT_PATIENCE_S, Errand, Place, Whereabouts, way
 from device_agent.runtime.lease import Refused
 from device_agent.runtime.robot import ScriptRobot
 from device_agent.runtime.room import Reading, Room
@@ -84,6 +84,41 @@ def test_somebody_who_stands_in_the_way_is_gone_around_or_waited_for() -> None:
     floor.blocked[:, 2] = True
     with pytest.raises(Refused, match="no free way"):
         way(floor, (0.5, 0.5), (4.5, 0.5))
+
+
+def test_a_refusal_names_the_nearest_place_that_has_a_way() -> None:
+    for goal, code, near in (((1.0, 0.0), "no_way", r"x_m -0\.\d+, y_m -?0\.0"), ((0.0, 0.3), "taken", r"y_m 0\.\d+")):
+        with pytest.raises(Refused, match=f"nearest place to go to is .*{near}") as refused:
+            Errand(goal, None, limits=LIMITS, radius_m=0.25).twist(Place(-1.0, 0.0, 0.0), room((-0.1, -2.0, 0.1, 2.0)))
+        assert refused.value.code == code
+    full = Floor(np.ones((5, 5), dtype=bool), (0.0, 0.0), 1.0)
+    with pytest.raises(Refused, match=r"or nobody has seen it$"):
+        way(full, (0.5, 0.5), (4.5, 0.5))
+
+
+def test_who_stands_too_near_to_something_leaves_it_for_the_nearest_free_place() -> None:
+    floor = Floor(np.zeros((40, 40), dtype=bool), (0.0, 0.0), 0.05)
+    floor.blocked[:, :6] = True
+    places = way(floor, (0.08, 1.0), (1.5, 1.0))
+    assert places[0] == pytest.approx((0.325, 1.025))
+    floor.blocked[:, :20] = True
+    with pytest.raises(Refused, match="no free way"):
+        way(floor, (0.08, 1.0), (1.5, 1.0))
+
+
+def test_a_way_leads_between_things_corner_by_corner() -> None:
+    floor = Floor(np.eye(6, dtype=bool)[::-1].copy(), (0.0, 0.0), 1.0)
+    floor.blocked[0, 5] = False
+    assert way(floor, (0.5, 0.5), (5.5, 5.5))[-1] == (5.5, 5.5)
+
+
+def test_a_place_that_is_taken_from_the_beginning_is_not_waited_for_long() -> None:
+    errand = Errand((1.0, 0.0), None, limits=LIMITS, radius_m=0.25)
+    taken = Refused("taken", "")
+    assert errand.patience_s(taken) == SHORT_PATIENCE_S
+    assert errand.patience_s(Refused("out_of_room", "")) == 0
+    errand.twist(Place(0.0, 0.0, 0.0), room())
+    assert errand.patience_s(taken) == PATIENCE_S
 
 
 def test_the_room_corrects_what_the_wheels_believe() -> None:
@@ -174,7 +209,8 @@ def test_a_robot_goes_to_a_place_and_rests_there() -> None:
 
 
 def test_who_cannot_see_the_room_or_waits_in_vain_says_so(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(robot_module, "PATIENCE_S", 0.15)
+    monkeypatch.setattr(errand_module, "PATIENCE_S", 0.15)
+    monkeypatch.setattr(errand_module, "SHORT_PATIENCE_S", 0.15)
     shut = room((0.5, -2, 0.7, 2))
     for ground, x_m, code in ((None, 1.0, "no_ground"), (shut, 0.6, "taken"), (room(), 9.0, "out_of_room")):
         toy = Toy(ground)

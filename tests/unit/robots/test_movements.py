@@ -61,7 +61,27 @@ class PlayedRobot:
     def state(self) -> dict[str, Any]:
         bench = self.bench
         position_rad = dict(zip(bench.names, bench.data.qpos[bench.qpos].tolist(), strict=True))
-        return {"position_rad": position_rad, "streams": heard(bench.type)}
+        streams = heard(bench.type)
+        if bench.type.base is not None:
+            streams["odometry"] = {"values": {"yaw_rad": self.place()[2]}, "age_s": 0.0}
+        return {"position_rad": position_rad, "streams": streams}
+
+    def place(self) -> tuple[float, float, float]:
+        """x, y [m], yaw [rad] of its base."""
+        base = self.bench.data.body(1)
+        return float(base.xpos[0]), float(base.xpos[1]), math.atan2(base.xmat[3], base.xmat[0])
+
+    def go_to(self, x_m: float, y_m: float, yaw_rad: float | None = None) -> None:
+        """Straight there: nothing stands in its scene. ``test_errands.py`` goes around things."""
+        x, y, yaw = self.place()
+        towards = math.atan2(y_m - y, x_m - x)
+        self._turn(towards - yaw)
+        self.drive(forward_m_s=0.2, duration_s=math.dist((x, y), (x_m, y_m)) / 0.2)
+        self._turn(0.0 if yaw_rad is None else yaw_rad - towards)
+
+    def _turn(self, angle_rad: float) -> None:
+        angle_rad = math.remainder(angle_rad, 2 * math.pi)
+        self.drive(turn_rad_s=math.copysign(0.5, angle_rad), duration_s=abs(angle_rad) / 0.5)
 
     def look(self, position_m: Sequence[float], speed: float = 0.5) -> None:
         assert len(position_m) == 3
@@ -125,9 +145,7 @@ class PlayedRoom:
     def latest(self, device: str, stream: str) -> dict[str, Any]:
         assert (device, stream) == ("perception", "positions")
         assert isinstance(self.robot, PlayedRobot)
-        base = self.robot.bench.data.body(1)
-        yaw_rad = math.atan2(base.xmat[3], base.xmat[0])
-        return whereabouts(self.robot.bench.type, base.xpos[0], base.xpos[1], yaw_rad)
+        return whereabouts(self.robot.bench.type, *self.robot.place())
 
 
 def play(path: Path, parameters: dict[str, Any]) -> PlayedRobot | WalkedRobot:
