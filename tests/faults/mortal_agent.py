@@ -34,8 +34,7 @@ from device_agent.runtime.outbox import Outbox
 from device_agent.runtime.room import Room
 from device_agent.runtime.shelf import Shelf
 from tests.support.jail import LateJail
-from tests.unit.agent.test_controller import robot_type
-from tests.unit.agent.test_device import ToyDriver
+from tests.support.toys import ToyDriver, robot_type
 
 TARGET_RAD = 1e-4
 """The elbow's target [rad] times this is the number of the command that moved it: so each move says whose it is."""

@@ -15,8 +15,8 @@ import pytest
 from device_agent.protocol import signing
 from device_agent.protocol.messages import AckStatus, CancelAction, Command, GrantLease, MoveJoints, RunMovement
 from tests.faults.mortal_agent import AGENT, DEVICE, SPACE, TARGET_RAD, Life
+from tests.support.bench import signed_movement
 from tests.support.brokers import ROOT
-from tests.unit.agent.test_device import signed_movement
 
 LIVES = 30
 """Lives on one journal, one after another; the last is not cut short."""

@@ -12,39 +12,14 @@ from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass, field
 
-from device_agent.protocol.messages import Joint, JointTarget, Mode, Setpoint, StopLatch
-from device_agent.protocol.robot_type import RobotType
+from device_agent.protocol.messages import JointTarget, Mode, Setpoint, StopLatch
 from device_agent.runtime.controller import Controller
 from device_agent.runtime.lease import Lease, LeaseGate, Refused
+from tests.support.toys import PERIOD_S, joint, robot_type
 
-PERIOD_S = 0.008
 HANDOVERS = 50
 """In one history, of one robot."""
-_JOINT = Joint(
-    name="elbow",
-    label="Elbow",
-    lower_rad=-3.0,
-    upper_rad=3.0,
-    max_velocity_rad_s=3.0,
-    max_acceleration_rad_s2=8.0,
-    max_jerk_rad_s3=80.0,
-    max_effort_nm=100.0,
-)
-_TYPE = RobotType(
-    type="toy",
-    label="Toy",
-    kind="robot",
-    version=1,
-    description="",
-    model="",
-    scene="",
-    driver="none",
-    period_ms=8,
-    joints=(_JOINT,),
-    frames=(),
-    home_rad={"elbow": 0.0},
-    braking_rad_s2=20.0,
-)
+_TYPE = robot_type(joints=[joint("elbow")])
 MakeGate = Callable[[int, int], LeaseGate]
 
 

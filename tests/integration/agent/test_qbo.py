@@ -11,7 +11,7 @@ from device_agent.drivers import load
 from device_agent.drivers.mujoco import WheeledDriver
 from device_agent.protocol import robot_type, topics
 from device_agent.protocol.messages import AckStatus, Measurements
-from tests.unit.agent.test_device import Bench, eventually
+from tests.support.bench import Bench, eventually
 from tests.unit.robots.folders import ROBOTS
 
 FOLDER = ROBOTS / "qbo"

@@ -14,8 +14,8 @@ from device_agent.protocol import codec, robot_type, topics
 from device_agent.protocol.messages import AckStatus, Measurements, Mode, MoveJoints, State
 from function_app.entrypoints.ingest import ingest, ingest_telemetry
 from tests.integration.functions.test_diagnostics import MINUTE, Pair, field, open_faults
+from tests.support.bench import Bench, eventually
 from tests.support.cloud import Cloud, Robot
-from tests.unit.agent.test_device import Bench, eventually
 from tests.unit.robots.folders import ROBOTS
 
 UR5 = robot_type.load(ROBOTS / "ur5")

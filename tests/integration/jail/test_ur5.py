@@ -10,7 +10,7 @@ import pytest
 from device_agent import drivers, geometry
 from device_agent.catalogue import ROBOTS, TYPES
 from device_agent.protocol.messages import AckStatus
-from tests.unit.agent.test_device import Bench
+from tests.support.bench import Bench
 
 UR5 = ROBOTS / "ur5"
 

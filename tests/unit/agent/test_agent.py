@@ -12,7 +12,7 @@ from device_agent.runtime.agent import Agent
 from device_agent.runtime.outbox import Outbox
 from device_agent.runtime.room import Room
 from device_agent.runtime.shelf import Shelf
-from tests.unit.agent.test_device import Bench, eventually
+from tests.support.bench import Bench, eventually
 
 
 class ToyLink:

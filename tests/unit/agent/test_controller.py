@@ -2,110 +2,11 @@
 
 import pytest
 
-from device_agent.ports.geometry import Geometry
-from device_agent.protocol.messages import Joint, JointTarget, Mode, Setpoint, StopLatch
-from device_agent.protocol.robot_type import Base, RobotType
-from device_agent.runtime.controller import Controller
+from device_agent.protocol.messages import Mode, StopLatch
 from device_agent.runtime.courses import Outcome
-from device_agent.runtime.lease import LeaseGate, Refused
-
-PERIOD_S = 0.008
-NAMES = ("shoulder", "elbow")
-
-
-def robot_type(base: Base | None = None) -> RobotType:
-    joints = tuple(
-        Joint(
-            name=name,
-            label=name,
-            lower_rad=-3.0,
-            upper_rad=3.0,
-            max_velocity_rad_s=3.0,
-            max_acceleration_rad_s2=8.0,
-            max_jerk_rad_s3=80.0,
-            max_effort_nm=100.0,
-        )
-        for name in NAMES
-    )
-    return RobotType(
-        type="toy",
-        label="Toy",
-        kind="robot",
-        version=1,
-        description="",
-        model="",
-        scene="",
-        driver="none",
-        period_ms=8,
-        joints=joints,
-        frames=(),
-        home_rad=dict.fromkeys(NAMES, 0.0),
-        braking_rad_s2=20.0,
-        base=base,
-    )
-
-
-class Rig:
-    """A controller with a clock of its own and an operator who answers the newest telemetry."""
-
-    def __init__(self, *, geometry: Geometry | None = None, base: Base | None = None, **gate: int) -> None:
-        self.controller = Controller(robot_type(base), LeaseGate(**gate), geometry=geometry)
-        self.controller.start_at([0.0, 0.0])
-        self.limited: set[str] = set()
-        self.now_s = 100.0
-        self.sequence = 0
-        self.velocities: list[float] = []
-
-    @property
-    def tick_ms(self) -> int:
-        return round(self.now_s * 1000)
-
-    def take(self, epoch: int, lease_s: float = 30.0) -> None:
-        self.controller.grant(epoch=epoch, holder="ann", lease_s=lease_s, now_s=self.now_s)
-        self.sequence = 0
-
-    def offer(self, epoch: int, elbow: float = 2.0, *, age_ms: int = 20, sequence: int | None = None) -> None:
-        self.sequence += 1
-        setpoint = Setpoint(
-            epoch=epoch,
-            sequence=self.sequence if sequence is None else sequence,
-            echo_tick_ms=self.tick_ms - age_ms,
-            sent_ms=1.0,
-            target=JointTarget(position_rad={"elbow": elbow}),
-        )
-        self.controller.offer(setpoint, now_s=self.now_s, tick_ms=self.tick_ms)
-
-    def run(self, seconds: float) -> Mode:
-        before = self.elbow
-        for _ in range(round(seconds / PERIOD_S)):
-            self.now_s += PERIOD_S
-            tick = self.controller.step(self.now_s)
-            self.limited |= set(tick.limited)
-            self.elbow = tick.position_rad[1]
-            self.velocities.append((self.elbow - before) / PERIOD_S)
-            before = self.elbow
-        return self.controller.mode
-
-    elbow = 0.0
-
-    def stream(self, epoch: int, seconds: float, elbow: float = 2.0, *, age_ms: int = 20) -> Mode:
-        mode = self.controller.mode
-        for _ in range(round(seconds / 0.024)):
-            self.offer(epoch, elbow, age_ms=age_ms)
-            mode = self.run(0.024)
-        return mode
-
-    def at_rest_after(self, limit_s: float) -> float:
-        start = self.now_s
-        while self.now_s - start < limit_s:
-            self.run(PERIOD_S)
-            if not self.controller.moving:
-                return self.now_s - start
-        pytest.fail(f"still moving after {limit_s} s")
-
-
-def lost(_: Refused) -> None:
-    pass
+from device_agent.runtime.lease import Refused
+from tests.support.rig import Rig, interruptions, lost
+from tests.support.toys import PERIOD_S
 
 
 def test_streamed_setpoints_move_the_device_and_end_at_the_target() -> None:
@@ -294,17 +195,6 @@ def test_a_move_that_cannot_be_is_refused_whole(position_rad: dict[str, float], 
     assert refused.value.code == code
     rig.run(0.5)
     assert not rig.controller.moving
-
-
-def interruptions() -> dict[str, object]:
-    return {
-        "stop": lambda rig: rig.controller.stop(StopLatch(by="bob", reason="", at_ms=1)),
-        "link": lambda rig: rig.controller.lost(Refused("link_lost", "the link is gone")),
-        "takeover": lambda rig: rig.take(2),
-        "release": lambda rig: rig.controller.release(epoch=1),
-        "expiry": lambda rig: rig.run(6.0),
-        "fault": lambda rig: rig.controller.fail("no answer"),
-    }
 
 
 @pytest.mark.parametrize("cause", interruptions())

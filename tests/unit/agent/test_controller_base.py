@@ -7,21 +7,12 @@ import pytest
 
 from device_agent.ports.driver import REST, Twist
 from device_agent.protocol.messages import StopLatch
-from device_agent.protocol.robot_type import Base
 from device_agent.runtime.base import BaseMotion
 from device_agent.runtime.courses import Drive, Outcome
 from device_agent.runtime.lease import Refused
 from device_agent.runtime.motion import MotionError
-from tests.unit.agent.test_controller import PERIOD_S, Rig, interruptions, lost
-
-BASE = Base(
-    max_linear_m_s=0.5,
-    max_angular_rad_s=1.0,
-    max_linear_acceleration_m_s2=0.8,
-    max_angular_acceleration_rad_s2=2.0,
-    braking_linear_m_s2=3.0,
-    braking_angular_rad_s2=6.0,
-)
+from tests.support.rig import Rig, interruptions, lost
+from tests.support.toys import BASE, PERIOD_S
 
 
 def twists(rig: Rig, seconds: float) -> list[Twist]:

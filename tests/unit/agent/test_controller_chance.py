@@ -14,9 +14,8 @@ from device_agent.ports.driver import Twist
 from device_agent.ports.geometry import Clearance, Sweep
 from device_agent.protocol.messages import JointTarget, Mode, Setpoint, StopLatch
 from device_agent.runtime.lease import Refused
-from tests.unit.agent.test_controller import PERIOD_S, Rig
-from tests.unit.agent.test_controller_base import BASE
-from tests.unit.agent.test_controller_limits import Wall
+from tests.support.rig import Rig, Wall
+from tests.support.toys import BASE, PERIOD_S
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence

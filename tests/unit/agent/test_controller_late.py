@@ -2,7 +2,8 @@
 
 import pytest
 
-from tests.unit.agent.test_controller import PERIOD_S, Rig
+from tests.support.rig import Rig
+from tests.support.toys import PERIOD_S
 
 LIMIT_S = 0.3
 FASTEST_RAD_S = 3.0

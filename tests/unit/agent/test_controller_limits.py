@@ -1,73 +1,22 @@
 """Limits for every source: nothing comes nearer than it may, and whoever is too near can still leave."""
 
 import math
-from collections.abc import Callable, Mapping, Sequence
-from itertools import pairwise
+from collections.abc import Sequence
 
 import msgspec
 import pytest
 from ruckig import InputParameter, Result, Ruckig, RuckigError, Trajectory
 
-from device_agent.ports.geometry import Clearance, Sweep, never
-from device_agent.protocol.messages import Mode, Pose
+from device_agent.ports.geometry import Sweep
+from device_agent.protocol.messages import Mode
 from device_agent.protocol.robot_type import Workspace
 from device_agent.runtime.courses import Outcome
 from device_agent.runtime.envelope import Envelope
 from device_agent.runtime.lease import Refused
 from device_agent.runtime.motion import Motion, MotionError, plan
 from device_agent.runtime.pace import Pace
-from tests.unit.agent.test_controller import PERIOD_S, Rig, lost, robot_type
-
-WALL_RAD = 1.0
-
-
-class Wall:
-    """An elbow, one metre long, before a wall; whoever is beyond it may only come back."""
-
-    frames: tuple[str, ...] = ()
-
-    def __init__(self, at_rad: float = WALL_RAD) -> None:
-        self.at_rad = at_rad
-
-    def poses(self, position_rad: Sequence[float]) -> Mapping[str, Pose]:
-        raise NotImplementedError
-
-    def clearance(self, position_rad: Sequence[float]) -> Clearance:
-        return Clearance(self.at_rad - position_rad[1], ("hand", "wall"))
-
-    def sweep(self, path_rad: Sequence[Sequence[float]]) -> Sweep:
-        rooms = [self.clearance(position).room_m for position in path_rad]
-        least = min(0.0, rooms[0]) - 1e-7
-        for leg, (begin, end) in enumerate(pairwise(rooms)):
-            if end < least:
-                share = (leg + (begin - least) / (begin - end)) / (len(rooms) - 1)
-                return Sweep(share, Clearance(end, ("hand", "wall")))
-        return Sweep(1.0)
-
-    def glance(self, start_rad: Sequence[float], end_rad: Sequence[float]) -> float:
-        return self.sweep([start_rad, end_rad]).share
-
-    def speed_m_s(self, velocity_rad_s: Sequence[float]) -> float:
-        return abs(velocity_rad_s[1])
-
-    def solve(self, frame: str, pose: Pose, start_rad: Sequence[float]) -> tuple[float, ...]:
-        raise NotImplementedError
-
-    def rates(
-        self, frame: str, twist: Sequence[float], position_rad: Sequence[float], *, tool: bool
-    ) -> tuple[float, ...]:
-        raise NotImplementedError
-
-    def plan(
-        self,
-        start_rad: Sequence[float],
-        goal_rad: Sequence[float],
-        *,
-        seed: int = 0,
-        within_s: float = 5.0,
-        ended: Callable[[], bool] = never,
-    ) -> tuple[tuple[float, ...], ...]:
-        raise NotImplementedError
+from tests.support.rig import WALL_RAD, Rig, Wall, lost
+from tests.support.toys import PERIOD_S, robot_type
 
 
 def test_a_streamed_arm_stops_before_the_wall_and_says_so() -> None:

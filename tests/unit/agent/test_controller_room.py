@@ -8,7 +8,7 @@ from device_agent.protocol.messages import Mode
 from device_agent.runtime.courses import Outcome
 from device_agent.runtime.lease import Refused
 from device_agent.runtime.restrictions import Restriction, Restrictions
-from tests.unit.agent.test_controller import Rig, lost
+from tests.support.rig import Rig, lost
 
 
 def test_the_strictest_of_several_sources_counts_until_it_is_lifted() -> None:

@@ -9,58 +9,14 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from device_agent.protocol.abilities import Mirror, Narrowing
-from device_agent.protocol.messages import Joint, JointTarget, Setpoint, StopLatch
-from device_agent.protocol.robot_type import RobotType
+from device_agent.protocol.messages import JointTarget, Setpoint, StopLatch
 from device_agent.runtime.controller import Controller
 from device_agent.runtime.couplings import Couplings
 from device_agent.runtime.courses import Outcome
 from device_agent.runtime.envelope import Envelope
 from device_agent.runtime.lease import LeaseGate, Refused
 from device_agent.runtime.motion import Motion
-
-PERIOD_S = 0.02
-NAMES = ("yaw", "pitch", "left", "right")
-RANGES = ((-2.0, 2.0), (-0.7, 0.5), (-1.0, 0.5), (-0.25, 0.5))
-SPEED = 4.0
-FACTOR = -0.5
-WIDE = ((-2.0, -0.4, 0.1), (-0.5, -0.7, 0.5), (0.5, -0.7, 0.5), (2.0, -0.4, 0.1))
-BENT = ((-2.0, -0.7, -0.3), (-0.4, -0.5, 0.1), (0.4, -0.2, 0.3), (2.0, 0.2, 0.5))
-"""No one pitch does for all yaws."""
-
-
-def head(table: tuple[tuple[float, float, float], ...] = WIDE) -> RobotType:
-    joints = tuple(
-        Joint(
-            name=name,
-            label=name,
-            lower_rad=lower,
-            upper_rad=upper,
-            max_velocity_rad_s=SPEED,
-            max_acceleration_rad_s2=10.0,
-            max_jerk_rad_s3=100.0,
-            max_effort_nm=5.0,
-        )
-        for name, (lower, upper) in zip(NAMES, RANGES, strict=True)
-    )
-    return RobotType(
-        type="head",
-        label="Head",
-        kind="robot",
-        version=1,
-        description="",
-        model="",
-        scene="",
-        driver="none",
-        period_ms=round(PERIOD_S * 1000),
-        joints=joints,
-        frames=(),
-        home_rad=dict.fromkeys(NAMES, 0.0),
-        braking_rad_s2=25.0,
-        streaming_speed=1.0,
-        mirrors=(Mirror(joint="right", of="left", factor=FACTOR),),
-        narrowing=(Narrowing(joint="pitch", by="yaw", table=table),),
-    )
+from tests.support.head import BENT, FACTOR, PERIOD_S, RANGES, SPEED, WIDE, head
 
 
 class Neck:

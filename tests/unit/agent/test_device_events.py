@@ -26,7 +26,7 @@ from device_agent.protocol.messages import (
     Twin,
 )
 from device_agent.runtime.interlocks import Interlock
-from tests.unit.agent.test_device import Bench, eventually
+from tests.support.bench import Bench, eventually
 
 
 @pytest.fixture

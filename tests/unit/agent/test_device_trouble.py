@@ -13,7 +13,8 @@ from device_agent.runtime import office
 from device_agent.runtime.journal import Journal, JournalError
 from device_agent.runtime.office import Office
 from device_agent.runtime.robot import ScriptRobot
-from tests.unit.agent.test_device import Bench, ToyDriver, eventually
+from tests.support.bench import Bench, eventually
+from tests.support.toys import ToyDriver
 
 MOVE = MoveJoints(position_rad={"elbow": 0.1}, speed=1.0)
 

@@ -17,8 +17,8 @@ from device_agent.runtime.errand import EVERY_S, PATIENCE_S, SHORT_PATIENCE_S, E
 from device_agent.runtime.lease import Refused
 from device_agent.runtime.robot import ScriptRobot
 from device_agent.runtime.room import Reading, Room
-from tests.unit.agent.test_controller import PERIOD_S, Rig, robot_type
-from tests.unit.agent.test_controller_base import BASE
+from tests.support.rig import Rig
+from tests.support.toys import BASE, PERIOD_S, robot_type
 
 LIMITS = Twist(0.3, 0.0, 1.5)
 

@@ -15,8 +15,8 @@ from device_agent.protocol.errors import ProtocolError
 from device_agent.protocol.messages import DriveTarget, JogTarget, JointTarget, Mode, Setpoint, StopLatch
 from device_agent.runtime.controller import Controller
 from device_agent.runtime.lease import LeaseGate, Refused
-from tests.unit.agent.test_controller import Rig, lost
-from tests.unit.agent.test_controller_base import BASE
+from tests.support.rig import Rig, lost
+from tests.support.toys import BASE
 
 UR5 = Path(__file__).parents[3] / "robots" / "ur5"
 KIND = robot_type.load(UR5)

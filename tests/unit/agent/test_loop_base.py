@@ -10,9 +10,8 @@ from device_agent.runtime.controller import Controller
 from device_agent.runtime.courses import Outcome
 from device_agent.runtime.lease import LeaseGate
 from device_agent.runtime.loop import ControlLoop
-from tests.unit.agent.test_controller import lost, robot_type
-from tests.unit.agent.test_controller_base import BASE
-from tests.unit.agent.test_device import ToyDriver
+from tests.support.rig import lost
+from tests.support.toys import BASE, ToyDriver, robot_type
 
 WITHIN_S = 20.0
 

@@ -6,7 +6,7 @@ import pytest
 from device_agent.runtime.motion import Motion
 from device_agent.runtime.score import Score
 from device_agent.runtime.way import Way
-from tests.unit.agent.test_couplings import head
+from tests.support.head import head
 
 
 def way_to(yaw: float) -> Way:

@@ -13,7 +13,7 @@ from device_agent.protocol.messages import Event
 from device_agent.runtime import outbox as module
 from device_agent.runtime.outbox import BUSY_RATE_HZ, RATE_HZ, Outbox
 from device_agent.runtime.shelf import Item, Shelf, ShelfError
-from tests.unit.agent.test_device import eventually
+from tests.support.bench import eventually
 
 ARM = "ts/v1/s/a/arm"
 LATE = ARM + "/late/joints"

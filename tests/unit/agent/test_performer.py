@@ -33,8 +33,8 @@ from device_agent.runtime.lease import Refused
 from device_agent.runtime.performer import Performer
 from device_agent.runtime.slack import Slack
 from device_agent.runtime.speaker import Speaker
-from tests.unit.agent.test_controller import robot_type
-from tests.unit.agent.test_device import Bench, ToyDriver, eventually
+from tests.support.bench import Bench, eventually
+from tests.support.toys import ToyDriver, robot_type
 
 WAIT_S = 0.3
 

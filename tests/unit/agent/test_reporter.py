@@ -16,8 +16,8 @@ from device_agent.protocol import codec, topics
 from device_agent.protocol.messages import Measurements, Stream
 from device_agent.runtime.interlocks import Interlock
 from device_agent.runtime.reporter import Reporter
-from tests.unit.agent.test_controller import robot_type
-from tests.unit.agent.test_device import Bench, ToyDriver, eventually
+from tests.support.bench import Bench, eventually
+from tests.support.toys import ToyDriver, robot_type
 from tests.unit.agent.test_robot import play
 
 WITHIN_S = 15.0

@@ -40,9 +40,9 @@ from device_agent.runtime.controller import Controller
 from device_agent.runtime.lease import LeaseGate, Refused
 from device_agent.runtime.robot import ScriptRobot
 from device_agent.runtime.room import Room
+from tests.support.bench import Bench, eventually
 from tests.support.jail import LACK, NoJail
-from tests.unit.agent.test_controller import robot_type
-from tests.unit.agent.test_device import Bench, ToyDriver, eventually
+from tests.support.toys import ToyDriver, robot_type
 
 
 class AbleDriver(ToyDriver):

@@ -38,7 +38,7 @@ from device_agent.protocol.room import RoomDevice
 from device_agent.runtime.instrument import Instrument
 from device_agent.runtime.interlocks import Interlock
 from device_agent.runtime.room import Room
-from tests.unit.agent.test_device import Bench, eventually, shown
+from tests.support.bench import Bench, eventually, shown
 
 JPEG = b"\xff\xd8 a picture \xff\xd9"
 ENTRY = RoomDevice(

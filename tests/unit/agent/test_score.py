@@ -14,7 +14,7 @@ from device_agent.runtime import mouth
 from device_agent.runtime.envelope import Envelope
 from device_agent.runtime.score import Line, Score
 from device_agent.runtime.way import Way
-from tests.unit.agent.test_couplings import BENT, RANGES, head
+from tests.support.head import BENT, RANGES, head
 
 HOME = (0.0, 0.0, 0.0, 0.0)
 NAMES = ("yaw", "pitch", "left")

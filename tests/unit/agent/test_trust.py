@@ -11,7 +11,7 @@ from device_agent.protocol.messages import SHIPPED, RunMovement
 from device_agent.runtime.journal import Journal
 from device_agent.runtime.lease import Refused
 from device_agent.runtime.trust import Trust
-from tests.unit.agent.test_device import signed_movement
+from tests.support.bench import signed_movement
 
 OWNER, OTHER = "accountaaaaaaaaa", "accountbbbbbbbbb"
 KEY = signing.generate()

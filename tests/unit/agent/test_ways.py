@@ -16,8 +16,8 @@ from device_agent.runtime.courses import Outcome
 from device_agent.runtime.lease import Refused
 from device_agent.runtime.routes import Routes, quaternion_of
 from device_agent.runtime.way import Floats, Way
-from tests.unit.agent.test_controller import PERIOD_S, Rig, interruptions, lost, robot_type
-from tests.unit.agent.test_controller_limits import Wall
+from tests.support.rig import Rig, Wall, interruptions, lost
+from tests.support.toys import PERIOD_S, robot_type
 
 JOINTS = robot_type().joints
 CORNER = [[0.0, 0.0], [1.2, 0.0], [1.2, 1.0]]
