@@ -15,9 +15,9 @@ from device_agent.runtime.instrument import Instrument
 from device_agent.sensors.mujoco import meters
 from function_app.entrypoints.ingest import ingest, ingest_telemetry
 from tests.integration.functions.test_diagnostics import MINUTE, diagnostics, open_faults
+from tests.support.bench import Bench, eventually
 from tests.support.cloud import Cloud, Person, Robot
 from tests.support.rooms import LAB, StillWorld
-from tests.unit.agent.test_device import Bench, eventually
 
 WINDOW_S = 10.0
 HURRY = 20.0
