@@ -9,6 +9,10 @@ NODE = PATH="$(if $(wildcard $(BIN)/npm),$(CURDIR)/$(BIN):)$$PATH" npm
 NPM = $(NODE) --prefix web
 
 SECONDS_EACH ?= 60
+# Most tests wait for processes of their own, so three run side by side on two cores; a file's tests stay together.
+SIDE_BY_SIDE = -n 3 --dist loadfile --no-loadscope-reorder
+# Those run one at a time that have a browser or a robot in motion before them, or an answer that must come in time.
+ALONE = tests/api tests/e2e tests/faults
 
 .PHONY: help up link env console test test-long coverage fuzz check contract requirements clean
 .DELETE_ON_ERROR:
@@ -80,7 +84,8 @@ web/dist/index.html: web/node_modules/.installed web/index.html web/package.json
 test: .venv/.dev console check tests/azurite/node_modules/.installed .venv/.azure-worker coverage
 	@tests/system-packages
 	@$(NPM) test --silent
-	@$(BIN)/python -m pytest -m "not long" --ignore tests/unit/agent
+	@$(BIN)/python -m pytest -m "not long" $(SIDE_BY_SIDE) --ignore tests/unit/agent $(ALONE:%=--ignore %)
+	@$(BIN)/python -m pytest -m "not long" $(ALONE)
 
 test-long: .venv/.dev console check tests/azurite/node_modules/.installed .venv/.azure-worker coverage
 	@tests/system-packages
@@ -88,7 +93,7 @@ test-long: .venv/.dev console check tests/azurite/node_modules/.installed .venv/
 	@$(BIN)/python -m pytest
 
 coverage: .venv/.dev
-	@$(BIN)/python -m pytest -q tests/unit/agent -m "not long" --cov=device_agent/runtime --cov-branch \
+	@$(BIN)/python -m pytest -q tests/unit/agent -m "not long" $(SIDE_BY_SIDE) --cov=device_agent/runtime --cov-branch \
 		--cov-report=term-missing:skip-covered --cov-fail-under=100
 
 fuzz: .venv/.dev

@@ -55,7 +55,7 @@ class TestEnroll:
     @pytest.mark.parametrize(
         "claims",
         [
-            {"key": signing.generate()},
+            pytest.param({"key": signing.generate()}, id="another key"),
             {"aud": "telescope/session"},
             {"aud": None},
             {"iss": "telescope"},
