@@ -11,10 +11,12 @@ class Kind(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
 
     Attributes:
         name: As the positions call it; of several at a time the others are ``person_2``, ``person_3`` …
-        lowest_m: Height above the floor at which it is recognised [m]; ``highest_m``: the same.
+        lowest_m: How high it is at least, sitting or crouching [m]; ``highest_m``: at most. Kinds may overlap: where
+            they do, it tells them apart where each was last, and began.
         radius_m: From its middle to the side that sensors see [m].
         fastest_m_s: How fast it goes [m/s]; it gets there in about a second.
         several: Whether there may be more than one.
+        start_m: x, y where it was put at the beginning [m]; ``None`` where nobody knows.
     """
 
     name: str
@@ -23,6 +25,7 @@ class Kind(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     radius_m: float
     fastest_m_s: float = 1.5
     several: bool = False
+    start_m: tuple[float, float] | None = None
 
     def __post_init__(self) -> None:
         if not 0 <= self.lowest_m < self.highest_m or self.radius_m < 0 or self.fastest_m_s <= 0:

@@ -133,7 +133,7 @@ class Sight:
             seen = views.points(image, depth_m[new], lines[new])
             seen = self._within(seen[(seen[:, 2] > FLOOR_M) & (seen[:, 2] < self._tallest_m)])
             with self._lock:
-                self._share(seen, np.asarray(image.position_m[:2], dtype=np.float64), image.taken_s)
+                self._share(sensor, seen, np.asarray(image.position_m[:2], dtype=np.float64), image.taken_s)
 
     def _within(self, points_m: Floats) -> Floats:
         low_x, low_y, high_x, high_y = self.inside
@@ -153,13 +153,13 @@ class Sight:
         counted = (above | (np.abs(seen_m[:, 2]) < FLOOR_M)) & (away < MAPPED_M)
         self.grid.see_points(sensor, seen_m[counted, :2], above[counted])
 
-    def _share(self, seen_m: Floats, from_m: Floats, at_s: float) -> None:
+    def _share(self, sensor: str, seen_m: Floats, from_m: Floats, at_s: float) -> None:
         """Points of robots that are fixed somewhere are theirs, unless they are of somebody who came there."""
         free = np.ones(len(seen_m), dtype=bool)
         for mounted in self._mounted:
             own = free & mounted.own(seen_m)
             own[own] = ~_on_legs(seen_m[own], seen_m[seen_m[:, 2] < mounted.mount.lowest_m - BELOW_M])
-            mounted.see(seen_m[own], from_m, at_s)
+            mounted.see(sensor, seen_m[own], from_m, at_s)
             free &= ~own
         self._tracks.see("depth", seen_m[free], from_m, at_s)
 

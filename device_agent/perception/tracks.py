@@ -37,6 +37,8 @@ NAMING_LOOKS = 5
 """How often its height must be seen before it has a name."""
 TRAVEL_M = 0.4
 """How far it must go to count when only a lidar sees it: what the room's survey missed stands still [m]."""
+AROUND_M, ANYWHERE_M = 0.3, 3.0
+"""Standard deviation of where somebody is who was seen just now, and of who may have gone anywhere in the room [m]."""
 WALKING_M_S = 0.12
 """From this speed on its way says where it looks [m/s]."""
 WALKED_M = 0.15
@@ -184,6 +186,7 @@ class Tracks:
     kinds: Sequence[Kind]
     quiet: Sequence[Box] = ()
     all: list[Track] = field(default_factory=list)
+    _began_s: float = field(default=math.inf, init=False)
 
     def see(self, sense: Sense, points_m: Floats, from_m: Floats, at_s: float) -> None:
         """Take in one look of one sensor.
@@ -194,6 +197,7 @@ class Tracks:
             from_m: x, y of the sensor, shape (2,) [m].
             at_s: When [s].
         """
+        self._began_s = min(self._began_s, at_s)
         for track in self.all:
             track.advance(at_s)
         found: dict[int, list[Floats]] = {}
@@ -286,15 +290,24 @@ class Tracks:
                 min(same, key=lambda track: track.number).number = 1
 
     def _name(self, now_s: float) -> None:
-        """Give a name to whoever has been seen well enough: the kind that fits its height best."""
+        """Give a name to whoever has been seen well enough: the kind that fits best its height and where it is."""
         for track in self.all:
             if track.kind is not None and track.kind.beyond_m(track.height_m) > DOUBTFUL_M:
                 track.kind, track.number, track.heights = None, 1, 0
-        for track in [one for one in self.all if one.kind is None and one.heights >= NAMING_LOOKS]:
-            fitting = [kind for kind in self.kinds if kind.misfit(track.height_m) <= 1 and self._free(kind, now_s)]
-            if not fitting:
+        new = [one for one in self.all if one.kind is None and one.heights >= NAMING_LOOKS]
+        # The surest first: who sits where NAO was is NAO, and then who is left may be Qbo.
+        for _, track, kind in sorted(
+            (
+                (self._strangeness(track, kind, now_s), track, kind)
+                for track in new
+                for kind in self.kinds
+                if kind.misfit(track.height_m) <= 1
+            ),
+            key=lambda entry: entry[0],
+        ):
+            if track.kind is not None or not self._free(kind, now_s):
                 continue
-            track.kind = min(fitting, key=lambda kind: kind.misfit(track.height_m))
+            track.kind = kind
             before = self._lost(track, now_s)
             if before is not None:
                 track.number = before.number
@@ -302,6 +315,21 @@ class Tracks:
                 taken = {one.number for one in self.all if one is not track and one.kind == track.kind}
                 track.number = min(set(range(1, len(self.all) + 2)) - taken)
             self.all = [one for one in self.all if one is not before]
+
+    def _strangeness(self, track: Track, kind: Kind, now_s: float) -> float:
+        """How much there is against a track's being of a kind: how high it is, how far from where that was last.
+
+        Negative logarithm of how likely it is, but for a constant: whoever was last seen long ago may be anywhere.
+        """
+        strange = kind.misfit(track.height_m) ** 2 / 2
+        last = next((one for one in self.all if one.kind == kind), None)
+        if kind.several or (last is None and kind.start_m is None):
+            return strange + 2 * math.log(ANYWHERE_M)
+        place = last.state[:2] if last is not None else np.array(kind.start_m)
+        missed_s = now_s - (last.seen_s if last is not None else self._began_s)
+        spread_m = min(ANYWHERE_M, AROUND_M + kind.fastest_m_s * missed_s)
+        away_m = float(np.hypot(*(track.state[:2] - place)))
+        return strange + away_m**2 / (2 * spread_m**2) + 2 * math.log(spread_m)
 
     def _free(self, kind: Kind, now_s: float) -> bool:
         """Whether somebody may be this: one that there is once is not in two places."""

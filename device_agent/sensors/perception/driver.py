@@ -9,7 +9,7 @@ from typing import NoReturn
 
 import msgspec
 import numpy as np
-from msgspec import Struct
+from msgspec import Struct, field
 
 from device_agent.perception import picture
 from device_agent.perception.grid import OccupancyGrid
@@ -43,6 +43,24 @@ _STOP_TIMEOUT_S = 5.0
 _DIGITS = 3
 
 
+class _Kind(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """A ``Kind`` without the place where it begins, which is the robot's in the room's manifest."""
+
+    name: str
+    lowest_m: float
+    highest_m: float
+    radius_m: float
+    fastest_m_s: float = 1.5
+    several: bool = False
+
+    def __post_init__(self) -> None:
+        self.begins(None)  # which says what is wrong
+
+    def begins(self, start_m: tuple[float, float] | None) -> Kind:
+        """It, where it begins."""
+        return Kind(**msgspec.structs.asdict(self), start_m=start_m)
+
+
 class _Mount(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """A ``Mount`` without the place, which is the robot's in the room's manifest."""
 
@@ -64,7 +82,7 @@ class Options(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
         kinds: Who may come into the room.
         mounts: Which of the room's robots are fixed to something.
         quiet: Boxes (lowest x, y, highest x, y [m]) in which nobody appears from nothing.
-        look_hz: How often it looks.
+        look_hz: How often it looks; ``seldom_hz``: the same of single lidars and cameras, where less will do.
         resolution_m: Side of a cell of the grid [m].
     """
 
@@ -72,15 +90,22 @@ class Options(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     cameras: tuple[str, ...] = ()
     light: str = ""
     survey: str = ""
-    kinds: tuple[Kind, ...] = ()
+    kinds: tuple[_Kind, ...] = ()
     mounts: tuple[_Mount, ...] = ()
     quiet: tuple[Box, ...] = ()
     look_hz: float = 6.0
+    seldom_hz: dict[str, float] = field(default_factory=dict)
     resolution_m: float = 0.05
 
     def __post_init__(self) -> None:
-        if not 0 < self.look_hz <= 50:  # noqa: PLR2004 - as for streams
-            raise ValueError("look_hz is above 0, and 50 at most")
+        if not all(0 < rate_hz <= 50 for rate_hz in (self.look_hz, *self.seldom_hz.values())):  # noqa: PLR2004 - as for streams
+            raise ValueError("look_hz and seldom_hz are above 0, and 50 at most")
+        eyes = (*self.lidars, *self.cameras)
+        for name in self.seldom_hz:
+            if name not in eyes:
+                raise ValueError(
+                    f"seldom_hz names '{name}', with which it does not look; it does with: {', '.join(eyes)}"
+                )
         if not 0.01 <= self.resolution_m <= 1:  # noqa: PLR2004 - cells of a useful size
             raise ValueError("resolution_m lies between 0.01 and 1")
 
@@ -108,7 +133,7 @@ class PerceptionDriver:
         self._stopping = threading.Event()
         self._life = threading.Lock()
         self._looked_s = -np.inf
-        self._coloured_s: dict[str, float] = {}
+        self._next_s: dict[str, float] = {}
         self._blind: dict[str, str] = {}
 
     # ------------------------------------------------------------ RoomDriver
@@ -203,7 +228,7 @@ class PerceptionDriver:
                 plan=(low_x, low_y, high_x, high_y),
             ),
             survey=self._survey(),
-            kinds=self._options.kinds,
+            kinds=self._kinds(room),
             mounts=self._mounts(room),
             zones=[Zone(zone.name, (*zone.lower_m[:2], *zone.upper_m[:2])) for zone in room.zones],
             quiet=self._options.quiet,
@@ -224,6 +249,14 @@ class PerceptionDriver:
             why = "; ".join(sorted(self._blind.values())) or "its sensors say nothing"
             raise SensorError(f"'{self._device.name}' sees nothing: {why}")
         return sight
+
+    def _kinds(self, room: Room) -> list[Kind]:
+        """Robots that move begin where the manifest puts them."""
+        found = []
+        for kind in self._options.kinds:
+            robot = room.robot(kind.name)
+            found.append(kind.begins(None if robot is None else (robot.position_m[0], robot.position_m[1])))
+        return found
 
     def _mounts(self, room: Room) -> list[Mount]:
         found = []
@@ -280,8 +313,11 @@ class PerceptionDriver:
             self._stopping.wait(due_s - now_s)
 
     def _look(self, sight: Sight, name: str) -> None:
-        if time.monotonic() - self._coloured_s.get(name, -np.inf) < COLOURS_EVERY_S:
+        now_s = time.monotonic()
+        if now_s < self._next_s.get(name, -np.inf):
             return
+        if name in self._options.seldom_hz:
+            self._next_s[name] = now_s + 1.0 / self._options.seldom_hz[name]
         try:
             raw = self._neighbours[name].raw()
             if raw is None:
@@ -299,7 +335,7 @@ class PerceptionDriver:
             self._blind.pop(name, None)
             self._looked_s = time.monotonic()
             if isinstance(raw, Image) and raw.depth_m is None:
-                self._coloured_s[name] = self._looked_s
+                self._next_s[name] = self._looked_s + COLOURS_EVERY_S
 
     def _lacks(self, what: str, name: str, known: tuple[str, ...]) -> NoReturn:
         there = ", ".join(known) or "none"
