@@ -22,9 +22,9 @@ from device_agent.runtime.robot import ScriptRobot
 from device_agent.runtime.room import Reading, Room
 from device_agent.sensors.mujoco import cameras, view
 from device_agent.sensors.perception.driver import _flat
-from tests.support.rooms import STEP_S, StillWorld
-from tests.unit.perception.test_lab import PERIOD_S as LOOK_S
-from tests.unit.perception.test_lab import Watched
+from tests.support.rooms import STEP_S
+from tests.unit.perception.lab import EYES, Watched
+from tests.unit.perception.lab import PERIOD_S as LOOK_S
 from tests.unit.robots.folders import ROBOTS
 
 QBO = robot_type.load(ROBOTS / "qbo")
@@ -77,7 +77,7 @@ class Laboratory:
     """Qbo in its room, with driver, controller and errands; the person walks, the room looks five times a second."""
 
     def __init__(self, *, settle_s: float = 3.0) -> None:
-        self.watched = Watched(StillWorld())
+        self.watched = Watched()
         world = self.watched.world.world
         self.driver = WheeledDriver(robot_type=QBO, world=world, device="qbo", prefix=worlds.prefix("qbo"))
         self.driver._resolve(world.model)
@@ -145,7 +145,7 @@ class Laboratory:
 
     def look(self) -> None:
         now_s = self.looked_s = self.now_s
-        for name in ("lidar", "depth"):
+        for name in EYES:
             self.watched.sight.see(name, self.watched.raw(name))
         self.watched.sight.settle(now_s)
         told = _flat(self.watched.sight.places(now_s))
