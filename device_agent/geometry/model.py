@@ -10,8 +10,10 @@ import mujoco
 import numpy as np
 import numpy.typing as npt
 
+from device_agent.geometry.bounds import Bounds
 from device_agent.geometry.pairs import ROOM_PREFIX, Pairs
 from device_agent.geometry.planner import Planner
+from device_agent.geometry.planning import PlanningProcess, Site
 from device_agent.geometry.probe import Probe
 from device_agent.geometry.solver import Solver
 from device_agent.geometry.standing import Standing
@@ -60,7 +62,9 @@ class MujocoGeometry:
         self._pairs.calibrate(self._probe.data, self._probe.place, home=self._home, lower=lower, upper=upper)
         self._probe = Probe(self._model, self._qpos, self._pairs, self._ties, self._home)
         self._solver = Solver(self._model, self._qpos, self._frames, lower=lower, upper=upper)
-        self._planner = Planner(self._model, joints, self._pairs, self._ties, lower=lower, upper=upper)
+        bounds = Bounds(robot_type)
+        self._planner = Planner(self._model, joints, self._pairs, self._ties, bounds)
+        self._planning = PlanningProcess(Site.of(robot_type, scene, standing))
 
     @property
     def frames(self) -> tuple[str, ...]:
@@ -134,12 +138,23 @@ class MujocoGeometry:
         within_s: float = 5.0,
         ended: Callable[[], bool] = never,
     ) -> tuple[tuple[float, ...], ...]:
-        """A way around what is near.
+        """A way around what is near, looked for in a process of its own.
 
         Raises:
             GeometryError: None was found in time, or there is no room at its end.
+            PlannerLostError: That process has ended or does not answer.
         """
-        return self._planner.plan(start_rad, goal_rad, seed=seed, within_s=within_s, ended=ended)
+        return self._planning.plan(start_rad, goal_rad, seed=seed, within_s=within_s, ended=ended)
+
+    def plan_here(
+        self, start_rad: Sequence[float], goal_rad: Sequence[float], *, seed: int, within_s: float
+    ) -> tuple[tuple[float, ...], ...]:
+        """The same in this process, which it keeps busy.
+
+        Raises:
+            GeometryError: As ``plan`` does.
+        """
+        return self._planner.plan(start_rad, goal_rad, seed=seed, within_s=within_s)
 
     # ------------------------------------------------------------ positions and names
 

@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from device_agent.geometry.bounds import Bounds
 from device_agent.geometry.pairs import Pairs
 from device_agent.geometry.probe import Probe
 from device_agent.mjcf.ties import Ties
@@ -25,8 +26,6 @@ _STRETCH_RAD = 0.8
 """The longest step by which the trees grow."""
 _SHORTCUTS = 4
 """Rounds of making what was found shorter."""
-_NAP_S = 0.0005
-"""Control loops of the same process get their turn after each look: they come every few milliseconds."""
 _SAME_RAD = 1e-9
 
 
@@ -38,19 +37,16 @@ class Planner:
         joints: The joints' indices in the model.
         pairs: What may come near what; calibrated.
         ties: Which joints go with these.
-        lower: Of the joints [rad].
-        upper: Of the joints [rad].
+        bounds: Where the joints may be.
     """
 
-    def __init__(
-        self, model: Any, joints: Sequence[int], pairs: Pairs, ties: Ties, *, lower: Floats, upper: Floats
-    ) -> None:
+    def __init__(self, model: Any, joints: Sequence[int], pairs: Pairs, ties: Ties, bounds: Bounds) -> None:
         self._model = model
         self._joints = list(joints)
         self._qpos: Ints = np.array([model.jnt_qposadr[joint] for joint in joints], dtype=np.intp)
         self._pairs = pairs
         self._ties = ties
-        self._lower, self._upper = lower, upper
+        self._bounds = bounds
 
     def plan(
         self,
@@ -59,7 +55,6 @@ class Planner:
         *,
         seed: int,
         within_s: float,
-        ended: Callable[[], bool],
     ) -> tuple[tuple[float, ...], ...]:
         """See ``Geometry.plan``."""
         start, goal = np.array(start_rad, dtype=np.float64), np.array(goal_rad, dtype=np.float64)
@@ -68,22 +63,21 @@ class Planner:
         if there.room_m < min(0.0, probe.clearance(start).room_m):
             raise GeometryError(f"no room there: {there.text}, {-there.room_m * 1000:.0f} mm too near; choose another")
         roomy = Probe(self._model, self._qpos, self._pairs.widened(_WIDER), self._ties, start)
-        if _clear(roomy, start, goal):
+        search = _Search(roomy, self._bounds, start, goal)
+        if search.straight(start, goal):
             return _tuples([start, goal])
         moving = self._limbs(np.flatnonzero(np.abs(goal - start) > _SAME_RAD))
         deadline_s = time.monotonic() + within_s
         for detour_rad, share in ((_DETOUR_RAD, _NEAR_SHARE), (np.inf, 1.0)):
-            search = _Search(roomy, start, goal, moving)
-            search.between(
-                np.maximum(np.minimum(start, goal) - detour_rad, self._lower),
-                np.minimum(np.maximum(start, goal) + detour_rad, self._upper),
+            search.among(
+                moving,
+                np.maximum(np.minimum(start, goal) - detour_rad, self._bounds.lower),
+                np.minimum(np.maximum(start, goal) + detour_rad, self._bounds.upper),
             )
             until_s = time.monotonic() + share * (deadline_s - time.monotonic())
-            found = search.run(seed, lambda: ended() or time.monotonic() > until_s)  # noqa: B023 (asked before the next)
+            found = search.run(seed, lambda: time.monotonic() > until_s)  # noqa: B023 (asked before the next)
             if found is not None:
                 return _tuples(found)
-        if ended():
-            raise GeometryError("nobody waits for a way any more")
         raise GeometryError(
             f"found no way there in {within_s:.0f} s: something is in between; move to a place beside it first"
         )
@@ -95,7 +89,8 @@ class Planner:
         kept = [
             index
             for index, body in enumerate(bodies)
-            if any(body in above[other] or bodies[other] in above[index] for other in moved.tolist())
+            if index not in self._bounds.led
+            and any(body in above[other] or bodies[other] in above[index] for other in moved.tolist())
         ]
         return np.array(kept, dtype=np.intp)
 
@@ -108,28 +103,32 @@ class Planner:
 
 
 class _Search:
-    """One search with one probe.
+    """A search with one probe.
 
     Args:
         probe: Looks.
+        bounds: Where the joints may be.
         start: Where it begins, shape (n,) [rad].
         goal: Where it ends, shape (n,) [rad].
-        moving: The joints that may move, shape (k,).
     """
 
-    def __init__(self, probe: Probe, start: Floats, goal: Floats, moving: Ints) -> None:
+    def __init__(self, probe: Probe, bounds: Bounds, start: Floats, goal: Floats) -> None:
         from ompl import base, geometric, util  # noqa: PLC0415 (20 MB, for who asks for a plan only)
 
         util.noOutputHandler()
         self._base, self._geometric, self._random = base, geometric, util.RNG
-        self._probe = probe
-        self._start, self._goal, self._moving = start, goal, moving
-        self._space: Any = base.RealVectorStateSpace(len(moving))
+        self._probe, self._bounds = probe, bounds
+        self._start, self._goal = start, goal
+        self._spare = bounds.spare(start, goal)
+        self._moving: Ints = np.zeros(0, dtype=np.intp)
+        self._space: Any = None
 
-    def between(self, lower: Floats, upper: Floats) -> None:
-        """Look among these positions, shape (n,) [rad]."""
-        bounds = self._base.RealVectorBounds(len(self._moving))
-        bounds.low, bounds.high = lower[self._moving].tolist(), upper[self._moving].tolist()
+    def among(self, moving: Ints, lower: Floats, upper: Floats) -> None:
+        """Look among positions of the joints that may move, shape (k,), between two, shape (n,) [rad]."""
+        self._moving = moving
+        self._space = self._base.RealVectorStateSpace(len(moving))
+        bounds = self._base.RealVectorBounds(len(moving))
+        bounds.low, bounds.high = lower[moving].tolist(), upper[moving].tolist()
         self._space.setBounds(bounds)
 
     def run(self, seed: int, over: Callable[[], bool]) -> list[Floats] | None:
@@ -179,11 +178,19 @@ class _Search:
 
     def _valid(self, state: Any) -> bool:
         position = self._position(state)
-        return self._is_end(position) or self._probe.clear(position)
+        return self._is_end(position) or (
+            self._bounds.keeps(position, position, self._spare) and self._probe.clear(position)
+        )
 
     def _clear(self, begin: Any, end: Any) -> bool:
-        time.sleep(_NAP_S)
-        return _clear(self._probe, self._position(begin), self._position(end))
+        return self.straight(self._position(begin), self._position(end))
+
+    def straight(self, start: Floats, end: Floats) -> bool:
+        """Whether a straight way is clear; where an end has little room, its half has nowhere less."""
+        if not self._bounds.keeps(start, end, self._spare):
+            return False
+        middle = (start + end) / 2
+        return all(self._probe.sweep(np.array([one, middle])).clearance is None for one in (start, end))
 
     def _is_end(self, position: Floats) -> bool:
         return any(float(np.abs(position - end).max()) <= _SAME_RAD for end in (self._start, self._goal))
@@ -196,13 +203,8 @@ class _Search:
     def _position(self, state: Any) -> Floats:
         position = self._start.copy()
         position[self._moving] = state[0 : len(self._moving)]
+        self._bounds.tie(position)
         return position
-
-
-def _clear(probe: Probe, start: Floats, goal: Floats) -> bool:
-    """Whether a straight way is clear; where an end has little room, its half has nowhere less."""
-    middle = (start + goal) / 2
-    return all(probe.sweep(np.array([end, middle])).clearance is None for end in (start, goal))
 
 
 def _tuples(path: Sequence[Floats]) -> tuple[tuple[float, ...], ...]:

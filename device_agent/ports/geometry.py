@@ -15,6 +15,10 @@ class GeometryError(Exception):
     """The model cannot be used, or has no answer. Its text is fit for an operator."""
 
 
+class PlannerLostError(GeometryError):
+    """Whoever looks for ways has ended, or does not answer; asked again, another one does."""
+
+
 def never() -> bool:
     """It is always wanted."""
     return False
@@ -136,4 +140,5 @@ class Geometry(Protocol):
 
         Raises:
             GeometryError: None was found in time, or there is no room at its end; the text says so.
+            PlannerLostError: Whoever looks for it has ended or does not answer.
         """

@@ -5,10 +5,11 @@ from collections.abc import Callable, Mapping, Sequence
 
 import numpy as np
 
-from device_agent.ports.geometry import Geometry, GeometryError
+from device_agent.ports.geometry import Geometry, GeometryError, PlannerLostError
 from device_agent.protocol.messages import Pose, Quaternion, Vector3
 from device_agent.protocol.robot_type import RobotType
 from device_agent.runtime import way
+from device_agent.runtime.couplings import Couplings
 from device_agent.runtime.lease import Refused
 from device_agent.runtime.way import Floats, Way
 
@@ -36,6 +37,7 @@ class Routes:
         self._seed = seed
         self._type = robot_type
         self._geometry = geometry
+        self._couplings = Couplings(robot_type)
 
     def around(
         self, start_rad: Sequence[float], goal_rad: Sequence[float], *, speed: float, ended: Callable[[], bool]
@@ -49,13 +51,15 @@ class Routes:
             ended: Whether nobody wants it any more.
 
         Raises:
-            Refused: None was found.
+            Refused: None was found, or whoever looks for it has ended.
         """
         for seed in range(_SEEDS):
             try:
                 corners = self._geometry.plan(
                     start_rad, goal_rad, seed=self._seed + seed, within_s=_SEARCH_S, ended=ended
                 )
+            except PlannerLostError as error:
+                raise Refused("planner_lost", str(error)) from error
             except GeometryError as error:
                 raise Refused("no_way", str(error)) from error
             points = way.smooth(corners, self._clear)
@@ -107,7 +111,7 @@ class Routes:
         return way.timed(points, self._type.joints, speed=speed, step_s=self._type.period_ms / 1000)
 
     def _clear(self, path_rad: Floats) -> bool:
-        return self._geometry.sweep(path_rad.tolist()).clearance is None
+        return not self._couplings.parted(path_rad) and self._geometry.sweep(path_rad.tolist()).clearance is None
 
 
 def quaternion_of(

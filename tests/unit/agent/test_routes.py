@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from device_agent.geometry.model import MujocoGeometry
-from device_agent.ports.geometry import GeometryError
+from device_agent.ports.geometry import GeometryError, PlannerLostError
 from device_agent.protocol import robot_type
 from device_agent.runtime.controller import Controller
 from device_agent.runtime.courses import Outcome
@@ -124,6 +124,16 @@ def test_a_search_ends_when_its_time_is_over(shape: MujocoGeometry) -> None:
 def test_who_no_longer_wants_a_way_does_not_wait_for_it(shape: MujocoGeometry) -> None:
     with pytest.raises(GeometryError, match="nobody waits"):
         shape.plan(HOME, BEYOND, ended=lambda: True)
+
+
+def test_whoever_looks_for_a_way_may_be_lost(shape: MujocoGeometry, monkeypatch: pytest.MonkeyPatch) -> None:
+    def lost(*_: object, **__: object) -> None:
+        raise PlannerLostError("the program that looks for ways has ended; try again")
+
+    monkeypatch.setattr(shape, "plan", lost)
+    with pytest.raises(Refused, match="try again") as refused:
+        Routes(KIND, shape).around(HOME, BEYOND, speed=1.0, ended=lambda: False)
+    assert refused.value.code == "planner_lost"
 
 
 def test_the_same_seed_finds_the_same_way(shape: MujocoGeometry) -> None:
