@@ -6,7 +6,7 @@ import logging
 import sys
 from collections.abc import Sequence
 
-from function_app import bootstrap, settings
+from function_app import bootstrap, choices, settings
 from function_app.bootstrap import Functions
 from function_app.entrypoints.serve import PortTaken, serve
 from function_app.entrypoints.worker import check_models, work
@@ -36,7 +36,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     try:
         known = settings.read()
         if options.command == "prepare":
-            asyncio.run(bootstrap.prepare(known))
+            asyncio.run(choices.prepare(known))
             return 0
         functions = bootstrap.build(known)
         if options.command == "serve":

@@ -1,20 +1,15 @@
-"""Puts the functions together: the one place that picks adapters."""
+"""Puts the functions together: the adapters, of which settings make ``choices``, and the services on top of them."""
 
-import hashlib
 from dataclasses import dataclass
 
-from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
-
+from function_app import choices
 from function_app.adapters.local.blobs import FileBlobs
-from function_app.adapters.local.broker_access import MosquittoBrokerAccess, TokenBrokerAccess
 from function_app.adapters.local.catalogue import FolderCatalogue
 from function_app.adapters.local.clock import SystemClock
-from function_app.adapters.local.command_bus import MqttCommandBus
 from function_app.adapters.local.feed import MqttFeed, MqttLate, MqttTelemetry
 from function_app.adapters.local.keys import FileKeys
 from function_app.adapters.local.model_compiler import MujocoCompiler
 from function_app.adapters.local.orders import MqttOrders
-from function_app.adapters.local.tables import SqliteTables
 from function_app.domain.series import Keep
 from function_app.ports.blobs import Blobs, Transfers
 from function_app.ports.broker_access import BrokerAccess
@@ -71,12 +66,7 @@ from function_app.services.unpair import Unpair
 from function_app.services.upload_robot_type import UploadRobotType
 from function_app.services.uploads import Uploads
 from function_app.services.xmpp_access import XmppAccess
-from function_app.settings import AwsStore, AzureStore, EventGridBus, IotBus, Settings, SettingsError
-
-TABLES_FILE = "tables.sqlite"
-BLOBS_PATH = "/api/v1/blobs"
-"""Where the addresses of blobs in files lead to."""
-MOSQUITTO_SERVICE = "service"
+from function_app.settings import Settings, SettingsError
 
 
 @dataclass(frozen=True, slots=True)
@@ -148,23 +138,14 @@ def build(settings: Settings, *, clock: Clock | None = None) -> Functions:
     now = clock or SystemClock()
     keys = FileKeys(settings.home / "keys")
     private = keys.load()
-    tables, blobs = _stores(settings, private)
+    tables, blobs = choices.stores(settings, private)
     catalogue = FolderCatalogue(settings.robots)
 
     async def publish(topic: str, payload: bytes) -> None:
         await bus.publish(topic, payload)
 
-    access: TokenBrokerAccess | MosquittoBrokerAccess
-    if settings.broker == "amqtt":
-        access = TokenBrokerAccess(key=private, publish=publish)
-    else:
-        access = MosquittoBrokerAccess(
-            host=settings.mqtt_host,
-            port=settings.mqtt_port,
-            username=MOSQUITTO_SERVICE,
-            password_file=settings.home / "mosquitto" / "service.password",
-        )
-    bus = _bus(settings, access)
+    access = choices.access(settings, private, publish)
+    bus = choices.bus(settings, access)
     feed = MqttFeed(host=settings.mqtt_host, port=settings.mqtt_port, credentials=access.service_credentials)
     telemetry = MqttTelemetry(host=settings.mqtt_host, port=settings.mqtt_port, credentials=access.service_credentials)
     late = MqttLate(host=settings.mqtt_host, port=settings.mqtt_port, credentials=access.service_credentials)
@@ -365,72 +346,3 @@ def orders(functions: Functions) -> Orders:
     """What the broker brings for agents that a program of ours speaks for, not yet open."""
     settings = functions.settings
     return MqttOrders(host=settings.mqtt_host, port=settings.mqtt_port, access=functions.access)
-
-
-async def prepare(settings: Settings) -> None:
-    """Make what the store must have before its first use. Safe to repeat.
-
-    Only Amazon's needs it: a file, and Azure's tables and container, are made when first written to.
-
-    Raises:
-        StoreError: It cannot be made.
-    """
-    if isinstance(settings.store, AwsStore):
-        from function_app.adapters.aws.blobs import S3Blobs  # noqa: PLC0415
-        from function_app.adapters.aws.tables import DynamoTables  # noqa: PLC0415
-
-        for store in _stores(settings):
-            assert isinstance(store, DynamoTables | S3Blobs)  # noqa: S101 (the settings say so)
-            try:
-                await store.prepare()
-            finally:
-                await store.close()
-
-
-def _bus(settings: Settings, access: BrokerAccess) -> CommandBus:
-    """What publishes commands."""
-    match settings.bus:
-        case IotBus() as iot:
-            from function_app.adapters.aws.command_bus import IotCommandBus  # noqa: PLC0415 (only where it is in use)
-
-            return IotCommandBus(region=iot.region, endpoint=iot.endpoint)
-        case EventGridBus() as grid:
-            from function_app.adapters.azure.command_bus import EventGridCommandBus  # noqa: PLC0415
-
-            return EventGridCommandBus(endpoint=grid.endpoint, identity=grid.identity)
-        case None:
-            return MqttCommandBus(
-                host=settings.mqtt_host, port=settings.mqtt_port, credentials=access.service_credentials
-            )
-
-
-def _stores(settings: Settings, private: Ed25519PrivateKey | None = None) -> tuple[Tables, Blobs]:
-    """Tables and blobs. Of the clouds' adapters only the one in use is imported, and it its SDK only when needed."""
-    match settings.store:
-        case AzureStore() as azure:
-            from function_app.adapters.azure.blobs import AzureBlobs  # noqa: PLC0415
-            from function_app.adapters.azure.client import Place  # noqa: PLC0415
-            from function_app.adapters.azure.tables import AzureTables  # noqa: PLC0415
-
-            tables_place = Place(azure.connection, azure.tables_url, azure.identity)
-            blobs_place = Place(azure.connection, azure.blobs_url, azure.identity)
-            return (
-                AzureTables(place=tables_place, prefix=azure.prefix),
-                AzureBlobs(place=blobs_place, container=azure.container),
-            )
-        case AwsStore() as aws:
-            from function_app.adapters.aws.blobs import S3Blobs  # noqa: PLC0415
-            from function_app.adapters.aws.tables import DynamoTables  # noqa: PLC0415
-
-            return (
-                DynamoTables(table=aws.table, region=aws.region, endpoint=aws.endpoint),
-                S3Blobs(bucket=aws.bucket, region=aws.region, endpoint=aws.endpoint),
-            )
-        case None:
-            return SqliteTables(settings.home / TABLES_FILE), _files(settings, private)
-
-
-def _files(settings: Settings, private: Ed25519PrivateKey | None) -> FileBlobs:
-    """Blobs in files, whose addresses any instance with the same signing key makes and knows."""
-    key = None if private is None else hashlib.sha256(b"telescope/v1/blobs" + private.private_bytes_raw()).digest()
-    return FileBlobs(settings.home / "blobs", key=key, url=f"{settings.public_url}{BLOBS_PATH}")

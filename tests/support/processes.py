@@ -19,7 +19,7 @@ from unittest import mock
 
 from device_agent.protocol import codec, signing, topics
 from device_agent.protocol.messages import Command
-from function_app import bootstrap
+from function_app import bootstrap, choices
 from function_app.bootstrap import Functions
 from function_app.domain.devices import DeviceSpec
 from function_app.domain.ids import agent_id
@@ -138,15 +138,15 @@ class MortalTables:
 def open_functions(place: Place, *, dies_at: int | None = None, clock: SetClock | None = None) -> Functions:
     """An instance over the real store, with the noting bus in the broker's place."""
     death = Death(dies_at)
-    stores = bootstrap._stores
+    stores = choices.stores
 
     def cut(*given: Any) -> Any:
         tables, blobs = stores(*given)
         return MortalTables(tables, death), blobs
 
     with (
-        mock.patch.object(bootstrap, "_stores", cut),
-        mock.patch.object(bootstrap, "MqttCommandBus", return_value=NotingBus(place.sent, death)),
+        mock.patch.object(choices, "stores", cut),
+        mock.patch.object(choices, "MqttCommandBus", return_value=NotingBus(place.sent, death)),
     ):
         return bootstrap.build(read(place.environment), clock=clock or SetClock(place.now_ms))
 

@@ -1,7 +1,9 @@
 """What a world looked like at one moment."""
 
+import time
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -51,3 +53,50 @@ class Snapshot:
     def position_rad(self) -> dict[str, float]:
         """True position of every hinge [rad] and slide [m] by the joint's full name."""
         return {name: float(self.qpos[address]) for name, address in self.addresses.items()}
+
+
+def take(data: Any, *, passive_gravity: Floats, addresses: Mapping[str, int], lag_s: float, fault: str) -> Snapshot:
+    """A snapshot of now.
+
+    Args:
+        data: The world's ``MjData``.
+        passive_gravity: Share of gravity compensation that counts beside the motors' work, at each degree of freedom.
+        addresses: Full name of each joint → its place in ``qpos``.
+        lag_s: Simulated time lost so far [s].
+        fault: Why the world stands still.
+    """
+    arrays = [
+        np.array(source)
+        for source in (
+            data.qpos,
+            data.qvel,
+            data.qfrc_actuator + passive_gravity * data.qfrc_gravcomp,
+            data.ctrl,
+            data.xpos,
+            data.xquat,
+            data.site_xpos,
+            data.site_xmat,
+            data.mocap_pos,
+            data.mocap_quat,
+        )
+    ]
+    for array in arrays:
+        array.setflags(write=False)
+    qpos, qvel, effort, ctrl, xpos, xquat, site_xpos, site_xmat, mocap_pos, mocap_quat = arrays
+    return Snapshot(
+        time_s=float(data.time),
+        taken_s=time.monotonic(),
+        qpos=qpos,
+        qvel=qvel,
+        effort=effort,
+        ctrl=ctrl,
+        body_position_m=xpos,
+        body_quaternion=xquat,
+        site_position_m=site_xpos,
+        site_matrix=site_xmat,
+        mocap_position_m=mocap_pos,
+        mocap_quaternion=mocap_quat,
+        lag_ms=lag_s * 1000,
+        fault=fault,
+        addresses=addresses,
+    )

@@ -18,7 +18,7 @@ import numpy as np
 
 from device_agent.drivers.mujoco.assembly import SCALAR_JOINTS, TIMESTEP_S, Placement, assemble, at_home
 from device_agent.drivers.mujoco.ramps import Ramps, follow
-from device_agent.drivers.mujoco.snapshot import Floats, Ints, Snapshot
+from device_agent.drivers.mujoco.snapshot import Floats, Ints, Snapshot, take
 from device_agent.drivers.mujoco.trace import Trace
 from device_agent.ports.driver import DriverError
 from device_agent.ports.world import Process
@@ -329,42 +329,12 @@ class World:
                 self._fault = f"the simulation became unstable at {data.time:.3f} s ({name}) and was stopped"
 
     def _publish(self) -> None:
-        data = self._data
-        effort = data.qfrc_actuator + self._passive_gravity * data.qfrc_gravcomp
-        arrays = [
-            np.array(source)
-            for source in (
-                data.qpos,
-                data.qvel,
-                effort,
-                data.ctrl,
-                data.xpos,
-                data.xquat,
-                data.site_xpos,
-                data.site_xmat,
-                data.mocap_pos,
-                data.mocap_quat,
-            )
-        ]
-        for array in arrays:
-            array.setflags(write=False)
-        qpos, qvel, effort, ctrl, xpos, xquat, site_xpos, site_xmat, mocap_pos, mocap_quat = arrays
-        self._snapshot = Snapshot(
-            time_s=float(data.time),
-            taken_s=time.monotonic(),
-            qpos=qpos,
-            qvel=qvel,
-            effort=effort,
-            ctrl=ctrl,
-            body_position_m=xpos,
-            body_quaternion=xquat,
-            site_position_m=site_xpos,
-            site_matrix=site_xmat,
-            mocap_position_m=mocap_pos,
-            mocap_quaternion=mocap_quat,
-            lag_ms=self._lag_s * 1000,
-            fault=self._fault,
+        self._snapshot = take(
+            self._data,
+            passive_gravity=self._passive_gravity,
             addresses=self._addresses,
+            lag_s=self._lag_s,
+            fault=self._fault,
         )
 
     def _write_traces(self) -> None:

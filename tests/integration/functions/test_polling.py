@@ -273,7 +273,7 @@ def test_where_the_bus_hears_no_acks_confirmation_is_read_from_the_tables(
     import contextlib
     from collections.abc import AsyncIterator
 
-    from function_app import bootstrap
+    from function_app import choices
     from function_app.adapters.local.command_bus import MqttCommandBus
     from tests.support.cloud import paired
 
@@ -284,7 +284,7 @@ def test_where_the_bus_hears_no_acks_confirmation_is_read_from_the_tables(
 
     ingesting = open_cloud()
     ingesting.start_ingest()
-    monkeypatch.setattr(bootstrap, "MqttCommandBus", Deaf)
+    monkeypatch.setattr(choices, "MqttCommandBus", Deaf)
     cloud = open_cloud(clock=ingesting.clock)
     with paired(cloud) as (anna, robot):
         assert anna.take(robot.device, wait_ms=20_000).json()["confirmed"]

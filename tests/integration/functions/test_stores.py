@@ -12,7 +12,7 @@ import pytest
 
 from device_agent.protocol import codec, topics
 from device_agent.protocol.messages import AckStatus, Fault, Measurements, Mode, RunMovement, State, StopDevice
-from function_app import bootstrap
+from function_app import choices
 from function_app.entrypoints.ingest import ingest, ingest_telemetry
 from function_app.services.delete_robot_type import AFTER_MS
 from function_app.services.store import CONTROL
@@ -57,7 +57,7 @@ def store(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> Az
 def clouds(home: Path, broker: RunningBroker, store: AzureStore | AwsStore | None) -> Iterator[tuple[Cloud, Cloud]]:
     """Two instances; the ingest runs in the second."""
     chosen = replace(settings(home, broker), store=store)
-    asyncio.run(bootstrap.prepare(chosen))
+    asyncio.run(choices.prepare(chosen))
     with contextlib.ExitStack() as stack:
         one, other = (stack.enter_context(Cloud(chosen)) for _ in range(2))
         other.start_ingest()

@@ -9,7 +9,7 @@ from pathlib import Path
 import httpx
 import pytest
 
-from function_app import bootstrap, settings
+from function_app import choices, settings
 from infra.aws.__main__ import SERVICES
 from infra.aws.__main__ import main as package_for_aws
 from tests.support.aws import REGION, start_moto, use_credentials
@@ -88,7 +88,7 @@ def test_the_package_for_aws_answers_and_reaches_its_store(for_aws: Path, moto: 
         "AWS_ACCESS_KEY_ID": "testing",
         "AWS_SECRET_ACCESS_KEY": "testing",
     }
-    asyncio.run(bootstrap.prepare(settings.read(environment)))
+    asyncio.run(choices.prepare(settings.read(environment)))
     with start_lambda(environment, package=for_aws) as host:
         assert httpx.get(f"{host.url}{API}/health", timeout=PATIENCE_S).json()["tables"] == "ok"
         host.tick()

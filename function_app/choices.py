@@ -1,0 +1,107 @@
+"""The adapters that settings choose between: stores, the bus for commands, the broker's access.
+
+Of the clouds' adapters only the one in use is imported, and it its SDK only when needed.
+"""
+
+import hashlib
+from collections.abc import Awaitable, Callable
+
+from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
+
+from function_app.adapters.local.blobs import FileBlobs
+from function_app.adapters.local.broker_access import MosquittoBrokerAccess, TokenBrokerAccess
+from function_app.adapters.local.command_bus import MqttCommandBus
+from function_app.adapters.local.tables import SqliteTables
+from function_app.ports.blobs import Blobs
+from function_app.ports.broker_access import BrokerAccess
+from function_app.ports.command_bus import CommandBus
+from function_app.ports.tables import Tables
+from function_app.settings import AwsStore, AzureStore, EventGridBus, IotBus, Settings
+
+TABLES_FILE = "tables.sqlite"
+BLOBS_PATH = "/api/v1/blobs"
+"""Where the addresses of blobs in files lead to."""
+MOSQUITTO_SERVICE = "service"
+
+
+def stores(settings: Settings, private: Ed25519PrivateKey | None = None) -> tuple[Tables, Blobs]:
+    """Tables and blobs."""
+    match settings.store:
+        case AzureStore() as azure:
+            from function_app.adapters.azure.blobs import AzureBlobs  # noqa: PLC0415
+            from function_app.adapters.azure.client import Place  # noqa: PLC0415
+            from function_app.adapters.azure.tables import AzureTables  # noqa: PLC0415
+
+            tables_place = Place(azure.connection, azure.tables_url, azure.identity)
+            blobs_place = Place(azure.connection, azure.blobs_url, azure.identity)
+            return (
+                AzureTables(place=tables_place, prefix=azure.prefix),
+                AzureBlobs(place=blobs_place, container=azure.container),
+            )
+        case AwsStore() as aws:
+            from function_app.adapters.aws.blobs import S3Blobs  # noqa: PLC0415
+            from function_app.adapters.aws.tables import DynamoTables  # noqa: PLC0415
+
+            return (
+                DynamoTables(table=aws.table, region=aws.region, endpoint=aws.endpoint),
+                S3Blobs(bucket=aws.bucket, region=aws.region, endpoint=aws.endpoint),
+            )
+        case None:
+            return SqliteTables(settings.home / TABLES_FILE), _files(settings, private)
+
+
+def access(
+    settings: Settings, private: Ed25519PrivateKey, publish: Callable[[str, bytes], Awaitable[None]]
+) -> TokenBrokerAccess | MosquittoBrokerAccess:
+    """What gives and takes the broker's rights. ``publish``: how the embedded broker is told."""
+    if settings.broker == "amqtt":
+        return TokenBrokerAccess(key=private, publish=publish)
+    return MosquittoBrokerAccess(
+        host=settings.mqtt_host,
+        port=settings.mqtt_port,
+        username=MOSQUITTO_SERVICE,
+        password_file=settings.home / "mosquitto" / "service.password",
+    )
+
+
+def bus(settings: Settings, granted: BrokerAccess) -> CommandBus:
+    """What publishes commands."""
+    match settings.bus:
+        case IotBus() as iot:
+            from function_app.adapters.aws.command_bus import IotCommandBus  # noqa: PLC0415 (only where it is in use)
+
+            return IotCommandBus(region=iot.region, endpoint=iot.endpoint)
+        case EventGridBus() as grid:
+            from function_app.adapters.azure.command_bus import EventGridCommandBus  # noqa: PLC0415
+
+            return EventGridCommandBus(endpoint=grid.endpoint, identity=grid.identity)
+        case None:
+            return MqttCommandBus(
+                host=settings.mqtt_host, port=settings.mqtt_port, credentials=granted.service_credentials
+            )
+
+
+async def prepare(settings: Settings) -> None:
+    """Make what the store must have before its first use. Safe to repeat.
+
+    Only Amazon's needs it: a file, and Azure's tables and container, are made when first written to.
+
+    Raises:
+        StoreError: It cannot be made.
+    """
+    if isinstance(settings.store, AwsStore):
+        from function_app.adapters.aws.blobs import S3Blobs  # noqa: PLC0415
+        from function_app.adapters.aws.tables import DynamoTables  # noqa: PLC0415
+
+        for store in stores(settings):
+            assert isinstance(store, DynamoTables | S3Blobs)  # noqa: S101 (the settings say so)
+            try:
+                await store.prepare()
+            finally:
+                await store.close()
+
+
+def _files(settings: Settings, private: Ed25519PrivateKey | None) -> FileBlobs:
+    """Blobs in files, whose addresses any instance with the same signing key makes and knows."""
+    key = None if private is None else hashlib.sha256(b"telescope/v1/blobs" + private.private_bytes_raw()).digest()
+    return FileBlobs(settings.home / "blobs", key=key, url=f"{settings.public_url}{BLOBS_PATH}")
