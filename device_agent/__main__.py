@@ -1,4 +1,4 @@
-"""``python -m device_agent enroll|run|doctor|devices|import-model``: the agent's command line."""
+"""``python -m device_agent enroll|run|doctor|repin|devices|import-model``: the agent's command line."""
 
 import argparse
 import gc
@@ -92,6 +92,9 @@ def _parser() -> argparse.ArgumentParser:
     examine.add_argument("--json", action="store_true", help="for programs: one object with all findings")
     examine.set_defaults(command=_doctor)
 
+    repin = commands.add_parser("repin", help="trust the keys that the server signs with now, after a long absence")
+    repin.set_defaults(command=_repin)
+
     devices = commands.add_parser("devices", help="list this agent's devices, and known robot types, rooms and drivers")
     devices.set_defaults(command=_devices)
 
@@ -110,7 +113,7 @@ def _parser() -> argparse.ArgumentParser:
     )
     take_over.set_defaults(command=_import_model)
 
-    for command in (enroll, run, examine, devices):
+    for command in (enroll, run, examine, repin, devices):
         command.add_argument("--home", type=Path, default=default, help="the agent's folder (default: %(default)s)")
     return parser
 
@@ -199,13 +202,7 @@ def _await_claim(home: Home, api: CloudApi, configuration: Configuration, claim:
         found = api.enrollment(wait_s=_POLL_S if claim.code is not None else 0.0)
         if found.get("state") == "claimed":
             claimed = answers.read(found, answers.Claimed)
-            pairing = Pairing(
-                agent=claimed.agent,
-                space=claimed.space,
-                account=claimed.account.name,
-                owner=claimed.account.id,
-                keys={key.id: key.public for key in claimed.keys},
-            )
+            pairing = links.pairing_of(claimed)
             home.save_pairing(pairing)
             print(f"paired with {pairing.account}", flush=True)
             return pairing
@@ -303,6 +300,33 @@ def _doctor(options: argparse.Namespace) -> int:
     if options.json:
         print(msgspec.json.encode({"ok": good, "findings": found}).decode())
     return 0 if good else _EXIT_FAILED
+
+
+# ------------------------------------------------------------ repin
+
+
+def _repin(options: argparse.Namespace) -> int:
+    """As at the first enrolment, whoever is at the machine vouches for the server; the pairing stays as it is."""
+    home = Home(options.home)
+    with home.hold():
+        before = home.pairing()
+        if before is None:
+            raise HomeError("this agent is not paired, so it has pinned nothing; run `python -m device_agent enroll`")
+        found = bootstrap.api_of(home, home.configuration(), CloudClock()).enrollment()
+        if found.get("state") != "claimed":
+            raise HomeError("the agent was un-paired; `python -m device_agent run` shows a new claim code")
+        after = links.pairing_of(answers.read(found, answers.Claimed))
+        if after.serial < before.serial:
+            raise HomeError(
+                f"the server's newest key is number {after.serial}, older than number {before.serial}, which is pinned: "
+                "it is another server, or one put back to an old state. If you trust it, un-pair the agent there and "
+                "claim it again"
+            )
+        home.save_pairing(after)
+    for name in sorted(set(after.keys) - set(before.keys)):
+        print(f"pinned key {name}; `rotate-keys` has named it at the server")
+    print(f"obeys {len(after.keys)} of the server's keys, the newest number {after.serial}")
+    return 0
 
 
 # ------------------------------------------------------------ devices

@@ -25,6 +25,7 @@ from device_agent.runtime.home import Configuration, DeviceEntry, Home, HomeErro
 from device_agent.runtime.instrument import Instrument
 from device_agent.runtime.journal import Journal
 from device_agent.runtime.outbox import Outbox, Publish
+from device_agent.runtime.pins import Pins
 from device_agent.runtime.room import Room
 from device_agent.runtime.shelf import Shelf
 from device_agent.speech import Espeak
@@ -199,7 +200,8 @@ def build(home: Home, *, trace: Path | None = None) -> Cell:
     journal = Journal(home.journal)
     journal.open(now_ms=wall_ms())
     journal.end_open(now_ms=wall_ms(), tick_ms=tick_ms())
-    membership = links.Membership(pairing, configuration, enrolled_devices(configuration))
+    pins = Pins(pairing, save=home.save_pairing, now_ms=clock.now_ms)
+    membership = links.Membership(pairing, configuration, enrolled_devices(configuration), pins)
     room = Room(
         space=pairing.space,
         agent=pairing.agent,
@@ -229,6 +231,7 @@ def build(home: Home, *, trace: Path | None = None) -> Cell:
         devices[entry.name] = _device(
             entry,
             pairing,
+            pins=pins,
             instrument=instrument,
             ground=(lambda: _ground(neighbours)) if entry.room else None,
             journal=journal,
@@ -287,6 +290,7 @@ def _device(
     entry: DeviceEntry,
     pairing: Pairing,
     *,
+    pins: Pins,
     instrument: Instrument | None,
     ground: Callable[[], Ground | None] | None,
     journal: Journal,
@@ -310,7 +314,7 @@ def _device(
         driver=driver_of(entry, kind, trace=trace, faults=faults) if instrument is None else instrument,
         journal=journal,
         cloud_clock=clock,
-        keys=pairing.public_keys(),
+        keys=pins,
         publish=transport.publish,
         outbox=outbox,
         room=room,

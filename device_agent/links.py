@@ -12,6 +12,8 @@ from typing import Any
 from device_agent.ports.transport import Transport
 from device_agent.protocol import topics
 from device_agent.runtime.home import Configuration, HomeError, Pairing
+from device_agent.runtime.lease import Refused
+from device_agent.runtime.pins import Pins
 from device_agent.transports.http import answers
 from device_agent.transports.http.api import CloudApi, CloudError
 
@@ -55,10 +57,14 @@ class Membership:
         configuration: What the cloud is told of at the first connection, so that whoever edits ``agent.toml`` need not
             enroll again.
         devices: The devices as the cloud is told of them.
+        pins: Learn of the cloud's new keys whenever it is asked for something.
     """
 
-    def __init__(self, pairing: Pairing, configuration: Configuration, devices: list[dict[str, str]]) -> None:
+    def __init__(
+        self, pairing: Pairing, configuration: Configuration, devices: list[dict[str, str]], pins: Pins
+    ) -> None:
         self._pairing = pairing
+        self._pins = pins
         self._configuration = configuration
         self._devices = devices
         self._introduced = False
@@ -105,13 +111,23 @@ class Membership:
     def _ask(self, api: CloudApi, call: Callable[[], dict[str, Any]]) -> dict[str, Any]:
         try:
             self._introduce(api)
-            return call()
+            given = call()
+            self._learn(answers.read(given, answers.News))
         except CloudError as error:
             if error.code == "agent-unclaimed":
                 raise self._gone("this agent was un-paired") from error
             # The cloud has forgotten it, or never knew it: an introduction is what it understands then.
             self._introduced = self._introduced and error.code != "unauthorized"
             raise
+        return given
+
+    def _learn(self, news: answers.News) -> None:
+        """Follow the cloud to its new keys. A link is worth having also where that fails: Stop and what is measured."""
+        try:
+            self._pins.follow(news.key_statements)
+        except Refused as refused:
+            _log.error("the cloud's new key is not followed: %s", refused.message)
+        self._pins.check(news.signing_key)
 
     def _introduce(self, api: CloudApi) -> None:
         if self._introduced:
@@ -125,6 +141,19 @@ class Membership:
     def _gone(self, message: str) -> CloudError:
         self.outdated.set()
         return CloudError(message)
+
+
+def pairing_of(claimed: answers.Claimed) -> Pairing:
+    """What an agent pins that has been claimed."""
+    return Pairing(
+        agent=claimed.agent,
+        space=claimed.space,
+        account=claimed.account.name,
+        owner=claimed.account.id,
+        keys={key.id: key.public for key in claimed.keys},
+        serial=claimed.serial,
+        until_ms={key.id: key.until_ms for key in claimed.keys if key.until_ms},
+    )
 
 
 def names() -> tuple[str, ...]:

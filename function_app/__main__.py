@@ -1,4 +1,4 @@
-"""``python -m function_app serve|work|xmpp|check-models|prepare|sign-in-link``: the functions on one machine."""
+"""``python -m function_app serve|work|xmpp|check-models|prepare|rotate-keys|sign-in-link``: the functions here."""
 
 import argparse
 import asyncio
@@ -8,12 +8,18 @@ from collections.abc import Sequence
 
 from function_app import bootstrap, choices, settings
 from function_app.bootstrap import Functions
+from function_app.domain.times import rfc3339
 from function_app.entrypoints.serve import PortTaken, serve
 from function_app.entrypoints.worker import check_models, work
+from function_app.ports.keys import LEARN_MS, OVERLAP_MS, RotationRefused
 from function_app.ports.model_compiler import CompilerMissingError
 from function_app.ports.tables import StoreError
 
 _EXIT_FAILED = 1
+_MINUTE_MS = 60_000
+_HOUR_MS = 60 * _MINUTE_MS
+_LEAST_LEARN_MINUTES = 65
+_LEAST_OVERLAP_HOURS = 24
 _EXIT_TAKEN = 3
 
 
@@ -27,6 +33,24 @@ def main(arguments: Sequence[str] | None = None) -> int:
     commands.add_parser("prepare", help="make Amazon's table and bucket, where there are none")
     checks = commands.add_parser("check-models", help="compile uploaded robot types with MuJoCo, as `work` does too")
     checks.add_argument("--drain", action="store_true", help="end as soon as none is left")
+    rotate = commands.add_parser("rotate-keys", help="make a new signing key; the present one counts on for a while")
+    rotate.add_argument(
+        "--learn-minutes",
+        type=int,
+        default=LEARN_MS // _MINUTE_MS,
+        metavar="N",
+        help="orders to devices are signed with it after so long (default: %(default)s; at least 65)",
+    )
+    rotate.add_argument(
+        "--overlap-hours",
+        type=int,
+        default=OVERLAP_MS // _HOUR_MS,
+        metavar="N",
+        help="how long the present key counts beside it (default: %(default)s; at least 24)",
+    )
+    rotate.add_argument(
+        "--leaked", action="store_true", help="the present key ends at once; everybody signs in and every agent repins"
+    )
     link = commands.add_parser("sign-in-link", help="print a one-time sign-in link; makes the account if it is new")
     link.add_argument("--account", default="demo", help="name of the account (default: %(default)s)")
     options = parser.parse_args(arguments)
@@ -42,14 +66,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
         if options.command == "serve":
             asyncio.run(_check(functions))
             serve(functions)
-        elif options.command == "work":
-            asyncio.run(work(functions))
-        elif options.command == "xmpp":
-            asyncio.run(_speak(functions))
-        elif options.command == "check-models":
-            asyncio.run(_check_models(functions, drain=options.drain))
         else:
-            asyncio.run(_link(functions, options.account))
+            asyncio.run(_COMMANDS[options.command](functions, options))
     except PortTaken as taken:
         print(f"telescope functions: {taken}", file=sys.stderr)
         return _EXIT_TAKEN
@@ -67,14 +85,18 @@ async def _check(functions: Functions) -> None:
     await functions.tables.close()
 
 
-async def _check_models(functions: Functions, *, drain: bool) -> None:
+async def _work(functions: Functions, _: argparse.Namespace) -> None:
+    await work(functions)
+
+
+async def _check_models(functions: Functions, options: argparse.Namespace) -> None:
     try:
-        await check_models(functions, drain=drain)
+        await check_models(functions, drain=options.drain)
     finally:
         await functions.close()
 
 
-async def _speak(functions: Functions) -> None:
+async def _speak(functions: Functions, _: argparse.Namespace) -> None:
     from function_app.entrypoints.xmpp import speak  # noqa: PLC0415 (what it needs is not everywhere)
 
     try:
@@ -83,11 +105,46 @@ async def _speak(functions: Functions) -> None:
         raise settings.SettingsError(f"speaking XMPP needs the Python package {error.name}; run `make env`") from error
 
 
-async def _link(functions: Functions, account: str) -> None:
-    found = await functions.sign_in.account(account)
+async def _rotate(functions: Functions, options: argparse.Namespace) -> None:
+    learn_ms, overlap_ms = options.learn_minutes * _MINUTE_MS, options.overlap_hours * _HOUR_MS
+    if options.learn_minutes < _LEAST_LEARN_MINUTES or options.overlap_hours < _LEAST_OVERLAP_HOURS:
+        raise settings.SettingsError(
+            f"--learn-minutes must be {_LEAST_LEARN_MINUTES} or more (agents ask once an hour), --overlap-hours "
+            f"{_LEAST_OVERLAP_HOURS} or more (sign-ins live for 12)"
+        )
+    if learn_ms >= overlap_ms:
+        raise settings.SettingsError("--learn-minutes must be less than --overlap-hours")
+    try:
+        news = await functions.keys.rotate(learn_ms=learn_ms, overlap_ms=overlap_ms, leaked=options.leaked)
+    except RotationRefused as refused:
+        raise settings.SettingsError(
+            f"devices are still learning the last new key, until {rfc3339(refused.until_ms)}; wait, or say --leaked"
+        ) from refused
+    finally:
+        await functions.close()
+    new = news.pins[-1]
+    print(f"new key {new.id}, number {new.serial}")
+    if options.leaked:
+        print("all former keys have ended; sign in again, and run `python -m device_agent repin` at every agent")
+    else:
+        ends_ms = max(pin.until_ms for pin in news.pins)
+        print(f"orders to devices are signed with it in {options.learn_minutes} minutes; agents learn it until then")
+        print(f"the former key counts until {rfc3339(ends_ms)}; an agent that is off until then must `repin`")
+
+
+async def _link(functions: Functions, options: argparse.Namespace) -> None:
+    found = await functions.sign_in.account(options.account)
     print(f"{functions.settings.public_url}/#sign-in={await functions.sign_in.link(found)}")
     await functions.close()
 
+
+_COMMANDS = {
+    "work": _work,
+    "xmpp": _speak,
+    "check-models": _check_models,
+    "rotate-keys": _rotate,
+    "sign-in-link": _link,
+}
 
 if __name__ == "__main__":
     sys.exit(main())

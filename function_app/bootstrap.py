@@ -7,7 +7,6 @@ from function_app.adapters.local.blobs import FileBlobs
 from function_app.adapters.local.catalogue import FolderCatalogue
 from function_app.adapters.local.clock import SystemClock
 from function_app.adapters.local.feed import MqttFeed, MqttLate, MqttTelemetry
-from function_app.adapters.local.keys import FileKeys
 from function_app.adapters.local.model_compiler import MujocoCompiler
 from function_app.adapters.local.orders import MqttOrders
 from function_app.domain.series import Keep
@@ -61,6 +60,7 @@ from function_app.services.sign_in import SignIn
 from function_app.services.start_action import StartAction
 from function_app.services.stop import StopDevices
 from function_app.services.sweep import Sweep
+from function_app.services.tell_keys import TellKeys
 from function_app.services.tend_robot_types import TendRobotTypes
 from function_app.services.unpair import Unpair
 from function_app.services.upload_robot_type import UploadRobotType
@@ -127,6 +127,7 @@ class Functions:
         await self.access.close()
         await self.tables.close()
         await self.blobs.close()
+        await self.keys.close()
 
 
 def build(settings: Settings, *, clock: Clock | None = None) -> Functions:
@@ -136,15 +137,14 @@ def build(settings: Settings, *, clock: Clock | None = None) -> Functions:
         StoreError: The signing keys cannot be used.
     """
     now = clock or SystemClock()
-    keys = FileKeys(settings.home / "keys")
-    private = keys.load()
-    tables, blobs = choices.stores(settings, private)
+    keys = choices.keys(settings, now.now_ms)
+    tables, blobs = choices.stores(settings, keys)
     catalogue = FolderCatalogue(settings.robots)
 
     async def publish(topic: str, payload: bytes) -> None:
         await bus.publish(topic, payload)
 
-    access = choices.access(settings, private, publish)
+    access = choices.access(settings, keys, publish)
     bus = choices.bus(settings, access)
     feed = MqttFeed(host=settings.mqtt_host, port=settings.mqtt_port, credentials=access.service_credentials)
     telemetry = MqttTelemetry(host=settings.mqtt_host, port=settings.mqtt_port, credentials=access.service_credentials)
@@ -280,7 +280,13 @@ def build(settings: Settings, *, clock: Clock | None = None) -> Functions:
         polling=Polling(tables=tables, mailbox=mailbox, clock=now),
         mailbox=mailbox,
         relay=relay,
-        presence=PresenceIngest(tables=tables, events=events, conditions=conditions, clock=now),
+        presence=PresenceIngest(
+            tables=tables,
+            events=events,
+            conditions=conditions,
+            keys=TellKeys(keys=keys, commands=commands),
+            clock=now,
+        ),
         forget=forget,
         events=events,
         faults=faults,

@@ -1,4 +1,4 @@
-"""The adapters that settings choose between: stores, the bus for commands, the broker's access.
+"""The adapters that settings choose between: signing keys, stores, the bus for commands, the broker's access.
 
 Of the clouds' adapters only the one in use is imported, and it its SDK only when needed.
 """
@@ -6,12 +6,12 @@ Of the clouds' adapters only the one in use is imported, and it its SDK only whe
 import hashlib
 from collections.abc import Awaitable, Callable
 
-from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
-
 from function_app.adapters.local.blobs import FileBlobs
 from function_app.adapters.local.broker_access import MosquittoBrokerAccess, TokenBrokerAccess
 from function_app.adapters.local.command_bus import MqttCommandBus
+from function_app.adapters.local.keys import FileKeys
 from function_app.adapters.local.tables import SqliteTables
+from function_app.adapters.ring_keys import RingKeys
 from function_app.ports.blobs import Blobs
 from function_app.ports.broker_access import BrokerAccess
 from function_app.ports.command_bus import CommandBus
@@ -24,7 +24,18 @@ BLOBS_PATH = "/api/v1/blobs"
 MOSQUITTO_SERVICE = "service"
 
 
-def stores(settings: Settings, private: Ed25519PrivateKey | None = None) -> tuple[Tables, Blobs]:
+def keys(settings: Settings, now_ms: Callable[[], int]) -> RingKeys:
+    """The signing keys, read where they are files.
+
+    Raises:
+        StoreError: They cannot be used.
+    """
+    found = FileKeys(settings.home / "keys", now_ms=now_ms)
+    found.load()
+    return found
+
+
+def stores(settings: Settings, signing: RingKeys | None = None) -> tuple[Tables, Blobs]:
     """Tables and blobs."""
     match settings.store:
         case AzureStore() as azure:
@@ -47,15 +58,15 @@ def stores(settings: Settings, private: Ed25519PrivateKey | None = None) -> tupl
                 S3Blobs(bucket=aws.bucket, region=aws.region, endpoint=aws.endpoint),
             )
         case None:
-            return SqliteTables(settings.home / TABLES_FILE), _files(settings, private)
+            return SqliteTables(settings.home / TABLES_FILE), _files(settings, signing)
 
 
 def access(
-    settings: Settings, private: Ed25519PrivateKey, publish: Callable[[str, bytes], Awaitable[None]]
+    settings: Settings, signing: RingKeys, publish: Callable[[str, bytes], Awaitable[None]]
 ) -> TokenBrokerAccess | MosquittoBrokerAccess:
     """What gives and takes the broker's rights. ``publish``: how the embedded broker is told."""
     if settings.broker == "amqtt":
-        return TokenBrokerAccess(key=private, publish=publish)
+        return TokenBrokerAccess(signer=signing.signer, publish=publish)
     return MosquittoBrokerAccess(
         host=settings.mqtt_host,
         port=settings.mqtt_port,
@@ -101,7 +112,12 @@ async def prepare(settings: Settings) -> None:
                 await store.close()
 
 
-def _files(settings: Settings, private: Ed25519PrivateKey | None) -> FileBlobs:
-    """Blobs in files, whose addresses any instance with the same signing key makes and knows."""
-    key = None if private is None else hashlib.sha256(b"telescope/v1/blobs" + private.private_bytes_raw()).digest()
-    return FileBlobs(settings.home / "blobs", key=key, url=f"{settings.public_url}{BLOBS_PATH}")
+def _files(settings: Settings, signing: RingKeys | None) -> FileBlobs:
+    """Blobs in files, whose addresses any instance with the same signing keys makes and knows."""
+
+    def derived() -> list[bytes]:
+        secrets = () if signing is None else signing.secrets()
+        return [hashlib.sha256(b"telescope/v1/blobs" + secret).digest() for secret in secrets]
+
+    url = f"{settings.public_url}{BLOBS_PATH}"
+    return FileBlobs(settings.home / "blobs", keys=None if signing is None else derived, url=url)

@@ -11,6 +11,9 @@ from device_agent.doctor.finding import Finding, ok, problem, warning
 from device_agent.ports.clock import CloudClock, tick_ms, wall_ms
 from device_agent.runtime.home import Configuration, Home, HomeError, Pairing
 from device_agent.runtime.journal import Journal
+from device_agent.runtime.lease import Refused
+from device_agent.runtime.pins import ADVICE, Pins
+from device_agent.transports.http import answers
 from device_agent.transports.http.api import CloudApi, CloudError
 
 _OFF_MS = 2000
@@ -41,6 +44,7 @@ def look(home: Home, configuration: Configuration) -> Iterator[Finding]:
         yield warning("pairing", "the agent was moved to another space", "Nothing: `run` notices it by itself.")
         return
     yield ok("pairing", f"paired with {pairing.account}")
+    yield _keys(found, pairing, clock)
     yield from _link(home, configuration, pairing, clock)
 
 
@@ -68,6 +72,24 @@ def _server(
     took_ms = (time.monotonic() - began_s) * 1000
     yield ok("server", f"{configuration.server} answers in {took_ms:.0f} ms and knows this agent")
     return found
+
+
+def _keys(found: dict[str, Any], pairing: Pairing, clock: CloudClock) -> Finding:
+    """Whether this agent obeys what the cloud signs now, or learns to by itself."""
+    try:
+        news = answers.read(found, answers.News)
+        pins = Pins(pairing, save=lambda _: None, now_ms=clock.now_ms)
+        pins.follow(news.key_statements)
+    except (CloudError, Refused) as error:
+        return problem("keys", f"the cloud's new key is not followed: {error}", f"Then {ADVICE}.")
+    if news.signing_key and news.signing_key not in pins:
+        return problem(
+            "keys",
+            f"the cloud signs its orders with key {news.signing_key}, which this agent has not learned: it was off for "
+            "longer than the former one counted, or that one has leaked",
+            "End the agent, run `python -m device_agent repin`, and start it again; or un-pair it and claim it anew.",
+        )
+    return ok("keys", f"obeys {len(pins)} of the cloud's keys, the newest number {pins.serial}")
 
 
 def _clocks(clock: CloudClock) -> Iterator[Finding]:
@@ -103,7 +125,8 @@ def _link(home: Home, configuration: Configuration, pairing: Pairing, clock: Clo
 def _connect(home: Home, configuration: Configuration, pairing: Pairing, clock: CloudClock) -> Iterator[Finding]:
     journal = Journal(home.journal)
     journal.open(now_ms=wall_ms())
-    membership = links.Membership(pairing, configuration, catalogue.enrolled_devices(configuration))
+    pins = Pins(pairing, save=home.save_pairing, now_ms=clock.now_ms)
+    membership = links.Membership(pairing, configuration, catalogue.enrolled_devices(configuration), pins)
     transport = links.make(
         links.Wiring(
             configuration=configuration,

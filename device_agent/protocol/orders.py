@@ -8,6 +8,7 @@ from typing import Annotated, Any
 from msgspec import Meta, Struct
 
 from device_agent.protocol.fields import Count, Id, JointPositions, Label, Milliseconds, Quaternion, Text, Vector3
+from device_agent.protocol.keys import MAX_STATEMENTS, Statement
 
 LANGUAGE_PATTERN = r"([A-Za-z]{1,8}(-[A-Za-z0-9]{1,8})*)?"
 """As in BCP 47: ``en``, ``sk``, ``en-GB``; or nothing."""
@@ -211,8 +212,26 @@ class ResetStop(_Order, frozen=True, kw_only=True, tag="reset_stop"):
     """
 
 
+class FollowKey(_Order, frozen=True, kw_only=True, tag="follow_key"):
+    """The cloud has new keys: statements that lead to the newest, oldest first (``device_agent.protocol.keys``).
+
+    Changes nothing else, and takes the device from nobody.
+    """
+
+    statements: Annotated[tuple[Statement, ...], Meta(min_length=1, max_length=MAX_STATEMENTS)]
+
+
 Request = (
-    GrantLease | ReleaseLease | AskLease | DropRequest | RunMovement | Task | CancelAction | StopDevice | ResetStop
+    GrantLease
+    | ReleaseLease
+    | AskLease
+    | DropRequest
+    | RunMovement
+    | Task
+    | CancelAction
+    | StopDevice
+    | ResetStop
+    | FollowKey
 )
 
 

@@ -7,9 +7,7 @@ thread straight into the controller.
 
 import logging
 import time
-from collections.abc import Callable, Mapping, Sequence
-
-from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PublicKey
+from collections.abc import Callable, Sequence
 
 from device_agent.ports.clock import CloudClock, tick_ms, wall_ms
 from device_agent.ports.driver import Audible, Driver, Reporting
@@ -36,6 +34,7 @@ from device_agent.runtime.lease import LeaseGate, Refused
 from device_agent.runtime.loop import ControlLoop
 from device_agent.runtime.office import Office
 from device_agent.runtime.outbox import Outbox, Publish
+from device_agent.runtime.pins import Pins
 from device_agent.runtime.reporter import Reporter
 from device_agent.runtime.room import Room
 from device_agent.runtime.sensing import SensorLoop
@@ -64,7 +63,7 @@ class Device:
         driver: Not yet connected; an ``Instrument`` for a device of a room.
         journal: Open.
         cloud_clock: For ``ttl_ms``.
-        keys: The cloud's pinned public keys by key id.
+        keys: The cloud's keys, as far as they are pinned.
         publish: Sends a message.
         outbox: Sends what must not be lost.
         room: What the space's other devices have measured last.
@@ -88,7 +87,7 @@ class Device:
         driver: Driver | Instrument,
         journal: Journal,
         cloud_clock: CloudClock,
-        keys: Mapping[str, Ed25519PublicKey],
+        keys: Pins,
         publish: Publish,
         outbox: Outbox,
         room: Room,

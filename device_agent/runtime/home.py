@@ -3,7 +3,7 @@
 ```
 identity.pem     the private key, mode 0600; never leaves the machine
 agent.toml       server, transport and devices; written by ``enroll``, edited by people
-pairing.json     space, account and pinned keys, once claimed
+pairing.json     space, account and pinned keys, once claimed; written before a new key is obeyed
 journal.db       what must not be forgotten
 outbox.db        what could not be sent yet
 running.lock     held by the agent that runs: two on one robot would fight
@@ -28,6 +28,8 @@ from msgspec.structs import replace
 
 from device_agent.protocol import signing
 from device_agent.protocol.errors import ProtocolError
+from device_agent.protocol.fields import Milliseconds
+from device_agent.protocol.keys import Serial
 from device_agent.protocol.messages import Id, Label
 from device_agent.runtime.interlocks import Interlock
 
@@ -122,7 +124,8 @@ class Configuration(Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tru
 class Pairing(Struct, frozen=True, kw_only=True):
     """``pairing.json``: what the agent learned when it was claimed. ``keys`` are pinned: key id → public key.
 
-    ``owner`` is the account's id: scripts of any other account are a stranger's.
+    ``owner`` is the account's id: scripts of any other account are a stranger's. ``serial`` is the newest key's, and
+    only rises; ``until_ms`` says when each of the others ends, on the cloud's clock.
     """
 
     agent: Id
@@ -130,6 +133,8 @@ class Pairing(Struct, frozen=True, kw_only=True):
     account: str
     keys: dict[str, str]
     owner: str = ""
+    serial: Serial = 1
+    until_ms: dict[str, Milliseconds] = {}
 
     def public_keys(self) -> dict[str, Ed25519PublicKey]:
         """The pinned keys, ready to verify with."""

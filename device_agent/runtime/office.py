@@ -8,10 +8,8 @@ import logging
 import queue
 import threading
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from functools import partial
-
-from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PublicKey
 
 from device_agent.ports.clock import CloudClock, wall_ms
 from device_agent.protocol import codec, signing
@@ -24,6 +22,7 @@ from device_agent.protocol.messages import (
     Command,
     DropRequest,
     Fault,
+    FollowKey,
     GrantLease,
     Reason,
     ReleaseLease,
@@ -39,6 +38,7 @@ from device_agent.runtime.controller import Controller
 from device_agent.runtime.handover import Handover
 from device_agent.runtime.journal import Journal, JournalError
 from device_agent.runtime.lease import Refused
+from device_agent.runtime.pins import Pins
 from device_agent.runtime.voice import Condition, Voice
 
 _FUTURE_MS = 2000
@@ -58,7 +58,7 @@ class Office:
         audit: What happened, to be told.
         journal: Open.
         cloud_clock: For ``ttl_ms``.
-        keys: The cloud's pinned public keys by key id.
+        keys: The cloud's keys, as far as they are pinned.
         ailing: What is wrong with the device though its driver raises no error.
     """
 
@@ -72,7 +72,7 @@ class Office:
         audit: Audit,
         journal: Journal,
         cloud_clock: CloudClock,
-        keys: Mapping[str, Ed25519PublicKey],
+        keys: Pins,
         ailing: Callable[[], tuple[Fault, ...]] = tuple,
     ) -> None:
         self._address = address
@@ -246,6 +246,8 @@ class Office:
                     message = f"Stop was reset by {command.who}"
                     self._audit.note(Happened(EventKind.STOP_RESET, message, data={"by": command.who}))
                 _log.warning("%s: Stop reset by %s", self._name, command.who)
+            case FollowKey(statements=statements):
+                self._keys.follow(statements)
             case CancelAction(action=action):
                 self._executor.cancel(action, command.who)
             case order:  # an action

@@ -1,8 +1,10 @@
 """Signed commands on their way to a device, and the device's first answer."""
 
+from msgspec.structs import replace
+
 from device_agent.protocol import codec, signing
-from device_agent.protocol.errors import ProtocolError
-from device_agent.protocol.messages import CancelAction, Command, Request, StopDevice
+from device_agent.protocol.errors import ProtocolError, SignatureError
+from device_agent.protocol.messages import CancelAction, Command, Request, RunMovement, StopDevice
 from function_app.domain.devices import Device
 from function_app.domain.ids import command_id
 from function_app.domain.problems import broker_unavailable, invalid
@@ -47,9 +49,11 @@ class Commands:
         Raises:
             Problem: ``invalid``: it holds a number that is not finite, or is too long for a message.
         """
+        if isinstance(request, RunMovement):
+            request = await self._known_to_devices(request)
         order = _order(device, command, request, who=who, epoch=epoch, issued_ms=issued_ms, ttl_ms=ttl_ms)
         try:
-            payload = signing.sign(codec.encode(order), await self._keys.current())
+            payload = signing.sign(codec.encode(order), await self._keys.for_devices())
         except ProtocolError as error:
             raise invalid(f"{error}.") from error
         stop = isinstance(request, StopDevice)
@@ -86,6 +90,24 @@ class Commands:
             return await self._delivery.confirmed(device, signed, wait_ms=wait_ms)
         except BusUnavailable as error:
             raise broker_unavailable(f"{error}.") from error
+
+    async def _known_to_devices(self, order: RunMovement) -> RunMovement:
+        """The same movement, signed with the key that devices know, once the one it was saved with is seen to be ours.
+
+        A device knows the newest keys alone. What it is sent was saved with whichever was new then.
+        """
+        key = await self._keys.for_devices()
+        name = signing.key_id(key.public_key())
+        saved = (await self._keys.archive()).get(order.key)
+        if order.key == name or saved is None:
+            return order  # where it is not ours, the device is to refuse it
+        text = signing.movement_text(order.robot_type, order.name, order.version, order.sha256)
+        try:
+            signing.verify_text(text, order.signature, saved, context=signing.MOVEMENT_CONTEXT)
+        except SignatureError:
+            return order
+        signature = signing.sign_text(text, key, context=signing.MOVEMENT_CONTEXT)
+        return replace(order, key=name, signature=signature)
 
     async def _short(self, device: Device, request: Request, *, who: str, epoch: int) -> Signed:
         now_ms = self._clock.now_ms()

@@ -138,7 +138,7 @@ class Identify:
     async def _verify(self, token: str, audience: Audience) -> _Known:
         try:
             kid = jwt.get_unverified_header(token).get("kid", "")
-            key = (await self._keys.public()).get(str(kid))
+            key = (await self._keys.public(str(kid))).get(str(kid))
             if key is None:
                 raise unauthorized("The access token was not issued here. Sign in again.")
             claims = decode(token, key, audience, now_s=self._now_s(), leeway_s=0)

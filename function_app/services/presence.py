@@ -17,6 +17,7 @@ from function_app.ports.tables import Tables
 from function_app.services import store
 from function_app.services.conditions import Conditions
 from function_app.services.events import Events
+from function_app.services.tell_keys import TellKeys
 
 T = TypeVar("T")
 
@@ -24,10 +25,11 @@ T = TypeVar("T")
 class PresenceIngest:
     """Writes down what arrives. Safe to repeat; what does not belong to a claimed agent is dropped."""
 
-    def __init__(self, *, tables: Tables, events: Events, conditions: Conditions, clock: Clock) -> None:
+    def __init__(self, *, tables: Tables, events: Events, conditions: Conditions, keys: TellKeys, clock: Clock) -> None:
         self._tables = tables
         self._events = events
         self._conditions = conditions
+        self._keys = keys
         self._clock = clock
 
     async def ingest(self, topic: Topic, payload: bytes, *, by: Transport = "mqtt") -> None:
@@ -66,6 +68,7 @@ class PresenceIngest:
             await store.upsert(
                 self._tables, store.AGENTS, topic.agent, f"state:{topic.device}", lambda _: state, LastState
             )
+            await self._keys.heard(agent, topic.device)
         elif topic.kind == topics.DESC and not topic.name:
             description = codec.decode(payload, Description)
             await store.upsert(

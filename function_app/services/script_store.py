@@ -66,9 +66,9 @@ class ScriptStore:
         await self._blobs.delete(blob_name(who, robot_type, movement))
 
     async def _verify(self, robot_type: str, movement: Movement) -> None:
-        key = (await self._keys.public()).get(movement.key)
+        key = (await self._keys.archive()).get(movement.key)
         if key is None:
-            raise _damaged(movement, "was signed with a key that no longer counts")
+            raise _damaged(movement, "was signed with a key that has leaked or is not ours")
         try:
             signing.verify_text(
                 signed_text(robot_type, movement), movement.signature, key, context=signing.MOVEMENT_CONTEXT

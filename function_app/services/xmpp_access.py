@@ -186,7 +186,7 @@ class XmppAccess:
     async def _claims(self, token: str) -> dict[str, object]:
         try:
             kid = str(jwt.get_unverified_header(token).get("kid", ""))
-            key = (await self._keys.public()).get(kid)
+            key = (await self._keys.public(kid)).get(kid)
             if key is None:
                 raise _refused()
             return decode(token, key, XMPP, now_s=self._clock.now_ms() / 1000, leeway_s=0)

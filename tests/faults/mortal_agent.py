@@ -34,6 +34,7 @@ from device_agent.runtime.outbox import Outbox
 from device_agent.runtime.room import Room
 from device_agent.runtime.shelf import Shelf
 from tests.support.jail import LateJail
+from tests.support.pins import pins_of
 from tests.support.toys import ToyDriver, robot_type
 
 TARGET_RAD = 1e-4
@@ -129,7 +130,7 @@ class Body:
             device = Device(
                 name=DEVICE, label="Arm", space=SPACE, agent=AGENT, robot_type=swift(), driver=ToyDriver(),
                 journal=journal, cloud_clock=self.clock, publish=self._publish, jail=LateJail(),
-                keys={signing.key_id(key.public_key()): key.public_key()},
+                keys=pins_of(key),
                 room=Room(space=SPACE, agent=AGENT, own=[DEVICE]), outbox=self._outbox(),
             )  # fmt: skip
             device.start()

@@ -343,7 +343,7 @@ def _access(broker: RunningBroker) -> BrokerAccess:
 
         await asyncio.to_thread(send)
 
-    return TokenBrokerAccess(key=broker.key, publish=publish)
+    return TokenBrokerAccess(signer=lambda: broker.key, publish=publish)
 
 
 _NO_ACCESS: Any = None

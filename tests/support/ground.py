@@ -31,6 +31,7 @@ from function_app.services.devices import devices_of
 from tests.support.brokers import HOST, BrokerKind, Client, Message, RunningBroker, start_broker, wait_until
 from tests.support.cloud import Cloud, Robot, settings
 from tests.support.hosts.host import Program, environment_of, start_program
+from tests.support.pins import pinned
 from tests.support.proxy import Proxy, start_proxy
 
 ORDER_MS = 30_000
@@ -191,7 +192,7 @@ class Link:
         )
         pairing = Pairing(agent=self.robot.id, space=self.robot.space, account="anna", keys={})
         entry = {"name": "arm", "kind": "arm", "robot_type": "ur5", "label": "Arm"}
-        self.membership = links.Membership(pairing, told, [entry])
+        self.membership = links.Membership(pairing, told, [entry], pinned(pairing))
         if through:
             self.proxy = self._stack.enter_context(start_proxy(ground.endpoints[through].port))
         self.transport = links.make(

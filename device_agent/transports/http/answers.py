@@ -5,6 +5,8 @@ from typing import Annotated, Any, TypeVar
 import msgspec
 from msgspec import Meta, Struct
 
+from device_agent.protocol.fields import Milliseconds
+from device_agent.protocol.keys import PublicKeyText, Serial, Statement
 from device_agent.protocol.messages import Id
 from device_agent.transports.http.api import CloudError
 
@@ -50,10 +52,12 @@ class Owner(Struct, frozen=True, kw_only=True):
 
 
 class Key(Struct, frozen=True, kw_only=True):
-    """One of the cloud's public keys."""
+    """One of the cloud's public keys; it counts until ``until_ms``, 0: for now without an end."""
 
     id: str
-    public: str
+    public: PublicKeyText
+    serial: Serial = 1
+    until_ms: Milliseconds = 0
 
 
 class Claimed(Struct, frozen=True, kw_only=True):
@@ -63,6 +67,18 @@ class Claimed(Struct, frozen=True, kw_only=True):
     space: Id
     account: Owner
     keys: tuple[Key, ...]
+
+    @property
+    def serial(self) -> int:
+        """The newest key's."""
+        return max((key.serial for key in self.keys), default=1)
+
+
+class News(Struct, frozen=True, kw_only=True):
+    """Of the cloud's keys: statements that lead to the newest, and which of them orders are signed with now."""
+
+    key_statements: tuple[Statement, ...] = ()
+    signing_key: str = ""
 
 
 def read(answer: dict[str, Any], kind: type[T]) -> T:

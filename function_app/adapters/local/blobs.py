@@ -6,7 +6,7 @@ import contextlib
 import os
 import secrets
 import time
-from collections.abc import AsyncIterator, Mapping
+from collections.abc import AsyncIterator, Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, BinaryIO
 from urllib.parse import quote, unquote
@@ -40,10 +40,11 @@ _DOWNLOAD = "telescope/blobs/download"
 class FileBlobs:
     """``Blobs`` in ``folder``. Files are read and written in a thread: a disk may be slow, and blobs are large."""
 
-    def __init__(self, folder: Path, *, key: bytes | None = None, url: str = "") -> None:
-        """``key`` signs addresses below ``url``, at which ``receive`` and ``send`` are to be reached."""
+    def __init__(self, folder: Path, *, keys: Callable[[], Sequence[bytes]] | None = None, url: str = "") -> None:
+        """The first of ``keys`` signs addresses below ``url``, at which ``receive`` and ``send`` are to be reached."""
         self._folder = folder
-        self._key = key or secrets.token_bytes(32)
+        own = (secrets.token_bytes(32),)
+        self._keys = keys or (lambda: own)
         self._url = url
 
     async def put(self, name: str, content: bytes) -> None:
@@ -128,17 +129,21 @@ class FileBlobs:
         return Download(_parts(file), os.fstat(file.fileno()).st_size, claims["type"])
 
     def _address(self, claims: dict[str, Any], lifetime_s: int) -> str:
-        token = jwt.encode({**claims, "exp": time.time() + lifetime_s}, self._key, _ALGORITHM)
+        token = jwt.encode({**claims, "exp": time.time() + lifetime_s}, self._keys()[0], _ALGORITHM)
         return f"{self._url}/{token}"
 
     def _claims(self, token: str, audience: str) -> dict[str, Any]:
-        try:
-            claims: dict[str, Any] = jwt.decode(
-                token, self._key, [_ALGORITHM], audience=audience, options={"require": ["exp", "aud", "sub"]}
-            )
-        except (jwt.PyJWTError, ValueError) as error:
-            raise TransferRefused(403, "The address is not one of ours, or is over. Ask for a new one.") from error
-        return claims
+        why: Exception | None = None
+        for key in self._keys():
+            try:
+                claims: dict[str, Any] = jwt.decode(
+                    token, key, [_ALGORITHM], audience=audience, options={"require": ["exp", "aud", "sub"]}
+                )
+            except (jwt.PyJWTError, ValueError) as error:
+                why = error
+            else:
+                return claims
+        raise TransferRefused(403, "The address is not one of ours, or is over. Ask for a new one.") from why
 
     @staticmethod
     def _refuse_second(path: Path) -> None:

@@ -38,22 +38,24 @@ def _service_client_id() -> str:
 class TokenBrokerAccess:
     """Rights for the embedded broker: the grant itself, signed. The broker needs the public key alone."""
 
-    def __init__(self, *, key: Ed25519PrivateKey, publish: Publish, service_token_s: float = _SERVICE_TOKEN_S) -> None:
+    def __init__(
+        self, *, signer: Callable[[], Ed25519PrivateKey], publish: Publish, service_token_s: float = _SERVICE_TOKEN_S
+    ) -> None:
         """Prepare.
 
         Args:
-            key: Its public half is in the broker's file of keys.
+            signer: The key to sign with now; its public half is in the broker's file of keys.
             publish: Brings a revocation to the broker.
             service_token_s: How long the functions' own credentials run [s].
         """
-        self._key = key
+        self._signer = signer
         self._publish = publish
         self._service_token_s = service_token_s
 
     async def issue(self, grant: Grant) -> Credentials:
         """As the port says; no broker is asked."""
         grants.check(grant)
-        return Credentials(grant.principal, grants.issue(grant, self._key))
+        return Credentials(grant.principal, grants.issue(grant, self._signer()))
 
     async def revoke(self, *, client_id: str | None = None, principal: str | None = None) -> None:
         """As the port says; tokens made until now are refused, by the clock that stamps them."""
@@ -73,7 +75,9 @@ class TokenBrokerAccess:
         grant = grants.service_grant(
             client_id=client_id, token_id=secrets.token_hex(16), lifetime_s=self._service_token_s
         )
-        return ServiceCredentials(client_id, grant.principal, grants.issue(grant, self._key), float(grant.expires_at))
+        return ServiceCredentials(
+            client_id, grant.principal, grants.issue(grant, self._signer()), float(grant.expires_at)
+        )
 
     async def close(self) -> None:
         """Nothing is open."""

@@ -67,13 +67,20 @@ def router(functions: Functions, caller: Caller) -> Routes:
     async def enrollment(request: Request, wait_ms: Wait = 0) -> Response:
         """Called by an agent: its space, its owner, and the keys whose commands it is to obey."""
         agent = await functions.enroll.wait(await caller.agent(request), wait_ms)
-        keys = await functions.keys.public()
+        news = await functions.keys.news()
         body = contract.EnrollmentState(
             agent=agent.id,
             state="claimed" if agent.claimed else "waiting",
             space=agent.space,
             account=await _account(functions, agent),
-            keys=tuple(contract.KeyOut(id=name, public=signing.public_text(key)) for name, key in keys.items()),
+            keys=tuple(
+                contract.KeyOut(
+                    id=pin.id, public=signing.public_text(pin.key), serial=pin.serial, until_ms=pin.until_ms
+                )
+                for pin in news.pins
+            ),
+            key_statements=news.statements,
+            signing_key=news.signing,
         )
         return answer(body)
 

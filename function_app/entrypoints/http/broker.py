@@ -31,6 +31,7 @@ def router(functions: Functions, caller: Caller) -> Routes:
         asked: Any = await read(request, contract.MqttRequest)
         issued = await _issue(request, asked)
         settings = functions.settings
+        news = await functions.keys.news() if isinstance(asked, contract.AgentRequest) else None
         body = contract.MqttCredentialsOut(
             client_id=issued.client_id,
             username=issued.credentials.username,
@@ -42,6 +43,8 @@ def router(functions: Functions, caller: Caller) -> Routes:
             tcp=contract.TcpAddress(host=settings.mqtt_host, port=settings.mqtt_port),
             websocket_url=settings.websocket_url,
             server_time_ms=functions.clock.now_ms(),
+            key_statements=() if news is None else news.statements,
+            signing_key="" if news is None else news.signing,
         )
         return answer(body, headers={"Cache-Control": "no-store"})
 

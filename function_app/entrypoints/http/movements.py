@@ -46,7 +46,7 @@ def router(functions: Functions, caller: Caller) -> Routes:
         """Its newest version, or the one that is asked for."""
         who = await caller.account(request)
         found, source = await functions.movements.get(who, robot_type, name, version)
-        public = signing.public_text((await functions.keys.public())[found.key])
+        public = signing.public_text((await functions.keys.archive())[found.key])
         return answer(show.movement_source(robot_type, found, source, public))
 
     @routes.add(

@@ -40,6 +40,7 @@ def router(functions: Functions, caller: Caller) -> Routes:
         else:
             given = await functions.xmpp_access.account(await caller.account(request))
         settings = functions.settings
+        news = None if space is None else await functions.keys.news()
         body = contract.XmppCredentialsOut(
             jid=f"{given.user}@{settings.xmpp_domain}",
             password=given.password,
@@ -50,6 +51,8 @@ def router(functions: Functions, caller: Caller) -> Routes:
             host=settings.xmpp_host,
             port=settings.xmpp_port,
             server_time_ms=functions.clock.now_ms(),
+            key_statements=() if news is None else news.statements,
+            signing_key="" if news is None else news.signing,
         )
         return answer(body, headers=_NOT_KEPT)
 

@@ -43,7 +43,7 @@ def again(tmp_path: Path) -> Again:
 
 @pytest.fixture
 async def direct(tmp_path: Path) -> AsyncIterator[Direct]:
-    blobs = FileBlobs(tmp_path / "blobs", key=b"k" * 32)
+    blobs = FileBlobs(tmp_path / "blobs", keys=lambda: (b"k" * 32,))
     app = FastAPI()
     app.include_router(transfers.router(blobs))
     app.add_exception_handler(Problem, lambda _, error: Response(str(error), error.status))

@@ -28,7 +28,7 @@ def another_instance(broker: RunningBroker) -> BrokerAccess:
 
         await asyncio.to_thread(send)
 
-    return TokenBrokerAccess(key=broker.key, publish=publish)
+    return TokenBrokerAccess(signer=lambda: broker.key, publish=publish)
 
 
 @pytest.mark.parametrize("client_id", ["", "with space", "a/b", "a+", "x" * 65, "ü"])
@@ -121,7 +121,7 @@ def test_mosquitto_without_its_password_file_is_one_clear_error(tmp_path: Path) 
 def test_a_token_made_with_another_key_is_refused(tmp_path: Path) -> None:
     with start_broker("amqtt", tmp_path) as broker:
         grant = broker.grant("thief", publish=("#",))
-        forged = TokenBrokerAccess(key=signing.generate(), publish=_nowhere)
+        forged = TokenBrokerAccess(signer=signing.generate, publish=_nowhere)
         with broker.connect("thief", broker.run(forged.issue(grant))) as thief:
             assert not thief.connected.is_set()
 

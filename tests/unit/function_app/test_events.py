@@ -73,7 +73,9 @@ class BrokenTables:
 def without_store(cloud: Cloud) -> Any:
     tables: Any = BrokenTables()
     own = cloud.functions
-    presence = PresenceIngest(tables=tables, events=own.events, conditions=own.conditions, clock=cloud.clock)
+    presence = PresenceIngest(
+        tables=tables, events=own.events, conditions=own.conditions, keys=own.presence._keys, clock=cloud.clock
+    )
     return replace(cloud.functions, presence=presence)
 
 

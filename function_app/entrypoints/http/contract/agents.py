@@ -42,20 +42,27 @@ class Enrolled(Answer, frozen=True, kw_only=True):
 
 
 class KeyOut(Answer, frozen=True, kw_only=True):
-    """A public key (Ed25519, base64url) and its id."""
+    """A public key (Ed25519, base64url), its id and place in their order; it counts until ``until_ms`` (0: on)."""
 
     id: str
     public: str
+    serial: int
+    until_ms: int
 
 
 class EnrollmentState(Answer, frozen=True, kw_only=True):
-    """Whether an agent is claimed, and the keys whose commands it is to obey."""
+    """Whether an agent is claimed, and the keys whose commands it is to obey.
+
+    ``key_statements`` lead from a key that is pinned already to the newest; ``signing_key`` signs commands now.
+    """
 
     agent: str
     state: Literal["waiting", "claimed"]
     space: str | None
     account: AccountRef | None
     keys: tuple[KeyOut, ...]
+    key_statements: tuple[str, ...]
+    signing_key: str
 
 
 class ClaimRequest(Request, frozen=True, kw_only=True):

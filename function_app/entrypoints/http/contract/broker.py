@@ -30,7 +30,7 @@ class TcpAddress(Answer, frozen=True, kw_only=True):
 
 
 class MqttCredentialsOut(Answer, frozen=True, kw_only=True):
-    """What to connect with, and the topics it is good for."""
+    """What to connect with, and the topics it is good for; for an agent also what is new of the cloud's keys."""
 
     client_id: str
     username: str
@@ -42,3 +42,5 @@ class MqttCredentialsOut(Answer, frozen=True, kw_only=True):
     tcp: TcpAddress
     websocket_url: str
     server_time_ms: int
+    key_statements: tuple[str, ...] = ()
+    signing_key: str = ""

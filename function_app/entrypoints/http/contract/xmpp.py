@@ -25,6 +25,8 @@ class XmppCredentialsOut(Answer, frozen=True, kw_only=True):
     host: str
     port: int
     server_time_ms: int
+    key_statements: tuple[str, ...] = ()
+    signing_key: str = ""
 
 
 class VerifyRequest(Request, frozen=True, kw_only=True):
