@@ -318,9 +318,9 @@ def _repin(options: argparse.Namespace) -> int:
         after = links.pairing_of(answers.read(found, answers.Claimed))
         if after.serial < before.serial:
             raise HomeError(
-                f"the server's newest key is number {after.serial}, older than number {before.serial}, which is pinned: "
-                "it is another server, or one put back to an old state. If you trust it, un-pair the agent there and "
-                "claim it again"
+                f"the server's newest key is number {after.serial}, older than number {before.serial}, which is "
+                "pinned: it is another server, or one put back to an old state. If you trust it, un-pair the agent "
+                "there and claim it again"
             )
         home.save_pairing(after)
     for name in sorted(set(after.keys) - set(before.keys)):

@@ -119,8 +119,12 @@ class Pins(Mapping[str, Ed25519PublicKey]):
 
     def _known(self, statement: bytes) -> bool:
         """Whether it tells of a key that is pinned already, and was signed by one that is so no longer."""
-        body = codec.decode(bytes(codec.decode(statement, signing.Signed).body), NewKey)
-        return signing.key_id(signing.public_key(body.key)) in self._keys and body.serial <= self._pairing.serial
+        try:
+            body = codec.decode(bytes(codec.decode(statement, signing.Signed).body), NewKey)
+            name = signing.key_id(signing.public_key(body.key))
+        except ProtocolError:
+            return False
+        return name in self._keys and body.serial <= self._pairing.serial
 
     def _ended(self, pairing: Pairing, name: str) -> bool:
         until_ms, now_ms = pairing.until_ms.get(name, 0), self._now_ms()

@@ -154,7 +154,7 @@ def test_a_damaged_file_of_tables_is_one_line_and_left_as_it_is(tmp_path: Path, 
 
 
 def test_damaged_keys_are_one_line_and_left_as_they_are(tmp_path: Path) -> None:
-    damaged = tmp_path / "keys" / "signing.pem"
+    damaged = tmp_path / "keys" / "ring.json"
     damaged.parent.mkdir()
     damaged.write_text("no key")
     code, out, err = run(tmp_path, free_port(), "serve")
@@ -174,7 +174,7 @@ def test_the_worker_ends_when_it_is_told_to(tmp_path: Path) -> None:
 
 def test_private_files_are_for_their_owner_only(home: Path, server: int) -> None:
     assert server
-    assert (home / "keys" / "signing.pem").stat().st_mode & 0o077 == 0
+    assert (home / "keys" / "ring.json").stat().st_mode & 0o077 == 0
     assert (home / "keys").stat().st_mode & 0o077 == 0
     assert (home / "tables.sqlite").stat().st_mode & 0o077 == 0
     assert len(json.loads((home / "keys" / "public.json").read_text())) == 1

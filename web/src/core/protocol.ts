@@ -344,7 +344,7 @@ export interface Command {
   ttl_ms: number;
   who: string;
   epoch: number;
-  request: GrantLease | ReleaseLease | AskLease | DropRequest | RunMovement | MoveJoints | MovePose | Say | Express | TakePosture | RunBehaviour | SetStiffness | LookAt | Drive | GoTo | Gather | Shoot | CaptureRaw | SetControl | CancelAction | StopDevice | ResetStop;
+  request: GrantLease | ReleaseLease | AskLease | DropRequest | RunMovement | MoveJoints | MovePose | Say | Express | TakePosture | RunBehaviour | SetStiffness | LookAt | Drive | GoTo | Gather | Shoot | CaptureRaw | SetControl | CancelAction | StopDevice | ResetStop | FollowKey;
 }
 
 /**
@@ -544,6 +544,16 @@ export interface StopDevice {
  */
 export interface ResetStop {
   kind: "reset_stop";
+}
+
+/**
+ * The cloud has new keys: statements that lead to the newest, oldest first (`device_agent.protocol.keys`).
+ *
+ * Changes nothing else, and takes the device from nobody.
+ */
+export interface FollowKey {
+  kind: "follow_key";
+  statements: string[];
 }
 
 /**
