@@ -34,6 +34,7 @@ from device_agent.runtime.outbox import Outbox
 from device_agent.runtime.room import Room
 from device_agent.runtime.shelf import Shelf
 from tests.support.jail import warm_jail
+from tests.support.pins import pins_of
 from tests.support.toys import ToyDriver, robot_type
 
 WITHIN_S = 15.0
@@ -78,7 +79,7 @@ class Bench:
             driver=self.driver,
             journal=self.journal,
             cloud_clock=self.clock,
-            keys={signing.key_id(self.key.public_key()): self.key.public_key()},
+            keys=pins_of(self.key),
             publish=self.publish,
             outbox=self.outbox,
             room=Room(space="s", agent="a", own=["arm"], named=[(rule.device, rule.stream) for rule in interlocks]),
