@@ -33,6 +33,7 @@ from function_app.services.diagnostics import Diagnostics
 from function_app.services.enroll import Enroll
 from function_app.services.events import Events
 from function_app.services.faults import Faults
+from function_app.services.fence import Fence
 from function_app.services.fleet import StartOnMany
 from function_app.services.forget import DAY_MS, Forget
 from function_app.services.handover import Handovers
@@ -56,13 +57,16 @@ from function_app.services.robot_types import RobotTypes
 from function_app.services.send_action import SendAction
 from function_app.services.series import SeriesWriter
 from function_app.services.series_range import SeriesReader
+from function_app.services.sharing import Sharing
 from function_app.services.sign_in import SignIn
+from function_app.services.spaces import Spaces
 from function_app.services.start_action import StartAction
 from function_app.services.stop import StopDevices
 from function_app.services.sweep import Sweep
 from function_app.services.tell_keys import TellKeys
 from function_app.services.tend_robot_types import TendRobotTypes
 from function_app.services.unpair import Unpair
+from function_app.services.unshare import Unshare
 from function_app.services.upload_robot_type import UploadRobotType
 from function_app.services.uploads import Uploads
 from function_app.services.xmpp_access import XmppAccess
@@ -89,6 +93,8 @@ class Functions:
     claim: Claim
     unpair: Unpair
     devices: Devices
+    spaces: Spaces
+    sharing: Sharing
     leases: Leases
     handovers: Handovers
     robot_types: RobotTypes
@@ -157,6 +163,7 @@ def build(settings: Settings, *, clock: Clock | None = None) -> Functions:
     identify = Identify(tables=tables, keys=keys, forget=forget, clock=now)
     sign_in = SignIn(tables=tables, identify=identify, access=access, clock=now)
     devices = Devices(tables=tables, clock=now)
+    spaces = Spaces(tables=tables, clock=now)
     keep = _keep(settings)
     writer = SeriesWriter(tables=tables, forget=forget, keep=keep, clock=now)
     uploads = Uploads(tables=tables, blobs=blobs, keep_ms=settings.keep_uploads_days * DAY_MS, clock=now)
@@ -166,7 +173,7 @@ def build(settings: Settings, *, clock: Clock | None = None) -> Functions:
     commands = Commands(delivery=delivery, keys=keys, clock=now)
     robot_types = RobotTypes(tables=tables, blobs=blobs, catalogue=catalogue)
     diagnostics = Diagnostics(
-        tables=tables, devices=devices, faults=faults, robot_types=robot_types, sign_in=sign_in, clock=now
+        tables=tables, devices=devices, faults=faults, robot_types=robot_types, spaces=spaces, clock=now
     )
     intake = Intake(tables=tables, writer=writer, clock=now, observers=(diagnostics.observe,))
     movements = Movements(
@@ -182,21 +189,48 @@ def build(settings: Settings, *, clock: Clock | None = None) -> Functions:
     pending = Pending(tables=tables)
     audit = Audit(tables=tables, events=events, pending=pending, clock=now)
     lease_rows = LeaseRows(tables=tables, audit=audit, clock=now)
+    fence = Fence(tables=tables, commands=commands, access=access, clock=now)
     leases = Leases(
-        tables=tables, devices=devices, rows=lease_rows, commands=commands, access=access, audit=audit, clock=now
+        tables=tables,
+        devices=devices,
+        rows=lease_rows,
+        fence=fence,
+        commands=commands,
+        access=access,
+        audit=audit,
+        clock=now,
     )
-    sending = SendAction(tables=tables, rows=rows, commands=commands, movements=movements, clock=now)
+    sending = SendAction(tables=tables, devices=devices, rows=rows, commands=commands, movements=movements, clock=now)
     queues = Queues(tables=tables, devices=devices, rows=rows, pending=pending, sending=sending, audit=audit, clock=now)
     leave = Leave(
         tables=tables,
         rows=rows,
         queues=queues,
         pending=pending,
-        commands=commands,
+        fence=fence,
         access=access,
         bus=bus,
         series=writer,
         forget=forget,
+        clock=now,
+    )
+    sharing = Sharing(
+        tables=tables,
+        devices=devices,
+        spaces=spaces,
+        sign_in=sign_in,
+        unshare=Unshare(
+            tables=tables,
+            devices=devices,
+            rows=rows,
+            queues=queues,
+            commands=commands,
+            fence=fence,
+            access=access,
+            clock=now,
+        ),
+        pending=pending,
+        audit=audit,
         clock=now,
     )
     latencies = Latencies(tables=tables, forget=forget, clock=now)
@@ -231,6 +265,8 @@ def build(settings: Settings, *, clock: Clock | None = None) -> Functions:
         claim=Claim(tables=tables, sign_in=sign_in, forget=forget, leave=leave, clock=now),
         unpair=Unpair(tables=tables, sign_in=sign_in, leave=leave),
         devices=devices,
+        spaces=spaces,
+        sharing=sharing,
         leases=leases,
         handovers=Handovers(
             tables=tables,
@@ -260,7 +296,7 @@ def build(settings: Settings, *, clock: Clock | None = None) -> Functions:
         action_acks=acks,
         stop=StopDevices(
             devices=devices,
-            sign_in=sign_in,
+            spaces=spaces,
             rows=lease_rows,
             commands=commands,
             queues=queues,
@@ -305,6 +341,7 @@ def build(settings: Settings, *, clock: Clock | None = None) -> Functions:
             sending=sending,
             queues=queues,
             leave=leave,
+            sharing=sharing,
             audit=audit,
             access=access,
             forget=forget,

@@ -13,7 +13,8 @@ class Revoke(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True, omit
 
     Attributes:
         client_id: Every token of this client id made up to ``before_s``.
-        principal: Every token of this principal made up to ``before_s``.
+        principal: Every token of this principal, and of what is part of it, made up to ``before_s``; see
+            ``grants.covering``.
         token_id: This one token.
         before_s: The teller's clock, the same that stamps the tokens [s since 1970]; the broker's own where it is not
             given.

@@ -71,6 +71,18 @@ class Grant(Struct, frozen=True, kw_only=True):
         return any(topics.matches(granted, pattern) for granted in self.subscribe)
 
 
+def covering(principal: str) -> tuple[str, ...]:
+    """How a revocation may name a principal: itself, what it is part of, and either with ``+`` for any one part.
+
+    ``account:a:s:watch`` is part of ``account:a:s``, and one of ``account:a:+:watch``.
+    """
+    parts = principal.split(":")
+    whole = [parts[:length] for length in range(1, len(parts) + 1)]
+    found = [":".join(some) for some in whole]
+    found += [":".join((*some[:place], "+", *some[place + 1 :])) for some in whole for place in range(len(some))]
+    return tuple(found)
+
+
 def issue(grant: Grant, key: Ed25519PrivateKey) -> str:
     """The token of a grant."""
     claims = {

@@ -28,6 +28,8 @@ class Fact(StrEnum):
     STOP_ORDERED = "stop-ordered"
     RESET_ORDERED = "stop-reset-ordered"
     ORDER_REFUSED = "order-refused"
+    SHARED = "shared"
+    UNSHARED = "unshared"
 
 
 @dataclass(frozen=True, slots=True)
@@ -84,8 +86,9 @@ def changed(before: Lease | None, after: Lease, *, by: str, now_ms: int) -> Iter
 
 
 def ended(before: Lease, after: Lease, *, why: str, now_ms: int) -> Happened:
-    """Control has ended because the device was ``unpaired``, ``moved`` or ``removed``."""
-    message = f"Control of {before.holder} ended: the device was {why}."
+    """Control has ended because the device was ``unpaired``, ``moved``, ``removed``, or is ``unshared``."""
+    how = "is shared with them no longer" if why == "unshared" else f"was {why}"
+    message = f"Control of {before.holder} ended: the device {how}."
     return _of_lease(after, Fact.ENDED, now_ms, message, {"holder": before.holder, "why": why})
 
 

@@ -80,7 +80,15 @@ class Agent:
 
 @dataclass(frozen=True, slots=True)
 class Device:
-    """One device, as one account may see it. ``topic`` is the first levels of all its topics."""
+    """One device, as one account may see it.
+
+    Attributes:
+        role: The highest that the account has here.
+        topic: The first levels of all its topics.
+        owner: The account that its agent belongs to; its movements and robot types count here, whoever asks.
+        until_ms: When the role changes by itself [ms since 1970].
+        space_role: The account's role in the whole space; ``None`` where it has a part in this device alone.
+    """
 
     id: str
     name: str
@@ -93,6 +101,9 @@ class Device:
     role: Role
     topic: str
     transport: Transport = "mqtt"
+    owner: str = ""
+    until_ms: int = NEVER_MS
+    space_role: Role | None = None
 
 
 def claim(agent: Agent, *, account: str, space: str, pairing: str, now_ms: int) -> Agent:

@@ -96,6 +96,15 @@ class Lease:
         return replace(self.asked, outcome="ended" if how == "open" else how)
 
 
+MIN_MS = 1_000
+"""The shortest lease."""
+
+
+def lasting(lease_ms: int, left_ms: int) -> int:
+    """How long a lease is given to whom the right to it is left for so long [ms]."""
+    return max(MIN_MS, min(lease_ms, left_ms))
+
+
 def take(
     lease: Lease | None,
     who: Identity,

@@ -4,6 +4,7 @@ Nothing starts by itself after something went wrong: when an action fails, or so
 are dropped, each with the reason.
 """
 
+from collections.abc import Collection
 from dataclasses import dataclass, field, replace
 from typing import Final
 
@@ -17,6 +18,7 @@ STOPPED = "stopped"
 UNPAIRED = "unpaired"
 MOVED = "moved"
 REMOVED = "removed"
+UNSHARED = "unshared"
 DROPPED: Final = {
     FAILED_BEFORE: (
         Status.CANCELLED,
@@ -29,6 +31,7 @@ DROPPED: Final = {
     UNPAIRED: (Status.FAILED, "The device was un-paired before it ended."),
     MOVED: (Status.FAILED, "The device's agent was moved to another space before it ended. Start it again."),
     REMOVED: (Status.FAILED, "Its agent no longer has this device."),
+    UNSHARED: (Status.FAILED, "The device is no longer shared with who started it."),
 }
 """Why a waiting action ends without its turn: code → its end and what people read."""
 
@@ -76,8 +79,14 @@ class Queue:
         actions = tuple(other for other in self.actions if other != action)
         return replace(self, actions=actions, dropped={id_: why for id_, why in self.dropped.items() if id_ != action})
 
+    def dropping(self, actions: Collection[str], why: str) -> "Queue":
+        """Some of them dropped; the same object when none of these waits."""
+        lost = [action for action in self.actions if action in actions]
+        if not lost:
+            return self
+        kept = tuple(action for action in self.actions if action not in lost)
+        return replace(self, actions=kept, dropped={**self.dropped, **dict.fromkeys(lost, why)})
+
     def halted(self, why: str) -> "Queue":
         """All of them dropped; the same object when nobody waits."""
-        if not self.actions:
-            return self
-        return replace(self, actions=(), dropped={**self.dropped, **dict.fromkeys(self.actions, why)})
+        return self.dropping(self.actions, why)

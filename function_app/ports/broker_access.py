@@ -54,6 +54,8 @@ class BrokerAccess(Protocol):
     async def revoke(self, *, client_id: str | None = None, principal: str | None = None) -> None:
         """Cut the live connections of a client id or of a principal, and refuse what was issued for it so far.
 
+        A principal stands for what is part of it too, and a part may be ``+`` for any one: ``grants.covering``.
+
         On return the broker has done so. Credentials issued afterwards work. Revoking what does not exist is no error.
 
         Raises:

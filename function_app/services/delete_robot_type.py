@@ -59,7 +59,8 @@ class DeleteRobotType:
                 await self._tables.delete(store.MEMBERS, index)
 
     async def _require_unused(self, who: Identity, robot_type: str) -> None:
-        devices = [device.id for device in await self._devices.all(who) if device.robot_type == robot_type]
+        own = [device for device in await self._devices.all(who) if device.owner == who.account]
+        devices = [device.id for device in own if device.robot_type == robot_type]
         movements = list(await self._movements.own(who, robot_type))
         users = [f"device {name}" for name in devices] + [f"movement {name}" for name in movements]
         if users:

@@ -19,14 +19,14 @@ from function_app.domain.detectors import MINUTE_MS, WINDOW_MS, Limits, Watch
 from function_app.domain.devices import Agent, Device
 from function_app.domain.diagnosis import Health, Rule
 from function_app.domain.faults import Fault, Report, Severity
-from function_app.domain.problems import Problem, not_found
+from function_app.domain.problems import Problem
 from function_app.ports.clock import Clock
 from function_app.ports.tables import Row, Tables
 from function_app.services import store
 from function_app.services.devices import Devices, DeviceView
 from function_app.services.faults import Faults
 from function_app.services.robot_types import RobotTypes
-from function_app.services.sign_in import SignIn
+from function_app.services.spaces import Spaces
 
 MAX_FIELDS = 100
 """Fields of one stream that are watched: those listed by the robot type, then others by name; a row stays small."""
@@ -82,14 +82,14 @@ class Diagnostics:
         devices: Devices,
         faults: Faults,
         robot_types: RobotTypes,
-        sign_in: SignIn,
+        spaces: Spaces,
         clock: Clock,
     ) -> None:
         self._tables = tables
         self._devices = devices
         self._faults = faults
         self._robot_types = robot_types
-        self._sign_in = sign_in
+        self._spaces = spaces
         self._clock = clock
         self._rules: dict[tuple[str, str], tuple[int, tuple[Diagnostic, ...]]] = {}
 
@@ -156,8 +156,8 @@ class Diagnostics:
         Raises:
             Problem: ``space-unknown``, ``cursor-invalid``.
         """
-        if space is not None and all(known.id != space for known in await self._sign_in.spaces(who.account)):
-            raise not_found("space", space)
+        if space is not None:
+            await self._spaces.get(who, space)
         views, following = await self._devices.views(who, cursor=cursor, limit=limit)
         chosen = [view for view in views if space in {None, view.device.space}]
         found: list[Summary] = []

@@ -111,6 +111,8 @@ class Handovers:
             require_operator(device)
             await self._require_asker(device, request)
             before, lease = await self._change(who, device, rules.accept, request)
+            if before is not lease:
+                await self._require_asker_still(device, lease)
         _, asked = rules.find(lease, request)
         if before is lease or before is None:
             # Handed over already, by an earlier request of the same kind. The device hears of it with each renewal.
@@ -161,8 +163,14 @@ class Handovers:
         asker = Identity(asked.account, asked.by, asked.session)
         found, _ = await self._devices.find(asker, device.id)
         if found is None or not found.role.may_operate or await self._identify.signed_out(asker):
-            detail = f"{asked.by} has signed out, or may not operate this device any more. Control stays with you."
-            raise Problem("asker-gone", 409, "Who asked is gone", detail)
+            raise _asker_gone(asked.by, "Control stays with you.")
+
+    async def _require_asker_still(self, device: Device, lease: Lease) -> None:
+        asker = Identity(lease.account, lease.holder, lease.session)
+        try:
+            await self._leases.require_still(asker, device)
+        except Problem as problem:
+            raise _asker_gone(lease.holder, "Nobody has control now.") from problem
 
     async def _drop(self, who: Identity, device: Device, lease: Lease, request: str) -> None:
         """Have the device show it no longer. Where that does not arrive, its time is over there soon by itself."""
@@ -170,3 +178,8 @@ class Handovers:
             await self._commands.send(device, DropRequest(request=request), who=who.name, epoch=lease.epoch)
         except BusUnavailable as error:
             _log.warning("request for %s: %s", device.id, error)
+
+
+def _asker_gone(by: str, then: str) -> Problem:
+    detail = f"{by} has signed out, or may not operate this device any more. {then}"
+    return Problem("asker-gone", 409, "Who asked is gone", detail)

@@ -11,6 +11,7 @@ from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PublicKey
 
 from device_agent.protocol import signing
 from device_agent.protocol.errors import ProtocolError
+from device_agent.protocol.topics import ANY
 from function_app.domain.accounts import Account, Identity
 from function_app.domain.devices import Agent
 from function_app.domain.ids import agent_id, new_id
@@ -176,6 +177,16 @@ def new_session() -> str:
 def principal(who: Identity) -> str:
     """A sign-in session, as the broker knows it: signing out ends its connections and nobody else's."""
     return f"account:{who.account}:{who.session}"
+
+
+def watch_principal(who: Identity) -> str:
+    """The part of a sign-in session that watches: it is cut apart from what steers, and by account (``watchers``)."""
+    return f"{principal(who)}:watch"
+
+
+def watchers(account: str) -> str:
+    """All sessions of an account that watch, as a pattern for ``BrokerAccess.revoke``."""
+    return f"account:{account}:{ANY}:watch"
 
 
 def new_secret() -> str:

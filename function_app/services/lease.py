@@ -8,6 +8,7 @@ from function_app.domain.accounts import Identity
 from function_app.domain.devices import Device
 from function_app.domain.lease import Lease
 from function_app.domain.problems import Problem
+from function_app.domain.queue import UNSHARED
 from function_app.ports.broker_access import BrokerAccess, BrokerAccessError
 from function_app.ports.clock import Clock
 from function_app.ports.command_bus import BusUnavailable
@@ -16,6 +17,7 @@ from function_app.services.audit import Audit
 from function_app.services.commands import Commands
 from function_app.services.control import ended_at_device, read_lease
 from function_app.services.devices import Devices, require_operator, require_owner
+from function_app.services.fence import Fence, control_client
 from function_app.services.lease_rows import LeaseRows
 
 _log = logging.getLogger(__name__)
@@ -30,6 +32,7 @@ class Leases:
         tables: Tables,
         devices: Devices,
         rows: LeaseRows,
+        fence: Fence,
         commands: Commands,
         access: BrokerAccess,
         audit: Audit,
@@ -38,6 +41,7 @@ class Leases:
         self._tables = tables
         self._devices = devices
         self._rows = rows
+        self._fence = fence
         self._commands = commands
         self._access = access
         self._audit = audit
@@ -71,7 +75,7 @@ class Leases:
             who: Who takes it.
             device_id: Of which device.
             epoch: What is renewed; ``None``: take.
-            lease_ms: For how long.
+            lease_ms: For how long; not longer than the device is shared with them.
             wait_ms: How long the device's answer is waited for.
             over: Why it is taken even from somebody else. Only an owner may.
 
@@ -82,15 +86,17 @@ class Leases:
         what = "take control over" if over else "take control" if epoch is None else "go on in control"
 
         def changed(lease: Lease | None, now_ms: int) -> Lease:
+            for_ms = rules.lasting(lease_ms, device.until_ms - now_ms)
             if epoch is None:
-                return rules.take(lease, who, lease_ms=lease_ms, now_ms=now_ms, pairing=device.pairing, over=over)
-            return rules.renew(lease, who, epoch=epoch, lease_ms=lease_ms, now_ms=now_ms)
+                return rules.take(lease, who, lease_ms=for_ms, now_ms=now_ms, pairing=device.pairing, over=over)
+            return rules.renew(lease, who, epoch=epoch, lease_ms=for_ms, now_ms=now_ms)
 
         async with self._audit.refusals(device, who, what):
             require_operator(device)
             if over:
                 require_owner(device)
             before, lease = await self._rows.change(who, device, changed)
+            await self.require_still(who, device)
         confirmed = await self.grant(device, lease, by=who.name, wait_ms=wait_ms)
         if before is not None and lease.reason and epoch is None:
             await self.revoke(device, before.epoch)
@@ -117,6 +123,18 @@ class Leases:
             _log.warning("release of %s: %s", device.id, error)
         await self.revoke(device, epoch)
 
+    async def require_still(self, who: Identity, device: Device) -> None:
+        """See that whoever has just got the lease may still have it; else it has ended before the device hears of it.
+
+        Raises:
+            Problem: ``device-unknown``, ``forbidden``.
+        """
+        try:
+            await self._devices.require_still(who, device)
+        except Problem:
+            await self._fence.end(device, UNSHARED, account=who.account)
+            raise
+
     async def grant(self, device: Device, lease: Lease, *, by: str, wait_ms: int) -> bool:
         """Tell the device whose lease it is; whether it has confirmed.
 
@@ -135,8 +153,3 @@ class Leases:
             await self._access.revoke(client_id=control_client(device.id, epoch))
         except BrokerAccessError as error:
             _log.warning("setpoints of lease %d of %s: %s", epoch, device.id, error)
-
-
-def control_client(device: str, epoch: int) -> str:
-    """The MQTT client id of the connection that carries one epoch's setpoints."""
-    return f"c-{device}-{epoch}"

@@ -12,23 +12,22 @@ from dataclasses import replace
 from typing import Final
 
 from device_agent.protocol import topics
-from device_agent.protocol.messages import ReleaseLease
 from function_app.domain.actions import Status, end
-from function_app.domain.authority import ended
 from function_app.domain.devices import Agent, Device, Leaving
-from function_app.domain.lease import Lease
+from function_app.domain.ids import device_id
 from function_app.domain.queue import DROPPED
+from function_app.domain.sharing import Share, device_target
 from function_app.ports.broker_access import BrokerAccess, BrokerAccessError
 from function_app.ports.clock import Clock
 from function_app.ports.command_bus import BusUnavailable, CommandBus
 from function_app.ports.tables import Conflict, Row, Tables
 from function_app.services import store
 from function_app.services.action_rows import ActionRows
-from function_app.services.audit import told
-from function_app.services.commands import Commands
 from function_app.services.control import read_control_rows
 from function_app.services.devices import left_devices
+from function_app.services.fence import Fence
 from function_app.services.forget import Forget
+from function_app.services.identity import watchers
 from function_app.services.pending import Pending
 from function_app.services.queue import Queues
 from function_app.services.series import MARGIN_MS, SeriesWriter
@@ -51,7 +50,7 @@ class Leave:
         rows: ActionRows,
         queues: Queues,
         pending: Pending,
-        commands: Commands,
+        fence: Fence,
         access: BrokerAccess,
         bus: CommandBus,
         series: SeriesWriter,
@@ -62,7 +61,7 @@ class Leave:
         self._rows = rows
         self._queues = queues
         self._pending = pending
-        self._commands = commands
+        self._fence = fence
         self._access = access
         self._bus = bus
         self._series = series
@@ -107,7 +106,8 @@ class Leave:
 
     async def _settle(self, agent: Agent, leaving: Leaving) -> None:
         for device in left_devices(agent, leaving):
-            await self._fence(device, leaving.why)
+            # Before its actions end: with them would go the lease that tells that somebody has moved it.
+            await self._fence.end(device, leaving.why)
             await self._end_actions(device, leaving.why)
             await self._delete(store.AGENTS, agent.id, f"state:{device.name}", leaving)
             if leaving.why == "unpaired":
@@ -136,30 +136,6 @@ class Leave:
             now_ms = self._clock.now_ms()
             await self._rows.change(control.action, lambda action: end(action, Status.FAILED, why, message, now_ms))
 
-    async def _fence(self, device: Device, why: str) -> None:
-        """Raise the epoch, so that the former holder's setpoints are old, and bring the device to a hold.
-
-        Before its actions end: with them would go the lease that tells that somebody has moved it.
-        """
-
-        async def once() -> Lease | None:
-            control = await read_control_rows(self._tables, device.id)
-            known = control.lease
-            if known is None or not known.account or known.pairing != device.pairing:
-                return None
-            lease = Lease(epoch=known.epoch + 1, pairing=device.pairing)
-            facts = told(device.id, device.pairing, [ended(known, lease, why=why, now_ms=self._clock.now_ms())])
-            await self._tables.batch(store.CONTROL, [control.write_lease(device.id, lease), *facts])
-            return lease
-
-        lease = await store.retry(once)
-        if lease is None:
-            return
-        try:
-            await self._commands.send(device, ReleaseLease(), who="telescope", epoch=lease.epoch)
-        except BusUnavailable as error:
-            _log.warning("end of control of %s: %s", device.id, error)
-
     async def _delete(self, table: str, partition: str, key: str, leaving: Leaving) -> None:
         """Delete a row of the pairing that is left, not one that was written anew."""
         row = await self._tables.get(table, partition, key)
@@ -171,6 +147,9 @@ class Leave:
         """Cut the agent, then clear what is retained: its will may have spoken. Not what is said there anew."""
         if leaving.why != "removed":
             await self._access.revoke(principal=f"agent:{agent_id}")
+        if leaving.why == "unpaired":
+            for name in leaving.devices:
+                await self._end_shares(device_id(agent_id, name), leaving.pairing)
         row = await self._tables.get(store.AGENTS, agent_id, "agent")
         agent = store.read(row, Agent) if row else None
         back = agent if agent is not None and agent.space == leaving.space else None
@@ -182,6 +161,24 @@ class Leave:
             for kind, stream in _RETAINED:
                 topic = topics.device(leaving.space, agent_id, name, kind, stream)
                 await self._bus.publish(topic, b"", retain=True)
+
+    async def _end_shares(self, device: str, pairing: str) -> None:
+        """Cut who watched by a share that has ended with the pairing; then forget the share.
+
+        They hold topics of this device by name, and would hear it again if its owner claimed it anew.
+        """
+        on = device_target(device)
+        page = await self._tables.query(store.SHARES, on, first="account:", last="account;", limit=1000)
+        for row in page.rows:
+            share = store.read(row, Share)
+            if share.pairing != pairing:
+                continue
+            await self._access.revoke(principal=watchers(share.account))
+            with contextlib.suppress(Conflict):
+                await self._tables.delete(store.SHARES, row)
+                index = await self._tables.get(store.MEMBERS, share.account, f"share:{on}")
+                if index is not None:
+                    await self._tables.delete(store.MEMBERS, index)
 
     async def _strike(self, agent_id: str, done: Iterable[Leaving]) -> None:
         gone = set(done)

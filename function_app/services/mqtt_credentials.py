@@ -6,21 +6,23 @@ from device_agent.protocol import grants, topics
 from device_agent.protocol.grants import Grant
 from function_app.domain import lease as rules
 from function_app.domain.accounts import Identity
-from function_app.domain.devices import Agent
+from function_app.domain.devices import Agent, Device
 from function_app.domain.ids import new_id
-from function_app.domain.problems import broker_unavailable
+from function_app.domain.problems import Problem, broker_unavailable, busy_store
 from function_app.ports.broker_access import BrokerAccess, BrokerAccessError, Credentials
 from function_app.ports.clock import Clock
 from function_app.ports.tables import Tables
 from function_app.services.audit import Audit
 from function_app.services.control import read_lease
 from function_app.services.devices import Devices, require_claimed, require_operator
-from function_app.services.identity import principal
-from function_app.services.lease import control_client
+from function_app.services.fence import control_client
+from function_app.services.identity import principal, watch_principal
 
 WATCH_S = 15 * 60
 AGENT_S = 3600
 CONTROL_MIN_S = 60
+TOPIC_BYTES = 10_000
+"""Filters in one grant [bytes]: signed and in base 64 they fit into the 16 KiB that a CONNECT may have."""
 
 _WATCHED = (topics.DESC, topics.STATE, topics.EVENT, topics.ACK)
 _WATCHED_NAMED = ((topics.DESC, topics.TWIN), (topics.TELE, topics.ANY), (topics.CAM, topics.ANY))
@@ -49,38 +51,48 @@ class MqttCredentials:
         self._clock = clock
 
     async def watch(self, who: Identity) -> Issued:
-        """To see every device of the account, and to stop those it may operate.
+        """To see every device that the account may see, and to stop those it may operate.
 
-        A space belongs to one account, so what the broker is told is said by space and stays small however many
-        devices there are; the answer names each topic.
+        Where the account has a part in a whole space, what the broker is told is said by space and stays small however
+        many devices there are; a device that is shared by itself is named, topic by topic. The answer names each topic.
+        The credentials end with the first share that they rest on.
 
         Raises:
-            Problem: ``broker-unavailable``.
+            Problem: ``broker-unavailable``, ``busy``.
         """
         devices = await self._devices.all(who)
-        spaces = sorted({device.space for device in devices})
-        publish = tuple(f"{device.topic}/{topics.STOP}" for device in devices if device.role.may_operate)
-        subscribe: list[str] = []
-        for space, agent in sorted({(device.space, device.agent) for device in devices}):
-            subscribe.append(topics.conn(space, agent))
-        for device in devices:
-            subscribe += [f"{device.topic}/{kind}" for kind in _WATCHED]
-            subscribe += [f"{device.topic}/{kind}/{name}" for kind, name in _WATCHED_NAMED]
-        anyone = topics.ANY
-        granted_subscribe: list[str] = []
-        for space in spaces:
-            granted_subscribe.append(topics.conn(space, anyone))
-            granted_subscribe += [topics.device(space, anyone, anyone, kind) for kind in _WATCHED]
-            granted_subscribe += [topics.device(space, anyone, anyone, kind, name) for kind, name in _WATCHED_NAMED]
+        issued = await self._watch(who, devices)
+        if any(device.owner != who.account for device in devices) and _rights(await self._devices.all(who)) != _rights(
+            devices
+        ):
+            # Something was un-shared meanwhile: its sessions were cut before these credentials were there to be cut.
+            await self._take_back(issued)
+            raise busy_store()
+        return issued
+
+    async def _watch(self, who: Identity, devices: list[Device]) -> Issued:
+        said, heard, seen = _watching(devices)
+        now_ms = self._clock.now_ms()
+        ends_ms = min([now_ms + WATCH_S * 1000, *(device.until_ms for device in seen)])
         grant = Grant(
-            principal=principal(who),
+            principal=watch_principal(who),
             client_id=f"w-{who.session}-{new_id(10)}",
-            publish=tuple(topics.device(space, anyone, anyone, topics.STOP) for space in spaces),
-            subscribe=tuple(granted_subscribe),
+            publish=said,
+            subscribe=heard,
             token_id=new_id(),
-            expires_at=self._clock.now_ms() // 1000 + WATCH_S,
+            expires_at=max(now_ms // 1000 + 1, ends_ms // 1000),
         )
-        return await self._issue(grant, WATCH_S, publish, tuple(subscribe))
+        publish = tuple(f"{device.topic}/{topics.STOP}" for device in seen if device.role.may_operate)
+        subscribe = [topics.conn(space, agent) for space, agent in sorted({(one.space, one.agent) for one in seen})]
+        for device in seen:
+            subscribe += _topics(device)
+        return await self._issue(grant, max(1, (ends_ms - now_ms) // 1000), publish, tuple(subscribe))
+
+    async def _take_back(self, issued: Issued) -> None:
+        try:
+            await self._access.revoke(client_id=issued.client_id)
+        except BrokerAccessError as error:
+            raise broker_unavailable(f"{error}.") from error
 
     async def control(self, who: Identity, device_id: str, epoch: int) -> Issued:
         """To send setpoints under one epoch of a lease.
@@ -103,7 +115,13 @@ class MqttCredentials:
             token_id=new_id(),
             expires_at=now_ms // 1000 + lifetime_s,
         )
-        return await self._issue(grant, lifetime_s, publish, ())
+        issued = await self._issue(grant, lifetime_s, publish, ())
+        try:
+            await self._devices.require_still(who, device)
+        except Problem:
+            await self._take_back(issued)
+            raise
+        return issued
 
     async def agent(self, agent: Agent) -> Issued:
         """To speak for an agent's own devices and hear what is addressed to them.
@@ -125,3 +143,57 @@ class MqttCredentials:
         except BrokerAccessError as error:
             raise broker_unavailable(f"{error}.") from error
         return Issued(grant.client_id, credentials, grant.expires_at * 1000, lifetime_s, publish, subscribe)
+
+
+def _watching(devices: list[Device]) -> tuple[tuple[str, ...], tuple[str, ...], list[Device]]:
+    """What may be said and heard in order to watch these devices, and those of them that fit.
+
+    Whole spaces come first. All filters travel in one CONNECT, which brokers bound: devices that are shared one by one
+    beyond ``TOPIC_BYTES`` are left out. Whoever has so many in one room is better given the room.
+    """
+    publish: list[str] = []
+    subscribe: list[str] = []
+    seen: list[Device] = []
+    room = TOPIC_BYTES
+    for space, role in sorted({(device.space, device.space_role) for device in devices if device.space_role}):
+        anyone = topics.ANY
+        says = [topics.device(space, anyone, anyone, topics.STOP)] if role.may_operate else []
+        hears = [topics.conn(space, anyone), *_topics_at(f"{topics.ROOT}/{space}/{anyone}/{anyone}")]
+        if (room := room - _size(says, hears)) < 0:
+            break
+        publish += says
+        subscribe += hears
+        seen += [device for device in devices if device.space == space and device.space_role]
+    more = {device.id for device in seen}
+    for device in devices:
+        says = [f"{device.topic}/{topics.STOP}"] if device.role.may_operate else []
+        hears = [] if device.id in more else [topics.conn(device.space, device.agent), *_topics(device)]
+        says = [] if device.space_role and device.space_role.may_operate else says
+        if not says and not hears:
+            continue
+        if (room := room - _size(says, hears)) < 0:
+            break
+        publish += says
+        subscribe += hears
+        seen += [device] if device.id not in more else []
+    return tuple(publish), tuple(dict.fromkeys(subscribe)), seen
+
+
+def _topics(device: Device) -> list[str]:
+    return _topics_at(device.topic)
+
+
+def _topics_at(base: str) -> list[str]:
+    """What whoever watches a device hears. Never ``cmd``, ``ctl`` or ``stop``."""
+    return [
+        *(f"{base}/{kind}" for kind in _WATCHED),
+        *(f"{base}/{kind}/{name}" for kind, name in _WATCHED_NAMED),
+    ]
+
+
+def _size(*lists: list[str]) -> int:
+    return sum(len(pattern) + 3 for patterns in lists for pattern in patterns)
+
+
+def _rights(devices: list[Device]) -> set[tuple[object, ...]]:
+    return {(device.id, device.topic, device.role, device.space_role, device.until_ms) for device in devices}

@@ -18,12 +18,12 @@ class Pending:
     def __init__(self, *, tables: Tables) -> None:
         self._tables = tables
 
-    async def note(self, action: str, due_ms: int) -> None:
-        """Look at ``action`` at ``due_ms``; the same note twice is one."""
+    async def note(self, action: str, due_ms: int) -> Row | None:
+        """Look at ``action`` at ``due_ms``. The same note twice is one; whoever writes it second gets no row."""
         try:
-            await self._tables.create(store.PENDING, Row(_shard(action), f"{due_ms:013d}:{action}", {}))
+            return await self._tables.create(store.PENDING, Row(_shard(action), f"{due_ms:013d}:{action}", {}))
         except Conflict:
-            return
+            return None
 
     async def due(self, shard: int, now_ms: int, *, limit: int = 100) -> list[tuple[str, Row]]:
         """Actions whose time has come, with their notes."""

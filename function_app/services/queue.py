@@ -6,7 +6,7 @@ to begin in the very moment in which that person lets go would surprise whoever 
 """
 
 import logging
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 from dataclasses import replace
 from typing import Final
 
@@ -16,7 +16,7 @@ from function_app.domain.actions import REPEAT_MS, Action, Status, end, give_tur
 from function_app.domain.devices import Device
 from function_app.domain.lease import Lease
 from function_app.domain.problems import Problem
-from function_app.domain.queue import DROPPED, UNPAIRED
+from function_app.domain.queue import DROPPED, UNPAIRED, UNSHARED, Queue
 from function_app.ports.clock import Clock
 from function_app.ports.command_bus import BusUnavailable
 from function_app.ports.tables import Row, Tables, Write
@@ -26,7 +26,7 @@ from function_app.services.audit import Audit, lease_change
 from function_app.services.control import heed_device, read_control, read_control_rows
 from function_app.services.devices import Devices
 from function_app.services.pending import Pending
-from function_app.services.send_action import MovementChanged, SendAction
+from function_app.services.send_action import MovementChanged, NotShared, SendAction
 
 LOOK_MS: Final = 2_000
 """A queue is looked at so often, for the case that whoever freed the slot was killed before it saw to the queue."""
@@ -97,12 +97,22 @@ class Queues:
         Raises:
             Problem: ``busy``.
         """
+        await self._lose(device, lambda queue: queue.halted(why))
 
+    async def drop(self, device: str, actions: Collection[str], why: str) -> None:
+        """Drop some of those that wait, and end them.
+
+        Raises:
+            Problem: ``busy``.
+        """
+        await self._lose(device, lambda queue: queue.dropping(actions, why))
+
+    async def _lose(self, device: str, change: Callable[[Queue], Queue]) -> None:
         async def once() -> None:
             control = await read_control_rows(self._tables, device)
-            halted = control.queue.halted(why)
-            if halted is not control.queue:
-                await self._tables.batch(store.CONTROL, [control.write_queue(device, halted)])
+            changed = change(control.queue)
+            if changed is not control.queue:
+                await self._tables.batch(store.CONTROL, [control.write_queue(device, changed)])
 
         await store.retry(once)
         await self.advance(device)
@@ -150,7 +160,8 @@ class Queues:
         who = Identity(action.account, action.who, action.session)
         device, _ = await self._devices.find(who, action.device)
         if device is None or device.pairing != action.pairing or not device.role.may_operate:
-            await self._refuse(found, *_reason(UNPAIRED))
+            paired = await self._sending.device(action) is not None
+            await self._refuse(found, *_reason(UNSHARED if paired else UNPAIRED))
             return True
         try:
             started = await self._start(found, device, who)
@@ -166,6 +177,8 @@ class Queues:
             await self._sending.send(started, device)
         except MovementChanged:
             _log.warning("action %s: its script is gone; the timer ends it", action.id)
+        except NotShared:
+            _log.warning("action %s: the device is shared no longer; the timer ends it", action.id)
         return False
 
     async def _start(self, found: Found, device: Device, who: Identity) -> Found | None:

@@ -7,12 +7,13 @@ from function_app.domain.accounts import Identity
 from function_app.domain.actions import Action, mark_published
 from function_app.domain.devices import Agent, Device
 from function_app.domain.ids import split_command, split_device
+from function_app.domain.problems import Problem
 from function_app.ports.clock import Clock
 from function_app.ports.tables import Tables
 from function_app.services import store
 from function_app.services.action_rows import ActionRows, Found
 from function_app.services.commands import Commands
-from function_app.services.devices import devices_of
+from function_app.services.devices import Devices, devices_of
 from function_app.services.movements import Movements
 
 
@@ -20,13 +21,25 @@ class MovementChanged(Exception):  # noqa: N818 (an outcome that callers expect)
     """The script that the action pinned is gone."""
 
 
+class NotShared(Exception):  # noqa: N818 (an outcome that callers expect)
+    """Who started the action may not operate its device any more."""
+
+
 class SendAction:
     """Publishes written actions: those whose turn has come, and those that nobody has answered."""
 
     def __init__(
-        self, *, tables: Tables, rows: ActionRows, commands: Commands, movements: Movements, clock: Clock
+        self,
+        *,
+        tables: Tables,
+        devices: Devices,
+        rows: ActionRows,
+        commands: Commands,
+        movements: Movements,
+        clock: Clock,
     ) -> None:
         self._tables = tables
+        self._devices = devices
         self._rows = rows
         self._commands = commands
         self._movements = movements
@@ -48,9 +61,14 @@ class SendAction:
 
         Raises:
             MovementChanged: There is nothing to send.
+            NotShared: Who started it may not operate the device any more.
             BusUnavailable: The broker did not confirm it.
         """
         action = found.action
+        try:
+            await self._devices.require_still(Identity(action.account, action.who, action.session), device)
+        except Problem as problem:
+            raise NotShared from problem
         signed = await self._commands.signed(
             device,
             action.id,
@@ -68,7 +86,8 @@ class SendAction:
         if action.request["kind"] != "run_movement":
             task: Task = msgspec.convert(action.request, Task)
             return task
-        owner = Identity(action.account, action.who, "")
+        # On a shared device its owner's movements run: whoever wrote it is whose store it is in.
+        owner = Identity(action.pinned["author"] or action.account, action.who, "")
         source = await self._movements.pinned_source(owner, action.request["name"], action.pinned)
         if source is None:
             raise MovementChanged

@@ -91,6 +91,11 @@ class SignIn:
         await self._tables.create(store.ACCOUNTS, Row(who.account, f"space:{space.id}", store.fields(space)))
         return space
 
+    async def known(self, name: str) -> Account | None:
+        """The account of this name, if there is one."""
+        row = await self._tables.get(store.ACCOUNTS, f"name:{name}", "account")
+        return Account(id=str(row.data["account"]), name=name) if row else None
+
     async def named(self, account: str) -> str:
         """The name of an account; empty when it is gone."""
         row = await self._tables.get(store.ACCOUNTS, account, "account")

@@ -12,11 +12,12 @@ from msgspec import Struct
 from device_agent.protocol.messages import Ack, Gather, Id, RunMovement, Task
 from function_app.domain import lease as rules
 from function_app.domain.accounts import Identity
-from function_app.domain.actions import REPEAT_MS, Action, Status, reached
+from function_app.domain.actions import REPEAT_MS, Action, Status, end, reached
 from function_app.domain.devices import Device, Link
 from function_app.domain.ids import command_id
 from function_app.domain.lease import Lease
 from function_app.domain.problems import Problem, busy_store, invalid
+from function_app.domain.queue import DROPPED, UNSHARED
 from function_app.ports.clock import Clock
 from function_app.ports.command_bus import BusUnavailable
 from function_app.ports.tables import Row, Tables, Write
@@ -194,6 +195,7 @@ class StartAction:
             await self._queues.advance(device.id)
         if not fresh or found.action.status is Status.QUEUED:
             return await self._join(found, device, listening)
+        await self._require_still(who, device, found)
         signed = await self._signed(plan, found.action)
         acks = await listening.enter_async_context(self._delivery.acks(device, plan.action))
         try:
@@ -202,6 +204,22 @@ class StartAction:
             # It is written: the timer publishes it as soon as the broker is back, or ends it.
             return _Begun(found, acks, undelivered=True)
         return _Begun(found, acks, published=True)
+
+    async def _require_still(self, who: Identity, device: Device, found: Found) -> None:
+        """End an action of somebody with whom the device was un-shared while it was written.
+
+        Raises:
+            Problem: ``device-unknown``, ``forbidden``.
+        """
+        try:
+            await self._devices.require_still(who, device)
+        except Problem:
+            status, message = DROPPED[UNSHARED]
+            now_ms = self._clock.now_ms()
+            await self._queues.change(
+                found.action.id, lambda known: end(known, status, UNSHARED, message, now_ms), known=found
+            )
+            raise
 
     async def _join(self, found: Found, device: Device, listening: AsyncExitStack) -> "_Begun":
         """Where nothing is to be sent: an earlier request started it, or it waits for its turn."""
@@ -218,7 +236,9 @@ class StartAction:
             await abilities.check(self._tables, device, asked)
             plan = _Plan(device, action, now_ms, request, asked)
         else:
-            movement, source = await self._movements.get(who, device.robot_type, asked.name)
+            # Whoever starts it: on a device run the movements that its owner has for it, and no others.
+            owner = Identity(device.owner, "", "")
+            movement, source = await self._movements.get(owner, device.robot_type, asked.name)
             command = RunMovement(
                 robot_type=device.robot_type,
                 name=movement.name,
@@ -226,7 +246,7 @@ class StartAction:
                 sha256=movement.sha256,
                 source=source,
                 parameters=parameters.fit(movement.parameters_schema, asked.parameters),
-                author=movement.author or who.account,
+                author=movement.author or device.owner,
                 key=movement.key,
                 signature=movement.signature,
                 timeout_ms=start.timeout_ms,

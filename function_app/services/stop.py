@@ -17,7 +17,7 @@ from function_app.domain.accounts import Identity
 from function_app.domain.authority import Fact
 from function_app.domain.devices import Device
 from function_app.domain.ids import new_id
-from function_app.domain.problems import Problem, not_found
+from function_app.domain.problems import Problem
 from function_app.domain.queue import STOPPED
 from function_app.ports.command_bus import BusUnavailable
 from function_app.ports.tables import StoreError
@@ -27,7 +27,7 @@ from function_app.services.delivery import Delivery
 from function_app.services.devices import Devices, require_operator
 from function_app.services.lease_rows import LeaseRows
 from function_app.services.queue import Queues
-from function_app.services.sign_in import SignIn
+from function_app.services.spaces import Spaces
 
 REPEAT_S: Final = 0.2
 CONFIRM_MS: Final = 1_000
@@ -53,7 +53,7 @@ class StopDevices:
         self,
         *,
         devices: Devices,
-        sign_in: SignIn,
+        spaces: Spaces,
         rows: LeaseRows,
         commands: Commands,
         queues: Queues,
@@ -61,7 +61,7 @@ class StopDevices:
         audit: Audit,
     ) -> None:
         self._devices = devices
-        self._sign_in = sign_in
+        self._spaces = spaces
         self._rows = rows
         self._commands = commands
         self._queues = queues
@@ -90,8 +90,8 @@ class StopDevices:
         Raises:
             Problem: ``space-unknown``.
         """
-        if space is not None and space not in {known.id for known in await self._sign_in.spaces(who.account)}:
-            raise not_found("space", space)
+        if space is not None:
+            await self._spaces.get(who, space)
         gate = asyncio.Semaphore(AT_ONCE)
         devices = [
             device
@@ -115,6 +115,7 @@ class StopDevices:
         _, lease = await self._rows.change(
             who, device, lambda lease, now_ms: rules.overtake(lease, pairing=device.pairing, now_ms=now_ms)
         )
+        await self._devices.require_still(who, device)
         return await self._commands.confirmed(device, ResetStop(), who=who.name, epoch=lease.epoch, wait_ms=CONFIRM_MS)
 
     async def _one(self, who: Identity, device: Device, reason: str, gate: asyncio.Semaphore) -> Stopped:

@@ -21,13 +21,19 @@ CLAIMS = "Claims"
 ATTEMPTS = "Attempts"
 """Partition: account id, or ``address:<address>``; key: what is being tried."""
 MEMBERS = "Members"
-"""Partition: account id; key ``agent:<agent id>``. Only an index: the agent's own row says whose it is."""
+"""Partition: account id; keys ``agent:<agent id>``, ``share:device:<id>``, ``share:space:<id>``. Only an index: the
+agent's own row says whose it is, the share's own what is shared."""
+SHARES = "Shares"
+"""Partition: ``device:<id>`` or ``space:<id>``; key ``account:<account id>``; and, as an index, with ``agent:<id>`` as
+well, ``invitation:<id>``."""
+INVITATIONS = "Invitations"
+"""Partition: first letter of the secret's hash; key: the hash."""
 CONTROL = "Control"
 """Partition: device id; keys ``now:lease``, ``now:slot``, ``now:queue``, ``action:<suffix>``, ``once:<hash>``, and
 ``event:<id>``, what is still to be told among the device's events."""
 PENDING = "Pending"
-"""Partition: shard; key: ``<due ms>:<what>``, an action's id, ``queue:<device id>``, ``lease:<device id>`` or
-``leave:<agent id>``."""
+"""Partition: shard; key: ``<due ms>:<what>``, an action's id, ``queue:<device id>``, ``lease:<device id>``,
+``leave:<agent id>``, ``share-changed:<on>|<account id>`` or ``share-expires:<on>|<account id>``."""
 ROBOT_TYPES = "RobotTypes"
 """Partition: ``<account>/<robot type>``; keys ``type``, ``version:<number>``. Index in ``Members``: ``type:<type>``."""
 MODEL_CHECKS = "ModelChecks"

@@ -9,6 +9,7 @@ from device_agent.protocol.messages import CancelAction
 from function_app.domain.actions import Action, Status, Verdict, end, judge, next_look_ms
 from function_app.domain.ids import CLAIM_ALPHABET
 from function_app.domain.problems import Problem
+from function_app.domain.queue import DROPPED, UNSHARED
 from function_app.ports.broker_access import BrokerAccess, BrokerAccessError
 from function_app.ports.clock import Clock
 from function_app.ports.command_bus import BusUnavailable
@@ -23,7 +24,8 @@ from function_app.services.intake import Intake
 from function_app.services.leave import Leave, leaver_of
 from function_app.services.pending import SHARDS, Pending
 from function_app.services.queue import TIMEOUT, Queues, queue_of
-from function_app.services.send_action import MovementChanged, SendAction
+from function_app.services.send_action import MovementChanged, NotShared, SendAction
+from function_app.services.sharing import Sharing, about_share
 from function_app.services.start_action import ABANDON_MS
 from function_app.services.tend_robot_types import TendRobotTypes
 from function_app.services.uploads import Uploads
@@ -51,6 +53,7 @@ class Sweep:
         sending: SendAction,
         queues: Queues,
         leave: Leave,
+        sharing: Sharing,
         audit: Audit,
         access: BrokerAccess,
         forget: Forget,
@@ -68,6 +71,7 @@ class Sweep:
         self._sending = sending
         self._queues = queues
         self._leave = leave
+        self._sharing = sharing
         self._audit = audit
         self._access = access
         self._forget = forget
@@ -110,6 +114,8 @@ class Sweep:
             await self._look_at_queue(device, note)
         elif agent := leaver_of(what):
             await self._look_at_leaver(agent, note)
+        elif about_share(what):
+            await self._sharing.look(what, note)
         elif device := lease_of(what):
             await self._audit.look(device)
             await self._pending.drop(note)
@@ -203,6 +209,9 @@ class Sweep:
         except MovementChanged:
             message = "The movement's script was changed before the command could be sent. Start it again."
             await self._end(found, Status.FAILED, "movement-changed", message, now_ms)
+        except NotShared:
+            status, message = DROPPED[UNSHARED]
+            await self._end(found, status, UNSHARED, message, now_ms)
 
     async def _cancel(self, action: Action) -> None:
         device = await self._sending.device(action)

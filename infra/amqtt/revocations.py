@@ -10,7 +10,7 @@ from typing import IO
 import msgspec
 
 from device_agent.protocol.control import Revoke
-from device_agent.protocol.grants import Grant
+from device_agent.protocol.grants import Grant, covering
 
 _TIDY_AT = 1_000
 """Revocations from which on those that have run out are looked for."""
@@ -88,8 +88,9 @@ class Revocations:
 
     def covers(self, grant: Grant, issued_at: float) -> bool:
         """Whether a grant whose token was made at ``issued_at`` [s since 1970] has been taken back."""
+        named = [("client_id", grant.client_id), *(("principal", name) for name in covering(grant.principal))]
         return ("token_id", grant.token_id) in self._before or any(
-            issued_at <= self._before.get((field, getattr(grant, field)), -1.0) for field in ("client_id", "principal")
+            issued_at <= self._before.get(name, -1.0) for name in named
         )
 
     def close(self) -> None:

@@ -158,7 +158,11 @@ class MosquittoBrokerAccess:
         _exactly_one(client_id, principal)
         entries = await self._entries()
         await self._delete(
-            [entry.username for entry in entries if entry.client_id == client_id or entry.principal == principal]
+            [
+                entry.username
+                for entry in entries
+                if entry.client_id == client_id or principal in grants.covering(entry.principal)
+            ]
         )
 
     async def expire(self, now_s: float) -> None:

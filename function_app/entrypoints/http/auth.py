@@ -7,6 +7,7 @@ from function_app.entrypoints.http.answers import answer, empty, read
 from function_app.entrypoints.http.caller import COOKIE, Caller
 from function_app.entrypoints.http.contract import auth as contract
 from function_app.entrypoints.http.routing import Routes
+from function_app.services.spaces import SpaceView
 
 
 def router(functions: Functions, caller: Caller) -> Routes:
@@ -49,13 +50,11 @@ def router(functions: Functions, caller: Caller) -> Routes:
         who = await caller.account(request)
         return answer(contract.Me(id=who.account, name=who.name, session=who.session))
 
-    @routes.add("GET", "/spaces", summary="The account's spaces", answers={200: contract.SpaceList})
+    @routes.add("GET", "/spaces", summary="Spaces one may see", answers={200: contract.SpaceList})
     async def list_spaces(request: Request) -> Response:
-        """Rooms into which agents can be claimed."""
-        who = await caller.account(request)
-        spaces = await functions.sign_in.spaces(who.account)
-        items = tuple(contract.SpaceOut(id=space.id, name=space.name) for space in spaces)
-        return answer(contract.SpaceList(items=items, cursor=None))
+        """One's own, into which agents can be claimed, and those that are shared with one."""
+        views = await functions.spaces.list(await caller.account(request))
+        return answer(contract.SpaceList(items=tuple(_space(view) for view in views), cursor=None))
 
     @routes.add(
         "POST",
@@ -70,6 +69,11 @@ def router(functions: Functions, caller: Caller) -> Routes:
         who = await caller.account(request)
         asked: contract.SpaceRequest = await read(request, contract.SpaceRequest)
         space = await functions.sign_in.add_space(who, asked.name)
-        return answer(contract.SpaceOut(id=space.id, name=space.name), 201)
+        return answer(_space(await functions.spaces.get(who, space.id)), 201)
 
     return routes
+
+
+def _space(view: SpaceView) -> contract.SpaceOut:
+    owner = contract.AccountRef(id=view.owner.id, name=view.owner.name)
+    return contract.SpaceOut(id=view.space.id, name=view.space.name, role=view.role.value, owner=owner)

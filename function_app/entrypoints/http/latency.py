@@ -11,7 +11,7 @@ from function_app.entrypoints.http.answers import answer, empty, read
 from function_app.entrypoints.http.caller import Caller
 from function_app.entrypoints.http.contract import latency as contract
 from function_app.entrypoints.http.routing import Routes
-from function_app.services.devices import devices_of
+from function_app.services.devices import devices_of, require_operator
 from function_app.services.latency import Found, Path, Samples, Transport
 
 Key = Annotated[
@@ -45,10 +45,10 @@ def router(functions: Functions, caller: Caller) -> Routes:
         problems=(404,),
     )
     async def add_latency(request: Request, device: str, once: Key = None) -> Response:
-        """Times that the operator's side has measured, on its own clock alone."""
+        """Times that the operator's side has measured, on its own clock alone. Who only watches adds none."""
         who = await caller.account(request)
         asked: contract.LatencyRequest = await read(request, contract.LatencyRequest)
-        found = await functions.devices.get(who, device)
+        found = require_operator(await functions.devices.get(who, device))
         await functions.latencies.add(found, _samples(asked), who=f"account:{who.account}", once=once or "")
         return empty()
 

@@ -13,6 +13,7 @@ from function_app.domain.robot_types import TypeVersion
 from function_app.domain.times import rfc3339
 from function_app.entrypoints.http.contract import actions, devices, movements, robot_types
 from function_app.entrypoints.http.contract import lease as leases
+from function_app.entrypoints.http.contract.auth import AccountRef
 from function_app.services.devices import DeviceView
 from function_app.services.parameters import ObjectSchema
 from function_app.services.robot_types import KnownType
@@ -31,6 +32,7 @@ def device(view: DeviceView, who: Identity, now_ms: int) -> devices.DeviceOut:
         agent=known.agent,
         space=known.space,
         role=known.role.value,
+        owner=AccountRef(id=known.owner, name=view.owner_name),
         topic=known.topic,
         online=view.online,
         last_seen_at=None if view.last_seen_ms is None else rfc3339(view.last_seen_ms),

@@ -23,6 +23,8 @@ BODIES: dict[str, Any] = {
         "samples": [{"at_ms": 1, "ms": 1}],
     },
     "move_agent": {"space": "x"},
+    "share_device": {"account": "bert", "role": "operator"},
+    "share_space": {"account": "bert", "role": "operator"},
     "tell_messages": {"messages": [{"topic": "t", "payload": {}}]},
     "begin_upload": {"stream": "camera", "length": 3, "content_type": "image/png"},
     "begin_agent_upload": {"device": "arm", "stream": "camera", "length": 3, "content_type": "image/png"},
@@ -70,6 +72,7 @@ def test_every_route_with_the_others_ids_finds_nothing_and_changes_nothing(
         "stream": "joints",
         "fault": fault,
         "upload": upload,
+        "account": anna.account,
     }
     told = len(robot.commands)
     before = everything(cloud)
@@ -107,6 +110,10 @@ def test_every_route_with_the_others_ids_finds_nothing_and_changes_nothing(
         "stop_device",
         "reset_stop",
         "unpair_agent",
+        "share_device",
+        "unshare_device",
+        "share_space",
+        "unshare_space",
         "move_agent",
         "fetch_commands",
         "tell_messages",

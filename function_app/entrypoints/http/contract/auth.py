@@ -45,10 +45,12 @@ class SpaceRequest(Request, frozen=True, kw_only=True):
 
 
 class SpaceOut(Answer, frozen=True, kw_only=True):
-    """A space."""
+    """A space. ``role``: what the caller may do in it; agents can be claimed into one's own."""
 
     id: str
     name: str
+    role: Literal["owner", "operator", "viewer"]
+    owner: AccountRef
 
 
 class SpaceList(Answer, frozen=True, kw_only=True):

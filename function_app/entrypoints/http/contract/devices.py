@@ -3,12 +3,13 @@
 from typing import Literal
 
 from device_agent.protocol.messages import State
+from function_app.entrypoints.http.contract.auth import AccountRef
 from function_app.entrypoints.http.contract.base import Answer, Moment
 from function_app.entrypoints.http.contract.lease import LeaseOut
 
 
 class DeviceOut(Answer, frozen=True, kw_only=True):
-    """A device. ``state`` is the newest ``state`` message of the device."""
+    """A device. ``role``: what the caller may do with it; ``state``: the newest ``state`` message of the device."""
 
     id: str
     name: str
@@ -18,6 +19,7 @@ class DeviceOut(Answer, frozen=True, kw_only=True):
     agent: str
     space: str
     role: Literal["owner", "operator", "viewer"]
+    owner: AccountRef
     topic: str
     online: bool
     last_seen_at: Moment | None

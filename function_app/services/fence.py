@@ -1,0 +1,88 @@
+"""Ending control that somebody has lost the right to: the epoch is burned, and the device is brought to a hold."""
+
+import logging
+
+from device_agent.protocol.messages import ReleaseLease
+from function_app.domain.authority import ended
+from function_app.domain.devices import Device
+from function_app.domain.lease import Lease
+from function_app.ports.broker_access import BrokerAccess, BrokerAccessError
+from function_app.ports.clock import Clock
+from function_app.ports.command_bus import BusUnavailable
+from function_app.ports.tables import Tables
+from function_app.services import store
+from function_app.services.audit import told
+from function_app.services.commands import Commands
+from function_app.services.control import read_control_rows
+
+_log = logging.getLogger(__name__)
+
+
+class Fence:
+    """Ends leases from outside."""
+
+    def __init__(self, *, tables: Tables, commands: Commands, access: BrokerAccess, clock: Clock) -> None:
+        self._tables = tables
+        self._commands = commands
+        self._access = access
+        self._clock = clock
+
+    async def end(self, device: Device, why: str, *, account: str | None = None) -> bool:
+        """Raise the epoch, so that the holder's setpoints and orders are old, and have the device hold.
+
+        A lease that has run out is fenced too: what was ordered under it may still be on its way.
+
+        Args:
+            device: Whose lease; of which pairing.
+            why: What has happened to the device.
+            account: Only if this account has it; ``None``: whoever has.
+
+        Returns:
+            Whether everybody who had to be told has been. The lease has ended in any case.
+
+        Raises:
+            Problem: ``busy``.
+        """
+
+        async def once() -> Lease | None:
+            control = await read_control_rows(self._tables, device.id)
+            known = control.lease
+            if known is None or not known.account or known.pairing != device.pairing:
+                return None
+            if account not in {None, known.account}:
+                return None
+            lease = Lease(epoch=known.epoch + 1, pairing=device.pairing)
+            facts = told(device.id, device.pairing, [ended(known, lease, why=why, now_ms=self._clock.now_ms())])
+            await self._tables.batch(store.CONTROL, [control.write_lease(device.id, lease), *facts])
+            return lease
+
+        lease = await store.retry(once)
+        return lease is None or await self._tell(device, lease)
+
+    async def repeat(self, device: Device) -> bool:
+        """Tell again of the end of a lease that nobody has had since; whether it could be told."""
+        control = await read_control_rows(self._tables, device.id)
+        lease = control.lease
+        if lease is None or lease.account or lease.pairing != device.pairing:
+            return True
+        return await self._tell(device, lease)
+
+    async def _tell(self, device: Device, lease: Lease) -> bool:
+        """Cut the connection that carries the setpoints of the epoch before, and tell the device: each in its way."""
+        done = True
+        try:
+            await self._access.revoke(client_id=control_client(device.id, lease.epoch - 1))
+        except BrokerAccessError as error:
+            _log.warning("setpoints of lease %d of %s: %s", lease.epoch - 1, device.id, error)
+            done = False
+        try:
+            await self._commands.send(device, ReleaseLease(), who="telescope", epoch=lease.epoch)
+        except BusUnavailable as error:
+            _log.warning("end of control of %s: %s", device.id, error)
+            done = False
+        return done
+
+
+def control_client(device: str, epoch: int) -> str:
+    """The MQTT client id of the connection that carries one epoch's setpoints."""
+    return f"c-{device}-{epoch}"

@@ -1,0 +1,275 @@
+"""Sharing devices and spaces with other accounts, and ending that.
+
+A share's row decides from the moment in which it is written or deleted. What was done under a role that is lost ends
+then (``services/unshare.py``); a note for the timer, written first, has that done where this process is killed.
+"""
+
+import asyncio
+import logging
+from dataclasses import dataclass, replace
+from typing import Final, Literal
+
+from function_app.domain.accounts import Account, Identity, Role
+from function_app.domain.authority import Fact
+from function_app.domain.devices import NEVER_MS
+from function_app.domain.problems import Problem, forbidden, invalid, not_found
+from function_app.domain.sharing import (
+    MOST_SHARES,
+    Share,
+    device_target,
+    lasting,
+    outranks,
+    shareable,
+    space_target,
+    split_target,
+)
+from function_app.ports.clock import Clock
+from function_app.ports.tables import Conflict, Row, Tables
+from function_app.services import store
+from function_app.services.audit import Audit
+from function_app.services.devices import Devices, require_owner, share_key
+from function_app.services.pending import Pending
+from function_app.services.sign_in import SignIn
+from function_app.services.spaces import Spaces
+from function_app.services.unshare import Unshare, index
+
+LOOK_MS: Final = 10_000
+"""The timer sees to what a change has left undone after so long, where whoever made it was killed."""
+AGAIN_MS: Final = 1_000
+"""And so often, as long as the broker cannot be told."""
+_CHANGED: Final = "share-changed:"
+_EXPIRES: Final = "share-expires:"
+
+_log = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True, slots=True)
+class Shared:
+    """What is shared or handed over, once it is seen that it is the caller's."""
+
+    on: str
+    owner: Account
+    label: str
+    pairing: str = ""
+
+
+class Sharing:
+    """Shares."""
+
+    def __init__(
+        self,
+        *,
+        tables: Tables,
+        devices: Devices,
+        spaces: Spaces,
+        sign_in: SignIn,
+        unshare: Unshare,
+        pending: Pending,
+        audit: Audit,
+        clock: Clock,
+    ) -> None:
+        self._tables = tables
+        self._devices = devices
+        self._spaces = spaces
+        self._sign_in = sign_in
+        self._unshare = unshare
+        self._pending = pending
+        self._audit = audit
+        self._clock = clock
+
+    # ------------------------------------------------------------ what people ask for
+
+    async def of(self, who: Identity, kind: Literal["device", "space"], name: str) -> Shared:
+        """A device or space of the caller's own, to share it.
+
+        Raises:
+            Problem: ``device-unknown``, ``space-unknown``, ``forbidden``.
+        """
+        if kind == "space":
+            view = await self._spaces.own(who, name)
+            return Shared(space_target(name), view.owner, view.space.name)
+        device = await self._devices.get(who, name)
+        async with self._audit.refusals(device, who, "share it"):
+            require_owner(device)
+        owner = Account(device.owner, await self._sign_in.named(device.owner))
+        return Shared(device_target(name), owner, device.label, device.pairing)
+
+    async def shares(self, shared: Shared) -> list[tuple[Share, str]]:
+        """With whom it is shared now, each with the account's name."""
+        page = await self._tables.query(store.SHARES, shared.on, first="account:", last="account;", limit=1000)
+        now_ms = self._clock.now_ms()
+        found = [share for row in page.rows if _holds(share := store.read(row, Share), shared, now_ms)]
+        names = await asyncio.gather(*(self._sign_in.named(share.account) for share in found))
+        return sorted(zip(found, names, strict=True), key=lambda each: each[0].created_ms)
+
+    async def put(
+        self, who: Identity, shared: Shared, account: Account, role: Role, for_s: int | None
+    ) -> tuple[Share, bool]:
+        """Share it with an account, or change that; and whether it is new.
+
+        Raises:
+            Problem: ``invalid``, ``too-many-shares``, ``busy``.
+        """
+        expires_ms = lasting(for_s, self._clock.now_ms())
+        share = self._share(shared, account.id, shareable(role), who.name, expires_ms)
+        return await self._write(who, shared, account, share, keep_more=False)
+
+    async def give(self, who: Identity, shared: Shared, account: Account, role: Role, expires_ms: int) -> Share:
+        """The same by an invitation, which takes nothing away from who has more already."""
+        share = self._share(shared, account.id, role, who.name, expires_ms)
+        return (await self._write(who, shared, account, share, keep_more=True))[0]
+
+    async def end(self, who: Identity, shared: Shared, account: str) -> None:
+        """Un-share.
+
+        Raises:
+            Problem: ``share-unknown``, ``busy``.
+        """
+        row = await self._tables.get(store.SHARES, shared.on, share_key(account))
+        if row is None or not _holds(store.read(row, Share), shared, self._clock.now_ms()):
+            raise not_found("share", account)
+        await self._end(who, row)
+
+    async def leave(self, who: Identity, on: str) -> None:
+        """Give one's own part in something of another's back.
+
+        Raises:
+            Problem: ``share-unknown``, ``forbidden``, ``busy``.
+        """
+        if who.key:
+            raise forbidden("An API key cannot give its account's part in something back.")
+        row = await self._tables.get(store.SHARES, on, share_key(who.account))
+        if row is None:
+            raise not_found("share", who.account)
+        await self._end(who, row)
+
+    async def person(self, name: str) -> Account:
+        """The account of this name.
+
+        Raises:
+            Problem: ``account-unknown``.
+        """
+        found = await self._sign_in.known(name)
+        if found is None:
+            raise not_found("account", name)
+        return found
+
+    # ------------------------------------------------------------ writing
+
+    def _share(self, shared: Shared, account: str, role: Role, by: str, expires_ms: int) -> Share:
+        if account == shared.owner.id:
+            raise invalid("It is this account's own: there is nothing to share with it.")
+        return Share(
+            on=shared.on,
+            account=account,
+            role=role,
+            owner=shared.owner.id,
+            by=by,
+            created_ms=self._clock.now_ms(),
+            expires_ms=expires_ms,
+            pairing=shared.pairing,
+        )
+
+    async def _write(
+        self, who: Identity, shared: Shared, account: Account, share: Share, *, keep_more: bool
+    ) -> tuple[Share, bool]:
+        note = await self._pending.note(_note(_CHANGED, share), self._clock.now_ms() + LOOK_MS)
+        if share.expires_ms < NEVER_MS:
+            await self._pending.note(_note(_EXPIRES, share), share.expires_ms)
+        # The index first: without the share's row behind it it shows nothing.
+        await index(self._tables, share)
+        lowered = False
+
+        async def once() -> tuple[Share, bool]:
+            nonlocal lowered
+            row = await self._tables.get(store.SHARES, share.on, share_key(share.account))
+            known = store.read(row, Share) if row else None
+            before = known if known is not None and _holds(known, shared, self._clock.now_ms()) else None
+            if before is not None and keep_more and not _more(share, before):
+                return before, False
+            lowered = before is not None and (outranks(before.role, share.role) or share.expires_ms < before.expires_ms)
+            if row is None:
+                await self._check_room(share.on)
+                await self._tables.create(store.SHARES, Row(share.on, share_key(share.account), store.fields(share)))
+            else:
+                await self._tables.replace(store.SHARES, replace(row, data=store.fields(share)))
+            return share, before is None
+
+        written, fresh = await store.retry(once)
+        if written is share:
+            message = f"{who.name} shared it with {account.name} as {share.role}."
+            await self._tell(share, Fact.SHARED, message, by=who.name, account=account.id, role=share.role.value)
+        if not lowered or await self._unshare.settle(share):
+            await self._drop(note)
+        return written, fresh
+
+    async def _check_room(self, on: str) -> None:
+        page = await self._tables.query(store.SHARES, on, first="account:", last="account;", limit=MOST_SHARES)
+        now_ms = self._clock.now_ms()
+        dead = [row for row in page.rows if not store.read(row, Share).live(now_ms)]
+        if len(page.rows) - len(dead) >= MOST_SHARES:
+            detail = f"It is shared with {MOST_SHARES} accounts, the most there can be. End one of these shares."
+            raise Problem("too-many-shares", 409, "Too many shares", detail)
+
+    async def _end(self, who: Identity | None, row: Row) -> None:
+        """Delete the share's row, which decides, and end what was done under it."""
+        share = store.read(row, Share)
+        note = await self._pending.note(_note(_CHANGED, share), self._clock.now_ms() + LOOK_MS)
+        try:
+            await self._tables.delete(store.SHARES, row)
+        except Conflict:
+            fresh = await self._tables.get(store.SHARES, row.partition, row.key)
+            if fresh is not None:
+                await self._end(who, fresh)
+            return
+        if await self._unshare.settle(share):
+            await self._drop(note)
+        name = await self._sign_in.named(share.account)
+        if who is None:
+            await self._tell(share, Fact.UNSHARED, f"The time of {name}'s share ran out.", account=share.account)
+        else:
+            message = f"{who.name} ended {name}'s share."
+            await self._tell(share, Fact.UNSHARED, message, by=who.name, account=share.account)
+
+    async def _tell(self, share: Share, fact: Fact, message: str, **data: str) -> None:
+        kind, name = split_target(share.on)
+        device = await self._devices.owned(name) if kind == "device" else None
+        if device is not None and device.pairing == share.pairing:
+            await self._audit.happened(device, fact, message, **data)
+
+    async def _drop(self, note: Row | None) -> None:
+        if note is not None:
+            await self._pending.drop(note)
+
+    async def look(self, what: str, note: Row) -> None:
+        """The timer's look at a share that was changed, or whose time may be over."""
+        expired = what.startswith(_EXPIRES)
+        on, _, account = what.removeprefix(_EXPIRES if expired else _CHANGED).rpartition("|")
+        row = await self._tables.get(store.SHARES, on, share_key(account))
+        share = store.read(row, Share) if row else None
+        if row is not None and share is not None and not share.live(self._clock.now_ms()):
+            await self._end(None, row)
+        elif not expired:
+            kept = share or Share(on, account, Role.VIEWER, "", "", 0)
+            if not await self._unshare.settle(kept, again=True):
+                await self._pending.note(what, self._clock.now_ms() + AGAIN_MS)
+        await self._pending.drop(note)
+
+
+def about_share(note: str) -> bool:
+    """Whether a note of the timer is about a share."""
+    return note.startswith((_CHANGED, _EXPIRES))
+
+
+def _note(kind: str, share: Share) -> str:
+    return f"{kind}{share.on}|{share.account}"
+
+
+def _holds(share: Share, shared: Shared, now_ms: int) -> bool:
+    return share.live(now_ms) and share.owner == shared.owner.id and share.pairing == shared.pairing
+
+
+def _more(share: Share, than: Share) -> bool:
+    if share.role is than.role:
+        return share.expires_ms > than.expires_ms
+    return outranks(share.role, than.role)
