@@ -72,7 +72,8 @@ def test_the_same_name_is_the_same_account_with_one_space(cloud: Cloud) -> None:
     assert one.session != two.session
     assert one.get("/accounts/me").json() == {"id": one.account, "name": "anna", "session": one.session}
     (space,) = one.get("/spaces").json()["items"]
-    assert set(space) == {"id", "name"}
+    owner = {"id": one.account, "name": "anna"}
+    assert space == {"id": space["id"], "name": "Home", "role": "owner", "owner": owner}
     assert two.get("/spaces").json()["items"] == [space]
     (other,) = cloud.sign_in("bert").get("/spaces").json()["items"]
     assert other["id"] != space["id"]
