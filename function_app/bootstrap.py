@@ -40,6 +40,7 @@ from function_app.services.handover import Handovers
 from function_app.services.health import CheckHealth
 from function_app.services.identity import Identify
 from function_app.services.intake import Intake
+from function_app.services.invitations import Invitations
 from function_app.services.latency import Latencies
 from function_app.services.lease import Leases
 from function_app.services.lease_rows import LeaseRows
@@ -65,6 +66,7 @@ from function_app.services.stop import StopDevices
 from function_app.services.sweep import Sweep
 from function_app.services.tell_keys import TellKeys
 from function_app.services.tend_robot_types import TendRobotTypes
+from function_app.services.transfer import Transfer
 from function_app.services.unpair import Unpair
 from function_app.services.unshare import Unshare
 from function_app.services.upload_robot_type import UploadRobotType
@@ -95,6 +97,7 @@ class Functions:
     devices: Devices
     spaces: Spaces
     sharing: Sharing
+    invitations: Invitations
     leases: Leases
     handovers: Handovers
     robot_types: RobotTypes
@@ -233,6 +236,15 @@ def build(settings: Settings, *, clock: Clock | None = None) -> Functions:
         audit=audit,
         clock=now,
     )
+    invitations = Invitations(
+        tables=tables,
+        sharing=sharing,
+        transfer=Transfer(tables=tables, devices=devices, sharing=sharing, leave=leave, clock=now),
+        sign_in=sign_in,
+        pending=pending,
+        forget=forget,
+        clock=now,
+    )
     latencies = Latencies(tables=tables, forget=forget, clock=now)
     acks = ActionAcks(rows=rows, queues=queues, mailbox=mailbox, latencies=latencies, clock=now)
     start_action = StartAction(
@@ -267,6 +279,7 @@ def build(settings: Settings, *, clock: Clock | None = None) -> Functions:
         devices=devices,
         spaces=spaces,
         sharing=sharing,
+        invitations=invitations,
         leases=leases,
         handovers=Handovers(
             tables=tables,
@@ -342,6 +355,7 @@ def build(settings: Settings, *, clock: Clock | None = None) -> Functions:
             queues=queues,
             leave=leave,
             sharing=sharing,
+            invitations=invitations,
             audit=audit,
             access=access,
             forget=forget,

@@ -133,6 +133,15 @@ def unpair(agent: Agent) -> Agent:
     )
 
 
+def hand_over(agent: Agent, *, account: str, space: str, pairing: str, now_ms: int) -> Agent:
+    """The agent, from one account to another in one step: it is nobody's at no time.
+
+    A new pairing, as if it had been un-paired and claimed: nothing that was seen, said or shared under the owner before
+    goes with it.
+    """
+    return claim(unpair(agent), account=account, space=space, pairing=pairing, now_ms=now_ms)
+
+
 def move(agent: Agent, space: str) -> Agent:
     """The agent in another space of its account, with all that is known of its devices."""
     return replace(_leaves(agent, "moved", [spec.name for spec in agent.devices]), space=space)

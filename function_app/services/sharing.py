@@ -83,14 +83,17 @@ class Sharing:
         """A device or space of the caller's own, to share it.
 
         Raises:
-            Problem: ``device-unknown``, ``space-unknown``, ``forbidden``.
+            Problem: ``device-unknown``, ``space-unknown``, ``forbidden``; to an API key always: what it shares would
+                outlive it.
         """
         if kind == "space":
             view = await self._spaces.own(who, name)
+            require_person(who)
             return Shared(space_target(name), view.owner, view.space.name)
         device = await self._devices.get(who, name)
         async with self._audit.refusals(device, who, "share it"):
             require_owner(device)
+        require_person(who)
         owner = Account(device.owner, await self._sign_in.named(device.owner))
         return Shared(device_target(name), owner, device.label, device.pairing)
 
@@ -130,14 +133,23 @@ class Sharing:
             raise not_found("share", account)
         await self._end(who, row)
 
+    async def end_all(self, on: str) -> None:
+        """End all shares of something that its owner has given away.
+
+        Raises:
+            Problem: ``busy``.
+        """
+        page = await self._tables.query(store.SHARES, on, first="account:", last="account;", limit=1000)
+        for row in page.rows:
+            await self._end(None, row)
+
     async def leave(self, who: Identity, on: str) -> None:
         """Give one's own part in something of another's back.
 
         Raises:
             Problem: ``share-unknown``, ``forbidden``, ``busy``.
         """
-        if who.key:
-            raise forbidden("An API key cannot give its account's part in something back.")
+        require_person(who)
         row = await self._tables.get(store.SHARES, on, share_key(who.account))
         if row is None:
             raise not_found("share", who.account)
@@ -226,7 +238,7 @@ class Sharing:
             await self._drop(note)
         name = await self._sign_in.named(share.account)
         if who is None:
-            await self._tell(share, Fact.UNSHARED, f"The time of {name}'s share ran out.", account=share.account)
+            await self._tell(share, Fact.UNSHARED, f"{name}'s share is over.", account=share.account)
         else:
             message = f"{who.name} ended {name}'s share."
             await self._tell(share, Fact.UNSHARED, message, by=who.name, account=share.account)
@@ -254,6 +266,16 @@ class Sharing:
             if not await self._unshare.settle(kept, again=True):
                 await self._pending.note(what, self._clock.now_ms() + AGAIN_MS)
         await self._pending.drop(note)
+
+
+def require_person(who: Identity) -> None:
+    """See that it is a person who shares, gives away or takes: an API key never does.
+
+    Raises:
+        Problem: ``forbidden``.
+    """
+    if who.key:
+        raise forbidden("An API key shares nothing, gives nothing away and takes nothing. Sign in for that.")
 
 
 def about_share(note: str) -> bool:

@@ -27,13 +27,14 @@ SHARES = "Shares"
 """Partition: ``device:<id>`` or ``space:<id>``; key ``account:<account id>``; and, as an index, with ``agent:<id>`` as
 well, ``invitation:<id>``."""
 INVITATIONS = "Invitations"
-"""Partition: first letter of the secret's hash; key: the hash."""
+"""Partition: first letter of the secret's hash; key: the hash, which is the invitation's id."""
 CONTROL = "Control"
 """Partition: device id; keys ``now:lease``, ``now:slot``, ``now:queue``, ``action:<suffix>``, ``once:<hash>``, and
 ``event:<id>``, what is still to be told among the device's events."""
 PENDING = "Pending"
 """Partition: shard; key: ``<due ms>:<what>``, an action's id, ``queue:<device id>``, ``lease:<device id>``,
-``leave:<agent id>``, ``share-changed:<on>|<account id>`` or ``share-expires:<on>|<account id>``."""
+``leave:<agent id>``, ``share-changed:<on>|<account id>``, ``share-expires:<on>|<account id>`` or
+``transfer:<invitation id>``."""
 ROBOT_TYPES = "RobotTypes"
 """Partition: ``<account>/<robot type>``; keys ``type``, ``version:<number>``. Index in ``Members``: ``type:<type>``."""
 MODEL_CHECKS = "ModelChecks"

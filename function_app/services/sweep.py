@@ -21,6 +21,7 @@ from function_app.services.commands import Commands
 from function_app.services.conditions import Conditions
 from function_app.services.forget import DAY_MS, Forget
 from function_app.services.intake import Intake
+from function_app.services.invitations import Invitations, about_transfer
 from function_app.services.leave import Leave, leaver_of
 from function_app.services.pending import SHARDS, Pending
 from function_app.services.queue import TIMEOUT, Queues, queue_of
@@ -54,6 +55,7 @@ class Sweep:
         queues: Queues,
         leave: Leave,
         sharing: Sharing,
+        invitations: Invitations,
         audit: Audit,
         access: BrokerAccess,
         forget: Forget,
@@ -72,6 +74,7 @@ class Sweep:
         self._queues = queues
         self._leave = leave
         self._sharing = sharing
+        self._invitations = invitations
         self._audit = audit
         self._access = access
         self._forget = forget
@@ -116,6 +119,8 @@ class Sweep:
             await self._look_at_leaver(agent, note)
         elif about_share(what):
             await self._sharing.look(what, note)
+        elif about_transfer(what):
+            await self._invitations.go_on(what, note)
         elif device := lease_of(what):
             await self._audit.look(device)
             await self._pending.drop(note)

@@ -25,6 +25,10 @@ BODIES: dict[str, Any] = {
     "move_agent": {"space": "x"},
     "share_device": {"account": "bert", "role": "operator"},
     "share_space": {"account": "bert", "role": "operator"},
+    "invite_to_device": {"role": "operator"},
+    "invite_to_space": {"role": "operator"},
+    "transfer_agent": {},
+    "transfer_space": {},
     "tell_messages": {"messages": [{"topic": "t", "payload": {}}]},
     "begin_upload": {"stream": "camera", "length": 3, "content_type": "image/png"},
     "begin_agent_upload": {"device": "arm", "stream": "camera", "length": 3, "content_type": "image/png"},
@@ -61,6 +65,7 @@ def test_every_route_with_the_others_ids_finds_nothing_and_changes_nothing(
     upload = anna.post(f"/devices/{robot.device}/uploads", capture).json()["id"]
     fault = anna.get(f"/devices/{robot.device}/faults").json()["items"][0]["id"]
     request = cloud.sign_in("anna").post(f"/devices/{robot.device}/lease/requests").json()["request"]["id"]
+    invitation = anna.post(f"/devices/{robot.device}/invitations", {"role": "operator"}).json()["id"]
     ids = {
         "request_id": request,
         "device": robot.device,
@@ -73,6 +78,7 @@ def test_every_route_with_the_others_ids_finds_nothing_and_changes_nothing(
         "fault": fault,
         "upload": upload,
         "account": anna.account,
+        "invitation": invitation,
     }
     told = len(robot.commands)
     before = everything(cloud)
@@ -114,6 +120,10 @@ def test_every_route_with_the_others_ids_finds_nothing_and_changes_nothing(
         "unshare_device",
         "share_space",
         "unshare_space",
+        "invite_to_device",
+        "withdraw_space_invitation",
+        "transfer_agent",
+        "transfer_space",
         "move_agent",
         "fetch_commands",
         "tell_messages",

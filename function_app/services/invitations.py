@@ -1,0 +1,324 @@
+"""Invitations: sharing by link, and transfers, which somebody else must accept. Each is a secret of 256 random bits.
+
+Only its hash is stored, as the row's key. Of several who bring it one gets each use: whoever writes the row by its
+ETag. It counts only as long as what it offers belongs to whom it belonged to when it was made.
+"""
+
+import contextlib
+import hashlib
+from dataclasses import dataclass
+from typing import Final
+
+from function_app.domain import invitations as rules
+from function_app.domain.accounts import Account, Identity, Role
+from function_app.domain.devices import Agent
+from function_app.domain.ids import ID, new_id
+from function_app.domain.invitations import Invitation
+from function_app.domain.problems import Problem, forbidden, not_found
+from function_app.domain.sharing import split_target
+from function_app.ports.clock import Clock
+from function_app.ports.tables import Conflict, Row, Tables
+from function_app.services import store
+from function_app.services.forget import Forget
+from function_app.services.identity import new_secret
+from function_app.services.pending import Pending
+from function_app.services.sharing import Shared, Sharing, require_person
+from function_app.services.sign_in import SignIn
+from function_app.services.transfer import Transfer, void
+
+LOOK_MS: Final = 10_000
+"""The timer goes on with a transfer that was accepted so long ago and is not done."""
+_NOTE: Final = "transfer:"
+_INDEX: Final = "invitation:"
+
+
+@dataclass(frozen=True, slots=True)
+class Offer:
+    """What is offered.
+
+    Attributes:
+        role: ``owner``: it is transferred.
+        uses: How many may redeem it.
+        for_s: How long it can be redeemed [s].
+        share_s: How long a part lasts from then on [s]; 0: until it is ended.
+        account: Who alone may redeem it, by id; empty: whoever has the secret.
+    """
+
+    role: Role
+    uses: int
+    for_s: int
+    share_s: int = 0
+    account: str = ""
+
+
+@dataclass(frozen=True, slots=True)
+class Known:
+    """An invitation and its id."""
+
+    id: str
+    invitation: Invitation
+
+
+class Invitations:
+    """Makes invitations, and has them redeemed."""
+
+    def __init__(
+        self,
+        *,
+        tables: Tables,
+        sharing: Sharing,
+        transfer: Transfer,
+        sign_in: SignIn,
+        pending: Pending,
+        forget: Forget,
+        clock: Clock,
+    ) -> None:
+        self._tables = tables
+        self._sharing = sharing
+        self._transfer = transfer
+        self._sign_in = sign_in
+        self._pending = pending
+        self._forget = forget
+        self._clock = clock
+
+    # ------------------------------------------------------------ the owner's side
+
+    async def agent(self, who: Identity, agent_id: str) -> Shared:
+        """An agent of the caller's own, to hand it over.
+
+        Raises:
+            Problem: ``agent-unknown``, ``forbidden``.
+        """
+        row = await self._tables.get(store.AGENTS, agent_id, "agent")
+        agent = store.read(row, Agent) if row else None
+        if agent is None or agent.account != who.account:
+            raise not_found("agent", agent_id)
+        require_person(who)
+        owner = Account(who.account, await self._sign_in.named(who.account))
+        return Shared(f"agent:{agent_id}", owner, agent.name, agent.pairing)
+
+    async def space(self, who: Identity, space: str) -> Shared:
+        """A space of the caller's own, to hand it over.
+
+        Raises:
+            Problem: ``space-unknown``, ``forbidden``, ``last-space``.
+        """
+        shared = await self._sharing.of(who, "space", space)
+        require_person(who)
+        if len(await self._sign_in.spaces(who.account)) == 1:
+            detail = "It is this account's only space. Make another one first."
+            raise Problem("last-space", 409, "The last space", detail)
+        return shared
+
+    async def make(self, who: Identity, shared: Shared, offer: Offer) -> tuple[str, Known]:
+        """A new invitation, and its secret, which nobody can be told again.
+
+        Raises:
+            Problem: ``too-many-invitations``.
+        """
+        if len(await self.open(shared)) >= rules.MOST:
+            detail = f"There are {rules.MOST} open invitations to it, the most there can be. Take one back."
+            raise Problem("too-many-invitations", 409, "Too many invitations", detail)
+        now_ms = self._clock.now_ms()
+        fresh = Invitation(
+            on=shared.on,
+            role=offer.role,
+            owner=shared.owner.id,
+            by=who.name,
+            label=shared.label,
+            uses=offer.uses,
+            created_ms=now_ms,
+            expires_ms=now_ms + offer.for_s * 1000,
+            share_s=offer.share_s,
+            pairing=shared.pairing,
+            account=offer.account,
+        )
+        secret = new_secret()
+        known = Known(_hash(secret), fresh)
+        # Forgotten on time whatever happens from here on, and listed before it can be redeemed.
+        await self._forget.row(store.INVITATIONS, known.id[0], known.id, due_ms=fresh.expires_ms)
+        await self._forget.row(store.SHARES, fresh.on, _INDEX + known.id, due_ms=fresh.expires_ms)
+        await self._tables.create(store.SHARES, Row(fresh.on, _INDEX + known.id, {"expires_ms": fresh.expires_ms}))
+        await self._tables.create(store.INVITATIONS, Row(known.id[0], known.id, store.fields(fresh)))
+        return secret, known
+
+    async def open(self, shared: Shared) -> list[Known]:
+        """Open invitations to something, oldest first."""
+        page = await self._tables.query(store.SHARES, shared.on, first=_INDEX, last="invitation;", limit=1000)
+        found = [await self._get(row.key.removeprefix(_INDEX)) for row in page.rows]
+        now_ms = self._clock.now_ms()
+        known = [
+            Known(row.key, invitation)
+            for row, invitation in found
+            if row is not None
+            and invitation is not None
+            and invitation.open(now_ms)
+            and (invitation.owner, invitation.pairing) == (shared.owner.id, shared.pairing)
+        ]
+        return sorted(known, key=lambda each: each.invitation.created_ms)
+
+    async def withdraw(self, shared: Shared, invitation: str) -> None:
+        """Take an invitation back. What was redeemed stays shared.
+
+        Raises:
+            Problem: ``invitation-unknown``, ``busy``.
+        """
+
+        async def once() -> None:
+            row, known = await self._get(invitation)
+            if row is None or known is None or known.on != shared.on or not known.open(self._clock.now_ms()):
+                raise not_found("invitation", invitation)
+            await self._tables.delete(store.INVITATIONS, row)
+
+        await store.retry(once)
+        await self._unlist(shared.on, invitation)
+
+    # ------------------------------------------------------------ the other side
+
+    async def look(self, secret: str) -> Known:
+        """What an invitation offers.
+
+        Raises:
+            Problem: ``invitation-unknown``: wrong, used, expired, taken back or void, all the same.
+        """
+        row, known = await self._get(_hash(secret))
+        if row is None or known is None or not known.open(self._clock.now_ms()) or not await self._good(known):
+            raise _unknown()
+        return Known(row.key, known)
+
+    async def redeem(self, who: Identity, secret: str, *, space: str | None = None) -> Known:
+        """Take what an invitation offers.
+
+        Args:
+            who: Who takes it.
+            secret: The invitation's.
+            space: The space of theirs for an agent that is handed over; ``None``: their first.
+
+        Raises:
+            Problem: ``invitation-unknown``; ``forbidden``: it is for another account, or an API key asks;
+                ``already-yours``, ``space-unknown``, ``too-many-shares``, ``transfer-void``, ``busy``.
+        """
+        require_person(who)
+        known = await self.look(secret)
+        offered = known.invitation
+        if offered.account and offered.account != who.account:
+            raise forbidden("This invitation is for another account. Sign in as the one it was made for.")
+        if offered.owner == who.account:
+            raise Problem("already-yours", 409, "It is yours", "It belongs to this account: there is nothing to take.")
+        if offered.role is Role.OWNER:
+            await self._take(who, known, space)
+        else:
+            await self._use(known.id, who.account)
+            owner = Account(offered.owner, offered.by)
+            shared = Shared(offered.on, owner, offered.label, offered.pairing)
+            giver = Identity(offered.owner, offered.by, "")
+            ends_ms = offered.ends_ms(self._clock.now_ms())
+            await self._sharing.give(giver, shared, Account(who.account, who.name), offered.role, ends_ms)
+        return known
+
+    async def go_on(self, what: str, note: Row) -> None:
+        """The timer's look at a transfer that was accepted."""
+        row, known = await self._get(what.removeprefix(_NOTE))
+        if row is not None and known is not None and known.taken_by:
+            with contextlib.suppress(_Void):
+                await self._carry_out(row.key, known)
+        await self._pending.drop(note)
+
+    async def _take(self, who: Identity, known: Known, space: str | None) -> None:
+        """Accept a transfer. The write on the invitation decides; from then on the timer sees to it as well."""
+        kind, _ = split_target(known.invitation.on)
+        goal = new_id(12)
+        if kind == "agent":
+            own = await self._sign_in.spaces(who.account)
+            chosen = next((each.id for each in own if space in {None, each.id}), None)
+            if chosen is None:
+                raise not_found("space", space or "")
+            goal = chosen
+        note = await self._pending.note(f"{_NOTE}{known.id}", self._clock.now_ms() + LOOK_MS)
+
+        async def once() -> Invitation:
+            row, fresh = await self._get(known.id)
+            if row is None or fresh is None or not fresh.open(self._clock.now_ms()):
+                raise _unknown()
+            taken = fresh.taken(who.account, goal)
+            await self._tables.replace(store.INVITATIONS, Row(row.partition, row.key, store.fields(taken), row.etag))
+            return taken
+
+        try:
+            await self._carry_out(known.id, await store.retry(once))
+        except _Void as nothing:
+            raise void() from nothing
+        if note is not None:
+            await self._pending.drop(note)
+
+    async def _carry_out(self, invitation: str, taken: Invitation) -> None:
+        try:
+            await self._transfer.carry_out(taken)
+        except Problem as problem:
+            if problem.code != "transfer-void":
+                raise
+            await self._delete(invitation, taken)
+            raise _Void from problem
+        await self._delete(invitation, taken)
+
+    async def _use(self, invitation: str, account: str) -> None:
+        """Count one use, or find that somebody else was faster."""
+
+        async def once() -> None:
+            row, fresh = await self._get(invitation)
+            if row is None or fresh is None or not fresh.open(self._clock.now_ms()) or account in fresh.takers:
+                raise _unknown()
+            left = fresh.used(account)
+            if left.uses:
+                await self._tables.replace(store.INVITATIONS, Row(row.partition, row.key, store.fields(left), row.etag))
+            else:
+                await self._tables.delete(store.INVITATIONS, row)
+                await self._unlist(left.on, invitation)
+
+        await store.retry(once)
+
+    async def _good(self, known: Invitation) -> bool:
+        """Whether what it offers is still the offerer's."""
+        kind, name = split_target(known.on)
+        if kind == "space":
+            return await self._tables.get(store.ACCOUNTS, known.owner, f"space:{name}") is not None
+        row = await self._tables.get(store.AGENTS, name.partition("-")[0], "agent")
+        agent = store.read(row, Agent) if row else None
+        return agent is not None and (agent.account, agent.pairing) == (known.owner, known.pairing)
+
+    async def _get(self, invitation: str) -> tuple[Row | None, Invitation | None]:
+        if not ID.match(invitation):
+            return None, None
+        row = await self._tables.get(store.INVITATIONS, invitation[0], invitation)
+        return row, store.read(row, Invitation) if row else None
+
+    async def _delete(self, invitation: str, known: Invitation) -> None:
+        row, _ = await self._get(invitation)
+        if row is not None:
+            with contextlib.suppress(Conflict):
+                await self._tables.delete(store.INVITATIONS, row)
+        await self._unlist(known.on, invitation)
+
+    async def _unlist(self, on: str, invitation: str) -> None:
+        row = await self._tables.get(store.SHARES, on, _INDEX + invitation)
+        if row is not None:
+            with contextlib.suppress(Conflict):
+                await self._tables.delete(store.SHARES, row)
+
+
+class _Void(Exception):  # noqa: N818 (an outcome)
+    """What was offered has gone elsewhere."""
+
+
+def about_transfer(note: str) -> bool:
+    """Whether a note of the timer is about a transfer."""
+    return note.startswith(_NOTE)
+
+
+def _hash(secret: str) -> str:
+    return hashlib.sha256(secret.encode()).hexdigest()
+
+
+def _unknown() -> Problem:
+    detail = "This invitation is wrong, used, expired or taken back. Ask for a new one."
+    return Problem("invitation-unknown", 404, "No such invitation", detail)
