@@ -1,6 +1,8 @@
 """The twin moves as the simulation does: the page computes exactly this."""
 
+import json
 import math
+import runpy
 from pathlib import Path
 from typing import Any
 
@@ -178,3 +180,22 @@ def test_colour_is_the_materials_or_the_geoms():
       </body></worldbody></mujoco>""")
     (body,) = draw(model, base=1, device="x").bodies
     assert [shape.rgba for shape in body.geometries] == [(0.1, 0.2, 0.3, 1.0), (0.5, 0.5, 0.5, 1.0)]
+
+
+def test_the_arm_of_the_consoles_own_tests_is_todays() -> None:
+    """Else run ``.venv/bin/python web/tests/fixtures/make.py``."""
+    fixtures = ROBOTS.parent / "web" / "tests" / "fixtures"
+    made = runpy.run_path(str(fixtures / "make.py"))["content"]()
+    kept = json.loads((fixtures / "ur5.json").read_text(encoding="utf-8"))
+    assert alike(made, kept)
+
+
+def alike(one: Any, other: Any) -> bool:
+    """The same but for the last digits of numbers: another machine may round otherwise."""
+    if isinstance(one, dict) and isinstance(other, dict):
+        return one.keys() == other.keys() and all(alike(one[name], other[name]) for name in one)
+    if isinstance(one, list | tuple) and isinstance(other, list | tuple):
+        return len(one) == len(other) and all(map(alike, one, other))
+    if isinstance(one, float) and isinstance(other, int | float):
+        return math.isclose(one, other, rel_tol=1e-9, abs_tol=1e-9)
+    return bool(one == other)

@@ -9,7 +9,8 @@ import pytest
 
 from device_agent import geometry
 from device_agent.mjcf.ties import Ties
-from device_agent.runtime import gaze
+from device_agent.runtime import gaze, mouth
+from device_agent.runtime.score import Line, Score
 from tests.unit.robots.folders import ROBOTS, Bench
 
 FOLDER = ROBOTS / "hanson"
@@ -88,3 +89,17 @@ def test_its_mouth_has_a_dozen_shapes(bench: Bench):
     assert len(bench.type.visemes) >= 12
     mouth = ("Jaw", "Lip", "EE-oo", "Smile", "Frown")
     assert all(joint.startswith(mouth) for pose in bench.type.visemes.values() for joint in pose)
+
+
+def test_it_opens_its_mouth_for_a_vowel_as_wide_as_its_shape_says_at_a_calm_pace(bench: Bench):
+    text = "Hello, I am a robot, and I am glad to see all of you at the table today."
+    score = Score(bench.type, bench.home.tolist())
+    score.speak(Line(0.0, text, mouth.guessed_s(text)))
+    way, jaw = score.way(), bench.names.index("Jaw")
+    assert way.position_rad[:, jaw].max() == pytest.approx(bench.type.visemes["aa"]["Jaw"], abs=1e-3)
+    follows = []
+    for time_s in np.arange(0.0, way.duration_s, bench.model.opt.timestep):
+        bench.data.ctrl[bench.ctrl] = way.at(float(time_s))[0]
+        mujoco.mj_step(bench.model, bench.data)
+        follows.append(bench.data.qpos[bench.qpos][jaw])
+    assert max(follows) > 0.95 * bench.type.visemes["aa"]["Jaw"], "the servo follows"
