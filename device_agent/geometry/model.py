@@ -11,6 +11,7 @@ import numpy as np
 import numpy.typing as npt
 
 from device_agent.geometry.bounds import Bounds
+from device_agent.geometry.carried import Carried
 from device_agent.geometry.pairs import ROOM_PREFIX, Pairs
 from device_agent.geometry.planner import Planner
 from device_agent.geometry.planning import PlanningProcess, Site
@@ -61,7 +62,11 @@ class MujocoGeometry:
         self._probe = Probe(self._model, self._qpos, self._pairs, self._ties, self._home)
         self._pairs.calibrate(self._probe.data, self._probe.place, home=self._home, lower=lower, upper=upper)
         self._probe = Probe(self._model, self._qpos, self._pairs, self._ties, self._home)
-        self._solver = Solver(self._model, self._qpos, self._frames, lower=lower, upper=upper)
+        carried = Carried(self._model, robot_type, joints, self._ties)
+        self._carried = carried
+        self._solver = Solver(
+            self._model, self._qpos, self._frames, carried=carried, ties=self._ties, lower=lower, upper=upper
+        )
         bounds = Bounds(robot_type)
         self._planner = Planner(self._model, joints, self._pairs, self._ties, bounds)
         self._planning = PlanningProcess(Site.of(robot_type, scene, standing))
@@ -102,7 +107,9 @@ class MujocoGeometry:
         """Joint velocities that move a frame: damped least squares, damped where the robot is near a singularity."""
         is_site, index = self._frames[frame]
         with self._lock:
-            return self._probe.rates(self._base, is_site, index, np.array(twist), position_rad, tool=tool)
+            return self._probe.rates(
+                self._base, is_site, index, np.array(twist), position_rad, carried=self._carried, tool=tool
+            )
 
     def solve(self, frame: str, pose: Pose, start_rad: Sequence[float]) -> tuple[float, ...]:
         """Joint positions that bring a frame to a pose in the robot's base frame.

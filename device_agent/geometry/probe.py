@@ -7,6 +7,7 @@ import mujoco
 import numpy as np
 import numpy.typing as npt
 
+from device_agent.geometry.carried import Carried
 from device_agent.geometry.pairs import Pairs
 from device_agent.mjcf.ties import Ties
 from device_agent.ports.geometry import Clearance, Sweep
@@ -44,8 +45,6 @@ class Probe:
         self._qpos = qpos
         self._pairs = pairs
         self._ties = ties
-        joints = [int(np.flatnonzero(model.jnt_qposadr == at)[0]) for at in qpos]
-        self._dofs = np.array([model.jnt_dofadr[joint] for joint in joints], dtype=np.intp)
         self.data: Any = mujoco.MjData(model)
         self.place(at_rad)
         self._measured = np.asarray(at_rad, dtype=np.float64), pairs.rooms_at_least(self.data)
@@ -109,7 +108,15 @@ class Probe:
         return 1.0
 
     def rates(
-        self, base: int, is_site: bool, index: int, twist: Floats, position_rad: Sequence[float], *, tool: bool
+        self,
+        base: int,
+        is_site: bool,
+        index: int,
+        twist: Floats,
+        position_rad: Sequence[float],
+        *,
+        carried: Carried,
+        tool: bool,
     ) -> tuple[float, ...]:
         """See ``Geometry.rates``."""
         self.place(position_rad)
@@ -121,12 +128,12 @@ class Probe:
         own = data.site_xmat[index] if is_site else data.xmat[index]
         axes = (own if tool else data.xmat[base]).reshape(3, 3)
         asked = np.concatenate((axes @ twist[:3], axes @ twist[3:]))
-        jacobian = whole[:, self._dofs]
+        jacobian = whole @ carried.whole
         # The nearer to a singularity, the more damping: joints then follow slowly instead of jumping.
         left, sizes, right = np.linalg.svd(jacobian, full_matrices=False)
         near = np.clip(1.0 - sizes[-1] / _SINGULAR, 0.0, 1.0)
         found = right.T @ (sizes / (sizes**2 + (near * _DAMPING) ** 2 + _NOTHING) * (left.T @ asked))
-        return tuple(found.tolist())
+        return tuple((carried.spread @ found).tolist())
 
     def _surely_clear(self, path: Floats) -> bool:
         """Whether nothing can come too near, by the room there was where it was last measured: most ways, cheaply.
