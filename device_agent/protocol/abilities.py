@@ -13,6 +13,7 @@ from msgspec import Meta, Struct
 
 from device_agent.protocol.errors import ProtocolError
 from device_agent.protocol.fields import Id, Label, Vector3
+from device_agent.protocol.manifest import check_known, check_positive
 from device_agent.protocol.reports import Joint
 
 Positions = Annotated[dict[str, float], Meta(min_length=1, max_length=128)]
@@ -190,12 +191,10 @@ def _check_simulation(simulation: Simulation, known: Mapping[str, Joint]) -> Non
         ("battery", simulation.battery, Battery.__struct_fields__),
     ):
         for field in () if holder is None else fields:
-            value = getattr(holder, field)
-            if not 0 < value < math.inf:
-                raise ProtocolError(f"simulation.{part}: {field} is {value}; it must be above 0 and finite")
+            check_positive(f"simulation.{part}: {field}", getattr(holder, field))
     if simulation.walk is not None:
         legs = (*simulation.walk.left, *simulation.walk.right)
-        _check_names("simulation.walk", legs, known)
+        check_known("simulation.walk", "joint", legs, known)
         if len(set(legs)) < len(legs):
             raise ProtocolError("simulation.walk: no joint can be named twice")
     if simulation.battery is not None and simulation.battery.empty_v > simulation.battery.full_v:
@@ -206,7 +205,7 @@ def _check_mirrors(mirrors: Sequence[Mirror], known: Mapping[str, Joint]) -> Non
     followers = [mirror.joint for mirror in mirrors]
     for mirror in mirrors:
         where = f"mirrors: '{mirror.joint}'"
-        _check_names("mirrors", (mirror.joint, mirror.of), known)
+        check_known("mirrors", "joint", (mirror.joint, mirror.of), known)
         if followers.count(mirror.joint) > 1:
             raise ProtocolError(f"{where} mirrors two joints")
         if mirror.of in followers:
@@ -227,7 +226,7 @@ def _check_narrowing(abilities: Abilities, known: Mapping[str, Joint]) -> None:
     narrowed = [narrowing.joint for narrowing in abilities.narrowing]
     for narrowing in abilities.narrowing:
         where = f"narrowing of '{narrowing.joint}'"
-        _check_names("narrowing", (narrowing.joint, narrowing.by), known)
+        check_known("narrowing", "joint", (narrowing.joint, narrowing.by), known)
         if narrowed.count(narrowing.joint) > 1:
             raise ProtocolError(f"{where} stands there twice")
         if narrowing.by in narrowed:
@@ -263,12 +262,6 @@ def _check_keyframes(where: str, keyframes: Sequence[Keyframe], allowed: "_Allow
         allowed.check(f"{where}, keyframe {number}", keyframe.position_rad)
 
 
-def _check_names(where: str, named: Sequence[str], known: Mapping[str, Joint]) -> None:
-    unknown = [name for name in named if name not in known]
-    if unknown:
-        raise ProtocolError(f"{where}: no joint '{unknown[0]}'; there are: {', '.join(known)}")
-
-
 class _Allowed:
     """Where joints may be, by name; where a place does not say, they are taken to be at home."""
 
@@ -279,7 +272,7 @@ class _Allowed:
         self._home_rad = home_rad
 
     def check(self, where: str, position_rad: Mapping[str, float]) -> None:
-        _check_names(where, tuple(position_rad), self._known)
+        check_known(where, "joint", tuple(position_rad), self._known)
         for name, value in position_rad.items():
             joint = self._known[name]
             if not joint.lower_rad <= value <= joint.upper_rad:  # false for NaN

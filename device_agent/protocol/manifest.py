@@ -1,6 +1,7 @@
 """How the manifest of a folder is read: TOML of one type; what is wrong is one error that names file and field."""
 
-from collections.abc import Callable
+import math
+from collections.abc import Callable, Collection, Sequence
 from pathlib import Path
 from typing import TypeVar
 
@@ -44,3 +45,35 @@ def convert(text: str, kind: type[Manifest]) -> Manifest:
         return msgspec.convert(tomllib.loads(text), kind, strict=False)
     except (tomllib.TOMLDecodeError, msgspec.ValidationError) as error:
         raise ProtocolError(str(error)) from error
+
+
+def check_positive(what: str, value: float) -> None:
+    """Refuse what is not above 0 and finite.
+
+    Raises:
+        ProtocolError: It is not.
+    """
+    if not 0 < value < math.inf:
+        raise ProtocolError(f"{what} is {value}; it must be above 0 and finite")
+
+
+def check_box(where: str, lower_m: Sequence[float], upper_m: Sequence[float]) -> None:
+    """Refuse a box without an inside.
+
+    Raises:
+        ProtocolError: A corner is not finite, or the lower one is not below the upper one.
+    """
+    for lower, upper in zip(lower_m, upper_m, strict=True):
+        if not -math.inf < lower < upper < math.inf:
+            raise ProtocolError(f"{where}: lower_m must be below upper_m everywhere, and all of them finite")
+
+
+def check_known(where: str, what: str, named: Sequence[str], known: Collection[str]) -> None:
+    """Refuse a name that nothing has.
+
+    Raises:
+        ProtocolError: There is one; the text lists those there are.
+    """
+    for name in named:
+        if name not in known:
+            raise ProtocolError(f"{where}: no {what} '{name}'; there are: {', '.join(known)}")

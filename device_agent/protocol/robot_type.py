@@ -173,7 +173,7 @@ def _check_figures(robot_type: RobotType) -> None:
         raise ProtocolError(f"{len(robot_type.joints)} joints; {MAX_JOINTS} is the most")
     if not 0 < robot_type.streaming_speed <= 1:
         raise ProtocolError(f"streaming_speed is {robot_type.streaming_speed}; it must be above 0 and at most 1")
-    _check_positive(robot_type, ("braking_rad_s2",), "")
+    manifest.check_positive("braking_rad_s2", robot_type.braking_rad_s2)
     limits = ("max_velocity_rad_s", "max_acceleration_rad_s2", "max_jerk_rad_s3", "max_effort_nm")
     for joint in robot_type.joints:
         _check_positive(joint, limits, f" of '{joint.name}'")
@@ -186,34 +186,23 @@ def _check_figures(robot_type: RobotType) -> None:
     if robot_type.base is not None:
         _check_positive(robot_type.base, [field for field in Base.__struct_fields__ if field != "sideways"], " of base")
     for stream in robot_type.streams:
-        _check_positive(stream, ("rate_hz",), f" of stream '{stream.name}'")
+        manifest.check_positive(f"rate_hz of stream '{stream.name}'", stream.rate_hz)
 
 
 def _check_workspace(box: Workspace, robot_type: RobotType) -> None:
-    for lower, upper in zip(box.lower_m, box.upper_m, strict=True):
-        if not -math.inf < lower < upper < math.inf:
-            raise ProtocolError("workspace: lower_m must be below upper_m in x, y and z, and all of them finite")
-    unknown = sorted(set(box.frames) - set(robot_type.frames))
-    if unknown:
-        raise ProtocolError(f"workspace: no frame '{unknown[0]}'; there are: {', '.join(robot_type.frames)}")
+    manifest.check_box("workspace", box.lower_m, box.upper_m)
+    manifest.check_known("workspace", "frame", box.frames, robot_type.frames)
     if not robot_type.model:
         raise ProtocolError("workspace needs a model: without one nobody knows where a frame is")
 
 
 def _check_gaze(gaze: Gaze, robot_type: RobotType) -> None:
-    for what, named, known in (
-        ("frame", (gaze.frame, *gaze.also), robot_type.frames),
-        ("joint", gaze.joints, tuple(joint.name for joint in robot_type.joints)),
-    ):
-        unknown = sorted(set(named) - set(known))
-        if unknown:
-            raise ProtocolError(f"gaze: no {what} '{unknown[0]}'; there are: {', '.join(known)}")
+    manifest.check_known("gaze", "frame", (gaze.frame, *gaze.also), robot_type.frames)
+    manifest.check_known("gaze", "joint", gaze.joints, [joint.name for joint in robot_type.joints])
     if not 0 < math.hypot(*gaze.axis) < math.inf:
         raise ProtocolError("gaze: axis must be a direction, with finite numbers that are not all 0")
 
 
 def _check_positive(holder: Struct, fields: Sequence[str], where: str) -> None:
     for field in fields:
-        value = getattr(holder, field)
-        if not 0 < value < math.inf:
-            raise ProtocolError(f"{field}{where} is {value}; it must be above 0 and finite")
+        manifest.check_positive(f"{field}{where}", getattr(holder, field))

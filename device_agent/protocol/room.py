@@ -243,8 +243,8 @@ def parse(text: str) -> Room:
         ProtocolError: Not TOML, a field is wrong, or fields contradict each other.
     """
     room = manifest.convert(text, Room)
-    _check_box("plan", room.plan.lower_m, room.plan.upper_m)
-    _check_positive("height_m of the plan", room.plan.height_m)
+    manifest.check_box("plan", room.plan.lower_m, room.plan.upper_m)
+    manifest.check_positive("height_m of the plan", room.plan.height_m)
     _check_names("robots and devices", room.names)
     _check_names("zones", [zone.name for zone in room.zones])
     for robot in room.robots:
@@ -253,7 +253,7 @@ def parse(text: str) -> Room:
     for device in room.devices:
         _check_device(device)
     for zone in room.zones:
-        _check_box(f"zone '{zone.name}'", zone.lower_m, zone.upper_m)
+        manifest.check_box(f"zone '{zone.name}'", zone.lower_m, zone.upper_m)
     for person in room.people:
         _check_person(person, room.plan)
     _check_climate(room.climate)
@@ -298,7 +298,7 @@ def _check_judgements(device: RoomDevice, where: str) -> None:
 
 def _check_person(person: Person, plan: Plan) -> None:
     where = f"person '{person.name}'"
-    _check_positive(f"speed_m_s of {where}", person.speed_m_s)
+    manifest.check_positive(f"speed_m_s of {where}", person.speed_m_s)
     if not 0 <= person.pause_s < math.inf:
         raise ProtocolError(f"pause_s of {where} must be at least 0 and finite")
     for corner in person.path_m:
@@ -311,7 +311,7 @@ def _check_person(person: Person, plan: Plan) -> None:
 
 def _check_climate(climate: Climate) -> None:
     _check_finite("climate", [getattr(climate, field) for field in Climate.__struct_fields__])
-    _check_positive("capacity_j_k of climate", climate.capacity_j_k)
+    manifest.check_positive("capacity_j_k of climate", climate.capacity_j_k)
     for field in ("ventilation_per_h", "door_m3_h", "loss_w_k", "heater_w", "daylight_lux", "lamp_lux"):
         if getattr(climate, field) < 0:
             raise ProtocolError(f"{field} of climate must be at least 0")
@@ -323,12 +323,6 @@ def _check_inside(where: str, position_m: Sequence[float], plan: Plan) -> None:
             raise ProtocolError(f"{where} stands outside of the plan: {tuple(position_m[:2])}")
 
 
-def _check_box(where: str, lower_m: Sequence[float], upper_m: Sequence[float]) -> None:
-    for lower, upper in zip(lower_m, upper_m, strict=True):
-        if not -math.inf < lower < upper < math.inf:
-            raise ProtocolError(f"{where}: lower_m must be below upper_m everywhere, and all of them finite")
-
-
 def _check_names(what: str, names: Sequence[str]) -> None:
     twice = sorted({name for name in names if list(names).count(name) > 1})
     if twice:
@@ -338,8 +332,3 @@ def _check_names(what: str, names: Sequence[str]) -> None:
 def _check_finite(where: str, values: Iterable[float]) -> None:
     if not all(map(math.isfinite, values)):
         raise ProtocolError(f"{where}: all numbers must be finite")
-
-
-def _check_positive(what: str, value: float) -> None:
-    if not 0 < value < math.inf:
-        raise ProtocolError(f"{what} is {value}; it must be above 0 and finite")

@@ -12,7 +12,6 @@ import socket
 import subprocess
 import sys
 import threading
-import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -308,11 +307,6 @@ class XmppClient:
         """Whether this user's newest presence says that they are there."""
         heard = [each for each in self.presences if each.get("from", "").startswith(f"{user}@")]
         return bool(heard) and heard[-1].get("type") is None
-
-    def nothing_for(self, seconds: float) -> bool:
-        """Whether no message comes for a while."""
-        time.sleep(seconds)
-        return not self.messages
 
     def __enter__(self) -> Self:
         return self

@@ -11,8 +11,6 @@ from dataclasses import dataclass, field
 from device_agent.ports.driver import REST, Twist
 
 Point = tuple[float, float, float]
-LEG_JOINTS = 6
-"""Hip yaw (or yaw-pitch), hip roll, hip pitch, knee, ankle pitch, ankle roll."""
 _BOTH_FEET = 0.1
 """Share of a step at its beginning, and again at its end, with both feet on the ground."""
 _SWAY = 0.4

@@ -6,7 +6,6 @@ from typing import Any
 import pytest
 
 from device_agent.protocol.messages import Fault, Mode, State
-from function_app.services import store
 from tests.support.brokers import wait_until
 from tests.support.cloud import Cloud, Person, Robot, paired, problem
 
@@ -34,7 +33,6 @@ BODIES: dict[str, Any] = {
     "begin_agent_upload": {"device": "arm", "stream": "camera", "length": 3, "content_type": "image/png"},
     "complete_agent_upload": {"device": "arm"},
 }
-TABLES = [name for key, name in vars(store).items() if key.isupper() and isinstance(name, str)]
 
 
 def everything(cloud: Cloud) -> list[Any]:

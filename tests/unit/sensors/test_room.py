@@ -19,7 +19,7 @@ from tests.support.rooms import LAB, StillWorld
 
 ROUND_S = 45.0
 """Longer than the person's way round the room."""
-CHAIR_M, LEG_M = 0.5, 0.35
+LEG_M = 0.35
 
 
 @pytest.fixture
