@@ -27,6 +27,7 @@ class BaseMotion:
         self.limits = Twist(base.max_linear_m_s, base.max_linear_m_s * base.sideways, base.max_angular_rad_s)
         self._acceleration = [linear, linear, angular]
         self._braking = [braking, braking, turning]
+        self._period_s = period_s
         self._generator = Ruckig(3, period_s)
         self._output = OutputParameter(3)
         self._input = InputParameter(3)
@@ -77,6 +78,11 @@ class BaseMotion:
         """How long ``brake`` would take from the present twist [s], rounded up by the ramps at both ends."""
         times = [abs(part) / limit for part, limit in zip(self.twist, self._braking, strict=True)]
         return max(times) + 3 * _BRAKING_RAMP_S if self.moving else 0.0
+
+    def limits_to_stop_within(self, time_s: float) -> Twist:
+        """The highest twist from which it comes to rest in this time, a control period late [s]."""
+        left_s = time_s - self._period_s - 2 * _BRAKING_RAMP_S
+        return Twist(*(min(most, limit * left_s) for most, limit in zip(self.limits, self._braking, strict=True)))
 
     def _aim(self, twist: Twist, acceleration: list[float], ramp_s: float) -> None:
         self._input.target_velocity = list(twist)

@@ -322,7 +322,7 @@ class Controller:
 
         Args:
             now_s: Monotonic clock [s].
-            measured_rad: Where the joints are, shape (n,); limp ones are commanded there.
+            measured_rad: Where the joints are, shape (n,); limp ones are commanded there, others are to arrive there.
         """
         with self._lock:
             return self._pilot.step(now_s, measured_rad)

@@ -1,13 +1,14 @@
 """What an action asks of one device's joints and base: one course at a time, carried out tick by tick."""
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 
 import numpy as np
 
 from device_agent.ports.driver import REST, Twist
 from device_agent.ports.geometry import Clearance
 from device_agent.protocol.robot_type import RobotType
+from device_agent.runtime.arrival import Arrival
 from device_agent.runtime.base import BaseMotion
 from device_agent.runtime.courses import Course, Drive, Move, Outcome, Passage
 from device_agent.runtime.envelope import Envelope
@@ -38,6 +39,7 @@ class Helm:
         self.motion = Motion(robot_type)
         self.base = None if robot_type.base is None else BaseMotion(robot_type.base, self._period_s)
         self.course: Course | None = None
+        self._arrival = Arrival([joint.name for joint in robot_type.joints], self._period_s)
 
     # ------------------------------------------------------------ what actions ask
 
@@ -51,6 +53,7 @@ class Helm:
             raise Refused("bad_speed", f"speed must be above 0 and at most 1, not {speed}")
         target = self._envelope.target(position_rad, self.motion.position_rad)
         self._replace()
+        self._arrival.begin(_differ(target, self.motion.position_rad))
         self.course = move = Move(target_rad=target, speed=speed)
         return move
 
@@ -65,6 +68,7 @@ class Helm:
             raise Refused("moved", "the robot is no longer where the way begins; plan it again")
         self._envelope.check_way(way.position_rad)
         self._replace()
+        self._arrival.begin(np.flatnonzero(np.any(way.position_rad != way.position_rad[0], axis=0)).tolist())
         self.course = passage = Passage(way=way)
         return passage
 
@@ -134,20 +138,39 @@ class Helm:
         if self.base is not None:
             self.base.update()
 
-    def settle(self, limited: tuple[str, ...]) -> None:
+    def settle(self, limited: tuple[str, ...], *, measured_rad: Sequence[float] | None, soft: Collection[int]) -> None:
         """See whether the course has come to its end.
 
         Args:
             limited: What makes it other than asked now.
+            measured_rad: Where the joints are, shape (n,); where nobody measures, where they are told to be.
+            soft: Joints that hold with less than all their strength.
         """
         course = self.course
         if course is None:
             return
         course.note(limited)
-        done = course.periods <= 0 and not self.moving if isinstance(course, Drive) else self.motion.reached
+        try:
+            done = self._drove(course) if isinstance(course, Drive) else self._arrived(measured_rad, soft)
+        except Refused as short:
+            self.interrupt(short)
+            return
         if done:
             self.course = None
             course.end(Outcome.REACHED)
+
+    def _drove(self, drive: Drive) -> bool:
+        return drive.periods <= 0 and not self.moving
+
+    def _arrived(self, measured_rad: Sequence[float] | None, soft: Collection[int]) -> bool:
+        """Whether the joints rest at their target.
+
+        Raises:
+            Refused: They were told to long ago.
+        """
+        if not self.motion.reached:
+            return False
+        return measured_rad is None or self._arrival.there(self.motion.position_rad, measured_rad, soft=soft)
 
     def interrupt(self, why: Refused) -> None:
         """End the course, if there is one, and brake."""
@@ -196,3 +219,8 @@ class Helm:
 
     def _replace(self) -> None:
         self.interrupt(Refused("replaced", "another course took its place"))
+
+
+def _differ(one: Sequence[float], other: Sequence[float]) -> list[int]:
+    """Indices of the joints that are not in the same place in both."""
+    return [index for index, (a, b) in enumerate(zip(one, other, strict=True)) if abs(a - b) > _SAME_RAD]

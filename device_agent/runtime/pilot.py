@@ -91,7 +91,7 @@ class Pilot:
 
         Args:
             now_s: Monotonic clock [s].
-            measured_rad: Where the joints are, shape (n,); limp ones are commanded there.
+            measured_rad: Where the joints are, shape (n,); limp ones are commanded there, others are to arrive there.
         """
         if measured_rad is not None:
             self._motion.loosen(self.slack.feel(measured_rad))
@@ -109,7 +109,7 @@ class Pilot:
             self.mode = Mode.HOLDING
             self.helm.give_up()
         limited = self._limits()
-        self.helm.settle(limited)
+        self.helm.settle(limited, measured_rad=measured_rad, soft=self.slack.soft)
         lease = self.authority.lease(now_s)
         return Tick(
             list(self._motion.position_rad),

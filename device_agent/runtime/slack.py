@@ -11,6 +11,10 @@ class Slack:
 
     Args:
         robot_type: Joints and their ranges.
+
+    Attributes:
+        limited: Which joints are limp, as telemetry names it.
+        soft: Indices of the joints that hold with less than all their strength.
     """
 
     def __init__(self, robot_type: RobotType) -> None:
@@ -19,6 +23,7 @@ class Slack:
         self._values: dict[str, float] = {}
         self._limp: tuple[int, ...] = ()
         self.limited: tuple[str, ...] = ()
+        self.soft: frozenset[int] = frozenset()
 
     @property
     def values(self) -> Mapping[str, float]:
@@ -41,6 +46,7 @@ class Slack:
         known = {**self._values, **values}
         # In the type's order, so that the same stiffness is always shown the same.
         self._values = {name: known[name] for name in self._index if known.get(name, 1.0) < 1.0}
+        self.soft = frozenset(self._index[name] for name in self._values)
         self._limp = tuple(self._index[name] for name, value in self._values.items() if value <= 0)
         self.limited = tuple(f"{self._joints[index].name}: limp" for index in self._limp)
 

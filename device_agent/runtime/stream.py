@@ -19,6 +19,8 @@ MAX_LOOP_AGE_S = 0.2
 """A setpoint that answers telemetry older than this is not fresh."""
 _SOONEST_BRAKING_S = 0.15
 """Braking never begins sooner than this after a setpoint, so that ordinary jitter does not stop the arm."""
+_SOONEST_BASE_BRAKING_S = 0.1
+"""The same of a base, which takes longer to stop."""
 _NUDGE_RAD = 1e-4
 """A target that is nearer than this to one that was in the way is the same."""
 
@@ -140,7 +142,7 @@ class Stream:
             braking_s: How long the device would brake [s].
             late_s: How late the control loop may be called next [s].
         """
-        return _fresh(now_s - self._at_s, braking_s, late_s)
+        return _fresh(now_s - self._at_s, braking_s, late_s, _SOONEST_BRAKING_S)
 
     def steer(self, base: BaseMotion, now_s: float, *, late_s: float, allowed: float) -> None:
         """Set the base in motion as the newest setpoint for it asks, while that is fresh; else brake it.
@@ -152,10 +154,11 @@ class Stream:
             allowed: Share of the speed that the room leaves, above 0.
         """
         self._driven = ()
-        if not _fresh(now_s - self._drive_at_s, base.braking_time_s(), late_s):
+        if not _fresh(now_s - self._drive_at_s, base.braking_time_s(), late_s, _SOONEST_BASE_BRAKING_S):
             base.brake()
             return
-        twist = Twist(*(min(max(part, -most), most) for part, most in zip(self._drive, base.limits, strict=True)))
+        limits = base.limits_to_stop_within(WATCHDOG_S - _SOONEST_BASE_BRAKING_S)
+        twist = Twist(*(min(max(part, -most), most) for part, most in zip(self._drive, limits, strict=True)))
         share = self._pace.blind_share()
         parts = zip(Twist._fields, self._drive, twist, strict=True)
         ranged = tuple(f"{name}: range" for name, asked, done in parts if asked != done)
@@ -231,8 +234,8 @@ class Stream:
         return self._ranged + self._slowed + self._driven + (() if self._obstacle is None else (self._obstacle[1],))
 
 
-def _fresh(age_s: float, braking_s: float, late_s: float) -> bool:
-    return age_s < max(_SOONEST_BRAKING_S, WATCHDOG_S - braking_s - late_s)
+def _fresh(age_s: float, braking_s: float, late_s: float, soonest_s: float) -> bool:
+    return age_s < max(soonest_s, WATCHDOG_S - braking_s - late_s)
 
 
 def _same(one: Sequence[float], other: Sequence[float]) -> bool:

@@ -5,14 +5,15 @@ from __future__ import annotations
 import math
 import random
 from contextlib import suppress
+from functools import partial
 from itertools import pairwise
 from typing import TYPE_CHECKING
 
 import pytest
 
-from device_agent.ports.driver import Twist
+from device_agent.ports.driver import REST, Twist
 from device_agent.ports.geometry import Clearance, Sweep
-from device_agent.protocol.messages import JointTarget, Mode, Setpoint, StopLatch
+from device_agent.protocol.messages import DriveTarget, JogTarget, JointTarget, Mode, Setpoint, StopLatch
 from device_agent.runtime.lease import Refused
 from tests.support.rig import Rig, Wall
 from tests.support.toys import BASE, PERIOD_S
@@ -22,7 +23,13 @@ if TYPE_CHECKING:
 
     from device_agent.runtime.authority import Tenure
 
+    Target = JointTarget | JogTarget | DriveTarget
+
 MAX_SPEED, MAX_ACCELERATION, BRAKING, RANGE = 3.0, 8.0, 20.0, 3.0
+LIMITS = (BASE.max_linear_m_s, 0.0, BASE.max_angular_rad_s)
+EASY = (BASE.max_linear_acceleration_m_s2, BASE.max_linear_acceleration_m_s2, BASE.max_angular_acceleration_rad_s2)
+HARD = (BASE.braking_linear_m_s2, BASE.braking_linear_m_s2, BASE.braking_angular_rad_s2)
+"""Of the base, part by part of its twist: it goes nowhere sideways."""
 WALL_RAD = 1.4
 REST_WITHIN_S = 0.3
 EVENTS = 120
@@ -33,7 +40,19 @@ JERK_PERIODS = 20
 """What speeds up when the room slows it needs a tenth of a second to turn."""
 
 
-class Post(Wall):
+class Board(Wall):
+    """A wall, with a hand whose x the elbow moves and whose y the shoulder."""
+
+    frames = ("hand",)
+
+    def rates(
+        self, frame: str, twist: Sequence[float], position_rad: Sequence[float], *, tool: bool
+    ) -> tuple[float, ...]:
+        del frame, position_rad
+        return (twist[1], -twist[0] if tool else twist[0])
+
+
+class Post(Board):
     """A post: whoever reaches out far enough, in its direction, touches it."""
 
     def clearance(self, position_rad: Sequence[float]) -> Clearance:
@@ -55,7 +74,7 @@ class Chance:
     def __init__(self, seed: int) -> None:
         self.random = random.Random(seed)  # noqa: S311
         shape = self.random.random()
-        self.shape = Wall(WALL_RAD) if shape < 0.4 else Post(WALL_RAD) if shape < 0.8 else None
+        self.shape = Board(WALL_RAD) if shape < 0.4 else Post(WALL_RAD) if shape < 0.8 else None
         self.rig = Rig(geometry=self.shape, base=BASE)
         self.controller = self.rig.controller
         self.now_s = 100.0
@@ -65,6 +84,7 @@ class Chance:
         self.may_move_until_s = -1.0
         self.position = [0.0, 0.0]
         self.velocity = [0.0, 0.0]
+        self.twist = REST
         self.unmoved_since_s = 0.0
         self.rest_from_s = 0.0
         self.unasked = 0
@@ -118,7 +138,7 @@ class Chance:
     def setpoint(self) -> None:
         if self.tenure is None and self.likely():
             self.grant()
-        elbow = self.random.uniform(-4, 4)
+        target = self.target()
         for _ in range(self.random.choice((1, 5, 20, 60, 120))):
             self.sequence += 1
             tick_ms = round(self.now_s * 1000)
@@ -127,7 +147,7 @@ class Chance:
                 sequence=self.sequence,
                 echo_tick_ms=tick_ms - self.random.randint(0, 210),
                 sent_ms=0.0,
-                target=JointTarget(position_rad={"elbow": elbow, "shoulder": self.random.choice((0.0, 1.5))}),
+                target=target() if callable(target) else target,
             )
             self.controller.offer(setpoint, now_s=self.now_s, tick_ms=tick_ms)
             assert self.epoch > self.burned, "a lease that has ended"
@@ -136,6 +156,22 @@ class Chance:
             self.rest_from_s = self.now_s + REST_WITHIN_S
             for _ in range(3):
                 self.tick()
+
+    def target(self) -> Target | Callable[[], Target]:
+        """What a hand on a slider, a joystick or a pad asks for, beyond every limit as well; sometimes each in turn."""
+        push = partial(self.random.uniform, -6, 6)
+        elbow = push()
+        kinds: list[Callable[[], Target]] = [
+            lambda: JointTarget(position_rad={"elbow": elbow, "shoulder": self.random.choice((0.0, 1.5))}),
+            lambda: DriveTarget(forward_m_s=push(), left_m_s=push(), turn_rad_s=push()),
+        ]
+        if self.shape is not None:
+            kinds.append(lambda: JogTarget(linear_m_s=(push(), push(), 0.0), tool=self.random.random() < 0.5))
+
+        def any_of_them() -> Target:
+            return self.random.choice(kinds)()
+
+        return any_of_them if self.random.random() < 0.2 else any_of_them()
 
     def act(self) -> None:
         if self.tenure is None and not self.likely():
@@ -234,8 +270,7 @@ class Chance:
         self.position = tick.position_rad
         if self.shape is not None:
             assert self.shape.clearance(self.position).room_m >= -CLIPPED
-        for speed, limit in zip(tick.twist, self.controller._helm.base.limits, strict=True):  # type: ignore[union-attr]
-            assert abs(speed) <= limit + 1e-6
+        faster |= self.base(tick.twist)
         allowed = self.tenure is not None or self.now_s <= self.may_move_until_s + 1e-9
         # What speeds up when the hold begins does so for four milliseconds more: the brakes have a ramp.
         asked = allowed and tick.mode in {Mode.STREAMING, Mode.ACTION}
@@ -251,6 +286,19 @@ class Chance:
             assert not moving, "a hold is complete within 200 ms"
         if self.tenure is None and self.now_s > self.may_move_until_s + PERIOD_S and tick.mode is Mode.STREAMING:
             pytest.fail("setpoints that stopped coming are followed no more after 300 ms")
+
+    def base(self, twist: Twist) -> bool:
+        """What holds for the base; whether any part of its twist grows."""
+        faster = False
+        for was, now, limit, easy, hard in zip(self.twist, twist, LIMITS, EASY, HARD, strict=True):
+            gain = abs(now) - abs(was)
+            assert abs(now) <= limit + 1e-6
+            assert abs(now - was) / PERIOD_S <= (easy if gain > 0 and now * was >= 0 else hard) + 1e-3
+            faster |= gain > 1e-6
+            if gain > 1e-6 and self.slowed_for > JERK_PERIODS:
+                assert abs(now) <= self.speed() * limit + 1e-6, "faster than the room allows"
+        self.twist = twist
+        return faster
 
 
 @pytest.mark.parametrize("seed", range(40))

@@ -1,6 +1,8 @@
 """Setpoints for a frame and for a base: while they are fresh, inside every limit, and nothing goes on after them."""
 
+import json
 import math
+from contextlib import suppress
 from pathlib import Path
 
 import msgspec
@@ -220,6 +222,49 @@ def test_without_a_model_there_is_no_jog() -> None:
     assert refused.value.code == "no_model"
     with pytest.raises(Refused, match="finite"):
         jogger(base=True).hold(DriveTarget(forward_m_s=-math.inf), 0.03)
+
+
+_ODD: st.SearchStrategy[object] = st.one_of(
+    st.floats(),
+    st.floats(-3, 3),
+    st.integers(),
+    st.sampled_from([None, True, "1", "NaN", [], [0.1], {}, 1e308, -1e308, 5e-324, -0.0]),
+)
+
+
+@settings(max_examples=100, deadline=None)
+@given(st.dictionaries(st.sampled_from([*DriveTarget.__struct_fields__, "up_m_s", ""]), _ODD), st.integers(0, 220))
+def test_whatever_is_sent_to_drive_a_base_is_refused_or_driven_inside_its_limits(
+    sent: dict[str, object], age_ms: int
+) -> None:
+    text = json.dumps(
+        {"epoch": 1, "sequence": 1, "echo_tick_ms": 1, "sent_ms": 1.0, "target": {"kind": "drive"} | sent}
+    )
+    try:
+        target = codec.decode(text.encode(), Setpoint).target
+    except ProtocolError:
+        assert any(name not in DriveTarget.__struct_fields__ or not _number(value) for name, value in sent.items())
+        return
+    assert isinstance(target, DriveTarget)
+    assert all(math.isfinite(part) for part in (target.forward_m_s, target.left_m_s, target.turn_rad_s))
+    rig = jogger(base=True)
+    with suppress(Refused):
+        rig.hold(target, 0.4, age_ms=age_ms)
+    rig.rest(0.31)
+    limits = (BASE.max_linear_m_s, 0.0, BASE.max_angular_rad_s)
+    assert all(abs(part) <= most + 1e-9 for twist in rig.twists for part, most in zip(twist, limits, strict=True))
+    assert rig.twists[-1] == pytest.approx((0.0, 0.0, 0.0), abs=1e-6)
+    assert age_ms <= 200 or not any(map(any, rig.twists))
+
+
+def _number(value: object) -> bool:
+    """What JSON has as a number that fits."""
+    if isinstance(value, bool) or not isinstance(value, int | float):
+        return False
+    try:
+        return math.isfinite(float(value))
+    except OverflowError:
+        return False
 
 
 @pytest.mark.parametrize("wrong", [b'{"kind":"jog","linear_m_s":[1,2]}', b'{"kind":"drive","forward_m_s":1e999}'])
