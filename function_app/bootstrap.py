@@ -9,6 +9,7 @@ from function_app.adapters.local.clock import SystemClock
 from function_app.adapters.local.feed import MqttFeed, MqttLate, MqttTelemetry
 from function_app.adapters.local.model_compiler import MujocoCompiler
 from function_app.adapters.local.orders import MqttOrders
+from function_app.adapters.local.password_hashes import Argon2Hashes
 from function_app.domain.series import Keep
 from function_app.ports.blobs import Blobs, Transfers
 from function_app.ports.broker_access import BrokerAccess
@@ -22,6 +23,7 @@ from function_app.ports.xmpp_line import XmppLine
 from function_app.services.action_acks import ActionAcks
 from function_app.services.action_rows import ActionRows
 from function_app.services.actions import Actions
+from function_app.services.attempts import Attempts
 from function_app.services.audit import Audit
 from function_app.services.claim import Claim
 from function_app.services.commands import Commands
@@ -49,6 +51,7 @@ from function_app.services.mailbox import Mailbox
 from function_app.services.model_checks import ModelChecks
 from function_app.services.movements import Movements
 from function_app.services.mqtt_credentials import MqttCredentials
+from function_app.services.passwords import Passwords
 from function_app.services.pending import Pending
 from function_app.services.polling import Polling
 from function_app.services.presence import PresenceIngest
@@ -58,8 +61,10 @@ from function_app.services.robot_types import RobotTypes
 from function_app.services.send_action import SendAction
 from function_app.services.series import SeriesWriter
 from function_app.services.series_range import SeriesReader
+from function_app.services.sessions import Sessions
 from function_app.services.sharing import Sharing
 from function_app.services.sign_in import SignIn
+from function_app.services.sign_out import SignOut
 from function_app.services.spaces import Spaces
 from function_app.services.start_action import StartAction
 from function_app.services.stop import StopDevices
@@ -91,6 +96,9 @@ class Functions:
     clock: Clock
     identify: Identify
     sign_in: SignIn
+    sessions: Sessions
+    sign_out: SignOut
+    passwords: Passwords
     enroll: Enroll
     claim: Claim
     unpair: Unpair
@@ -164,7 +172,9 @@ def build(settings: Settings, *, clock: Clock | None = None) -> Functions:
     faults = Faults(tables=tables, events=events, forget=forget, clock=now)
     conditions = Conditions(tables=tables, faults=faults, clock=now)
     identify = Identify(tables=tables, keys=keys, forget=forget, clock=now)
-    sign_in = SignIn(tables=tables, identify=identify, access=access, clock=now)
+    sessions = Sessions(tables=tables, identify=identify, forget=forget, clock=now)
+    sign_in = SignIn(tables=tables, sessions=sessions, clock=now)
+    attempts = Attempts(tables=tables, forget=forget, clock=now)
     devices = Devices(tables=tables, clock=now)
     spaces = Spaces(tables=tables, clock=now)
     keep = _keep(settings)
@@ -201,6 +211,15 @@ def build(settings: Settings, *, clock: Clock | None = None) -> Functions:
         commands=commands,
         access=access,
         audit=audit,
+        clock=now,
+    )
+    sign_out = SignOut(
+        tables=tables,
+        identify=identify,
+        sessions=sessions,
+        access=access,
+        devices=devices,
+        leases=leases,
         clock=now,
     )
     sending = SendAction(tables=tables, devices=devices, rows=rows, commands=commands, movements=movements, clock=now)
@@ -273,8 +292,19 @@ def build(settings: Settings, *, clock: Clock | None = None) -> Functions:
         clock=now,
         identify=identify,
         sign_in=sign_in,
+        sessions=sessions,
+        sign_out=sign_out,
+        passwords=Passwords(
+            tables=tables,
+            hashes=Argon2Hashes(),
+            attempts=attempts,
+            sign_in=sign_in,
+            sessions=sessions,
+            sign_out=sign_out,
+            clock=now,
+        ),
         enroll=Enroll(tables=tables, leave=leave, forget=forget, clock=now),
-        claim=Claim(tables=tables, sign_in=sign_in, forget=forget, leave=leave, clock=now),
+        claim=Claim(tables=tables, sign_in=sign_in, attempts=attempts, leave=leave, clock=now),
         unpair=Unpair(tables=tables, sign_in=sign_in, leave=leave),
         devices=devices,
         spaces=spaces,

@@ -1,7 +1,7 @@
 """An account claims an agent with the code that the agent shows; and gives it up again."""
 
 import contextlib
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 from function_app.domain import devices
 from function_app.domain.accounts import Identity
@@ -11,19 +11,12 @@ from function_app.domain.problems import Problem, not_found
 from function_app.ports.clock import Clock
 from function_app.ports.tables import Conflict, Row, Tables
 from function_app.services import store
-from function_app.services.forget import Forget
+from function_app.services.attempts import Attempts, Guess, by_address
 from function_app.services.leave import Leave
 from function_app.services.sign_in import SignIn
 
 WRONG_TRIES = 5
-WINDOW_MS = 300_000
-
-
-@dataclass(frozen=True, slots=True)
-class _Tries:
-    since_ms: int
-    count: int
-    expires_ms: int
+GUESS = Guess("claim", 300_000, "Too many wrong claim codes.")
 
 
 @dataclass(frozen=True, slots=True)
@@ -34,9 +27,9 @@ class _Member:
 class Claim:
     """Pairing by claim code. What decides is one ETag write on the agent's row."""
 
-    def __init__(self, *, tables: Tables, sign_in: SignIn, forget: Forget, leave: Leave, clock: Clock) -> None:
+    def __init__(self, *, tables: Tables, sign_in: SignIn, attempts: Attempts, leave: Leave, clock: Clock) -> None:
         self._tables = tables
-        self._forget = forget
+        self._attempts = attempts
         self._leave = leave
         self._sign_in = sign_in
         self._clock = clock
@@ -55,13 +48,13 @@ class Claim:
         chosen = next((known.id for known in spaces if space in (None, known.id)), None)
         if chosen is None:
             raise not_found("space", space or "")
-        counters = (who.account, f"address:{address}") if address else (who.account,)
-        await self._count(counters)
+        counters = {who.account: WRONG_TRIES, **by_address(address, WRONG_TRIES)}
+        await self._attempts.count(GUESS, counters)
         agent = await self._redeem(who, read_claim_code(text), chosen)
         if agent is None:
             detail = "This code is wrong, used or expired. Codes live five minutes; the agent shows its newest."
             raise Problem("claim-code-unknown", 404, "No such claim code", detail)
-        await self._uncount(counters)
+        await self._attempts.uncount(GUESS, counters)
         return agent
 
     async def _redeem(self, who: Identity, code: str | None, space: str) -> Agent | None:
@@ -91,37 +84,3 @@ class Claim:
         await store.upsert(self._tables, store.MEMBERS, who.account, f"agent:{agent.id}", lambda _: member, _Member)
         await self._tables.replace(store.AGENTS, Row(agent.id, "agent", store.fields(claimed), row.etag))
         return claimed
-
-    async def _count(self, counters: tuple[str, ...]) -> None:
-        """Count a try before looking, so that parallel guesses are no way around.
-
-        Raises:
-            Problem: ``too-many-tries``, by the account or from the address; such a try counts nowhere.
-        """
-        for done, counter in enumerate(counters):
-            try:
-                await self._change(counter, 1)
-            except Problem:
-                await self._uncount(counters[:done])
-                raise
-
-    async def _uncount(self, counters: tuple[str, ...]) -> None:
-        for counter in counters:
-            await self._change(counter, -1)
-
-    async def _change(self, counter: str, change: int) -> None:
-        now_ms = self._clock.now_ms()
-
-        def counted(tries: _Tries | None) -> _Tries:
-            if tries is None or now_ms - tries.since_ms >= WINDOW_MS:
-                tries = _Tries(now_ms, 0, now_ms + WINDOW_MS)
-            if change > 0 and tries.count >= WRONG_TRIES:
-                wait_s = -(-(tries.since_ms + WINDOW_MS - now_ms) // 1000)
-                detail = f"Too many wrong claim codes. Try again in {wait_s} s."
-                raise Problem("too-many-tries", 429, "Too many tries", detail, retry_after_s=wait_s)
-            return replace(tries, count=max(0, tries.count + change))
-
-        # One note for all tries of a while, and written first: nothing stays that nobody forgets.
-        due_ms = (now_ms // WINDOW_MS + 2) * WINDOW_MS
-        await self._forget.row(store.ATTEMPTS, counter, "claim", due_ms=due_ms)
-        await store.upsert(self._tables, store.ATTEMPTS, counter, "claim", counted, _Tries)

@@ -43,6 +43,7 @@ class _Known:
     identity: Identity
     expires_ms: int
     checked_ms: int
+    csrf: str
 
 
 class Identify:
@@ -55,8 +56,10 @@ class Identify:
         self._clock = clock
         self._known: OrderedDict[tuple[str, str], _Known] = OrderedDict()
 
-    async def issue(self, account: Account, session: str, audience: Audience, lifetime_s: int) -> str:
-        """A token of one sign-in session."""
+    async def issue(
+        self, account: Account, session: str, audience: Audience, lifetime_s: int, *, csrf: str | None = None
+    ) -> str:
+        """A token of one sign-in session; in a cookie, with what a page has to show beside it (``csrf``)."""
         key = await self._keys.current()
         now_s = self._clock.now_ms() // 1000
         claims = {
@@ -69,6 +72,8 @@ class Identify:
             "exp": now_s + lifetime_s,
             "jti": new_id(),
         }
+        if csrf is not None:
+            claims["csrf"] = csrf
         return jwt.encode(claims, key, ALGORITHM, headers={"kid": signing.key_id(key.public_key())})
 
     async def person(self, token: str, audience: Audience) -> Identity:
@@ -77,6 +82,18 @@ class Identify:
         Raises:
             Problem: ``unauthorized``: forged, expired, for another purpose, or signed out.
         """
+        return (await self._find(token, audience)).identity
+
+    async def page(self, cookie: str) -> tuple[Identity, str]:
+        """The account and session behind a page's cookie, and the CSRF token that belongs to it.
+
+        Raises:
+            Problem: ``unauthorized``, as ``person``.
+        """
+        known = await self._find(cookie, SESSION)
+        return known.identity, known.csrf
+
+    async def _find(self, token: str, audience: Audience) -> _Known:
         now_ms = self._clock.now_ms()
         known = self._known.get((audience, token))
         if known is None:
@@ -90,7 +107,7 @@ class Identify:
         if now_ms - known.checked_ms >= RECHECK_MS or now_ms < known.checked_ms:
             # In full, and not for sign-outs alone: its key may have leaked, and counts no more.
             known = self._known[audience, token] = await self._verify(token, audience)
-        return known.identity
+        return known
 
     async def sign_out(self, who: Identity) -> None:
         """End the session: its tokens are refused from now on, by other instances within ``RECHECK_MS``."""
@@ -102,7 +119,7 @@ class Identify:
         except Conflict:
             return
         finally:
-            for name in [name for name, known in self._known.items() if known.identity == who]:
+            for name in [name for name, known in self._known.items() if known.identity.session == who.session]:
                 del self._known[name]
 
     async def enrolling(self, token: str, public_key: str) -> str:
@@ -147,7 +164,7 @@ class Identify:
         except (jwt.PyJWTError, KeyError) as error:
             raise unauthorized(f"The access token is refused: {error}. Sign in again.") from error
         await self._check_signed_out(identity)
-        return _Known(identity, int(claims["exp"]) * 1000, self._clock.now_ms())
+        return _Known(identity, int(claims["exp"]) * 1000, self._clock.now_ms(), str(claims.get("csrf", "")))
 
     async def signed_out(self, who: Identity) -> bool:
         """Whether somebody has ended this session."""

@@ -1,54 +1,28 @@
 """Signing in by a one-time link, and the accounts behind it."""
 
 import hashlib
-import logging
-from dataclasses import dataclass
 
 from function_app.domain.accounts import Account, Identity, Space
 from function_app.domain.ids import new_id
 from function_app.domain.problems import Problem, unauthorized
-from function_app.ports.broker_access import BrokerAccess, BrokerAccessError
 from function_app.ports.clock import Clock
 from function_app.ports.tables import Conflict, Row, Tables
 from function_app.services import store
-from function_app.services.identity import (
-    ACCESS_S,
-    API,
-    SESSION,
-    SESSION_S,
-    Identify,
-    new_secret,
-    new_session,
-    principal,
-)
+from function_app.services.identity import new_secret
+from function_app.services.sessions import From, Sessions, SignedIn
 
 LINK_MS = 24 * 3600 * 1000
 FIRST_SPACE = "Home"
 MOST_SPACES = 100
 """More or less: two that are made at once may both be the last."""
 
-_log = logging.getLogger(__name__)
-
-
-@dataclass(frozen=True, slots=True)
-class SignedIn:
-    """A new sign-in session."""
-
-    account: Account
-    session: str
-    access_token: str
-    cookie: str
-    expires_in_s: int = ACCESS_S
-    cookie_s: int = SESSION_S
-
 
 class SignIn:
     """Accounts and their one-time links."""
 
-    def __init__(self, *, tables: Tables, identify: Identify, access: BrokerAccess, clock: Clock) -> None:
+    def __init__(self, *, tables: Tables, sessions: Sessions, clock: Clock) -> None:
         self._tables = tables
-        self._access = access
-        self._identify = identify
+        self._sessions = sessions
         self._clock = clock
 
     async def account(self, name: str) -> Account:
@@ -56,7 +30,7 @@ class SignIn:
 
         Written so that a stop after any step leaves something the next call completes.
         """
-        partition = f"name:{name}"
+        partition = named_partition(name)
         row = await self._tables.get(store.ACCOUNTS, partition, "account")
         if row is None:
             ids = {"account": new_id(12), "space": new_id(12)}
@@ -109,7 +83,7 @@ class SignIn:
         await self._tables.create(store.SIGN_INS, Row(hashed[0], hashed, data))
         return token
 
-    async def redeem(self, token: str) -> SignedIn:
+    async def redeem(self, token: str, whence: From | None = None) -> SignedIn:
         """Sign in. Of several that bring the same token one wins: whoever deletes the row.
 
         Raises:
@@ -127,28 +101,18 @@ class SignIn:
         if self._clock.now_ms() >= row.data["expires_ms"]:
             raise refused
         account = Account(id=row.data["account"], name=row.data["name"])
-        session = new_session()
-        return SignedIn(
-            account=account,
-            session=session,
-            access_token=await self._identify.issue(account, session, API, ACCESS_S),
-            cookie=await self._identify.issue(account, session, SESSION, SESSION_S),
-        )
-
-    async def sign_out(self, who: Identity) -> None:
-        """End the session of ``who``, and its connections to the broker."""
-        await self._identify.sign_out(who)
-        try:
-            await self._access.revoke(principal=principal(who))
-        except BrokerAccessError as error:
-            # Signed out it is; what the broker was told ends by itself, within a quarter of an hour.
-            _log.warning("sign-out: %s", error)
+        return await self._sessions.begin(account, "link", whence or From())
 
     async def _create(self, row: Row) -> None:
         try:
             await self._tables.create(store.ACCOUNTS, row)
         except Conflict:
             return
+
+
+def named_partition(name: str) -> str:
+    """Where it is written which local account has a name."""
+    return f"name:{name}"
 
 
 def _hash(token: str) -> str:

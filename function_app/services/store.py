@@ -11,7 +11,8 @@ from function_app.domain.problems import busy_store
 from function_app.ports.tables import Conflict, Row, Tables
 
 ACCOUNTS = "Accounts"
-"""Partition: account id (or ``name:<name>``); keys ``account``, ``space:<id>``, ``signed-out:<session>``."""
+"""Partition: account id (or ``name:<name>``); keys ``account``, ``space:<id>``, ``session:<id>``,
+``signed-out:<session>``, ``password``."""
 SIGN_INS = "SignIns"
 """Partition: first letter of the token's hash; key: the hash."""
 AGENTS = "Agents"
@@ -19,7 +20,7 @@ AGENTS = "Agents"
 CLAIMS = "Claims"
 """Partition: first letter of the code; key: the code."""
 ATTEMPTS = "Attempts"
-"""Partition: account id, or ``address:<address>``; key: what is being tried."""
+"""Partition: account id, ``name:<name>`` or ``address:<address>``; key: what is being tried."""
 MEMBERS = "Members"
 """Partition: account id; keys ``agent:<agent id>``, ``share:device:<id>``, ``share:space:<id>``. Only an index: the
 agent's own row says whose it is, the share's own what is shared."""

@@ -44,7 +44,6 @@ class Telescope:
     def __init__(self, server: str) -> None:
         self._base = server.rstrip("/") + "/api/v1"
         self._http = requests.Session()  # keeps the cookie
-        self._http.headers["X-Telescope-Client"] = "home-assistant"
 
     def sign_in(self, link: str) -> None:
         """With what stands after ``#sign-in=`` in a one-time link.
@@ -52,7 +51,8 @@ class Telescope:
         Raises:
             OSError: Not reached, or refused.
         """
-        self._post("/auth/sign-in", {"link": link.rpartition("#sign-in=")[2]})
+        signed_in = self._post("/auth/sign-in", {"link": link.rpartition("#sign-in=")[2]})
+        self._http.headers["X-CSRF-Token"] = str(signed_in["csrf_token"])
 
     def watch(self) -> dict[str, Any]:
         """Credentials to hear all that the account may see.

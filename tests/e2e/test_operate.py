@@ -177,14 +177,15 @@ def test_the_elbow_slider_moves_the_simulation_and_nobody_elses_does(browser: Br
 def assert_not_moved_by_force(page: Page) -> None:
     """What a page without the lease gets when it asks past its own buttons: no credentials, and no action."""
     device = page.evaluate("() => fetch('/api/v1/devices').then(r => r.json())")["items"][0]
-    ask = """([path, body]) => fetch('/api/v1' + path, {method: 'POST', body: JSON.stringify(body),
-        headers: {'Content-Type': 'application/json', 'X-Telescope-Client': 'test'}}).then(r => r.status)"""
+    csrf = page.evaluate("() => fetch('/api/v1/accounts/me').then(r => r.json())")["csrf_token"]
+    ask = """([path, body, csrf]) => fetch('/api/v1' + path, {method: 'POST', body: JSON.stringify(body),
+        headers: {'Content-Type': 'application/json', 'X-CSRF-Token': csrf}}).then(r => r.status)"""
     epoch = device["lease"]["epoch"]
     credentials = {"purpose": "control", "device": device["id"], "epoch": epoch}
-    assert page.evaluate(ask, ["/mqtt/credentials", credentials]) in {403, 409}
+    assert page.evaluate(ask, ["/mqtt/credentials", credentials, csrf]) in {403, 409}
     move = {"kind": "move_joints", "position_rad": {"elbow": 0.0}}
     for body in ({"request": move}, {"request": move, "epoch": epoch}):
-        assert page.evaluate(ask, [f"/devices/{device['id']}/actions", body]) == 409
+        assert page.evaluate(ask, [f"/devices/{device['id']}/actions", body, csrf]) == 409
 
 
 def test_stop_latches_until_it_is_reset(browser: Browser, machine: Machine) -> None:

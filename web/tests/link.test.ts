@@ -21,6 +21,7 @@ async function start(options: ConstructorParameters<typeof Cloud>[0] = {}): Prom
   cloud = new Cloud(options);
   await cloud.start();
   api = new Api(`${cloud.address}/api/v1`);
+  await api.me();
 }
 
 beforeEach(() => {

@@ -23,6 +23,7 @@ beforeEach(async () => {
   cloud = new Cloud();
   await cloud.start();
   api = new Api(`${cloud.address}/api/v1`);
+  await api.me();
   fleet = new Fleet(api);
   ends = [startClock(), () => fleet.dispose()];
   await until(() => fleet.devices.value?.has(DEVICE) === true, "the list");
@@ -76,10 +77,19 @@ describe("a session", () => {
     expect(session.state.value).toEqual({ kind: "out", why: "" });
   });
 
-  it("marks what it changes as coming from the console", () => {
+  it("shows the session's token with what it changes, and with nothing else", () => {
     const [call] = cloud.callsTo("POST", "/mqtt/credentials");
-    expect(call?.headers["x-telescope-client"]).toBe("console");
-    expect(cloud.callsTo("GET", "/devices")[0]?.headers["x-telescope-client"]).toBeUndefined();
+    expect(call?.headers["x-csrf-token"]).toBe("of-this-session");
+    expect(cloud.callsTo("GET", "/devices")[0]?.headers["x-csrf-token"]).toBeUndefined();
+  });
+
+  it("takes the token of the session that another tab has begun, once", async () => {
+    cloud.csrf = "of-another-session";
+    expect((await api.stop(DEVICE, "test")).confirmed).toBe(false);
+    expect(cloud.callsTo("POST", `/devices/${DEVICE}/stop`)).toHaveLength(2);
+    cloud.instead.set(`POST /devices/${DEVICE}/stop`, () => problem(403, "csrf-token", "No."));
+    await expect(api.stop(DEVICE, "test")).rejects.toMatchObject({ status: 403, code: "csrf-token" });
+    expect(cloud.callsTo("POST", `/devices/${DEVICE}/stop`)).toHaveLength(4);
   });
 
   it("tells a server that is away from one that refuses", async () => {

@@ -14,6 +14,7 @@ from starlette.types import ASGIApp, Message, Receive, Scope, Send
 from function_app.bootstrap import Functions
 from function_app.domain.problems import Problem, invalid, store_unavailable
 from function_app.entrypoints.http import (
+    accounts,
     actions,
     agents,
     auth,
@@ -73,6 +74,7 @@ def create_app(functions: Functions) -> FastAPI:
     caller = Caller(functions.identify)
     resources = (
         auth.router(functions, caller),
+        accounts.router(functions, caller),
         agents.router(functions, caller),
         messages.router(functions, caller),
         devices.router(functions, caller),

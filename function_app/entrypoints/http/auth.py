@@ -1,19 +1,21 @@
-"""``auth``, ``accounts/me``, ``spaces``."""
+"""``auth``, ``spaces``."""
 
 from fastapi import Request, Response
 
 from function_app.bootstrap import Functions
 from function_app.entrypoints.http.answers import answer, empty, read
-from function_app.entrypoints.http.caller import COOKIE, Caller
+from function_app.entrypoints.http.caller import Caller, refuse_other_sites
 from function_app.entrypoints.http.contract import auth as contract
+from function_app.entrypoints.http.cookies import clear_session, signed_in, whence
 from function_app.entrypoints.http.routing import Routes
+from function_app.services.identity import ACCESS_S
 from function_app.services.spaces import SpaceView
 
 
 def router(functions: Functions, caller: Caller) -> Routes:
     """The routes."""
     routes = Routes("accounts")
-    secure = "; Secure" if functions.settings.public_url.startswith("https:") else ""
+    settings = functions.settings
 
     @routes.add(
         "POST",
@@ -21,34 +23,50 @@ def router(functions: Functions, caller: Caller) -> Routes:
         summary="Sign in with a one-time link",
         body=contract.SignInRequest,
         answers={200: contract.SignedIn},
-        problems=(401,),
+        problems=(401, 403),
         caller="nobody",
     )
     async def sign_in(request: Request) -> Response:
         """Gives an access token for programs, and sets a cookie for the page."""
+        refuse_other_sites(request)
         asked: contract.SignInRequest = await read(request, contract.SignInRequest)
-        done = await functions.sign_in.redeem(asked.link)
-        body = contract.SignedIn(
-            access_token=done.access_token,
+        return signed_in(settings, await functions.sign_in.redeem(asked.link, whence(request, settings)))
+
+    @routes.add(
+        "POST",
+        "/auth/password",
+        summary="Sign in with name and password",
+        body=contract.PasswordSignIn,
+        answers={200: contract.SignedIn},
+        problems=(401, 403, 429),
+        caller="nobody",
+    )
+    async def sign_in_by_password(request: Request) -> Response:
+        """As with a link. Wrong ones are counted by the name and by the address that asks."""
+        refuse_other_sites(request)
+        asked: contract.PasswordSignIn = await read(request, contract.PasswordSignIn)
+        done = await functions.passwords.sign_in(asked.name, asked.password, whence(request, settings))
+        return signed_in(settings, done)
+
+    @routes.add("POST", "/auth/token", summary="The next access token", answers={200: contract.AccessToken})
+    async def renew_token(request: Request) -> Response:
+        """For programs that keep the cookie: an access token ends after an hour, the session after 12 h.
+
+        Needs the cookie, and the session's CSRF token in ``X-CSRF-Token``: no access token lives on by itself.
+        """
+        who, _ = await caller.page(request)
+        body = contract.AccessToken(
+            access_token=await functions.sessions.access_token(who),
             token_type="Bearer",  # noqa: S106 (a scheme's name)
-            expires_in_s=done.expires_in_s,
-            account=contract.AccountRef(id=done.account.id, name=done.account.name),
-            session=done.session,
+            expires_in_s=ACCESS_S,
         )
-        cookie = f"{COOKIE}={done.cookie}; Path=/api; Max-Age={done.cookie_s}; HttpOnly; SameSite=Strict{secure}"
-        return answer(body, headers={"Set-Cookie": cookie, "Cache-Control": "no-store"})
+        return answer(body, headers={"Cache-Control": "no-store"})
 
     @routes.add("POST", "/auth/sign-out", summary="End this sign-in session", answers={204: None})
     async def sign_out(request: Request) -> Response:
-        """Ends the session behind the token or cookie, and clears the cookie."""
-        await functions.sign_in.sign_out(await caller.account(request))
-        return empty({"Set-Cookie": f"{COOKIE}=; Path=/api; Max-Age=0; HttpOnly; SameSite=Strict{secure}"})
-
-    @routes.add("GET", "/accounts/me", summary="Who is signed in", answers={200: contract.Me})
-    async def me(request: Request) -> Response:
-        """The account and sign-in session behind the token or cookie."""
-        who = await caller.account(request)
-        return answer(contract.Me(id=who.account, name=who.name, session=who.session))
+        """Ends the session behind the token or cookie with all that it holds, and clears the cookie."""
+        await functions.sign_out.end(await caller.account(request))
+        return empty({"Set-Cookie": clear_session(settings)})
 
     @routes.add("GET", "/spaces", summary="Spaces one may see", answers={200: contract.SpaceList})
     async def list_spaces(request: Request) -> Response:

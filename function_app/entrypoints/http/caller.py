@@ -1,14 +1,16 @@
 """Who calls: a bearer token, or the page's cookie."""
 
+import hmac
+
 from fastapi import Request
 
 from function_app.domain.accounts import Identity
 from function_app.domain.devices import Agent
-from function_app.domain.problems import forbidden, unauthorized
-from function_app.services.identity import API, SESSION, Identify
+from function_app.domain.problems import Problem, forbidden, unauthorized
+from function_app.services.identity import API, Identify
 
 COOKIE = "telescope_session"
-CLIENT_HEADER = "X-Telescope-Client"
+CSRF_HEADER = "X-CSRF-Token"
 _READING = frozenset({"GET", "HEAD", "OPTIONS"})
 
 
@@ -21,22 +23,37 @@ class Caller:
     async def account(self, request: Request) -> Identity:
         """The account that asks.
 
-        A cookie travels with every request that a browser makes, whoever wrote the page: what changes something must
-        carry a header as well that another site's page cannot send.
-
         Raises:
-            Problem: ``unauthorized``; ``forbidden`` for a changing request by cookie without the header.
+            Problem: ``unauthorized``; ``csrf-token`` for a changing request by cookie without the session's token.
         """
         token = bearer(request)
         if token:
             return await self._identify.person(token, API)
+        who, _ = await self.page(request)
+        return who
+
+    async def page(self, request: Request) -> tuple[Identity, str]:
+        """The account that asks by a page's cookie, and the session's CSRF token.
+
+        A cookie travels with every request that a browser makes, whoever wrote the page: what changes something must
+        carry the token as well, which is in the cookie where no script can read it, and is told to our own page alone
+        (``accounts/me``: no other site's page is allowed to read that).
+
+        Raises:
+            Problem: ``unauthorized``; ``csrf-token``.
+        """
         cookie = request.cookies.get(COOKIE)
         if not cookie:
             raise unauthorized("Give an access token (Authorization: Bearer …), or sign in.")
-        who = await self._identify.person(cookie, SESSION)
-        if request.method not in _READING and not request.headers.get(CLIENT_HEADER):
-            raise forbidden(f"A changing request by cookie needs the header {CLIENT_HEADER}.")
-        return who
+        who, csrf = await self._identify.page(cookie)
+        if request.method not in _READING:
+            shown = request.headers.get(CSRF_HEADER, "")
+            if not csrf or not hmac.compare_digest(shown.encode(), csrf.encode()):
+                detail = (
+                    f"A changing request by cookie needs the session's token in {CSRF_HEADER}; accounts/me tells it."
+                )
+                raise Problem("csrf-token", 403, "The CSRF token is not this session's", detail)
+        return who, csrf
 
     async def agent(self, request: Request) -> Agent:
         """The enrolled agent that asks.
@@ -53,6 +70,18 @@ class Caller:
             Problem: ``unauthorized``.
         """
         return await self._identify.enrolling(bearer(request), public_key)
+
+
+def refuse_other_sites(request: Request) -> None:
+    """Refuse what another site's page has a browser send: nobody is signed in as somebody else behind their back.
+
+    Browsers say whose page asks (``Sec-Fetch-Site``), and programs say nothing.
+
+    Raises:
+        Problem: ``forbidden``.
+    """
+    if request.headers.get("sec-fetch-site", "same-origin") not in {"same-origin", "none"}:
+        raise forbidden("Sign in on the page of this server itself.")
 
 
 def bearer(request: Request) -> str:

@@ -70,7 +70,8 @@ def test_the_same_name_is_the_same_account_with_one_space(cloud: Cloud) -> None:
     one, two = cloud.sign_in("anna"), cloud.sign_in("anna")
     assert one.account == two.account
     assert one.session != two.session
-    assert one.get("/accounts/me").json() == {"id": one.account, "name": "anna", "session": one.session}
+    me = {"id": one.account, "name": "anna", "session": one.session, "csrf_token": None}
+    assert one.get("/accounts/me").json() == me
     (space,) = one.get("/spaces").json()["items"]
     owner = {"id": one.account, "name": "anna"}
     assert space == {"id": space["id"], "name": "Home", "role": "owner", "owner": owner}
@@ -91,8 +92,10 @@ class TestCookie:
         assert cookie["secure"] == ""
         return client
 
-    def test_it_reads_and_changes_only_with_the_header(self, cloud: Cloud, page: httpx.AsyncClient) -> None:
-        assert cloud.run(page.get(f"{API}/accounts/me")).json()["name"] == "anna"
+    def test_it_reads_and_changes_only_with_the_sessions_own_token(self, cloud: Cloud, page: httpx.AsyncClient) -> None:
+        me = cloud.run(page.get(f"{API}/accounts/me")).json()
+        assert me["name"] == "anna"
+        other = cloud.run(cloud.client().post(SIGN_IN, json={"link": cloud.link("anna")})).json()["csrf_token"]
         for method, path, body in (
             ("POST", "/auth/sign-out", None),
             ("POST", "/agents/claim", {"code": "BCDF-GHJK"}),
@@ -101,14 +104,17 @@ class TestCookie:
             ("POST", "/mqtt/credentials", {"purpose": "watch"}),
             ("POST", "/devices/abcdefgh23-arm/stop", None),
         ):
-            problem(cloud.run(page.request(method, API + path, json=body)), 403, "forbidden")
-        headers = {"X-Telescope-Client": "console"}
-        answer = cloud.run(page.put(f"{API}/robot-types/ur5/movements/mine", json={"source": "1"}, headers=headers))
+            for wrong in ("", "x", "ü", other, me["csrf_token"] + "x", me["csrf_token"][:-1]):
+                headers = [(b"X-CSRF-Token", wrong.encode())] if wrong else []
+                problem(cloud.run(page.request(method, API + path, json=body, headers=headers)), 403, "csrf-token")
+        shown = {"X-CSRF-Token": me["csrf_token"]}
+        answer = cloud.run(page.put(f"{API}/robot-types/ur5/movements/mine", json={"source": "1"}, headers=shown))
         assert answer.status_code == 201
 
     def test_sign_out_clears_it_and_ends_the_session(self, cloud: Cloud, page: httpx.AsyncClient) -> None:
         stolen = dict(page.cookies)
-        answer = cloud.run(page.post(f"{API}/auth/sign-out", headers={"X-Telescope-Client": "console"}))
+        token = cloud.run(page.get(f"{API}/accounts/me")).json()["csrf_token"]
+        answer = cloud.run(page.post(f"{API}/auth/sign-out", headers={"X-CSRF-Token": token}))
         assert answer.status_code == 204
         assert dict(page.cookies) == {}
         problem(cloud.run(page.get(f"{API}/accounts/me")), 401, "unauthorized")
@@ -123,6 +129,25 @@ class TestCookie:
         problem(answer, 401, "unauthorized")
         client = cloud.client(cookies={"telescope_session": cloud.sign_in("anna").token})
         problem(cloud.run(client.get(f"{API}/accounts/me")), 401, "unauthorized")
+
+    def test_it_is_good_for_the_next_access_token_and_an_access_token_is_not(
+        self, cloud: Cloud, page: httpx.AsyncClient
+    ) -> None:
+        me = cloud.run(page.get(f"{API}/accounts/me")).json()
+        problem(cloud.run(page.post(f"{API}/auth/token")), 403, "csrf-token")
+        answer = cloud.run(page.post(f"{API}/auth/token", headers={"X-CSRF-Token": me["csrf_token"]}))
+        headers = {"Authorization": f"Bearer {answer.json()['access_token']}"}
+        assert cloud.ask("GET", f"{API}/accounts/me", headers=headers).json()["session"] == me["session"]
+        problem(cloud.ask("POST", f"{API}/auth/token", headers=headers), 401, "unauthorized")
+
+    @pytest.mark.parametrize("site", ["cross-site", "same-site"])
+    def test_another_sites_page_signs_nobody_in(self, cloud: Cloud, site: str) -> None:
+        link = cloud.link("mallory")
+        headers = {"Sec-Fetch-Site": site}
+        problem(cloud.ask("POST", SIGN_IN, json={"link": link}, headers=headers), 403, "forbidden")
+        body = {"name": "mallory", "password": "does not matter"}
+        problem(cloud.ask("POST", f"{API}/auth/password", json=body, headers=headers), 403, "forbidden")
+        assert cloud.ask("POST", SIGN_IN, json={"link": link}, headers={"Sec-Fetch-Site": "same-origin"}).is_success
 
     def test_over_https_it_is_secure(self, home: Path) -> None:
         from dataclasses import replace

@@ -221,7 +221,7 @@ def test_wrong_tries_are_forgotten_when_they_no_longer_count(alone: Cloud) -> No
     alone.clock.advance(601)
     alone.sweep()
     assert left(alone, store.ATTEMPTS, anna.account) == []
-    assert notes(alone) == []
+    assert notes(alone, store.ATTEMPTS) == []
 
 
 def test_an_agent_that_nobody_claims_is_forgotten_after_a_week_and_no_other(cloud: Cloud) -> None:

@@ -10,7 +10,7 @@ import pytest
 from device_agent.protocol import codec, topics
 from device_agent.protocol.messages import AckStatus, MoveJoints, Presence
 from function_app.entrypoints.http.answers import MAX_BODY
-from function_app.entrypoints.http.caller import CLIENT_HEADER
+from function_app.entrypoints.http.caller import CSRF_HEADER
 from tests.support.brokers import wait_until
 from tests.support.cloud import API, MOVE, problem
 from tests.support.hosts import HOSTS, HostFailed, HostKind, start_host
@@ -40,7 +40,7 @@ def test_a_person_signs_in_with_a_cookie_and_out_again(there: Reached) -> None:
         fields = {part.strip().lower().partition("=")[0] for part in cookie.split(";")}
         assert fields >= {"path", "max-age", "httponly", "samesite"}
         assert anna.get("/accounts/me").json()["name"] == "anna"
-        gone = anna.post("/auth/sign-out", headers={CLIENT_HEADER: "test"})
+        gone = anna.post("/auth/sign-out", headers={CSRF_HEADER: answer.json()["csrf_token"]})
         assert (gone.status_code, gone.content) == (204, b"")
         assert list(anna.cookies.jar) == []
         problem(anna.get("/accounts/me"), 401, "unauthorized")

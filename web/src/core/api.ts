@@ -75,6 +75,12 @@ export interface Space {
   name: string;
 }
 
+interface SignedIn {
+  account: { id: string; name: string };
+  session: string;
+  csrf_token: string;
+}
+
 interface Page<T> {
   items: T[];
   cursor: string | null;
@@ -106,29 +112,32 @@ interface CallOptions {
   headers?: Record<string, string>;
   /** Let the call outlive the page. */
   keepalive?: boolean;
+  /** It was refused once for want of the session's token. */
+  again?: boolean;
 }
 
 /** One method for each call. All of them throw `ApiError`, and nothing else. */
 export class Api {
   readonly #base: string;
+  /** What goes with the cookie in calls that change something: a page of another site cannot know it. */
+  #csrf = "";
 
   constructor(base = "/api/v1") {
     this.#base = base;
   }
 
   async signIn(link: string): Promise<Account> {
-    const answer = await this.#call<{ account: { id: string; name: string }; session: string }>("POST", "/auth/sign-in", {
-      body: { link },
-    });
-    return { ...answer.account, session: answer.session };
+    return this.#signedIn(await this.#call("POST", "/auth/sign-in", { body: { link } }));
   }
 
   async signOut(): Promise<void> {
     await this.#call("POST", "/auth/sign-out");
   }
 
-  me(): Promise<Account> {
-    return this.#call("GET", "/accounts/me");
+  async me(): Promise<Account> {
+    const { csrf_token: csrf, ...account } = await this.#call<Account & { csrf_token: string | null }>("GET", "/accounts/me");
+    this.#csrf = csrf ?? "";
+    return account;
   }
 
   devices(): Promise<Device[]> {
@@ -192,6 +201,11 @@ export class Api {
     return this.#call("POST", "/mqtt/credentials", { body: purpose });
   }
 
+  #signedIn(answer: SignedIn): Account {
+    this.#csrf = answer.csrf_token;
+    return { ...answer.account, session: answer.session };
+  }
+
   async #all<T>(path: string): Promise<T[]> {
     const items: T[] = [];
     let cursor: string | null = null;
@@ -206,7 +220,7 @@ export class Api {
 
   async #call<T>(method: string, path: string, options: CallOptions = {}): Promise<T> {
     const headers: Record<string, string> = { Accept: "application/json", ...options.headers };
-    if (method !== "GET") headers["X-Telescope-Client"] = "console";
+    if (method !== "GET") headers["X-CSRF-Token"] = this.#csrf;
     if (options.body !== undefined) headers["Content-Type"] = "application/json";
     const askedAt = now();
     let response: Response;
@@ -228,8 +242,12 @@ export class Api {
     const serverMs = response.headers.get("X-Telescope-Time-Ms");
     if (serverMs !== null) learnServerTime(Number(serverMs), askedAt, now());
     const body = parseBody(text, response.status);
-    if (!response.ok) throw problem(response.status, body);
-    return body as T;
+    if (response.ok) return body as T;
+    const refused = problem(response.status, body);
+    // Signed in anew in another tab: the cookie is the new session's, and so has the token to be.
+    if (refused.code !== "csrf-token" || options.again === true) throw refused;
+    await this.me();
+    return this.#call(method, path, { ...options, again: true });
   }
 }
 

@@ -67,6 +67,8 @@ export class Cloud {
   epoch = 0;
   /** Refuse connections to the broker, as if it were down. */
   brokerDown = false;
+  /** What a call has to show beside the cookie when it changes something. */
+  csrf = "of-this-session";
   readonly calls: Call[] = [];
   /** The number of filters of each SUBSCRIBE. */
   readonly subscribes: number[] = [];
@@ -209,14 +211,16 @@ export class Cloud {
 
   async #answer(call: Call, url: string): Promise<Answer> {
     const { method, path, body } = call;
+    if (method !== "GET" && path !== "/auth/sign-in" && call.headers["x-csrf-token"] !== this.csrf)
+      return problem(403, "csrf-token", "A changing request needs the session's token.");
     switch (`${method} ${path}`) {
       case "POST /auth/sign-in":
         if (body["link"] !== "good") return problem(401, "link-used", "This sign-in link was used before or is too old.");
-        return ok({ account: { id: "demo", name: "Demo" }, session: "s1" });
+        return ok({ account: { id: "demo", name: "Demo" }, session: "s1", csrf_token: this.csrf });
       case "POST /auth/sign-out":
         return { status: 204, body: null };
       case "GET /accounts/me":
-        return ok({ id: "demo", name: "Demo", session: "s1" });
+        return ok({ id: "demo", name: "Demo", session: "s1", csrf_token: this.csrf });
       case "GET /devices":
         return ok({ items: [this.device()], cursor: null });
       case "GET /spaces":

@@ -4,13 +4,32 @@ from typing import Annotated, Literal
 
 from msgspec import Meta
 
-from function_app.entrypoints.http.contract.base import Answer, Name, Request
+from function_app.entrypoints.http.contract.base import Answer, Moment, Name, Request
 
 
 class SignInRequest(Request, frozen=True, kw_only=True):
     """The token of a one-time link."""
 
     link: Annotated[str, Meta(min_length=1, max_length=200)]
+
+
+NewPassword = Annotated[
+    str, Meta(max_length=1000, description="At least 12 characters, and none that is guessed first.")
+]
+
+
+class PasswordSignIn(Request, frozen=True, kw_only=True):
+    """A local account's name and password."""
+
+    name: Name
+    password: Annotated[str, Meta(min_length=1, max_length=1000)]
+
+
+class PasswordRequest(Request, frozen=True, kw_only=True):
+    """A new password."""
+
+    password: NewPassword
+    old_password: Annotated[str, Meta(max_length=1000)] | None = None
 
 
 class AccountRef(Answer, frozen=True, kw_only=True):
@@ -28,14 +47,49 @@ class SignedIn(Answer, frozen=True, kw_only=True):
     expires_in_s: int
     account: AccountRef
     session: str
+    csrf_token: str
+
+
+class AccessToken(Answer, frozen=True, kw_only=True):
+    """The next access token of a session."""
+
+    access_token: str
+    token_type: Literal["Bearer"]
+    expires_in_s: int
 
 
 class Me(Answer, frozen=True, kw_only=True):
-    """Who asks."""
+    """Who asks. ``csrf_token``: what a page shows with its cookie; ``null`` for who comes without one."""
 
     id: str
     name: str
     session: str
+    csrf_token: str | None
+
+
+class SessionOut(Answer, frozen=True, kw_only=True):
+    """A sign-in session. ``mine``: the one that asks."""
+
+    id: str
+    how: Literal["link", "password", "open-id"]
+    since: Moment
+    expires_at: Moment
+    address: str
+    program: str
+    mine: bool
+
+
+class SessionList(Answer, frozen=True, kw_only=True):
+    """Sign-in sessions, the newest first."""
+
+    items: tuple[SessionOut, ...]
+    cursor: str | None
+
+
+class SessionsEnded(Answer, frozen=True, kw_only=True):
+    """How many were ended."""
+
+    ended: int
 
 
 class SpaceRequest(Request, frozen=True, kw_only=True):

@@ -1,0 +1,155 @@
+"""Local accounts' passwords: signing in by one, setting and changing it, an account made with one."""
+
+from dataclasses import dataclass
+from typing import Final
+
+from function_app.domain.accounts import Account, Identity
+from function_app.domain.ids import new_id
+from function_app.domain.passwords import normal, why_weak
+from function_app.domain.problems import Problem, forbidden, invalid, unauthorized
+from function_app.ports.clock import Clock
+from function_app.ports.password_hashes import PasswordHashes
+from function_app.ports.tables import Conflict, Row, Tables
+from function_app.services import store
+from function_app.services.attempts import Attempts, Guess, by_address
+from function_app.services.sessions import From, Sessions, SignedIn
+from function_app.services.sign_in import SignIn, named_partition
+from function_app.services.sign_out import SignOut
+
+GUESS: Final = Guess("password", 300_000, "Too many wrong passwords.")
+WRONG_TRIES: Final = 10
+"""By one account in five minutes: in a year a million, of more than 10²⁰ that twelve characters can be. NIST SP 800-63B
+allows a hundred in a row."""
+WRONG_TRIES_FROM: Final = 30
+"""From one address: behind one may be a whole school."""
+_PASSWORD: Final = "password"  # noqa: S105 (the key of a row)
+_NOBODY: Final = "name:"
+"""A partition of no account: a name that nobody has costs the same reads."""
+
+
+@dataclass(frozen=True, slots=True)
+class _Stored:
+    hash: str
+    changed_ms: int
+
+
+class Passwords:
+    """Passwords, of which only hashes are stored."""
+
+    def __init__(
+        self,
+        *,
+        tables: Tables,
+        hashes: PasswordHashes,
+        attempts: Attempts,
+        sign_in: SignIn,
+        sessions: Sessions,
+        sign_out: SignOut,
+        clock: Clock,
+    ) -> None:
+        self._tables = tables
+        self._hashes = hashes
+        self._attempts = attempts
+        self._sign_in = sign_in
+        self._sessions = sessions
+        self._sign_out = sign_out
+        self._clock = clock
+
+    async def sign_in(self, name: str, password: str, whence: From) -> SignedIn:
+        """Sign in by name and password. An unknown name takes as long as a wrong password, and is answered the same.
+
+        Raises:
+            Problem: ``unauthorized``; ``too-many-tries`` for this name, or from this address.
+        """
+        counters = {named_partition(name): WRONG_TRIES, **by_address(whence.address, WRONG_TRIES_FROM)}
+        await self._attempts.count(GUESS, counters)
+        named = await self._tables.get(store.ACCOUNTS, named_partition(name), "account")
+        account = str(named.data["account"]) if named else ""
+        row = await self._tables.get(store.ACCOUNTS, account or _NOBODY, _PASSWORD)
+        stored = store.read(row, _Stored) if row else None
+        right = await self._hashes.check(stored.hash if stored else None, normal(password))
+        if row is None or stored is None or not right:
+            raise unauthorized("This name and password do not belong together.")
+        await self._attempts.uncount(GUESS, counters)
+        done = await self._sessions.begin(Account(account, name), "password", whence)
+        again = await self._tables.get(store.ACCOUNTS, account, _PASSWORD)
+        if again is None or store.read(again, _Stored) != stored:
+            # It was changed while this was looked at: that ended the sessions that it saw, not this one.
+            await self._sign_out.end(Identity(account, name, done.session))
+            raise unauthorized("The password was changed just now. Sign in with the new one.")
+        if self._hashes.outdated(stored.hash):
+            await self._renew(again, password)
+        return done
+
+    async def put(self, who: Identity, password: str, *, old: str | None, whence: From) -> None:
+        """Set or change the password of one's own account; every other session of it ends.
+
+        The old one has to be given, except in the first minutes after a one-time link was redeemed: whoever finds a
+        page that is signed in does not keep the account.
+
+        Raises:
+            Problem: ``password-elsewhere``, ``forbidden``, ``password-weak``, ``too-many-tries``.
+        """
+        named = await self._tables.get(store.ACCOUNTS, named_partition(who.name), "account")
+        if named is None or named.data["account"] != who.account:
+            detail = "This account signs in elsewhere and has no password here. Change it there."
+            raise Problem("password-elsewhere", 409, "No password here", detail)
+        row = await self._tables.get(store.ACCOUNTS, who.account, _PASSWORD)
+        await self._require_right(who, row, old, whence)
+        data = store.fields(await self._store(password, who.name))
+        try:
+            if row is None:
+                await self._tables.create(store.ACCOUNTS, Row(who.account, _PASSWORD, data))
+            else:
+                await self._tables.replace(store.ACCOUNTS, Row(who.account, _PASSWORD, data, row.etag))
+        except Conflict as conflict:
+            raise forbidden("The password was changed in the meantime. Give the new one as the old one.") from conflict
+        await self._sign_out.others(who)
+
+    async def register(self, name: str, password: str) -> Account:
+        """A new local account. Its password is there before its name: a name without one would be nobody's.
+
+        Raises:
+            Problem: ``name-taken``, ``password-weak``.
+        """
+        stored = await self._store(password, name)
+        account = new_id(12)
+        row = await self._tables.create(store.ACCOUNTS, Row(account, _PASSWORD, store.fields(stored)))
+        try:
+            ids = {"account": account, "space": new_id(12)}
+            await self._tables.create(store.ACCOUNTS, Row(named_partition(name), "account", ids))
+        except Conflict as conflict:
+            await self._tables.delete(store.ACCOUNTS, row)
+            raise Problem(
+                "name-taken", 409, "The name is taken", "Somebody has this name. Choose another."
+            ) from conflict
+        return await self._sign_in.account(name)
+
+    async def _require_right(self, who: Identity, row: Row | None, old: str | None, whence: From) -> None:
+        if old is None:
+            session = await self._sessions.get(who)
+            if session is None or not session.fresh_by_link(self._clock.now_ms()):
+                raise forbidden(
+                    "Give the old password, or sign in by a new one-time link and set it within 10 minutes."
+                )
+            return
+        counters = {named_partition(who.name): WRONG_TRIES, **by_address(whence.address, WRONG_TRIES_FROM)}
+        await self._attempts.count(GUESS, counters)
+        if not await self._hashes.check(store.read(row, _Stored).hash if row else None, normal(old)):
+            raise forbidden("The old password is not right.")
+        await self._attempts.uncount(GUESS, counters)
+
+    async def _store(self, password: str, name: str) -> _Stored:
+        password = normal(password)
+        why = why_weak(password, name=name)
+        if why:
+            raise invalid(why, code="password-weak")
+        return _Stored(await self._hashes.make(password), self._clock.now_ms())
+
+    async def _renew(self, row: Row, password: str) -> None:
+        """The same password under today's parameters."""
+        fresh = _Stored(await self._hashes.make(normal(password)), self._clock.now_ms())
+        try:
+            await self._tables.replace(store.ACCOUNTS, Row(row.partition, row.key, store.fields(fresh), row.etag))
+        except Conflict:
+            return  # it was changed just now

@@ -1,0 +1,209 @@
+"""Local accounts' passwords, and the sessions that they begin and end."""
+
+import asyncio
+from typing import Any
+
+import httpx
+import pytest
+
+from function_app.adapters.local import password_hashes
+from function_app.services import store
+from tests.support.cloud import API, Cloud, Person, Robot, problem
+
+GOOD, BETTER = "correct horse battery", "staple correct horse"
+PASSWORD = "/accounts/me/password"
+SESSIONS = "/accounts/me/sessions"
+
+
+def sign_in(cloud: Cloud, name: str, password: str, *, address: str = "127.0.0.1") -> httpx.Response:
+    body = {"name": name, "password": password}
+    return cloud.run(cloud.client(address=address).post(f"{API}/auth/password", json=body))
+
+
+@pytest.fixture
+def anna(cloud: Cloud) -> Person:
+    """Who has just come by a link, and set a password."""
+    anna = cloud.sign_in("anna")
+    assert anna.put(PASSWORD, {"password": GOOD}).status_code == 204
+    return anna
+
+
+def test_who_has_set_one_signs_in_by_it(cloud: Cloud, anna: Person) -> None:
+    answer = sign_in(cloud, "anna", GOOD)
+    assert answer.status_code == 200
+    assert answer.headers["cache-control"] == "no-store"
+    again = Person(cloud, answer.json())
+    assert (again.account, again.name) == (anna.account, "anna")
+    assert again.session != anna.session
+    assert "HttpOnly; SameSite=Strict" in answer.headers["set-cookie"]
+
+
+def test_one_text_written_in_two_ways_is_one_password(cloud: Cloud) -> None:
+    assert cloud.sign_in("bert").put(PASSWORD, {"password": "cafe\u0301 au lait noir"}).status_code == 204
+    assert sign_in(cloud, "bert", "caf\u00e9 au lait noir").status_code == 200
+
+
+def test_only_a_slow_hash_of_it_is_stored(cloud: Cloud, anna: Person) -> None:
+    row = cloud.run(cloud.functions.tables.get(store.ACCOUNTS, anna.account, "password"))
+    assert row is not None
+    assert row.data["hash"].startswith("$argon2id$v=19$m=19456,t=2,p=1$")
+    assert GOOD not in str(row.data)
+
+
+def test_a_hash_of_older_parameters_is_made_again(cloud: Cloud, anna: Person, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(password_hashes, "PASSES", 3)
+    hashes: Any = cloud.functions.passwords._hashes
+    hashes._made = None
+    assert sign_in(cloud, "anna", GOOD).status_code == 200
+    row = cloud.run(cloud.functions.tables.get(store.ACCOUNTS, anna.account, "password"))
+    assert row is not None
+    assert "t=3" in row.data["hash"]
+    assert sign_in(cloud, "anna", GOOD).status_code == 200
+
+
+def test_a_wrong_one_and_an_unknown_name_are_answered_the_same(cloud: Cloud, anna: Person) -> None:
+    cloud.sign_in("carl")  # has none
+    refused = [
+        problem(sign_in(cloud, name, text), 401, "unauthorized")
+        for name, text in (("anna", BETTER), ("nobody", GOOD), ("carl", GOOD), ("Anna", GOOD), ("anna", GOOD + " "))
+    ]
+    assert all(each == refused[0] for each in refused)
+    assert anna.get("/accounts/me").status_code == 200
+
+
+@pytest.mark.usefixtures("anna")
+def test_a_name_that_nobody_has_costs_a_whole_hash(cloud: Cloud, monkeypatch: pytest.MonkeyPatch) -> None:
+    from argon2 import PasswordHasher
+
+    done: list[str] = []
+    verify = PasswordHasher.verify
+
+    def counted(self: PasswordHasher, stored: str, text: str) -> bool:
+        done.append(stored[:30])
+        return verify(self, stored, text)
+
+    monkeypatch.setattr(PasswordHasher, "verify", counted)
+    for name in ("anna", "nobody"):
+        sign_in(cloud, name, BETTER)
+    assert len(done) == 2
+    assert done[0] == done[1]
+
+
+class TestGuessing:
+    def test_a_name_is_guessed_at_ten_times_then_not_even_the_right_one_counts(
+        self, cloud: Cloud, anna: Person
+    ) -> None:
+        for number in range(9):
+            problem(sign_in(cloud, "anna", "wrong", address=f"192.0.2.{number}"), 401, "unauthorized")
+        for _ in range(2):
+            assert sign_in(cloud, "anna", GOOD).status_code == 200  # a right one does not count
+        problem(sign_in(cloud, "anna", "wrong"), 401, "unauthorized")
+        answer = sign_in(cloud, "anna", GOOD, address="192.0.2.77")
+        problem(answer, 429, "too-many-tries")
+        assert 0 < int(answer.headers["retry-after"]) <= 300
+        assert anna.get("/accounts/me").status_code == 200
+        assert cloud.sign_in("anna").get("/accounts/me").status_code == 200  # a link comes in
+        cloud.clock.advance(301)
+        assert sign_in(cloud, "anna", GOOD).status_code == 200
+
+    @pytest.mark.usefixtures("anna")
+    def test_an_address_guesses_thirty_times_at_whatever_names(self, cloud: Cloud) -> None:
+        statuses = [sign_in(cloud, f"n{number}", GOOD, address="198.51.100.7").status_code for number in range(31)]
+        assert statuses == [401] * 30 + [429]
+        problem(sign_in(cloud, "anna", GOOD, address="198.51.100.7"), 429, "too-many-tries")
+        assert sign_in(cloud, "anna", GOOD, address="198.51.100.8").status_code == 200
+
+    def test_the_old_one_is_not_guessed_at_either(self, anna: Person) -> None:
+        for _ in range(10):
+            problem(anna.put(PASSWORD, {"password": BETTER, "old_password": "wrong"}), 403, "forbidden")
+        problem(anna.put(PASSWORD, {"password": BETTER, "old_password": GOOD}), 429, "too-many-tries")
+
+
+class TestChanging:
+    def test_it_needs_the_old_one_once_the_link_is_ten_minutes_old(self, cloud: Cloud, anna: Person) -> None:
+        assert anna.put(PASSWORD, {"password": BETTER}).status_code == 204
+        cloud.clock.advance(600)
+        problem(anna.put(PASSWORD, {"password": GOOD}), 403, "forbidden")
+        assert anna.put(PASSWORD, {"password": GOOD, "old_password": BETTER}).status_code == 204
+        problem(sign_in(cloud, "anna", BETTER), 401, "unauthorized")
+
+    def test_who_came_by_password_needs_the_old_one_at_once(self, cloud: Cloud, anna: Person) -> None:
+        again = Person(cloud, sign_in(cloud, "anna", GOOD).json())
+        problem(again.put(PASSWORD, {"password": BETTER}), 403, "forbidden")
+        assert anna.get("/accounts/me").status_code == 200
+
+    def test_it_ends_every_other_session(self, cloud: Cloud, anna: Person) -> None:
+        others = [cloud.sign_in("anna"), Person(cloud, sign_in(cloud, "anna", GOOD).json())]
+        stranger = cloud.sign_in("bert")
+        assert anna.put(PASSWORD, {"password": BETTER, "old_password": GOOD}).status_code == 204
+        for other in others:
+            problem(other.get("/accounts/me"), 401, "unauthorized")
+        assert anna.get("/accounts/me").status_code == stranger.get("/accounts/me").status_code == 200
+
+    @pytest.mark.parametrize(
+        "weak",
+        ["", "eleven char", "aaaaaaaaaaaaaaaa", "123456789012", "qwertyuiopas", "Password1234!", "annaanna2026",
+         "t3l3sc0pe-t3l3sc0pe", "x" * 257],
+    )  # fmt: skip
+    def test_what_is_guessed_first_is_refused(self, anna: Person, weak: str) -> None:
+        problem(anna.put(PASSWORD, {"password": weak, "old_password": GOOD}), 422, "password-weak")
+
+
+class TestSessions:
+    def test_they_are_listed_with_whence_they_came(self, cloud: Cloud, anna: Person) -> None:
+        client = cloud.client(address="192.0.2.9", headers={"User-Agent": "Phone"})
+        body = {"name": "anna", "password": GOOD}
+        phone = cloud.run(client.post(f"{API}/auth/password", json=body)).json()["session"]
+        newest, first = anna.get(SESSIONS).json()["items"]
+        assert (newest["id"], newest["how"], newest["address"], newest["program"], newest["mine"]) == (
+            phone, "password", "192.0.2.9", "Phone", False,
+        )  # fmt: skip
+        assert (first["id"], first["how"], first["mine"]) == (anna.session, "link", True)
+        assert cloud.sign_in("bert").get(SESSIONS).json()["items"][0]["how"] == "link"
+
+    def test_one_is_ended_and_only_ones_own(self, cloud: Cloud, anna: Person) -> None:
+        other, stranger = cloud.sign_in("anna"), cloud.sign_in("bert")
+        problem(stranger.delete(f"{SESSIONS}/{other.session}"), 404, "session-unknown")
+        assert anna.delete(f"{SESSIONS}/{other.session}").status_code == 204
+        problem(other.get("/accounts/me"), 401, "unauthorized")
+        problem(anna.delete(f"{SESSIONS}/{other.session}"), 404, "session-unknown")
+        assert [each["mine"] for each in anna.get(SESSIONS).json()["items"]] == [True]
+
+    def test_all_others_are_ended(self, cloud: Cloud, anna: Person) -> None:
+        others = [cloud.sign_in("anna") for _ in range(3)]
+        assert anna.delete(SESSIONS).json() == {"ended": 3}
+        for other in others:
+            problem(other.get("/accounts/me"), 401, "unauthorized")
+        assert anna.delete(SESSIONS).json() == {"ended": 0}
+
+    def test_they_are_gone_after_twelve_hours(self, cloud: Cloud, anna: Person) -> None:
+        cloud.clock.advance(12 * 3600)
+        newest = cloud.sign_in("anna")
+        assert [each["id"] for each in newest.get(SESSIONS).json()["items"]] == [newest.session]
+        cloud.sweep()
+        keys = [row.key for row in cloud.run(cloud.functions.tables.query(store.ACCOUNTS, anna.account)).rows]
+        assert [key for key in keys if key.startswith("session:")] == [f"session:{newest.session}"]
+
+
+def test_who_signs_out_lets_go_of_what_they_control(cloud: Cloud, pair: tuple[Person, Robot]) -> None:
+    anna, robot = pair
+    other = cloud.sign_in("anna")
+    assert other.take(robot.device, lease_ms=600_000, wait_ms=10_000).json()["confirmed"] is True
+    assert other.post("/auth/sign-out").status_code == 204
+    assert anna.get(f"/devices/{robot.device}/lease").json()["lease"] is None
+    assert anna.take(robot.device).json()["epoch"] == 2
+
+
+def test_ten_who_register_one_name_at_once_are_one_account(cloud: Cloud) -> None:
+    async def all_at_once() -> list[Any]:
+        passwords = cloud.functions.passwords
+        calls = (passwords.register("dora", f"{GOOD} {number}") for number in range(10))
+        return await asyncio.gather(*calls, return_exceptions=True)
+
+    done = cloud.run(all_at_once())
+    made = [number for number, each in enumerate(done) if not isinstance(each, BaseException)]
+    assert len(made) == 1
+    assert {each.code for number, each in enumerate(done) if number not in made} == {"name-taken"}
+    answer = sign_in(cloud, "dora", f"{GOOD} {made[0]}")
+    assert answer.json()["account"]["id"] == done[made[0]].id
+    assert Person(cloud, answer.json()).get("/spaces").json()["items"]
