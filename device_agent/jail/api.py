@@ -6,6 +6,7 @@ robot cannot do this, a limit is in the way, somebody stopped it. SI units and r
 A script's process has nothing else: no file, no network, no other process. It may import what ``modules`` names.
 """
 
+import math
 import time
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
@@ -14,6 +15,9 @@ Ask = Callable[..., Any]
 """``ask(kind, **arguments)``: sends a call to the agent and gives its answer."""
 Tell = Callable[..., None]
 """``tell(kind, **arguments)``: sends what needs no answer."""
+
+OLD_S = 5.0
+"""A floor that was seen longer ago is not known any more [s]."""
 
 
 class RobotError(Exception):
@@ -166,6 +170,29 @@ class Room:
         """
         found: dict[str, Any] | None = self._ask("latest", device=str(device), stream=str(stream))
         return found
+
+    def taken(self, x_m: float, y_m: float, device: str = "perception") -> bool | None:
+        """Whether something stands at a place in the room, as its sensors saw it, in squares of about 0.2 m.
+
+        The robot that asks is seen as well. ``None`` where nobody knows: unseen, beyond the walls, or nothing was heard
+        for ``OLD_S``.
+
+        Raises:
+            RobotError: A number is not finite.
+        """
+        if not (math.isfinite(x_m) and math.isfinite(y_m)):
+            raise RobotError(f"a place in the room is two finite numbers, not {x_m}, {y_m}")
+        heard = self.latest(device, "occupancy")
+        if heard is None or heard["age_s"] > OLD_S:
+            return None
+        floor = heard["values"]
+        column = math.floor((x_m - floor["lower_x_m"]) / floor["side_m"])
+        row = math.floor((y_m - floor["lower_y_m"]) / floor["side_m"])
+        if not (0 <= column < floor["columns"] and 0 <= row < floor["rows"]):
+            return None
+        if int(floor[f"taken_bits.{row}"]) >> column & 1:
+            return True
+        return None if int(floor[f"unknown_bits.{row}"]) >> column & 1 else False
 
 
 def names(tell: Tell, ask: Ask, flush: Callable[[], None], task: Mapping[str, Any]) -> dict[str, Any]:

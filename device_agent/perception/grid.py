@@ -26,6 +26,8 @@ TAKEN, CLEAR = 0.9, -0.6
 """Log odds that one look adds: a hit tells more than a ray that passes, as thin things are often missed."""
 MOST = 4.0
 """Bound of the log odds: 0.98 sure. More would have to be unlearned when things change."""
+OVER = 3.0
+"""What a point above the floor counts where others are on it: three of those."""
 FADE_S = 2.0
 """Time constant in which what is not looked at falls back to the lasting memory [s]."""
 LASTING_S = 60.0
@@ -147,7 +149,9 @@ class OccupancyGrid:
         self.see_places(sensor, taken_m=ends_m[hit], clear_m=places)
 
     def see_points(self, sensor: str, points_m: Floats, taken: Bools) -> None:
-        """Take in points: a cell is taken when more of its points say so than not.
+        """Take in points: a cell is taken when a quarter of its points say so.
+
+        Who looks in below a desk sees floor there, and the desk's top above it.
 
         Args:
             sensor: Whose layer it is.
@@ -156,7 +160,7 @@ class OccupancyGrid:
         """
         cells, inside = self._cells(points_m)
         size = self.shape[0] * self.shape[1]
-        votes = np.bincount(cells, np.where(taken[inside], 1.0, -1.0), size)
+        votes = np.bincount(cells, np.where(taken[inside], OVER, -1.0), size)
         seen = np.bincount(cells, minlength=size) > 0
         self._learn(sensor, (seen & (votes > 0)).reshape(self.shape), (seen & (votes <= 0)).reshape(self.shape))
 

@@ -147,7 +147,7 @@ class Sight:
         return max(heights, default=2.0) + BELOW_HEAD_M
 
     def _map(self, sensor: str, seen_m: Floats, from_m: Floats) -> None:
-        """Floor that is seen is free; a place with more points above it than on it is taken."""
+        """Floor that is seen is free, but for what is above it."""
         away = np.linalg.norm(seen_m - from_m, axis=1)
         above = (seen_m[:, 2] > OBSTACLE_M[0] + ERROR_1_M * away**2) & (seen_m[:, 2] < OBSTACLE_M[1])
         counted = (above | (np.abs(seen_m[:, 2]) < FLOOR_M)) & (away < MAPPED_M)

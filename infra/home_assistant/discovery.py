@@ -42,6 +42,10 @@ class Announcement(NamedTuple):
     content: dict[str, Any]
 
 
+_FOR_PROGRAMS = "_bits"
+"""So end names of values that say nothing to people: rows of the room's floor, a place a bit."""
+
+
 def topic(device: str, kind: str, name: str = "") -> str:
     """Where the bridge says what a device says: ``telescope/{device}/{kind}[/{name}]``."""
     return f"{ROOT}/{device}/{kind}" + (f"/{name}" if name else "")
@@ -63,6 +67,8 @@ def of_values(
         if stream == SETTINGS and field in controls:
             continue  # its number shows it
         quantity, _, part = field.partition(".")
+        if quantity.endswith(_FOR_PROGRAMS):
+            continue
         picked = f"value_json['values']['{field}']"
         content = _common(device, about, f"{stream}-{field}", _spoken(quantity, part)) | {
             "state_topic": topic(device, "tele", stream)

@@ -145,6 +145,28 @@ def test_pictures_come_to_who_may_see_them(api: Api) -> None:
     assert all(each.jpeg.startswith(b"\xff\xd8") for each in told)
 
 
+LOOKS = """
+for _ in range(100):
+    seen = {name: room.latest("perception", name) for name in ("positions", "presence", "light", "occupancy")}
+    if all(seen.values()) and "x_m.ur5" in seen["positions"]["values"] and room.taken(0.0, 1.0) is False:
+        break
+    wait(0.3)
+values = {name: reading["values"] for name, reading in seen.items()}
+there = values["positions"]["y_m.ur5"] > 1, values["light"]["light_lux"] > 1, "people" in values["presence"]
+print(*there, room.taken(2.5, -1.45))
+"""
+"""Asks the room for everything; the last is the desk of the head."""
+
+
+def test_a_script_is_told_what_the_room_knows(api: Api) -> None:
+    saved = api.http.put("/robot-types/hanson/movements/what_the_room_knows", json={"source": LOOKS})
+    assert saved.is_success, saved.text
+    done = act(api, api.device("hanson"), kind="run_movement", name="what_the_room_knows")
+    if done["status"] != "done":
+        wait_until(lambda: api.get(f"/actions/{done['id']}")["status"] == "done", "the script to end", 60)
+    assert "True True True True" in json.dumps(api.get(f"/actions/{done['id']}")), done
+
+
 def test_a_gathering_longer_than_its_action_is_refused(api: Api) -> None:
     answer = refused(api, api.device("lidar"), kind="gather", rate_hz=1.0, duration_s=4000.0)
     assert answer.status_code == 422

@@ -14,6 +14,7 @@ from msgspec import Struct, field
 from device_agent.perception import picture
 from device_agent.perception.grid import OccupancyGrid
 from device_agent.perception.kinds import Kind, Mount, Place
+from device_agent.perception.rows import rows
 from device_agent.perception.sight import Sight, Zone
 from device_agent.perception.survey import Survey, SurveyError
 from device_agent.perception.tracks import Box
@@ -25,9 +26,9 @@ from device_agent.sensors import png
 
 log = logging.getLogger(__name__)
 
-POSITIONS, PRESENCE, LIGHT = "positions", "presence", "light"
-STREAMS = (POSITIONS, PRESENCE, LIGHT)
-OCCUPANCY, MAP, SURVEY = "occupancy", "map", "survey"
+POSITIONS, PRESENCE, LIGHT, OCCUPANCY = "positions", "presence", "light", "occupancy"
+STREAMS = (POSITIONS, PRESENCE, LIGHT, OCCUPANCY)
+MAP, SURVEY = "map", "survey"
 CAPTURES = (OCCUPANCY, MAP, SURVEY)
 SURVEY_LOOKS, SURVEY_EVERY_S = 20, 0.5
 """How long a survey takes: people who walk through it disappear."""
@@ -115,8 +116,9 @@ class PerceptionDriver:
 
     Streams ``positions`` (``x_m.{who}``, ``y_m.{who}``, ``age_s.{who}``, ``speed_m_s.{who}``, and ``yaw_rad.{who}``
     once it has gone somewhere), ``presence`` (``people``, ``people.{zone}``, ``present.{zone}``), ``light``
-    (``light_lux``, ``brightness.{zone}``); captures ``occupancy`` (a picture), ``map`` (the grid as numbers, JSON), and
-    ``survey``: the room as it is now, for the option of that name. Clear the room before.
+    (``light_lux``, ``brightness.{zone}``), ``occupancy`` (the floor, row by row: see ``perception.rows``); captures
+    ``occupancy`` (a picture), ``map`` (the grid as numbers, JSON), and ``survey``: the room as it is now, for the
+    option of that name. Clear the room before.
     """
 
     def __init__(self, device: RoomDevice, folder: Path, neighbours: Mapping[str, RoomDriver]) -> None:
@@ -168,6 +170,8 @@ class PerceptionDriver:
             return sight.presence(now_s)
         if stream == LIGHT:
             return {**self._light(), **{name: round(value, _DIGITS) for name, value in sight.brightness().items()}}
+        if stream == OCCUPANCY:
+            return rows(sight.grid)
         return self._lacks("stream", stream, STREAMS)
 
     def capture(self, name: str) -> Capture:

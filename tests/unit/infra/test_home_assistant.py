@@ -28,6 +28,7 @@ VALUES: dict[str, float | bool] = {
     "present": True,
     "open": False,
     "seen.door": True,
+    "taken_bits.3": 1024.0,
 }
 
 
@@ -84,6 +85,7 @@ def test_every_announcement_is_one_that_home_assistant_takes(both: Both) -> None
             )
     announced = both.announced()
     components = [topic.split("/")[1] for topic, _ in announced]
+    assert not any("_bits" in topic for topic, _ in announced), "that is for programs"
     assert set(components) == {"sensor", "binary_sensor", "number", "camera"}
     for component, (_, content) in zip(components, announced, strict=True):
         allowed = OWN["keys"][component]

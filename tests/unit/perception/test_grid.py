@@ -5,7 +5,11 @@ import math
 import numpy as np
 import pytest
 
+from device_agent.jail import api
 from device_agent.perception.grid import OccupancyGrid
+from device_agent.perception.rows import rows
+from device_agent.protocol import codec
+from device_agent.protocol.messages import MAX_VALUES, Measurements
 
 EMPTY = np.zeros((0, 2))
 
@@ -143,3 +147,44 @@ def test_nobody_plans_a_way_through_the_walls_of_the_plan():
         assert not floor.at(0.3, 1.0)
         assert floor.at(0.15, 1.0)
         assert floor.at(-0.2, 1.0)
+
+
+def floor_of(values: dict[str, float]) -> api.Room:
+    """A script's room in which the floor was measured just now."""
+    return api.Room(lambda kind, device, stream: {"values": values, "age_s": 0.5})  # noqa: ARG005
+
+
+def test_a_script_reads_the_grid_from_its_rows():
+    grid = OccupancyGrid((-3.2, -2.7), (3.2, 2.7), plan=(-3.0, -2.5, 3.0, 2.5))
+    across, up = np.meshgrid(np.arange(-2.9, 2.9, 0.05), np.arange(-2.4, 1.0, 0.05))
+    clear = np.column_stack((across.ravel(), up.ravel()))
+    for _ in range(5):
+        grid.see_places("depth", taken_m=np.array([[1.01, -1.0], [-2.5, 0.6]]), clear_m=clear)
+    found = rows(grid)
+    assert (found["columns"], found["rows"], found["side_m"]) == (32.0, 27.0, 0.2)
+    assert len(found) <= MAX_VALUES
+    room = floor_of(found)
+    for x_m, y_m, taken in (
+        (1.01, -1.0, True),
+        (-2.5, 0.6, True),
+        (0.0, 0.0, False),
+        (1.5, -1.0, False),
+        (0.0, 2.0, None),  # nobody looked there
+        (3.1, 0.0, None),  # behind the wall
+        (50.0, 0.0, None),
+    ):
+        assert room.taken(x_m, y_m) is taken, (x_m, y_m)
+    with pytest.raises(api.RobotError, match="finite"):
+        room.taken(math.nan, 0.0)
+    assert api.Room(lambda *_, **__: None).taken(0.0, 0.0) is None
+    assert api.Room(lambda *_, **__: {"values": found, "age_s": 60.0}).taken(0.0, 0.0) is None
+
+
+@pytest.mark.parametrize("size_m", [6.0, 40.0, 200.0])
+def test_a_floor_fits_into_a_message_however_large_it_is(size_m):
+    grid = OccupancyGrid((0.0, 0.0), (size_m, size_m * 0.9))
+    last = np.array([[size_m - 0.03, size_m * 0.9 - 0.03]])
+    grid.see_places("depth", taken_m=last, clear_m=np.zeros((0, 2)))
+    found = rows(grid)
+    codec.encode(Measurements(tick_ms=1, at_ms=1, sequence=1, values=found))
+    assert floor_of(found).taken(*last[0]) is True
