@@ -18,6 +18,8 @@ MEDIAN_M = 0.15
 ALL = {"person", "ur5", "nao", "qbo", "hanson"}
 UNKNOWN = 0.05
 """Share of looks in which somebody may be nowhere."""
+KNOWN_S = 4.4
+"""Until then whoever stands on a table must be known [s]."""
 SAME = 0.01
 """Share of beams and pixels that may see something else than the survey."""
 
@@ -70,11 +72,11 @@ def seen() -> tuple[Watched, dict[str, list[float]]]:
     """The laboratory after a while of watching, and how far off everybody was meanwhile."""
     watched = Watched(walks=True)
     try:
-        watched.look(3.0)
+        watched.look(KNOWN_S)
         found: dict[str, list[float]] = {}
-        for turn in range(4):
+        for turn in range(3):
             watched.go_about(turn)
-            for name, off in watched.look(3.5).items():
+            for name, off in watched.look(3.2).items():
                 found.setdefault(name, []).extend(off)
         return watched, found
     finally:
@@ -86,7 +88,7 @@ def test_the_person_and_all_four_robots_are_found_within_the_promise_as_they_mov
 ) -> None:
     watched, found = seen
     kept(found)
-    assert watched.walked_m > 0.4, "NAO has not walked"
+    assert watched.walked_m > 0.3, "NAO has not walked"
 
 
 def test_walls_and_tables_of_the_laboratory_are_blocked_and_its_floor_is_free(
@@ -109,14 +111,14 @@ def test_nao_that_is_as_low_as_qbo_is_not_mistaken_for_it(posture: str) -> None:
     watched = Watched(walks=True)
     assert watched.nao is not None
     try:
-        watched.look(1.4)
+        watched.look(2.4)
         watched.nao.posture(posture, speed=1.0)
         while watched.nao.busy:
             watched.look(0.2)
         watched.look(2.0)
         kept(watched.look(1.0))
         watched.begin()
-        watched.look(3.0)
+        watched.look(KNOWN_S)
         kept(watched.look(0.6))
     finally:
         watched.close()
@@ -127,7 +129,7 @@ def test_nao_that_is_as_low_as_qbo_is_not_mistaken_for_it(posture: str) -> None:
 def test_the_person_and_all_four_robots_are_found_for_minutes_while_all_move() -> None:
     watched = Watched(walks=True)
     try:
-        watched.look(3.0)
+        watched.look(KNOWN_S)
         found: dict[str, list[float]] = {}
         for turn in range(60):
             watched.go_about(turn)

@@ -23,8 +23,8 @@ from device_agent.runtime.room import Reading, Room
 from device_agent.sensors.mujoco import cameras, view
 from device_agent.sensors.perception.driver import _flat
 from tests.support.rooms import STEP_S
-from tests.unit.perception.lab import EYES, Watched
 from tests.unit.perception.lab import PERIOD_S as LOOK_S
+from tests.unit.perception.lab import Watched
 from tests.unit.robots.folders import ROBOTS
 
 QBO = robot_type.load(ROBOTS / "qbo")
@@ -145,9 +145,7 @@ class Laboratory:
 
     def look(self) -> None:
         now_s = self.looked_s = self.now_s
-        for name in EYES:
-            self.watched.sight.see(name, self.watched.raw(name))
-        self.watched.sight.settle(now_s)
+        self.watched.see()
         told = _flat(self.watched.sight.places(now_s))
         tick_ms = round(now_s * 1000)
         self.room.note("perception", "positions", Measurements(tick_ms=tick_ms, at_ms=0, sequence=tick_ms, values=told))
