@@ -8,15 +8,16 @@ import numpy as np
 import pytest
 
 from device_agent.ports.sensor import Camera, Image, Movable, RoomDriver, SensorError
+from device_agent.protocol import room
 from device_agent.protocol.errors import ProtocolError
 from device_agent.sensors.mujoco import ailments, meters
 from device_agent.sensors.mujoco.ailments import WELL, Ailments, read
-from tests.support.rooms import StillWorld
+from tests.support.rooms import LAB, StillWorld
 
 
 @pytest.fixture(scope="module")
 def world() -> StillWorld:
-    return StillWorld()
+    return StillWorld(manifest=msgspec.structs.replace(room.load(LAB), robots=()))
 
 
 @pytest.fixture

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from device_agent.ports.sensor import Image, RoomDriver, Scan, SensorError, Surroundings
+from device_agent.protocol import room
 from device_agent.protocol.messages import Stream
 from device_agent.protocol.room import RoomDevice
 from device_agent.sensors import load, names
@@ -22,11 +23,22 @@ ROUND_S = 45.0
 LEG_M = 0.35
 
 
-@pytest.fixture
-def world(monkeypatch: pytest.MonkeyPatch) -> StillWorld:
+@pytest.fixture(autouse=True)
+def present(monkeypatch: pytest.MonkeyPatch) -> None:
     """Everything that looks sees the present: time is driven by hand."""
     monkeypatch.setattr(view, "OLDEST_S", -1.0)
     monkeypatch.setattr(cameras, "FRESH_S", -1.0)
+
+
+@pytest.fixture
+def world() -> StillWorld:
+    """The laboratory without its robots, which take most of the time."""
+    return StillWorld(manifest=msgspec.structs.replace(room.load(LAB), robots=()))
+
+
+@pytest.fixture
+def lab() -> StillWorld:
+    """With them."""
     return StillWorld()
 
 
@@ -120,16 +132,16 @@ def test_a_scan_has_the_errors_of_its_kind_and_leaves_the_lidar_itself_out(world
     assert scans.min() >= 0.15
 
 
-def test_the_cameras_see_a_robot_that_moves(world: StillWorld) -> None:
-    corner, turning = connected(world, "camera"), connected(world, "pan_tilt")
-    model = world.model
+def test_the_cameras_see_a_robot_that_moves(lab: StillWorld) -> None:
+    corner, turning = connected(lab, "camera"), connected(lab, "pan_tilt")
+    model = lab.model
     arm = [index for index in range(model.nu) if model.actuator(index).name.startswith("ur5/")]
     for camera in (corner, turning):
         noise = difference(image(camera), image(camera))
         before = image(camera)
-        now = world.world.snapshot().ctrl[arm]
-        world.world.command("test", np.array(arm), now + np.array([1.2, 0.4, -0.6, 0, 0, 0]), ramp_s=1.0)
-        world.go_on(2.0)
+        now = lab.world.snapshot().ctrl[arm]
+        lab.world.command("test", np.array(arm), now + np.array([1.2, 0.4, -0.6, 0, 0, 0]), ramp_s=1.0)
+        lab.go_on(2.0)
         after = image(camera)
         assert difference(before, after) > noise + 20, "the picture is the same"
         camera.close()
