@@ -75,9 +75,9 @@ class ToySensor:
         self.reads[stream] += 1
         return {"reads": float(self.reads[stream]), **self.values} if stream == "air" else {}
 
-    def frame(self, _camera: str) -> Frame:
+    def frame(self, _camera: str) -> Frame | None:
         self._check()
-        return Frame(4, 3, self.picture, time.monotonic())
+        return None if not self.picture else Frame(4, 3, self.picture, time.monotonic())
 
     def capture(self, _name: str) -> Capture:
         self._check()
@@ -190,6 +190,15 @@ def test_pictures_travel_with_their_header_and_are_not_kept(bench: RoomBench) ->
     assert [each.sequence for each in told] == list(range(1, len(told) + 1))
     assert all((each.width, each.height, each.jpeg) == (4, 3, JPEG) for each in told)
     assert not any(topics.CAM in item.topic for item in bench.outbox._incoming)
+
+
+def test_a_camera_that_has_no_picture_yet_films_none(bench: RoomBench) -> None:
+    grows(bench.pictures)
+    bench.sensor.picture = b""
+    grows(bench.measured)
+    filmed = len(bench.pictures())
+    grows(bench.measured)
+    assert len(bench.pictures()) <= filmed + 1, "one may have been on its way"
 
 
 def test_a_picture_that_is_too_large_is_a_fault_that_says_what_to_do(bench: RoomBench) -> None:

@@ -32,6 +32,12 @@ def test_what_gives_nothing_is_silent_until_it_is_heard() -> None:
     assert bed.pass_s(1, {"x": 1.0}) == []
 
 
+def test_nothing_is_wrong_before_anything_is_expected() -> None:
+    vigil = Vigil((Watch(source="air", silent_s=5.0),), lambda _: 1.0, lambda: 100.0)
+    vigil.note("air", {"x": 1.0})
+    assert vigil.faults() == ()
+
+
 def test_what_is_there_again_has_its_time_anew() -> None:
     bed = Bedside(Watch(source="air", silent_s=5.0))
     assert bed.pass_s(60) == ["silent.air"]
