@@ -53,6 +53,9 @@ def _parser() -> argparse.ArgumentParser:
 
     enroll = commands.add_parser("enroll", help="make this agent known and print a claim code")
     enroll.add_argument("--server", help="address of the Telescope server, http://host:port")
+    enroll.add_argument(
+        "--ca", type=Path, metavar="FILE", help="the authority (PEM) that alone may speak for an https server"
+    )
     enroll.add_argument("--name", help="name of this agent, for people (default: the folder's name)")
     enroll.add_argument(
         "--device",
@@ -144,9 +147,12 @@ def _configuration(options: argparse.Namespace, home: Home) -> Configuration:
     server = options.server or (before.server if before else "")
     if not server.startswith(("http://", "https://")):
         raise HomeError("say where the server is, for example `--server http://127.0.0.1:8080`")
+    if options.ca and not server.startswith("https://"):
+        raise HomeError("--ca says who may speak for an https server; this one speaks http, which nobody vouches for")
     polling = _polling(options, before.http if before else HttpPolling())
     said = Configuration(
         server=server,
+        ca=home.pin_authority(options.ca) if options.ca else (before.ca if before else ""),
         name=options.name or (before.name if before else home.folder.resolve().name),
         transport=options.transport or (before.transport if before else links.names()[0]),
         http=polling,

@@ -177,7 +177,7 @@ def api_of(home: Home, configuration: Configuration, clock: CloudClock, *, creat
     Raises:
         HomeError: There is no identity.
     """
-    return CloudApi(configuration.server, home.identity(create=create), clock)
+    return CloudApi(configuration.server, home.identity(create=create), clock, ca=home.authority(configuration))
 
 
 def build(home: Home, *, trace: Path | None = None) -> Cell:

@@ -14,6 +14,7 @@ from device_agent.protocol import topics
 from device_agent.runtime.home import Configuration, HomeError, Pairing
 from device_agent.runtime.lease import Refused
 from device_agent.runtime.pins import Pins
+from device_agent.transports import trust
 from device_agent.transports.http import answers
 from device_agent.transports.http.api import CloudApi, CloudError
 
@@ -188,6 +189,7 @@ def _mqtt(wiring: Wiring) -> Transport:
             password=given.password,
             subscribe=given.subscribe,
             lifetime_s=given.lifetime_s,
+            tls=trust.broker(given.tcp.tls, server=api.server, ca=api.ca),
         )
 
     return MqttTransport(

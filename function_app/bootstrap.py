@@ -1,6 +1,7 @@
 """Puts the functions together: the adapters, of which settings make ``choices``, and the services on top of them."""
 
 from dataclasses import dataclass
+from typing import Any
 
 from function_app import choices
 from function_app.adapters.local.blobs import FileBlobs
@@ -163,9 +164,15 @@ def build(settings: Settings, *, clock: Clock | None = None) -> Functions:
 
     access = choices.access(settings, keys, publish)
     bus = choices.bus(settings, access)
-    feed = MqttFeed(host=settings.mqtt_host, port=settings.mqtt_port, credentials=access.service_credentials)
-    telemetry = MqttTelemetry(host=settings.mqtt_host, port=settings.mqtt_port, credentials=access.service_credentials)
-    late = MqttLate(host=settings.mqtt_host, port=settings.mqtt_port, credentials=access.service_credentials)
+    heard: Any = {
+        "host": settings.mqtt_host,
+        "port": settings.mqtt_port,
+        "credentials": access.service_credentials,
+        "tls": choices.broker_tls(settings),
+    }
+    feed = MqttFeed(**heard)
+    telemetry = MqttTelemetry(**heard)
+    late = MqttLate(**heard)
 
     forget = Forget(tables=tables, blobs=blobs)
     events = Events(tables=tables, forget=forget, clock=now)
@@ -432,4 +439,6 @@ def xmpp_line(functions: Functions) -> XmppLine:
 def orders(functions: Functions) -> Orders:
     """What the broker brings for agents that a program of ours speaks for, not yet open."""
     settings = functions.settings
-    return MqttOrders(host=settings.mqtt_host, port=settings.mqtt_port, access=functions.access)
+    return MqttOrders(
+        host=settings.mqtt_host, port=settings.mqtt_port, access=functions.access, tls=choices.broker_tls(settings)
+    )

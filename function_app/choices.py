@@ -4,6 +4,7 @@ Of the clouds' adapters only the one in use is imported, and it its SDK only whe
 """
 
 import hashlib
+import ssl
 from collections.abc import Awaitable, Callable
 
 from function_app.adapters.local.blobs import FileBlobs
@@ -11,6 +12,7 @@ from function_app.adapters.local.broker_access import MosquittoBrokerAccess, Tok
 from function_app.adapters.local.command_bus import MqttCommandBus
 from function_app.adapters.local.keys import FileKeys
 from function_app.adapters.local.tables import SqliteTables
+from function_app.adapters.local.tls import client_context
 from function_app.adapters.ring_keys import RingKeys
 from function_app.ports.blobs import Blobs
 from function_app.ports.broker_access import BrokerAccess
@@ -72,6 +74,7 @@ def access(
         port=settings.mqtt_port,
         username=MOSQUITTO_SERVICE,
         password_file=settings.home / "mosquitto" / "service.password",
+        tls=broker_tls(settings),
     )
 
 
@@ -88,8 +91,20 @@ def bus(settings: Settings, granted: BrokerAccess) -> CommandBus:
             return EventGridCommandBus(endpoint=grid.endpoint, identity=grid.identity)
         case None:
             return MqttCommandBus(
-                host=settings.mqtt_host, port=settings.mqtt_port, credentials=granted.service_credentials
+                host=settings.mqtt_host,
+                port=settings.mqtt_port,
+                credentials=granted.service_credentials,
+                tls=broker_tls(settings),
             )
+
+
+def broker_tls(settings: Settings) -> ssl.SSLContext | None:
+    """How connections to the broker are kept from others.
+
+    Raises:
+        BrokerAccessError: The authority's certificate cannot be read.
+    """
+    return None if settings.tls is None else client_context(settings.tls.ca)
 
 
 async def prepare(settings: Settings) -> None:

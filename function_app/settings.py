@@ -93,6 +93,21 @@ class EventGridBus:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
+class Tls:
+    """TLS, towards everybody and towards the broker.
+
+    Attributes:
+        certificate: The API's own, with its chain.
+        key: Its key.
+        ca: Who is trusted to speak for the broker; ``None``: whom the machine trusts.
+    """
+
+    certificate: Path
+    key: Path
+    ca: Path | None = None
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Settings:
     """Where things are.
 
@@ -103,6 +118,7 @@ class Settings:
         host: Address to listen on.
         port: Of the page and the API.
         public_url: The page's address as people open it; sign-in links begin with it.
+        tls: What the API shows, and whom the functions trust, where they speak TLS; ``None`` where they do not.
         mqtt_host: The broker's address, for the functions and for agents.
         websocket_url: The broker's address for the page.
         xmpp_domain: The part after the ``@`` of every address at the XMPP server; empty where there is none.
@@ -123,6 +139,7 @@ class Settings:
     host: str = "127.0.0.1"
     port: int = 8080
     public_url: str = "http://127.0.0.1:8080"
+    tls: Tls | None = None
     broker: Broker = "amqtt"
     mqtt_host: str = "127.0.0.1"
     mqtt_port: int = 8081
@@ -156,8 +173,10 @@ def read(environment: Mapping[str, str] | None = None) -> Settings:
     broker = given.get("TELESCOPE_BROKER", "amqtt")
     if broker not in ("amqtt", "mosquitto"):
         raise SettingsError(f"TELESCOPE_BROKER is '{broker}'; it must be amqtt or mosquitto")
-    public_url = _url(given, "TELESCOPE_PUBLIC_URL", f"http://{_in_url(host)}:{port}", ("http", "https")).rstrip("/")
-    websocket_url = f"ws://{_in_url(mqtt_host)}:{websocket_port}/mqtt"
+    tls = _tls(given)
+    s = "" if tls is None else "s"
+    public_url = _url(given, "TELESCOPE_PUBLIC_URL", f"http{s}://{_in_url(host)}:{port}", ("http", "https")).rstrip("/")
+    websocket_url = f"ws{s}://{_in_url(mqtt_host)}:{websocket_port}/mqtt"
     return Settings(
         home=_folder(given, "TELESCOPE_HOME", Path(".telescope")),
         store=_store(given),
@@ -165,6 +184,7 @@ def read(environment: Mapping[str, str] | None = None) -> Settings:
         host=host,
         port=port,
         public_url=public_url,
+        tls=tls,
         broker=cast("Broker", broker),
         mqtt_host=mqtt_host,
         mqtt_port=_port(given, "TELESCOPE_MQTT_PORT", port + 1),
@@ -183,6 +203,25 @@ def read(environment: Mapping[str, str] | None = None) -> Settings:
         keep_1min_days=_number(given, "TELESCOPE_KEEP_1MIN_DAYS", 90, 1, 36_500),
         keep_10min_days=_number(given, "TELESCOPE_KEEP_10MIN_DAYS", 730, 1, 36_500),
     )
+
+
+def _tls(given: Mapping[str, str]) -> Tls | None:
+    certificate, key = (given.get(f"TELESCOPE_TLS_{name}", "") for name in ("CERTIFICATE", "KEY"))
+    if bool(certificate) != bool(key):
+        raise SettingsError("TELESCOPE_TLS_CERTIFICATE and TELESCOPE_TLS_KEY belong together; set both, or neither")
+    if not certificate:
+        return None
+    ca = _file(given, "TELESCOPE_TLS_CA") if given.get("TELESCOPE_TLS_CA") else None
+    return Tls(certificate=_file(given, "TELESCOPE_TLS_CERTIFICATE"), key=_file(given, "TELESCOPE_TLS_KEY"), ca=ca)
+
+
+def _file(given: Mapping[str, str], name: str) -> Path:
+    path = _folder(given, name, Path())
+    if not path.is_file():
+        raise SettingsError(
+            f"{name} is '{given[name][:_SHOWN]}'; it must be a file: make one with `python -m infra.tls`"
+        )
+    return path
 
 
 def _store(given: Mapping[str, str]) -> AzureStore | AwsStore | None:

@@ -1,10 +1,13 @@
 """What is at the other end: the server, whose the agent is, the clocks, and the link itself."""
 
 import logging
+import socket
+import ssl
 import threading
 import time
 from collections.abc import Generator, Iterator
 from typing import Any, Self
+from urllib.parse import urlsplit
 
 from device_agent import bootstrap, catalogue, links
 from device_agent.doctor.finding import Finding, ok, problem, warning
@@ -13,11 +16,14 @@ from device_agent.runtime.home import Configuration, Home, HomeError, Pairing
 from device_agent.runtime.journal import Journal
 from device_agent.runtime.lease import Refused
 from device_agent.runtime.pins import ADVICE, Pins
+from device_agent.transports import trust
 from device_agent.transports.http import answers
 from device_agent.transports.http.api import CloudApi, CloudError
 
 _OFF_MS = 2000
 _LINK_S = 20.0
+_TLS_S = 5.0
+_SOON_DAYS = 30
 
 
 def look(home: Home, configuration: Configuration) -> Iterator[Finding]:
@@ -29,6 +35,8 @@ def look(home: Home, configuration: Configuration) -> Iterator[Finding]:
     except HomeError as error:
         yield problem("server", str(error), "Run `python -m device_agent enroll`.")
         return
+    if api.server.startswith("https:"):
+        yield _certificate(api)
     found = yield from _server(api, configuration, clock)
     if found is None:
         return
@@ -46,6 +54,33 @@ def look(home: Home, configuration: Configuration) -> Iterator[Finding]:
     yield ok("pairing", f"paired with {pairing.account}")
     yield _keys(found, pairing, clock)
     yield from _link(home, configuration, pairing, clock)
+
+
+def _certificate(api: CloudApi) -> Finding:
+    """Whether the server is who its address says, and for how long."""
+    parts = urlsplit(api.server)
+    host, port = parts.hostname or "", parts.port or 443
+    whom = f"the authority in {api.ca}" if api.ca else "the authorities of this machine"
+    try:
+        with (
+            socket.create_connection((host, port), timeout=_TLS_S) as plain,
+            trust.context(api.ca).wrap_socket(plain, server_hostname=host) as link,
+        ):
+            shown = link.getpeercert() or {}
+            version = link.version()
+    except ssl.SSLCertVerificationError as error:
+        return problem(
+            "certificate",
+            f"{host}: {error.verify_message}; trusted are {whom}",
+            "If the server's authority is its own, give the agent its certificate: `enroll --ca ca.crt`. If it is over "
+            "or names another host, make a new one at the server: `python -m infra.tls --renew`.",
+        )
+    except OSError as error:
+        return problem("certificate", f"{host}:{port} shows none: {error}", "Check whether the server speaks TLS.")
+    days = (ssl.cert_time_to_seconds(str(shown["notAfter"])) - time.time()) / 86_400
+    if days < _SOON_DAYS:
+        return warning("certificate", f"{host}'s ends in {days:.0f} days", "Renew it: `python -m infra.tls --renew`.")
+    return ok("certificate", f"{host} is vouched for by {whom} for {days:.0f} days ({version})")
 
 
 def _server(

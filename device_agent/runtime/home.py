@@ -3,6 +3,7 @@
 ```
 identity.pem     the private key, mode 0600; never leaves the machine
 agent.toml       server, transport and devices; written by ``enroll``, edited by people
+server-ca.pem    the authority that may speak for the server, where ``enroll --ca`` pinned one
 pairing.json     space, account and pinned keys, once claimed; written before a new key is obeyed
 journal.db       what must not be forgotten
 outbox.db        what could not be sent yet
@@ -14,6 +15,7 @@ import contextlib
 import json
 import os
 import sqlite3
+import ssl
 import tempfile
 import tomllib
 from collections.abc import Iterator
@@ -32,6 +34,8 @@ from device_agent.protocol.fields import Milliseconds
 from device_agent.protocol.keys import Serial
 from device_agent.protocol.messages import Id, Label
 from device_agent.runtime.interlocks import Interlock
+
+SERVER_CA = "server-ca.pem"
 
 
 class HomeError(Exception):
@@ -93,12 +97,14 @@ class Buffer(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
 class Configuration(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """``agent.toml``. ``transport`` is one of ``device_agent.links.names()``.
 
-    ``trusted-scripts``: movement scripts run also where this machine cannot lock them in. Set by hand, on the machine.
+    ``ca``: a file beside it, the authority that alone may speak for the server. ``trusted-scripts``: movement scripts
+    run also where this machine cannot lock them in. Set by hand, on the machine.
     """
 
     server: str
     name: Label
     devices: tuple[DeviceEntry, ...]
+    ca: str = ""
     transport: str = "mqtt"
     http: HttpPolling = HttpPolling()
     trusted_scripts: bool = msgspec.field(default=False, name="trusted-scripts")
@@ -210,6 +216,8 @@ class Home:
     def save_configuration(self, configuration: Configuration) -> None:
         """Write ``agent.toml``."""
         lines = [f"{key} = {_toml(getattr(configuration, key))}" for key in ("server", "name", "transport")]
+        if configuration.ca:
+            lines.insert(1, f"ca = {_toml(configuration.ca)}")
         if configuration.trusted_scripts:
             lines.append("trusted-scripts = true")
         if configuration.transport == "http" or configuration.http != HttpPolling():
@@ -230,6 +238,33 @@ class Home:
             for rule in device.interlocks:
                 lines += ["", "[[devices.interlocks]]", *_table(rule)]
         self._write(self.folder / "agent.toml", ("\n".join(lines) + "\n").encode())
+
+    def authority(self, configuration: Configuration) -> Path | None:
+        """The pinned authority's certificate.
+
+        Raises:
+            HomeError: It is named, and not there.
+        """
+        if not configuration.ca:
+            return None
+        path = self.folder / configuration.ca
+        if not path.is_file():
+            raise HomeError(f"{path} is not there, which agent.toml names as `ca`; give it again with `enroll --ca`")
+        return path
+
+    def pin_authority(self, given: Path) -> str:
+        """Keep a copy of an authority's certificate; its name for ``agent.toml``.
+
+        Raises:
+            HomeError: It cannot be read, or is none.
+        """
+        try:
+            content = given.read_bytes()
+            ssl.create_default_context(cadata=content.decode())
+        except (OSError, ValueError) as error:
+            raise HomeError(f"--ca: {given} cannot be read as a certificate: {error}") from error
+        self._write(self.folder / SERVER_CA, content)
+        return SERVER_CA
 
     def pairing(self) -> Pairing | None:
         """What was learned when the agent was claimed, or ``None`` before.

@@ -22,6 +22,7 @@ def serve(functions: Functions) -> None:
         PortTaken: With a sentence that says what to do.
     """
     listener = listen(functions.settings.host, functions.settings.port)
+    tls = functions.settings.tls
     config = uvicorn.Config(
         create_app(functions),
         timeout_keep_alive=KEEP_ALIVE_S,
@@ -30,6 +31,8 @@ def serve(functions: Functions) -> None:
         server_header=False,
         proxy_headers=False,  # whom to believe about addresses is a setting
         timeout_graceful_shutdown=3,
+        ssl_certfile=None if tls is None else tls.certificate,
+        ssl_keyfile=None if tls is None else tls.key,
     )
     uvicorn.Server(config).run(sockets=[listener])
 

@@ -9,6 +9,7 @@ import asyncio
 import logging
 import signal
 import socket
+import ssl
 import sys
 from pathlib import Path
 from typing import Any
@@ -37,6 +38,11 @@ def main() -> int:
     except (KeysError, RevocationsError) as error:
         print(f"broker: {error}", file=sys.stderr)
         return BAD_INPUT
+    try:
+        tls = _tls(arguments)
+    except OSError as error:  # SSLError is one
+        print(f"broker: cannot use {arguments.certificate} with {arguments.certificate_key}: {error}", file=sys.stderr)
+        return BAD_INPUT
     sockets: dict[str, socket.socket] = {}
     for name, port in ((TCP, arguments.tcp_port), (WEBSOCKET, arguments.websocket_port)):
         try:
@@ -45,7 +51,7 @@ def main() -> int:
             why = getattr(error, "strerror", None) or error
             print(f"broker: cannot listen on {arguments.host}:{port}: {why}; choose another port", file=sys.stderr)
             return PORT_TAKEN
-    asyncio.run(_run(sockets, keys, revocations, limits))
+    asyncio.run(_run(sockets, keys, revocations, limits, tls))
     return 0
 
 
@@ -57,10 +63,29 @@ def _arguments() -> argparse.Namespace:
     parser.add_argument(
         "--keys", type=Path, required=True, help='JSON {"key id": "Ed25519 public key in base64url"}, read on change'
     )
+    parser.add_argument("--certificate", type=Path, help="speak TLS alone, with this certificate and its chain (PEM)")
+    parser.add_argument("--certificate-key", type=Path, help="its key (PEM)")
     parser.add_argument(
         "--revocations", type=Path, help="file in which revoked tokens are remembered (default: beside the keys)"
     )
-    return parser.parse_args()
+    found = parser.parse_args()
+    if bool(found.certificate) != bool(found.certificate_key):
+        parser.error("--certificate and --certificate-key belong together")
+    return found
+
+
+def _tls(arguments: argparse.Namespace) -> ssl.SSLContext | None:
+    """What the listeners show; ``None`` where they speak in the clear.
+
+    Raises:
+        OSError: A file cannot be read, or is not what it should be.
+    """
+    if arguments.certificate is None:
+        return None
+    context = ssl.create_default_context(ssl.Purpose.CLIENT_AUTH)
+    context.minimum_version = ssl.TLSVersion.TLSv1_2
+    context.load_cert_chain(arguments.certificate, arguments.certificate_key)
+    return context
 
 
 def _bind(host: str, port: int) -> socket.socket:
@@ -82,13 +107,14 @@ async def _run(
     keys: KeyRing,
     revocations: Revocations,
     limits: Limits,
+    tls: ssl.SSLContext | None,
 ) -> None:
     loop = asyncio.get_running_loop()
     loop.set_exception_handler(_one_line)
     stop = asyncio.Event()
     for number in (signal.SIGTERM, signal.SIGINT):
         loop.add_signal_handler(number, stop.set)
-    broker = TelescopeBroker(sockets=sockets, keys=keys, revocations=revocations, limits=limits)
+    broker = TelescopeBroker(sockets=sockets, keys=keys, revocations=revocations, limits=limits, tls=tls)
     await broker.start()
     ports = {name: bound.getsockname()[1] for name, bound in sockets.items()}
     print(f"ready tcp={ports[TCP]} websocket={ports[WEBSOCKET]}", flush=True)

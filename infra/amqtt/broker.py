@@ -10,6 +10,7 @@ and queues without bound for clients that are away. ``tests/contract/brokers`` h
 import asyncio
 import logging
 import socket
+import ssl
 import time
 from collections.abc import Mapping
 from typing import Any
@@ -51,6 +52,7 @@ class TelescopeBroker(Broker):  # type: ignore[misc]  # amqtt is not typed
         keys: KeyRing,
         revocations: Revocations,
         limits: Limits | None = None,
+        tls: ssl.SSLContext | None = None,
     ) -> None:
         """Prepare; ``start`` listens.
 
@@ -59,6 +61,7 @@ class TelescopeBroker(Broker):  # type: ignore[misc]  # amqtt is not typed
             keys: Read already.
             revocations: Opened already; closed by ``shutdown``.
             limits: Bounds, where the usual ones do not fit.
+            tls: What the listeners show; ``None`` where they speak in the clear.
         """
         kinds = {TCP: ListenerType.TCP, WEBSOCKET: ListenerType.WS}
         super().__init__(
@@ -69,6 +72,7 @@ class TelescopeBroker(Broker):  # type: ignore[misc]  # amqtt is not typed
         )
         self.limits = limits or Limits()
         self._sockets = sockets
+        self._tls = tls
         self._keys = keys
         self._revocations = revocations
         self._connections: set[Connection] = set()
@@ -113,13 +117,17 @@ class TelescopeBroker(Broker):  # type: ignore[misc]  # amqtt is not typed
         bound = self._sockets[listener_name]
         if listener_type == ListenerType.TCP:
             return await asyncio.get_running_loop().create_server(
-                lambda: TcpLink(self._connected, congested_bytes=self.limits.congested_bytes), sock=bound
+                lambda: TcpLink(self._connected, congested_bytes=self.limits.congested_bytes),
+                sock=bound,
+                ssl=self._tls,
+                ssl_handshake_timeout=None if self._tls is None else self.limits.connect_timeout_s,
             )
         quiet = logging.getLogger("telescope.broker.websocket")
         quiet.setLevel(logging.CRITICAL + 1)  # it logs every failed handshake with a traceback
         return await websockets.serve(
             self._websocket_connected,
             sock=bound,
+            ssl=self._tls,
             subprotocols=[websockets.Subprotocol("mqtt")],
             compression=None,  # costs time for each small message, and lets a small frame become a huge one
             max_size=_FRAME_BYTES,

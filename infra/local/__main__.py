@@ -5,6 +5,7 @@ import json
 import os
 import signal
 import socket
+import ssl
 import subprocess
 import sys
 import threading
@@ -33,10 +34,13 @@ class Machine:
 
     def __init__(self, chosen: settings.Settings) -> None:
         self._chosen = chosen
-        self._environment = chosen.environment()
         self._logs = chosen.home / "logs"
         self._agent_home = chosen.home / "agents" / "this-machine"
         self._children: list[Child] = []
+
+    @property
+    def _environment(self) -> dict[str, str]:
+        return self._chosen.environment()
 
     def start(self) -> None:
         """Start all of it.
@@ -46,6 +50,8 @@ class Machine:
         """
         self._check()
         say("starting")
+        if self._chosen.tls:
+            self._certify()
         link = self._sign_in_link()  # first of all: makes tables and keys, or says what is wrong with them
         self._run("broker", *self._broker()).await_line("ready", _START_WITHIN_S)
         self._run("functions", "-m", "function_app", "serve")
@@ -105,6 +111,12 @@ class Machine:
         except OSError as error:
             raise StartError(f"{self._logs} cannot be made ({error.strerror}); set TELESCOPE_HOME") from error
 
+    def _certify(self) -> None:
+        """Make certificates for this machine's own address, where nobody has put others there; or say what is wrong."""
+        chosen = self._chosen
+        made = ("--show",) if chosen.certificate[0].exists() else ("--address", chosen.host)
+        say(f"TLS {self._once('-m', 'infra.tls', '--home', str(chosen.tls_home), *made).splitlines()[0]}")
+
     def _broker(self) -> list[str]:
         chosen = self._chosen
         ports = [
@@ -115,6 +127,9 @@ class Machine:
             "--websocket-port",
             str(chosen.websocket_port),
         ]
+        if chosen.tls:
+            certificate, key = chosen.certificate
+            ports += ["--certificate", str(certificate), "--certificate-key", str(key)]
         if chosen.broker == "mosquitto":
             return ["-m", "infra.mosquitto", "--home", str(chosen.home / "mosquitto"), *ports]
         return ["-m", "infra.amqtt", "--keys", str(chosen.home / "keys" / "public.json"), *ports]
@@ -172,7 +187,7 @@ class Machine:
         devices = ("--room", self._chosen.room) if self._chosen.room else _ARM
         said = self._once(
             "-m", "device_agent", "enroll", "--home", str(self._agent_home), "--server", self._chosen.url,
-            "--name", "This machine", *devices, "--no-wait",
+            "--name", "This machine", *devices, "--no-wait", *(["--ca", str(self._chosen.ca)] if self._private else []),
         )  # fmt: skip
         words = said.split()
         if "code" not in words:
@@ -195,6 +210,11 @@ class Machine:
             time.sleep(0.05)
         raise StartError(f"the agent found no link; see {agent.log}")
 
+    @property
+    def _private(self) -> bool:
+        """Whether the site's certificates are of an authority of its own."""
+        return self._chosen.tls and self._chosen.ca.exists()
+
     def _call(self, method: str, path: str, body: dict[str, Any] | None = None, token: str = "") -> dict[str, Any]:
         request = urllib.request.Request(  # noqa: S310 (our own address)
             f"{self._chosen.url}/api/v1{path}",
@@ -203,7 +223,8 @@ class Machine:
             headers={"Content-Type": "application/json"} | ({"Authorization": f"Bearer {token}"} if token else {}),
         )
         try:
-            with urllib.request.urlopen(request, timeout=10) as answer:  # noqa: S310
+            trusted = ssl.create_default_context(cafile=str(self._chosen.ca)) if self._private else None
+            with urllib.request.urlopen(request, timeout=10, context=trusted) as answer:  # noqa: S310
                 found: dict[str, Any] = json.load(answer)
         except urllib.error.HTTPError as error:
             raise ValueError(json.load(error).get("detail", error.reason)) from error

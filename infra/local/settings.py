@@ -20,6 +20,7 @@ class SettingsError(Exception):
 class Settings:
     """Where things are. Ports follow ``port``: MQTT is the next one, MQTT over WebSocket the one after, then XMPP.
 
+    ``tls``: page, API and broker speak TLS alone, by the certificates in ``tls_home``.
     ``room``: the simulated room whose robots and devices are started; empty for an arm alone.
     """
 
@@ -29,6 +30,7 @@ class Settings:
     host: str = "127.0.0.1"
     xmpp: bool = False
     room: str = "lab"
+    tls: bool = False
 
     @property
     def mqtt_port(self) -> int:
@@ -46,9 +48,24 @@ class Settings:
         return self.port + 3
 
     @property
+    def tls_home(self) -> Path:
+        """Folder of the certificates."""
+        return self.home / "tls"
+
+    @property
+    def certificate(self) -> tuple[Path, Path]:
+        """The server's certificate and its key."""
+        return self.tls_home / "server.crt", self.tls_home / "server.key"
+
+    @property
+    def ca(self) -> Path:
+        """The authority that programs on this machine are to trust, where it is a private one."""
+        return self.tls_home / "ca.crt"
+
+    @property
     def url(self) -> str:
         """The page's address."""
-        return f"http://{self.host}:{self.port}"
+        return f"http{'s' if self.tls else ''}://{self.host}:{self.port}"
 
     def environment(self) -> dict[str, str]:
         """What the started programs see."""
@@ -63,6 +80,15 @@ class Settings:
             "TELESCOPE_XMPP_HOST": self.host,
             "TELESCOPE_XMPP_PORT": str(self.xmpp_port),
             "PYTHONUNBUFFERED": "1",
+            **(self._tls_environment() if self.tls else {}),
+        }
+
+    def _tls_environment(self) -> dict[str, str]:
+        certificate, key = self.certificate
+        return {
+            "TELESCOPE_TLS_CERTIFICATE": str(certificate),
+            "TELESCOPE_TLS_KEY": str(key),
+            "TELESCOPE_TLS_CA": str(self.ca) if self.ca.exists() else "",
         }
 
 
@@ -81,6 +107,11 @@ def read(environment: Mapping[str, str]) -> Settings:
     xmpp = environment.get("TELESCOPE_XMPP", "0")
     if xmpp not in ("0", "1"):
         raise SettingsError(f"TELESCOPE_XMPP is '{xmpp}'; it must be 1, for an XMPP server too, or 0")
+    tls = environment.get("TELESCOPE_TLS", "0")
+    if tls not in ("0", "1"):
+        raise SettingsError(f"TELESCOPE_TLS is '{tls}'; it must be 1, for TLS with the certificates in tls/, or 0")
+    if tls == xmpp == "1":
+        raise SettingsError("TELESCOPE_XMPP=1 asks the functions in the clear; on a site with TELESCOPE_TLS=1 use MQTT")
     room = environment.get("TELESCOPE_ROOM", "lab")
     known = sorted(path.parent.name for path in ROOMS.glob("*/room.toml"))
     if room not in (*known, NO_ROOM):
@@ -91,5 +122,6 @@ def read(environment: Mapping[str, str]) -> Settings:
         port=int(port),
         broker=cast("Literal['amqtt', 'mosquitto']", broker),
         xmpp=xmpp == "1",
+        tls=tls == "1",
         room="" if room == NO_ROOM else room,
     )

@@ -11,6 +11,7 @@ from pathlib import Path
 
 from infra import programs
 from infra.mosquitto import configuration
+from infra.mosquitto.configuration import Tls
 
 
 def main() -> int:
@@ -22,7 +23,14 @@ def main() -> int:
         host = programs.address(arguments.host)
         binary, plugin = configuration.binary(), configuration.plugin()
         tcp_port, websocket_port = programs.free_ports(host, arguments.tcp_port, arguments.websocket_port)
-        configuration.write(home, host=host, tcp_port=tcp_port, websocket_port=websocket_port, plugin_path=plugin)
+        configuration.write(
+            home,
+            host=host,
+            tcp_port=tcp_port,
+            websocket_port=websocket_port,
+            plugin_path=plugin,
+            tls=None if arguments.certificate is None else Tls(arguments.certificate, arguments.certificate_key),
+        )
     except programs.NotInstalledError as error:
         print(f"broker: {error}", file=sys.stderr)
         return programs.CANNOT_START
@@ -50,7 +58,12 @@ def _arguments() -> argparse.Namespace:
     parser.add_argument("--host", default="127.0.0.1", help="IPv4 address or name to listen on (default: loopback)")
     parser.add_argument("--tcp-port", type=int, required=True, help="MQTT; 0 takes a free one")
     parser.add_argument("--websocket-port", type=int, required=True, help="MQTT over WebSocket; 0 takes a free one")
-    return parser.parse_args()
+    parser.add_argument("--certificate", type=Path, help="speak TLS alone, with this certificate and its chain (PEM)")
+    parser.add_argument("--certificate-key", type=Path, help="its key (PEM)")
+    found = parser.parse_args()
+    if bool(found.certificate) != bool(found.certificate_key):
+        parser.error("--certificate and --certificate-key belong together")
+    return found
 
 
 if __name__ == "__main__":

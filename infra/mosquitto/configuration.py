@@ -12,7 +12,7 @@ import pwd
 import secrets
 from collections.abc import Iterable
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 from device_agent.protocol import codec, control, grants
 from infra import programs
@@ -65,12 +65,23 @@ def plugin() -> str:
     raise programs.NotInstalledError(f"mosquitto's {_PLUGIN} is not installed; on Debian: apt-get install {PACKAGE}")
 
 
-def write(home: Path, *, host: str, tcp_port: int, websocket_port: int, plugin_path: str) -> None:
+class Tls(NamedTuple):
+    """What the listeners show."""
+
+    certificate: Path
+    key: Path
+
+
+def write(
+    home: Path, *, host: str, tcp_port: int, websocket_port: int, plugin_path: str, tls: Tls | None = None
+) -> None:
     """Write what is not there yet; the listeners of the configuration follow the arguments each time.
 
     Raises:
-        OSError: ``home`` cannot be written.
+        OSError: ``home`` cannot be written, or a certificate not read.
     """
+    for path in tls or ():
+        path.read_bytes()  # the broker itself would end with a line about OpenSSL
     home.mkdir(parents=True, exist_ok=True, mode=0o700)
     security = home / SECURITY_FILE
     if not security.exists():
@@ -85,14 +96,20 @@ def write(home: Path, *, host: str, tcp_port: int, websocket_port: int, plugin_p
         )
     else:
         _renew_service_rights(security)
-    text = configuration(home, host=host, tcp_port=tcp_port, websocket_port=websocket_port, plugin_path=plugin_path)
+    text = configuration(
+        home, host=host, tcp_port=tcp_port, websocket_port=websocket_port, plugin_path=plugin_path, tls=tls
+    )
     path = home / CONFIGURATION_FILE
     if not path.exists() or path.read_text() != text:
         path.write_text(text)
 
 
-def configuration(home: Path, *, host: str, tcp_port: int, websocket_port: int, plugin_path: str) -> str:
+def configuration(
+    home: Path, *, host: str, tcp_port: int, websocket_port: int, plugin_path: str, tls: Tls | None = None
+) -> str:
     """The text of ``mosquitto.conf``; ``host`` is an IPv4 address."""
+    # The broker takes TLS 1.2 and 1.3 where no version is named.
+    shown = [] if tls is None else [f"certfile {tls.certificate.absolute()}", f"keyfile {tls.key.absolute()}"]
     lines = [
         "# Written by `python -m infra.mosquitto` at each start: change it there.",
         "per_listener_settings false",
@@ -118,8 +135,10 @@ def configuration(home: Path, *, host: str, tcp_port: int, websocket_port: int, 
         f"user {pwd.getpwuid(os.geteuid()).pw_name}",
         f"listener {tcp_port} {host}",
         "protocol mqtt",
+        *shown,
         f"listener {websocket_port} {host}",
         "protocol websockets",
+        *shown,
         # Without this the listener for WebSocket ignores its address, and is open to the whole network on IPv6.
         "socket_domain ipv4",
     ]

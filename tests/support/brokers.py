@@ -12,11 +12,12 @@ import json
 import queue
 import secrets
 import socket
+import ssl
 import subprocess
 import sys
 import threading
 import time
-from collections.abc import Callable, Coroutine, Iterator
+from collections.abc import Callable, Coroutine, Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal, Self, TypeVar
@@ -72,6 +73,7 @@ class Client:
         protocol: int = paho.MQTTv311,
         keep_alive_s: int = 60,
         will: Message | None = None,
+        tls: ssl.SSLContext | None = None,
     ) -> None:
         self.client_id = client_id
         self.messages: queue.Queue[Message] = queue.Queue()
@@ -90,6 +92,8 @@ class Client:
             transport=transport,
             reconnect_on_failure=False,
         )
+        if tls is not None:
+            self.paho.tls_set_context(tls)
         if credentials is not None:
             self.paho.username_pw_set(*credentials)
         if will is not None:
@@ -265,7 +269,14 @@ class RunningBroker:
 
 @contextlib.contextmanager
 def start_broker(
-    kind: BrokerKind, home: Path, *, tcp_port: int = 0, websocket_port: int = 0, keys: Path | None = None
+    kind: BrokerKind,
+    home: Path,
+    *,
+    tcp_port: int = 0,
+    websocket_port: int = 0,
+    keys: Path | None = None,
+    more: Sequence[str] = (),
+    tls: ssl.SSLContext | None = None,
 ) -> Iterator[RunningBroker]:
     """Run a broker for the time of a ``with``.
 
@@ -275,9 +286,11 @@ def start_broker(
         tcp_port: 0 for a free one.
         websocket_port: 0 for a free one.
         keys: For amqtt: public keys of functions that are under test themselves. ``access`` cannot issue then.
+        more: Arguments of the program.
+        tls: How the functions' own clients are to connect, where ``more`` asks for TLS.
     """
     home.mkdir(parents=True, exist_ok=True)
-    ports = ["--host", HOST, "--tcp-port", str(tcp_port), "--websocket-port", str(websocket_port)]
+    ports = [*more, "--host", HOST, "--tcp-port", str(tcp_port), "--websocket-port", str(websocket_port)]
     key = None
     if kind == "amqtt":
         key, own = _keys(home)
@@ -293,7 +306,7 @@ def start_broker(
             try:
                 tcp, websocket = _ready(process, home)
                 broker = RunningBroker(kind, home, process, tcp, websocket, _NO_ACCESS, loop, key)
-                broker.access = _access(broker)
+                broker.access = _access(broker, tls)
                 yield broker
             finally:
                 if broker is not None:
@@ -327,10 +340,10 @@ def _keys(home: Path) -> tuple[Any, Path]:
     return key, path
 
 
-def _access(broker: RunningBroker) -> BrokerAccess:
+def _access(broker: RunningBroker, tls: ssl.SSLContext | None) -> BrokerAccess:
     if broker.kind == "mosquitto":
         return MosquittoBrokerAccess(
-            host=HOST, port=broker.tcp_port, username="service", password_file=broker.home / "service.password"
+            host=HOST, port=broker.tcp_port, username="service", password_file=broker.home / "service.password", tls=tls
         )
     line: list[Client] = []
 

@@ -6,6 +6,7 @@ import os
 import re
 import signal
 import socket
+import ssl
 import subprocess
 import sys
 import threading
@@ -48,10 +49,16 @@ class Machine:
     home: Path
     port: int
     lines: list[str]
+    tls: bool = False
 
     @property
     def url(self) -> str:
-        return f"http://127.0.0.1:{self.port}"
+        return f"http{'s' if self.tls else ''}://127.0.0.1:{self.port}"
+
+    @property
+    def trusted(self) -> ssl.SSLContext:
+        """Trusts the authority that the product has made for itself, where it speaks TLS."""
+        return ssl.create_default_context(cafile=str(self.home / "tls" / "ca.crt") if self.tls else None)
 
     @property
     def ready(self) -> str:
@@ -100,7 +107,7 @@ class Api:
     """One sign-in's view of the HTTP API. ``with`` closes it."""
 
     def __init__(self, machine: Machine) -> None:
-        self.http = httpx.Client(base_url=f"{machine.url}/api/v1", timeout=30)
+        self.http = httpx.Client(base_url=f"{machine.url}/api/v1", timeout=30, verify=machine.trusted)
         signed_in = self.http.post("/auth/sign-in", json={"link": machine.sign_in_link().partition("#sign-in=")[2]})
         assert signed_in.status_code == httpx.codes.OK, signed_in.text
         self.http.cookies.clear()
@@ -195,7 +202,7 @@ def start_machine(home: Path, *, port: int = 0, **settings: str) -> Iterator[Mac
         while process.poll() is None and not any(line.startswith("ready") for line in lines):
             assert time.monotonic() < deadline_s, "".join(lines)
             time.sleep(0.05)
-        yield Machine(process, home, port, lines)
+        yield Machine(process, home, port, lines, settings.get("TELESCOPE_TLS") == "1")
     finally:
         if process.poll() is None:
             process.send_signal(signal.SIGINT)

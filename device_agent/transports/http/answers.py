@@ -20,6 +20,7 @@ class Address(Struct, frozen=True, kw_only=True):
 
     host: str
     port: Port
+    tls: bool = False
 
 
 class MqttCredentials(Struct, frozen=True, kw_only=True):

@@ -44,7 +44,10 @@ class HttpUploads:
                 api = self._api = self._api or self._open_api()
                 begun = api.post(path, announced)
                 upload = str(begun["id"])
-                _send(str(begun["method"]), urljoin(api.server, str(begun["url"])), dict(begun["headers"]), content)
+                url = urljoin(api.server, str(begun["url"]))
+                # The pinned authority speaks for the server alone, not for a cloud's store of blobs.
+                verify = str(api.ca) if api.ca is not None and url.startswith(api.server) else True
+                _send(str(begun["method"]), url, dict(begun["headers"]), content, verify)
                 api.post(f"{path}/{upload}/complete", {"device": device})
             except (CloudError, OSError) as error:
                 raise UploadError(f"the capture could not be stored: {error}") from error
@@ -53,11 +56,18 @@ class HttpUploads:
         return upload
 
 
-def _send(method: str, url: str, headers: dict[str, str], content: bytes) -> None:
+def _send(method: str, url: str, headers: dict[str, str], content: bytes, verify: str | bool) -> None:
     """What the address asks for. No token of ours goes with it, and no password of a ``.netrc`` either."""
     try:
         answer = requests.request(
-            method, url, data=content, headers=headers, auth=_as_it_is, timeout=_WITHIN_S, allow_redirects=False
+            method,
+            url,
+            data=content,
+            headers=headers,
+            auth=_as_it_is,
+            timeout=_WITHIN_S,
+            allow_redirects=False,
+            verify=verify,
         )
     except requests.RequestException as error:
         raise OSError(f"the blob store cannot be reached: {error}") from error

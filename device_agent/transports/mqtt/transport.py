@@ -3,6 +3,7 @@
 import contextlib
 import logging
 import socket
+import ssl
 import threading
 import time
 from collections.abc import Callable
@@ -35,7 +36,10 @@ _log = logging.getLogger(__name__)
 
 @dataclass(frozen=True, slots=True)
 class BrokerAccess:
-    """Where and as whom to connect. ``subscribe`` are the filters to ask for; ``lifetime_s`` from now [s]."""
+    """Where and as whom to connect. ``subscribe`` are the filters to ask for; ``lifetime_s`` from now [s].
+
+    ``tls``: how to check who the broker is; ``None`` where the cloud says that it speaks no TLS.
+    """
 
     host: str
     port: int
@@ -44,6 +48,7 @@ class BrokerAccess:
     password: str
     subscribe: tuple[str, ...]
     lifetime_s: float
+    tls: ssl.SSLContext | None = None
 
 
 class MqttTransport:
@@ -188,6 +193,8 @@ class MqttTransport:
             **options,
         )
         client.username_pw_set(access.username, access.password)
+        if access.tls is not None:
+            client.tls_set_context(access.tls)
         client.will_set(self._presence_topic, self._presence(online=False), qos=1, retain=True)
         client.max_queued_messages_set(_MOST_QUEUED)
         client.max_inflight_messages_set(100)

@@ -4,6 +4,7 @@ import asyncio
 import math
 import secrets
 import socket
+import ssl
 import time
 from collections.abc import Awaitable, Callable, Mapping, Sequence
 from pathlib import Path
@@ -116,7 +117,14 @@ class MosquittoBrokerAccess:
     """
 
     def __init__(
-        self, *, host: str, port: int, username: str, password_file: Path, answer_s: float = _ANSWER_S
+        self,
+        *,
+        host: str,
+        port: int,
+        username: str,
+        password_file: Path,
+        answer_s: float = _ANSWER_S,
+        tls: ssl.SSLContext | None = None,
     ) -> None:
         """Prepare.
 
@@ -126,11 +134,12 @@ class MosquittoBrokerAccess:
             username: The client that the broker's configuration made for the functions.
             password_file: Where its password is.
             answer_s: How long the broker may take to answer [s].
+            tls: How the connection is kept from others; ``None``: not at all.
         """
         self._username = username
         self._password_file = password_file
         self._answer_s = answer_s
-        self._line = _ControlLine(host, port)
+        self._line = _ControlLine(host, port, tls)
 
     async def issue(self, grant: Grant) -> Credentials:
         """As the port says; role and client are made in one message, the role first."""
@@ -216,7 +225,8 @@ class MosquittoBrokerAccess:
 class _ControlLine:
     """One warm connection to the dynamic security plugin, made when it is needed and made anew after it broke."""
 
-    def __init__(self, host: str, port: int) -> None:
+    def __init__(self, host: str, port: int, tls: ssl.SSLContext | None) -> None:
+        self._tls = tls
         self._host = host
         self._port = port
         self._client: paho.Client | None = None
@@ -270,6 +280,8 @@ class _ControlLine:
             reconnect_on_failure=False,
         )
         client.username_pw_set(service.username, service.password)
+        if self._tls is not None:
+            client.tls_set_context(self._tls)
         client.connect_timeout = answer_s
 
         def connected(_: Any, __: Any, ___: Any, reason: ReasonCode, ____: Any) -> None:

@@ -2,6 +2,7 @@
 
 import asyncio
 import contextlib
+import ssl
 from collections.abc import AsyncGenerator, AsyncIterator, Callable
 
 from paho.mqtt.client import MQTTMessage
@@ -18,11 +19,19 @@ _READY_S = 2.0
 class MqttCommandBus:
     """``CommandBus`` over MQTT. Every instance hears all acks and hands on those that somebody here waits for."""
 
-    def __init__(self, *, host: str, port: int, credentials: Callable[[], ServiceCredentials]) -> None:
+    def __init__(
+        self,
+        *,
+        host: str,
+        port: int,
+        credentials: Callable[[], ServiceCredentials],
+        tls: ssl.SSLContext | None = None,
+    ) -> None:
         self._link = MqttLink(
             host=host,
             port=port,
             credentials=credentials,
+            tls=tls,
             subscriptions=(topics.device(topics.ANY, topics.ANY, topics.ANY, topics.ACK),),
             receive=self._dispatch,
         )

@@ -2,6 +2,7 @@
 
 import asyncio
 import logging
+import ssl
 from collections.abc import Callable
 from typing import NamedTuple
 
@@ -49,12 +50,20 @@ class _Arrived(NamedTuple):
 class MqttFeed:
     """``Feed`` over MQTT: one connection, one message at a time, so that every topic keeps its order."""
 
-    def __init__(self, *, host: str, port: int, credentials: Callable[[], ServiceCredentials]) -> None:
+    def __init__(
+        self,
+        *,
+        host: str,
+        port: int,
+        credentials: Callable[[], ServiceCredentials],
+        tls: ssl.SSLContext | None = None,
+    ) -> None:
         self._waiting: asyncio.Queue[_Arrived] = asyncio.Queue(MAX_WAITING)
         self._link = MqttLink(
             host=host,
             port=port,
             credentials=credentials,
+            tls=tls,
             subscriptions=FILTERS,
             receive=self._arrived,
             manual_ack=True,
@@ -105,13 +114,21 @@ class MqttFeed:
 class MqttLate:
     """``Telemetry`` over MQTT for what was measured while a link was down: each is confirmed once it is stored."""
 
-    def __init__(self, *, host: str, port: int, credentials: Callable[[], ServiceCredentials]) -> None:
+    def __init__(
+        self,
+        *,
+        host: str,
+        port: int,
+        credentials: Callable[[], ServiceCredentials],
+        tls: ssl.SSLContext | None = None,
+    ) -> None:
         self._collected: list[_Arrived] = []
         self._some = asyncio.Event()
         self._link = MqttLink(
             host=host,
             port=port,
             credentials=credentials,
+            tls=tls,
             subscriptions=(topics.device(ANY, ANY, ANY, topics.LATE, ANY),),
             receive=self._arrived,
             manual_ack=True,
@@ -155,7 +172,14 @@ class MqttLate:
 class MqttTelemetry:
     """``Telemetry`` over MQTT, by a connection of its own: measurements that queue up hold up no ack."""
 
-    def __init__(self, *, host: str, port: int, credentials: Callable[[], ServiceCredentials]) -> None:
+    def __init__(
+        self,
+        *,
+        host: str,
+        port: int,
+        credentials: Callable[[], ServiceCredentials],
+        tls: ssl.SSLContext | None = None,
+    ) -> None:
         self._collected: list[tuple[str, bytes]] = []
         self._bytes = 0
         self._dropped = 0
@@ -164,6 +188,7 @@ class MqttTelemetry:
             host=host,
             port=port,
             credentials=credentials,
+            tls=tls,
             subscriptions=(topics.device(ANY, ANY, ANY, topics.TELE, ANY),),
             receive=self._arrived,
             qos=0,

@@ -12,6 +12,7 @@ import contextlib
 import logging
 import random
 import socket
+import ssl
 import time
 from collections.abc import Awaitable, Callable, Iterable, Sequence
 from typing import Any
@@ -58,6 +59,7 @@ class MqttLink:
         receive: Callable[[mqtt.MQTTMessage], None] | None = None,
         manual_ack: bool = False,
         qos: int = 1,
+        tls: ssl.SSLContext | None = None,
     ) -> None:
         self._host = host
         self._port = port
@@ -66,6 +68,7 @@ class MqttLink:
         self._receive = receive
         self._manual_ack = manual_ack
         self._qos = qos
+        self._tls = tls
         self._version = 0
         self._client: mqtt.Client | None = None
         self._keeper: asyncio.Task[None] | None = None
@@ -261,6 +264,8 @@ class MqttLink:
             clean_session=None if version is MQTTProtocolVersion.MQTTv5 else True,
         )
         client.username_pw_set(credentials.username, credentials.password)
+        if self._tls is not None:
+            client.tls_set_context(self._tls)
         client.connect_timeout = CONNECT_TIMEOUT_S
         client.max_inflight_messages_set(1000)
         loop = asyncio.get_running_loop()
@@ -383,6 +388,9 @@ class MqttLink:
 
     def _read(self, client: mqtt.Client) -> None:
         client.loop_read()
+        # With TLS a message may have been decrypted with the one before it: then the socket has nothing more to tell.
+        while isinstance(sock := client.socket(), ssl.SSLSocket) and sock.pending():
+            client.loop_read()
         self._flush(client)
 
     def _flush(self, client: mqtt.Client) -> None:

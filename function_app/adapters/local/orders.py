@@ -2,6 +2,7 @@
 
 import asyncio
 import secrets
+import ssl
 from collections.abc import Awaitable, Callable, Sequence
 
 from paho.mqtt.client import MQTTMessage
@@ -18,10 +19,10 @@ LIFETIME_S = 24 * 3600.0
 class MqttOrders:
     """``Orders`` over MQTT, by a connection with rights of its own."""
 
-    def __init__(self, *, host: str, port: int, access: BrokerAccess) -> None:
+    def __init__(self, *, host: str, port: int, access: BrokerAccess, tls: ssl.SSLContext | None = None) -> None:
         self._hear: Hear | None = None
         self._wanted: dict[tuple[str, str], tuple[str, ...]] = {}
-        self._link = MqttLink(host=host, port=port, credentials=_credentials(access), receive=self._arrived)
+        self._link = MqttLink(host=host, port=port, credentials=_credentials(access), receive=self._arrived, tls=tls)
 
     @property
     def up(self) -> bool:

@@ -4,6 +4,7 @@ import logging
 from collections.abc import AsyncIterator, Sequence
 from contextlib import asynccontextmanager
 from typing import Any
+from urllib.parse import urlsplit
 
 from fastapi import FastAPI, Request, Response
 from fastapi.exceptions import RequestValidationError
@@ -46,6 +47,8 @@ from function_app.entrypoints.http.routing import ACCOUNT_SCHEMES, AGENT_SCHEME,
 from function_app.ports.clock import Clock
 from function_app.ports.tables import StoreError
 
+_SECURE_FOR = b"max-age=31536000"
+"""A year: a browser that has once come by TLS comes no other way."""
 _log = logging.getLogger(__name__)
 _WRONG_METHOD = 405
 _TITLES = {404: "Nothing here", _WRONG_METHOD: "Not this method"}
@@ -107,8 +110,19 @@ def create_app(functions: Functions) -> FastAPI:
     app.add_exception_handler(HTTPException, _on_http)
     # What no route knows at all; a mount would also swallow a wrong method, which is a 405.
     app.router.default = Console(functions.settings.console)
-    app.add_middleware(_Headers, clock=functions.clock, websocket_url=functions.settings.websocket_url)
+    app.add_middleware(
+        _Headers,
+        clock=functions.clock,
+        websocket_url=functions.settings.websocket_url,
+        secure=_by_name(functions.settings.public_url),
+    )
     return app
+
+
+def _by_name(url: str) -> bool:
+    """Whether browsers are to remember that this name speaks TLS; on ``localhost`` other programs have pages too."""
+    parts = urlsplit(url)
+    return parts.scheme == "https" and parts.hostname != "localhost"
 
 
 def _document(app: FastAPI, kinds: Sequence[Any]) -> None:
@@ -185,7 +199,7 @@ def _methods(request: Request) -> list[str]:
 class _Headers:
     """The headers of every answer, and an answer for what nobody has foreseen. Plain ASGI: it costs microseconds."""
 
-    def __init__(self, app: ASGIApp, *, clock: Clock, websocket_url: str) -> None:
+    def __init__(self, app: ASGIApp, *, clock: Clock, websocket_url: str, secure: bool) -> None:
         self._app = app
         self._clock = clock
         policy = (
@@ -201,6 +215,7 @@ class _Headers:
             (b"cross-origin-opener-policy", b"same-origin"),
             (b"cross-origin-resource-policy", b"same-origin"),
             (b"permissions-policy", b"camera=(), microphone=(), geolocation=()"),
+            *([(b"strict-transport-security", _SECURE_FOR)] if secure else []),
         ]
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:

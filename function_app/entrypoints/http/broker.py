@@ -40,7 +40,7 @@ def router(functions: Functions, caller: Caller) -> Routes:
             lifetime_s=issued.lifetime_s,
             publish=issued.publish,
             subscribe=issued.subscribe,
-            tcp=contract.TcpAddress(host=settings.mqtt_host, port=settings.mqtt_port),
+            tcp=contract.TcpAddress(host=settings.mqtt_host, port=settings.mqtt_port, tls=settings.tls is not None),
             websocket_url=settings.websocket_url,
             server_time_ms=functions.clock.now_ms(),
             key_statements=() if news is None else news.statements,

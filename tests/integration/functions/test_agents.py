@@ -35,12 +35,14 @@ class TestEnroll:
         assert (answer.status_code, body["agent"]) == (201, robot.id)
         assert 280 <= body["expires_in_s"] <= 300
         assert len(body["claim_code"]) == 9
-        assert robot.enrollment() | {"keys": []} == {
+        assert robot.enrollment() | {"keys": [], "signing_key": ""} == {
             "agent": robot.id,
             "state": "waiting",
             "space": None,
             "account": None,
             "keys": [],
+            "key_statements": [],
+            "signing_key": "",
         }
 
     def test_the_same_key_is_the_same_agent_with_a_new_code(self, alone: Cloud) -> None:

@@ -27,6 +27,7 @@ class TcpAddress(Answer, frozen=True, kw_only=True):
 
     host: str
     port: int
+    tls: bool
 
 
 class MqttCredentialsOut(Answer, frozen=True, kw_only=True):

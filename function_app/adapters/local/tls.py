@@ -1,0 +1,20 @@
+"""TLS towards the broker."""
+
+import ssl
+from pathlib import Path
+
+from function_app.ports.broker_access import BrokerAccessError
+
+
+def client_context(ca: Path | None) -> ssl.SSLContext:
+    """Trusts one authority, or those that the machine trusts.
+
+    Raises:
+        BrokerAccessError: Its certificate cannot be read.
+    """
+    try:
+        context = ssl.create_default_context(cafile=None if ca is None else str(ca))
+    except (OSError, ssl.SSLError) as error:
+        raise BrokerAccessError(f"the authority in {ca} cannot be read: {error}") from error
+    context.minimum_version = ssl.TLSVersion.TLSv1_2
+    return context

@@ -1,0 +1,128 @@
+"""Brokers that speak TLS do so alone, and only with who trusts the site's authority."""
+
+import datetime as dt
+import socket
+import ssl
+import warnings
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from device_agent.protocol import topics
+from function_app.adapters.local.mqtt_link import MqttLink
+from function_app.adapters.local.tls import client_context
+from function_app.ports.broker_access import Credentials
+from infra.tls import authority
+from tests.support.brokers import HOST, BrokerKind, Client, RunningBroker, Transport, start_broker, wait_until
+
+
+@pytest.fixture(scope="module")
+def site(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("site") / "tls"
+    authority.make(folder, authority.names((), ()), now=dt.datetime.now(dt.UTC))
+    return folder
+
+
+@pytest.fixture(scope="module")
+def trusting(site: Path) -> ssl.SSLContext:
+    return client_context(site / "ca.crt")
+
+
+@pytest.fixture(scope="module")
+def running(
+    kind: BrokerKind, site: Path, trusting: ssl.SSLContext, tmp_path_factory: pytest.TempPathFactory
+) -> Iterator[RunningBroker]:
+    shown = ["--certificate", str(site / "server.crt"), "--certificate-key", str(site / "server.key")]
+    with start_broker(kind, tmp_path_factory.mktemp(kind), more=shown, tls=trusting) as broker:
+        yield broker
+
+
+def connect(broker: RunningBroker, transport: Transport, tls: ssl.SSLContext | None) -> Client:
+    service = broker.access.service_credentials()
+    port = port_of(broker, transport)
+    client = Client(
+        service.client_id, Credentials(service.username, service.password), port=port, transport=transport, tls=tls
+    )
+    if transport == "websockets":
+        client.paho.ws_set_options(path="/mqtt")
+    broker.closers.append(client.close)
+    return client.open()
+
+
+def test_who_trusts_the_authority_connects(
+    broker: RunningBroker, transport: Transport, trusting: ssl.SSLContext
+) -> None:
+    assert connect(broker, transport, trusting).connected.is_set()
+
+
+def port_of(broker: RunningBroker, transport: Transport) -> int:
+    return broker.tcp_port if transport == "tcp" else broker.websocket_port
+
+
+def test_who_trusts_another_does_not_connect(broker: RunningBroker, transport: Transport, tmp_path: Path) -> None:
+    authority.make(tmp_path, authority.names((), ()), now=dt.datetime.now(dt.UTC))
+    for context in (client_context(tmp_path / "ca.crt"), client_context(None)):
+        with (
+            socket.create_connection((HOST, port_of(broker, transport))) as plain,
+            pytest.raises(ssl.SSLCertVerificationError),
+        ):
+            context.wrap_socket(plain, server_hostname=HOST)
+
+
+def test_a_name_that_is_not_the_sites_is_refused(
+    broker: RunningBroker, transport: Transport, trusting: ssl.SSLContext
+) -> None:
+    with (
+        socket.create_connection((HOST, port_of(broker, transport))) as plain,
+        pytest.raises(ssl.SSLCertVerificationError, match=r"other\.example"),
+    ):
+        trusting.wrap_socket(plain, server_hostname="other.example")
+
+
+def test_nobody_is_answered_in_the_clear(broker: RunningBroker, transport: Transport) -> None:
+    mqtt = b"\x10\x0d\x00\x04MQTT\x04\x02\x00\x3c\x00\x01a"
+    upgrade = b"GET /mqtt HTTP/1.1\r\nHost: a\r\nConnection: Upgrade\r\nUpgrade: websocket\r\n\r\n"
+    with socket.create_connection((HOST, port_of(broker, transport)), timeout=10) as plain:
+        plain.sendall(mqtt if transport == "tcp" else upgrade)
+        try:
+            answer = plain.recv(1000)
+        except ConnectionResetError:
+            answer = b""
+    assert answer[:1] in {b"", b"\x15"}, "nothing, or an alert of TLS"
+
+
+def test_old_tls_is_not_spoken(broker: RunningBroker, site: Path) -> None:
+    old = ssl.SSLContext(ssl.PROTOCOL_TLS_CLIENT)
+    old.load_verify_locations(site / "ca.crt")
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # the library itself warns of it
+        old.minimum_version, old.maximum_version = ssl.TLSVersion.TLSv1, ssl.TLSVersion.TLSv1_1
+    old.set_ciphers("ALL:@SECLEVEL=0")
+    with socket.create_connection((HOST, broker.tcp_port)) as plain, pytest.raises(OSError, match=r"SSL|EOF|reset"):
+        old.wrap_socket(plain, server_hostname=HOST)
+
+
+def test_nothing_is_left_lying_in_what_was_decrypted(
+    broker: RunningBroker, trusting: ssl.SSLContext, space: str
+) -> None:
+    """Several messages come in one record of TLS: the socket tells of the first alone."""
+    heard: list[object] = []
+    link = MqttLink(
+        host=HOST,
+        port=broker.tcp_port,
+        credentials=broker.access.service_credentials,
+        subscriptions=(topics.conn(space, "+"),),
+        receive=lambda message: heard.append(message.payload),
+        tls=trusting,
+    )
+
+    async def begin() -> None:
+        assert await link.ready(10), link.trouble
+
+    broker.run(begin())
+    talker = connect(broker, "tcp", trusting)
+    for number in range(200):
+        talker.publish(topics.conn(space, f"agent{number}"), b"x" * 50)
+    wait_until(lambda: len(heard) == 200, "all of them", 10)
+    broker.run(link.close())
