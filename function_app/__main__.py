@@ -1,14 +1,17 @@
-"""``python -m function_app serve|work|xmpp|check-models|prepare|rotate-keys|sign-in-link``: the functions here."""
+"""``python -m function_app serve|work|xmpp|check-models|prepare|rotate-keys|sign-in-link|audit``: the functions."""
 
 import argparse
 import asyncio
 import logging
 import sys
-from collections.abc import Sequence
+from collections.abc import Callable, Coroutine, Sequence
+from typing import Any
 
 from function_app import bootstrap, choices, settings
 from function_app.bootstrap import Functions
+from function_app.domain.audit_chain import CLOUD, Deed
 from function_app.domain.times import rfc3339
+from function_app.entrypoints import audit
 from function_app.entrypoints.serve import PortTaken, serve
 from function_app.entrypoints.worker import check_models, work
 from function_app.ports.keys import LEARN_MS, OVERLAP_MS, RotationRefused
@@ -53,6 +56,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     )
     link = commands.add_parser("sign-in-link", help="print a one-time sign-in link; makes the account if it is new")
     link.add_argument("--account", default="demo", help="name of the account (default: %(default)s)")
+    audit.add_command(commands)
     options = parser.parse_args(arguments)
     logging.basicConfig(level=logging.INFO, format="%(asctime)s %(levelname)s %(message)s", stream=sys.stderr)
     for sdk in ("azure", "botocore"):  # they tell of every request
@@ -67,7 +71,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
             asyncio.run(_check(functions))
             serve(functions)
         else:
-            asyncio.run(_COMMANDS[options.command](functions, options))
+            return asyncio.run(_COMMANDS[options.command](functions, options)) or 0
     except PortTaken as taken:
         print(f"telescope functions: {taken}", file=sys.stderr)
         return _EXIT_TAKEN
@@ -116,6 +120,8 @@ async def _rotate(functions: Functions, options: argparse.Namespace) -> None:
         raise settings.SettingsError("--learn-minutes must be less than --overlap-hours")
     try:
         news = await functions.keys.rotate(learn_ms=learn_ms, overlap_ms=overlap_ms, leaked=options.leaked)
+        key = news.pins[-1].id
+        await functions.chain.record(CLOUD, Deed.SIGNING_KEY_ROTATED, None, on=key, leaked=options.leaked)
     except RotationRefused as refused:
         raise settings.SettingsError(
             f"devices are still learning the last new key, until {rfc3339(refused.until_ms)}; wait, or say --leaked"
@@ -138,7 +144,8 @@ async def _link(functions: Functions, options: argparse.Namespace) -> None:
     await functions.close()
 
 
-_COMMANDS = {
+_COMMANDS: dict[str, Callable[[Functions, argparse.Namespace], Coroutine[Any, Any, int | None]]] = {
+    "audit": audit.run,
     "work": _work,
     "xmpp": _speak,
     "check-models": _check_models,

@@ -26,6 +26,8 @@ from function_app.services.action_rows import ActionRows
 from function_app.services.actions import Actions
 from function_app.services.attempts import Attempts
 from function_app.services.audit import Audit
+from function_app.services.audit_chain import AuditChain
+from function_app.services.audit_trail import AuditTrail
 from function_app.services.claim import Claim
 from function_app.services.commands import Commands
 from function_app.services.conditions import Conditions
@@ -136,6 +138,8 @@ class Functions:
     uploads: Uploads
     transfers: Transfers | None
     series: SeriesReader
+    chain: AuditChain
+    trail: AuditTrail
     sweep: Sweep
     health: CheckHealth
 
@@ -175,6 +179,8 @@ def build(settings: Settings, *, clock: Clock | None = None) -> Functions:
     late = MqttLate(**heard)
 
     forget = Forget(tables=tables, blobs=blobs)
+    pending = Pending(tables=tables)
+    chain = AuditChain(tables=tables, blobs=blobs, keys=keys, forget=forget, pending=pending, clock=now)
     events = Events(tables=tables, forget=forget, clock=now)
     faults = Faults(tables=tables, events=events, forget=forget, clock=now)
     conditions = Conditions(tables=tables, faults=faults, clock=now)
@@ -203,11 +209,11 @@ def build(settings: Settings, *, clock: Clock | None = None) -> Functions:
         robot_types=robot_types,
         keys=keys,
         forget=forget,
+        chain=chain,
         clock=now,
     )
     rows = ActionRows(tables=tables)
-    pending = Pending(tables=tables)
-    audit = Audit(tables=tables, events=events, pending=pending, clock=now)
+    audit = Audit(tables=tables, events=events, chain=chain, pending=pending, clock=now)
     lease_rows = LeaseRows(tables=tables, audit=audit, clock=now)
     fence = Fence(tables=tables, commands=commands, access=access, clock=now)
     leases = Leases(
@@ -241,6 +247,7 @@ def build(settings: Settings, *, clock: Clock | None = None) -> Functions:
         bus=bus,
         series=writer,
         forget=forget,
+        audit=audit,
         clock=now,
     )
     sharing = Sharing(
@@ -311,8 +318,10 @@ def build(settings: Settings, *, clock: Clock | None = None) -> Functions:
             clock=now,
         ),
         enroll=Enroll(tables=tables, leave=leave, forget=forget, clock=now),
-        claim=Claim(tables=tables, sign_in=sign_in, attempts=attempts, leave=leave, clock=now),
-        unpair=Unpair(tables=tables, sign_in=sign_in, leave=leave),
+        claim=Claim(
+            tables=tables, sign_in=sign_in, attempts=attempts, leave=leave, chain=chain, clock=now
+        ),
+        unpair=Unpair(tables=tables, sign_in=sign_in, leave=leave, chain=chain),
         devices=devices,
         spaces=spaces,
         sharing=sharing,
@@ -330,10 +339,10 @@ def build(settings: Settings, *, clock: Clock | None = None) -> Functions:
         ),
         robot_types=robot_types,
         upload_robot_type=UploadRobotType(
-            tables=tables, blobs=blobs, catalogue=catalogue, robot_types=robot_types, clock=now
+            tables=tables, blobs=blobs, catalogue=catalogue, robot_types=robot_types, chain=chain, clock=now
         ),
         delete_robot_type=DeleteRobotType(
-            tables=tables, catalogue=catalogue, devices=devices, movements=movements, clock=now
+            tables=tables, catalogue=catalogue, devices=devices, movements=movements, chain=chain, clock=now
         ),
         model_checks=ModelChecks(tables=tables, blobs=blobs, compiler=MujocoCompiler(), clock=now),
         movements=movements,
@@ -383,6 +392,8 @@ def build(settings: Settings, *, clock: Clock | None = None) -> Functions:
         uploads=uploads,
         transfers=blobs if isinstance(blobs, FileBlobs) else None,
         series=SeriesReader(tables=tables, devices=devices, keep=keep, clock=now),
+        chain=chain,
+        trail=AuditTrail(tables=tables, blobs=blobs, keys=keys),
         sweep=Sweep(
             tables=tables,
             rows=rows,
@@ -394,6 +405,7 @@ def build(settings: Settings, *, clock: Clock | None = None) -> Functions:
             sharing=sharing,
             invitations=invitations,
             audit=audit,
+            chain=chain,
             access=access,
             forget=forget,
             conditions=conditions,

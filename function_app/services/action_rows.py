@@ -3,6 +3,7 @@
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 
+from function_app.domain.accounts import Identity
 from function_app.domain.actions import Action, Status
 from function_app.domain.devices import Device
 from function_app.domain.ids import split_command
@@ -123,5 +124,6 @@ def _freed(action: Action, control: Control) -> list[Write]:
     if control.lease is not None and control.lease.action == action.id:
         nobody = release(control.lease, now_ms=action.ended_ms)
         writes.append(control.write_lease(action.device, nobody))
-        writes += lease_change(action.device, control.lease, nobody, by=action.who, now_ms=action.ended_ms)
+        who = Identity(action.account, action.who, action.session)
+        writes += lease_change(action.device, control.lease, nobody, who=who, now_ms=action.ended_ms)
     return writes

@@ -1,25 +1,28 @@
-"""What happened to the control over devices, into their events: nothing of it is lost, and nobody waits for it.
+"""What happened to the control over devices, into their events and their owner's chain: nothing of it is lost.
 
 A change of a lease and the events that tell of it are one batch in the device's partition of ``Control``. From there
-they are moved to ``Events`` at once, by whoever makes the next change, or by the timer, which looks at a device with a
-lease by a note in ``Pending``. A refusal changes nothing, so it is written straight to ``Events``.
+they are moved to ``Events`` and to the chain (``services/audit_chain.py``) at once, by whoever makes the next change,
+or by the timer, which looks at a device with a lease by a note in ``Pending``. A refusal changes nothing, so it is
+written straight there.
 """
 
 import contextlib
 import logging
-from collections.abc import AsyncGenerator, Iterable
+from collections.abc import AsyncGenerator, Iterable, Mapping
 from typing import Any, Final
 
 from function_app.domain import authority
 from function_app.domain.accounts import Identity
+from function_app.domain.audit_chain import CLOUD, Entry, Outcome
 from function_app.domain.authority import Fact, Happened
-from function_app.domain.devices import Device
+from function_app.domain.devices import Agent, Device
 from function_app.domain.ids import new_id, split_device
 from function_app.domain.lease import Lease
 from function_app.domain.problems import Problem
 from function_app.ports.clock import Clock
 from function_app.ports.tables import Conflict, Row, StoreError, Tables, Write
 from function_app.services import store
+from function_app.services.audit_chain import AuditChain
 from function_app.services.control import read_control_rows
 from function_app.services.events import Events
 from function_app.services.pending import Pending
@@ -40,9 +43,10 @@ _log = logging.getLogger(__name__)
 class Audit:
     """Tells what happened."""
 
-    def __init__(self, *, tables: Tables, events: Events, pending: Pending, clock: Clock) -> None:
+    def __init__(self, *, tables: Tables, events: Events, chain: AuditChain, pending: Pending, clock: Clock) -> None:
         self._tables = tables
         self._events = events
+        self._chain = chain
         self._pending = pending
         self._clock = clock
         self._refused: dict[tuple[str, ...], int] = {}
@@ -52,12 +56,21 @@ class Audit:
         await self._pending.note(f"{_NOTE}{device}", self._clock.now_ms() + LOOK_MS)
 
     async def look(self, device: str) -> None:
-        """The timer's look: tell what was left, and what time has brought; note when to look again."""
-        await self.tell(device)
+        """The timer's look: tell what was left, and what time has brought; note when to look again.
+
+        Raises:
+            Problem: ``busy``.
+            StoreError: The tables cannot be used.
+        """
+        await self._move(device)
         lease = (await read_control_rows(self._tables, device)).lease
         now_ms = self._clock.now_ms()
-        for happened in authority.overdue(lease, now_ms):
-            await self._events.add(device, lease.pairing if lease else "", happened.event(_name(device)))
+        pairing = lease.pairing if lease else ""
+        late = [happened.event(_name(device)) for happened in authority.overdue(lease, now_ms)]
+        for event in late:
+            await self._events.add(device, pairing, event)
+        if late:
+            await self._chain.tell(await self._owner(device, pairing), [_entry(device, event, {}) for event in late])
         if lease is not None:
             ends = [lease.expires_ms] if lease.live(now_ms) else []
             if lease.asked is not None and lease.asked.how(lease, now_ms) == "open":
@@ -66,21 +79,59 @@ class Audit:
                 await self._pending.note(f"{_NOTE}{device}", min(ends))
 
     async def tell(self, device: str) -> None:
-        """Move what is noted to the device's events. Safe to repeat and to be done by several at once."""
+        """Move what is noted to the device's events and its owner's chain. Safe to repeat and to be done by several.
+
+        Where others are in the way for long, the timer does it.
+        """
+        try:
+            await self._move(device)
+        except Problem as problem:
+            _log.warning("events of %s: %s", device, problem.detail)
+
+    async def _move(self, device: str) -> None:
         page = await self._tables.query(store.CONTROL, device, first=_EVENT, last="event;", limit=1000)
+        owned: dict[str, list[Entry]] = {}
         for row in page.rows:
             await self._events.add(device, row.data["pairing"], row.data["event"])
+            owner = row.data.get("owner") or await self._owner(device, row.data["pairing"])
+            owned.setdefault(owner, []).append(_entry(device, row.data["event"], row.data.get("by", {})))
+        for owner, entries in owned.items():
+            await self._chain.tell(owner, entries)
+        for row in page.rows:
             with contextlib.suppress(Conflict):  # another process tells the same
                 await self._tables.delete(store.CONTROL, row)
 
-    async def happened(self, device: Device, fact: Fact, message: str, *, severity: Any = "info", **data: Any) -> None:
+    async def _owner(self, device: str, pairing: str) -> str:
+        """Whose chain the events of a pairing stand in: told before the agent's row forgets whose it was."""
+        agent_id, _ = split_device(device) or (device, "")
+        row = await self._tables.get(store.AGENTS, agent_id, "agent")
+        agent = None if row is None else store.read(row, Agent)
+        if agent is None:
+            return CLOUD
+        if agent.account is not None and pairing in {"", agent.pairing}:
+            return agent.account
+        return next((each.account for each in agent.leaving if each.pairing == pairing), CLOUD)
+
+    async def happened(
+        self,
+        device: Device,
+        fact: Fact,
+        message: str,
+        *,
+        who: Identity | None = None,
+        severity: Any = "info",
+        outcome: Outcome = "done",
+        **data: Any,
+    ) -> None:
         """Tell of something that is no change of a lease.
 
         Raises:
             StoreError: The tables cannot be used.
         """
         fresh = Happened(new_id(), fact, self._clock.now_ms(), message, data, severity)
-        await self._events.add(device.id, device.pairing, fresh.event(device.name))
+        event = fresh.event(device.name)
+        await self._events.add(device.id, device.pairing, event)
+        await self._chain.keep(device.owner or CLOUD, _entry(device.id, event, _by(who), outcome))
 
     @contextlib.asynccontextmanager
     async def refusals(self, device: Device, who: Identity, what: str) -> AsyncGenerator[None]:
@@ -111,16 +162,38 @@ class Audit:
         message = f"{who.name} was refused to {what}: {problem.detail}"
         try:
             await self.happened(
-                device, Fact.ORDER_REFUSED, message, severity="warning", by=who.name, wanted=what, code=problem.code
+                device,
+                Fact.ORDER_REFUSED,
+                message,
+                who=who,
+                severity="warning",
+                outcome="refused",
+                by=who.name,
+                wanted=what,
+                code=problem.code,
             )
         except (StoreError, Problem) as error:
             _log.warning("refusal on %s: %s", device.id, error)
 
 
-def told(device: str, pairing: str, facts: Iterable[Happened]) -> list[Write]:
-    """The writes that note facts, to go into one batch with the change that they tell of."""
+def told(
+    device: str, pairing: str, facts: Iterable[Happened], *, owner: str = "", who: Identity | None = None
+) -> list[Write]:
+    """The writes that note facts, to go into one batch with the change that they tell of.
+
+    Args:
+        device: On which device.
+        pairing: In which.
+        facts: What happened.
+        owner: Whose device it is, where that is known.
+        who: Who did it, where somebody did.
+    """
+    more = ({"owner": owner} if owner else {}) | ({"by": _by(who)} if who else {})
     return [
-        Write("create", Row(device, f"{_EVENT}{fact.id}", {"pairing": pairing, "event": fact.event(_name(device))}))
+        Write(
+            "create",
+            Row(device, f"{_EVENT}{fact.id}", {"pairing": pairing, "event": fact.event(_name(device)), **more}),
+        )
         for fact in facts
     ]
 
@@ -130,9 +203,23 @@ def lease_of(note: str) -> str | None:
     return note.removeprefix(_NOTE) if note.startswith(_NOTE) else None
 
 
-def lease_change(device: str, before: Lease | None, after: Lease, *, by: str, now_ms: int) -> list[Write]:
+def lease_change(
+    device: str, before: Lease | None, after: Lease, *, who: Identity, now_ms: int, owner: str = ""
+) -> list[Write]:
     """The events of a change of a lease, to go into its batch."""
-    return told(device, after.pairing, authority.changed(before, after, by=by, now_ms=now_ms))
+    facts = authority.changed(before, after, by=who.name, now_ms=now_ms)
+    return told(device, after.pairing, facts, owner=owner, who=who)
+
+
+def _entry(device: str, event: Mapping[str, Any], by: Mapping[str, str], outcome: Outcome = "done") -> Entry:
+    data = {"message": event["message"], **event["data"]}
+    return Entry(f"{device}/{event['id']}", event["at_ms"], event["kind"], outcome, device, **by, data=data)
+
+
+def _by(who: Identity | None) -> dict[str, str]:
+    if who is None:
+        return {}
+    return {"who": who.name, "account": who.account, "session": who.session, "key": who.key}
 
 
 def _name(device: str) -> str:

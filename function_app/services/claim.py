@@ -5,6 +5,7 @@ from dataclasses import dataclass
 
 from function_app.domain import devices
 from function_app.domain.accounts import Identity
+from function_app.domain.audit_chain import Deed
 from function_app.domain.devices import Agent
 from function_app.domain.ids import new_id, read_claim_code
 from function_app.domain.problems import Problem, not_found
@@ -12,6 +13,7 @@ from function_app.ports.clock import Clock
 from function_app.ports.tables import Conflict, Row, Tables
 from function_app.services import store
 from function_app.services.attempts import Attempts, Guess, by_address
+from function_app.services.audit_chain import AuditChain, Change
 from function_app.services.leave import Leave
 from function_app.services.sign_in import SignIn
 
@@ -27,11 +29,14 @@ class _Member:
 class Claim:
     """Pairing by claim code. What decides is one ETag write on the agent's row."""
 
-    def __init__(self, *, tables: Tables, sign_in: SignIn, attempts: Attempts, leave: Leave, clock: Clock) -> None:
+    def __init__(
+        self, *, tables: Tables, sign_in: SignIn, attempts: Attempts, leave: Leave, chain: AuditChain, clock: Clock
+    ) -> None:
         self._tables = tables
         self._attempts = attempts
         self._leave = leave
         self._sign_in = sign_in
+        self._chain = chain
         self._clock = clock
 
     async def claim(self, who: Identity, text: str, space: str | None, *, address: str = "") -> Agent:
@@ -49,13 +54,22 @@ class Claim:
         if chosen is None:
             raise not_found("space", space or "")
         counters = {who.account: WRONG_TRIES, **by_address(address, WRONG_TRIES)}
-        await self._attempts.count(GUESS, counters)
-        agent = await self._redeem(who, read_claim_code(text), chosen)
+        try:
+            await self._attempts.count(GUESS, counters)
+            agent = await self._redeem(who, read_claim_code(text), chosen)
+        except Problem as problem:
+            await self._refused(who, problem, address)
+            raise
         if agent is None:
             detail = "This code is wrong, used or expired. Codes live five minutes; the agent shows its newest."
-            raise Problem("claim-code-unknown", 404, "No such claim code", detail)
+            unknown = Problem("claim-code-unknown", 404, "No such claim code", detail)
+            await self._refused(who, unknown, address)
+            raise unknown
         await self._attempts.uncount(GUESS, counters)
         return agent
+
+    async def _refused(self, who: Identity, problem: Problem, address: str) -> None:
+        await self._chain.refused(who.account, Deed.CLAIM_REFUSED, who, code=problem.code, address=address)
 
     async def _redeem(self, who: Identity, code: str | None, space: str) -> Agent | None:
         if code is None:
@@ -63,13 +77,17 @@ class Claim:
         found = await self._tables.get(store.CLAIMS, code[0], code)
         if found is None:
             return None
-        claimed = await store.retry(lambda: self._take(who, code, found.data["agent"], space))
+        agent = str(found.data["agent"])
+        async with self._chain.change(who.account, Deed.AGENT_CLAIMED, who, on=agent, space=space) as change:
+            claimed = await store.retry(lambda: self._take(who, code, agent, space, change))
+            if claimed is None:
+                change.nothing()
         if claimed is not None:
             with contextlib.suppress(Conflict):
                 await self._tables.delete(store.CLAIMS, found)
         return claimed
 
-    async def _take(self, who: Identity, code: str, agent_id: str, space: str) -> Agent | None:
+    async def _take(self, who: Identity, code: str, agent_id: str, space: str, change: Change) -> Agent | None:
         row = await self._tables.get(store.AGENTS, agent_id, "agent")
         if row is None:
             return None
@@ -78,6 +96,7 @@ class Claim:
         if agent.claimed or agent.claim_code != code or now_ms >= agent.claim_expires_ms:
             return None
         await self._leave.settle(agent)
+        await change.noted()
         claimed = devices.claim(agent, account=who.account, space=space, pairing=new_id(), now_ms=now_ms)
         # The index first: without the agent's row behind it it shows nothing, so a stop in between leaves no harm.
         member = _Member(claimed.pairing)

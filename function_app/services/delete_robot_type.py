@@ -4,11 +4,13 @@ import contextlib
 from dataclasses import replace
 
 from function_app.domain.accounts import Identity
+from function_app.domain.audit_chain import Deed
 from function_app.domain.problems import Problem, not_found
 from function_app.ports.catalogue import Catalogue
 from function_app.ports.clock import Clock
 from function_app.ports.tables import Conflict, Row, Tables
 from function_app.services import store
+from function_app.services.audit_chain import AuditChain
 from function_app.services.devices import Devices
 from function_app.services.movements import Movements
 from function_app.services.robot_type_rows import INDEX, note_look, place, read_head
@@ -22,12 +24,20 @@ class DeleteRobotType:
     """Takes an account's own robot type out of use."""
 
     def __init__(
-        self, *, tables: Tables, catalogue: Catalogue, devices: Devices, movements: Movements, clock: Clock
+        self,
+        *,
+        tables: Tables,
+        catalogue: Catalogue,
+        devices: Devices,
+        movements: Movements,
+        chain: AuditChain,
+        clock: Clock,
     ) -> None:
         self._tables = tables
         self._catalogue = catalogue
         self._devices = devices
         self._movements = movements
+        self._chain = chain
         self._clock = clock
 
     async def delete(self, who: Identity, robot_type: str) -> None:
@@ -50,10 +60,12 @@ class DeleteRobotType:
                 raise not_found("robot-type", robot_type)
             await self._require_unused(who, robot_type)
             await note_look(self._tables, where, self._clock.now_ms() + AFTER_MS)
+            await change.noted()
             gone = replace(head, deleted=True, ready=0, manifest={})
             await self._tables.replace(store.ROBOT_TYPES, Row(row.partition, row.key, store.fields(gone), row.etag))
 
-        await store.retry(once)
+        async with self._chain.change(who.account, Deed.ROBOT_TYPE_DELETED, who, on=robot_type) as change:
+            await store.retry(once)
         if index is not None:
             with contextlib.suppress(Conflict):
                 await self._tables.delete(store.MEMBERS, index)

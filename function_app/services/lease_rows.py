@@ -44,7 +44,7 @@ class LeaseRows:
             lease = change(control.lease, now_ms)
             if lease is control.lease:
                 return lease, lease
-            facts = lease_change(device.id, control.lease, lease, by=who.name, now_ms=now_ms)
+            facts = lease_change(device.id, control.lease, lease, who=who, now_ms=now_ms, owner=device.owner)
             if facts and not watched:
                 await self._audit.watch(device.id)
                 watched = True

@@ -23,6 +23,7 @@ from function_app.ports.command_bus import BusUnavailable, CommandBus
 from function_app.ports.tables import Conflict, Row, Tables
 from function_app.services import store
 from function_app.services.action_rows import ActionRows
+from function_app.services.audit import Audit
 from function_app.services.control import read_control_rows
 from function_app.services.devices import left_devices
 from function_app.services.fence import Fence
@@ -55,6 +56,7 @@ class Leave:
         bus: CommandBus,
         series: SeriesWriter,
         forget: Forget,
+        audit: Audit,
         clock: Clock,
     ) -> None:
         self._tables = tables
@@ -66,6 +68,7 @@ class Leave:
         self._bus = bus
         self._series = series
         self._forget = forget
+        self._audit = audit
         self._clock = clock
 
     async def watch(self, agent: str) -> None:
@@ -109,6 +112,8 @@ class Leave:
             # Before its actions end: with them would go the lease that tells that somebody has moved it.
             await self._fence.end(device, leaving.why)
             await self._end_actions(device, leaving.why)
+            # While the agent's row still knows whose it was.
+            await self._audit.tell(device.id)
             await self._delete(store.AGENTS, agent.id, f"state:{device.name}", leaving)
             if leaving.why == "unpaired":
                 await self._series.forget(device.id, device.pairing)

@@ -13,6 +13,7 @@ from typing import Any
 
 from device_agent.protocol.messages import SHIPPED
 from function_app.domain.accounts import Identity
+from function_app.domain.audit_chain import Deed
 from function_app.domain.ids import ID
 from function_app.domain.movements import Movement
 from function_app.domain.problems import Problem, invalid, not_found
@@ -22,6 +23,7 @@ from function_app.ports.clock import Clock
 from function_app.ports.keys import Keys
 from function_app.ports.tables import Row, Tables, Write
 from function_app.services import store
+from function_app.services.audit_chain import AuditChain
 from function_app.services.forget import DAY_MS, Forget
 from function_app.services.robot_types import RobotTypes
 from function_app.services.script_store import ScriptStore, blob_name
@@ -57,6 +59,7 @@ class Movements:
         robot_types: RobotTypes,
         keys: Keys,
         forget: Forget,
+        chain: AuditChain,
         clock: Clock,
     ) -> None:
         self._tables = tables
@@ -64,6 +67,7 @@ class Movements:
         self._catalogue = catalogue
         self._types = robot_types
         self._forget = forget
+        self._chain = chain
         self._clock = clock
         self._read: dict[str, Script] = {}
 
@@ -173,11 +177,15 @@ class Movements:
             numbered = await self._scripts.sign(robot_type, await self._numbered(robot_type, new, old))
             await self._scripts.put(who, robot_type, numbered, draft.source)
             lost.append(numbered)
+            change.data["version"] = numbered.version
+            await change.noted()
             await self._tables.batch(store.MOVEMENTS, _writes(_partition(who, robot_type), numbered, row))
             lost.pop()
             return numbered, old is None or old.deleted
 
-        done = await store.retry(once)
+        on = f"{robot_type}/{name}"
+        async with self._chain.change(who.account, Deed.MOVEMENT_SAVED, who, on=on, sha256=new.sha256) as change:
+            done = await store.retry(once)
         for tried in lost:
             await self._drop_lost(who, robot_type, tried)
         return done
@@ -203,10 +211,13 @@ class Movements:
                     raise Problem("movement-built-in", 409, "Built-in", detail)
                 raise not_found("movement", name)
             gone = replace(old, deleted=True, updated_ms=self._clock.now_ms())
+            await change.noted()
             await self._tables.replace(store.MOVEMENTS, Row(row.partition, row.key, store.fields(gone), row.etag))
             return gone
 
-        await self._forget_versions(who, robot_type, await store.retry(once))
+        async with self._chain.change(who.account, Deed.MOVEMENT_DELETED, who, on=f"{robot_type}/{name}") as change:
+            gone = await store.retry(once)
+        await self._forget_versions(who, robot_type, gone)
 
     async def own(self, who: Identity, robot_type: str) -> tuple[str, ...]:
         """Names of the account's own movements of a robot type."""

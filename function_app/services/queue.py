@@ -209,7 +209,7 @@ class Queues:
         ]
         if lease is not control.lease:
             writes.append(control.write_lease(device.id, lease))
-            writes += lease_change(device.id, control.lease, lease, by=who.name, now_ms=now_ms)
+            writes += lease_change(device.id, control.lease, lease, who=who, now_ms=now_ms, owner=device.owner)
         rows: tuple[Row, ...] = await self._tables.batch(store.CONTROL, writes)
         return Found(started, rows[0])
 

@@ -312,7 +312,9 @@ class StartAction:
                 writes.append(control.write_queue(plan.device.id, control.queue.joined(plan.action)))
             elif lease is not None and lease is not control.lease:
                 writes.append(control.write_lease(plan.device.id, lease))
-                writes += lease_change(plan.device.id, control.lease, lease, by=who.name, now_ms=now_ms)
+                writes += lease_change(
+                    plan.device.id, control.lease, lease, who=who, now_ms=now_ms, owner=plan.device.owner
+                )
             if start.once:
                 data = {"action": plan.action, "request": start.fingerprint()}
                 writes.append(Write("create", Row(plan.device.id, action.once, data)))

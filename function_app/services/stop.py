@@ -158,7 +158,7 @@ class StopDevices:
             async with gate:
                 await self._queues.halt(device.id, STOPPED)
                 await self._audit.happened(
-                    device, Fact.STOP_ORDERED, message, severity="warning", by=who.name, reason=reason
+                    device, Fact.STOP_ORDERED, message, who=who, severity="warning", by=who.name, reason=reason
                 )
         except (Problem, StoreError) as error:
             _log.warning("stop of %s: %s", device.id, error)

@@ -34,8 +34,8 @@ CONTROL = "Control"
 ``event:<id>``, what is still to be told among the device's events."""
 PENDING = "Pending"
 """Partition: shard; key: ``<due ms>:<what>``, an action's id, ``queue:<device id>``, ``lease:<device id>``,
-``leave:<agent id>``, ``share-changed:<on>|<account id>``, ``share-expires:<on>|<account id>`` or
-``transfer:<invitation id>``."""
+``leave:<agent id>``, ``share-changed:<on>|<account id>``, ``share-expires:<on>|<account id>``
+``transfer:<invitation id>``, ``audit:<account>`` or ``anchor:<account>``."""
 ROBOT_TYPES = "RobotTypes"
 """Partition: ``<account>/<robot type>``; keys ``type``, ``version:<number>``. Index in ``Members``: ``type:<type>``."""
 MODEL_CHECKS = "ModelChecks"
@@ -60,6 +60,9 @@ UPLOADS = "Uploads"
 """Partition: ``<device>/<pairing>``; see ``services/uploads.py``."""
 EVENTS = "Events"
 """Partition: ``<device>/<pairing>``; key: counts down with time, newest first."""
+AUDIT = "Audit"
+"""Partition: account id (or ``cloud``); keys ``head``, ``record:<number>``, ``wait:<id>``, ``once:<day>:<id>``; and
+``chains``, which lists them. See ``services/audit_chain.py``."""
 FORGET = "Forget"
 """Partition: shard; key: ``<due ms>:<hash of what is to be deleted>``."""
 MAILBOX = "Mailbox"

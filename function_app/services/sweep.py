@@ -17,6 +17,7 @@ from function_app.ports.tables import Conflict, Row, Tables
 from function_app.services import store
 from function_app.services.action_rows import ActionRows, Found, place
 from function_app.services.audit import Audit, lease_of
+from function_app.services.audit_chain import AuditChain, anchor_of, chain_of
 from function_app.services.commands import Commands
 from function_app.services.conditions import Conditions
 from function_app.services.forget import DAY_MS, Forget
@@ -57,6 +58,7 @@ class Sweep:
         sharing: Sharing,
         invitations: Invitations,
         audit: Audit,
+        chain: AuditChain,
         access: BrokerAccess,
         forget: Forget,
         conditions: Conditions,
@@ -76,6 +78,7 @@ class Sweep:
         self._sharing = sharing
         self._invitations = invitations
         self._audit = audit
+        self._chain = chain
         self._access = access
         self._forget = forget
         self._conditions = conditions
@@ -123,6 +126,12 @@ class Sweep:
             await self._invitations.go_on(what, note)
         elif device := lease_of(what):
             await self._audit.look(device)
+            await self._pending.drop(note)
+        elif owner := chain_of(what):
+            await self._chain.look(owner)
+            await self._pending.drop(note)
+        elif owner := anchor_of(what):
+            await self._chain.anchor(owner)
             await self._pending.drop(note)
         else:
             await self._look_at_action(what, note)

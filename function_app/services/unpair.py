@@ -4,10 +4,12 @@ from collections.abc import Callable
 
 from function_app.domain import devices as rules
 from function_app.domain.accounts import Identity
+from function_app.domain.audit_chain import Deed
 from function_app.domain.devices import Agent
 from function_app.domain.problems import not_found
 from function_app.ports.tables import Row, Tables
 from function_app.services import store
+from function_app.services.audit_chain import AuditChain, Change
 from function_app.services.leave import Leave
 from function_app.services.sign_in import SignIn
 
@@ -15,10 +17,11 @@ from function_app.services.sign_in import SignIn
 class Unpair:
     """Ends a pairing, or takes it to another space."""
 
-    def __init__(self, *, tables: Tables, sign_in: SignIn, leave: Leave) -> None:
+    def __init__(self, *, tables: Tables, sign_in: SignIn, leave: Leave, chain: AuditChain) -> None:
         self._tables = tables
         self._sign_in = sign_in
         self._leave = leave
+        self._chain = chain
 
     async def unpair(self, who: Identity, agent_id: str) -> None:
         """End the pairing. The write on the agent's row decides; all that follows only tidies up.
@@ -29,7 +32,8 @@ class Unpair:
         Raises:
             Problem: ``agent-unknown``, ``busy``.
         """
-        await self._change(who, agent_id, rules.unpair)
+        async with self._chain.change(who.account, Deed.AGENT_UNPAIRED, who, on=agent_id) as change:
+            await self._change(who, agent_id, rules.unpair, change)
 
     async def move(self, who: Identity, agent_id: str, space: str) -> Agent:
         """Take an agent to another space of its account. What is known of its devices stays; what they do ends.
@@ -44,9 +48,10 @@ class Unpair:
                 raise not_found("space", space)
             return agent if agent.space == space else rules.move(agent, space)
 
-        return await self._change(who, agent_id, moved)
+        async with self._chain.change(who.account, Deed.AGENT_MOVED, who, on=agent_id, space=space) as change:
+            return await self._change(who, agent_id, moved, change)
 
-    async def _change(self, who: Identity, agent_id: str, change: Callable[[Agent], Agent]) -> Agent:
+    async def _change(self, who: Identity, agent_id: str, rule: Callable[[Agent], Agent], change: Change) -> Agent:
         watched = False
 
         async def once() -> Agent:
@@ -55,11 +60,12 @@ class Unpair:
             agent = store.read(row, Agent) if row else None
             if row is None or agent is None or agent.account != who.account:
                 raise not_found("agent", agent_id)
-            changed = change(agent)
+            changed = rule(agent)
             if changed is not agent:
                 if not watched:
                     await self._leave.watch(agent_id)
                     watched = True
+                await change.noted()
                 await self._tables.replace(store.AGENTS, Row(agent_id, "agent", store.fields(changed), row.etag))
             return changed
 

@@ -8,6 +8,7 @@ from collections.abc import Mapping
 import msgspec
 
 from function_app.domain.accounts import Identity
+from function_app.domain.audit_chain import Deed
 from function_app.domain.problems import Problem, busy_store, invalid
 from function_app.domain.robot_types import TypeHead, TypeVersion, next_version
 from function_app.ports.blobs import Blobs
@@ -15,6 +16,7 @@ from function_app.ports.catalogue import Catalogue
 from function_app.ports.clock import Clock
 from function_app.ports.tables import Conflict, Row, Tables, Write
 from function_app.services import store
+from function_app.services.audit_chain import AuditChain, Change
 from function_app.services.model_files import Upload, read_upload
 from function_app.services.robot_type_rows import (
     CHECKS,
@@ -39,12 +41,20 @@ class UploadRobotType:
     """Stores an upload and waits for the checker's verdict."""
 
     def __init__(
-        self, *, tables: Tables, blobs: Blobs, catalogue: Catalogue, robot_types: RobotTypes, clock: Clock
+        self,
+        *,
+        tables: Tables,
+        blobs: Blobs,
+        catalogue: Catalogue,
+        robot_types: RobotTypes,
+        chain: AuditChain,
+        clock: Clock,
     ) -> None:
         self._tables = tables
         self._blobs = blobs
         self._catalogue = catalogue
         self._types = robot_types
+        self._chain = chain
         self._clock = clock
 
     async def upload(
@@ -66,7 +76,8 @@ class UploadRobotType:
             raise Problem("robot-type-built-in", 409, "Built-in", detail)
         await note_look(self._tables, where, self._clock.now_ms() + GIVE_UP_MS)
         await self._index(where)
-        version, new = await self._number(where, given)
+        async with self._chain.change(who.account, Deed.ROBOT_TYPE_UPLOADED, who, on=where.type) as change:
+            version, new = await self._number(where, given, change)
         await self._index(where)
         for name, content in given.files.items():
             await self._blobs.put(where.prefix(version) + name, content)
@@ -92,7 +103,7 @@ class UploadRobotType:
                 raise Problem("robot-types-full", 409, "Too many robot types", detail)
             await self._tables.create(store.MEMBERS, Row(where.account, key, {}))
 
-    async def _number(self, where: Place, given: Upload) -> tuple[int, bool]:
+    async def _number(self, where: Place, given: Upload, change: Change) -> tuple[int, bool]:
         """Take the next version's number, and write that it is on its way."""
         manifest = msgspec.to_builtins(given.robot_type)
         sizes = {name: len(content) for name, content in given.files.items()}
@@ -106,6 +117,8 @@ class UploadRobotType:
             new_head = Row(where.partition, HEAD, store.fields(following), row.etag if row else "")
             new_version = Row(where.partition, version_key(following.last), store.fields(upload))
             writes = [Write("replace" if row else "create", new_head), Write("create", new_version)]
+            change.data["version"] = following.last
+            await change.noted()
             await self._tables.batch(store.ROBOT_TYPES, writes)
             return following.last, head is None or head.deleted
 
