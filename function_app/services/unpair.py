@@ -33,7 +33,8 @@ class Unpair:
             Problem: ``agent-unknown``, ``busy``.
         """
         async with self._chain.change(who.account, Deed.AGENT_UNPAIRED, who, on=agent_id) as change:
-            await self._change(who, agent_id, rules.unpair, change)
+            changed = await self._change(who, agent_id, rules.unpair, change)
+        await self._finish(changed)
 
     async def move(self, who: Identity, agent_id: str, space: str) -> Agent:
         """Take an agent to another space of its account. What is known of its devices stays; what they do ends.
@@ -49,7 +50,9 @@ class Unpair:
             return agent if agent.space == space else rules.move(agent, space)
 
         async with self._chain.change(who.account, Deed.AGENT_MOVED, who, on=agent_id, space=space) as change:
-            return await self._change(who, agent_id, moved, change)
+            changed = await self._change(who, agent_id, moved, change)
+        await self._finish(changed)
+        return changed
 
     async def _change(self, who: Identity, agent_id: str, rule: Callable[[Agent], Agent], change: Change) -> Agent:
         watched = False
@@ -69,7 +72,8 @@ class Unpair:
                 await self._tables.replace(store.AGENTS, Row(agent_id, "agent", store.fields(changed), row.etag))
             return changed
 
-        changed = await store.retry(once)
-        if changed.leaving:
-            await self._leave.finish(agent_id)
-        return changed
+        return await store.retry(once)
+
+    async def _finish(self, agent: Agent) -> None:
+        if agent.leaving:
+            await self._leave.finish(agent.id)

@@ -51,7 +51,8 @@ def reason(person: Person, action: str) -> tuple[str, str]:
 
 def notes(cloud: Cloud) -> list[str]:
     pages = [cloud.run(cloud.functions.tables.query(store.PENDING, str(shard))) for shard in range(SHARDS)]
-    return [row.key for page in pages for row in page.rows]
+    keys = [row.key for page in pages for row in page.rows]
+    return [key for key in keys if key.split(":")[1] not in {"anchor", "audit"}]
 
 
 def pass_time(cloud: Cloud, seconds: float, step_s: float = 1.0) -> None:

@@ -25,9 +25,10 @@ WAVE = {"kind": "run_movement", "name": "slow_square", "parameters": {"side_m": 
 
 
 def notes(cloud: Cloud) -> list[str]:
-    """Actions that the timer still means to look at."""
+    """Actions that the timer still means to look at, beside the chains of who did what."""
     pages = [cloud.run(cloud.functions.tables.query(store.PENDING, str(shard))) for shard in range(SHARDS)]
-    return [row.key for page in pages for row in page.rows]
+    keys = [row.key for page in pages for row in page.rows]
+    return [key for key in keys if key.split(":")[1] not in {"anchor", "audit"}]
 
 
 def rows(cloud: Cloud, device: str) -> dict[str, dict[str, Any]]:
@@ -290,7 +291,7 @@ def end_last(anna: Person, robot: Robot) -> None:
     assert anna.action(last, wait_ms=10_000)["status"] == "done"
 
 
-@pytest.mark.parametrize("after", range(2, 10))
+@pytest.mark.parametrize("after", range(4, 13))
 def test_an_unpairing_killed_after_any_write_gives_the_robot_away_whole(
     cloud: Cloud, pair: Pair, mortal: Mortal, after: int
 ) -> None:
@@ -313,7 +314,7 @@ def test_an_unpairing_killed_after_any_write_gives_the_robot_away_whole(
     assert bert.get(f"/devices/{robot.device}/actions").json()["items"][1:] == []
 
 
-@pytest.mark.parametrize("after", range(1, 6))
+@pytest.mark.parametrize("after", range(1, 9))
 def test_a_claim_killed_after_any_write_can_be_made_again_or_is_made(cloud: Cloud, mortal: Mortal, after: int) -> None:
     anna = cloud.sign_in("anna")
     robot = cloud.robot()
