@@ -119,7 +119,7 @@ def written(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[Cloud, s
 
         async def write() -> None:
             for number in range(10):
-                data = {"n": number, "text": 'ä"\\', "deep": {"list": [1, 2.5, None, True]}}
+                data: dict[str, Any] = {"n": number, "text": 'ä"\\', "deep": {"list": [1, 2.5, None, True]}}
                 await cloud.functions.chain.record(OWNER, "did", WHO, on=f"d{number}", **data)
                 if number == 4:
                     await cloud.functions.chain.anchor(OWNER)
