@@ -34,7 +34,7 @@ from tests.support.processes import (
 TTL_S, TIMEOUT_S, QUEUE_S = 2, 6, 10
 MOVE = MoveJoints(position_rad={"elbow": 1.0})
 TERMINAL = {"done", "failed", "expired", "cancelled"}
-MOST_STEPS = 30
+MOST_STEPS = 60
 
 
 def asked(**more: Any) -> Start:
@@ -195,7 +195,7 @@ CASES: dict[str, tuple[Callable[[Functions], Awaitable[Scene]], Work, int]] = {
     "timer": (queued, time_out, 4),
 }
 LONG_CASES = ("stop before a queue", "un-pair")
-"""With so many steps that CI is content with every second one."""
+"""With so many steps that CI is content with every third one."""
 """What it starts from, what is done, and the steps that it has at least."""
 
 
@@ -302,7 +302,7 @@ def actions_sent(sent: dict[str, set[bytes]]) -> set[str]:
 @pytest.mark.parametrize("place", ["local"], indirect=True)
 @pytest.mark.parametrize("case", CASES)
 def test_killed_at_any_step_it_leaves_nothing_without_an_end(place: Place, case: str) -> None:
-    scenes = kill_at_every_step(place, case, stride=2 if case in LONG_CASES else 1)
+    scenes = kill_at_every_step(place, case, stride=3 if case in LONG_CASES else 1)
     run_here(place, lambda functions: look(functions, place, scenes))
 
 
