@@ -166,9 +166,10 @@ class AuditTrail:
     async def _signature(self, chain: str, end: Row, head: Head) -> str:
         if set(end.data) != {"seq", "hash", "at_ms", "key", "signature"}:
             return "the head has other fields than it was written with"
-        key = (await self._keys.public()).get(str(end.data["key"]))
+        key = (await self._keys.archive()).get(str(end.data["key"]))
         if key is None:
-            return f"the head is signed with the key {str(end.data['key'])[:40]!r}, which is none of this cloud's"
+            name = str(end.data["key"])[:40]
+            return f"the head is signed with the key {name!r}, which is none of this cloud's, or has leaked"
         try:
             text = str(end.data["signature"])
             signature = base64.b64decode(text, altchars=b"-_", validate=True)
