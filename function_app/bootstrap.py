@@ -267,6 +267,7 @@ def build(settings: Settings, *, clock: Clock | None = None) -> Functions:
         ),
         pending=pending,
         audit=audit,
+        chain=chain,
         clock=now,
     )
     invitations = Invitations(
@@ -276,6 +277,7 @@ def build(settings: Settings, *, clock: Clock | None = None) -> Functions:
         sign_in=sign_in,
         pending=pending,
         forget=forget,
+        chain=chain,
         clock=now,
     )
     latencies = Latencies(tables=tables, forget=forget, clock=now)

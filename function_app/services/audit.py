@@ -128,10 +128,20 @@ class Audit:
         Raises:
             StoreError: The tables cannot be used.
         """
-        fresh = Happened(new_id(), fact, self._clock.now_ms(), message, data, severity)
-        event = fresh.event(device.name)
-        await self._events.add(device.id, device.pairing, event)
+        event = await self.event(device, fact, message, severity=severity, **data)
         await self._chain.keep(device.owner or CLOUD, _entry(device.id, event, _by(who), outcome))
+
+    async def event(
+        self, device: Device, fact: Fact, message: str, *, severity: Any = "info", **data: Any
+    ) -> Mapping[str, Any]:
+        """The same among the device's events alone, for what has its record otherwise; gives the event.
+
+        Raises:
+            StoreError: The tables cannot be used.
+        """
+        event = Happened(new_id(), fact, self._clock.now_ms(), message, data, severity).event(device.name)
+        await self._events.add(device.id, device.pairing, event)
+        return event
 
     @contextlib.asynccontextmanager
     async def refusals(self, device: Device, who: Identity, what: str) -> AsyncGenerator[None]:

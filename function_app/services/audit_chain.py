@@ -7,10 +7,7 @@ same time goes into one batch.
 Nothing that was acknowledged is missing. A change of the account is noted (``wait:<id>``) before the write that decides
 it, and its record takes the note away in its own batch; what a killed process leaves, the timer records as ``unknown``.
 What ``services/audit.py`` tells comes at least once, from rows written in the batch of the change, and is recorded once
-by its id (``once:<day>:<id>``).
-
-The signed head alone does not show that somebody with the tables in hand has put an older head back and cut off what
-came after it. So the timer notes it every hour in which there was something new in the blob store and in the log.
+by its id (``once:<day>:<id>``). Heads are noted elsewhere, against a chain that is cut off: see the architecture page.
 """
 
 import asyncio
@@ -83,7 +80,7 @@ class _Line:
 
 
 class Change:
-    """A change that is being made. ``data`` may be added to until it ends."""
+    """A change that is being made. Until it ends, ``data`` may be added to, and it may have ``came_to_nothing``."""
 
     def __init__(self, chain: "AuditChain", owner: str, fields: Entry) -> None:
         self.data: dict[str, Any] = dict(fields.data)
@@ -91,7 +88,7 @@ class Change:
         self._owner = owner
         self._entry = fields
         self._row: Row | None = None
-        self._nothing = False
+        self.came_to_nothing = False
 
     async def noted(self) -> None:
         """Note it: to be called before the write that decides, any number of times.
@@ -102,13 +99,9 @@ class Change:
         if self._row is None:
             self._row = await self._chain.open(self._owner, replace(self._entry, outcome="unknown"))
 
-    def nothing(self) -> None:
-        """Say that it was not made after all: somebody else was faster."""
-        self._nothing = True
-
     async def end(self, outcome: Outcome) -> None:
         """Say how it ended, where it was noted."""
-        if self._row is not None and self._nothing and outcome == "done":
+        if self._row is not None and self.came_to_nothing and outcome == "done":
             await self._chain.drop(self._row)
         elif self._row is not None:
             entry = replace(self._entry, outcome=outcome, data=self.data)
@@ -241,8 +234,6 @@ class AuditChain:
         await self._blobs.append(anchors(owner), line.encode())
         _log.info("audit head of %s: %s:%s", owner, row.data["seq"], row.data["hash"])
 
-    # ------------------------------------------------------------ notes
-
     async def open(self, owner: str, entry: Entry) -> Row:
         """Note an entry for the timer.
 
@@ -277,8 +268,6 @@ class AuditChain:
         self._noted[key] = None
         _bound(self._noted, key)
         return fresh
-
-    # ------------------------------------------------------------ the chain
 
     async def _append(self, owner: str, jobs: Sequence[_Job]) -> None:
         """Record ``jobs``, in order, together with what others in this process want to record."""

@@ -81,7 +81,7 @@ class Claim:
         async with self._chain.change(who.account, Deed.AGENT_CLAIMED, who, on=agent, space=space) as change:
             claimed = await store.retry(lambda: self._take(who, code, agent, space, change))
             if claimed is None:
-                change.nothing()
+                change.came_to_nothing = True
         if claimed is not None:
             with contextlib.suppress(Conflict):
                 await self._tables.delete(store.CLAIMS, found)

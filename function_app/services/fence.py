@@ -52,7 +52,8 @@ class Fence:
             if account not in {None, known.account}:
                 return None
             lease = Lease(epoch=known.epoch + 1, pairing=device.pairing)
-            facts = told(device.id, device.pairing, [ended(known, lease, why=why, now_ms=self._clock.now_ms())])
+            fact = ended(known, lease, why=why, now_ms=self._clock.now_ms())
+            facts = told(device.id, device.pairing, [fact], owner=device.owner)
             await self._tables.batch(store.CONTROL, [control.write_lease(device.id, lease), *facts])
             return lease
 

@@ -11,6 +11,7 @@ from typing import Final
 
 from function_app.domain import invitations as rules
 from function_app.domain.accounts import Account, Identity, Role
+from function_app.domain.audit_chain import Deed
 from function_app.domain.devices import Agent
 from function_app.domain.ids import ID, new_id
 from function_app.domain.invitations import Invitation
@@ -19,6 +20,7 @@ from function_app.domain.sharing import split_target
 from function_app.ports.clock import Clock
 from function_app.ports.tables import Conflict, Row, Tables
 from function_app.services import store
+from function_app.services.audit_chain import AuditChain
 from function_app.services.forget import Forget
 from function_app.services.identity import new_secret
 from function_app.services.pending import Pending
@@ -71,6 +73,7 @@ class Invitations:
         sign_in: SignIn,
         pending: Pending,
         forget: Forget,
+        chain: AuditChain,
         clock: Clock,
     ) -> None:
         self._tables = tables
@@ -79,6 +82,7 @@ class Invitations:
         self._sign_in = sign_in
         self._pending = pending
         self._forget = forget
+        self._chain = chain
         self._clock = clock
 
     # ------------------------------------------------------------ the owner's side
@@ -139,7 +143,10 @@ class Invitations:
         await self._forget.row(store.INVITATIONS, known.id[0], known.id, due_ms=fresh.expires_ms)
         await self._forget.row(store.SHARES, fresh.on, _INDEX + known.id, due_ms=fresh.expires_ms)
         await self._tables.create(store.SHARES, Row(fresh.on, _INDEX + known.id, {"expires_ms": fresh.expires_ms}))
-        await self._tables.create(store.INVITATIONS, Row(known.id[0], known.id, store.fields(fresh)))
+        terms = {"invitation": known.id[:12], "role": offer.role.value, "uses": offer.uses, "for": offer.account}
+        async with self._chain.change(fresh.owner, Deed.INVITED, who, on=fresh.on, **terms) as change:
+            await change.noted()
+            await self._tables.create(store.INVITATIONS, Row(known.id[0], known.id, store.fields(fresh)))
         return secret, known
 
     async def open(self, shared: Shared) -> list[Known]:
@@ -157,7 +164,7 @@ class Invitations:
         ]
         return sorted(known, key=lambda each: each.invitation.created_ms)
 
-    async def withdraw(self, shared: Shared, invitation: str) -> None:
+    async def withdraw(self, who: Identity, shared: Shared, invitation: str) -> None:
         """Take an invitation back. What was redeemed stays shared.
 
         Raises:
@@ -168,9 +175,12 @@ class Invitations:
             row, known = await self._get(invitation)
             if row is None or known is None or known.on != shared.on or not known.open(self._clock.now_ms()):
                 raise not_found("invitation", invitation)
+            await change.noted()
             await self._tables.delete(store.INVITATIONS, row)
 
-        await store.retry(once)
+        named = {"invitation": invitation[:12]}
+        async with self._chain.change(shared.owner.id, Deed.INVITATION_REVOKED, who, on=shared.on, **named) as change:
+            await store.retry(once)
         await self._unlist(shared.on, invitation)
 
     # ------------------------------------------------------------ the other side
@@ -208,7 +218,7 @@ class Invitations:
         if offered.role is Role.OWNER:
             await self._take(who, known, space)
         else:
-            await self._use(known.id, who.account)
+            await self._use(who, known)
             owner = Account(offered.owner, offered.by)
             shared = Shared(offered.on, owner, offered.label, offered.pairing)
             giver = Identity(offered.owner, offered.by, "")
@@ -241,11 +251,19 @@ class Invitations:
             if row is None or fresh is None or not fresh.open(self._clock.now_ms()):
                 raise _unknown()
             taken = fresh.taken(who.account, goal)
+            await given.noted()
+            await got.noted()
             await self._tables.replace(store.INVITATIONS, Row(row.partition, row.key, store.fields(taken), row.etag))
             return taken
 
+        owner, on, to = known.invitation.owner, known.invitation.on, {"to": who.account}
+        async with (
+            self._chain.change(owner, Deed.TRANSFERRED, who, on=on, **to) as given,
+            self._chain.change(who.account, Deed.TRANSFERRED, who, on=on, **to) as got,
+        ):
+            taken = await store.retry(once)
         try:
-            await self._carry_out(known.id, await store.retry(once))
+            await self._carry_out(known.id, taken)
         except _Void as nothing:
             raise void() from nothing
         if note is not None:
@@ -261,21 +279,24 @@ class Invitations:
             raise _Void from problem
         await self._delete(invitation, taken)
 
-    async def _use(self, invitation: str, account: str) -> None:
+    async def _use(self, who: Identity, known: Known) -> None:
         """Count one use, or find that somebody else was faster."""
 
         async def once() -> None:
-            row, fresh = await self._get(invitation)
-            if row is None or fresh is None or not fresh.open(self._clock.now_ms()) or account in fresh.takers:
+            row, fresh = await self._get(known.id)
+            if row is None or fresh is None or not fresh.open(self._clock.now_ms()) or who.account in fresh.takers:
                 raise _unknown()
-            left = fresh.used(account)
+            left = fresh.used(who.account)
+            await change.noted()
             if left.uses:
                 await self._tables.replace(store.INVITATIONS, Row(row.partition, row.key, store.fields(left), row.etag))
             else:
                 await self._tables.delete(store.INVITATIONS, row)
-                await self._unlist(left.on, invitation)
+                await self._unlist(left.on, known.id)
 
-        await store.retry(once)
+        owner, on, terms = known.invitation.owner, known.invitation.on, {"invitation": known.id[:12]}
+        async with self._chain.change(owner, Deed.INVITATION_REDEEMED, who, on=on, **terms) as change:
+            await store.retry(once)
 
     async def _good(self, known: Invitation) -> bool:
         """Whether what it offers is still the offerer's."""

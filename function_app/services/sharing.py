@@ -10,6 +10,7 @@ from dataclasses import dataclass, replace
 from typing import Final, Literal
 
 from function_app.domain.accounts import Account, Identity, Role
+from function_app.domain.audit_chain import Deed
 from function_app.domain.authority import Fact
 from function_app.domain.devices import NEVER_MS
 from function_app.domain.problems import Problem, forbidden, invalid, not_found
@@ -27,6 +28,7 @@ from function_app.ports.clock import Clock
 from function_app.ports.tables import Conflict, Row, Tables
 from function_app.services import store
 from function_app.services.audit import Audit
+from function_app.services.audit_chain import AuditChain
 from function_app.services.devices import Devices, require_owner, share_key
 from function_app.services.pending import Pending
 from function_app.services.sign_in import SignIn
@@ -66,6 +68,7 @@ class Sharing:
         unshare: Unshare,
         pending: Pending,
         audit: Audit,
+        chain: AuditChain,
         clock: Clock,
     ) -> None:
         self._tables = tables
@@ -75,6 +78,7 @@ class Sharing:
         self._unshare = unshare
         self._pending = pending
         self._audit = audit
+        self._chain = chain
         self._clock = clock
 
     # ------------------------------------------------------------ what people ask for
@@ -202,12 +206,16 @@ class Sharing:
             lowered = before is not None and (outranks(before.role, share.role) or share.expires_ms < before.expires_ms)
             if row is None:
                 await self._check_room(share.on)
+            await change.noted()
+            if row is None:
                 await self._tables.create(store.SHARES, Row(share.on, share_key(share.account), store.fields(share)))
             else:
                 await self._tables.replace(store.SHARES, replace(row, data=store.fields(share)))
             return share, before is None
 
-        written, fresh = await store.retry(once)
+        terms = {"with": account.id, "role": share.role.value, "expires_ms": share.expires_ms}
+        async with self._chain.change(share.owner, Deed.SHARED, who, on=share.on, **terms) as change:
+            written, fresh = await store.retry(once)
         if written is share:
             message = f"{who.name} shared it with {account.name} as {share.role}."
             await self._tell(share, Fact.SHARED, message, by=who.name, account=account.id, role=share.role.value)
@@ -227,9 +235,14 @@ class Sharing:
         """Delete the share's row, which decides, and end what was done under it."""
         share = store.read(row, Share)
         note = await self._pending.note(_note(_CHANGED, share), self._clock.now_ms() + LOOK_MS)
-        try:
-            await self._tables.delete(store.SHARES, row)
-        except Conflict:
+        on = {"on": share.on, "with": share.account}
+        async with self._chain.change(share.owner, Deed.UNSHARED, who, **on) as change:
+            await change.noted()
+            try:
+                await self._tables.delete(store.SHARES, row)
+            except Conflict:
+                change.came_to_nothing = True
+        if change.came_to_nothing:
             fresh = await self._tables.get(store.SHARES, row.partition, row.key)
             if fresh is not None:
                 await self._end(who, fresh)
@@ -247,7 +260,7 @@ class Sharing:
         kind, name = split_target(share.on)
         device = await self._devices.owned(name) if kind == "device" else None
         if device is not None and device.pairing == share.pairing:
-            await self._audit.happened(device, fact, message, **data)
+            await self._audit.event(device, fact, message, **data)
 
     async def _drop(self, note: Row | None) -> None:
         if note is not None:

@@ -178,7 +178,8 @@ class _Invitations:
         return answer(contract.InvitationList(items=items, cursor=None))
 
     async def withdraw(self, request: Request, kind: Kind, name: str, invitation: str) -> Response:
-        await self._functions.invitations.withdraw(await self._of(request, kind, name), invitation)
+        who = await self._caller.account(request)
+        await self._functions.invitations.withdraw(who, await self._of(request, kind, name), invitation)
         return empty()
 
     async def _of(self, request: Request, kind: Kind, name: str) -> Shared:

@@ -63,6 +63,29 @@ class TestWhatIsRecorded:
         assert (stop["who"], stop["by_account"], stop["data"]["reason"]) == ("anna", anna.account, "look out")
         assert verdict(cloud, anna.account) == ""
 
+    def test_what_others_do_on_what_is_shared_stands_in_its_owners_chain(self, cloud: Cloud) -> None:
+        anna, bert = cloud.sign_in("anna"), cloud.sign_in("bert")
+        robot = cloud.robot()
+        device = robot.pair(anna)
+        anna.post(f"/devices/{device}/shares", {"account": "bert", "role": "operator"})
+        bert.take(device)
+        anna.delete(f"/devices/{device}/shares/{bert.account}")
+        secret = anna.post(f"/devices/{device}/invitations", {"role": "viewer"}).json()["secret"]
+        assert bert.post("/invitations/redeem", {"secret": secret}).status_code == 200
+        problem(bert.take(device), 403, "forbidden")
+        items = [item for item in reversed(anna.get("/accounts/me/audit").json()["items"]) if device in item["on"]]
+        assert [(item["what"], item["who"]) for item in items] == [
+            ("shared", "anna"),
+            ("control-taken", "bert"),
+            ("unshared", "anna"),
+            ("invited", "anna"),
+            ("invitation-redeemed", "bert"),
+            ("shared", "anna"),
+            ("order-refused", "bert"),
+        ]
+        assert not [kind for kind in kinds(bert) if "sign" not in kind]
+        assert verdict(cloud, anna.account) == ""
+
     def test_movements_are_told_and_what_was_refused_before_anything_changed_is_not(self, cloud: Cloud) -> None:
         anna = cloud.sign_in("anna")
         anna.put("/robot-types/ur5/movements/mine", {"source": "1"})

@@ -193,7 +193,7 @@ def test_of_two_who_accept_a_transfer_at_once_one_gets_it(cloud: Cloud, three: T
     assert sorted(len(roles(person)) for person in (anna, bert, clara)) == [0, 0, 1]
 
 
-@pytest.mark.parametrize("after", [1, 2, 3, 4, 6, 8, 11, 14])
+@pytest.mark.parametrize("after", [1, 4, 5, 6, 7, 9, 12, 17])
 def test_whoever_accepts_killed_after_any_write_leaves_the_rest_to_the_timer(
     cloud: Cloud, three: Three, mortal: Mortal, after: int
 ) -> None:
@@ -211,7 +211,7 @@ def test_whoever_accepts_killed_after_any_write_leaves_the_rest_to_the_timer(
     cloud.clock.advance(LOOK_MS / 1000 + 61)
     cloud.sweep()
     if roles(anna):
-        assert after <= 2, "only before the write that accepts it"
+        assert after <= 5, "only before the write that accepts it"
         assert redeem(bert, made).status_code == 200
     assert (roles(anna), roles(bert)) == ({}, {robot.device: "owner"})
     assert [item["name"] for item in bert.get("/spaces").json()["items"]] == ["Home", "Attic"]
