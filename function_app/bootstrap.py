@@ -320,9 +320,7 @@ def build(settings: Settings, *, clock: Clock | None = None) -> Functions:
             clock=now,
         ),
         enroll=Enroll(tables=tables, leave=leave, forget=forget, clock=now),
-        claim=Claim(
-            tables=tables, sign_in=sign_in, attempts=attempts, leave=leave, chain=chain, clock=now
-        ),
+        claim=Claim(tables=tables, sign_in=sign_in, attempts=attempts, leave=leave, chain=chain, clock=now),
         unpair=Unpair(tables=tables, sign_in=sign_in, leave=leave, chain=chain),
         devices=devices,
         spaces=spaces,
