@@ -55,10 +55,14 @@ class Bench:
         return {(first, second) for first, second in names}
 
 
-def heard(kind: robot_type.RobotType) -> dict[str, Any]:
-    """What a robot with sonars hears in an empty hall; its own tests have walls."""
-    sonar = {"values": {"distance_m.left": 4.0, "distance_m.right": 4.0}, "age_s": 0.0}
-    return {"sonar": sonar} if any(stream.name == "sonar" for stream in kind.streams) else {}
+def heard(kind: robot_type.RobotType, yaw_rad: float) -> dict[str, Any]:
+    """What a robot that is turned so measures in an empty hall; its own tests have walls."""
+    measured = {
+        "sonar": {"distance_m.left": 4.0, "distance_m.right": 4.0},
+        "odometry": {"yaw_rad": yaw_rad},
+    }
+    streams = [stream.name for stream in kind.streams if stream.name in measured]
+    return {name: {"values": measured[name], "age_s": 0.0} for name in streams}
 
 
 def whereabouts(kind: robot_type.RobotType, x_m: float, y_m: float, yaw_rad: float) -> dict[str, Any]:

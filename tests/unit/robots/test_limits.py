@@ -102,10 +102,10 @@ class LimitedRobot:
         self.move_joints(self.type.postures[name], speed=speed)
 
     def state(self) -> dict[str, Any]:
-        streams = heard(self.type)
-        if self.type.base is not None:
-            streams["odometry"] = {"values": {"yaw_rad": self.place[2]}, "age_s": 0.0}
-        return {"position_rad": dict(zip(self.joints, self.position, strict=True)), "streams": streams}
+        return {
+            "position_rad": dict(zip(self.joints, self.position, strict=True)),
+            "streams": heard(self.type, self.place[2]),
+        }
 
 
 def play(path: Path, parameters: dict[str, Any]) -> LimitedRobot:

@@ -61,10 +61,7 @@ class PlayedRobot:
     def state(self) -> dict[str, Any]:
         bench = self.bench
         position_rad = dict(zip(bench.names, bench.data.qpos[bench.qpos].tolist(), strict=True))
-        streams = heard(bench.type)
-        if bench.type.base is not None:
-            streams["odometry"] = {"values": {"yaw_rad": self.place()[2]}, "age_s": 0.0}
-        return {"position_rad": position_rad, "streams": streams}
+        return {"position_rad": position_rad, "streams": heard(bench.type, self.place()[2])}
 
     def place(self) -> tuple[float, float, float]:
         """x, y [m], yaw [rad] of its base."""
