@@ -1,21 +1,24 @@
 """The laboratory with its own sensors and perception, its robots moved as the agent moves them, against the truth."""
 
+import contextlib
 import dataclasses
 import math
 import threading
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from typing import Any
 
 import msgspec
 import numpy as np
+import pytest
 
-from device_agent.drivers.mujoco import WalkingDriver
+from device_agent.drivers.mujoco import WalkingDriver, driver
 from device_agent.ports.driver import Twist
 from device_agent.ports.sensor import Image, RoomDriver, Scan
 from device_agent.protocol import robot_type
 from device_agent.protocol.room import Room
 from device_agent.runtime.controller import Controller
 from device_agent.runtime.lease import LeaseGate
+from device_agent.sensors.mujoco import cameras, studio, view
 from device_agent.sensors.perception import PerceptionDriver
 from tests.support.rooms import LAB, ROBOTS, StillWorld
 
@@ -25,6 +28,17 @@ EVERY = {"depth_ceiling": 2}
 PERIOD_S = 0.2
 WALK = (Twist(0.1, 0.0, 0.0), Twist(0.08, 0.0, 0.3), Twist(-0.05, 0.0, 0.3), Twist(0.0, 0.05, 0.0))
 """What NAO does, one after the other: it stays about where it began."""
+
+
+@contextlib.contextmanager
+def by_hand() -> Iterator[None]:
+    """Time is driven by hand: everything that looks sees the present, and nobody minds how long a picture takes."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(view, "OLDEST_S", -1.0)
+        patch.setattr(cameras, "FRESH_S", -1.0)
+        patch.setattr(studio, "WITHIN_S", 60.0)
+        patch.setattr(driver, "STALE_S", math.inf)
+        yield
 
 
 class Watched:
@@ -53,8 +67,7 @@ class Watched:
         """Forget all that was seen."""
         entry = self.world.entry("perception")
         options = {**entry.options, "cameras": list(EYES[1:]), "light": ""}
-        driver = PerceptionDriver(msgspec.structs.replace(entry, options=options), LAB, self.eyes)
-        self.sight = driver.make()
+        self.sight = PerceptionDriver(msgspec.structs.replace(entry, options=options), LAB, self.eyes).make()
 
     def close(self) -> None:
         for eye in self.eyes.values():

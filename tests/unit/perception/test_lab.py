@@ -9,9 +9,8 @@ import msgspec
 import numpy as np
 import pytest
 
-from device_agent.sensors.mujoco import cameras, view
 from tests.support.rooms import StillWorld
-from tests.unit.perception.lab import EYES, Watched
+from tests.unit.perception.lab import EYES, Watched, by_hand
 
 MEDIAN_M = 0.15
 """What issue 5 promises."""
@@ -26,10 +25,7 @@ SAME = 0.01
 
 @pytest.fixture(scope="module", autouse=True)
 def _present() -> Iterator[None]:
-    """Everything that looks sees the present: time is driven by hand."""
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(view, "OLDEST_S", -1.0)
-        patch.setattr(cameras, "FRESH_S", -1.0)
+    with by_hand():
         yield
 
 

@@ -20,11 +20,10 @@ from device_agent.runtime.courses import Course
 from device_agent.runtime.lease import LeaseGate, Refused
 from device_agent.runtime.robot import ScriptRobot
 from device_agent.runtime.room import Reading, Room
-from device_agent.sensors.mujoco import cameras, view
 from device_agent.sensors.perception.driver import _flat
 from tests.support.rooms import STEP_S
 from tests.unit.perception.lab import PERIOD_S as LOOK_S
-from tests.unit.perception.lab import Watched
+from tests.unit.perception.lab import Watched, by_hand
 from tests.unit.robots.folders import ROBOTS
 
 QBO = robot_type.load(ROBOTS / "qbo")
@@ -34,10 +33,7 @@ NEAR_M, NEAR_RAD = 0.15, math.radians(10)
 
 @pytest.fixture(scope="module", autouse=True)
 def _present() -> Iterator[None]:
-    """Everything that looks sees the present: time is driven by hand."""
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(view, "OLDEST_S", -1.0)
-        patch.setattr(cameras, "FRESH_S", -1.0)
+    with by_hand():
         yield
 
 
