@@ -115,6 +115,7 @@ export const texts = {
     mine: "You have control",
     unconfirmed: "You have control; the robot has not confirmed it yet",
     free: "Nobody has control",
+    watches: "You may watch this device, not operate it. Ask its owner.",
     other: (holder: string): string => `${holder} has control`,
     elsewhere: "This sign-in has control in another tab",
     lost: (why: string): string => `Control lost: ${why}`,

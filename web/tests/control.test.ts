@@ -79,6 +79,7 @@ const info: Device = {
   agent: "a1",
   space: "lab",
   role: "owner",
+  owner: { id: "account0001", name: "Ann" },
   topic: TOPIC,
   online: true,
   last_seen_at: null,

@@ -165,6 +165,39 @@ def test_revoking_a_principal_cuts_all_its_sessions_and_no_others(broker: Runnin
         assert not other.disconnected.is_set()
 
 
+@pytest.mark.parametrize(
+    ("named", "cut"),
+    [
+        ("account:{a}:s1", {"a1", "a1w"}),
+        ("account:{a}:+:watch", {"a1w", "a2w"}),
+        ("account:{a}", {"a1", "a1w", "a2w"}),
+        ("account:{a}:s1:watch", {"a1w"}),
+        ("account:{a}:s", set()),
+        ("account:+", {"a1", "a1w", "a2w", "b1w"}),
+    ],
+)
+def test_a_principal_stands_for_what_is_part_of_it_and_plus_for_any_one_part(
+    broker: RunningBroker, space: str, named: str, cut: set[str]
+) -> None:
+    a, b = f"{space}a", f"{space}b"
+    principals = {
+        "a1": f"account:{a}:s1",
+        "a1w": f"account:{a}:s1:watch",
+        "a2w": f"account:{a}:s2:watch",
+        "b1w": f"account:{b}:s1:watch",
+    }
+    clients = {
+        name: broker.connect(f"{space}-{name}", broker.issue(broker.grant(f"{space}-{name}", principal=principal)))
+        for name, principal in principals.items()
+    }
+    broker.revoke(principal=named.format(a=a))
+    for name in cut:
+        wait_until(clients[name].disconnected.is_set, f"the end of {name}")
+    assert {name for name, client in clients.items() if client.disconnected.is_set()} == cut
+    for client in clients.values():
+        client.close()
+
+
 def test_renewing_credentials_leaves_the_connection_alone(broker: RunningBroker, space: str) -> None:
     with broker.client(space) as client:
         broker.issue(broker.grant(space))

@@ -198,7 +198,19 @@ def test_the_owners_movements_run_on_a_shared_device_and_no_others(three: Three)
         robot.report(action, AckStatus.DONE)
         wait_until(lambda action=action: bert.action(action)["status"] == "done", "its end")  # type: ignore[misc]
     problem(run("his"), 404, "movement-unknown")
+    at = f"/devices/{robot.device}/movements"
+    listed = {item["name"] for item in bert.get(at).json()["items"]}
+    assert {"hers", "same"} <= listed
+    assert "his" not in listed
+    assert bert.get(f"{at}/same").json()["source"] == "'anna'"
     problem(bert.get("/robot-types/ur5/movements/hers"), 404, "movement-unknown")
+    assert bert.put("/robot-types/ur5/movements/hers", {"source": "'mine'"}).status_code == 201
+    assert bert.get(f"{at}/hers").json()["source"] == "'anna'", "what he writes is his, and stays with him"
+    share(anna, f"devices/{robot.device}", bert, "viewer")
+    for path in ("", "/same"):
+        problem(bert.get(at + path), 403, "forbidden")
+    assert bert.get(f"/devices/{robot.device}/robot-type").json()["type"] == "ur5"
+    assert bert.get(f"/devices/{robot.device}/robot-type/files/robot.toml").status_code == 200
 
 
 # ------------------------------------------------------------ bounds

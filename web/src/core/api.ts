@@ -23,7 +23,9 @@ export interface Device {
   robot_type: string;
   agent: string;
   space: string;
-  role: string;
+  /** What this account may do with it. A viewer watches, and changes nothing. */
+  role: "owner" | "operator" | "viewer";
+  owner: { id: string; name: string };
   topic: string;
   online: boolean;
   last_seen_at: string | null;
@@ -170,8 +172,9 @@ export class Api {
     await this.#call("DELETE", `/devices/${device}/lease?epoch=${epoch}`, { keepalive: leaving });
   }
 
-  movements(robotType: string): Promise<Movement[]> {
-    return this.#all(`/robot-types/${robotType}/movements`);
+  /** What can be run on a device: its owner's movements for its robot type, and those that come with the type. */
+  movements(device: string): Promise<Movement[]> {
+    return this.#all(`/devices/${device}/movements`);
   }
 
   runMovement(device: string, name: string, epoch: number | null, key: string): Promise<Action> {

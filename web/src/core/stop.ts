@@ -74,6 +74,10 @@ export class StopSwitch {
 
   /** Latch Stop. May be pressed again at any time. */
   press(reason = "Stop pressed on the console"): void {
+    if (this.#device.info.value.role === "viewer") {
+      this.#problem.value = "You may watch this device, not stop it. Ask its owner, or whoever stands there.";
+      return;
+    }
     this.#stateAtPress = this.#device.state.value;
     const at = now();
     this.#problem.value = null;

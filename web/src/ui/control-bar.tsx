@@ -14,6 +14,7 @@ export function ControlBar({ device, control, stop }: ControlBarProps) {
   const state = control.state.value;
   const held = state.kind === "held";
   const describedYet = device.description.value !== null;
+  const watches = device.info.value.role === "viewer";
   const resumable = device.holder.value?.mine === true && !held;
   return (
     <div class="control-bar" role="region" aria-label={texts.control.title}>
@@ -27,8 +28,8 @@ export function ControlBar({ device, control, stop }: ControlBarProps) {
           type="button"
           class="primary"
           data-testid="take-control"
-          disabled={state.kind === "taking" || !describedYet}
-          title={describedYet ? undefined : texts.control.needsDescription}
+          disabled={state.kind === "taking" || !describedYet || watches}
+          title={watches ? texts.control.watches : describedYet ? undefined : texts.control.needsDescription}
           onClick={() => void control.take()}
         >
           {state.kind === "taking" ? texts.control.taking : resumable ? texts.control.resume : texts.control.take}
@@ -38,7 +39,8 @@ export function ControlBar({ device, control, stop }: ControlBarProps) {
         type="button"
         class="stop"
         data-testid="stop"
-        title={texts.stop.keyExplained}
+        disabled={watches}
+        title={watches ? texts.control.watches : texts.stop.keyExplained}
         aria-keyshortcuts="Escape"
         onClick={() => {
           control.stopped();

@@ -18,25 +18,28 @@ type Library = { kind: "loading" } | { kind: "there"; items: readonly Movement[]
 export function Movements({ api, device, control, actions }: MovementsProps) {
   const [library, setLibrary] = useState<Library>({ kind: "loading" });
   const [tries, setTries] = useState(0);
-  const robotType = device.info.value.robot_type;
+  const { id, role } = device.info.value;
+  const watches = role === "viewer";
   useEffect(() => {
+    if (watches) return undefined;
     let wanted = true;
     setLibrary({ kind: "loading" });
-    api.movements(robotType).then(
+    api.movements(id).then(
       (items) => wanted && setLibrary({ kind: "there", items }),
       (error: unknown) => wanted && setLibrary({ kind: "failed", why: sentence(error) }),
     );
     return () => {
       wanted = false;
     };
-  }, [api, robotType, tries]);
+  }, [api, id, watches, tries]);
 
   const run = actions.run.value;
   const running = (run !== null && !ended(run)) || (device.live.value && device.state.value?.mode === "action");
   const blocked = running || device.stopped.value || device.reach.value === "offline";
   return (
     <Card title={texts.movements.title} class="movements">
-      {library.kind === "loading" && <p class="quiet">{texts.loading}</p>}
+      {watches && <p class="quiet">{texts.control.watches}</p>}
+      {!watches && library.kind === "loading" && <p class="quiet">{texts.loading}</p>}
       {library.kind === "failed" && (
         <p class="notice bad">
           {texts.movements.failed(library.why)}{" "}
@@ -103,7 +106,7 @@ function RunStatus({ device, run, actions }: RunStatusProps) {
         )}
         {othersRun && <p>{texts.movements.running(told.name === undefined || told.name === "" ? told.kind : told.name)}</p>}
       </div>
-      {(mineRuns || othersRun) && (
+      {(mineRuns || othersRun) && device.info.value.role !== "viewer" && (
         <button type="button" data-testid="cancel-action" onClick={() => void actions.cancel(othersRun ? told.id : null)}>
           {texts.movements.cancel}
         </button>

@@ -242,7 +242,7 @@ export class Cloud {
       case `POST /devices/${DEVICE}/stop/reset`:
         if (this.arm !== null) this.arm.stop = null;
         return ok({ confirmed: true });
-      case "GET /robot-types/ur5/movements":
+      case `GET /devices/${DEVICE}/movements`:
         return ok({
           items: [
             { name: "wave", description: "Waves the hand three times.", version: 1, built_in: true },
@@ -273,6 +273,7 @@ export class Cloud {
       agent: "agent00001",
       space: "lab",
       role: "owner",
+      owner: { id: "account0001", name: "Ann" },
       topic: TOPIC,
       online: true,
       last_seen_at: new Date().toISOString(),
