@@ -64,10 +64,10 @@ class Machine:
     def ready(self) -> str:
         return next(line for line in self.lines if line.startswith("ready"))
 
-    def sign_in_link(self) -> str:
+    def sign_in_link(self, account: str = "demo") -> str:
         """A new one-time link, as an administrator makes one."""
         done = subprocess.run(
-            [sys.executable, "-m", "function_app", "sign-in-link", "--account", "demo"],
+            [sys.executable, "-m", "function_app", "sign-in-link", "--account", account],
             cwd=ROOT,
             env=os.environ | {"TELESCOPE_HOME": str(self.home), "TELESCOPE_PORT": str(self.port)},
             capture_output=True,
@@ -76,9 +76,9 @@ class Machine:
         )
         return done.stdout.strip().splitlines()[-1]
 
-    def api(self) -> "Api":
+    def api(self, account: str = "demo") -> "Api":
         """The HTTP API, signed in."""
-        return Api(self)
+        return Api(self, account)
 
     def trace(self, device: str = "ur5") -> "Trace":
         """What the simulation of a device has written down."""
@@ -106,9 +106,10 @@ class Machine:
 class Api:
     """One sign-in's view of the HTTP API. ``with`` closes it."""
 
-    def __init__(self, machine: Machine) -> None:
+    def __init__(self, machine: Machine, account: str = "demo") -> None:
         self.http = httpx.Client(base_url=f"{machine.url}/api/v1", timeout=30, verify=machine.trusted)
-        signed_in = self.http.post("/auth/sign-in", json={"link": machine.sign_in_link().partition("#sign-in=")[2]})
+        link = machine.sign_in_link(account).partition("#sign-in=")[2]
+        signed_in = self.http.post("/auth/sign-in", json={"link": link})
         assert signed_in.status_code == httpx.codes.OK, signed_in.text
         self.http.cookies.clear()
         self.http.headers["Authorization"] = f"Bearer {signed_in.json()['access_token']}"

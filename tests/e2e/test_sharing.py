@@ -1,0 +1,50 @@
+"""An arm that is shared by link, moved by a guest, and un-shared in mid-motion: the real agent holds it at once."""
+
+import time
+
+import httpx
+
+from tests.support.brokers import wait_until
+from tests.support.machine import Machine, Trace
+
+
+def target_rad(trace: Trace) -> float:
+    found: float = trace.now()["target"]["shoulder_pan"]
+    return found
+
+
+def test_a_guest_who_is_unshared_in_mid_motion_leaves_the_arm_at_rest(machine: Machine) -> None:
+    trace = machine.trace()
+    with machine.api() as owner, machine.api("guest") as guest:
+        device = owner.device()["id"]
+        made = owner.post(f"/devices/{device}/invitations", {"role": "operator"})
+        guest.post("/invitations/redeem", {"secret": made["secret"]})
+        assert guest.device()["role"] == "operator"
+        begin_rad = target_rad(trace)
+        request = {
+            "kind": "move_joints",
+            "position_rad": {"shoulder_pan": -2.0 if begin_rad > 0 else 2.0},
+            "speed": 0.05,
+        }
+        action = guest.post(f"/devices/{device}/actions", {"request": request, "wait_ms": 10_000})["id"]
+        wait_until(lambda: abs(target_rad(trace) - begin_rad) > 0.01, "motion", 20)
+        account = guest.get("/accounts/me")["id"]
+        answer = owner.http.delete(f"/devices/{device}/shares/{account}")
+        assert answer.status_code == httpx.codes.NO_CONTENT
+        wait_until(lambda: at_rest(trace), "rest", 10)
+        ended = owner.get(f"/actions/{action}", wait_ms=20_000, wait_for="done")
+        # Whoever says it first: the cloud, or the device that has lost the lease.
+        assert (ended["status"], ended["reason"]["code"]) in {("failed", "unshared"), ("failed", "lease_lost")}
+        gone = guest.http.post(f"/devices/{device}/actions", json={"request": request})
+        assert gone.status_code == httpx.codes.NOT_FOUND
+        still_rad = target_rad(trace)
+        time.sleep(0.5)
+        assert target_rad(trace) == still_rad
+        taken = owner.post(f"/devices/{device}/lease", {"lease_ms": 10_000})
+        assert taken["confirmed"] is True, "the owner goes on from there"
+        owner.http.delete(f"/devices/{device}/lease", params={"epoch": taken["epoch"]})
+
+
+def at_rest(trace: Trace) -> bool:
+    first, *_, last = trace.rows(20)
+    return bool(first["target"] == last["target"])
