@@ -20,7 +20,7 @@ STALE_S = 1.0
 """A position that is older is none: the robot stands."""
 PATIENCE_S = 15.0
 """How long it waits for somebody to go out of the way."""
-SHORT_PATIENCE_S = 3.0
+SHORT_PATIENCE_S = 6.0
 """The same before it has set out: a place that is taken then is likelier to be furniture than somebody who goes on."""
 ODOMETRY, POSITIONS = "odometry", "positions"
 """Streams that tell where a robot is: its own, and a room device's."""

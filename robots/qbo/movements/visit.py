@@ -24,7 +24,7 @@ PARAMETERS = {
 SIDES_RAD = (0.0, 0.7, -0.7, 1.4, -1.4)  # where to stand around them, from the side where it is
 NEAR_M = 0.3  # so much further than asked is near enough to greet somebody who moves
 TURN_RAD_S, STRAIGHT_RAD = 0.6, 0.1
-LOOK_S, PATIENCE_S = 0.3, 20.0  # it waits so long for them to come by
+LOOK_S, PATIENCE_S = 0.3, 35.0  # it waits so long for them to come by
 OLD_S = 2.0
 
 who = str(parameters.get("who", "person"))
