@@ -1,4 +1,7 @@
-"""Puts the functions together: the adapters, of which settings make ``choices``, and the services on top of them."""
+"""Puts the functions together: the adapters, of which settings make ``choices``, and the services on top of them.
+
+As long as there are services: each is made here once, with all that it is given, and nothing is decided.
+"""
 
 from dataclasses import dataclass
 from typing import Any
