@@ -1,4 +1,4 @@
-"""``python -m function_app serve|work|xmpp|check-models|prepare|rotate-keys|sign-in-link|audit``: the functions."""
+"""``python -m function_app COMMAND``: the functions, and what whoever runs them does at a terminal."""
 
 import argparse
 import asyncio
@@ -9,7 +9,9 @@ from typing import Any
 
 from function_app import bootstrap, choices, settings
 from function_app.bootstrap import Functions
+from function_app.domain.accounts import Identity, Role
 from function_app.domain.audit_chain import CLOUD, Deed
+from function_app.domain.problems import Problem
 from function_app.domain.times import rfc3339
 from function_app.entrypoints import audit
 from function_app.entrypoints.serve import PortTaken, serve
@@ -17,6 +19,7 @@ from function_app.entrypoints.worker import check_models, work
 from function_app.ports.keys import LEARN_MS, OVERLAP_MS, RotationRefused
 from function_app.ports.model_compiler import CompilerMissingError
 from function_app.ports.tables import StoreError
+from function_app.services.api_keys import Wanted
 
 _EXIT_FAILED = 1
 _MINUTE_MS = 60_000
@@ -57,6 +60,12 @@ def main(arguments: Sequence[str] | None = None) -> int:
     link = commands.add_parser("sign-in-link", help="print a one-time sign-in link; makes the account if it is new")
     link.add_argument("--account", default="demo", help="name of the account (default: %(default)s)")
     audit.add_command(commands)
+    key = commands.add_parser("api-key", help="print a new API key of an account, for a program of somebody else's")
+    key.add_argument("--account", default="demo", help="name of the account (default: %(default)s)")
+    key.add_argument("--name", required=True, help="what it is for; shown beside the account wherever it acts")
+    key.add_argument("--role", choices=("viewer", "operator"), default="viewer", help="(default: %(default)s)")
+    key.add_argument("--only", action="append", default=[], metavar="DEVICE", help="a device's id, or space:ID; repeat")
+    key.add_argument("--days", type=int, default=90, help="how long it is good for (default: %(default)s)")
     options = parser.parse_args(arguments)
     logging.basicConfig(level=logging.INFO, format="%(asctime)s %(levelname)s %(message)s", stream=sys.stderr)
     for sdk in ("azure", "botocore"):  # they tell of every request
@@ -144,6 +153,18 @@ async def _link(functions: Functions, options: argparse.Namespace) -> None:
     await functions.close()
 
 
+async def _api_key(functions: Functions, options: argparse.Namespace) -> None:
+    account = await functions.sign_in.account(options.account)
+    wanted = Wanted(label=options.name, most=Role(options.role), only=tuple(options.only), days=options.days)
+    try:
+        _, token = await functions.api_keys.make(Identity(account.id, account.name, "terminal"), wanted)
+    except Problem as problem:
+        raise settings.SettingsError(problem.detail) from problem
+    finally:
+        await functions.close()
+    print(token)
+
+
 _COMMANDS: dict[str, Callable[[Functions, argparse.Namespace], Coroutine[Any, Any, int | None]]] = {
     "audit": audit.run,
     "work": _work,
@@ -151,6 +172,7 @@ _COMMANDS: dict[str, Callable[[Functions, argparse.Namespace], Coroutine[Any, An
     "check-models": _check_models,
     "rotate-keys": _rotate,
     "sign-in-link": _link,
+    "api-key": _api_key,
 }
 
 if __name__ == "__main__":

@@ -27,6 +27,7 @@ from function_app.ports.xmpp_line import XmppLine
 from function_app.services.action_acks import ActionAcks
 from function_app.services.action_rows import ActionRows
 from function_app.services.actions import Actions
+from function_app.services.api_keys import ApiKeys
 from function_app.services.attempts import Attempts
 from function_app.services.audit import Audit
 from function_app.services.audit_chain import AuditChain
@@ -105,6 +106,7 @@ class Functions:
     sessions: Sessions
     sign_out: SignOut
     passwords: Passwords
+    api_keys: ApiKeys
     enroll: Enroll
     claim: Claim
     unpair: Unpair
@@ -313,6 +315,9 @@ def build(settings: Settings, *, clock: Clock | None = None) -> Functions:
         sign_in=sign_in,
         sessions=sessions,
         sign_out=sign_out,
+        api_keys=ApiKeys(
+            tables=tables, devices=devices, sign_in=sign_in, sign_out=sign_out, chain=chain, forget=forget, clock=now
+        ),
         passwords=Passwords(
             tables=tables,
             hashes=Argon2Hashes(),

@@ -26,7 +26,8 @@ ALGORITHM = "EdDSA"
 API: Final = "telescope/api"
 SESSION: Final = "telescope/session"
 XMPP: Final = "telescope/xmpp"
-ACCESS_S = 3600
+ACCESS_S = 15 * 60
+"""One that leaks is of no use for long. Who has signed in gets the next one by the cookie."""
 SESSION_S = 12 * 3600
 AGENT_TOKEN_S = 60
 CLOCK_SKEW_S = 30

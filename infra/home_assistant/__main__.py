@@ -2,8 +2,8 @@
 
 Prints ``ready`` once both brokers are there. Runs until SIGTERM or SIGINT, and makes lost connections anew.
 
-Exits 4 when its sign-in is over, after 12 h at most: whoever runs it gives it a new link, in ``TELESCOPE_LINK``. The
-password of Home Assistant's broker stands in ``HOME_ASSISTANT_PASSWORD``: a list of processes shows neither.
+Its API key stands in ``TELESCOPE_KEY``, the password of Home Assistant's broker in ``HOME_ASSISTANT_PASSWORD``: a list
+of processes shows neither. Exits 4 when the key is refused: it was revoked, or has run out.
 """
 
 import argparse
@@ -23,36 +23,29 @@ from infra.home_assistant import discovery
 from infra.home_assistant.bridge import Bridge
 
 _WITHIN_S = 15.0
-_SIGNED_OUT = 4
+_REFUSED = 4
 _AGAIN_S = 5.0
 _RENEW_SHARE = 0.8
 """Credentials are renewed after this share of their life."""
 _log = logging.getLogger("infra.home_assistant")
 
 
-class SignedOutError(OSError):
-    """The sign-in is over, or the link was no good."""
+class KeyRefusedError(OSError):
+    """The API key is no good, or no longer."""
 
 
 class Telescope:
-    """An account's view of the HTTP API, for the 12 h of one sign-in.
+    """What an API key may see of the HTTP API.
 
     Args:
         server: ``https://host``.
+        key: ``ts_…``.
     """
 
-    def __init__(self, server: str) -> None:
+    def __init__(self, server: str, key: str) -> None:
         self._base = server.rstrip("/") + "/api/v1"
-        self._http = requests.Session()  # keeps the cookie
-
-    def sign_in(self, link: str) -> None:
-        """With what stands after ``#sign-in=`` in a one-time link.
-
-        Raises:
-            OSError: Not reached, or refused.
-        """
-        signed_in = self._post("/auth/sign-in", {"link": link.rpartition("#sign-in=")[2]})
-        self._http.headers["X-CSRF-Token"] = str(signed_in["csrf_token"])
+        self._http = requests.Session()
+        self._http.headers["Authorization"] = f"Bearer {key}"
 
     def watch(self) -> dict[str, Any]:
         """Credentials to hear all that the account may see.
@@ -77,7 +70,7 @@ class Telescope:
         answer = self._http.post(self._base + path, json=body, timeout=_WITHIN_S)
         found: dict[str, Any] = answer.json() if answer.content else {}
         if answer.status_code == requests.codes.unauthorized:
-            raise SignedOutError(str(found.get("detail") or answer.reason))
+            raise KeyRefusedError(str(found.get("detail") or answer.reason))
         if not answer.ok:
             raise OSError(str(found.get("detail") or answer.reason))
         return found
@@ -87,12 +80,11 @@ def main() -> int:
     """Run; the exit code."""
     logging.basicConfig(level=logging.INFO, format="%(asctime)s %(levelname)s %(message)s")
     arguments = _arguments()
-    telescope = Telescope(arguments.server)
-    try:
-        telescope.sign_in(os.environ.get("TELESCOPE_LINK", ""))
-    except (OSError, ValueError) as error:
-        print(f"home assistant: {arguments.server}: {error}; give a new link in TELESCOPE_LINK", file=sys.stderr)
+    key = os.environ.get("TELESCOPE_KEY", "").strip()
+    if not key.isascii() or not key:
+        print("home assistant: TELESCOPE_KEY is empty; make a key with `function_app api-key`", file=sys.stderr)
         return programs.BAD_INPUT
+    telescope = Telescope(arguments.server, key)
     ending = threading.Event()
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, lambda *_: ending.set())
@@ -107,9 +99,9 @@ def main() -> int:
         while not ending.is_set():
             try:
                 _watch(telescope, bridge, ending)
-            except SignedOutError as error:
+            except KeyRefusedError as error:
                 print(f"home assistant: {error}", file=sys.stderr)
-                return _SIGNED_OUT
+                return _REFUSED
             except (OSError, ValueError) as error:
                 _log.warning("telescope: %s; trying again in %.0f s", error, _AGAIN_S)
                 ending.wait(_AGAIN_S)

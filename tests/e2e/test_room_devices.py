@@ -193,11 +193,12 @@ def test_home_assistant_is_shown_the_room_and_moves_its_door(
     laboratory: Machine, api: Api, home_assistants_broker: int
 ) -> None:
     door = api.device("door")
+    key = api.post("/api-keys", {"name": "Home Assistant", "role": "operator", "only": [door["id"]]})["token"]
     command = [sys.executable, "-m", "infra.home_assistant", "--server", laboratory.url]
     bridge = subprocess.Popen(
         [*command, "--port", str(home_assistants_broker)],
         cwd=ROOT,
-        env=os.environ | {"TELESCOPE_LINK": laboratory.sign_in_link()},
+        env=os.environ | {"TELESCOPE_KEY": key},
     )
     shown: dict[str, bytes] = {}
     try:

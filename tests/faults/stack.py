@@ -118,6 +118,8 @@ class Stack:
         self._begin_agent()
         saved = self.http.put(f"/robot-types/ur5/movements/{MOVEMENT}", json={"source": SCRIPT})
         assert saved.is_success, saved.text
+        self.token = self.post("/api-keys", name="bench", role="operator", days=1)["token"]
+        self.http.headers["Authorization"] = f"Bearer {self.token}"
         self._consoles = self._warm("tests.faults.console")
 
     def _begin_agent(self) -> None:

@@ -33,10 +33,12 @@ from device_agent.protocol.messages import (
     Task,
 )
 from function_app import bootstrap
+from function_app.domain.accounts import Identity
 from function_app.domain.ids import agent_id
 from function_app.entrypoints.http import create_app
 from function_app.entrypoints.ingest import ingest, ingest_telemetry
 from function_app.ports.broker_access import Credentials
+from function_app.services.identity import ACCESS_S, SESSION_S
 from function_app.settings import Settings
 from tests.support.brokers import PATIENCE_S, Client, Message, RunningBroker, wait_until
 
@@ -44,6 +46,8 @@ BASE = "http://telescope.test"
 API = "/api/v1"
 MOVE = {"kind": "move_joints", "position_rad": {"elbow": 1.0}}
 """An action that every robot takes."""
+
+TOKEN_MS = ACCESS_S * 1000
 
 T = TypeVar("T")
 
@@ -174,7 +178,7 @@ class Cloud:
 
 
 class Person:
-    """An account in one sign-in session, by access token."""
+    """An account in one sign-in session, by access token, for which it gets the next one in time."""
 
     def __init__(self, cloud: Cloud, signed_in: dict[str, Any], *, address: str = "127.0.0.1") -> None:
         self.cloud = cloud
@@ -182,13 +186,24 @@ class Person:
         self.account: str = signed_in["account"]["id"]
         self.name: str = signed_in["account"]["name"]
         self.session: str = signed_in["session"]
+        self._given_ms = cloud.clock.now_ms()
         self._client = cloud.client(address=address, headers={"Authorization": f"Bearer {self.token}"})
 
+    def _stay(self) -> None:
+        """As a program does that has kept the cookie of its session."""
+        now_ms = self.cloud.clock.now_ms()
+        if TOKEN_MS // 2 < now_ms - self._given_ms < SESSION_S * 1000:
+            who = Identity(self.account, self.name, self.session)
+            self.token, self._given_ms = self.cloud.run(self.cloud.functions.sessions.access_token(who)), now_ms
+            self._client.headers["Authorization"] = f"Bearer {self.token}"
+
     def ask(self, method: str, path: str, **options: Any) -> httpx.Response:
+        self._stay()
         return self.cloud.run(self._client.request(method, API + path, **options))
 
     def begin(self, method: str, path: str, **options: Any) -> Callable[[], httpx.Response]:
         """Ask without waiting; call what this gives for the answer."""
+        self._stay()
         call = self._client.request(method, API + path, **options)
         future = asyncio.run_coroutine_threadsafe(call, self.cloud.loop)
         return lambda: future.result(4 * PATIENCE_S)

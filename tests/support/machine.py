@@ -111,8 +111,7 @@ class Api:
         link = machine.sign_in_link(account).partition("#sign-in=")[2]
         signed_in = self.http.post("/auth/sign-in", json={"link": link})
         assert signed_in.status_code == httpx.codes.OK, signed_in.text
-        self.http.cookies.clear()
-        self.http.headers["Authorization"] = f"Bearer {signed_in.json()['access_token']}"
+        self.http.headers["X-CSRF-Token"] = signed_in.json()["csrf_token"]  # with the cookie, which it keeps
 
     def __enter__(self) -> Self:
         return self

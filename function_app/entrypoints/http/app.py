@@ -18,6 +18,7 @@ from function_app.entrypoints.http import (
     accounts,
     actions,
     agents,
+    api_keys,
     audit,
     auth,
     broker,
@@ -45,7 +46,7 @@ from function_app.entrypoints.http.answers import JSON, problem
 from function_app.entrypoints.http.caller import COOKIE, Caller
 from function_app.entrypoints.http.console import Console
 from function_app.entrypoints.http.reference import reference
-from function_app.entrypoints.http.routing import ACCOUNT_SCHEMES, AGENT_SCHEME, PREFIX, VERSION, schemas
+from function_app.entrypoints.http.routing import ACCOUNT_SCHEMES, AGENT_SCHEME, KEY_SCHEME, PREFIX, VERSION, schemas
 from function_app.ports.clock import Clock
 from function_app.ports.tables import StoreError
 
@@ -76,10 +77,11 @@ def create_app(functions: Functions) -> FastAPI:
         lifespan=lifespan,
         redirect_slashes=False,
     )
-    caller = Caller(functions.identify)
+    caller = Caller(functions.identify, functions.api_keys)
     resources = (
         auth.router(functions, caller),
         accounts.router(functions, caller),
+        api_keys.router(functions, caller),
         agents.router(functions, caller),
         messages.router(functions, caller),
         audit.router(functions, caller),
@@ -142,6 +144,7 @@ def _document(app: FastAPI, kinds: Sequence[Any]) -> None:
             components["securitySchemes"] = {
                 ACCOUNT_SCHEMES[0]: {"type": "http", "scheme": "bearer", "bearerFormat": "JWT"},
                 ACCOUNT_SCHEMES[1]: {"type": "apiKey", "in": "cookie", "name": COOKIE},
+                KEY_SCHEME: {"type": "http", "scheme": "bearer", "description": "An API key, `ts_…`."},
                 AGENT_SCHEME: {"type": "http", "scheme": "bearer", "description": "A JWT that the agent's key signed."},
             }
             app.openapi_schema = document

@@ -48,9 +48,11 @@ def router(functions: Functions, caller: Caller) -> Routes:
         done = await functions.passwords.sign_in(asked.name, asked.password, whence(request, settings))
         return signed_in(settings, done)
 
-    @routes.add("POST", "/auth/token", summary="The next access token", answers={200: contract.AccessToken})
+    @routes.add(
+        "POST", "/auth/token", summary="The next access token", answers={200: contract.AccessToken}, caller="page"
+    )
     async def renew_token(request: Request) -> Response:
-        """For programs that keep the cookie: an access token ends after an hour, the session after 12 h.
+        """For programs that keep the cookie: an access token ends after a quarter of an hour, the session after 12 h.
 
         Needs the cookie, and the session's CSRF token in ``X-CSRF-Token``: no access token lives on by itself.
         """

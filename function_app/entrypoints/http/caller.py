@@ -1,12 +1,15 @@
-"""Who calls: a bearer token, or the page's cookie."""
+"""Who calls: a bearer token, an API key, or the page's cookie."""
 
 import hmac
 
 from fastapi import Request
 
 from function_app.domain.accounts import Identity
+from function_app.domain.api_keys import PREFIX as KEY_PREFIX
 from function_app.domain.devices import Agent
 from function_app.domain.problems import Problem, forbidden, unauthorized
+from function_app.entrypoints.http.routing import takes_keys
+from function_app.services.api_keys import ApiKeys
 from function_app.services.identity import API, Identify
 
 COOKIE = "telescope_session"
@@ -17,16 +20,23 @@ _READING = frozenset({"GET", "HEAD", "OPTIONS"})
 class Caller:
     """Finds out who makes a request."""
 
-    def __init__(self, identify: Identify) -> None:
+    def __init__(self, identify: Identify, api_keys: ApiKeys) -> None:
         self._identify = identify
+        self._api_keys = api_keys
 
     async def account(self, request: Request) -> Identity:
-        """The account that asks.
+        """The account that asks, itself or by an API key.
 
         Raises:
-            Problem: ``unauthorized``; ``csrf-token`` for a changing request by cookie without the session's token.
+            Problem: ``unauthorized``; ``csrf-token`` for a changing request by cookie without the session's token;
+                ``forbidden`` for an API key, where only people may ask.
         """
         token = bearer(request)
+        if token.startswith(KEY_PREFIX):
+            who = await self._api_keys.identify(token)
+            if not takes_keys(request.scope.get("route")):
+                raise forbidden("An API key may not do this. Sign in, and do it yourself.")
+            return who
         if token:
             return await self._identify.person(token, API)
         who, _ = await self.page(request)

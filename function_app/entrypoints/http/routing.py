@@ -8,9 +8,10 @@ from fastapi import APIRouter, Query, Response
 
 from function_app.entrypoints.http.answers import JSON, PROBLEM_JSON
 from function_app.entrypoints.http.contract import base as contract
+from function_app.entrypoints.http.for_keys import FOR_KEYS
 
 Handler = Callable[..., Awaitable[Response]]
-Caller = Literal["nobody", "account", "agent", "account or agent"]
+Caller = Literal["nobody", "account", "page", "agent", "account or agent"]
 
 PREFIX = "/api/v1"
 VERSION = "0.1.0"
@@ -19,6 +20,7 @@ Limit = Annotated[int, Query(ge=1, le=1000, description="At most so many in a pa
 
 REF = "#/components/schemas/{name}"
 ACCOUNT_SCHEMES = ("accessToken", "sessionCookie")
+KEY_SCHEME = "apiKey"
 AGENT_SCHEME = "agentToken"
 _MEANINGS = {
     200: "Done",
@@ -67,13 +69,14 @@ class Routes:
             problems: Statuses of refusals beside 401, 413, 422 and 503, which follow from the rest.
             body: Struct of the request's body.
             body_required: Whether it may be left out.
-            caller: Who may ask.
+            caller: Who may ask; ``page``: an account by its cookie alone. An API key stands for an account where the
+                handler's name is in ``FOR_KEYS``.
         """
         refusals = {*problems, 503}
         if caller != "nobody":
             refusals.add(401)
-        if caller.startswith("account") and method != "GET":
-            refusals.add(403)
+        if caller not in {"nobody", "agent"}:
+            refusals.add(403)  # for want of a role or of the page's token, or since an API key may not
         if body is not None:
             refusals |= {413, 422}
         responses: dict[int | str, dict[str, Any]] = {}
@@ -88,11 +91,12 @@ class Routes:
                 "description": _MEANINGS[status],
                 "content": {PROBLEM_JSON: {"schema": _reference(contract.Problem)}},
             }
-        extra: dict[str, Any] = {"security": _security(caller)}
+        extra: dict[str, Any] = {}
         if body is not None:
             extra["requestBody"] = {"required": body_required, "content": {JSON: {"schema": self._reference(body)}}}
 
         def register(handler: Handler) -> Handler:
+            extra["security"] = _security(caller, for_keys=handler.__name__ in FOR_KEYS)
             self.router.add_api_route(
                 path,
                 handler,
@@ -127,10 +131,20 @@ def _reference(kind: Any) -> dict[str, Any]:
     return schema
 
 
-def _security(caller: Caller) -> list[dict[str, list[str]]]:
+def takes_keys(route: object) -> bool:
+    """Whether what is asked for by this route may be asked for with an API key: as its description says."""
+    extra = getattr(route, "openapi_extra", None) or {}
+    return {KEY_SCHEME: []} in extra.get("security", [])
+
+
+def _security(caller: Caller, *, for_keys: bool) -> list[dict[str, list[str]]]:
     names: list[str] = []
     if "account" in caller:
         names += ACCOUNT_SCHEMES
+    if for_keys:
+        names.append(KEY_SCHEME)
+    if caller == "page":
+        names.append(ACCOUNT_SCHEMES[1])
     if "agent" in caller:
         names.append(AGENT_SCHEME)
     return [{name: []} for name in names]
