@@ -36,7 +36,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     commands.add_parser("serve", help="API and console, under uvicorn")
     commands.add_parser("work", help="ingest from the broker, and timers")
     commands.add_parser("xmpp", help="speak XMPP for the cloud, with agents that have chosen it")
-    commands.add_parser("prepare", help="make Amazon's table and bucket, where there are none")
+    commands.add_parser("prepare", help="make a vault's secret, Amazon's table and bucket, where there are none")
     checks = commands.add_parser("check-models", help="compile uploaded robot types with MuJoCo, as `work` does too")
     checks.add_argument("--drain", action="store_true", help="end as soon as none is left")
     rotate = commands.add_parser("rotate-keys", help="make a new signing key; the present one counts on for a while")
@@ -95,6 +95,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 async def _check(functions: Functions) -> None:
     """Say at once what is wrong with the tables, not at the first request."""
     await functions.health.require_tables()
+    await functions.keys.current()
     await functions.tables.close()
 
 

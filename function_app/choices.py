@@ -9,16 +9,18 @@ from collections.abc import Awaitable, Callable
 
 from function_app.adapters.local.blobs import FileBlobs
 from function_app.adapters.local.broker_access import MosquittoBrokerAccess, TokenBrokerAccess
+from function_app.adapters.local.clock import SystemClock
 from function_app.adapters.local.command_bus import MqttCommandBus
 from function_app.adapters.local.keys import FileKeys
 from function_app.adapters.local.tables import SqliteTables
 from function_app.adapters.local.tls import client_context
 from function_app.adapters.ring_keys import RingKeys
+from function_app.adapters.vault_keys import VaultKeys
 from function_app.ports.blobs import Blobs
 from function_app.ports.broker_access import BrokerAccess
 from function_app.ports.command_bus import CommandBus
 from function_app.ports.tables import Tables
-from function_app.settings import AwsStore, AzureStore, EventGridBus, IotBus, Settings
+from function_app.settings import AwsStore, AzureStore, EventGridBus, IotBus, KeyVault, SecretsManager, Settings
 
 TABLES_FILE = "tables.sqlite"
 BLOBS_PATH = "/api/v1/blobs"
@@ -27,14 +29,32 @@ MOSQUITTO_SERVICE = "service"
 
 
 def keys(settings: Settings, now_ms: Callable[[], int]) -> RingKeys:
-    """The signing keys, read where they are files.
+    """The signing keys; files are read, a vault is not asked yet.
 
     Raises:
         StoreError: They cannot be used.
     """
-    found = FileKeys(settings.home / "keys", now_ms=now_ms)
-    found.load()
-    return found
+    match settings.keys:
+        case KeyVault() as vault:
+            from function_app.adapters.azure.client import Place  # noqa: PLC0415 (only where it is in use)
+            from function_app.adapters.azure.keys import KeyVaultKeys  # noqa: PLC0415
+
+            place = Place(url=vault.url, identity=vault.identity)
+            return KeyVaultKeys(secret=vault.secret, place=place, now_ms=now_ms)
+        case SecretsManager() as manager:
+            from function_app.adapters.aws.keys import SecretsManagerKeys  # noqa: PLC0415
+
+            return SecretsManagerKeys(
+                secret=manager.secret,
+                region=manager.region,
+                endpoint=manager.endpoint,
+                kms_key=manager.kms_key,
+                now_ms=now_ms,
+            )
+        case None:
+            found = FileKeys(settings.home / "keys", now_ms=now_ms)
+            found.load()
+            return found
 
 
 def stores(settings: Settings, signing: RingKeys | None = None) -> tuple[Tables, Blobs]:
@@ -108,13 +128,20 @@ def broker_tls(settings: Settings) -> ssl.SSLContext | None:
 
 
 async def prepare(settings: Settings) -> None:
-    """Make what the store must have before its first use. Safe to repeat.
+    """Make what store and vault must have before their first use. Safe to repeat.
 
-    Only Amazon's needs it: a file, and Azure's tables and container, are made when first written to.
+    Of the stores only Amazon's needs it: a file, and Azure's tables and container, are made when first written to.
 
     Raises:
         StoreError: It cannot be made.
     """
+    if settings.keys is not None:
+        held = keys(settings, SystemClock().now_ms)
+        assert isinstance(held, VaultKeys)  # noqa: S101 (the settings say so)
+        try:
+            await held.prepare()
+        finally:
+            await held.close()
     if isinstance(settings.store, AwsStore):
         from function_app.adapters.aws.blobs import S3Blobs  # noqa: PLC0415
         from function_app.adapters.aws.tables import DynamoTables  # noqa: PLC0415

@@ -19,6 +19,8 @@ _TABLE = re.compile(r"\A[A-Za-z0-9_.-]{3,255}\Z")
 _BUCKET = re.compile(r"\A(?=.{3,63}\Z)[a-z0-9][a-z0-9.-]*[a-z0-9]\Z")
 _REGION = re.compile(r"\A[a-z]{2,}(-[a-z]+)+-[0-9]+\Z")
 _IDENTITY = re.compile(r"\A([0-9A-Fa-f]{8}(-[0-9A-Fa-f]{4}){3}-[0-9A-Fa-f]{12})?\Z")
+_SECRET = re.compile(r"\A[A-Za-z0-9-]{1,127}\Z")
+_KMS_KEY = re.compile(r"\A[A-Za-z0-9:/_-]{0,256}\Z")
 _DOMAIN = re.compile(r"\A(?=.{0,253}\Z)([a-z0-9]([a-z0-9-]{0,61}[a-z0-9])?(\.[a-z0-9]([a-z0-9-]{0,61}[a-z0-9])?)*)?\Z")
 _SHOWN = 80
 """Characters of a wrong value that are shown."""
@@ -93,6 +95,38 @@ class EventGridBus:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
+class KeyVault:
+    """A secret of Azure's Key Vault, as the place of the signing keys.
+
+    Attributes:
+        url: The vault's address.
+        secret: The secret's name.
+        identity: The client id of the functions' identity, where they have not only the one that the host gives them.
+    """
+
+    url: str
+    secret: str = "telescope-keys"  # noqa: S105 (a name)
+    identity: str = ""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class SecretsManager:
+    """A secret of Amazon's Secrets Manager, as the place of the signing keys.
+
+    Attributes:
+        region: Where it is.
+        secret: Its name.
+        kms_key: Id of the KMS key to make it with; empty for the account's own.
+        endpoint: An emulator's address, ``None`` for Amazon's own.
+    """
+
+    region: str
+    secret: str = "telescope-keys"  # noqa: S105 (a name)
+    kms_key: str = ""
+    endpoint: str | None = None
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Tls:
     """TLS, towards everybody and towards the broker.
 
@@ -114,6 +148,7 @@ class Settings:
     Attributes:
         home: Folder of everything that lasts: tables, blobs, keys.
         store: Where tables and blobs are, when not in ``home``.
+        keys: Where the signing keys are, when not in ``home``.
         bus: What publishes commands, when not a connection to the broker.
         host: Address to listen on.
         port: Of the page and the API.
@@ -135,6 +170,7 @@ class Settings:
 
     home: Path
     store: AzureStore | AwsStore | None = None
+    keys: KeyVault | SecretsManager | None = None
     bus: IotBus | EventGridBus | None = None
     host: str = "127.0.0.1"
     port: int = 8080
@@ -180,6 +216,7 @@ def read(environment: Mapping[str, str] | None = None) -> Settings:
     return Settings(
         home=_folder(given, "TELESCOPE_HOME", Path(".telescope")),
         store=_store(given),
+        keys=_keys(given),
         bus=_bus(given),
         host=host,
         port=port,
@@ -203,6 +240,34 @@ def read(environment: Mapping[str, str] | None = None) -> Settings:
         keep_1min_days=_number(given, "TELESCOPE_KEEP_1MIN_DAYS", 90, 1, 36_500),
         keep_10min_days=_number(given, "TELESCOPE_KEEP_10MIN_DAYS", 730, 1, 36_500),
     )
+
+
+def _keys(given: Mapping[str, str]) -> KeyVault | SecretsManager | None:
+    def secret() -> str:
+        what = "letters, digits and hyphens, at most 127"
+        return _matching(given, "TELESCOPE_KEYS_SECRET", "telescope-keys", _SECRET, what)
+
+    match given.get("TELESCOPE_KEYS", "local"):
+        case "local":
+            return None
+        case "azure":
+            url = _url(given, "TELESCOPE_KEYVAULT_URL", "", ("https",))
+            identity = _matching(
+                given, "TELESCOPE_KEYVAULT_IDENTITY", "", _IDENTITY, "the client id of a managed identity"
+            )
+            return KeyVault(url=url, secret=secret(), identity=identity)
+        case "aws":
+            kms_key = _matching(given, "TELESCOPE_KEYS_KMS_KEY", "", _KMS_KEY, "the id, alias or ARN of a KMS key")
+            return SecretsManager(
+                region=_region(given), secret=secret(), kms_key=kms_key, endpoint=_aws_endpoint(given)
+            )
+        case other:
+            raise SettingsError(f"TELESCOPE_KEYS is '{other[:_SHOWN]}'; it must be local, azure or aws")
+
+
+def _aws_endpoint(given: Mapping[str, str]) -> str | None:
+    endpoint = given.get("TELESCOPE_AWS_ENDPOINT")
+    return None if endpoint is None else _url(given, "TELESCOPE_AWS_ENDPOINT", endpoint, ("http", "https"))
 
 
 def _tls(given: Mapping[str, str]) -> Tls | None:
@@ -287,12 +352,11 @@ def _azure(given: Mapping[str, str]) -> AzureStore:
 
 
 def _aws(given: Mapping[str, str]) -> AwsStore:
-    endpoint = given.get("TELESCOPE_AWS_ENDPOINT")
     return AwsStore(
         region=_region(given),
         bucket=_matching(given, "TELESCOPE_AWS_BUCKET", "", _BUCKET, "the name of an S3 bucket"),
         table=_matching(given, "TELESCOPE_AWS_TABLE", "telescope", _TABLE, "the name of a DynamoDB table"),
-        endpoint=None if endpoint is None else _url(given, "TELESCOPE_AWS_ENDPOINT", endpoint, ("http", "https")),
+        endpoint=_aws_endpoint(given),
     )
 
 

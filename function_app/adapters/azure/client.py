@@ -58,7 +58,16 @@ T = TypeVar("T")
 class Client(Generic[Sdk]):
     """One service as one adapter uses it. Any number of calls at once; opens nothing before the first."""
 
-    def __init__(self, open_: Callable[[contextlib.ExitStack], Sdk], *, place: Place, what: str, role: str) -> None:
+    def __init__(
+        self,
+        open_: Callable[[contextlib.ExitStack], Sdk],
+        *,
+        place: Place,
+        what: str,
+        role: str,
+        settings: str = "the addresses in TELESCOPE_STORAGE_*, this machine's managed identity",
+        service: str = "the storage account",
+    ) -> None:
         """Remember the place.
 
         Args:
@@ -66,12 +75,13 @@ class Client(Generic[Sdk]):
             place: Where it is, for errors.
             what: What is used there, for errors: ``the container 'telescope'``.
             role: Azure's role that allows what the adapter does, for errors.
+            settings: What names the place, where it is an address.
+            service: What is to be checked where it is there and of no use.
         """
         self._open = open_
         self._what = what + (f" at {place.url}" if place.url else "")
-        self._settings = (
-            "the addresses in TELESCOPE_STORAGE_*, this machine's managed identity" if place.url else _CONNECTION
-        )
+        self._settings = settings if place.url else _CONNECTION
+        self._service = service
         self._right = f"Give the functions' identity the role '{role}'" if place.url else f"Check {_CONNECTION}"
         self._lock = threading.Lock()
         self._sdk: Sdk | None = None
@@ -106,7 +116,7 @@ class Client(Generic[Sdk]):
             return StoreError(f"{self._what} may not be used: {said}. {self._right}.")
         if error.status in _TOO_MUCH:
             return StoreError(f"{self._what} has too much to do: {said}. Try again.")
-        return StoreError(f"{self._what} cannot be used: {said}. Check the storage account.")
+        return StoreError(f"{self._what} cannot be used: {said}. Check {self._service}.")
 
     def _call(self, operation: Callable[[Sdk], T]) -> T:
         from azure.core import exceptions as sdk  # noqa: PLC0415 (see this page's first lines)
@@ -122,7 +132,7 @@ class Client(Generic[Sdk]):
                 f"{self._what} cannot be reached: {_reason(error)}. Check {self._settings} and the network."
             ) from error
         except sdk.AzureError as error:
-            raise StoreError(f"{self._what} cannot be used: {_line(error)}. Check the storage account.") from error
+            raise StoreError(f"{self._what} cannot be used: {_line(error)}. Check {self._service}.") from error
         except AttributeError as error:
             # How the SDK ends on an error whose answer it cannot read, as one from a proxy.
             raise StoreError(

@@ -134,7 +134,7 @@ class KeysSuite:
         await other.current()
         await rotate(keys)
         time.ms += LEARN_MS
-        await asyncio.to_thread(self.wait_for_followers)
+        self.wait_for_followers(time)
         assert await named(other) == await named(keys)
 
     async def test_private_halves_that_nothing_is_signed_with_are_not_kept(self, keys: Keys, time: Time) -> None:
@@ -146,5 +146,5 @@ class KeysSuite:
         ring = await keys._ring()  # type: ignore[attr-defined]
         assert [bool(key.private) for key in ring.keys] == [False, False, True, True]
 
-    def wait_for_followers(self) -> None:
-        """Until another process has looked again."""
+    def wait_for_followers(self, time: Time) -> None:
+        """Until another process looks again."""

@@ -39,7 +39,10 @@ def test_watching_hears_every_device_of_the_account_and_no_other(
             [*conns, *(f"{base}/{kind}" for base in bases for kind in WATCHED)]
         )
         assert sorted(issued["publish"]) == sorted(f"{base}/stop" for base in bases)
-        assert (issued["lifetime_s"], issued["tcp"]) == (900, {"host": "127.0.0.1", "port": broker.tcp_port})
+        assert (issued["lifetime_s"], issued["tcp"]) == (
+            900,
+            {"host": "127.0.0.1", "port": broker.tcp_port, "tls": False},
+        )
         with connect(broker, issued) as page:
             for start in range(0, len(issued["subscribe"]), 8):
                 chunk = issued["subscribe"][start : start + 8]
