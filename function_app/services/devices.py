@@ -290,7 +290,7 @@ def require_owner(device: Device) -> Device:
         Problem: ``forbidden``.
     """
     if not device.role.may_own:
-        raise forbidden("Only an owner of this device may take control over from somebody. Ask for it instead.")
+        raise forbidden("Only the owner of this device may do that. For control, ask who has it, at lease/requests.")
     return device
 
 

