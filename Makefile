@@ -66,6 +66,11 @@ tests/azurite/node_modules/.installed: tests/azurite/package-lock.json | .venv/.
 	@$(NODE) --prefix tests/azurite ci --loglevel error --no-fund --no-audit >/dev/null
 	@touch $@
 
+tests/oidc/node_modules/.installed: tests/oidc/package-lock.json | .venv/.node
+	@echo "telescope: installing an OpenID Connect provider" >&2
+	@$(NODE) --prefix tests/oidc ci --loglevel error --no-fund --no-audit >/dev/null
+	@touch $@
+
 # The Functions worker runs on every Python that Telescope does, though it asks for 3.13.
 .venv/.azure-worker: requirements/azure-worker.txt | .venv/.dev
 	@rm -rf .venv/azure-worker
@@ -81,13 +86,13 @@ web/dist/index.html: web/node_modules/.installed web/index.html web/package.json
 	@touch $@
 
 # The agent's unit tests run once: where their coverage is counted.
-test: .venv/.dev console check tests/azurite/node_modules/.installed .venv/.azure-worker coverage
+test: .venv/.dev console check tests/azurite/node_modules/.installed tests/oidc/node_modules/.installed .venv/.azure-worker coverage
 	@tests/system-packages
 	@$(NPM) test --silent
 	@$(BIN)/python -m pytest -m "not long" $(SIDE_BY_SIDE) --ignore tests/unit/agent $(ALONE:%=--ignore %)
 	@$(BIN)/python -m pytest -m "not long" $(ALONE)
 
-test-long: .venv/.dev console check tests/azurite/node_modules/.installed .venv/.azure-worker coverage
+test-long: .venv/.dev console check tests/azurite/node_modules/.installed tests/oidc/node_modules/.installed .venv/.azure-worker coverage
 	@tests/system-packages
 	@$(NPM) test --silent
 	@$(BIN)/python -m pytest

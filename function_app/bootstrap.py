@@ -58,6 +58,7 @@ from function_app.services.mailbox import Mailbox
 from function_app.services.model_checks import ModelChecks
 from function_app.services.movements import Movements
 from function_app.services.mqtt_credentials import MqttCredentials
+from function_app.services.open_id import OpenIdSignIn
 from function_app.services.passwords import Passwords
 from function_app.services.pending import Pending
 from function_app.services.polling import Polling
@@ -86,6 +87,9 @@ from function_app.services.uploads import Uploads
 from function_app.services.xmpp_access import XmppAccess
 from function_app.settings import Settings, SettingsError
 
+OPEN_ID_PATH = "/api/v1/auth/oidc/callback"
+"""Where a provider sends browsers back to; it has to be told this address."""
+
 
 @dataclass(frozen=True, slots=True)
 class Functions:
@@ -106,6 +110,7 @@ class Functions:
     sessions: Sessions
     sign_out: SignOut
     passwords: Passwords
+    open_id: OpenIdSignIn
     api_keys: ApiKeys
     enroll: Enroll
     claim: Claim
@@ -317,6 +322,14 @@ def build(settings: Settings, *, clock: Clock | None = None) -> Functions:
         sign_out=sign_out,
         api_keys=ApiKeys(
             tables=tables, devices=devices, sign_in=sign_in, sign_out=sign_out, chain=chain, forget=forget, clock=now
+        ),
+        open_id=OpenIdSignIn(
+            tables=tables,
+            provider=choices.open_id(settings, now),
+            redirect=f"{settings.public_url}{OPEN_ID_PATH}",
+            sign_in=sign_in,
+            sessions=sessions,
+            clock=now,
         ),
         passwords=Passwords(
             tables=tables,

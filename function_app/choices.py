@@ -18,7 +18,9 @@ from function_app.adapters.ring_keys import RingKeys
 from function_app.adapters.vault_keys import VaultKeys
 from function_app.ports.blobs import Blobs
 from function_app.ports.broker_access import BrokerAccess
+from function_app.ports.clock import Clock
 from function_app.ports.command_bus import CommandBus
+from function_app.ports.open_id import OpenId
 from function_app.ports.tables import Tables
 from function_app.settings import AwsStore, AzureStore, EventGridBus, IotBus, KeyVault, SecretsManager, Settings
 
@@ -55,6 +57,16 @@ def keys(settings: Settings, now_ms: Callable[[], int]) -> RingKeys:
             found = FileKeys(settings.home / "keys", now_ms=now_ms)
             found.load()
             return found
+
+
+def open_id(settings: Settings, clock: Clock) -> OpenId | None:
+    """Where people may sign in, beside here."""
+    if settings.open_id is None:
+        return None
+    from function_app.adapters.local.open_id import HttpOpenId  # noqa: PLC0415 (only where it is in use)
+
+    known = settings.open_id
+    return HttpOpenId(issuer=known.issuer, client_id=known.client_id, client_secret=known.client_secret, clock=clock)
 
 
 def stores(settings: Settings, signing: RingKeys | None = None) -> tuple[Tables, Blobs]:

@@ -22,6 +22,9 @@ _IDENTITY = re.compile(r"\A([0-9A-Fa-f]{8}(-[0-9A-Fa-f]{4}){3}-[0-9A-Fa-f]{12})?
 _SECRET = re.compile(r"\A[A-Za-z0-9-]{1,127}\Z")
 _KMS_KEY = re.compile(r"\A[A-Za-z0-9:/_-]{0,256}\Z")
 _DOMAIN = re.compile(r"\A(?=.{0,253}\Z)([a-z0-9]([a-z0-9-]{0,61}[a-z0-9])?(\.[a-z0-9]([a-z0-9-]{0,61}[a-z0-9])?)*)?\Z")
+_CLIENT_ID = re.compile(r"\A[!-~]{1,255}\Z")
+_PROVIDER = re.compile(r"\A[^\x00-\x1f\x7f]{1,60}\Z")
+_LOOPBACK = frozenset({"127.0.0.1", "::1", "localhost"})
 _SHOWN = 80
 """Characters of a wrong value that are shown."""
 
@@ -142,6 +145,23 @@ class Tls:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
+class OpenIdClient:
+    """What we are to an OpenID Connect provider.
+
+    Attributes:
+        issuer: The provider's own name for itself, an address.
+        client_id: Ours there.
+        client_secret: Ours there; empty where it gives none to a client with PKCE.
+        name: What people call it.
+    """
+
+    issuer: str
+    client_id: str
+    client_secret: str = field(default="", repr=False)
+    name: str
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Settings:
     """Where things are.
 
@@ -158,6 +178,7 @@ class Settings:
         websocket_url: The broker's address for the page.
         xmpp_domain: The part after the ``@`` of every address at the XMPP server; empty where there is none.
         xmpp_host: The XMPP server's address, for agents and for the program that speaks for the cloud.
+        open_id: Where people may sign in, beside here.
         robots: Folder of the robot types.
         console: Folder of the built console.
         trusted_proxies: Proxies of one's own in front of the API; the last of ``X-Forwarded-For`` are theirs.
@@ -184,6 +205,7 @@ class Settings:
     xmpp_domain: str = ""
     xmpp_host: str = "127.0.0.1"
     xmpp_port: int = 5222
+    open_id: OpenIdClient | None = None
     robots: Path = ROOT / "robots"
     console: Path = ROOT / "web" / "dist"
     trusted_proxies: int = 0
@@ -230,6 +252,7 @@ def read(environment: Mapping[str, str] | None = None) -> Settings:
         xmpp_domain=_matching(given, "TELESCOPE_XMPP_DOMAIN", "", _DOMAIN, "a domain in lower case"),
         xmpp_host=_host(given, "TELESCOPE_XMPP_HOST", host),
         xmpp_port=_port(given, "TELESCOPE_XMPP_PORT", 5222),
+        open_id=_open_id(given),
         robots=_folder(given, "TELESCOPE_ROBOTS", ROOT / "robots"),
         console=_folder(given, "TELESCOPE_CONSOLE", ROOT / "web" / "dist"),
         trusted_proxies=_number(given, "TELESCOPE_TRUSTED_PROXIES", 0, 0, 10),
@@ -319,6 +342,29 @@ def _bus(given: Mapping[str, str]) -> IotBus | EventGridBus | None:
             )
         case other:
             raise SettingsError(f"TELESCOPE_BUS is '{other[:_SHOWN]}'; it must be mqtt, iot or eventgrid")
+
+
+def _open_id(given: Mapping[str, str]) -> OpenIdClient | None:
+    names = ("TELESCOPE_OIDC_ISSUER", "TELESCOPE_OIDC_CLIENT_ID")
+    issuer, client_id = (given.get(name, "") for name in names)
+    if not issuer and not client_id:
+        if given.get("TELESCOPE_OIDC_CLIENT_SECRET"):
+            raise SettingsError(f"TELESCOPE_OIDC_CLIENT_SECRET is set; set {' and '.join(names)} too, or none of them")
+        return None
+    if not issuer or not client_id:
+        there, missing = names if issuer else names[::-1]
+        raise SettingsError(f"{there} is set; set {missing} too, or neither")
+    parts = urlsplit(_url(given, names[0], "", ("https", "http")))
+    if parts.scheme == "http" and parts.hostname not in _LOOPBACK:
+        raise SettingsError(f"{names[0]} is '{issuer[:_SHOWN]}'; it must be an address that begins with https://")
+    return OpenIdClient(
+        issuer=issuer,
+        client_id=_matching(given, names[1], "", _CLIENT_ID, "the client id that the provider gave, without spaces"),
+        client_secret=given.get("TELESCOPE_OIDC_CLIENT_SECRET", ""),
+        name=_matching(
+            given, "TELESCOPE_OIDC_NAME", parts.hostname or "", _PROVIDER, "a name of at most 60 characters"
+        ),
+    )
 
 
 def _region(given: Mapping[str, str]) -> str:

@@ -26,18 +26,35 @@ class SignIn:
         self._clock = clock
 
     async def account(self, name: str) -> Account:
-        """The account of this name, made with its first space when there is none.
+        """The local account of this name, made with its first space when there is none."""
+        return await self._account(named_partition(name), name)
 
-        Written so that a stop after any step leaves something the next call completes.
+    async def account_elsewhere(self, issuer: str, subject: str, name: str) -> Account:
+        """The account of somebody who signs in elsewhere: by who says so and who they are there, never by a name.
+
+        Names and e-mail addresses are given away again, and not every provider looks whose they are.
         """
-        partition = named_partition(name)
+        digest = hashlib.sha256(f"{issuer}\n{subject}".encode()).hexdigest()
+        account = await self._account(f"open-id:{digest}", name)
+        await store.upsert(
+            self._tables,
+            store.ACCOUNTS,
+            account.id,
+            "account",
+            lambda known: None if known == account else account,
+            Account,
+        )
+        return account
+
+    async def _account(self, partition: str, name: str) -> Account:
+        """Written so that a stop after any step leaves something the next call completes."""
         row = await self._tables.get(store.ACCOUNTS, partition, "account")
         if row is None:
             ids = {"account": new_id(12), "space": new_id(12)}
             try:
                 row = await self._tables.create(store.ACCOUNTS, Row(partition, "account", ids))
             except Conflict:
-                return await self.account(name)
+                return await self._account(partition, name)
         account = Account(id=str(row.data["account"]), name=name)
         spaces = await self.spaces(account.id)
         if not spaces:

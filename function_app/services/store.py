@@ -11,7 +11,7 @@ from function_app.domain.problems import busy_store
 from function_app.ports.tables import Conflict, Row, Tables
 
 ACCOUNTS = "Accounts"
-"""Partition: account id (or ``name:<name>``); keys ``account``, ``space:<id>``, ``session:<id>``,
+"""Partition: account id (or ``name:<name>``, ``open-id:<hash>``); keys ``account``, ``space:<id>``, ``session:<id>``,
 ``signed-out:<session>``, ``password``."""
 SIGN_INS = "SignIns"
 """Partition: first letter of the token's hash; key: the hash."""

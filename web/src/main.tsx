@@ -1,9 +1,10 @@
 import { render } from "preact";
 import { Api } from "./core/api";
 import { startClock } from "./core/clock";
-import { Session, signInToken } from "./core/session";
+import { Session, signInFailure, signInToken } from "./core/session";
 import { App } from "./ui/app";
 import "./style.css";
+import { texts } from "./texts";
 
 const api = new Api();
 const session = new Session(api);
@@ -15,8 +16,16 @@ function takeToken(): string | null {
   return token;
 }
 
+/** What went wrong elsewhere, taken out of the address: it is said once. */
+function takeFailure(): string {
+  const code = signInFailure(location.hash);
+  if (code === null) return "";
+  history.replaceState(null, "", `${location.pathname}${location.search}#/`);
+  return code === "open-id-expired" ? texts.session.elsewhereExpired : texts.session.elsewhereRefused;
+}
+
 startClock();
-void session.start(takeToken());
+void session.start(takeToken(), takeFailure());
 addEventListener("hashchange", () => {
   const token = takeToken();
   if (token !== null) void session.start(token);

@@ -33,7 +33,14 @@ export const texts = {
     checking: "Finding out who you are …",
     title: "Sign in",
     failed: "That did not work",
-    explain: "Open the sign-in link to come in. Each link works once.",
+    name: "Name",
+    password: "Password",
+    enter: "Sign in",
+    elsewhere: (name: string): string => `Sign in with ${name}`,
+    elsewhereExpired: "That took too long, or was begun in another browser. Begin again.",
+    elsewhereRefused: "You were not signed in there. Try again, or ask whoever runs this server.",
+    byLink: "With a sign-in link",
+    explain: "Each link works once. A new account has no password yet: come in by its link, and set one under your name.",
     where:
       "The program that runs this server prints one when it starts: look in its terminal for the line that begins with “ready”. For another one, run this there:",
     command: "make link",
@@ -41,8 +48,25 @@ export const texts = {
     use: "Sign in",
     notALink: "This is not a sign-in link: it has “#sign-in=” and a token in it.",
     out: "Sign out",
-    ended: "Your sign-in has ended. Open a new sign-in link to go on.",
+    ended: "Your sign-in has ended. Sign in again to go on.",
     signedInAs: (name: string): string => `Signed in as ${name}`,
+  },
+
+  account: {
+    title: "Your account",
+    password: "Password",
+    passwordExplained:
+      "At least twelve characters; a sentence of a few words is a good one. Every other sign-in of yours ends. Within ten minutes of opening a sign-in link the old one may be left empty.",
+    old: "Old password",
+    new: "New password",
+    change: "Set password",
+    changed: "The password is set.",
+    sessions: "Where you are signed in",
+    session: (how: string, since: string): string => `By ${how}, since ${since}`,
+    how: { link: "link", password: "password", "open-id": "your provider" },
+    this: "this one",
+    end: "End",
+    endOthers: "End all others",
   },
 
   link: {

@@ -3,7 +3,7 @@ import { degrees, radians } from "../src/core/angles";
 import { History, SPAN_MS } from "../src/core/history";
 import type { KnownTelemetry } from "../src/core/messages";
 import { percentile, RoundTrip } from "../src/core/round-trip";
-import { signInToken } from "../src/core/session";
+import { signInFailure, signInToken } from "../src/core/session";
 import { deviceTopics, matches } from "../src/core/topics";
 import { texts } from "../src/texts";
 
@@ -88,6 +88,11 @@ describe("small things", () => {
       "1 h ago",
       "2 days ago",
     ]);
+  });
+
+  it("why signing in elsewhere failed is a code, and nothing else", () => {
+    expect(signInFailure("#sign-in-failed=open-id-expired")).toBe("open-id-expired");
+    for (const hash of ["", "#/", "#sign-in-failed=", "#sign-in-failed=<b>"]) expect(signInFailure(hash)).toBeNull();
   });
 
   it("a sign-in token is taken from its own fragment only", () => {

@@ -68,6 +68,23 @@ describe("a session", () => {
     expect(session.state.value).toEqual({ kind: "out", why: "" });
   });
 
+  it("begins with a name and a password, or says what is wrong with them", async () => {
+    const session = new Session(api);
+    await expect(session.enter("demo", "wrong")).rejects.toMatchObject({ status: 401 });
+    expect(session.state.value.kind).not.toBe("in");
+    await session.enter("demo", "right");
+    expect(session.state.value).toMatchObject({ kind: "in", account: { name: "Demo" } });
+  });
+
+  it("says what went wrong elsewhere to who is not signed in, and to nobody else", async () => {
+    const session = new Session(api);
+    await session.start(null, "Not there.");
+    expect(session.state.value.kind).toBe("in");
+    cloud.instead.set("GET /accounts/me", () => problem(401, "unauthorized", "Sign in first."));
+    await session.start(null, "Not there.");
+    expect(session.state.value).toEqual({ kind: "out", why: "Not there." });
+  });
+
   it("says why a link did not work, and nothing at a first visit", async () => {
     const session = new Session(api);
     await session.start("used");

@@ -35,6 +35,7 @@ from function_app.entrypoints.http import (
     library,
     messages,
     movements,
+    open_id,
     robot_types,
     shares,
     stop,
@@ -81,6 +82,7 @@ def create_app(functions: Functions) -> FastAPI:
     resources = (
         auth.router(functions, caller),
         accounts.router(functions, caller),
+        open_id.router(functions),
         api_keys.router(functions, caller),
         agents.router(functions, caller),
         messages.router(functions, caller),

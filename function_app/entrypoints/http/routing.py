@@ -27,6 +27,7 @@ _MEANINGS = {
     201: "Made",
     202: "Under way",
     204: "Done, nothing to say",
+    303: "Go on there, by GET",
     207: "Partly refused; each item says how it went",
     401: "Not signed in",
     403: "Not allowed",

@@ -161,3 +161,34 @@ def test_speaking_xmpp_without_a_server_is_one_line(tmp_path: Path) -> None:
     assert (done.returncode, done.stdout) == (1, "")
     assert done.stderr.splitlines()[-1].startswith("telescope functions: TELESCOPE_XMPP_DOMAIN is empty; it must be")
     assert "Traceback" not in done.stderr
+
+
+ISSUER = {"TELESCOPE_OIDC_ISSUER": "https://id.example/tenant", "TELESCOPE_OIDC_CLIENT_ID": "app"}
+
+
+def test_an_open_id_provider_is_as_it_calls_itself_and_its_secret_is_not_shown() -> None:
+    found = settings.read({**ISSUER, "TELESCOPE_OIDC_CLIENT_SECRET": "hush"}).open_id
+    assert found is not None
+    assert (found.issuer, found.client_id, found.name) == ("https://id.example/tenant", "app", "id.example")
+    assert found.client_secret == "hush"
+    assert "hush" not in repr(found)
+    assert settings.read({}).open_id is None
+
+
+@pytest.mark.parametrize(
+    ("changes", "named"),
+    [
+        ({"TELESCOPE_OIDC_CLIENT_ID": ""}, "TELESCOPE_OIDC_CLIENT_ID"),
+        ({"TELESCOPE_OIDC_ISSUER": ""}, "TELESCOPE_OIDC_ISSUER"),
+        ({"TELESCOPE_OIDC_ISSUER": "id.example"}, "TELESCOPE_OIDC_ISSUER"),
+        ({"TELESCOPE_OIDC_ISSUER": "http://id.example"}, "TELESCOPE_OIDC_ISSUER"),
+        ({"TELESCOPE_OIDC_CLIENT_ID": "a b"}, "TELESCOPE_OIDC_CLIENT_ID"),
+        ({"TELESCOPE_OIDC_NAME": ""}, "TELESCOPE_OIDC_NAME"),
+        (dict.fromkeys(ISSUER, "") | {"TELESCOPE_OIDC_CLIENT_SECRET": "hush"}, "TELESCOPE_OIDC_CLIENT_SECRET"),
+    ],
+    ids=str,
+)
+def test_half_an_open_id_provider_is_refused_by_name(changes: dict[str, str], named: str) -> None:
+    with pytest.raises(SettingsError, match=named) as refused:
+        settings.read({**ISSUER, **changes})
+    assert "hush" not in str(refused.value)

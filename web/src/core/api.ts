@@ -8,6 +8,21 @@ export interface Account {
   session: string;
 }
 
+/** How one may sign in here; `open_id`: at a provider elsewhere. */
+export interface Methods {
+  password: boolean;
+  open_id: { name: string; address: string } | null;
+}
+
+export interface SignInSession {
+  id: string;
+  how: "link" | "password" | "open-id";
+  since: string;
+  address: string;
+  program: string;
+  mine: boolean;
+}
+
 export interface Lease {
   holder: string;
   epoch: number;
@@ -130,6 +145,31 @@ export class Api {
 
   async signIn(link: string): Promise<Account> {
     return this.#signedIn(await this.#call("POST", "/auth/sign-in", { body: { link } }));
+  }
+
+  async signInByPassword(name: string, password: string): Promise<Account> {
+    return this.#signedIn(await this.#call("POST", "/auth/password", { body: { name, password } }));
+  }
+
+  methods(): Promise<Methods> {
+    return this.#call("GET", "/auth/methods");
+  }
+
+  async setPassword(password: string, old: string): Promise<void> {
+    const body = old === "" ? { password } : { password, old_password: old };
+    await this.#call("PUT", "/accounts/me/password", { body });
+  }
+
+  sessions(): Promise<SignInSession[]> {
+    return this.#all("/accounts/me/sessions");
+  }
+
+  async endSession(id: string): Promise<void> {
+    await this.#call("DELETE", `/accounts/me/sessions/${id}`);
+  }
+
+  async endOtherSessions(): Promise<void> {
+    await this.#call("DELETE", "/accounts/me/sessions");
   }
 
   async signOut(): Promise<void> {

@@ -17,8 +17,12 @@ export class Session {
     this.#api = api;
   }
 
-  /** Use a link's token, or find the session that the browser already has. */
-  async start(link: string | null): Promise<void> {
+  /**
+   * Use a link's token, or find the session that the browser already has.
+   *
+   * `failed` says what went wrong with signing in elsewhere, where the browser has just come back from.
+   */
+  async start(link: string | null, failed = ""): Promise<void> {
     this.#state.value = { kind: "checking" };
     try {
       if (link !== null) await this.#api.signIn(link);
@@ -26,8 +30,14 @@ export class Session {
       this.#state.value = { kind: "in", account: await this.#api.me() };
     } catch (error) {
       const firstVisit = link === null && error instanceof ApiError && error.status === 401;
-      this.#state.value = { kind: "out", why: firstVisit ? "" : sentence(error) };
+      this.#state.value = { kind: "out", why: firstVisit ? failed : sentence(error) };
     }
+  }
+
+  /** Sign in by name and password. Throws what the server says against it. */
+  async enter(name: string, password: string): Promise<void> {
+    await this.#api.signInByPassword(name, password);
+    this.#state.value = { kind: "in", account: await this.#api.me() };
   }
 
   async signOut(): Promise<void> {
@@ -53,4 +63,9 @@ export function signInToken(hash: string): string | null {
   } catch {
     return null;
   }
+}
+
+/** Why signing in elsewhere came to nothing, in `#sign-in-failed=<code>`, or `null`. */
+export function signInFailure(hash: string): string | null {
+  return /^#sign-in-failed=([a-z-]{1,40})$/.exec(hash)?.[1] ?? null;
 }

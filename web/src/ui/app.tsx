@@ -4,9 +4,10 @@ import { ApiError, type Account, type Api } from "../core/api";
 import { Fleet } from "../core/fleet";
 import type { Session } from "../core/session";
 import { texts } from "../texts";
+import { AccountPage } from "./account-page";
 import { DevicePage } from "./device-page";
 import { FleetPage } from "./fleet-page";
-import { fleetAddress, route } from "./route";
+import { accountAddress, fleetAddress, route } from "./route";
 import { SignIn } from "./sign-in";
 
 interface AppProps {
@@ -26,7 +27,7 @@ export function App({ api, session }: AppProps) {
         </main>
       );
     case "out":
-      return <SignIn why={state.why} onToken={(token) => void session.start(token)} />;
+      return <SignIn api={api} session={session} why={state.why} />;
     case "in":
       return <SignedIn key={state.account.session} api={api} session={session} account={state.account} />;
   }
@@ -61,19 +62,17 @@ function SignedIn({ api, session, account }: SignedInProps) {
         <a class="brand" href={fleetAddress}>
           {texts.product}
         </a>
-        <span class="account" data-testid="signed-in" title={texts.session.signedInAs(account.name)}>
+        <a class="account" data-testid="signed-in" href={accountAddress} title={texts.session.signedInAs(account.name)}>
           {account.name}
-        </span>
+        </a>
         <button type="button" class="plain" onClick={() => void session.signOut()}>
           {texts.session.out}
         </button>
       </header>
       <LinkBanner fleet={fleet} />
-      {at.page === "fleet" ? (
-        <FleetPage fleet={fleet} />
-      ) : (
-        <DevicePage key={at.id} api={api} fleet={fleet} id={at.id} account={account} />
-      )}
+      {at.page === "fleet" && <FleetPage fleet={fleet} />}
+      {at.page === "account" && <AccountPage api={api} />}
+      {at.page === "device" && <DevicePage key={at.id} api={api} fleet={fleet} id={at.id} account={account} />}
     </>
   );
 }

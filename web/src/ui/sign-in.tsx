@@ -1,14 +1,112 @@
-import { useState } from "preact/hooks";
-import { signInToken } from "../core/session";
+import { useEffect, useState } from "preact/hooks";
+import { sentence, type Api, type Methods } from "../core/api";
+import { signInToken, type Session } from "../core/session";
 import { texts } from "../texts";
 
 interface SignInProps {
+  api: Api;
+  session: Session;
   /** What went wrong before; empty at a first visit. */
   why: string;
-  onToken: (token: string) => void;
 }
 
-export function SignIn({ why, onToken }: SignInProps) {
+export function SignIn({ api, session, why }: SignInProps) {
+  const [methods, setMethods] = useState<Methods | null>(null);
+  useEffect(() => {
+    // Where that cannot be read, what always works is offered.
+    api.methods().then(setMethods, () => setMethods({ password: true, open_id: null }));
+  }, [api]);
+  const elsewhere = methods?.open_id ?? null;
+  return (
+    <main class="narrow" id="content">
+      <h1>{texts.session.title}</h1>
+      {why !== "" && (
+        <p class="notice bad" role="alert">
+          <strong>{texts.session.failed}.</strong> {why}
+        </p>
+      )}
+      {elsewhere !== null && (
+        <p>
+          <a class="elsewhere" data-testid="sign-in-elsewhere" href={elsewhere.address}>
+            {texts.session.elsewhere(elsewhere.name)}
+          </a>
+        </p>
+      )}
+      {methods?.password === true && <PasswordForm session={session} />}
+      <h2>{texts.session.byLink}</h2>
+      <p>{texts.session.explain}</p>
+      <p>{texts.session.where}</p>
+      <pre class="command">{texts.session.command}</pre>
+      <LinkForm onToken={(token) => void session.start(token)} />
+    </main>
+  );
+}
+
+function PasswordForm({ session }: { session: Session }) {
+  const [name, setName] = useState("");
+  const [password, setPassword] = useState("");
+  const [busy, setBusy] = useState(false);
+  const [wrong, setWrong] = useState("");
+
+  const enter = async (): Promise<void> => {
+    setBusy(true);
+    setWrong("");
+    try {
+      await session.enter(name, password);
+    } catch (error) {
+      setWrong(sentence(error)); // What was typed stays.
+      setBusy(false);
+    }
+  };
+
+  return (
+    <form
+      class="row-form"
+      onSubmit={(event) => {
+        event.preventDefault();
+        void enter();
+      }}
+    >
+      <label for="sign-in-name">{texts.session.name}</label>
+      <div class="row">
+        <input
+          id="sign-in-name"
+          data-testid="sign-in-name"
+          type="text"
+          autocomplete="username"
+          autocapitalize="none"
+          spellcheck={false}
+          required
+          maxLength={200}
+          value={name}
+          onInput={(event) => setName(event.currentTarget.value)}
+        />
+      </div>
+      <label for="sign-in-password">{texts.session.password}</label>
+      <div class="row">
+        <input
+          id="sign-in-password"
+          data-testid="sign-in-password"
+          type="password"
+          autocomplete="current-password"
+          required
+          value={password}
+          aria-invalid={wrong !== ""}
+          aria-describedby="password-wrong"
+          onInput={(event) => setPassword(event.currentTarget.value)}
+        />
+        <button type="submit" class="primary" data-testid="sign-in" disabled={busy}>
+          {texts.session.enter}
+        </button>
+      </div>
+      <p id="password-wrong" class="field-error" aria-live="polite">
+        {wrong}
+      </p>
+    </form>
+  );
+}
+
+function LinkForm({ onToken }: { onToken: (token: string) => void }) {
   const [pasted, setPasted] = useState("");
   const [wrong, setWrong] = useState(false);
   const use = (event: SubmitEvent): void => {
@@ -19,38 +117,25 @@ export function SignIn({ why, onToken }: SignInProps) {
     if (token !== null) onToken(token);
   };
   return (
-    <main class="narrow" id="content">
-      <h1>{texts.session.title}</h1>
-      {why !== "" && (
-        <p class="notice bad" role="alert">
-          <strong>{texts.session.failed}.</strong> {why}
-        </p>
-      )}
-      <p>{texts.session.explain}</p>
-      <p>{texts.session.where}</p>
-      <pre class="command">{texts.session.command}</pre>
-      <form onSubmit={use} class="row-form">
-        <label for="sign-in-link">{texts.session.pasted}</label>
-        <div class="row">
-          <input
-            id="sign-in-link"
-            data-testid="sign-in-link"
-            type="text"
-            autocomplete="off"
-            spellcheck={false}
-            value={pasted}
-            aria-invalid={wrong}
-            aria-describedby="sign-in-wrong"
-            onInput={(event) => setPasted(event.currentTarget.value)}
-          />
-          <button type="submit" class="primary">
-            {texts.session.use}
-          </button>
-        </div>
-        <p id="sign-in-wrong" class="field-error" aria-live="polite">
-          {wrong ? texts.session.notALink : ""}
-        </p>
-      </form>
-    </main>
+    <form onSubmit={use} class="row-form">
+      <label for="sign-in-link">{texts.session.pasted}</label>
+      <div class="row">
+        <input
+          id="sign-in-link"
+          data-testid="sign-in-link"
+          type="text"
+          autocomplete="off"
+          spellcheck={false}
+          value={pasted}
+          aria-invalid={wrong}
+          aria-describedby="sign-in-wrong"
+          onInput={(event) => setPasted(event.currentTarget.value)}
+        />
+        <button type="submit">{texts.session.use}</button>
+      </div>
+      <p id="sign-in-wrong" class="field-error" aria-live="polite">
+        {wrong ? texts.session.notALink : ""}
+      </p>
+    </form>
   );
 }

@@ -211,11 +211,14 @@ export class Cloud {
 
   async #answer(call: Call, url: string): Promise<Answer> {
     const { method, path, body } = call;
-    if (method !== "GET" && path !== "/auth/sign-in" && call.headers["x-csrf-token"] !== this.csrf)
+    if (method !== "GET" && !["/auth/sign-in", "/auth/password"].includes(path) && call.headers["x-csrf-token"] !== this.csrf)
       return problem(403, "csrf-token", "A changing request needs the session's token.");
     switch (`${method} ${path}`) {
       case "POST /auth/sign-in":
         if (body["link"] !== "good") return problem(401, "link-used", "This sign-in link was used before or is too old.");
+        return ok({ account: { id: "demo", name: "Demo" }, session: "s1", csrf_token: this.csrf });
+      case "POST /auth/password":
+        if (body["password"] !== "right") return problem(401, "unauthorized", "This name and password do not belong together.");
         return ok({ account: { id: "demo", name: "Demo" }, session: "s1", csrf_token: this.csrf });
       case "POST /auth/sign-out":
         return { status: 204, body: null };

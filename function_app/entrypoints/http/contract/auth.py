@@ -50,6 +50,21 @@ class SignedIn(Answer, frozen=True, kw_only=True):
     csrf_token: str
 
 
+class Elsewhere(Answer, frozen=True, kw_only=True):
+    """A provider to sign in at: its name, and the address that leads there."""
+
+    name: str
+    address: str
+
+
+class Methods(Answer, frozen=True, kw_only=True):
+    """How one may sign in. ``open_id``: at an OpenID Connect provider, where there is one."""
+
+    link: bool
+    password: bool
+    open_id: Elsewhere | None
+
+
 class AccessToken(Answer, frozen=True, kw_only=True):
     """The next access token of a session."""
 

@@ -1,0 +1,28 @@
+// An OpenID Connect provider for the tests. The first line of its standard input says what it is to be:
+// {port, client: {...}, keys: [JWK, …]}; it prints its address once it listens, and ends with its standard input.
+import { createServer } from "node:http";
+import { createInterface } from "node:readline";
+import Provider from "oidc-provider";
+
+const lines = createInterface({ input: process.stdin });
+lines.on("close", () => process.exit());
+lines.once("line", (line) => {
+  const { port, client, keys } = JSON.parse(line);
+  const server = createServer((request, response) => answer(request, response));
+  let answer;
+  server.listen(port, "127.0.0.1", () => {
+    const issuer = `http://127.0.0.1:${server.address().port}`;
+    // Whoever signs in is who they say: the forms for that are the package's own, for development.
+    const provider = new Provider(issuer, {
+      clients: [client],
+      jwks: { keys },
+      cookies: { keys: ["of the tests"] },
+      claims: { openid: ["sub"], profile: ["name"] },
+      conformIdTokenClaims: false,
+      findAccount: (_context, id) => ({ accountId: id, claims: () => ({ sub: id, name: `Name of ${id}` }) }),
+      pkce: { required: () => true },
+    });
+    answer = provider.callback();
+    console.log(`listening at ${issuer}`);
+  });
+});
