@@ -20,6 +20,7 @@ from device_agent.ports.uploads import Uploads
 from device_agent.protocol import topics
 from device_agent.protocol.robot_type import RobotType
 from device_agent.runtime.agent import Agent
+from device_agent.runtime.certificate import OwnCertificate
 from device_agent.runtime.device import Device
 from device_agent.runtime.home import Configuration, DeviceEntry, Home, HomeError, Pairing
 from device_agent.runtime.instrument import Instrument
@@ -216,6 +217,8 @@ def build(home: Home, *, trace: Path | None = None) -> Cell:
             open_api=lambda: api_of(home, configuration, clock),
             next_session=journal.next_session,
             quiet=lambda: agent.quiet,
+            certificate=OwnCertificate(home.folder),
+            now_ms=clock.now_ms,
             listen=room.topics(),
         )
     )

@@ -11,6 +11,7 @@ from typing import Any
 
 from device_agent.ports.transport import Transport
 from device_agent.protocol import topics
+from device_agent.runtime.certificate import OwnCertificate
 from device_agent.runtime.home import Configuration, HomeError, Pairing
 from device_agent.runtime.lease import Refused
 from device_agent.runtime.pins import Pins
@@ -33,6 +34,8 @@ class Wiring:
         open_api: A view of the HTTP API for one thread.
         next_session: The next session number, rising across restarts.
         quiet: Whether a short break of the link would disturb nothing.
+        certificate: What a broker may want to see of this agent.
+        now_ms: The cloud's time [ms], once it is known.
         listen: Topics of the space's other agents to hear.
     """
 
@@ -42,6 +45,8 @@ class Wiring:
     open_api: Callable[[], CloudApi]
     next_session: Callable[[], int]
     quiet: Callable[[], bool]
+    certificate: OwnCertificate
+    now_ms: Callable[[], float | None]
     listen: tuple[str, ...] = ()
 
     @property
@@ -181,6 +186,13 @@ def _mqtt(wiring: Wiring) -> Transport:
 
     def access() -> BrokerAccess:
         given = answers.read(wiring.membership.credentials(api), answers.MqttCredentials)
+        own = None
+        if (after_ms := given.tcp.certificate_after_ms) is not None:
+            own = wiring.certificate.ready(
+                after_ms=after_ms,
+                now_ms=wiring.now_ms() or after_ms,
+                ask=lambda request: answers.read(api.certificate(request), answers.Certificate).chain,
+            )
         return BrokerAccess(
             host=given.tcp.host,
             port=given.tcp.port,
@@ -189,7 +201,7 @@ def _mqtt(wiring: Wiring) -> Transport:
             password=given.password,
             subscribe=given.subscribe,
             lifetime_s=given.lifetime_s,
-            tls=trust.broker(given.tcp.tls, server=api.server, ca=api.ca),
+            tls=trust.broker(tls=given.tcp.tls, server=api.server, ca=api.ca, own=own),
         )
 
     return MqttTransport(

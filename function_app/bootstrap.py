@@ -17,6 +17,7 @@ from function_app.adapters.local.password_hashes import Argon2Hashes
 from function_app.domain.series import Keep
 from function_app.ports.blobs import Blobs, Transfers
 from function_app.ports.broker_access import BrokerAccess
+from function_app.ports.certificates import Certificates
 from function_app.ports.clock import Clock
 from function_app.ports.command_bus import CommandBus
 from function_app.ports.feed import Feed, Telemetry
@@ -32,6 +33,7 @@ from function_app.services.attempts import Attempts
 from function_app.services.audit import Audit
 from function_app.services.audit_chain import AuditChain
 from function_app.services.audit_trail import AuditTrail
+from function_app.services.certify import Certify
 from function_app.services.claim import Claim
 from function_app.services.commands import Commands
 from function_app.services.conditions import Conditions
@@ -103,6 +105,8 @@ class Functions:
     telemetry: Telemetry
     late: Telemetry
     access: BrokerAccess
+    certificates: Certificates
+    certify: Certify
     keys: Keys
     clock: Clock
     identify: Identify
@@ -160,6 +164,7 @@ class Functions:
         await self.tables.close()
         await self.blobs.close()
         await self.keys.close()
+        await self.certificates.close()
 
 
 def build(settings: Settings, *, clock: Clock | None = None) -> Functions:
@@ -254,6 +259,7 @@ def build(settings: Settings, *, clock: Clock | None = None) -> Functions:
         pending=pending,
         fence=fence,
         access=access,
+        certificates=choices.certificates(settings),
         bus=bus,
         series=writer,
         forget=forget,
@@ -314,6 +320,8 @@ def build(settings: Settings, *, clock: Clock | None = None) -> Functions:
         telemetry=telemetry,
         late=late,
         access=access,
+        certificates=choices.certificates(settings),
+        certify=Certify(certificates=choices.certificates(settings)),
         keys=keys,
         clock=now,
         identify=identify,

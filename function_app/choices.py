@@ -9,6 +9,7 @@ from collections.abc import Awaitable, Callable
 
 from function_app.adapters.local.blobs import FileBlobs
 from function_app.adapters.local.broker_access import MosquittoBrokerAccess, TokenBrokerAccess
+from function_app.adapters.local.certificates import FileCertificates, NoCertificates
 from function_app.adapters.local.clock import SystemClock
 from function_app.adapters.local.command_bus import MqttCommandBus
 from function_app.adapters.local.keys import FileKeys
@@ -18,6 +19,7 @@ from function_app.adapters.ring_keys import RingKeys
 from function_app.adapters.vault_keys import VaultKeys
 from function_app.ports.blobs import Blobs
 from function_app.ports.broker_access import BrokerAccess
+from function_app.ports.certificates import Certificates
 from function_app.ports.clock import Clock
 from function_app.ports.command_bus import CommandBus
 from function_app.ports.open_id import OpenId
@@ -130,13 +132,20 @@ def bus(settings: Settings, granted: BrokerAccess) -> CommandBus:
             )
 
 
+def certificates(settings: Settings) -> Certificates:
+    """The authority for agents."""
+    if settings.tls is None or settings.tls.agents is None:
+        return NoCertificates()
+    return FileCertificates(settings.tls.agents)
+
+
 def broker_tls(settings: Settings) -> ssl.SSLContext | None:
     """How connections to the broker are kept from others.
 
     Raises:
         BrokerAccessError: The authority's certificate cannot be read.
     """
-    return None if settings.tls is None else client_context(settings.tls.ca)
+    return None if settings.tls is None else client_context(settings.tls.ca, settings.tls.agents)
 
 
 async def prepare(settings: Settings) -> None:

@@ -137,11 +137,13 @@ class Tls:
         certificate: The API's own, with its chain.
         key: Its key.
         ca: Who is trusted to speak for the broker; ``None``: whom the machine trusts.
+        agents: Where the broker wants certificates of agents: folder of their authority, and of the functions' own.
     """
 
     certificate: Path
     key: Path
     ca: Path | None = None
+    agents: Path | None = None
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -300,7 +302,13 @@ def _tls(given: Mapping[str, str]) -> Tls | None:
     if not certificate:
         return None
     ca = _file(given, "TELESCOPE_TLS_CA") if given.get("TELESCOPE_TLS_CA") else None
-    return Tls(certificate=_file(given, "TELESCOPE_TLS_CERTIFICATE"), key=_file(given, "TELESCOPE_TLS_KEY"), ca=ca)
+    agents = _folder(given, "TELESCOPE_TLS_AGENTS", Path()) if given.get("TELESCOPE_TLS_AGENTS") else None
+    return Tls(
+        certificate=_file(given, "TELESCOPE_TLS_CERTIFICATE"),
+        key=_file(given, "TELESCOPE_TLS_KEY"),
+        ca=ca,
+        agents=agents,
+    )
 
 
 def _file(given: Mapping[str, str], name: str) -> Path:

@@ -9,12 +9,14 @@ import subprocess
 import sys
 import time
 from collections.abc import Sequence
+from pathlib import Path
 from types import FrameType
 
 ENDED, BAD_INPUT, CANNOT_START = 1, 2, 3
 """Exit codes: it ended by itself; a folder or address cannot be used; a port is taken or it is not installed."""
 _START_S = 10.0
 _STOP_S = 1.5
+_LOOK_S = 0.25
 _PR_SET_PDEATHSIG = 1
 _PATH_BESIDE = "/usr/local/sbin:/usr/sbin:/sbin:/opt/homebrew/sbin"
 
@@ -69,7 +71,9 @@ def free_ports(host: str, *ports: int) -> list[int]:
         return [each.getsockname()[1] for each in held]
 
 
-def supervise(name: str, command: Sequence[str], *, host: str, ports: Sequence[int], ready: str) -> int:
+def supervise(
+    name: str, command: Sequence[str], *, host: str, ports: Sequence[int], ready: str, watched: Path | None = None
+) -> int:
     """Run a server until SIGTERM or SIGINT; prints ``ready`` once it answers on every port; the exit code.
 
     Args:
@@ -78,6 +82,7 @@ def supervise(name: str, command: Sequence[str], *, host: str, ports: Sequence[i
         host: The address it listens on.
         ports: Its ports.
         ready: The line to print.
+        watched: A file of the server's; when it changes the server is told to read again (SIGHUP).
     """
     stopping = False
     child: subprocess.Popen[bytes] | None = None
@@ -101,15 +106,37 @@ def supervise(name: str, command: Sequence[str], *, host: str, ports: Sequence[i
         child.terminate()
     elif _answers(name, child, host, ports):
         print(ready, flush=True)  # noqa: T201 (a terminal program prints)
+    changes = _Changes(watched)
     while child.poll() is None:
         try:
-            child.wait(_STOP_S if stopping else None)
+            child.wait(_STOP_S if stopping else _LOOK_S if watched else None)
         except subprocess.TimeoutExpired:
-            child.kill()
+            if stopping or changes.seen():
+                child.send_signal(signal.SIGKILL if stopping else signal.SIGHUP)
     if stopping:
         return 0
     _complain(f"{name} ended by itself with code {child.returncode}; its own words are above")
     return ENDED
+
+
+class _Changes:
+    """Whether a file is another than it was."""
+
+    def __init__(self, path: Path | None) -> None:
+        self._path = path
+        self._stamp = self._look()
+
+    def seen(self) -> bool:
+        """Since the last time that this was asked."""
+        before, self._stamp = self._stamp, self._look()
+        return self._stamp != before
+
+    def _look(self) -> tuple[int, int] | None:
+        try:
+            found = self._path.stat() if self._path else None
+        except OSError:
+            return None
+        return None if found is None else (found.st_mtime_ns, found.st_ino)
 
 
 def _answers(name: str, child: "subprocess.Popen[bytes]", host: str, ports: Sequence[int]) -> bool:

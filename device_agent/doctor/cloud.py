@@ -12,6 +12,7 @@ from urllib.parse import urlsplit
 from device_agent import bootstrap, catalogue, links
 from device_agent.doctor.finding import Finding, ok, problem, warning
 from device_agent.ports.clock import CloudClock, tick_ms, wall_ms
+from device_agent.runtime.certificate import OwnCertificate
 from device_agent.runtime.home import Configuration, Home, HomeError, Pairing
 from device_agent.runtime.journal import Journal
 from device_agent.runtime.lease import Refused
@@ -170,6 +171,8 @@ def _connect(home: Home, configuration: Configuration, pairing: Pairing, clock: 
             open_api=lambda: bootstrap.api_of(home, configuration, clock),
             next_session=journal.next_session,
             quiet=lambda: True,
+            certificate=OwnCertificate(home.folder),
+            now_ms=clock.now_ms,
         )
     )
     up = threading.Event()

@@ -18,6 +18,7 @@ from function_app.domain.ids import device_id
 from function_app.domain.queue import DROPPED
 from function_app.domain.sharing import Share, device_target
 from function_app.ports.broker_access import BrokerAccess, BrokerAccessError
+from function_app.ports.certificates import Certificates
 from function_app.ports.clock import Clock
 from function_app.ports.command_bus import BusUnavailable, CommandBus
 from function_app.ports.tables import Conflict, Row, Tables
@@ -53,6 +54,7 @@ class Leave:
         pending: Pending,
         fence: Fence,
         access: BrokerAccess,
+        certificates: Certificates,
         bus: CommandBus,
         series: SeriesWriter,
         forget: Forget,
@@ -65,6 +67,7 @@ class Leave:
         self._pending = pending
         self._fence = fence
         self._access = access
+        self._certificates = certificates
         self._bus = bus
         self._series = series
         self._forget = forget
@@ -151,6 +154,8 @@ class Leave:
     async def _tell_broker(self, agent_id: str, leaving: Leaving) -> None:
         """Cut the agent, then clear what is retained: its will may have spoken. Not what is said there anew."""
         if leaving.why != "removed":
+            if leaving.why == "unpaired":
+                await self._certificates.revoke(agent_id)
             await self._access.revoke(principal=f"agent:{agent_id}")
         if leaving.why == "unpaired":
             for name in leaving.devices:

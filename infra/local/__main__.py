@@ -117,6 +117,9 @@ class Machine:
         made = ("--show",) if chosen.certificate[0].exists() else ("--address", chosen.host)
         say(f"TLS {self._once('-m', 'infra.tls', '--home', str(chosen.tls_home), *made).splitlines()[0]}")
 
+        if chosen.certificates and not (chosen.tls_home / "devices-ca.key").exists():
+            self._once("-m", "infra.tls", "--home", str(chosen.tls_home), "--devices")
+
     def _broker(self) -> list[str]:
         chosen = self._chosen
         ports = [
@@ -130,6 +133,9 @@ class Machine:
         if chosen.tls:
             certificate, key = chosen.certificate
             ports += ["--certificate", str(certificate), "--certificate-key", str(key)]
+        if chosen.certificates:
+            agents = chosen.tls_home
+            ports += ["--agents-ca", str(agents / "devices-ca.crt"), "--revoked", str(agents / "devices.crl")]
         if chosen.broker == "mosquitto":
             return ["-m", "infra.mosquitto", "--home", str(chosen.home / "mosquitto"), *ports]
         return ["-m", "infra.amqtt", "--keys", str(chosen.home / "keys" / "public.json"), *ports]

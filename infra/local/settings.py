@@ -20,7 +20,8 @@ class SettingsError(Exception):
 class Settings:
     """Where things are. Ports follow ``port``: MQTT is the next one, MQTT over WebSocket the one after, then XMPP.
 
-    ``tls``: page, API and broker speak TLS alone, by the certificates in ``tls_home``.
+    ``tls``: page, API and broker speak TLS alone, by the certificates in ``tls_home``. ``certificates``: the broker
+    wants to see one of each agent, too.
     ``room``: the simulated room whose robots and devices are started; empty for an arm alone.
     """
 
@@ -31,6 +32,7 @@ class Settings:
     xmpp: bool = False
     room: str = "lab"
     tls: bool = False
+    certificates: bool = False
 
     @property
     def mqtt_port(self) -> int:
@@ -89,6 +91,7 @@ class Settings:
             "TELESCOPE_TLS_CERTIFICATE": str(certificate),
             "TELESCOPE_TLS_KEY": str(key),
             "TELESCOPE_TLS_CA": str(self.ca) if self.ca.exists() else "",
+            "TELESCOPE_TLS_AGENTS": str(self.tls_home) if self.certificates else "",
         }
 
 
@@ -112,6 +115,12 @@ def read(environment: Mapping[str, str]) -> Settings:
         raise SettingsError(f"TELESCOPE_TLS is '{tls}'; it must be 1, for TLS with the certificates in tls/, or 0")
     if tls == xmpp == "1":
         raise SettingsError("TELESCOPE_XMPP=1 asks the functions in the clear; on a site with TELESCOPE_TLS=1 use MQTT")
+    certificates = environment.get("TELESCOPE_AGENT_CERTIFICATES", "0")
+    if certificates not in ("0", "1") or (certificates == "1" and (tls != "1" or broker != "mosquitto")):
+        raise SettingsError(
+            f"TELESCOPE_AGENT_CERTIFICATES is '{certificates}'; it must be 0, or 1 with TELESCOPE_TLS=1 and "
+            "TELESCOPE_BROKER=mosquitto"
+        )
     room = environment.get("TELESCOPE_ROOM", "lab")
     known = sorted(path.parent.name for path in ROOMS.glob("*/room.toml"))
     if room not in (*known, NO_ROOM):
@@ -123,5 +132,6 @@ def read(environment: Mapping[str, str]) -> Settings:
         broker=cast("Literal['amqtt', 'mosquitto']", broker),
         xmpp=xmpp == "1",
         tls=tls == "1",
+        certificates=certificates == "1",
         room="" if room == NO_ROOM else room,
     )

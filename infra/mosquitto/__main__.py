@@ -29,7 +29,7 @@ def main() -> int:
             tcp_port=tcp_port,
             websocket_port=websocket_port,
             plugin_path=plugin,
-            tls=None if arguments.certificate is None else Tls(arguments.certificate, arguments.certificate_key),
+            tls=_tls(arguments),
         )
     except programs.NotInstalledError as error:
         print(f"broker: {error}", file=sys.stderr)
@@ -49,7 +49,14 @@ def main() -> int:
         host=host,
         ports=(tcp_port, websocket_port),
         ready=f"ready tcp={tcp_port} websocket={websocket_port}",
+        watched=arguments.revoked,
     )
+
+
+def _tls(arguments: argparse.Namespace) -> Tls | None:
+    if arguments.certificate is None:
+        return None
+    return Tls(arguments.certificate, arguments.certificate_key, arguments.agents_ca, arguments.revoked)
 
 
 def _arguments() -> argparse.Namespace:
@@ -60,7 +67,11 @@ def _arguments() -> argparse.Namespace:
     parser.add_argument("--websocket-port", type=int, required=True, help="MQTT over WebSocket; 0 takes a free one")
     parser.add_argument("--certificate", type=Path, help="speak TLS alone, with this certificate and its chain (PEM)")
     parser.add_argument("--certificate-key", type=Path, help="its key (PEM)")
+    parser.add_argument("--agents-ca", type=Path, help="over TCP let in only who shows a certificate of it (PEM)")
+    parser.add_argument("--revoked", type=Path, help="which of them count no more (CRL, PEM); read again on change")
     found = parser.parse_args()
+    if (found.agents_ca and not found.certificate) or (found.revoked and not found.agents_ca):
+        parser.error("--agents-ca needs --certificate, --revoked needs --agents-ca")
     if bool(found.certificate) != bool(found.certificate_key):
         parser.error("--certificate and --certificate-key belong together")
     return found

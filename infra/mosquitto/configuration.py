@@ -70,6 +70,10 @@ class Tls(NamedTuple):
 
     certificate: Path
     key: Path
+    agents: Path | None = None
+    """The authority by which agents, and the functions, have to show certificates; browsers cannot."""
+    revoked: Path | None = None
+    """Which of them count no more; read again when it changes."""
 
 
 def write(
@@ -80,7 +84,7 @@ def write(
     Raises:
         OSError: ``home`` cannot be written, or a certificate not read.
     """
-    for path in tls or ():
+    for path in [path for path in tls or () if path is not None]:
         path.read_bytes()  # the broker itself would end with a line about OpenSSL
     home.mkdir(parents=True, exist_ok=True, mode=0o700)
     security = home / SECURITY_FILE
@@ -110,6 +114,10 @@ def configuration(
     """The text of ``mosquitto.conf``; ``host`` is an IPv4 address."""
     # The broker takes TLS 1.2 and 1.3 where no version is named.
     shown = [] if tls is None else [f"certfile {tls.certificate.absolute()}", f"keyfile {tls.key.absolute()}"]
+    wanted = []
+    if tls is not None and tls.agents is not None:
+        wanted = [f"cafile {tls.agents.absolute()}", "require_certificate true"]
+        wanted += [f"crlfile {tls.revoked.absolute()}"] if tls.revoked is not None else []
     lines = [
         "# Written by `python -m infra.mosquitto` at each start: change it there.",
         "per_listener_settings false",
@@ -136,6 +144,7 @@ def configuration(
         f"listener {tcp_port} {host}",
         "protocol mqtt",
         *shown,
+        *wanted,
         f"listener {websocket_port} {host}",
         "protocol websockets",
         *shown,

@@ -5,7 +5,7 @@ import datetime as dt
 import sys
 from pathlib import Path
 
-from infra.tls import authority
+from infra.tls import authority, devices
 from infra.tls.authority import TlsError
 
 _BAD_INPUT = 2
@@ -18,6 +18,10 @@ def main() -> int:
     try:
         if options.renew:
             authority.renew(options.home, now=now)
+        elif options.devices:
+            devices.make(options.home, now=now)
+            print(f"agents are vouched for by {options.home / devices.CA_CERTIFICATE}")
+            return 0
         elif options.certificate:
             authority.take(options.home, certificate=options.certificate, key=options.key, ca=options.ca, now=now)
         elif not options.show:
@@ -43,6 +47,7 @@ def _arguments() -> argparse.Namespace:
     parser.add_argument("--address", action="append", default=[], help="its address; may be given several times")
     parser.add_argument("--renew", action="store_true", help="a new certificate for the same names")
     parser.add_argument("--show", action="store_true", help="only say what is there")
+    parser.add_argument("--devices", action="store_true", help="an authority for agents, where mosquitto wants theirs")
     parser.add_argument("--certificate", type=Path, metavar="FILE", help="use this one, with its chain (PEM)")
     parser.add_argument("--key", type=Path, metavar="FILE", help="the key of --certificate (PEM, without a password)")
     parser.add_argument("--ca", type=Path, metavar="FILE", help="the authority of --certificate, if it is private")

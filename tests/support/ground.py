@@ -19,6 +19,7 @@ from device_agent import links
 from device_agent.ports.clock import CloudClock
 from device_agent.protocol import codec, topics
 from device_agent.protocol.messages import Presence
+from device_agent.runtime.certificate import OwnCertificate
 from device_agent.runtime.home import Configuration, DeviceEntry, Pairing
 from device_agent.transports.http.api import CloudApi
 from function_app.adapters.local.keys import FileKeys
@@ -203,6 +204,8 @@ class Link:
                 open_api=self._open_api,
                 next_session=self._next_session,
                 quiet=lambda: self.quiet,
+                certificate=OwnCertificate(ground.folder),
+                now_ms=lambda: None,
             )
         )
 

@@ -16,11 +16,12 @@ T = TypeVar("T")
 
 
 class Address(Struct, frozen=True, kw_only=True):
-    """Where a broker takes MQTT."""
+    """Where a broker takes MQTT. It may want a certificate of this agent, newer than ``certificate_after_ms``."""
 
     host: str
     port: Port
     tls: bool = False
+    certificate_after_ms: Milliseconds | None = None
 
 
 class MqttCredentials(Struct, frozen=True, kw_only=True):
@@ -73,6 +74,12 @@ class Claimed(Struct, frozen=True, kw_only=True):
     def serial(self) -> int:
         """The newest key's."""
         return max((key.serial for key in self.keys), default=1)
+
+
+class Certificate(Struct, frozen=True, kw_only=True):
+    """A certificate of this agent's own, PEM."""
+
+    chain: str
 
 
 class News(Struct, frozen=True, kw_only=True):

@@ -182,6 +182,15 @@ class CloudApi:
         """
         return self._call("POST", "/xmpp/credentials", json={"purpose": "agent"})
 
+    def certificate(self, request: str) -> dict[str, Any]:
+        """A certificate for the broker, by a request (PKCS 10, PEM).
+
+        Raises:
+            CloudError: Refused.
+            OSError: Not reached.
+        """
+        return self._call("POST", "/agents/certificate", json={"request": request})
+
     def post(self, path: str, body: dict[str, Any]) -> dict[str, Any]:
         """Any other call of an agent's, below ``/api/v1``.
 

@@ -86,6 +86,22 @@ def router(functions: Functions, caller: Caller) -> Routes:
 
     @routes.add(
         "POST",
+        "/agents/certificate",
+        summary="A certificate to show to the broker",
+        body=contract.CertificateRequest,
+        answers={200: contract.CertificateOut},
+        problems=(409,),
+        caller="agent",
+    )
+    async def certify(request: Request) -> Response:
+        """Where the broker wants certificates of agents. It ends with the pairing."""
+        agent = await caller.agent(request)
+        asked: contract.CertificateRequest = await read(request, contract.CertificateRequest)
+        issued = await functions.certify.certify(agent, asked.request)
+        return answer(contract.CertificateOut(chain=issued.chain, expires_at=rfc3339(issued.expires_ms)))
+
+    @routes.add(
+        "POST",
         "/agents/claim",
         summary="Claim an agent with the code it shows",
         body=contract.ClaimRequest,

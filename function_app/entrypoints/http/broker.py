@@ -5,6 +5,7 @@ from typing import Any
 from fastapi import Request, Response
 
 from function_app.bootstrap import Functions
+from function_app.domain.devices import Agent
 from function_app.domain.times import rfc3339
 from function_app.entrypoints.http.answers import answer, read
 from function_app.entrypoints.http.caller import Caller
@@ -29,9 +30,12 @@ def router(functions: Functions, caller: Caller) -> Routes:
     async def mqtt_credentials(request: Request) -> Response:
         """For watching, for sending setpoints under a lease, or for an agent's own devices."""
         asked: Any = await read(request, contract.MqttRequest)
-        issued = await _issue(request, asked)
+        agent = await caller.agent(request) if isinstance(asked, contract.AgentRequest) else None
+        issued = await _issue(request, asked, agent)
+        wanted = agent is not None and functions.certificates.wanted
+        certificate_after_ms = agent.claimed_ms if agent is not None and wanted else None
         settings = functions.settings
-        news = await functions.keys.news() if isinstance(asked, contract.AgentRequest) else None
+        news = await functions.keys.news() if agent is not None else None
         body = contract.MqttCredentialsOut(
             client_id=issued.client_id,
             username=issued.credentials.username,
@@ -40,7 +44,12 @@ def router(functions: Functions, caller: Caller) -> Routes:
             lifetime_s=issued.lifetime_s,
             publish=issued.publish,
             subscribe=issued.subscribe,
-            tcp=contract.TcpAddress(host=settings.mqtt_host, port=settings.mqtt_port, tls=settings.tls is not None),
+            tcp=contract.TcpAddress(
+                host=settings.mqtt_host,
+                port=settings.mqtt_port,
+                tls=settings.tls is not None,
+                certificate_after_ms=certificate_after_ms,
+            ),
             websocket_url=settings.websocket_url,
             server_time_ms=functions.clock.now_ms(),
             key_statements=() if news is None else news.statements,
@@ -48,9 +57,9 @@ def router(functions: Functions, caller: Caller) -> Routes:
         )
         return answer(body, headers={"Cache-Control": "no-store"})
 
-    async def _issue(request: Request, asked: Any) -> Issued:
-        if isinstance(asked, contract.AgentRequest):
-            return await functions.mqtt_credentials.agent(await caller.agent(request))
+    async def _issue(request: Request, asked: Any, agent: Agent | None) -> Issued:
+        if agent is not None:
+            return await functions.mqtt_credentials.agent(agent)
         who = await caller.account(request)
         if isinstance(asked, contract.ControlRequest):
             return await functions.mqtt_credentials.control(who, asked.device, asked.epoch)

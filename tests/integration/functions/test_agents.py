@@ -1,14 +1,20 @@
 """Enrolment by the agent's own key, claim codes, un-pairing."""
 
+import datetime as dt
 from pathlib import Path
 from typing import Any
 
 import pytest
+from cryptography import x509
+from cryptography.hazmat.primitives import hashes, serialization
+from cryptography.hazmat.primitives.asymmetric import ec
 from fastapi import Request
 
 from device_agent.protocol import signing
+from function_app.adapters.local.certificates import FileCertificates
 from function_app.entrypoints.http.address import client_address
 from function_app.ports.broker_access import Credentials
+from infra.tls import devices
 from tests.support.brokers import BROKERS, RunningBroker, wait_until
 from tests.support.cloud import API, Cloud, MovingClock, Person, Robot, paired, problem, settings
 
@@ -315,3 +321,36 @@ def test_two_agents_of_two_owners_are_apart(cloud: Cloud) -> None:
         assert [item["id"] for item in anna.get("/devices").json()["items"]] == [one.device]
         assert [item["id"] for item in bert.get("/devices").json()["items"]] == [two.device]
         assert cloud.ask("GET", f"{API}/devices").status_code == 401
+
+
+class TestCertificates:
+    def test_where_the_broker_wants_none_none_is_made(self, alone: Cloud) -> None:
+        robot = alone.robot()
+        robot.pair(alone.sign_in("anna"))
+        answer = robot.ask("POST", "/agents/certificate", json={"request": "x"})
+        problem(answer, 409, "certificates-unused")
+
+    def test_an_agent_that_is_claimed_gets_one_and_loses_it_with_its_pairing(
+        self, alone: Cloud, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        devices.make(tmp_path / "tls", now=dt.datetime.now(dt.UTC))
+        authority = FileCertificates(tmp_path / "tls")
+        monkeypatch.setattr(alone.functions.certify, "_certificates", authority)
+        anna, robot = alone.sign_in("anna"), alone.robot()
+        robot.enroll()
+        key = ec.generate_private_key(ec.SECP256R1())
+        request = x509.CertificateSigningRequestBuilder().subject_name(x509.Name([])).sign(key, hashes.SHA256())
+        asked = {"request": request.public_bytes(serialization.Encoding.PEM).decode()}
+        problem(robot.ask("POST", "/agents/certificate", json=asked), 409, "agent-unclaimed")
+        robot.pair(anna)
+        problem(robot.ask("POST", "/agents/certificate", json={"request": "x"}), 422, "invalid")
+        made = robot.ask("POST", "/agents/certificate", json=asked)
+        assert made.status_code == 200, made.text
+        certificate = x509.load_pem_x509_certificate(made.json()["chain"].encode())
+        assert certificate.subject.rfc4514_string() == f"CN={robot.id}"
+
+        leave: Any = alone.functions.unpair._leave
+        monkeypatch.setattr(leave, "_certificates", authority)
+        assert anna.delete(f"/agents/{robot.id}").status_code == 204
+        revoked = x509.load_pem_x509_crl((tmp_path / "tls" / "devices.crl").read_bytes())
+        assert revoked.get_revoked_certificate_by_serial_number(certificate.serial_number) is not None

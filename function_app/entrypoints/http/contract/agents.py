@@ -65,6 +65,19 @@ class EnrollmentState(Answer, frozen=True, kw_only=True):
     signing_key: str
 
 
+class CertificateRequest(Request, frozen=True, kw_only=True):
+    """PKCS 10 in PEM, for a key on P-256 that has signed it."""
+
+    request: Annotated[str, Meta(min_length=1, max_length=4096)]
+
+
+class CertificateOut(Answer, frozen=True, kw_only=True):
+    """What the agent is to show to the broker, in PEM."""
+
+    chain: str
+    expires_at: Moment
+
+
 class ClaimRequest(Request, frozen=True, kw_only=True):
     """The code that an agent shows, and the space it shall be in (default: the first)."""
 

@@ -23,11 +23,12 @@ MqttRequest = WatchRequest | ControlRequest | AgentRequest
 
 
 class TcpAddress(Answer, frozen=True, kw_only=True):
-    """Where the broker takes MQTT."""
+    """Where the broker takes MQTT. It wants certificates of agents that are newer than ``certificate_after_ms``."""
 
     host: str
     port: int
     tls: bool
+    certificate_after_ms: int | None = None
 
 
 class MqttCredentialsOut(Answer, frozen=True, kw_only=True):

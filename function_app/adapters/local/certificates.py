@@ -1,0 +1,148 @@
+"""A site's authority for agents, in files that ``python -m infra.tls --devices`` has made; mosquitto reads two of them.
+
+``devices-ca.crt`` and ``devices-ca.key``, ``devices.crl`` with what is revoked, ``devices.json`` with what was issued.
+"""
+
+import asyncio
+import contextlib
+import datetime as dt
+import json
+import os
+import secrets
+import sqlite3
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+from function_app.adapters import certificate_requests
+from function_app.ports.broker_access import BrokerAccessError
+from function_app.ports.certificates import Issued
+
+CA_CERTIFICATE, CA_KEY, REVOKED, LEDGER = "devices-ca.crt", "devices-ca.key", "devices.crl", "devices.json"
+_LOCK = "devices.lock"
+DAYS = 397
+_SKEW = dt.timedelta(minutes=5)
+"""The broker's clock may be behind."""
+
+
+class NoCertificates:
+    """``Certificates`` where the broker wants none."""
+
+    wanted = False
+
+    async def issue(self, agent: str, request: str) -> Issued:
+        """Never asked for."""
+        del agent, request
+        raise BrokerAccessError("the broker wants no certificates of agents")
+
+    async def revoke(self, agent: str) -> None:
+        """There are none."""
+
+    async def close(self) -> None:
+        """Nothing is open."""
+
+
+class FileCertificates:
+    """``Certificates`` in ``folder``. One process at a time changes them, by a lock."""
+
+    wanted = True
+
+    def __init__(self, folder: Path) -> None:
+        self._folder = folder
+
+    async def issue(self, agent: str, request: str) -> Issued:
+        """See ``Certificates``."""
+        return await asyncio.to_thread(self._issue, agent, request)
+
+    async def revoke(self, agent: str) -> None:
+        """See ``Certificates``."""
+        await asyncio.to_thread(self._revoke, agent)
+
+    async def close(self) -> None:
+        """Nothing is open."""
+
+    def _issue(self, agent: str, text: str) -> Issued:
+        from cryptography import x509  # noqa: PLC0415 (only where certificates are in use)
+        from cryptography.hazmat.primitives import hashes, serialization  # noqa: PLC0415
+        from cryptography.x509.oid import ExtendedKeyUsageOID, NameOID  # noqa: PLC0415
+
+        request = certificate_requests.read(text)
+        with self._changing() as ledger:
+            authority, signer = self._authority()
+            now = dt.datetime.now(dt.UTC)
+            end = min(now + dt.timedelta(days=DAYS), authority.not_valid_after_utc)
+            serial = x509.random_serial_number()
+            ledger.setdefault(agent, []).append({"serial": str(serial), "revoked_at": None})
+            made = (
+                x509.CertificateBuilder()
+                .subject_name(x509.Name([x509.NameAttribute(NameOID.COMMON_NAME, agent)]))
+                .issuer_name(authority.subject)
+                .public_key(request.public_key())
+                .serial_number(serial)
+                .not_valid_before(now - _SKEW)
+                .not_valid_after(end)
+                .add_extension(x509.BasicConstraints(ca=False, path_length=None), critical=True)
+                .add_extension(x509.ExtendedKeyUsage([ExtendedKeyUsageOID.CLIENT_AUTH]), critical=True)
+                .add_extension(x509.AuthorityKeyIdentifier.from_issuer_public_key(signer.public_key()), critical=False)
+                .sign(signer, hashes.SHA256())
+            )
+        chain = made.public_bytes(serialization.Encoding.PEM).decode()
+        return Issued(chain, int(end.timestamp() * 1000))
+
+    def _revoke(self, agent: str) -> None:
+        from cryptography import x509  # noqa: PLC0415
+        from cryptography.hazmat.primitives import hashes, serialization  # noqa: PLC0415
+
+        with self._changing() as ledger:
+            now = dt.datetime.now(dt.UTC)
+            for entry in ledger.get(agent, []):
+                entry["revoked_at"] = entry["revoked_at"] or now.isoformat()
+            authority, signer = self._authority()
+            listed = (
+                x509.CertificateRevocationListBuilder()
+                .issuer_name(authority.subject)
+                .last_update(now)
+                .next_update(authority.not_valid_after_utc)  # one that had run out would shut everybody out
+            )
+            for entry in (entry for entries in ledger.values() for entry in entries if entry["revoked_at"]):
+                listed = listed.add_revoked_certificate(
+                    x509.RevokedCertificateBuilder()
+                    .serial_number(int(entry["serial"]))
+                    .revocation_date(dt.datetime.fromisoformat(entry["revoked_at"]))
+                    .build()
+                )
+            content = listed.sign(signer, hashes.SHA256()).public_bytes(serialization.Encoding.PEM)
+            self._write(REVOKED, content, mode=0o644)
+
+    def _authority(self) -> tuple[Any, Any]:
+        from cryptography import x509  # noqa: PLC0415
+        from cryptography.hazmat.primitives import serialization  # noqa: PLC0415
+
+        certificate = x509.load_pem_x509_certificate((self._folder / CA_CERTIFICATE).read_bytes())
+        key = serialization.load_pem_private_key((self._folder / CA_KEY).read_bytes(), None)
+        return certificate, key
+
+    @contextlib.contextmanager
+    def _changing(self) -> Iterator[dict[str, list[dict[str, Any]]]]:
+        """What was issued, by agent; written down at the end of the ``with``."""
+        try:
+            with contextlib.closing(sqlite3.connect(self._folder / _LOCK, timeout=10, isolation_level=None)) as lock:
+                lock.execute("BEGIN EXCLUSIVE")
+                path = self._folder / LEDGER
+                ledger: dict[str, list[dict[str, Any]]] = json.loads(path.read_bytes()) if path.exists() else {}
+                yield ledger
+                self._write(LEDGER, json.dumps(ledger, indent=1).encode(), mode=0o600)
+        except (OSError, ValueError, sqlite3.Error) as error:
+            raise BrokerAccessError(
+                f"the authority for agents in {self._folder} cannot be used: {error}; "
+                "`python -m infra.tls --devices` makes one"
+            ) from error
+
+    def _write(self, name: str, content: bytes, *, mode: int) -> None:
+        path = self._folder / f"{name}.{secrets.token_hex(4)}.new"
+        descriptor = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL, mode)
+        with os.fdopen(descriptor, "wb") as file:
+            file.write(content)
+            file.flush()
+            os.fsync(file.fileno())
+        path.replace(self._folder / name)
