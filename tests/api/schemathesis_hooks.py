@@ -4,6 +4,7 @@ Loaded by the program ``schemathesis`` itself (``SCHEMATHESIS_HOOKS``). ``TELESC
 test wrote: what there is at the API under test.
 """
 
+import functools
 import json
 import os
 import time
@@ -12,12 +13,16 @@ from pathlib import Path
 from typing import Any, Protocol
 
 import jwt
+import requests
 import schemathesis
 from cryptography.hazmat.primitives.serialization import load_pem_private_key
 
 from device_agent.protocol import signing
 
 WORLD: dict[str, Any] = json.loads(Path(os.environ["TELESCOPE_WORLD"]).read_text(encoding="utf-8"))
+TURN_S = 600
+"""An access token lives for a quarter of an hour: a long run asks for the next one in time."""
+_BEGUN_S = time.monotonic()
 LONGEST_MS = 30_000
 """What the API allows."""
 QUICK_MS = 50
@@ -44,6 +49,24 @@ def agent_token(name: str) -> str:
     return jwt.encode(claims, key, "EdDSA", headers={"kid": signing.key_id(key.public_key())})
 
 
+@functools.cache
+def _token_of(whose: str, turn: int) -> str:
+    """The access token of a session; the next one at each turn."""
+    if not turn:
+        return str(WORLD[f"{whose}token"])
+    page = WORLD[f"{whose}page"]
+    headers = {"Cookie": page["cookie"], "X-CSRF-Token": page["csrf_token"]}
+    answer = requests.post(f"{WORLD['url']}/api/v1/auth/token", headers=headers, timeout=30)
+    if answer.ok:
+        return str(answer.json()["access_token"])
+    return _token_of(whose, turn - 1)  # the session was ended by what is tried here
+
+
+def _token(whose: str) -> str:
+    """Of a session; ``spare_``: of the one that is signed out."""
+    return _token_of(whose, int((time.monotonic() - _BEGUN_S) / TURN_S))
+
+
 @schemathesis.auth(refresh_interval=None)
 class Caller:
     """A token of whoever the operation is for."""
@@ -54,8 +77,7 @@ class Caller:
         asks_for_agent = isinstance(case.body, dict) and case.body.get("purpose") == "agent"
         if "agentToken" in schemes and (asks_for_agent or "accessToken" not in schemes):
             return agent_token("new_agent_key" if operation["operationId"] == "enroll_agent" else "agent_key")
-        spent: str = WORLD["spare_token" if operation["operationId"] == "sign_out" else "token"]
-        return spent
+        return _token("spare_" if operation["operationId"] == "sign_out" else "")
 
     def set(self, case: _Case, data: str, _context: object) -> None:
         case.headers = {**(case.headers or {}), "Authorization": f"Bearer {data}"}

@@ -71,8 +71,11 @@ def furnish(host: Host, site: Site, anna: Visitor, another: Visitor, robot: Poll
     request = another.post(f"/devices/{held}/lease/requests", {"within_ms": 120_000}).json()["request"]["id"]
     new = signing.generate()
     return {
+        "url": host.url,
         "token": anna.token,
-        "spare_token": "",
+        "page": anna.page,
+        "spare_token": another.token,
+        "spare_page": another.page,
         "agent_key": pem(robot.key),
         "new_agent_key": pem(new),
         "new_agent_public": signing.public_text(new.public_key()),
@@ -98,7 +101,7 @@ def run(host: Host, home: Path, *options: str) -> None:
         robot.pair(anna)
         robot.connect()
         another = sign_in(host, site, home, "anna")
-        world = furnish(host, site, anna, another, robot) | {"spare_token": another.token}
+        world = furnish(host, site, anna, another, robot)
         (home / "world.json").write_text(json.dumps(world))
         done = subprocess.run(
             [

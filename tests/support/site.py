@@ -24,6 +24,7 @@ class Visitor(Person):
         self.account: str = signed_in["account"]["id"]
         self.name: str = signed_in["account"]["name"]
         self.session: str = signed_in["session"]
+        self.page = {"cookie": signed_in.get("cookie", ""), "csrf_token": signed_in["csrf_token"]}
 
     def ask(self, method: str, path: str, **options: Any) -> httpx.Response:
         headers = {"Authorization": f"Bearer {self.token}", **options.pop("headers", {})}
@@ -49,4 +50,4 @@ def sign_in(host: Host, site: Site, home: Path, name: str, environment: Mapping[
     link = sign_in_link({"TELESCOPE_HOME": str(home), **(environment or {})}, name)
     answer = site.ask("POST", f"{API}/auth/sign-in", json={"link": link})
     assert answer.status_code == 200, f"{host.url}: {answer.text}"
-    return Visitor(site, answer.json())
+    return Visitor(site, {**answer.json(), "cookie": answer.headers["set-cookie"].partition(";")[0]})

@@ -3,6 +3,8 @@
 from fastapi import Request, Response
 
 from function_app.bootstrap import Functions
+from function_app.domain.accounts import Identity
+from function_app.domain.problems import forbidden
 from function_app.entrypoints.http.answers import answer, empty, read
 from function_app.entrypoints.http.caller import Caller, refuse_other_sites
 from function_app.entrypoints.http.contract import auth as contract
@@ -47,6 +49,30 @@ def router(functions: Functions, caller: Caller) -> Routes:
         asked: contract.PasswordSignIn = await read(request, contract.PasswordSignIn)
         done = await functions.passwords.sign_in(asked.name, asked.password, whence(request, settings))
         return signed_in(settings, done)
+
+    @routes.add(
+        "POST",
+        "/auth/accounts",
+        summary="Make an account with an invitation",
+        body=contract.NewAccount,
+        answers={201: contract.SignedIn},
+        problems=(403, 404, 409),
+        caller="nobody",
+    )
+    async def make_account(request: Request) -> Response:
+        """For who was invited and has no account: makes one, signs in, and redeems the invitation.
+
+        Where somebody else is first with its last use the account is there all the same, and empty.
+        """
+        refuse_other_sites(request)
+        asked: contract.NewAccount = await read(request, contract.NewAccount)
+        known = await functions.invitations.look(asked.invitation)
+        if known.invitation.account:
+            raise forbidden("This invitation is for somebody who has an account. Sign in as the one it was made for.")
+        account = await functions.passwords.register(asked.name, asked.password)
+        done = await functions.sessions.begin(account, "password", whence(request, settings))
+        await functions.invitations.redeem(Identity(account.id, account.name, done.session), asked.invitation)
+        return signed_in(settings, done, 201)
 
     @routes.add(
         "POST", "/auth/token", summary="The next access token", answers={200: contract.AccessToken}, caller="page"

@@ -25,7 +25,7 @@ def secure(settings: Settings) -> str:
     return "; Secure" if settings.public_url.startswith("https:") else ""
 
 
-def signed_in(settings: Settings, done: SignedIn) -> Response:
+def signed_in(settings: Settings, done: SignedIn, status: int = 200) -> Response:
     """An access token for programs, and a cookie for the page."""
     body = contract.SignedIn(
         access_token=done.access_token,
@@ -35,7 +35,7 @@ def signed_in(settings: Settings, done: SignedIn) -> Response:
         session=done.session,
         csrf_token=done.csrf,
     )
-    return answer(body, headers={"Set-Cookie": set_session(settings, done), "Cache-Control": "no-store"})
+    return answer(body, status, {"Set-Cookie": set_session(settings, done), "Cache-Control": "no-store"})
 
 
 def whence(request: Request, settings: Settings) -> From:

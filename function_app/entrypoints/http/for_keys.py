@@ -44,6 +44,8 @@ FOR_KEYS: Final = frozenset(
         "list_robot_types",
         "get_robot_type",
         "list_movements",
+        "get_device_robot_type",
+        "list_device_movements",
     }
 )
 """Operations, by their names in the API's description."""

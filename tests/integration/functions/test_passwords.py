@@ -207,3 +207,41 @@ def test_ten_who_register_one_name_at_once_are_one_account(cloud: Cloud) -> None
     answer = sign_in(cloud, "dora", f"{GOOD} {made[0]}")
     assert answer.json()["account"]["id"] == done[made[0]].id
     assert Person(cloud, answer.json()).get("/spaces").json()["items"]
+
+
+class TestJoining:
+    """An account made with an invitation."""
+
+    @staticmethod
+    def join(cloud: Cloud, invitation: str, name: str = "dora", password: str = GOOD) -> httpx.Response:
+        body = {"invitation": invitation, "name": name, "password": password}
+        return cloud.ask("POST", f"{API}/auth/accounts", json=body)
+
+    @pytest.fixture
+    def invitation(self, pair: tuple[Person, Robot]) -> str:
+        anna, robot = pair
+        answer = anna.post(f"/devices/{robot.device}/invitations", {"role": "viewer"})
+        assert answer.status_code == 201, answer.text
+        secret: str = answer.json()["secret"]
+        return secret
+
+    def test_who_was_invited_has_an_account_and_what_is_shared(
+        self, cloud: Cloud, pair: tuple[Person, Robot], invitation: str
+    ) -> None:
+        _, robot = pair
+        answer = self.join(cloud, invitation)
+        assert answer.status_code == 201, answer.text
+        dora = Person(cloud, answer.json())
+        assert [each["id"] for each in dora.get("/devices").json()["items"]] == [robot.device]
+        assert dora.get(f"/devices/{robot.device}").json()["role"] == "viewer"
+        assert sign_in(cloud, "dora", GOOD).json()["account"]["id"] == dora.account
+        problem(self.join(cloud, invitation, "emil"), 404, "invitation-unknown")
+
+    def test_nobody_joins_without_one_or_takes_a_name(self, cloud: Cloud, invitation: str) -> None:
+        problem(self.join(cloud, "x" * 43), 404, "invitation-unknown")
+        problem(self.join(cloud, invitation, "anna"), 409, "name-taken")
+        problem(self.join(cloud, invitation, "dora", "short"), 422, "password-weak")
+        for name in ("", " dora", "dora ", "do\nra", "x" * 61):
+            problem(self.join(cloud, invitation, name), 422, "invalid")
+        problem(sign_in(cloud, "dora", GOOD), 401, "unauthorized")
+        assert self.join(cloud, invitation, "dora d").status_code == 201

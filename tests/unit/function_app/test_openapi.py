@@ -121,6 +121,7 @@ def test_every_operation_says_who_may_call_it(document: dict[str, Any]) -> None:
         else:
             open_to_all.append(path)
     assert sorted(path.removeprefix("/api/v1") for path in open_to_all) == [
+        "/auth/accounts",
         "/auth/methods",
         "/auth/oidc/callback",
         "/auth/oidc/start",

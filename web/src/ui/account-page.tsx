@@ -128,9 +128,11 @@ function Sessions({ api }: { api: Api }) {
         ))}
       </ul>
       {sessions !== null && sessions.length > 1 && (
-        <button type="button" onClick={() => void end(api.endOtherSessions())}>
-          {texts.account.endOthers}
-        </button>
+        <p>
+          <button type="button" onClick={() => void end(api.endOtherSessions())}>
+            {texts.account.endOthers}
+          </button>
+        </p>
       )}
       <p class="field-error" aria-live="polite">
         {wrong}

@@ -32,6 +32,14 @@ class PasswordRequest(Request, frozen=True, kw_only=True):
     old_password: Annotated[str, Meta(max_length=1000)] | None = None
 
 
+class NewAccount(Request, frozen=True, kw_only=True):
+    """An account to be made. ``name`` is what its owner signs in by, and others see."""
+
+    invitation: Annotated[str, Meta(min_length=1, max_length=200)]
+    name: Annotated[str, Meta(pattern=r"^[^\s\x00-\x1f\x7f]([^\x00-\x1f\x7f]{0,58}[^\s\x00-\x1f\x7f])?$")]
+    password: NewPassword
+
+
 class AccountRef(Answer, frozen=True, kw_only=True):
     """An account, as others see it."""
 
