@@ -7,9 +7,11 @@ from typing import Any
 
 import msgspec
 import pytest
+from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
 
 from device_agent.ports.clock import tick_ms, wall_ms
 from device_agent.protocol import codec, signing, topics
+from device_agent.protocol.keys import KEYS_CONTEXT, NewKey
 from device_agent.protocol.messages import (
     Ack,
     AckStatus,
@@ -17,6 +19,7 @@ from device_agent.protocol.messages import (
     CancelAction,
     Description,
     DropRequest,
+    FollowKey,
     GrantLease,
     JointTarget,
     Mode,
@@ -157,6 +160,25 @@ def test_a_signed_stop_is_obeyed_however_late(bench: Bench) -> None:
     ack = bench.end(bench.command(StopDevice(reason="late"), issued_at_ms=1))
     assert ack.status is AckStatus.DONE
     eventually(lambda: bench.telemetry().mode is Mode.STOPPED)
+
+
+def test_it_follows_to_the_clouds_new_key_when_told_by_the_one_it_has_pinned(bench: Bench) -> None:
+    new = signing.generate()
+
+    def statement(by: Ed25519PrivateKey, of: Ed25519PrivateKey = new, serial: int = 2) -> str:
+        key = signing.public_text(of.public_key())
+        told = NewKey(serial=serial, key=key, former_until_ms=wall_ms() + 60_000)
+        return signing.sign(codec.encode(told), by, context=KEYS_CONTEXT).decode()
+
+    refused = bench.end(bench.command(FollowKey(statements=(statement(new),))))
+    assert refused.reason is not None
+    assert refused.reason.code == "bad_signature"
+    # The bench's pins know no time of the cloud, and without it no key is taken up.
+    later = bench.end(bench.command(FollowKey(statements=(statement(bench.key),))))
+    assert later.reason is not None
+    assert later.reason.code == "no_clock"
+    known = statement(bench.key, of=bench.key, serial=1)
+    assert bench.end(bench.command(FollowKey(statements=(known,)))).status is AckStatus.DONE
 
 
 def test_a_second_action_is_refused_while_one_runs_and_the_first_can_be_cancelled(bench: Bench) -> None:

@@ -1,5 +1,6 @@
 """The agent's folder: what is written is read again, and what people write wrong is named."""
 
+import datetime as dt
 import stat
 from pathlib import Path
 from typing import Any
@@ -23,6 +24,7 @@ from device_agent.runtime.home import (
     RoomStream,
 )
 from device_agent.runtime.interlocks import Interlock
+from infra.tls import authority
 
 ARM = DeviceEntry(name="arm", type="ur5")
 MINIMAL = 'server = "http://s"\nname = "n"\n[[devices]]\nname = "arm"\ntype = "ur5"\n'
@@ -58,6 +60,7 @@ def test_what_is_written_is_read_again(
         http=polling,
         devices=devices,
         room=room,
+        ca="server-ca.pem" if options else "",
     )
     written = replace(written, buffer=Buffer(max_mb=2), trusted_scripts=bool(options))
     home.save_configuration(written)
@@ -169,6 +172,30 @@ def test_a_folder_that_cannot_be_written_is_named(tmp_path: Path) -> None:
     (tmp_path / "file").write_text("no folder")
     with pytest.raises(HomeError, match="cannot be written"):
         Home(tmp_path / "file").save_pairing(Pairing(agent="a", space="s", account="ann", keys={}))
+
+
+def test_a_pinned_authority_is_kept_and_found(tmp_path: Path) -> None:
+    home, given = Home(tmp_path / "agent"), tmp_path / "given.pem"
+    authority.make(tmp_path / "tls", authority.names(("site.example",), ()), now=dt.datetime.now(dt.UTC))
+    given.write_bytes((tmp_path / "tls" / authority.CA_CERTIFICATE).read_bytes())
+    plain = Configuration(server="https://s", name="n", devices=(ARM,))
+    assert home.authority(plain) is None
+    pinned = replace(plain, ca=home.pin_authority(given))
+    kept = home.authority(pinned)
+    assert kept is not None
+    assert kept.read_bytes() == given.read_bytes()
+    kept.unlink()
+    with pytest.raises(HomeError, match="enroll --ca"):
+        home.authority(pinned)
+
+
+@pytest.mark.parametrize("content", [b"no certificate", b"\xff\xfe", None])
+def test_what_is_no_authoritys_certificate_is_not_pinned(tmp_path: Path, content: bytes | None) -> None:
+    home, given = Home(tmp_path / "agent"), tmp_path / "given.pem"
+    if content is not None:
+        given.write_bytes(content)
+    with pytest.raises(HomeError, match=r"--ca: .*given\.pem cannot be read as a certificate"):
+        home.pin_authority(given)
 
 
 def test_a_lock_that_cannot_be_written_is_named(tmp_path: Path) -> None:

@@ -150,3 +150,20 @@ def test_without_the_time_no_key_is_taken_up_and_none_ends(kept: Kept) -> None:
     kept.now_ms = None
     assert refusal(kept.pins, statement(THIRD, SECOND, 3)) == "no_clock"
     assert set(kept.pins) == {name(FIRST), name(SECOND)}
+
+
+def test_what_is_told_again_by_a_key_that_was_dropped_changes_nothing(kept: Kept) -> None:
+    first = statement(SECOND, FIRST, 2)
+    kept.pins.follow([first])
+    kept.now_ms = ENDS_MS
+    kept.pins.follow([statement(THIRD, SECOND, 3, ends_ms=2 * ENDS_MS)])
+    assert name(FIRST) not in kept.home.pairing().keys  # type: ignore[union-attr]
+    kept.pins.follow([first])
+    assert (set(kept.pins), kept.pins.serial) == ({name(SECOND), name(THIRD)}, 3)
+
+
+def test_a_key_that_counts_is_no_complaint(kept: Kept, caplog: pytest.LogCaptureFixture) -> None:
+    assert len(kept.pins) == 1
+    kept.pins.check(name(FIRST))
+    kept.pins.check("")
+    assert not caplog.text
