@@ -244,7 +244,8 @@ class Sharing:
                 change.came_to_nothing = True
         if change.came_to_nothing:
             fresh = await self._tables.get(store.SHARES, row.partition, row.key)
-            if fresh is not None:
+            # What time has ended, and somebody has shared anew at that moment, goes on.
+            if fresh is not None and (who is not None or not store.read(fresh, Share).live(self._clock.now_ms())):
                 await self._end(who, fresh)
             return
         if await self._unshare.settle(share):

@@ -279,6 +279,18 @@ describe("stop", () => {
     await until(() => stop.state.value.kind === "clear", "the robot's own word");
   });
 
+  it("is not for who only watches: nothing goes out, and the page says so", async () => {
+    cloud.role = "viewer";
+    await fleet.refresh();
+    const stop = stopSwitch();
+    stop.press("test");
+    expect(stop.state.value.kind).toBe("clear");
+    expect(stop.problem.value).toContain("watch");
+    await fleet.refresh();
+    expect(cloud.callsTo("POST", `/devices/${DEVICE}/stop`)).toEqual([]);
+    expect(arm().stop).toBeNull();
+  });
+
   it("stays latched until it is reset, and then nothing resumes", async () => {
     const control = await takeControl();
     const stop = stopSwitch();

@@ -398,6 +398,30 @@ def test_the_end_of_its_time_ends_it_the_same_way(broker: RunningBroker, busy: B
     assert [anna.action(action)["reason"]["code"] for action in (busy.running, busy.waiting)] == ["unshared"] * 2
 
 
+def test_a_share_that_is_extended_at_its_very_end_goes_on(
+    cloud: Cloud, monkeypatch: pytest.MonkeyPatch, three: Three
+) -> None:
+    anna, bert, robot = three
+    share(anna, f"devices/{robot.device}", bert, "operator", expires_in_s=SHARED_S)
+    cloud.clock.advance(SHARED_S)
+    sharing, who = cloud.functions.sharing, Identity(anna.account, anna.name, anna.session)
+    real = sharing._pending.note
+    times = 0
+
+    async def meanwhile(what: str, due_ms: int) -> Any:
+        nonlocal times
+        times += 1
+        if times == 1:
+            shared = await sharing.of(who, "device", robot.device)
+            await sharing.put(who, shared, await sharing.person("bert"), Role.OPERATOR, None)
+        return await real(what, due_ms)
+
+    monkeypatch.setattr(sharing._pending, "note", meanwhile)
+    cloud.sweep()
+    assert times > 1
+    assert devices(bert) == {robot.device: "operator"}
+
+
 def test_less_than_before_ends_what_is_over_the_new_role(broker: RunningBroker, busy: Busy) -> None:
     anna, bert, robot, epoch, running, waiting = busy
     page, _ = watching(broker, bert)

@@ -64,6 +64,7 @@ export class Cloud {
   #session = 1;
   arm: Arm | null = null;
   lease: (Lease & { session: string }) | null = null;
+  role: Device["role"] = "owner";
   epoch = 0;
   /** Refuse connections to the broker, as if it were down. */
   brokerDown = false;
@@ -275,7 +276,7 @@ export class Cloud {
       robot_type: description.robot_type,
       agent: "agent00001",
       space: "lab",
-      role: "owner",
+      role: this.role,
       owner: { id: "account0001", name: "Ann" },
       topic: TOPIC,
       online: true,
