@@ -1,5 +1,6 @@
 """Ending control that somebody has lost the right to: the epoch is burned, and the device is brought to a hold."""
 
+import asyncio
 import logging
 
 from device_agent.protocol.messages import ReleaseLease
@@ -69,19 +70,24 @@ class Fence:
         return await self._tell(device, lease)
 
     async def _tell(self, device: Device, lease: Lease) -> bool:
-        """Cut the connection that carries the setpoints of the epoch before, and tell the device: each in its way."""
-        done = True
+        """Cut the connection that carries the setpoints of the epoch before, and tell the device, both at once."""
+        return all(await asyncio.gather(self._cut(device, lease.epoch - 1), self._release(device, lease.epoch)))
+
+    async def _cut(self, device: Device, epoch: int) -> bool:
         try:
-            await self._access.revoke(client_id=control_client(device.id, lease.epoch - 1))
+            await self._access.revoke(client_id=control_client(device.id, epoch))
         except BrokerAccessError as error:
-            _log.warning("setpoints of lease %d of %s: %s", lease.epoch - 1, device.id, error)
-            done = False
+            _log.warning("setpoints of lease %d of %s: %s", epoch, device.id, error)
+            return False
+        return True
+
+    async def _release(self, device: Device, epoch: int) -> bool:
         try:
-            await self._commands.send(device, ReleaseLease(), who="telescope", epoch=lease.epoch)
+            await self._commands.send(device, ReleaseLease(), who="telescope", epoch=epoch)
         except BusUnavailable as error:
             _log.warning("end of control of %s: %s", device.id, error)
-            done = False
-        return done
+            return False
+        return True
 
 
 def control_client(device: str, epoch: int) -> str:
