@@ -91,6 +91,7 @@ class Conversation:
         self.fleet()
         self.measure()
         self.upload()
+        self.accounts()
         self.mistakes()
         self.leave()
 
@@ -335,6 +336,25 @@ class Conversation:
     def reached(self, url: str) -> str:
         """Where the functions keep blobs themselves, they are asked where they are now."""
         return url.replace(PUBLIC_URL, self.host.url)
+
+    def accounts(self) -> None:
+        """A password, and a key for a program of somebody else's."""
+        ask, good = self.site.ask, "grüß 🤖 correct horse"
+        ask("GET", f"{API}/auth/methods")
+        ask("GET", f"{API}/auth/oidc/start")
+        self.bert.put("/accounts/me/password", {"password": "short"})
+        assert self.bert.put("/accounts/me/password", {"password": good}).status_code == 204
+        ask("POST", f"{API}/auth/password", json={"name": "bert", "password": good + "x"})
+        assert ask("POST", f"{API}/auth/password", json={"name": "bert", "password": good}).status_code == 200
+        made = self.anna.post("/api-keys", {"name": "Wäve 🤖", "role": "viewer", "only": [self.robot.device]})
+        assert made.status_code == 201, made.text
+        key = {"Authorization": f"Bearer {made.json()['token']}"}
+        ask("GET", f"{API}/devices", headers=key)
+        ask("POST", f"{API}/devices/{self.robot.device}/lease", json={}, headers=key)
+        ask("GET", f"{API}/agents", headers=key)
+        self.anna.get("/api-keys")
+        assert self.anna.delete(f"/api-keys/{made.json()['api_key']['id']}").status_code == 204
+        assert ask("GET", f"{API}/devices", headers=key).status_code == 401
 
     def mistakes(self) -> None:
         device = self.robot.device

@@ -14,8 +14,8 @@ from tests.support.cloud import API
 _NAMED = frozenset({"id", "agent", "account", "session", "space", "action", "upload", "client_id", "public", "fault"})
 """Fields whose value is an id: it may stand inside other texts as well."""
 _SECRET = frozenset(
-    {"access_token", "csrf_token", "claim_code", "password", "username", "url", "cursor", "key", "port", "broker",
-     "websocket_url", "headers", "signature", "bins", "ms"}
+    {"access_token", "csrf_token", "token", "claim_code", "password", "username", "url", "cursor", "key", "port",
+     "broker", "websocket_url", "headers", "signature", "bins", "ms"}
 )  # fmt: skip
 _TIMES = ("_ms", "_at", "_in_s", "at")
 _MEANT = frozenset({"lease_ms", "queue_ms", "ttl_ms", "timeout_ms", "wait_ms"})

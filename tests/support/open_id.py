@@ -50,14 +50,14 @@ def new_key(name: str = "one") -> SigningKey:
 
 
 @contextlib.contextmanager
-def start_provider(keys: Sequence[SigningKey], port: int = 0) -> Iterator[str]:
+def start_provider(keys: Sequence[SigningKey], port: int = 0, *, redirect: str = REDIRECT) -> Iterator[str]:
     """``oidc-provider`` with one client, us; gives its address. What it has given out it forgets with its end."""
     program = FOLDER / "node_modules" / "oidc-provider"
     assert program.exists(), f"oidc-provider is not installed; run `npm ci --prefix {FOLDER}`, as `make test` does"
     places = f"{Path(sys.executable).parent}{os.pathsep}{os.environ.get('PATH', os.defpath)}"
     node = shutil.which("node", path=places)
     assert node, "Node.js is not installed; `make test` installs it"
-    client = {"client_id": CLIENT_ID, "client_secret": CLIENT_SECRET, "redirect_uris": [REDIRECT]}
+    client = {"client_id": CLIENT_ID, "client_secret": CLIENT_SECRET, "redirect_uris": [redirect]}
     wanted = {"port": port, "client": client, "keys": [key.shown(private=True) for key in keys]}
     with subprocess.Popen(
         [node, str(FOLDER / "server.mjs")],

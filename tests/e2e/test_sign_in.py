@@ -1,0 +1,97 @@
+"""Signing in as people do: in a real Chromium, by password, and at a provider of another site."""
+
+from collections.abc import Iterator
+
+import pytest
+from playwright.sync_api import Browser, Page, expect, sync_playwright
+
+from tests.support.brokers import wait_until
+from tests.support.hosts.host import environment_of, start_program
+from tests.support.hosts.uvicorn import _answers, _free_port
+from tests.support.open_id import CLIENT_ID, CLIENT_SECRET, new_key, start_provider
+from tests.support.site import sign_in_link
+
+PASSWORD = "correct horse battery"
+
+
+@pytest.fixture(scope="module")
+def browser() -> Iterator[Browser]:
+    with sync_playwright() as playwright:
+        browser = playwright.chromium.launch(
+            executable_path="/usr/bin/chromium", args=["--no-sandbox", "--disable-gpu"]
+        )
+        yield browser
+        browser.close()
+
+
+@pytest.fixture(scope="module")
+def environment(tmp_path_factory: pytest.TempPathFactory) -> Iterator[dict[str, str]]:
+    """The functions at ``localhost``, and a provider at ``127.0.0.1``: to a browser these are two sites."""
+    port = _free_port()
+    home = tmp_path_factory.mktemp("sign-in")
+    url = f"http://localhost:{port}"
+    with start_provider([new_key()], redirect=f"{url}/api/v1/auth/oidc/callback") as issuer:
+        settings = {
+            "TELESCOPE_HOME": str(home),
+            "TELESCOPE_HOST": "127.0.0.1",
+            "TELESCOPE_PORT": str(port),
+            "TELESCOPE_MQTT_PORT": "1",
+            "TELESCOPE_PUBLIC_URL": url,
+            "TELESCOPE_OIDC_ISSUER": issuer,
+            "TELESCOPE_OIDC_CLIENT_ID": CLIENT_ID,
+            "TELESCOPE_OIDC_CLIENT_SECRET": CLIENT_SECRET,
+            "TELESCOPE_OIDC_NAME": "the lab",
+        }
+        with start_program(["-m", "function_app", "serve"], environment_of(settings)) as server:
+            wait_until(lambda: _answers(port) or server.process.poll() is not None, "the server", 60)
+            assert server.process.poll() is None, server.said()
+            yield settings
+
+
+def page_of(browser: Browser) -> Page:
+    page = browser.new_context().new_page()
+    page.set_default_timeout(30_000)
+    return page
+
+
+def signed_in(page: Page, name: str) -> None:
+    expect(page.get_by_test_id("signed-in")).to_have_text(name, timeout=30_000)
+
+
+def test_a_password_is_set_after_a_link_and_signs_in(browser: Browser, environment: dict[str, str]) -> None:
+    url = environment["TELESCOPE_PUBLIC_URL"]
+    page = page_of(browser)
+    page.goto(f"{url}/#sign-in={sign_in_link(environment, 'ann')}")
+    signed_in(page, "ann")
+    page.get_by_test_id("signed-in").click()
+    page.get_by_label("New password").fill(PASSWORD)
+    page.get_by_role("button", name="Set password").click()
+    expect(page.get_by_text("The password is set.")).to_be_visible(timeout=30_000)
+    page = page_of(browser)
+    page.goto(url)
+    page.get_by_test_id("sign-in-name").fill("ann")
+    page.get_by_test_id("sign-in-password").fill("another one")
+    page.get_by_test_id("sign-in").click()
+    expect(page.get_by_text("do not belong together")).to_be_visible(timeout=30_000)
+    page.get_by_test_id("sign-in-password").fill(PASSWORD)
+    page.get_by_test_id("sign-in").click()
+    signed_in(page, "ann")
+
+
+def test_who_signs_in_at_another_site_comes_back_signed_in_and_stays_so(
+    browser: Browser, environment: dict[str, str]
+) -> None:
+    """What is shown here no HTTP client can show: a browser keeps the strict cookie that the way back sets."""
+    page = page_of(browser)
+    page.goto(environment["TELESCOPE_PUBLIC_URL"])
+    page.get_by_test_id("sign-in-elsewhere").click()
+    page.locator("input[name=login]").fill("bob")
+    page.locator("input[name=password]").fill("any")
+    page.locator("button[type=submit]").click()
+    page.locator("button[type=submit]").click()
+    signed_in(page, "Name of bob")
+    page.reload()
+    signed_in(page, "Name of bob")
+    cookies = {each["name"]: each for each in page.context.cookies(f"{environment['TELESCOPE_PUBLIC_URL']}/api/v1")}
+    assert cookies["telescope_session"]["sameSite"] == "Strict"
+    assert cookies["telescope_session"]["httpOnly"] is True
