@@ -181,7 +181,7 @@ def build(settings: Settings, *, clock: Clock | None = None) -> Functions:
     async def publish(topic: str, payload: bytes) -> None:
         await bus.publish(topic, payload)
 
-    access = choices.access(settings, keys, publish)
+    access = choices.access(settings, keys, tables, publish)
     bus = choices.bus(settings, access)
     heard: Any = {
         "host": settings.mqtt_host,

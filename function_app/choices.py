@@ -18,12 +18,12 @@ from function_app.adapters.local.tls import client_context
 from function_app.adapters.ring_keys import RingKeys
 from function_app.adapters.vault_keys import VaultKeys
 from function_app.ports.blobs import Blobs
-from function_app.ports.broker_access import BrokerAccess
+from function_app.ports.broker_access import BrokerAccess, BrokerAccessError
 from function_app.ports.certificates import Certificates
 from function_app.ports.clock import Clock
 from function_app.ports.command_bus import CommandBus
 from function_app.ports.open_id import OpenId
-from function_app.ports.tables import Tables
+from function_app.ports.tables import StoreError, Tables
 from function_app.settings import AwsStore, AzureStore, EventGridBus, IotBus, KeyVault, SecretsManager, Settings
 
 TABLES_FILE = "tables.sqlite"
@@ -98,9 +98,15 @@ def stores(settings: Settings, signing: RingKeys | None = None) -> tuple[Tables,
 
 
 def access(
-    settings: Settings, signing: RingKeys, publish: Callable[[str, bytes], Awaitable[None]]
-) -> TokenBrokerAccess | MosquittoBrokerAccess:
+    settings: Settings, signing: RingKeys, tables: Tables, publish: Callable[[str, bytes], Awaitable[None]]
+) -> BrokerAccess:
     """What gives and takes the broker's rights. ``publish``: how the embedded broker is told."""
+    if settings.broker == "iot":
+        from function_app.adapters.aws.broker_access import IotBrokerAccess  # noqa: PLC0415 (only where it is in use)
+
+        iot = settings.bus
+        assert isinstance(iot, IotBus)  # noqa: S101 (the settings see to it)
+        return IotBrokerAccess(keys=signing, tables=tables, region=iot.region, endpoint=iot.endpoint)
     if settings.broker == "amqtt":
         return TokenBrokerAccess(signer=signing.signer, publish=publish)
     return MosquittoBrokerAccess(
@@ -134,6 +140,12 @@ def bus(settings: Settings, granted: BrokerAccess) -> CommandBus:
 
 def certificates(settings: Settings) -> Certificates:
     """The authority for agents."""
+    if settings.broker == "iot":
+        from function_app.adapters.aws.certificates import IotCertificates  # noqa: PLC0415 (only where it is in use)
+
+        iot = settings.bus
+        assert isinstance(iot, IotBus)  # noqa: S101 (the settings see to it)
+        return IotCertificates(region=iot.region, policy=iot.policy)
     if settings.tls is None or settings.tls.agents is None:
         return NoCertificates()
     return FileCertificates(settings.tls.agents)
@@ -156,6 +168,17 @@ async def prepare(settings: Settings) -> None:
     Raises:
         StoreError: It cannot be made.
     """
+    if settings.broker == "iot":
+        from function_app.adapters.aws.certificates import IotCertificates  # noqa: PLC0415
+
+        agents = certificates(settings)
+        assert isinstance(agents, IotCertificates)  # noqa: S101 (the settings say so)
+        try:
+            await agents.prepare()
+        except BrokerAccessError as error:
+            raise StoreError(str(error)) from error
+        finally:
+            await agents.close()
     if settings.keys is not None:
         held = keys(settings, SystemClock().now_ms)
         assert isinstance(held, VaultKeys)  # noqa: S101 (the settings say so)

@@ -9,7 +9,7 @@ from typing import Literal, cast
 from urllib.parse import urlsplit
 
 ROOT = Path(__file__).resolve().parents[1]
-Broker = Literal["amqtt", "mosquitto"]
+Broker = Literal["amqtt", "mosquitto", "iot"]
 _LAST_PORT = 65_535
 _NUMBER = re.compile(r"\A[0-9]{1,9}\Z")
 _HOST = re.compile(r"\A[A-Za-z0-9._:%-]{1,255}\Z")
@@ -21,6 +21,7 @@ _REGION = re.compile(r"\A[a-z]{2,}(-[a-z]+)+-[0-9]+\Z")
 _IDENTITY = re.compile(r"\A([0-9A-Fa-f]{8}(-[0-9A-Fa-f]{4}){3}-[0-9A-Fa-f]{12})?\Z")
 _SECRET = re.compile(r"\A[A-Za-z0-9-]{1,127}\Z")
 _KMS_KEY = re.compile(r"\A[A-Za-z0-9:/_-]{0,256}\Z")
+_IOT_POLICY = re.compile(r"\A[A-Za-z0-9_+=,.@-]{0,128}\Z")
 _DOMAIN = re.compile(r"\A(?=.{0,253}\Z)([a-z0-9]([a-z0-9-]{0,61}[a-z0-9])?(\.[a-z0-9]([a-z0-9-]{0,61}[a-z0-9])?)*)?\Z")
 _CLIENT_ID = re.compile(r"\A[!-~]{1,255}\Z")
 _PROVIDER = re.compile(r"\A[^\x00-\x1f\x7f]{1,60}\Z")
@@ -78,10 +79,12 @@ class IotBus:
     Attributes:
         region: Where it is.
         endpoint: The account's own address for data.
+        policy: The IoT policy of agents' certificates, where it is also the broker that agents and pages connect to.
     """
 
     region: str
     endpoint: str
+    policy: str = ""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -231,8 +234,13 @@ def read(environment: Mapping[str, str] | None = None) -> Settings:
     mqtt_host = _host(given, "TELESCOPE_MQTT_HOST", host)
     websocket_port = _port(given, "TELESCOPE_WEBSOCKET_PORT", port + 2)
     broker = given.get("TELESCOPE_BROKER", "amqtt")
-    if broker not in ("amqtt", "mosquitto"):
-        raise SettingsError(f"TELESCOPE_BROKER is '{broker}'; it must be amqtt or mosquitto")
+    if broker not in ("amqtt", "mosquitto", "iot"):
+        raise SettingsError(f"TELESCOPE_BROKER is '{broker[:_SHOWN]}'; it must be amqtt, mosquitto or iot")
+    bus = _bus(given)
+    if broker == "iot" and not (isinstance(bus, IotBus) and bus.policy):
+        raise SettingsError(
+            "TELESCOPE_BROKER is iot; set TELESCOPE_BUS=iot, and TELESCOPE_IOT_POLICY to agents' certificates' policy"
+        )
     tls = _tls(given)
     s = "" if tls is None else "s"
     public_url = _url(given, "TELESCOPE_PUBLIC_URL", f"http{s}://{_in_url(host)}:{port}", ("http", "https")).rstrip("/")
@@ -241,7 +249,7 @@ def read(environment: Mapping[str, str] | None = None) -> Settings:
         home=_folder(given, "TELESCOPE_HOME", Path(".telescope")),
         store=_store(given),
         keys=_keys(given),
-        bus=_bus(given),
+        bus=bus,
         host=host,
         port=port,
         public_url=public_url,
@@ -340,6 +348,7 @@ def _bus(given: Mapping[str, str]) -> IotBus | EventGridBus | None:
             return IotBus(
                 region=_region(given),
                 endpoint=_url(given, "TELESCOPE_IOT_ENDPOINT", "", ("https", "http")),
+                policy=_matching(given, "TELESCOPE_IOT_POLICY", "", _IOT_POLICY, "the name of an IoT policy"),
             )
         case "eventgrid":
             return EventGridBus(

@@ -129,6 +129,14 @@ def read(token: str, keys: Mapping[str, Ed25519PublicKey], *, leeway_s: float = 
         raise SignatureError(f"broker token refused: {error}") from error
 
 
+def key_of(token: str) -> str:
+    """Id of the key that a token says it was signed with; empty where it does not say."""
+    try:
+        return str(jwt.get_unverified_header(token).get("kid", ""))
+    except jwt.PyJWTError:
+        return ""
+
+
 def issued_at(token: str) -> float:
     """When a token that ``read`` has accepted was made [s since 1970]; 0 where it does not say."""
     claims: dict[str, Any] = jwt.decode(token, options={"verify_signature": False})

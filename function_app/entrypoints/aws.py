@@ -1,4 +1,4 @@
-"""AWS Lambda: one handler for HTTP, for what devices say, and for the timer.
+"""AWS Lambda: one handler for HTTP, for what devices say, for who connects to the broker, and for the timer.
 
 The functions, and the event loop that their connections belong to, are made at the first event and live as long as the
 instance. The loop only runs during an invocation: between two the instance is frozen, for milliseconds or for an hour.
@@ -12,6 +12,7 @@ from mangum import Mangum
 
 from function_app import bootstrap, settings
 from function_app.bootstrap import Functions
+from function_app.entrypoints.authoriser import authorise
 from function_app.entrypoints.events import from_iot_rule, from_queue
 from function_app.entrypoints.http import create_app
 
@@ -31,6 +32,8 @@ def handler(event: dict[str, Any], context: Any) -> Any:
     loop = _loop()
     if "requestContext" in event:
         return _http()(event, context)
+    if "protocolData" in event:
+        return loop.run_until_complete(authorise(_functions(), event, context.invoked_function_arn))
     if "Records" in event:
         return loop.run_until_complete(from_queue(_functions(), event))
     if "topic" in event:

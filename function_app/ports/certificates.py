@@ -33,6 +33,13 @@ class Certificates(Protocol):
             BrokerAccessError: It cannot be made or kept.
         """
 
+    async def place(self, agent: str, space: str) -> None:
+        """Where the broker goes by certificates alone: they are good for this space, and for no other from now on.
+
+        Raises:
+            BrokerAccessError: It is not known whether that is so.
+        """
+
     async def revoke(self, agent: str) -> None:
         """No certificate of this agent counts any more. Safe to repeat.
 

@@ -20,11 +20,12 @@ class Certify:
             Problem: ``agent-unclaimed``; ``certificates-unused``: the broker wants none; ``invalid``: it is no request;
                 ``broker-unavailable``.
         """
-        require_claimed(agent)
+        space = require_claimed(agent)
         if not self._certificates.wanted:
             detail = "The broker here wants no certificates of agents."
             raise Problem("certificates-unused", 409, "No certificates here", detail)
         try:
+            await self._certificates.place(agent.id, space)
             return await self._certificates.issue(agent.id, request)
         except CertificateRefused as refused:
             raise invalid(f"request: {refused}.") from refused

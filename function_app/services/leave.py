@@ -153,9 +153,13 @@ class Leave:
 
     async def _tell_broker(self, agent_id: str, leaving: Leaving) -> None:
         """Cut the agent, then clear what is retained: its will may have spoken. Not what is said there anew."""
+        found = await self._tables.get(store.AGENTS, agent_id, "agent")
+        now = store.read(found, Agent) if found else None
         if leaving.why != "removed":
             if leaving.why == "unpaired":
                 await self._certificates.revoke(agent_id)
+            elif now is not None and now.space is not None:
+                await self._certificates.place(agent_id, now.space)
             await self._access.revoke(principal=f"agent:{agent_id}")
         if leaving.why == "unpaired":
             for name in leaving.devices:

@@ -17,7 +17,7 @@ from pathlib import Path
 ROOT = Path(__file__).resolve().parents[2]
 PARTS = ("function_app", "device_agent/__init__.py", "device_agent/protocol", "robots", "web/dist")
 """Of the project. The console (``web/dist``) where it has been built."""
-SERVICES = frozenset({"dynamodb", "iot-data", "s3", "sts"})
+SERVICES = frozenset({"dynamodb", "iot", "iot-data", "s3", "secretsmanager", "sts"})
 """What the functions call at Amazon; sts is how a role is taken."""
 
 

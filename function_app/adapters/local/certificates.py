@@ -35,6 +35,9 @@ class NoCertificates:
         del agent, request
         raise BrokerAccessError("the broker wants no certificates of agents")
 
+    async def place(self, agent: str, space: str) -> None:
+        """There are none."""
+
     async def revoke(self, agent: str) -> None:
         """There are none."""
 
@@ -53,6 +56,9 @@ class FileCertificates:
     async def issue(self, agent: str, request: str) -> Issued:
         """See ``Certificates``."""
         return await asyncio.to_thread(self._issue, agent, request)
+
+    async def place(self, agent: str, space: str) -> None:
+        """Nothing: at mosquitto credentials say which space."""
 
     async def revoke(self, agent: str) -> None:
         """See ``Certificates``."""
