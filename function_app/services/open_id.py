@@ -107,7 +107,7 @@ class OpenIdSignIn:
         provider = self._known()
         begun = await self._begun(returned)
         if returned.error or not returned.code:
-            _log.warning("sign-in elsewhere: the provider says '%s'", returned.error[:200])
+            _log.warning("sign-in elsewhere: the provider says %r", returned.error[:200])
             raise _refused()
         try:
             subject = await provider.redeem(

@@ -61,7 +61,8 @@ class Passwords:
         Raises:
             Problem: ``unauthorized``; ``too-many-tries`` for this name, or from this address.
         """
-        counters = {named_partition(name): WRONG_TRIES, **by_address(whence.address, WRONG_TRIES_FROM)}
+        # The address first: once it has had its tries, names that it makes up leave no rows.
+        counters = {**by_address(whence.address, WRONG_TRIES_FROM), named_partition(name): WRONG_TRIES}
         await self._attempts.count(GUESS, counters)
         named = await self._tables.get(store.ACCOUNTS, named_partition(name), "account")
         account = str(named.data["account"]) if named else ""
@@ -133,7 +134,7 @@ class Passwords:
                     "Give the old password, or sign in by a new one-time link and set it within 10 minutes."
                 )
             return
-        counters = {named_partition(who.name): WRONG_TRIES, **by_address(whence.address, WRONG_TRIES_FROM)}
+        counters = {**by_address(whence.address, WRONG_TRIES_FROM), named_partition(who.name): WRONG_TRIES}
         await self._attempts.count(GUESS, counters)
         if not await self._hashes.check(store.read(row, _Stored).hash if row else None, normal(old)):
             raise forbidden("The old password is not right.")

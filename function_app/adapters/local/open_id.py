@@ -79,7 +79,7 @@ class HttpOpenId:
         provider = await self._provider()
         says_issuer = provider.get("authorization_response_iss_parameter_supported") is True
         if issuer != self._issuer and (issuer is not None or says_issuer):
-            raise OpenIdError(f"the browser came back from '{issuer}', not from {self._issuer}")
+            raise OpenIdError(f"the browser came back from {(issuer or '')[:200]!r}, not from {self._issuer}")
         form = {"grant_type": "authorization_code", "code": code, "redirect_uri": redirect, "code_verifier": verifier}
         headers: dict[str, str] = {}
         ways = provider.get("token_endpoint_auth_methods_supported") or ["client_secret_basic"]
@@ -120,7 +120,7 @@ class HttpOpenId:
             header = jwt.get_unverified_header(token)
             algorithm = str(header.get("alg"))
             if algorithm not in ALGORITHMS:
-                raise OpenIdError(f"the ID token is signed by '{algorithm[:20]}', which proves nothing here")
+                raise OpenIdError(f"the ID token is signed by {algorithm[:20]!r}, which proves nothing here")
             key = await self._key(header.get("kid"), algorithm)
             claims: dict[str, Any] = jwt.decode(
                 token,
@@ -164,7 +164,12 @@ class HttpOpenId:
             and key.get("alg", algorithm) == algorithm
         ]
         # Without a name it must be clear which one is meant.
-        return jwt.PyJWK(fitting[0], algorithm).key if len(fitting) == 1 else None
+        if len(fitting) != 1:
+            return None
+        try:
+            return jwt.PyJWK(fitting[0], algorithm).key
+        except (ValueError, TypeError, KeyError) as error:
+            raise OpenIdError(f"a key of the provider's cannot be read: {error!r}") from error
 
     async def _provider(self) -> dict[str, Any]:
         """The provider's document about itself."""
@@ -172,7 +177,7 @@ class HttpOpenId:
             found = await self._fetch("GET", f"{self._issuer.rstrip('/')}/.well-known/openid-configuration")
             if found.get("issuer") != self._issuer:
                 said = str(found.get("issuer"))[:200]
-                raise OpenIdError(f"the provider calls itself '{said}'; TELESCOPE_OIDC_ISSUER has to say so too")
+                raise OpenIdError(f"the provider calls itself {said!r}; TELESCOPE_OIDC_ISSUER has to say so too")
             for name in _ADDRESSES:
                 if not _safe(found.get(name)):
                     raise OpenIdError(f"the provider's {name} is no https address")

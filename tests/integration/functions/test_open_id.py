@@ -299,7 +299,8 @@ def test_a_token_that_others_signed_is_not(liar: Liar, key: SigningKey, strange:
 
 def test_a_key_for_something_else_is_none(liar: Liar, key: SigningKey) -> None:
     liar.token = signed(claims(liar), key)
-    for shown in ({**key.shown(), "use": "enc"}, {**key.shown(), "alg": "PS256"}, {"kid": "one", "kty": "oct"}, "x"):
+    for shown in ({**key.shown(), "use": "enc"}, {**key.shown(), "alg": "PS256"}, {"kid": "one", "kty": "oct"}, "x",
+                  {**key.shown(), "n": "!"}, {**key.shown(), "n": 1}, {**key.shown(), "e": None}):  # fmt: skip
         liar.keys = [shown]
         with pytest.raises(OpenIdError):
             redeem(client(liar))
