@@ -68,6 +68,7 @@ from function_app.services.presence import PresenceIngest
 from function_app.services.queue import Queues
 from function_app.services.relay import Relay
 from function_app.services.robot_types import RobotTypes
+from function_app.services.seals import Seals
 from function_app.services.send_action import SendAction
 from function_app.services.series import SeriesWriter
 from function_app.services.series_range import SeriesReader
@@ -212,7 +213,7 @@ def build(settings: Settings, *, clock: Clock | None = None) -> Functions:
     relay = Relay(bus=bus, clock=now)
     delivery = Delivery(bus=bus, mailbox=mailbox, relay=relay)
     commands = Commands(delivery=delivery, keys=keys, clock=now)
-    robot_types = RobotTypes(tables=tables, blobs=blobs, catalogue=catalogue)
+    robot_types = RobotTypes(tables=tables, blobs=blobs, catalogue=catalogue, seals=Seals(keys=keys))
     diagnostics = Diagnostics(
         tables=tables, devices=devices, faults=faults, robot_types=robot_types, spaces=spaces, clock=now
     )
@@ -368,7 +369,13 @@ def build(settings: Settings, *, clock: Clock | None = None) -> Functions:
         ),
         robot_types=robot_types,
         upload_robot_type=UploadRobotType(
-            tables=tables, blobs=blobs, catalogue=catalogue, robot_types=robot_types, chain=chain, clock=now
+            tables=tables,
+            blobs=blobs,
+            catalogue=catalogue,
+            seals=Seals(keys=keys),
+            robot_types=robot_types,
+            chain=chain,
+            clock=now,
         ),
         delete_robot_type=DeleteRobotType(
             tables=tables, catalogue=catalogue, devices=devices, movements=movements, chain=chain, clock=now

@@ -13,9 +13,11 @@ running.lock     held by the agent that runs: two on one robot would fight
 
 import contextlib
 import json
+import logging
 import os
 import sqlite3
 import ssl
+import stat
 import tempfile
 import tomllib
 from collections.abc import Iterator
@@ -36,6 +38,7 @@ from device_agent.protocol.messages import Id, Label
 from device_agent.runtime.interlocks import Interlock
 
 SERVER_CA = "server-ca.pem"
+_log = logging.getLogger(__name__)
 
 
 class HomeError(Exception):
@@ -175,6 +178,7 @@ class Home:
             self._write(path, pem)
             return key
         try:
+            _close_to_others(path)
             key = serialization.load_pem_private_key(path.read_bytes(), None)  # type: ignore[assignment]
         except FileNotFoundError as error:
             raise HomeError(f"{self.folder} holds no agent; run `python -m device_agent enroll` first") from error
@@ -324,6 +328,19 @@ class Home:
             Path(temporary).replace(path)
         except OSError as error:
             raise HomeError(f"{path} cannot be written: {error.strerror}") from error
+
+
+def _close_to_others(path: Path) -> None:
+    """Keep others of this machine from a key. Windows has no such rights: there the folder's own hold."""
+    mode = stat.S_IMODE(path.stat().st_mode)
+    if os.name != "nt" and mode & (stat.S_IRWXG | stat.S_IRWXO):
+        path.chmod(stat.S_IRUSR | stat.S_IWUSR)
+        _log.warning(
+            "%s was open to others of this machine (mode %03o) and is no longer; if one of them may have read it, "
+            "delete it and enroll again",
+            path,
+            mode,
+        )
 
 
 def _table(entry: Struct) -> list[str]:

@@ -7,6 +7,15 @@ State = Literal["uploading", "checking", "ready", "refused"]
 
 
 @dataclass(frozen=True, slots=True)
+class Seal:
+    """That what is stored is what was uploaded: a key's id, its signature, and each file's hash (SHA-256, hex)."""
+
+    key: str = ""
+    signature: str = ""
+    hashes: dict[str, str] = field(default_factory=dict)
+
+
+@dataclass(frozen=True, slots=True)
 class TypeVersion:
     """One upload of a robot type.
 
@@ -16,6 +25,7 @@ class TypeVersion:
         files: Name → bytes.
         errors: Why it is refused.
         checked_ms: When the verdict came [ms since 1970].
+        seal: On manifest and files.
     """
 
     version: int
@@ -25,6 +35,7 @@ class TypeVersion:
     created_ms: int
     errors: tuple[str, ...] = ()
     checked_ms: int = 0
+    seal: Seal = field(default_factory=Seal)
 
     @property
     def open(self) -> bool:
@@ -40,7 +51,8 @@ class TypeHead:
         last: The highest version ever given; none is given twice.
         since: The first version since it was last made new.
         ready: The newest version that is ready, 0 when none is; it never goes back.
-        manifest: Of the version that is ready.
+        manifest: Of the version that is ready, and
+        seal: what says so.
         ready_ms: When that became ready [ms since 1970].
     """
 
@@ -51,6 +63,7 @@ class TypeHead:
     manifest: dict[str, Any] = field(default_factory=dict)
     ready_ms: int = 0
     deleted: bool = False
+    seal: Seal = field(default_factory=Seal)
 
     def needs(self, version: int) -> bool:
         """Whether a version may still be used, or become so."""
@@ -71,4 +84,6 @@ def with_ready(head: TypeHead, version: TypeVersion) -> TypeHead:
     """The type after one of its versions was found good; the newest good one counts."""
     if version.version <= head.ready:
         return head
-    return replace(head, ready=version.version, manifest=version.manifest, ready_ms=version.checked_ms)
+    return replace(
+        head, ready=version.version, manifest=version.manifest, ready_ms=version.checked_ms, seal=version.seal
+    )

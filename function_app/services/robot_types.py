@@ -19,6 +19,7 @@ from function_app.ports.catalogue import Catalogue
 from function_app.ports.tables import Tables
 from function_app.services import store
 from function_app.services.robot_type_rows import INDEX, Place, place, read_head, read_version
+from function_app.services.seals import Seals, require_whole
 
 _ZIP_TIME = (1980, 1, 1, 0, 0, 0)
 
@@ -50,7 +51,8 @@ class KnownType:
 class RobotTypes:
     """All robot types that an account may use."""
 
-    def __init__(self, *, tables: Tables, blobs: Blobs, catalogue: Catalogue) -> None:
+    def __init__(self, *, tables: Tables, blobs: Blobs, catalogue: Catalogue, seals: Seals) -> None:
+        self._seals = seals
         self._tables = tables
         self._blobs = blobs
         self._catalogue = catalogue
@@ -79,15 +81,16 @@ class RobotTypes:
         """A robot type that can be used.
 
         Raises:
-            Problem: ``robot-type-unknown``, ``robot-type-not-ready``.
+            Problem: ``robot-type-unknown``, ``robot-type-not-ready``, ``robot-type-damaged``.
         """
         built_in = (await self._catalogue.types()).get(robot_type)
         if built_in is not None:
             return built_in
-        _, head = await self._head(who, robot_type)
+        where, head = await self._head(who, robot_type)
         if not head.ready:
             detail = f"No version of '{robot_type}' is ready. Look at the robot type: it says why."
             raise Problem("robot-type-not-ready", 409, "The robot type is not ready", detail)
+        await self._seals.check(where.account, robot_type, head)
         return msgspec.convert(head.manifest, RobotType)
 
     async def view(self, who: Identity, robot_type: str) -> KnownType:
@@ -105,7 +108,7 @@ class RobotTypes:
         """One file of the version in use; ``robot.toml`` is the manifest.
 
         Raises:
-            Problem: ``robot-type-unknown``, ``robot-type-not-ready``, ``file-unknown``.
+            Problem: ``robot-type-unknown``, ``robot-type-not-ready``, ``robot-type-damaged``, ``file-unknown``.
         """
         await self.get(who, robot_type)
         files = await self._catalogue.files(robot_type)
@@ -116,6 +119,8 @@ class RobotTypes:
             _, version = await read_version(self._tables, where, head.ready)
             known = version is not None and name in version.files
             content = await self._blobs.get(where.prefix(head.ready) + name) if known else None
+            if content is not None:
+                require_whole(robot_type, head.seal, name, content)
         if content is None:
             raise not_found("file", name)
         return content

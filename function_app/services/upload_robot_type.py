@@ -29,6 +29,7 @@ from function_app.services.robot_type_rows import (
     version_key,
 )
 from function_app.services.robot_types import KnownType, RobotTypes
+from function_app.services.seals import Seals
 
 MAX_OWN = 100
 """Robot types an account may have."""
@@ -47,6 +48,7 @@ class UploadRobotType:
         blobs: Blobs,
         catalogue: Catalogue,
         robot_types: RobotTypes,
+        seals: Seals,
         chain: AuditChain,
         clock: Clock,
     ) -> None:
@@ -54,6 +56,7 @@ class UploadRobotType:
         self._blobs = blobs
         self._catalogue = catalogue
         self._types = robot_types
+        self._seals = seals
         self._chain = chain
         self._clock = clock
 
@@ -113,7 +116,8 @@ class UploadRobotType:
             if head is not None and not head.deleted:
                 await self._require_no_other(where, head)
             following = next_version(head, given.robot_type.version, where.type)
-            upload = TypeVersion(following.last, "uploading", manifest, sizes, self._clock.now_ms())
+            plain = TypeVersion(following.last, "uploading", manifest, sizes, self._clock.now_ms())
+            upload = await self._seals.sealed(where.account, where.type, plain, given.files)
             new_head = Row(where.partition, HEAD, store.fields(following), row.etag if row else "")
             new_version = Row(where.partition, version_key(following.last), store.fields(upload))
             writes = [Write("replace" if row else "create", new_head), Write("create", new_version)]

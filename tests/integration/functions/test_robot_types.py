@@ -3,6 +3,7 @@
 import asyncio
 import base64
 import contextlib
+import copy
 import ctypes
 import io
 import os
@@ -21,11 +22,13 @@ from function_app.adapters.local.model_compiler import MujocoCompiler
 from function_app.entrypoints.http.contract.robot_types import MAX_UPLOAD
 from function_app.entrypoints.worker import check_models
 from function_app.ports.model_compiler import CompilerMissingError
+from function_app.ports.tables import Row
 from function_app.services import store
 from function_app.services.delete_robot_type import AFTER_MS
 from function_app.services.forget import DAY_MS
 from function_app.services.model_checks import LEASE_MS, MAX_TRIES
 from function_app.services.model_files import MAX_BYTES, MAX_FILES
+from function_app.services.robot_type_rows import Place
 from function_app.services.tend_robot_types import CUT_OFF, NO_CHECKER
 from function_app.services.upload_robot_type import GIVE_UP_MS
 from tests.support.brokers import PATIENCE_S, wait_until
@@ -734,3 +737,63 @@ class TestLimits:
         found = cloud.run(compiler.check(manifests.parse(manifest()), {"lever.xml": xml, "scene.xml": xml}))
         # Where the kernel has no Landlock, the look at references has to do alone.
         assert bool(found) == (ctypes.CDLL(None).syscall(444, None, 0, 1) > 0)
+
+
+class TestSeal:
+    """Somebody can write to the stores: what was checked is used, or nothing."""
+
+    @pytest.fixture
+    def lever(self, cloud: Cloud, anna: Person) -> Place:
+        assert add(anna, wait_ms=0).status_code < 300
+        check_all(cloud)
+        assert anna.get("/robot-types/lever/files/robot.toml").status_code == 200
+        return Place(anna.account, "lever")
+
+    def change(self, cloud: Cloud, place: Place, key: str, edit: Callable[[dict[str, Any]], object]) -> None:
+        row = cloud.run(cloud.functions.tables.get(store.ROBOT_TYPES, place.partition, key))
+        assert row is not None
+        data = copy.deepcopy(dict(row.data))
+        edit(data)
+        cloud.run(cloud.functions.tables.replace(store.ROBOT_TYPES, Row(row.partition, row.key, data, row.etag)))
+
+    def test_no_byte_of_a_manifest_or_a_model_may_differ(self, cloud: Cloud, anna: Person, lever: Place) -> None:
+        for name in ("robot.toml", "lever.xml"):
+            blob = lever.prefix(1) + name
+            good = cloud.run(cloud.functions.blobs.get(blob))
+            assert good is not None
+            for index in range(0, len(good), 23):
+                bad = good[:index] + bytes([good[index] ^ 1]) + good[index + 1 :]
+                cloud.run(cloud.functions.blobs.put(blob, bad))
+                problem(anna.get(f"/robot-types/lever/files/{name}"), 409, "robot-type-damaged")
+            cloud.run(cloud.functions.blobs.put(blob, good))
+            assert anna.get(f"/robot-types/lever/files/{name}").content == good
+
+    def test_no_field_of_it_may_differ_and_no_other_seal_fits(self, cloud: Cloud, anna: Person, lever: Place) -> None:
+        first = cloud.run(cloud.functions.tables.get(store.ROBOT_TYPES, lever.partition, "type"))
+        assert first is not None
+        good = copy.deepcopy(dict(first.data))
+        edits: tuple[Callable[[dict[str, Any]], object], ...] = (
+            lambda data: data["manifest"].update(label="Another"),
+            lambda data: data["manifest"]["joints"][0].update(max_velocity_rad_s=99.0),
+            lambda data: data["manifest"].update(type="ur5"),
+            lambda data: data["seal"].update(signature=data["seal"]["signature"][::-1]),
+            lambda data: data["seal"].update(key="0" * 16),
+            lambda data: data["seal"]["hashes"].update({"lever.xml": "0" * 64}),
+            lambda data: data.pop("seal"),
+        )
+        for edit in edits:
+            self.change(cloud, lever, "type", edit)
+            problem(anna.get("/robot-types/lever/files/robot.toml"), 409, "robot-type-damaged")
+            self.change(cloud, lever, "type", lambda data: data.update(copy.deepcopy(good)))
+        assert anna.get("/robot-types/lever/files/robot.toml").status_code == 200
+
+        bert = cloud.sign_in("bert")
+        add(bert, wait_ms=0)
+        add(anna, wait_ms=0)
+        check_all(cloud)
+        self.change(cloud, Place(bert.account, "lever"), "type", lambda data: data.update(seal=good["seal"]))
+        problem(bert.get("/robot-types/lever/files/robot.toml"), 409, "robot-type-damaged")
+        # An older version passed off as the newest.
+        old = {"manifest": good["manifest"], "seal": good["seal"]}
+        self.change(cloud, lever, "type", lambda data: data.update(old))
+        problem(anna.get("/robot-types/lever/files/robot.toml"), 409, "robot-type-damaged")

@@ -202,3 +202,18 @@ def test_a_lock_that_cannot_be_written_is_named(tmp_path: Path) -> None:
     (tmp_path / "running.lock").mkdir()
     with pytest.raises(HomeError, match=r"running\.lock cannot be written"), Home(tmp_path).hold():
         pass
+
+
+def test_an_identity_that_was_open_to_others_is_closed_and_it_is_said(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    home = Home(tmp_path / "agent")
+    home.identity(create=True)
+    path = tmp_path / "agent" / "identity.pem"
+    path.chmod(0o644)
+    home.identity()
+    assert path.stat().st_mode & 0o777 == 0o600
+    assert "enroll again" in caplog.text
+    caplog.clear()
+    home.identity()
+    assert caplog.text == ""
