@@ -193,7 +193,9 @@ def test_home_assistant_is_shown_the_room_and_moves_its_door(
     laboratory: Machine, api: Api, home_assistants_broker: int
 ) -> None:
     door = api.device("door")
-    key = api.post("/api-keys", {"name": "Home Assistant", "role": "operator", "only": [door["id"]]})["token"]
+    key = api.post("/api-keys", {"name": "Home Assistant", "role": "operator", "only": [f"space:{door['space']}"]})[
+        "token"
+    ]
     command = [sys.executable, "-m", "infra.home_assistant", "--server", laboratory.url]
     bridge = subprocess.Popen(
         [*command, "--port", str(home_assistants_broker)],
