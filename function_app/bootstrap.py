@@ -56,6 +56,7 @@ from function_app.services.latency import Latencies
 from function_app.services.lease import Leases
 from function_app.services.lease_rows import LeaseRows
 from function_app.services.leave import Leave
+from function_app.services.limits import Limits
 from function_app.services.mailbox import Mailbox
 from function_app.services.model_checks import ModelChecks
 from function_app.services.movements import Movements
@@ -155,6 +156,7 @@ class Functions:
     series: SeriesReader
     chain: AuditChain
     trail: AuditTrail
+    limits: Limits
     sweep: Sweep
     health: CheckHealth
 
@@ -201,8 +203,8 @@ def build(settings: Settings, *, clock: Clock | None = None) -> Functions:
     faults = Faults(tables=tables, events=events, forget=forget, clock=now)
     conditions = Conditions(tables=tables, faults=faults, clock=now)
     identify = Identify(tables=tables, keys=keys, forget=forget, clock=now)
-    sessions = Sessions(tables=tables, identify=identify, forget=forget, clock=now)
-    sign_in = SignIn(tables=tables, sessions=sessions, clock=now)
+    sessions = Sessions(tables=tables, identify=identify, forget=forget, chain=chain, clock=now)
+    sign_in = SignIn(tables=tables, sessions=sessions, chain=chain, clock=now)
     attempts = Attempts(tables=tables, forget=forget, clock=now)
     devices = Devices(tables=tables, clock=now)
     spaces = Spaces(tables=tables, clock=now)
@@ -249,6 +251,7 @@ def build(settings: Settings, *, clock: Clock | None = None) -> Functions:
         access=access,
         devices=devices,
         leases=leases,
+        chain=chain,
         clock=now,
     )
     sending = SendAction(tables=tables, devices=devices, rows=rows, commands=commands, movements=movements, clock=now)
@@ -347,6 +350,7 @@ def build(settings: Settings, *, clock: Clock | None = None) -> Functions:
             sign_in=sign_in,
             sessions=sessions,
             sign_out=sign_out,
+            chain=chain,
             clock=now,
         ),
         enroll=Enroll(tables=tables, leave=leave, forget=forget, clock=now),
@@ -430,6 +434,15 @@ def build(settings: Settings, *, clock: Clock | None = None) -> Functions:
         series=SeriesReader(tables=tables, devices=devices, keep=keep, clock=now),
         chain=chain,
         trail=AuditTrail(tables=tables, blobs=blobs, keys=keys),
+        limits=Limits(
+            per_s={
+                "address": settings.rate_address,
+                "account": settings.rate_account,
+                "key": settings.rate_key,
+                "agent": settings.rate_agent,
+            },
+            clock=now,
+        ),
         sweep=Sweep(
             tables=tables,
             rows=rows,

@@ -187,6 +187,10 @@ class Settings:
         robots: Folder of the robot types.
         console: Folder of the built console.
         trusted_proxies: Proxies of one's own in front of the API; the last of ``X-Forwarded-For`` are theirs.
+        rate_address: Requests a second that are answered to one address, by one process; 0: any number. So also of
+        rate_account: one account,
+        rate_key: one API key, and
+        rate_agent: one agent.
         keep_actions_days: How long actions are kept after their end [d].
         keep_uploads_days: How long captures are kept after their upload [d].
         keep_raw_hours: How long every sample is kept, and how late one may come [h].
@@ -214,6 +218,10 @@ class Settings:
     robots: Path = ROOT / "robots"
     console: Path = ROOT / "web" / "dist"
     trusted_proxies: int = 0
+    rate_address: int = 200
+    rate_account: int = 100
+    rate_key: int = 20
+    rate_agent: int = 100
     keep_actions_days: int = 30
     keep_uploads_days: int = 30
     keep_raw_hours: int = 24
@@ -266,6 +274,10 @@ def read(environment: Mapping[str, str] | None = None) -> Settings:
         robots=_folder(given, "TELESCOPE_ROBOTS", ROOT / "robots"),
         console=_folder(given, "TELESCOPE_CONSOLE", ROOT / "web" / "dist"),
         trusted_proxies=_number(given, "TELESCOPE_TRUSTED_PROXIES", 0, 0, 10),
+        rate_address=_number(given, "TELESCOPE_RATE_ADDRESS", 200, 0, 1_000_000),
+        rate_account=_number(given, "TELESCOPE_RATE_ACCOUNT", 100, 0, 1_000_000),
+        rate_key=_number(given, "TELESCOPE_RATE_KEY", 20, 0, 1_000_000),
+        rate_agent=_number(given, "TELESCOPE_RATE_AGENT", 100, 0, 1_000_000),
         keep_actions_days=_number(given, "TELESCOPE_KEEP_ACTIONS_DAYS", 30, 1, 3650),
         keep_uploads_days=_number(given, "TELESCOPE_KEEP_UPLOADS_DAYS", 30, 1, 36_500),
         keep_raw_hours=_number(given, "TELESCOPE_KEEP_RAW_HOURS", 24, 1, 9600),

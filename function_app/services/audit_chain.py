@@ -18,7 +18,7 @@ import logging
 import random
 from collections import OrderedDict
 from collections.abc import AsyncGenerator, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from typing import Any, Final
 
 from device_agent.protocol import signing
@@ -71,12 +71,12 @@ class _Job:
     once: str = ""
 
 
-@dataclass(slots=True)
 class _Line:
     """Those of one process who wait for one chain."""
 
-    lock: asyncio.Lock = field(default_factory=asyncio.Lock)
-    jobs: list[tuple[_Job, "asyncio.Future[None]"]] = field(default_factory=list)
+    def __init__(self) -> None:
+        self.lock = asyncio.Lock()
+        self.jobs: list[tuple[_Job, asyncio.Future[None]]] = []
 
 
 class Change:
@@ -164,12 +164,17 @@ class AuditChain:
         at_ms = self._clock.now_ms()
         await self.keep(owner, rules.entry(what, who, entry_id=new_id(), at_ms=at_ms, on=on, outcome=outcome, **data))
 
-    async def refused(self, owner: str, what: str, who: Identity | None, *, on: str = "", **data: Any) -> None:
-        """Record a refusal. Whatever goes wrong with that: the refusal stands."""
+    async def refused(
+        self, owner: str, what: str, who: Identity | None, *, on: str = "", each: bool = False, **data: Any
+    ) -> None:
+        """Record a refusal; the same again and again once in a while only, but where it says ``each``.
+
+        Whatever goes wrong with that: the refusal stands.
+        """
         now_ms = self._clock.now_ms()
         code = str(data.get("code", ""))
         key = (owner, what, on, code, who.session if who else str(data.get("address", "")))
-        if now_ms - self._refused.get(key, -QUIET_MS) < QUIET_MS:
+        if not each and now_ms - self._refused.get(key, -QUIET_MS) < QUIET_MS:
             return
         self._refused[key] = now_ms
         _bound(self._refused, key)
@@ -216,7 +221,8 @@ class AuditChain:
         """
         page = await self._tables.query(store.AUDIT, owner, first=_WAIT, last="wait;", limit=1000)
         now_ms = self._clock.now_ms()
-        left = [row for row in page.rows if row.data["outcome"] != "unknown" or _old(row, now_ms)]
+        since_ms = now_ms - ABANDON_MS
+        left = [row for row in page.rows if row.data["outcome"] != "unknown" or row.data["at_ms"] <= since_ms]
         await self._append(owner, [_Job(dict(row.data), waiting=row) for row in left])
         if len(left) < len(page.rows) or page.cursor is not None:
             await self._pending.note(f"{_NOTE}{owner}", now_ms + LOOK_MS)
@@ -388,10 +394,6 @@ def _each_once(jobs: list[_Job]) -> list[_Job]:
     """Without what two have brought at the same time: the later one of the same note knows more."""
     named = {job.once or (job.waiting.key if job.waiting else str(id(job))): job for job in jobs}
     return list(named.values())
-
-
-def _old(row: Row, now_ms: int) -> bool:
-    return now_ms - int(row.data["at_ms"]) >= ABANDON_MS
 
 
 def _bound(known: OrderedDict[Any, Any], newest: Any) -> None:

@@ -4,6 +4,7 @@ from dataclasses import dataclass
 from typing import Final
 
 from function_app.domain.accounts import Account, Identity
+from function_app.domain.audit_chain import CLOUD, Deed
 from function_app.domain.ids import new_id
 from function_app.domain.passwords import normal, why_weak
 from function_app.domain.problems import Problem, forbidden, invalid, unauthorized
@@ -12,6 +13,7 @@ from function_app.ports.password_hashes import PasswordHashes
 from function_app.ports.tables import Conflict, Row, Tables
 from function_app.services import store
 from function_app.services.attempts import Attempts, Guess, by_address
+from function_app.services.audit_chain import AuditChain
 from function_app.services.sessions import From, Sessions, SignedIn
 from function_app.services.sign_in import SignIn, named_partition
 from function_app.services.sign_out import SignOut
@@ -22,6 +24,7 @@ WRONG_TRIES: Final = 10
 allows a hundred in a row."""
 WRONG_TRIES_FROM: Final = 30
 """From one address: behind one may be a whole school."""
+WRONG: Final = "wrong-password"
 _PASSWORD: Final = "password"  # noqa: S105 (the key of a row)
 _NOBODY: Final = "name:"
 """A partition of no account: a name that nobody has costs the same reads."""
@@ -45,6 +48,7 @@ class Passwords:
         sign_in: SignIn,
         sessions: Sessions,
         sign_out: SignOut,
+        chain: AuditChain,
         clock: Clock,
     ) -> None:
         self._tables = tables
@@ -53,6 +57,7 @@ class Passwords:
         self._sign_in = sign_in
         self._sessions = sessions
         self._sign_out = sign_out
+        self._chain = chain
         self._clock = clock
 
     async def sign_in(self, name: str, password: str, whence: From) -> SignedIn:
@@ -63,13 +68,18 @@ class Passwords:
         """
         # The address first: once it has had its tries, names that it makes up leave no rows.
         counters = {**by_address(whence.address, WRONG_TRIES_FROM), named_partition(name): WRONG_TRIES}
-        await self._attempts.count(GUESS, counters)
+        try:
+            await self._attempts.count(GUESS, counters)
+        except Problem as problem:
+            await self._refused("", whence, problem.code)
+            raise
         named = await self._tables.get(store.ACCOUNTS, named_partition(name), "account")
         account = str(named.data["account"]) if named else ""
         row = await self._tables.get(store.ACCOUNTS, account or _NOBODY, _PASSWORD)
         stored = store.read(row, _Stored) if row else None
         right = await self._hashes.check(stored.hash if stored else None, normal(password))
         if row is None or stored is None or not right:
+            await self._refused(account, whence, WRONG)
             raise unauthorized("This name and password do not belong together.")
         await self._attempts.uncount(GUESS, counters)
         done = await self._sessions.begin(Account(account, name), "password", whence)
@@ -98,13 +108,16 @@ class Passwords:
         row = await self._tables.get(store.ACCOUNTS, who.account, _PASSWORD)
         await self._require_right(who, row, old, whence)
         data = store.fields(await self._store(password, who.name))
-        try:
-            if row is None:
-                await self._tables.create(store.ACCOUNTS, Row(who.account, _PASSWORD, data))
-            else:
-                await self._tables.replace(store.ACCOUNTS, Row(who.account, _PASSWORD, data, row.etag))
-        except Conflict as conflict:
-            raise forbidden("The password was changed in the meantime. Give the new one as the old one.") from conflict
+        async with self._chain.change(who.account, Deed.PASSWORD_SET, who, address=whence.address) as change:
+            await change.noted()
+            try:
+                if row is None:
+                    await self._tables.create(store.ACCOUNTS, Row(who.account, _PASSWORD, data))
+                else:
+                    await self._tables.replace(store.ACCOUNTS, Row(who.account, _PASSWORD, data, row.etag))
+            except Conflict as conflict:
+                detail = "The password was changed in the meantime. Give the new one as the old one."
+                raise forbidden(detail) from conflict
         await self._sign_out.others(who)
 
     async def register(self, name: str, password: str) -> Account:
@@ -118,13 +131,24 @@ class Passwords:
         row = await self._tables.create(store.ACCOUNTS, Row(account, _PASSWORD, store.fields(stored)))
         try:
             ids = {"account": account, "space": new_id(12)}
-            await self._tables.create(store.ACCOUNTS, Row(named_partition(name), "account", ids))
+            async with self._chain.change(account, Deed.ACCOUNT_MADE, Identity(account, name, "")) as change:
+                await change.noted()
+                await self._tables.create(store.ACCOUNTS, Row(named_partition(name), "account", ids))
         except Conflict as conflict:
             await self._tables.delete(store.ACCOUNTS, row)
             raise Problem(
                 "name-taken", 409, "The name is taken", "Somebody has this name. Choose another."
             ) from conflict
         return await self._sign_in.account(name)
+
+    async def _refused(self, account: str, whence: From, code: str) -> None:
+        """Record it with the account that was meant, or, where there is none of that name, with the cloud's own.
+
+        Each wrong password, for there are few, so that a name that nobody has takes as long as one that is known.
+        """
+        wrong = code == WRONG
+        data = {"code": code, "address": whence.address}
+        await self._chain.refused(account or CLOUD, Deed.SIGN_IN_REFUSED, None, each=wrong, **data)
 
     async def _require_right(self, who: Identity, row: Row | None, old: str | None, whence: From) -> None:
         if old is None:
@@ -137,6 +161,7 @@ class Passwords:
         counters = {**by_address(whence.address, WRONG_TRIES_FROM), named_partition(who.name): WRONG_TRIES}
         await self._attempts.count(GUESS, counters)
         if not await self._hashes.check(store.read(row, _Stored).hash if row else None, normal(old)):
+            await self._refused(who.account, whence, WRONG)
             raise forbidden("The old password is not right.")
         await self._attempts.uncount(GUESS, counters)
 

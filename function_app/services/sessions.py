@@ -4,9 +4,11 @@ from dataclasses import dataclass
 from typing import Final, Literal
 
 from function_app.domain.accounts import Account, Identity
+from function_app.domain.audit_chain import Deed
 from function_app.ports.clock import Clock
 from function_app.ports.tables import Conflict, Row, Tables
 from function_app.services import store
+from function_app.services.audit_chain import AuditChain
 from function_app.services.forget import Forget
 from function_app.services.identity import ACCESS_S, API, SESSION, SESSION_S, Identify, new_secret, new_session
 
@@ -67,10 +69,11 @@ class SignedIn:
 class Sessions:
     """Begins sessions, and knows those that an account has."""
 
-    def __init__(self, *, tables: Tables, identify: Identify, forget: Forget, clock: Clock) -> None:
+    def __init__(self, *, tables: Tables, identify: Identify, forget: Forget, chain: AuditChain, clock: Clock) -> None:
         self._tables = tables
         self._identify = identify
         self._forget = forget
+        self._chain = chain
         self._clock = clock
 
     async def begin(self, account: Account, how: How, whence: From) -> SignedIn:
@@ -80,7 +83,10 @@ class Sessions:
         begun = Session(new_session(), how, now_ms, ends_ms, address=whence.address, program=whence.program[:_SHOWN])
         row = Row(account.id, _ROW + begun.id, store.fields(begun))
         await self._forget.row(store.ACCOUNTS, row.partition, row.key, due_ms=ends_ms)
-        await self._tables.create(store.ACCOUNTS, row)
+        who = Identity(account.id, account.name, begun.id)
+        async with self._chain.change(account.id, Deed.SIGNED_IN, who, how=how, address=whence.address) as change:
+            await change.noted()
+            await self._tables.create(store.ACCOUNTS, row)
         csrf = new_secret()
         return SignedIn(
             account=account,

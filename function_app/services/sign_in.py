@@ -3,11 +3,13 @@
 import hashlib
 
 from function_app.domain.accounts import Account, Identity, Space
+from function_app.domain.audit_chain import CLOUD, Deed
 from function_app.domain.ids import new_id
 from function_app.domain.problems import Problem, unauthorized
 from function_app.ports.clock import Clock
 from function_app.ports.tables import Conflict, Row, Tables
 from function_app.services import store
+from function_app.services.audit_chain import AuditChain
 from function_app.services.identity import new_secret
 from function_app.services.sessions import From, Sessions, SignedIn
 
@@ -20,9 +22,10 @@ MOST_SPACES = 100
 class SignIn:
     """Accounts and their one-time links."""
 
-    def __init__(self, *, tables: Tables, sessions: Sessions, clock: Clock) -> None:
+    def __init__(self, *, tables: Tables, sessions: Sessions, chain: AuditChain, clock: Clock) -> None:
         self._tables = tables
         self._sessions = sessions
+        self._chain = chain
         self._clock = clock
 
     async def account(self, name: str) -> Account:
@@ -79,7 +82,9 @@ class SignIn:
             detail = f"An account has at most {MOST_SPACES} spaces. Use one of them."
             raise Problem("too-many-spaces", 409, "Too many spaces", detail)
         space = Space(id=new_id(12), name=name, created_ms=self._clock.now_ms())
-        await self._tables.create(store.ACCOUNTS, Row(who.account, f"space:{space.id}", store.fields(space)))
+        async with self._chain.change(who.account, Deed.SPACE_MADE, who, on=space.id, name=name) as change:
+            await change.noted()
+            await self._tables.create(store.ACCOUNTS, Row(who.account, f"space:{space.id}", store.fields(space)))
         return space
 
     async def known(self, name: str) -> Account | None:
@@ -110,6 +115,8 @@ class SignIn:
         refused = unauthorized("This sign-in link is unknown, used or expired. Ask for a new one.")
         row = await self._tables.get(store.SIGN_INS, hashed[0], hashed)
         if row is None:
+            address = whence.address if whence else ""
+            await self._chain.refused(CLOUD, Deed.SIGN_IN_REFUSED, None, code="link-unknown", address=address)
             raise refused
         try:
             await self._tables.delete(store.SIGN_INS, row)

@@ -4,11 +4,13 @@ import asyncio
 import logging
 
 from function_app.domain.accounts import Identity
+from function_app.domain.audit_chain import Deed
 from function_app.domain.devices import Device
 from function_app.domain.problems import Problem, not_found
 from function_app.ports.broker_access import BrokerAccess, BrokerAccessError
 from function_app.ports.clock import Clock
 from function_app.ports.tables import Tables
+from function_app.services.audit_chain import AuditChain
 from function_app.services.control import read_lease
 from function_app.services.devices import Devices
 from function_app.services.identity import Identify, principal
@@ -33,6 +35,7 @@ class SignOut:
         access: BrokerAccess,
         devices: Devices,
         leases: Leases,
+        chain: AuditChain,
         clock: Clock,
     ) -> None:
         self._tables = tables
@@ -41,6 +44,7 @@ class SignOut:
         self._access = access
         self._devices = devices
         self._leases = leases
+        self._chain = chain
         self._clock = clock
 
     async def end(self, who: Identity) -> None:
@@ -49,8 +53,10 @@ class SignOut:
         Whoever is not reached changes nothing: what the broker was told ends by itself within a quarter of an hour, a
         lease when it runs out, and until then nobody can renew either.
         """
-        await self._identify.sign_out(who)
-        await self._sessions.drop(who.account, who.session)
+        async with self._chain.change(who.account, Deed.SIGNED_OUT, who) as change:
+            await change.noted()
+            await self._identify.sign_out(who)
+            await self._sessions.drop(who.account, who.session)
         try:
             await self._access.revoke(principal=principal(who))
         except BrokerAccessError as error:

@@ -43,13 +43,15 @@ from function_app.entrypoints.http import (
     uploads,
     xmpp,
 )
+from function_app.entrypoints.http.address import client_address
 from function_app.entrypoints.http.answers import JSON, problem
-from function_app.entrypoints.http.caller import COOKIE, Caller
+from function_app.entrypoints.http.caller import COOKIE, Caller, is_stop
 from function_app.entrypoints.http.console import Console
 from function_app.entrypoints.http.reference import reference
 from function_app.entrypoints.http.routing import ACCOUNT_SCHEMES, AGENT_SCHEME, KEY_SCHEME, PREFIX, VERSION, schemas
 from function_app.ports.clock import Clock
 from function_app.ports.tables import StoreError
+from function_app.services.limits import Limits
 
 _SECURE_FOR = b"max-age=31536000"
 """A year: a browser that has once come by TLS comes no other way."""
@@ -78,7 +80,7 @@ def create_app(functions: Functions) -> FastAPI:
         lifespan=lifespan,
         redirect_slashes=False,
     )
-    caller = Caller(functions.identify, functions.api_keys)
+    caller = Caller(functions.identify, functions.api_keys, functions.limits)
     resources = (
         auth.router(functions, caller),
         accounts.router(functions, caller),
@@ -118,6 +120,7 @@ def create_app(functions: Functions) -> FastAPI:
     app.add_exception_handler(HTTPException, _on_http)
     # What no route knows at all; a mount would also swallow a wrong method, which is a 405.
     app.router.default = Console(functions.settings.console)
+    app.add_middleware(_Addresses, limits=functions.limits, proxies=functions.settings.trusted_proxies)
     app.add_middleware(
         _Headers,
         clock=functions.clock,
@@ -203,6 +206,27 @@ def _methods(request: Request) -> list[str]:
     # The first one that fits decides: ``agents/enroll`` is no agent.
     place = next((route.path for route in known if route.path_regex.match(path)), None)
     return sorted({method for route in known if route.path == place for method in route.methods})
+
+
+class _Addresses:
+    """Counts what is asked from each address, before anything else is done for it."""
+
+    def __init__(self, app: ASGIApp, *, limits: Limits, proxies: int) -> None:
+        self._app = app
+        self._limits = limits
+        self._proxies = proxies
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        if scope["type"] == "http" and scope["path"].startswith("/api/"):
+            request = Request(scope)
+            address = "" if is_stop(request) else client_address(request, self._proxies)
+            try:
+                if address:
+                    self._limits.admit("address", address)
+            except Problem as refused:
+                await problem(refused)(scope, receive, send)
+                return
+        await self._app(scope, receive, send)
 
 
 class _Headers:

@@ -1,6 +1,7 @@
 """Who calls: a bearer token, an API key, or the page's cookie."""
 
 import hmac
+import re
 
 from fastapi import Request
 
@@ -11,18 +12,21 @@ from function_app.domain.problems import Problem, forbidden, unauthorized
 from function_app.entrypoints.http.routing import takes_keys
 from function_app.services.api_keys import ApiKeys
 from function_app.services.identity import API, Identify
+from function_app.services.limits import Limits
 
 COOKIE = "telescope_session"
 CSRF_HEADER = "X-CSRF-Token"
+_STOP = re.compile(r"/api/v1/((devices|spaces)/[^/]+/)?stop")
 _READING = frozenset({"GET", "HEAD", "OPTIONS"})
 
 
 class Caller:
     """Finds out who makes a request."""
 
-    def __init__(self, identify: Identify, api_keys: ApiKeys) -> None:
+    def __init__(self, identify: Identify, api_keys: ApiKeys, limits: Limits) -> None:
         self._identify = identify
         self._api_keys = api_keys
+        self._limits = limits
 
     async def account(self, request: Request) -> Identity:
         """The account that asks, itself or by an API key.
@@ -36,10 +40,12 @@ class Caller:
             who = await self._api_keys.identify(token)
             if not takes_keys(request.scope.get("route")):
                 raise forbidden("An API key may not do this. Sign in, and do it yourself.")
-            return who
-        if token:
-            return await self._identify.person(token, API)
-        who, _ = await self.page(request)
+        elif token:
+            who = await self._identify.person(token, API)
+        else:
+            who, _ = await self.page(request)
+        if not is_stop(request):
+            self._limits.admit("key" if who.key else "account", who.key or who.account)
         return who
 
     async def page(self, request: Request) -> tuple[Identity, str]:
@@ -71,7 +77,9 @@ class Caller:
         Raises:
             Problem: ``unauthorized``.
         """
-        return await self._identify.agent(bearer(request))
+        agent = await self._identify.agent(bearer(request))
+        self._limits.admit("agent", agent.id)
+        return agent
 
     async def enrolling(self, request: Request, public_key: str) -> str:
         """The id of an agent that may be new, once its token is seen to be signed by ``public_key``.
@@ -92,6 +100,11 @@ def refuse_other_sites(request: Request) -> None:
     """
     if request.headers.get("sec-fetch-site", "same-origin") not in {"same-origin", "none"}:
         raise forbidden("Sign in on the page of this server itself.")
+
+
+def is_stop(request: Request) -> bool:
+    """Whether somebody wants to stop something: nobody is asked to wait with that."""
+    return request.method == "POST" and _STOP.fullmatch(request.url.path) is not None
 
 
 def bearer(request: Request) -> str:

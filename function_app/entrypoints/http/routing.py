@@ -35,7 +35,7 @@ _MEANINGS = {
     409: "Not in this state",
     413: "The body is too large",
     422: "The request is not valid",
-    429: "Too many tries; see Retry-After",
+    429: "Too many requests or tries; see Retry-After",
     503: "The store or the broker cannot be used; see Retry-After",
 }
 
@@ -67,13 +67,13 @@ class Routes:
             path: Below the API's prefix.
             summary: One line.
             answers: Status → struct of the body (``None``: no body; text: the media type of a file).
-            problems: Statuses of refusals beside 401, 413, 422 and 503, which follow from the rest.
+            problems: Statuses of refusals beside 401, 413, 422, 429 and 503, which follow from the rest.
             body: Struct of the request's body.
             body_required: Whether it may be left out.
             caller: Who may ask; ``page``: an account by its cookie alone. An API key stands for an account where the
                 handler's name is in ``FOR_KEYS``.
         """
-        refusals = {*problems, 503}
+        refusals = {*problems, 429, 503}
         if caller != "nobody":
             refusals.add(401)
         if caller not in {"nobody", "agent"}:

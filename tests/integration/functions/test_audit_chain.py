@@ -14,11 +14,11 @@ import pytest
 from function_app.__main__ import main
 from function_app.bootstrap import Functions
 from function_app.domain.accounts import Identity
-from function_app.domain.audit_chain import Head
+from function_app.domain.audit_chain import CLOUD, Head
 from function_app.services import store
 from function_app.services.audit_chain import ABANDON_MS, ANCHOR_MS, LOOK_MS, anchors
 from tests.integration.functions.conftest import Open
-from tests.support.cloud import Cloud, MovingClock, Person, problem, settings
+from tests.support.cloud import API, Cloud, MovingClock, Person, problem, settings
 from tests.support.processes import Place, begin, killed, open_functions, run_here, show_code
 
 OWNER = "owner"
@@ -62,6 +62,31 @@ class TestWhatIsRecorded:
         stop = next(item for item in items if item["what"] == "stop-ordered")
         assert (stop["who"], stop["by_account"], stop["data"]["reason"]) == ("anna", anna.account, "look out")
         assert verdict(cloud, anna.account) == ""
+
+    def test_who_signs_in_and_out_and_who_tries_in_vain_is_recorded_without_any_secret(self, cloud: Cloud) -> None:
+        anna = cloud.sign_in("anna")
+        assert anna.put("/accounts/me/password", {"password": "correct horse battery"}).status_code == 204
+        wrong = {"name": "anna", "password": "wrong wrong wrong"}
+        before = cloud.run(cloud.functions.trail.head(CLOUD)) or Head(0, "")
+        for name in ("anna", "nobody", "anna"):
+            answer = cloud.ask("POST", f"{API}/auth/password", json={**wrong, "name": name})
+            assert answer.status_code == 401, answer.text
+        assert cloud.ask("POST", f"{API}/auth/sign-in", json={"link": "x" * 43}).status_code == 401
+        again = cloud.sign_in("anna")
+        again.post("/auth/sign-out")
+        assert list(reversed(kinds(anna))) == [
+            "signed-in",
+            "password-set",
+            "sign-in-refused",
+            "sign-in-refused",
+            "signed-in",
+            "signed-out",
+        ]
+        after = cloud.run(cloud.functions.trail.head(CLOUD))
+        assert after is not None
+        assert after.seq == before.seq + 2, "of a name that nobody has, and of a link"
+        told = json.dumps(anna.get("/accounts/me/audit").json())
+        assert not [secret for secret in ("horse", "wrong wrong", anna.token) if secret in told]
 
     def test_what_others_do_on_what_is_shared_stands_in_its_owners_chain(self, cloud: Cloud) -> None:
         anna, bert = cloud.sign_in("anna"), cloud.sign_in("bert")
