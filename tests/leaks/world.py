@@ -197,6 +197,8 @@ def _bodies(device: str, space: str, epoch: int, introduction: dict[str, Any]) -
         "make_space": {"name": "Attic"},
         "make_api_key": {"name": "app", "role": "viewer", "days": 1},
         "enroll_agent": introduction,
+        "make_account": {"name": "new", "password": "correct horse battery", "invitation": "x" * 43},
+        "certify": {"request": "x"},
         "claim_agent": {"code": "BCDF-GHJK"},
         "move_agent": {"space": space},
         "tell_messages": {"messages": [{"topic": "t", "payload": {}}]},

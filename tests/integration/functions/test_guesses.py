@@ -1,0 +1,86 @@
+"""Claim codes that are guessed at and redeemed by many."""
+
+import asyncio
+import random
+from pathlib import Path
+
+import pytest
+
+from function_app.domain.accounts import Identity
+from function_app.domain.ids import new_claim_code
+from function_app.domain.problems import Problem
+from function_app.services import store
+from tests.support.cloud import Cloud, settings
+from tests.support.processes import show_code
+
+LIVE = 20
+"""Codes that are shown at the same time."""
+
+
+def guess(folder: Path, guesses: int) -> None:
+    """As many accounts as one likes, each with its five tries: what protects is that there are 2.56·10¹⁰ codes."""
+    chance = random.Random(1)  # noqa: S311 (chance with a seed)
+    with Cloud(settings(folder)) as cloud:
+        functions = cloud.functions
+
+        async def work() -> int:
+            shown = [await show_code(functions) for _ in range(LIVE)]
+            accounts = [(await functions.sign_in.account(f"a{number}")).id for number in range(20)]
+            claimed, answers = 0, set[str]()
+            for number in range(guesses):
+                if number % 100 == 0:
+                    for account in accounts:
+                        row = await functions.tables.get(store.ATTEMPTS, account, "claim")
+                        if row is not None:
+                            await functions.tables.delete(store.ATTEMPTS, row)
+                who = Identity(accounts[number // 5 % 20], "x", f"s{chance.randrange(9)}")
+                try:
+                    await functions.claim.claim(who, new_claim_code(), None)
+                    claimed += 1
+                except Problem as problem:
+                    answers.add(problem.code)
+            for agent, _ in shown:
+                row = await functions.tables.get(store.AGENTS, agent, "agent")
+                assert row is not None
+                claimed += row.data["account"] is not None
+            assert answers == {"claim-code-unknown"}
+            return claimed
+
+        assert asyncio.run_coroutine_threadsafe(work(), cloud.loop).result(3_600) == 0
+
+
+def test_guessed_claim_codes_claim_nothing(tmp_path: Path) -> None:
+    guess(tmp_path, 1_000)
+
+
+@pytest.mark.long
+@pytest.mark.timeout(3_600)
+def test_a_hundred_thousand_guessed_claim_codes_claim_nothing(tmp_path: Path) -> None:
+    guess(tmp_path, 100_000)
+
+
+def test_of_a_hundred_who_redeem_one_code_at_once_one_wins(tmp_path: Path) -> None:
+    with Cloud(settings(tmp_path)) as cloud:
+        functions = cloud.functions
+
+        async def work() -> list[str]:
+            agent, code = await show_code(functions)
+            accounts = [(await functions.sign_in.account(f"a{number}")).id for number in range(100)]
+
+            async def one(account: str) -> str:
+                try:
+                    await functions.claim.claim(Identity(account, "x", "s"), code, None)
+                except Problem as problem:
+                    return problem.code
+                return account
+
+            found = await asyncio.gather(*(one(account) for account in accounts))
+            row = await functions.tables.get(store.AGENTS, agent, "agent")
+            assert row is not None
+            assert [each for each in found if each in accounts] == [row.data["account"]]
+            replayed = await one(accounts[0])
+            return [each for each in (*found, replayed) if each not in accounts]
+
+        refusals = cloud.run(work())
+        assert len(refusals) == 100
+        assert set(refusals) <= {"claim-code-unknown", "busy"}
