@@ -14,7 +14,7 @@ SIDE_BY_SIDE = -n 3 --dist loadfile --no-loadscope-reorder
 # Those run one at a time that have a browser or a robot in motion before them, or an answer that must come in time.
 ALONE = tests/api tests/e2e tests/faults
 
-.PHONY: help up link env console test test-long coverage fuzz check contract requirements clean
+.PHONY: help up link env console test test-long coverage fuzz check audit-packages contract requirements clean
 .DELETE_ON_ERROR:
 
 help:
@@ -24,7 +24,8 @@ help:
 	@echo "make test-long     the same with every suite at full size"
 	@echo "make coverage      every branch of the agent's runtime, by its unit tests alone"
 	@echo "make fuzz          each parser under a fuzzer, SECONDS_EACH=60"
-	@echo "make check         linters, types, import contracts, generated files"
+	@echo "make check         linters, types, import contracts, generated files, unsafe code, committed secrets"
+	@echo "make audit-packages  ask osv.dev what is known against the pinned packages (needs a network)"
 	@echo "make contract      regenerate docs/asyncapi.json and web/src/core/protocol.ts"
 	@echo "make requirements  regenerate requirements.txt and requirements/*.txt"
 
@@ -109,6 +110,8 @@ check: .venv/.dev web/node_modules/.installed
 	@$(BIN)/ruff format --check .
 	@$(BIN)/mypy
 	@$(BIN)/lint-imports
+	@$(BIN)/bandit --quiet --recursive --configfile pyproject.toml function_app device_agent infra
+	@git ls-files -z | grep -zvE '\.(png|npz)$$' | xargs -0 $(BIN)/detect-secrets-hook --baseline .secrets.baseline
 	@$(BIN)/python requirements/export.py --check
 	@$(BIN)/python -m device_agent.protocol.document | cmp - docs/asyncapi.json || { echo "docs/asyncapi.json is stale; run \`make contract\`" >&2; exit 1; }
 	@$(NPM) run --silent check
@@ -116,6 +119,10 @@ check: .venv/.dev web/node_modules/.installed
 contract: .venv/.dev web/node_modules/.installed
 	@$(BIN)/python -m device_agent.protocol.document > docs/asyncapi.json
 	@$(NPM) run --silent contract
+
+# Apart from `check`, which needs no network. It says so where it could not ask, and is not green then.
+audit-packages: .venv/.dev
+	@$(BIN)/python requirements/audit.py
 
 requirements: .venv/.dev
 	@$(BIN)/python requirements/export.py

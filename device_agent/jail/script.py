@@ -106,7 +106,7 @@ def main() -> None:
     given = {"__name__": "__movement__", **api.names(link.tell, ask, output.flush, task)}
     error = ""
     try:
-        exec(compile(task["source"], filename, "exec"), given)  # noqa: S102 (the purpose of this process)
+        exec(compile(task["source"], filename, "exec"), given)  # noqa: S102 (the purpose of this process)  # nosec B102
     except BaseException as raised:  # noqa: BLE001 (whatever a script raises is an answer, not a crash)
         error = _explain(raised, filename)
     output.flush()

@@ -93,7 +93,7 @@ class Shelf:
         self._database.executescript(_SCHEMA)
         for table, column in (("kept", "topic"), ("dropped", "device")):
             self._database.execute(
-                f"DELETE FROM {table} WHERE substr({column}, 1, ?) <> ?",  # noqa: S608 (both are written above)
+                f"DELETE FROM {table} WHERE substr({column}, 1, ?) <> ?",  # noqa: S608 (both are written above)  # nosec B608
                 (len(self._own), self._own),
             )
         self._bytes = self._database.execute("SELECT coalesce(sum(size), 0) FROM kept").fetchone()[0]
@@ -148,7 +148,7 @@ class Shelf:
     def _drop(self, which: str, values: tuple[object, ...]) -> None:
         def write(database: sqlite3.Connection) -> int:
             gone = database.execute(
-                f"DELETE FROM kept WHERE {which} RETURNING late, topic, size",  # noqa: S608 (ours, see above)
+                f"DELETE FROM kept WHERE {which} RETURNING late, topic, size",  # noqa: S608 (ours, see above)  # nosec B608
                 values,
             ).fetchall()
             for late, topic, _ in gone:

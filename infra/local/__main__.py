@@ -230,7 +230,7 @@ class Machine:
         )
         try:
             trusted = ssl.create_default_context(cafile=str(self._chosen.ca)) if self._private else None
-            with urllib.request.urlopen(request, timeout=10, context=trusted) as answer:  # noqa: S310
+            with urllib.request.urlopen(request, timeout=10, context=trusted) as answer:  # noqa: S310  # nosec B310
                 found: dict[str, Any] = json.load(answer)
         except urllib.error.HTTPError as error:
             raise ValueError(json.load(error).get("detail", error.reason)) from error
