@@ -145,11 +145,10 @@ def test_a_key_is_kept_to_its_devices(cloud: Cloud) -> None:
             assert bert.post(KEYS, {"name": "x", "role": "viewer", "only": [foreign]}).status_code == 404
 
 
-@pytest.mark.parametrize(
-    "wrong", [{"role": "owner"}, {"days": 0}, {"days": 367}, {"name": ""}, {"only": ["a b"]}, {"more": 1}]
-)
-def test_what_is_no_key_is_not_made(cloud: Cloud, wrong: dict[str, Any]) -> None:
-    problem(cloud.sign_in("anna").post(KEYS, {"name": "x", "role": "viewer", **wrong}), 422, "invalid")
+def test_what_is_no_key_is_not_made(cloud: Cloud) -> None:
+    anna = cloud.sign_in("anna")
+    for wrong in ({"role": "owner"}, {"days": 0}, {"days": 367}, {"name": ""}, {"only": ["a b"]}, {"more": 1}):
+        problem(anna.post(KEYS, {"name": "x", "role": "viewer", **wrong}), 422, "invalid")
 
 
 def test_wrong_unknown_and_mixed_up_tokens_are_answered_the_same(cloud: Cloud) -> None:

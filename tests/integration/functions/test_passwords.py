@@ -140,13 +140,12 @@ class TestChanging:
             problem(other.get("/accounts/me"), 401, "unauthorized")
         assert anna.get("/accounts/me").status_code == stranger.get("/accounts/me").status_code == 200
 
-    @pytest.mark.parametrize(
-        "weak",
-        ["", "eleven char", "aaaaaaaaaaaaaaaa", "123456789012", "qwertyuiopas", "Password1234!", "annaanna2026",
-         "t3l3sc0pe-t3l3sc0pe", "x" * 257],
-    )  # fmt: skip
-    def test_what_is_guessed_first_is_refused(self, anna: Person, weak: str) -> None:
-        problem(anna.put(PASSWORD, {"password": weak, "old_password": GOOD}), 422, "password-weak")
+    def test_what_is_guessed_first_is_refused(self, anna: Person) -> None:
+        for weak in (
+            "", "eleven char", "aaaaaaaaaaaaaaaa", "123456789012", "qwertyuiopas", "Password1234!", "annaanna2026",
+            "t3l3sc0pe-t3l3sc0pe", "x" * 257,
+        ):  # fmt: skip
+            problem(anna.put(PASSWORD, {"password": weak, "old_password": GOOD}), 422, "password-weak")
 
 
 class TestSessions:
