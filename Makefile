@@ -111,7 +111,7 @@ check: .venv/.dev web/node_modules/.installed
 	@$(BIN)/mypy
 	@$(BIN)/lint-imports
 	@$(BIN)/bandit --quiet --recursive --configfile pyproject.toml function_app device_agent infra
-	@git ls-files -z | grep -zvE '\.(png|npz)$$' | xargs -0 $(BIN)/detect-secrets-hook --baseline .secrets.baseline
+	@git ls-files -z | grep -zvE '\.(png|npz)$$' | xargs -0 -n 300 -P 2 $(BIN)/detect-secrets-hook --baseline .secrets.baseline
 	@$(BIN)/python requirements/export.py --check
 	@$(BIN)/python -m device_agent.protocol.document | cmp - docs/asyncapi.json || { echo "docs/asyncapi.json is stale; run \`make contract\`" >&2; exit 1; }
 	@$(NPM) run --silent check

@@ -249,7 +249,7 @@ class TestChanged:
         found = 0
         for name in (key(3), "head"):
             text = rows[name]
-            for place, bit in itertools.product(range(len(text)), (0, 2)):
+            for place, bit in itertools.product(range(len(text)), (0,)):
                 changed = bytearray(text)
                 changed[place] ^= 1 << bit
                 try:
@@ -259,7 +259,7 @@ class TestChanged:
                 if not same:
                     assert self.check(written, {**rows, name: bytes(changed)}), changed
                     found += 1
-        assert found > 300
+        assert found > 200
 
     def test_swapped_inserted_doubled_and_anothers_records_are_found(self, written: Written) -> None:
         rows = rows_of(written[1])
@@ -395,7 +395,7 @@ async def later(functions: Functions) -> None:
         await functions.sweep.run()
 
 
-@pytest.mark.parametrize(("place", "records"), [("local", 30), ("azure", 5)], indirect=["place"])
+@pytest.mark.parametrize(("place", "records"), [("local", 20), ("azure", 3)], indirect=["place"])
 def test_of_processes_that_write_at_the_same_time_nothing_is_lost_and_the_chain_does_not_fork(
     place: Place, records: int
 ) -> None:
@@ -427,7 +427,7 @@ def test_of_processes_that_write_for_long_nothing_is_lost_and_the_chain_does_not
 
 @pytest.mark.parametrize("place", ["local"], indirect=True)
 def test_killed_at_many_steps_no_change_is_without_its_record(place: Place) -> None:
-    see_that_all_is_recorded(place, stride=8)
+    see_that_all_is_recorded(place, stride=13)
 
 
 @pytest.mark.long
