@@ -395,7 +395,7 @@ async def later(functions: Functions) -> None:
         await functions.sweep.run()
 
 
-@pytest.mark.parametrize(("place", "records"), [("local", 20), ("azure", 3)], indirect=["place"])
+@pytest.mark.parametrize(("place", "records"), [("local", 20), ("azure", 5)], indirect=["place"])
 def test_of_processes_that_write_at_the_same_time_nothing_is_lost_and_the_chain_does_not_fork(
     place: Place, records: int
 ) -> None:
