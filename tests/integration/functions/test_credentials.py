@@ -41,7 +41,7 @@ def test_watching_hears_every_device_of_the_account_and_no_other(
         assert sorted(issued["publish"]) == sorted(f"{base}/stop" for base in bases)
         assert (issued["lifetime_s"], issued["tcp"]) == (
             900,
-            {"host": "127.0.0.1", "port": broker.tcp_port, "tls": False},
+            {"host": "127.0.0.1", "port": broker.tcp_port, "tls": False, "certificate_after_ms": None},
         )
         with connect(broker, issued) as page:
             for start in range(0, len(issued["subscribe"]), 8):
