@@ -1,6 +1,6 @@
 """The adapters that settings choose between: signing keys, stores, the bus for commands, the broker's access.
 
-Of the clouds' adapters only the one in use is imported, and it its SDK only when needed.
+Of the stores, and of the clouds' adapters, only those in use are imported, and they their SDKs only when needed.
 """
 
 import hashlib
@@ -13,7 +13,6 @@ from function_app.adapters.local.certificates import FileCertificates, NoCertifi
 from function_app.adapters.local.clock import SystemClock
 from function_app.adapters.local.command_bus import MqttCommandBus
 from function_app.adapters.local.keys import FileKeys
-from function_app.adapters.local.tables import SqliteTables
 from function_app.adapters.local.tls import client_context
 from function_app.adapters.ring_keys import RingKeys
 from function_app.adapters.vault_keys import VaultKeys
@@ -94,6 +93,8 @@ def stores(settings: Settings, signing: RingKeys | None = None) -> tuple[Tables,
                 S3Blobs(bucket=aws.bucket, region=aws.region, endpoint=aws.endpoint),
             )
         case None:
+            from function_app.adapters.local.tables import SqliteTables  # noqa: PLC0415
+
             return SqliteTables(settings.home / TABLES_FILE), _files(settings, signing)
 
 

@@ -22,8 +22,6 @@ from device_agent.protocol.errors import ProtocolError
 
 NAMESPACE = "urn:telescope:v1"
 RECEIPTS = "urn:xmpp:receipts"
-CLOUD = "cloud"
-"""The user that speaks for the cloud, with a resource for each process that does."""
 PING_S = 2.5
 """Both ends say something at least this often."""
 DEAD_S = 7.0

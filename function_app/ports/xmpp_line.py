@@ -1,16 +1,18 @@
 """The cloud's own connection to the XMPP server."""
 
-from typing import Protocol
-from xml.etree.ElementTree import Element
+from typing import TYPE_CHECKING, Protocol
+
+if TYPE_CHECKING:
+    from xml.etree.ElementTree import Element  # functions that speak no XMPP load no XML
 
 
 class Listener(Protocol):
     """Who is told what comes; quick, on the event loop's own thread."""
 
-    def message(self, stanza: Element) -> None:
+    def message(self, stanza: "Element") -> None:
         """A ``<message>`` came."""
 
-    def presence(self, stanza: Element) -> None:
+    def presence(self, stanza: "Element") -> None:
         """A ``<presence>`` came."""
 
     def lost(self) -> None:

@@ -10,7 +10,7 @@ from typing import Final, Literal
 
 import jwt
 
-from device_agent.protocol import signing, stanzas
+from device_agent.protocol import jids, signing
 from device_agent.protocol.topics import is_id
 from function_app.domain.accounts import Account, Identity
 from function_app.domain.devices import Agent
@@ -120,7 +120,7 @@ class XmppAccess:
             Problem: ``xmpp-unavailable``.
         """
         self._require()
-        return await self._signed(stanzas.CLOUD, _SERVICE, AGENT_S)
+        return await self._signed(jids.CLOUD, _SERVICE, AGENT_S)
 
     async def verify(self, user: str, password: str) -> Admitted:
         """Who this is.
@@ -129,7 +129,7 @@ class XmppAccess:
             Problem: ``unauthorized``: not with this password, or not any more; ``xmpp-unavailable``.
         """
         self._require()
-        if user == stanzas.CLOUD:
+        if user == jids.CLOUD:
             claims = await self._claims(password)
             if claims.get("sub") != _SERVICE:
                 raise _refused()
@@ -147,14 +147,14 @@ class XmppAccess:
         if claims.get("pairing") != agent.pairing:
             raise _refused()
         owner = await self._sign_in.named(agent.account)
-        contacts = (Contact(stanzas.CLOUD, CLOUD_NAME), Contact(agent.account, owner))
+        contacts = (Contact(jids.CLOUD, CLOUD_NAME), Contact(agent.account, owner))
         return Admitted(user, agent.name, "agent", self._left_s(claims), contacts)
 
     async def _verify_account(self, user: str, password: str) -> Admitted:
         who = await self._identify.person(password, XMPP)
         if who.account != user:
             raise _refused()
-        contacts = [Contact(stanzas.CLOUD, CLOUD_NAME)]
+        contacts = [Contact(jids.CLOUD, CLOUD_NAME)]
         cursor: str | None = None
         while True:
             agents, cursor = await self._devices.agents(who, cursor=cursor, limit=_PAGE)

@@ -6,7 +6,7 @@ import os
 import re
 from pathlib import Path
 
-from device_agent.protocol import stanzas
+from device_agent.protocol import jids, stanzas
 from infra import programs
 
 CONFIGURATION_FILE = "prosody.cfg.lua"
@@ -109,7 +109,7 @@ def configuration(
         f"allow_unencrypted_plain_auth = {_lua(not encrypted)}",
         f"c2s_stanza_size_limit = {stanzas.MAX_STANZA_BYTES}",
         f'limits = {{ c2s = {{ rate = "{_RATE}", burst = "2s" }} }}',
-        f"unlimited_jids = {{ {_lua(f'{stanzas.CLOUD}@{domain}')} }}",
+        f"unlimited_jids = {{ {_lua(f'{jids.CLOUD}@{domain}')} }}",
         *(["run_as_root = true"] if os.geteuid() == 0 else []),
         f"VirtualHost {_lua(domain)}",
         'authentication = "telescope"',

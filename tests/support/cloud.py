@@ -421,8 +421,12 @@ def _plain(changes: dict[str, Any]) -> dict[str, Any]:
 
 
 def settings(home: Path, broker: RunningBroker | None = None, **changes: Any) -> Settings:
-    """Settings of functions with this home, at this broker (``None``: at no broker)."""
-    known = Settings(home=home, public_url=BASE, mqtt_port=1, **changes)
+    """Settings of functions with this home, at this broker (``None``: at no broker).
+
+    Requests are counted only where a test asks for it: all of a test's people share one address.
+    """
+    rates = dict.fromkeys(("rate_address", "rate_account", "rate_key", "rate_agent"), 0)
+    known = Settings(home=home, public_url=BASE, mqtt_port=1, **{**rates, **changes})
     if broker is None:
         return known
     return replace(

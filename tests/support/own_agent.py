@@ -41,6 +41,9 @@ _HEARD = (topics.STATE, topics.ACK, topics.EVENT)
 class _Api:
     """What the agent asks the functions for, from a file."""
 
+    server = "http://nobody.invalid"
+    ca = None
+
     def __init__(self, home: Home, clock: CloudClock) -> None:
         self._path = home.folder / _ACCESS
         self._clock = clock

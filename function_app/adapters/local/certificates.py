@@ -9,7 +9,6 @@ import datetime as dt
 import json
 import os
 import secrets
-import sqlite3
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -131,6 +130,8 @@ class FileCertificates:
     @contextlib.contextmanager
     def _changing(self) -> Iterator[dict[str, list[dict[str, Any]]]]:
         """What was issued, by agent; written down at the end of the ``with``."""
+        import sqlite3  # noqa: PLC0415 (only where something is written)
+
         try:
             with contextlib.closing(sqlite3.connect(self._folder / _LOCK, timeout=10, isolation_level=None)) as lock:
                 lock.execute("BEGIN EXCLUSIVE")

@@ -6,7 +6,7 @@ import random
 import secrets
 from collections.abc import Awaitable, Callable
 
-from device_agent.protocol.stanzas import CLOUD
+from device_agent.protocol.jids import CLOUD
 from device_agent.protocol.xmpp_stream import Login, Stream
 from function_app.domain.problems import Problem
 from function_app.ports.tables import StoreError

@@ -4,7 +4,7 @@ from typing import Any
 
 from fastapi import Request, Response
 
-from device_agent.protocol import stanzas
+from device_agent.protocol import jids
 from function_app.bootstrap import Functions
 from function_app.domain.times import rfc3339
 from function_app.entrypoints.http.answers import answer, read
@@ -47,7 +47,7 @@ def router(functions: Functions, caller: Caller) -> Routes:
             expires_at=rfc3339(given.expires_ms),
             lifetime_s=given.lifetime_s,
             space=space,
-            cloud=f"{stanzas.CLOUD}@{settings.xmpp_domain}",
+            cloud=f"{jids.CLOUD}@{settings.xmpp_domain}",
             host=settings.xmpp_host,
             port=settings.xmpp_port,
             server_time_ms=functions.clock.now_ms(),

@@ -9,7 +9,7 @@ import logging
 from collections.abc import Coroutine
 from xml.etree.ElementTree import Element
 
-from device_agent.protocol import codec, stanzas, topics
+from device_agent.protocol import codec, jids, stanzas, topics
 from device_agent.protocol.errors import ProtocolError
 from device_agent.protocol.messages import Presence, State
 from device_agent.protocol.stanzas import Told
@@ -99,7 +99,7 @@ class Speaker:
         """See ``Listener``."""
         jid = stanza.get("from", "")
         found = stanzas.user_at(jid, self._line.domain)
-        if found is None or found[0] == stanzas.CLOUD or stanza.get("type") not in {None, "unavailable"}:
+        if found is None or found[0] == jids.CLOUD or stanza.get("type") not in {None, "unavailable"}:
             return
         user, there = found[0], stanza.get("type") is None
         if len(user) == AGENT_LENGTH:

@@ -7,7 +7,7 @@ from typing import Any
 
 import pytest
 
-from function_app import choices
+from function_app.adapters.local import tables as adapter
 from function_app.adapters.local.keys import FileKeys
 from function_app.adapters.local.tables import SqliteTables
 from tests.conftest import Emulators
@@ -94,7 +94,7 @@ def mortal(open_cloud: Open, monkeypatch: pytest.MonkeyPatch) -> Callable[[Movin
     def opened(clock: MovingClock) -> tuple[Cloud, Knife]:
         knife = Knife()
         with monkeypatch.context() as patch:
-            patch.setattr(choices, "SqliteTables", lambda path: CutTables(SqliteTables(path), knife))
+            patch.setattr(adapter, "SqliteTables", lambda path: CutTables(SqliteTables(path), knife))
             return open_cloud(clock=clock), knife
 
     return opened

@@ -8,7 +8,7 @@ from typing import Any
 import pytest
 
 from device_agent.protocol.messages import AckStatus, CancelAction, Command, MoveJoints, RunMovement
-from function_app import choices
+from function_app.adapters.local import tables as adapter
 from function_app.adapters.local.tables import SqliteTables
 from function_app.services import store
 from function_app.services.pending import SHARDS
@@ -334,7 +334,7 @@ def test_an_account_killed_after_any_write_is_completed(home: Path) -> None:
     for after in range(1, 4):
         knife = Knife()
         with Cloud(settings(home)) as cloud, pytest.MonkeyPatch.context() as patch:
-            patch.setattr(choices, "SqliteTables", lambda path, knife=knife: CutTables(SqliteTables(path), knife))
+            patch.setattr(adapter, "SqliteTables", lambda path, knife=knife: CutTables(SqliteTables(path), knife))
             with Cloud(settings(home)) as process:
                 knife.left = after
                 with pytest.raises(Killed):

@@ -8,7 +8,7 @@ from xml.sax.saxutils import quoteattr
 
 import pytest
 
-from device_agent.protocol import codec, stanzas, topics
+from device_agent.protocol import codec, jids, stanzas, topics
 from device_agent.protocol.messages import Presence
 from function_app.services.xmpp_access import AGENT_S
 from tests.support.brokers import wait_until
@@ -28,7 +28,7 @@ def as_agent(site: XmppSite, robot: XmppRobot) -> Iterator[XmppClient]:
     """A client with an agent's own password, that can say what it likes."""
     with site.client(robot.id, password_of(robot)) as client:
         assert client.opened, client.trouble
-        wait_until(lambda: client.there(stanzas.CLOUD), "whoever speaks for the cloud")
+        wait_until(lambda: client.there(jids.CLOUD), "whoever speaks for the cloud")
         yield client
 
 
@@ -63,8 +63,8 @@ class TestLogin:
                 (other.id, mine),
                 (anna.account, mine),
                 (anna.account, anna.token),
-                (stanzas.CLOUD, mine),
-                (stanzas.CLOUD, hers),
+                (jids.CLOUD, mine),
+                (jids.CLOUD, hers),
                 ("somebody", hers),
             ]
             for user, password in wrong:
