@@ -122,7 +122,7 @@ def _live(cloud: Cloud) -> dict[str, str]:
         "password": password,
         "wrong password": "wrong wrong wrong",
         "claim code": code,
-        "API key": key.rpartition("_")[2],
+        "API key": key.split("_", 2)[2],
         "invitation": invitation,
         "control": control["password"],
         "watch": watch["password"],
