@@ -7,10 +7,10 @@ from device_agent.drivers.mujoco import worlds
 from device_agent.drivers.mujoco.assembly import Placement
 from device_agent.drivers.mujoco.driver import MujocoDriver
 from device_agent.drivers.mujoco.snapshot import Snapshot
-from device_agent.drivers.mujoco.twin import draw
 from device_agent.drivers.mujoco.walking import WalkingDriver
 from device_agent.drivers.mujoco.wheels import WheeledDriver
 from device_agent.drivers.mujoco.world import World
+from device_agent.mjcf.twin import draw
 from device_agent.ports.driver import DriverError
 from device_agent.protocol.robot_type import RobotType
 

@@ -12,17 +12,15 @@ charging = true                 # on its charger, or false: not, however empty
 ```
 """
 
-import tomllib
 from collections.abc import Mapping, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Annotated, Any
 
-import msgspec
 import numpy as np
 from msgspec import Meta, Struct
 
-from device_agent.ports.faults import FaultFile
+from device_agent.ports import faults
 from device_agent.protocol.errors import ProtocolError
 
 _CREEP_RAD_S = 1e-4
@@ -57,17 +55,14 @@ def read(text: str, joints: Sequence[str]) -> Ailments:
     Raises:
         ProtocolError: Not TOML, or a field or joint is unknown; the text lists those there are.
     """
-    try:
-        ailments = msgspec.convert(tomllib.loads(text), Ailments)
-    except (tomllib.TOMLDecodeError, msgspec.ValidationError) as error:
-        raise ProtocolError(f"{error}; there are: {', '.join(Ailments.__struct_fields__)}") from error
+    ailments = faults.read(text, Ailments)
     for name in (*ailments.overheating, *ailments.weak, *ailments.stuck):
         if name not in joints:
             raise ProtocolError(f"no joint '{name}'; there are: {', '.join(joints)}")
     return ailments
 
 
-class Sickbed(FaultFile[Ailments]):
+class Sickbed(faults.FaultFile[Ailments]):
     """The file of one robot.
 
     Args:

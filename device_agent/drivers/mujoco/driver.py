@@ -10,15 +10,17 @@ from typing import Any
 import mujoco
 import numpy as np
 
-from device_agent.drivers.mujoco import twin
 from device_agent.drivers.mujoco.ailments import WELL, Ailments, Infliction, Sickbed
 from device_agent.drivers.mujoco.assembly import SCALAR_JOINTS
+from device_agent.drivers.mujoco.eyes import Eyes
 from device_agent.drivers.mujoco.health import HEALTH, Health
 from device_agent.drivers.mujoco.snapshot import Floats, Ints, Snapshot
 from device_agent.drivers.mujoco.stiffness import Stiffness
 from device_agent.drivers.mujoco.world import STALE_S, World
+from device_agent.mjcf import twin
 from device_agent.ports import skills
 from device_agent.ports.driver import DriverError, Observation
+from device_agent.ports.sensor import Frame
 from device_agent.ports.skills import Skill, SkillError, Stage
 from device_agent.protocol.messages import Pose, Twin
 from device_agent.protocol.robot_type import RobotType
@@ -43,8 +45,10 @@ class MujocoDriver:
     The robot's base is its model's top-level body; frames and the twin are given in it. The model's joints, actuators
     and sites carry the manifest's names, after ``prefix`` where the world was put together from several robots.
 
-    It is ``Reporting`` too: stream ``health``. A motor that does not move though it gives all it can is an error, as it
-    is to a real arm's controller; connecting again forgives it.
+    It is ``Reporting`` too: stream ``health``; and ``Filming``, where its type has cameras.
+
+    A motor that does not move though it gives all it can is an error, as it is to a real arm's controller; connecting
+    again forgives it.
 
     Args:
         robot_type: Its manifest.
@@ -75,6 +79,7 @@ class MujocoDriver:
         self._sickbed = Sickbed(faults, [joint.name for joint in robot_type.joints])
         self._infliction: Infliction | None = None
         self._stiffness: Stiffness | None = None
+        self._seeing = Eyes(robot_type.cameras, world, prefix=prefix)
         self._noted_s = math.inf
 
     @property
@@ -97,6 +102,7 @@ class MujocoDriver:
         self._world.open()
         try:
             self._resolve(self._world.model)
+            self._seeing.open(self._world.model)
         except DriverError:
             self._world.close()
             raise
@@ -150,6 +156,10 @@ class MujocoDriver:
             self._suffer(news)
         return self._health.values()
 
+    def frame(self, camera: str) -> Frame | None:
+        """What one of its cameras sees now."""
+        return self._seeing.frame(camera)
+
     performs = (skills.STIFFNESS,)
 
     def perform(self, skill: Skill, stage: Stage) -> None:
@@ -172,6 +182,7 @@ class MujocoDriver:
         """Leave the world; it stands still when nobody is left in it."""
         if self._connected:
             self._connected = False
+            self._seeing.close()
             self._world.close()
 
     def _note(self, snapshot: Snapshot) -> None:

@@ -57,8 +57,27 @@ class Ramps:
         return [ramp for ramp in self._ramps.values() if ramp.remaining_s > 0]
 
 
-def follow(ramp: _Ramp, ctrl: Floats) -> None:
-    """Move the controls of one command one step further along its ramp."""
+def controls(ramps: Sequence[_Ramp], ctrl: Floats, count: int) -> Floats:
+    """Follow the ramps for some steps.
+
+    Args:
+        ramps: They know then that they have been followed.
+        ctrl: The controls of now, shape (nu,).
+        count: Of the steps.
+
+    Returns:
+        The controls of each step, shape (count, nu).
+    """
+    rows = np.tile(ctrl, (count, 1))
+    for index in range(count):
+        if index:
+            rows[index] = rows[index - 1]
+        for ramp in ramps:
+            _follow(ramp, rows[index])
+    return rows
+
+
+def _follow(ramp: _Ramp, ctrl: Floats) -> None:
     if ramp.remaining_s <= 0:
         return
     command = ramp.command

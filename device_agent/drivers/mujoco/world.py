@@ -17,8 +17,9 @@ import mujoco
 import numpy as np
 
 from device_agent.drivers.mujoco.assembly import SCALAR_JOINTS, TIMESTEP_S, Placement, assemble, at_home
-from device_agent.drivers.mujoco.ramps import Ramps, follow
+from device_agent.drivers.mujoco.ramps import Ramps, controls
 from device_agent.drivers.mujoco.snapshot import Floats, Ints, Snapshot, take
+from device_agent.drivers.mujoco.stepping import Stepper
 from device_agent.drivers.mujoco.trace import Trace
 from device_agent.ports.driver import DriverError
 from device_agent.ports.world import Process
@@ -27,7 +28,9 @@ log = logging.getLogger(__name__)
 
 GROUP_STEPS = 2
 """Steps between two snapshots: half of the shortest control period in use (8 ms)."""
-MAX_CATCH_UP_S = 0.04
+LATE_STEPS = 4
+"""The same while the world is behind real time by a group: what stands beside the steps is then paid half as often."""
+MAX_CATCH_UP_S = 0.1
 """Furthest that simulated time may fall behind before it slips."""
 STALE_S = 2.0
 """Age at which a snapshot of a running world means that its thread hangs."""
@@ -80,6 +83,7 @@ class World:
         self._stopping = threading.Event()
         self._model: Any = None
         self._data: Any = None
+        self._stepper: Stepper
         self._snapshot: Snapshot | None = None
         self._ramps = Ramps()
         self._addresses: dict[str, int] = {}
@@ -127,7 +131,7 @@ class World:
         }
         # Gravity compensation that the model does not already count as the motors' work.
         self._passive_gravity = np.where(model.jnt_actgravcomp[model.dof_jntid], 0.0, 1.0)
-        self._model, self._data = model, data
+        self._model, self._data, self._stepper = model, data, Stepper(model)
         self._publish()
 
     def recover(self) -> None:
@@ -318,11 +322,10 @@ class World:
         active = self._ramps.take(data.ctrl)
         for process in self._processes:
             process.step(model, data, data.time)
-        # Each call of MuJoCo hands the interpreter on, and may have to wait for it: as few as there can be.
-        for _ in range(count if active else 1):
-            for ramp in active:
-                follow(ramp, data.ctrl)
-            mujoco.mj_step(model, data, nstep=1 if active else count)
+        if active:
+            self._stepper.go(data, controls(active, data.ctrl, count))
+        else:
+            mujoco.mj_step(model, data, nstep=count)
         mujoco.mj_kinematics(model, data)  # poses of the positions just reached, not of those a step ago
         for name in _DIVERGED:
             if not self._fault and data.warning[int(getattr(mujoco.mjtWarning, name))].number:
@@ -354,19 +357,20 @@ class World:
                 trace.close()
 
     def _keep_time(self) -> None:
-        group_s = GROUP_STEPS * TIMESTEP_S
         due = time.monotonic()
+        count = GROUP_STEPS
         warned = -WARN_EVERY_S
         while not self._stopping.is_set():
-            self._advance(GROUP_STEPS)
+            self._advance(count)
             self._publish()
             if self._fault:
                 log.error(self._fault)
                 return
             if self._traces:
                 self._write_traces()
-            due += group_s
+            due += count * TIMESTEP_S
             now = time.monotonic()
+            count = LATE_STEPS if now - due >= GROUP_STEPS * TIMESTEP_S else GROUP_STEPS
             if now - due > MAX_CATCH_UP_S:
                 self._lag_s += now - due
                 due = now

@@ -13,16 +13,14 @@ drift = { co2_ppm = 50.0 }    # and this value moves away from the truth, by so 
 
 import logging
 import time
-import tomllib
 from collections.abc import Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
-import msgspec
 from msgspec import Struct
 
-from device_agent.ports.faults import FaultFile
+from device_agent.ports import faults
 from device_agent.ports.sensor import Camera, Capture, Frame, Image, Movable, RoomDriver, Scan, SensorError, Values
 from device_agent.protocol.errors import ProtocolError
 from device_agent.protocol.room import RoomDevice
@@ -60,10 +58,7 @@ def read(text: str, sources: Sequence[str]) -> Ailments:
     Raises:
         ProtocolError: Not TOML, or a field, stream or camera is unknown; the text lists those there are.
     """
-    try:
-        ailments = msgspec.convert(tomllib.loads(text), Ailments)
-    except (tomllib.TOMLDecodeError, msgspec.ValidationError) as error:
-        raise ProtocolError(f"{error}; there are: {', '.join(Ailments.__struct_fields__)}") from error
+    ailments = faults.read(text, Ailments)
     for name in (*ailments.silent, *ailments.stuck):
         if name not in sources:
             raise ProtocolError(f"no stream or camera '{name}'; there are: {', '.join(sources)}")
@@ -83,7 +78,7 @@ class Patient:
         self._driver = driver
         self._name = device.name
         sources = [stream.name for stream in (*device.streams, *device.cameras)]
-        self._file = FaultFile(path, partial(read, sources=sources))
+        self._file = faults.FaultFile(path, partial(read, sources=sources))
         self._ailments, self._since_s = WELL, 0.0
         self._told: dict[str, Values] = {}
         self._seen: Scan | Image | None = None

@@ -2,7 +2,9 @@
 
 Software renderers (OSMesa) are slow to make and large (about 127 MB), and belong to the thread that made them. Shadows,
 reflections and multisampling are off: with them a picture takes eight times as long (25 instead of 211 a second at
-320 x 240, measured).
+320 x 240, measured). What is left is a fixed price for each geom, some 20 microseconds: so what a camera cannot see is
+left out before anything is drawn, and depth is drawn without lamps and textures. In the laboratory a picture in colour
+takes 10 to 30 % less for it, one of depth about half (measured).
 """
 
 import contextlib
@@ -19,6 +21,7 @@ from typing import Any
 
 import mujoco
 import numpy as np
+import numpy.typing as npt
 
 from device_agent.ports.sensor import Bytes, Depths, Floats, SensorError
 from device_agent.ports.world import SimulatedWorld
@@ -28,6 +31,13 @@ WITHIN_S = 5.0
 _MOST_GEOMS = 5000
 _CHANGING = ("light_diffuse", "light_ambient", "light_active", "geom_rgba", "mat_rgba")
 """Of the model: what a process of the world may change while it goes on."""
+_NICE = 5
+"""Drawing gives way to what moves robots and steps the world. On a machine with much other work the laboratory lost
+0.6 and 0.9 s of 60 without it; with it 0, 0 and 0.3 s."""
+_HIDDEN = 5
+"""A group of geoms that MuJoCo does not draw unless told to."""
+_SMALLEST_PX = 1.0
+"""What is less than a pixel across would be seen in some pictures and not in others."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -115,6 +125,10 @@ class Studio:
 
 def _draw(world: SimulatedWorld, wishes: "queue.SimpleQueue[_Wish | None]") -> None:
     """The thread: one wish after another."""
+    if (
+        sys.platform == "linux"
+    ):  # elsewhere a thread has no priority of its own; the renderer's threads inherit this one's
+        os.setpriority(os.PRIO_PROCESS, threading.get_native_id(), _NICE)
     booth: _Booth | None = None
     while (wish := wishes.get()) is not None:
         if not wish.future.set_running_or_notify_cancel():
@@ -141,6 +155,7 @@ class _Booth:
         # Round things from fewer faces: half the time, and no difference that these pictures could show.
         quality.numslices, quality.numstacks = 12, 7
         self._data = mujoco.MjData(self._model)
+        self._groups = self._model.geom_group.copy()
         self._canvases: dict[tuple[int, int], _Canvas] = {}
 
     def draw(self, wish: _Wish) -> Shot:
@@ -152,6 +167,8 @@ class _Booth:
         taken_s = time.monotonic()
         if wish.size not in self._canvases:
             self._canvases[wish.size] = _Canvas(self._model, *wish.size)
+        seen = _in_view(self._model, self._data, wish.camera, *wish.size)
+        self._model.geom_group[:] = np.where(seen, self._groups, _HIDDEN)
         return Shot(
             taken_s=taken_s,
             pixels=self._canvases[wish.size].draw(self._data, wish.camera, depth=wish.depth),
@@ -165,6 +182,24 @@ class _Booth:
             canvas.close()
 
 
+def _in_view(model: Any, data: Any, camera: int, width: int, height: int) -> npt.NDArray[np.bool_]:
+    """Which geoms may show in a picture, by the sphere around each: shape (geoms,)."""
+    if model.cam_sensorsize[camera].any():  # a lens described by its sensor may look to a side: draw everything
+        return np.ones(model.ngeom, dtype=np.bool_)
+    up = float(np.tan(np.radians(model.cam_fovy[camera]) / 2))
+    aside = up * width / height
+    right_m, top_m, behind_m = ((data.geom_xpos - data.cam_xpos[camera]) @ data.cam_xmat[camera].reshape(3, 3)).T
+    ahead_m, radius_m = -behind_m, model.geom_rbound
+    inside = (
+        (ahead_m > -radius_m)
+        & (np.abs(right_m) - aside * ahead_m < radius_m * np.hypot(1, aside))
+        & (np.abs(top_m) - up * ahead_m < radius_m * np.hypot(1, up))
+        & (radius_m * height > _SMALLEST_PX * up * ahead_m)
+    )
+    seen: npt.NDArray[np.bool_] = inside | (radius_m == 0)  # a plane has no end, and so no sphere
+    return seen
+
+
 class _Canvas:
     """A renderer of one size. Leaner than MuJoCo's own, which has to be chosen before MuJoCo is first imported."""
 
@@ -174,7 +209,8 @@ class _Canvas:
         self._model = model
         self._rect = mujoco.MjrRect(0, 0, width, height)
         self._scene = mujoco.MjvScene(model=model, maxgeom=_MOST_GEOMS)
-        self._plain = mujoco.MjvOption()
+        self._coloured, self._bare = mujoco.MjvOption(), mujoco.MjvOption()
+        self._bare.flags[int(mujoco.mjtVisFlag.mjVIS_TEXTURE)] = 0
         self._camera = mujoco.MjvCamera()
         self._camera.type = mujoco.mjtCamera.mjCAMERA_FIXED
         self._screen = _screen()(width, height)
@@ -192,7 +228,10 @@ class _Canvas:
         """What a camera sees, the first row at the top: colours, or distances [m]."""
         self._camera.fixedcamid = camera
         every = mujoco.mjtCatBit.mjCAT_ALL.value
-        mujoco.mjv_updateScene(self._model, data, self._plain, None, self._camera, every, self._scene)
+        option = self._bare if depth else self._coloured
+        mujoco.mjv_updateScene(self._model, data, option, None, self._camera, every, self._scene)
+        if depth:
+            self._scene.nlight = 0
         self._screen.make_current()
         mujoco.mjr_render(self._rect, self._scene, self._context)
         height, width = self._rect.height, self._rect.width
