@@ -13,7 +13,7 @@ from pathlib import Path
 
 import msgspec
 
-from device_agent import bootstrap, catalogue, doctor, drivers, links, sensors, service
+from device_agent import bootstrap, catalogue, claim_link, doctor, drivers, links, sensors, service
 from device_agent.ports.clock import CloudClock
 from device_agent.ports.driver import DriverError
 from device_agent.ports.geometry import GeometryError
@@ -116,6 +116,10 @@ def _parser() -> argparse.ArgumentParser:
     )
     take_over.set_defaults(command=_import_model)
 
+    for command in (enroll, run):
+        command.add_argument(
+            "--no-qr", action="store_true", help="print code and link without the QR code, even on a terminal"
+        )
     for command in (enroll, run, examine, repin, devices):
         command.add_argument("--home", type=Path, default=default, help="the agent's folder (default: %(default)s)")
     return parser
@@ -129,10 +133,10 @@ def _enroll(options: argparse.Namespace) -> int:
     configuration = _configuration(options, home)
     home.save_configuration(configuration)
     api = bootstrap.api_of(home, configuration, CloudClock(), create=True)
-    claim = _announce(api, configuration)
+    claim = _announce(api, configuration, qr=not options.no_qr)
     if options.no_wait and claim.code is not None:
         return 0
-    _await_claim(home, api, configuration, claim)
+    _await_claim(home, api, configuration, claim, qr=not options.no_qr)
     return 0
 
 
@@ -188,7 +192,7 @@ def _entry(text: str) -> DeviceEntry:
     return DeviceEntry(name=name, type=kind, driver=driver, label=label)
 
 
-def _announce(api: CloudApi, configuration: Configuration) -> Claim:
+def _announce(api: CloudApi, configuration: Configuration, *, qr: bool) -> Claim:
     claim = api.enroll(
         name=configuration.name,
         software=links.SOFTWARE,
@@ -196,11 +200,11 @@ def _announce(api: CloudApi, configuration: Configuration) -> Claim:
         devices=catalogue.enrolled_devices(configuration),
     )
     if claim.code is not None:
-        print(f"claim code {claim.code}  (valid for {claim.expires_in_s or 0:.0f} s)", flush=True)
+        claim_link.show(claim, configuration.server, qr=qr)
     return claim
 
 
-def _await_claim(home: Home, api: CloudApi, configuration: Configuration, claim: Claim) -> Pairing:
+def _await_claim(home: Home, api: CloudApi, configuration: Configuration, claim: Claim, *, qr: bool) -> Pairing:
     """Wait until somebody redeems the code; a code that runs out is replaced."""
     expires_s = time.monotonic() + (claim.expires_in_s or 0)
     while True:
@@ -213,7 +217,7 @@ def _await_claim(home: Home, api: CloudApi, configuration: Configuration, claim:
             print(f"paired with {pairing.account}", flush=True)
             return pairing
         if time.monotonic() > expires_s:
-            claim = _announce(api, configuration)
+            claim = _announce(api, configuration, qr=qr)
             expires_s = time.monotonic() + (claim.expires_in_s or 0)
 
 
@@ -224,15 +228,15 @@ def _run(options: argparse.Namespace) -> int:
     home = Home(options.home)
     with home.hold():
         if home.pairing() is None:
-            _pair(home)
+            _pair(home, qr=not options.no_qr)
         if options.trace is not None:
             options.trace.mkdir(parents=True, exist_ok=True)
         while _run_until_told(home, options.trace):
-            _pair(home)
+            _pair(home, qr=not options.no_qr)
     return 0
 
 
-def _pair(home: Home) -> None:
+def _pair(home: Home, *, qr: bool) -> None:
     """Learn whose the agent is; where it is nobody's, show a code and wait to be claimed.
 
     A robot may start before its network does: where the cloud is not reached it is asked again.
@@ -244,7 +248,7 @@ def _pair(home: Home) -> None:
         while True:
             api = bootstrap.api_of(home, configuration, CloudClock())
             try:
-                _await_claim(home, api, configuration, _announce(api, configuration))
+                _await_claim(home, api, configuration, _announce(api, configuration, qr=qr), qr=qr)
             except OSError as error:
                 print(f"telescope agent: {error}; trying again in {_AGAIN_S:.0f} s", file=sys.stderr, flush=True)
                 time.sleep(_AGAIN_S)

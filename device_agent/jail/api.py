@@ -19,6 +19,9 @@ Tell = Callable[..., None]
 OLD_S = 5.0
 """A floor that was seen longer ago is not known any more [s]."""
 
+_DEEDS = ("posture", "behaviour", "express", "say", "drive", "go_to")
+"""What a keyframe may say to do where it is reached."""
+
 
 class RobotError(Exception):
     """The robot did not do what the script asked; says why. Ends the script unless it is caught."""
@@ -50,6 +53,40 @@ class Robot:
             plan: Look for a way around what is in between first.
         """
         self._ask("move_joints", position_rad=self._by_name(position_rad), speed=float(speed), plan=bool(plan))
+
+    def play(self, keyframes: Sequence[Mapping[str, Any]], speed: float = 1.0) -> None:
+        """Go through keyframes, each at its time: a joint passes where it goes on, and rests where it turns.
+
+        Goes to the first keyframe at half speed, and counts time from there. What the limits leave no time for comes
+        later, and the rest with it.
+
+        Args:
+            keyframes: Dictionaries, in the order of ``time_s``. ``position_rad``: joint name → position [rad]; a joint
+                that is not named is on its way to where the next one names it. And what to do there while time stands
+                still, in this order: ``posture``, ``behaviour``, ``express``, ``say``: a name or a text; ``drive``,
+                ``go_to``: what they take, by name.
+            speed: 1: in the time of the keyframes; 0.5: in twice that time. Above 0, up to 2.
+        """
+        begun_s, moments = 0.0, []
+        for number, keyframe in enumerate(keyframes):
+            places = self._by_name(keyframe.get("position_rad", {}))
+            at_s = float(keyframe["time_s"])
+            if not math.isfinite(at_s):
+                raise RobotError(f"the time of keyframe {number + 1} is not a finite number of seconds")
+            if number == 0:
+                begun_s = at_s
+                if places:
+                    self.move_joints(places, speed=min(0.5, 0.5 * float(speed)))
+            else:
+                moments.append({"time_s": at_s - begun_s, "position_rad": places})
+            deeds = [name for name in _DEEDS if name in keyframe]
+            if moments and (deeds or number == len(keyframes) - 1):
+                first = number + 2 - len(moments)
+                self._ask("play", keyframes=moments, first=first, speed=float(speed))
+                begun_s, moments = at_s, []
+            for name in deeds:
+                how = keyframe[name]
+                getattr(self, name)(**how) if isinstance(how, Mapping) else getattr(self, name)(how)
 
     def move_to(
         self,

@@ -4,6 +4,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple, Protocol, runtime_checkable
 
+from device_agent.ports.sensor import Frame
 from device_agent.protocol.messages import Pose, Twin
 
 
@@ -112,6 +113,21 @@ class Reporting(Protocol):
 
         Raises:
             DriverError: It cannot be measured now; it is asked again when the stream is next due.
+        """
+
+
+@runtime_checkable
+class Filming(Protocol):
+    """A driver whose robot has cameras: what its robot type's ``cameras`` name."""
+
+    def frame(self, camera: str) -> Frame | None:
+        """A picture taken now; ``None`` where it has none at this moment.
+
+        Called at the camera's rate, from one thread that is neither the control loop nor that of ``report``, and may
+        run beside both; also before ``connect`` has succeeded. A picture is at most 128 KB: small, and JPEG.
+
+        Raises:
+            DriverError: No such camera, or it failed; it is asked again when the next picture is due.
         """
 
 

@@ -1,13 +1,18 @@
 """A file of faults for something simulated, looked at again and again: whoever may write there can make it ill."""
 
 import logging
+import tomllib
 from collections.abc import Callable
 from pathlib import Path
 from typing import Generic, TypeVar
 
+import msgspec
+from msgspec import Struct
+
 from device_agent.protocol.errors import ProtocolError
 
 T = TypeVar("T")
+S = TypeVar("S", bound=Struct)
 _log = logging.getLogger(__name__)
 
 
@@ -49,3 +54,15 @@ class FaultFile(Generic[T]):
         except ProtocolError as error:
             _log.warning("%s: %s", self._path, error)
             return None
+
+
+def read(text: str, kind: type[S]) -> S:
+    """What a file's text says.
+
+    Raises:
+        ProtocolError: Not TOML, or a field is unknown or wrong; the text lists those there are.
+    """
+    try:
+        return msgspec.convert(tomllib.loads(text), kind)
+    except (tomllib.TOMLDecodeError, msgspec.ValidationError) as error:
+        raise ProtocolError(f"{error}; there are: {', '.join(kind.__struct_fields__)}") from error

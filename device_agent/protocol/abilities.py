@@ -4,15 +4,15 @@ All of it is data, so that a real robot has it as well as a simulated one.
 """
 
 import math
-from bisect import bisect_right
 from collections.abc import Mapping, Sequence
 from itertools import pairwise
 from typing import Annotated
 
 from msgspec import Meta, Struct
 
+from device_agent.protocol import reports
 from device_agent.protocol.errors import ProtocolError
-from device_agent.protocol.fields import Id, Label, Vector3
+from device_agent.protocol.fields import Id, Label
 from device_agent.protocol.manifest import check_known, check_positive
 from device_agent.protocol.reports import Joint
 
@@ -25,43 +25,12 @@ _SAME = 1e-9
 _TIED_RAD = 1e-6
 
 
-class Mirror(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """One motor moves two joints.
-
-    Attributes:
-        joint: The one that only follows: at ``factor`` times the position of
-        of: the joint that counts. Whoever names either moves both.
-    """
-
-    joint: Label
-    of: Label
-    factor: float = 1.0
+class Mirror(reports.Mirror, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """As a manifest has it."""
 
 
-class Narrowing(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """The range of one joint depends on where another one is.
-
-    Attributes:
-        joint: Whose range; ``by``: the other.
-        table: Rows of ``by``'s position and the range there, lower and upper [rad]; linear in between. It reaches over
-            all of ``by``'s range.
-    """
-
-    joint: Label
-    by: Label
-    table: Annotated[tuple[Vector3, ...], Meta(min_length=2, max_length=200)]
-
-    def at(self, by_rad: float) -> tuple[float, float]:
-        """The range while ``by`` is there [rad]; beyond the table's ends that of its ends."""
-        rows = self.table
-        if by_rad <= rows[0][0]:
-            return rows[0][1:]
-        if by_rad >= rows[-1][0]:
-            return rows[-1][1:]
-        after = bisect_right(rows, by_rad, key=lambda row: row[0])
-        (start, low, high), (end, next_low, next_high) = rows[after - 1], rows[after]
-        share = (by_rad - start) / (end - start)
-        return low + (next_low - low) * share, high + (next_high - high) * share
+class Narrowing(reports.Narrowing, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """As a manifest has it."""
 
 
 class Keyframe(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):

@@ -174,6 +174,17 @@ def agent_grant(space: str, agent: str, *, token_id: str, lifetime_s: float) -> 
     )
 
 
+def heard(space: str, agent: str, device: str) -> tuple[str, ...]:
+    """What whoever watches a device hears; ``+`` stands for all of a space. Never ``cmd``, ``ctl`` or ``stop``."""
+    plain = (topics.DESC, topics.STATE, topics.EVENT, topics.ACK)
+    named = ((topics.DESC, topics.TWIN), (topics.TELE, topics.ANY), (topics.CAM, topics.ANY))
+    return (
+        topics.conn(space, agent),
+        *(topics.device(space, agent, device, kind) for kind in plain),
+        *(topics.device(space, agent, device, kind, name) for kind, name in named),
+    )
+
+
 def service_grant(*, client_id: str, token_id: str, lifetime_s: float) -> Grant:
     """What a connection of the functions may do: tell every device and the broker, hear and pass on what agents say.
 

@@ -3,6 +3,7 @@
 Unknown fields pass, so that an old console still reads a newer robot.
 """
 
+from bisect import bisect_right
 from enum import StrEnum
 from typing import Annotated, Any, Literal
 
@@ -45,6 +46,53 @@ class Joint(Struct, frozen=True, kw_only=True):
     max_acceleration_rad_s2: float
     max_jerk_rad_s3: float
     max_effort_nm: float
+
+
+class Mirror(Struct, frozen=True, kw_only=True):
+    """One motor moves two joints.
+
+    Attributes:
+        joint: The one that only follows: at ``factor`` times the position of
+        of: the joint that counts. Whoever names either moves both.
+    """
+
+    joint: Label
+    of: Label
+    factor: float = 1.0
+
+
+class Narrowing(Struct, frozen=True, kw_only=True):
+    """The range of one joint depends on where another one is.
+
+    Attributes:
+        joint: Whose range; ``by``: the other.
+        table: Rows of ``by``'s position and the range there, lower and upper [rad]; linear in between. It reaches over
+            all of ``by``'s range.
+    """
+
+    joint: Label
+    by: Label
+    table: Annotated[tuple[Vector3, ...], Meta(min_length=2, max_length=200)]
+
+    def at(self, by_rad: float) -> tuple[float, float]:
+        """The range while ``by`` is there [rad]; beyond the table's ends that of its ends."""
+        rows = self.table
+        if by_rad <= rows[0][0]:
+            return rows[0][1:]
+        if by_rad >= rows[-1][0]:
+            return rows[-1][1:]
+        after = bisect_right(rows, by_rad, key=lambda row: row[0])
+        (start, low, high), (end, next_low, next_high) = rows[after - 1], rows[after]
+        share = (by_rad - start) / (end - start)
+        return low + (next_low - low) * share, high + (next_high - high) * share
+
+
+class BaseLimits(Struct, frozen=True, kw_only=True):
+    """How fast a base may be driven: forward or back, to a side (0: it cannot), turning."""
+
+    forward_m_s: float
+    left_m_s: float
+    turn_rad_s: float
 
 
 class Stream(Struct, frozen=True, kw_only=True):
@@ -113,9 +161,12 @@ class Description(Struct, frozen=True, kw_only=True):
 
     ``actions`` names the kinds of action that it takes; ``postures``, ``expressions`` and ``behaviours`` what those of
     these kinds may name. An agent that names no actions is an older one.
+    ``mirrors`` and ``narrowing``: how its joints hang together.
     ``cameras``: what ``cam/{name}`` shows; ``captures``: what raw data can be had; ``controls``: what can be set.
 
     ``diagnostics``: how what it measures is to be judged, where that is said by no robot type, but by its room.
+    ``position_m``: where a room device is, in its room's frame; of a robot its room tells (``positions``).
+    ``base``: the limits of one that drives or walks; missing where it stays in its place.
 
     ``scripts``: movement scripts run in the jail, run with less (``trusted``, as the agent's owner wants it), or are
     refused; ``scripts_note`` says why, and what to do.
@@ -126,6 +177,8 @@ class Description(Struct, frozen=True, kw_only=True):
     robot_type: Id
     label: Label
     joints: tuple[Joint, ...] = ()
+    mirrors: tuple[Mirror, ...] = ()
+    narrowing: tuple[Narrowing, ...] = ()
     frames: tuple[Label, ...] = ()
     capabilities: tuple[Label, ...] = ()
     actions: tuple[Label, ...] = ()
@@ -142,6 +195,8 @@ class Description(Struct, frozen=True, kw_only=True):
     limits: tuple[Label, ...] = ()
     interlocks: tuple[InterlockRule, ...] = ()
     diagnostics: Annotated[tuple[Diagnostic, ...], Meta(max_length=100)] = ()
+    position_m: Vector3 | None = None
+    base: BaseLimits | None = None
     scripts: Literal["jailed", "trusted", "refused"] = "refused"
     scripts_note: Text = ""
 

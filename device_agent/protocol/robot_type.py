@@ -14,6 +14,8 @@ from device_agent.protocol.messages import Id, Joint, Label, Stream, Text, Vecto
 MANIFEST = "robot.toml"
 MOVEMENTS = "movements"
 MAX_PERIOD_MS = 1000
+MOST_PICTURES_HZ = 10.0
+"""Of one camera of a robot: pictures are for people, and take the link and the machine from what moves it."""
 MAX_JOINTS = 128
 """Most that a ``JointPositions`` names."""
 
@@ -90,6 +92,8 @@ class RobotType(abilities.Abilities, frozen=True, kw_only=True, forbid_unknown_f
         home_rad: Joint name → position [rad] at start.
         braking_rad_s2: Deceleration for a hold or a Stop [rad/s²], every joint; above ``max_acceleration_rad_s2``.
         diagnostics: How its measurements are to be judged; the first that fits a field counts.
+        cameras: What it sees through, and how many pictures a second, at most ``MOST_PICTURES_HZ``. A simulated robot's
+            model has cameras of these names.
         streaming_speed: Share of each joint's velocity limit that streamed setpoints may use, 0…1.
         margin_m: How near the robot may come to itself and to what stands around it [m].
         workspace: Where some of its frames stay.
@@ -117,6 +121,7 @@ class RobotType(abilities.Abilities, frozen=True, kw_only=True, forbid_unknown_f
     gaze: Gaze | None = None
     capabilities: tuple[Label, ...] = ()
     streams: tuple[Stream, ...] = ()
+    cameras: Annotated[tuple[Stream, ...], Meta(max_length=4)] = ()
     diagnostics: Annotated[tuple[Diagnostic, ...], Meta(max_length=100)] = ()
 
 
@@ -187,6 +192,18 @@ def _check_figures(robot_type: RobotType) -> None:
         _check_positive(robot_type.base, [field for field in Base.__struct_fields__ if field != "sideways"], " of base")
     for stream in robot_type.streams:
         manifest.check_positive(f"rate_hz of stream '{stream.name}'", stream.rate_hz)
+    _check_cameras(robot_type.cameras)
+
+
+def _check_cameras(cameras: Sequence[Stream]) -> None:
+    if len({camera.name for camera in cameras}) != len(cameras):
+        raise ProtocolError("two cameras have the same name")
+    for camera in cameras:
+        manifest.check_positive(f"rate_hz of camera '{camera.name}'", camera.rate_hz)
+        if camera.rate_hz > MOST_PICTURES_HZ:
+            raise ProtocolError(
+                f"camera '{camera.name}': {camera.rate_hz:g} pictures a second; {MOST_PICTURES_HZ:g} is the most"
+            )
 
 
 def _check_workspace(box: Workspace, robot_type: RobotType) -> None:

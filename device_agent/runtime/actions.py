@@ -124,7 +124,7 @@ class _Playing:
     def __init__(self, order: RunMovement, run: "_Run", cell: Cell) -> None:
         self._script = Script(order, run.robot, run.tell, cell=cell, died=run.robot.give_back)
         self._timeout_s = order.timeout_ms / 1000
-        self._end = run.end
+        self._robot, self._end = run.robot, run.end
 
     def kill(self) -> None:
         """See ``_Activity``."""
@@ -140,7 +140,7 @@ class _Playing:
             self._script.run()
         finally:
             alarm.cancel()
-        return {}
+        return {"limited": self._robot.limited} if self._robot.limited else {}
 
 
 class _Run:

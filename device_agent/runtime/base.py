@@ -13,6 +13,11 @@ _REST = 1e-6
 _SAME = 1e-3
 
 
+def limits_of(base: Base) -> Twist:
+    """The highest twist that a base is told."""
+    return Twist(base.max_linear_m_s, base.max_linear_m_s * base.sideways, base.max_angular_rad_s)
+
+
 class BaseMotion:
     """The commanded twist of a base.
 
@@ -24,7 +29,7 @@ class BaseMotion:
     def __init__(self, base: Base, period_s: float) -> None:
         linear, angular = base.max_linear_acceleration_m_s2, base.max_angular_acceleration_rad_s2
         braking, turning = base.braking_linear_m_s2, base.braking_angular_rad_s2
-        self.limits = Twist(base.max_linear_m_s, base.max_linear_m_s * base.sideways, base.max_angular_rad_s)
+        self.limits = limits_of(base)
         self._acceleration = [linear, linear, angular]
         self._braking = [braking, braking, turning]
         self._period_s = period_s

@@ -74,6 +74,7 @@ class Body:
         by_skill = {capability for capability in named if self.performs(capability)}
         has = {
             "move_joints": bool(kind.joints),
+            "play": bool(kind.joints),
             "home": bool(kind.joints),
             "move_to": CARTESIAN in named and self.geometry is not None,
             "drive": kind.base is not None,

@@ -69,6 +69,24 @@ class MoveTo(_Message, frozen=True, kw_only=True, tag="move_to"):
     plan: bool = False
 
 
+class Moment(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """One of the keyframes of ``robot.play``: when, and where the joints that it names are then."""
+
+    time_s: float
+    position_rad: Annotated[dict[str, float], Meta(max_length=128)] = {}
+
+
+class Play(_Message, frozen=True, kw_only=True, tag="play"):
+    """``robot.play``, as far as nothing but joints moves: times count from where the joints rest now.
+
+    ``first``: what number the first of the keyframes has in the whole of it, to say which is meant.
+    """
+
+    keyframes: Annotated[tuple[Moment, ...], Meta(min_length=1, max_length=1000)]
+    first: Annotated[int, Meta(ge=1)] = 1
+    speed: float
+
+
 class Home(_Message, frozen=True, kw_only=True, tag="home"):
     """``robot.home``."""
 
@@ -146,7 +164,7 @@ class AskLatest(_Message, frozen=True, kw_only=True, tag="latest"):
 
 Show = Say | Stiffness | Express | Posture | Behaviour
 """Calls for what a robot shows, by its manifest or by its driver."""
-Call = MoveJoints | MoveTo | Home | Drive | GoTo | Look | Show | AskState | AskLatest
+Call = MoveJoints | Play | MoveTo | Home | Drive | GoTo | Look | Show | AskState | AskLatest
 """What the process waits for an answer to."""
 Message = Ready | Unfit | Output | Progress | Ended | Call
 

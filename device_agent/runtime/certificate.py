@@ -1,11 +1,9 @@
 """The agent's own certificate, where its broker wants to see one: by a key that never leaves this machine."""
 
-import os
-import secrets
 from collections.abc import Callable
 from pathlib import Path
 
-from device_agent.runtime.home import HomeError
+from device_agent.runtime import home
 
 _SKEW_MS = 300_000
 """The cloud dates a certificate so much before its making, for brokers whose clock is behind."""
@@ -69,21 +67,8 @@ class OwnCertificate:
         if not _same(x509.load_pem_x509_certificate(chain), pem):
             raise ValueError("the cloud gave a certificate for another key")
         # Killed in between the two do not fit, which is seen, and others are made.
-        self._write(self._key, pem)
-        self._write(self._certificate, chain)
-
-    @staticmethod
-    def _write(path: Path, content: bytes) -> None:
-        new = path.with_name(f"{path.name}.{secrets.token_hex(4)}.new")
-        try:
-            descriptor = os.open(new, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600)
-            with os.fdopen(descriptor, "wb") as file:
-                file.write(content)
-                file.flush()
-                os.fsync(file.fileno())
-            new.replace(path)
-        except OSError as error:
-            raise HomeError(f"{path} cannot be written: {error.strerror}") from error
+        home.write(self._key, pem)
+        home.write(self._certificate, chain)
 
 
 def _same(certificate: object, key_pem: bytes) -> bool:

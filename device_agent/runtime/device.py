@@ -1,7 +1,8 @@
 """One device at work: puts its control loop, office, executor and voice together, and routes what arrives.
 
 Two threads a device: the control loop (``loop``), which never waits for disk or network, and the ``office``, which
-does; a third, the ``reporter``, where its driver measures more than joints. Setpoints and Stop go from the transport's
+does; a third, the ``reporter``, where its driver measures more than joints; a fourth, the ``filmer``, where it has
+cameras. Setpoints and Stop go from the transport's
 thread straight into the controller.
 """
 
@@ -10,7 +11,7 @@ import time
 from collections.abc import Callable, Sequence
 
 from device_agent.ports.clock import CloudClock, tick_ms, wall_ms
-from device_agent.ports.driver import Audible, Driver, Reporting
+from device_agent.ports.driver import Audible, Driver, Filming, Reporting
 from device_agent.ports.geometry import Geometry
 from device_agent.ports.ground import Ground
 from device_agent.ports.jail import Jail
@@ -27,6 +28,7 @@ from device_agent.runtime.actions import Executor
 from device_agent.runtime.audit import Audit, Happened
 from device_agent.runtime.body import Body
 from device_agent.runtime.controller import Controller
+from device_agent.runtime.filming import Filmer
 from device_agent.runtime.instrument import Instrument
 from device_agent.runtime.interlocks import Interlock, Interlocks
 from device_agent.runtime.journal import Journal
@@ -143,6 +145,9 @@ class Device:
             publish=publish,
             outbox=outbox,
         )
+        self._filmer = Filmer(
+            robot_type.cameras, driver if isinstance(driver, Filming) else None, name=name, film=self.voice.film
+        )
         self._room = room
         self._interlocks = Interlocks(
             interlocks,
@@ -191,6 +196,7 @@ class Device:
         """
         self._loop.start()
         self._reporter.start()
+        self._filmer.start()
         epoch, _ = self._controller.epochs
         data = {"epoch": epoch, "stopped": self._controller.latch is not None}
         self._audit.note(Happened(EventKind.AGENT_STARTED, "the agent started; leases of before have ended", data=data))
@@ -205,6 +211,7 @@ class Device:
         self._executor.close()
         self._loop.stop()
         self._reporter.stop()
+        self._filmer.stop()
         self._audit.note(Happened(EventKind.AGENT_STOPPED, "the agent was shut down"))
         self._office.stop()
         self._driver.close()

@@ -175,7 +175,7 @@ class Home:
             pem = key.private_bytes(
                 serialization.Encoding.PEM, serialization.PrivateFormat.PKCS8, serialization.NoEncryption()
             )
-            self._write(path, pem)
+            write(path, pem)
             return key
         try:
             _close_to_others(path)
@@ -241,7 +241,7 @@ class Home:
                 lines += [f"{_toml(key)} = {_toml(value)}" for key, value in device.options.items()]
             for rule in device.interlocks:
                 lines += ["", "[[devices.interlocks]]", *_table(rule)]
-        self._write(self.folder / "agent.toml", ("\n".join(lines) + "\n").encode())
+        write(self.folder / "agent.toml", ("\n".join(lines) + "\n").encode())
 
     def authority(self, configuration: Configuration) -> Path | None:
         """The pinned authority's certificate.
@@ -267,7 +267,7 @@ class Home:
             ssl.create_default_context(cadata=content.decode())
         except (OSError, ValueError) as error:
             raise HomeError(f"--ca: {given} cannot be read as a certificate: {error}") from error
-        self._write(self.folder / SERVER_CA, content)
+        write(self.folder / SERVER_CA, content)
         return SERVER_CA
 
     def pairing(self) -> Pairing | None:
@@ -292,7 +292,7 @@ class Home:
         if pairing is None:
             path.unlink(missing_ok=True)
         else:
-            self._write(path, msgspec.json.encode(pairing))
+            write(path, msgspec.json.encode(pairing))
 
     @contextlib.contextmanager
     def hold(self) -> Iterator[None]:
@@ -316,18 +316,23 @@ class Home:
                 raise HomeError(f"{path} cannot be written: {error}") from error
             yield
 
-    def _write(self, path: Path, content: bytes) -> None:
-        """Whole or not at all, readable by the owner alone."""
-        try:
-            self.folder.mkdir(parents=True, exist_ok=True, mode=0o700)
-            handle, temporary = tempfile.mkstemp(dir=self.folder)
-            with os.fdopen(handle, "wb") as file:
-                file.write(content)
-                file.flush()
-                os.fsync(file.fileno())
-            Path(temporary).replace(path)
-        except OSError as error:
-            raise HomeError(f"{path} cannot be written: {error.strerror}") from error
+
+def write(path: Path, content: bytes) -> None:
+    """Write a file of the agent's folder whole or not at all, readable by the owner alone.
+
+    Raises:
+        HomeError: It cannot be written.
+    """
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True, mode=0o700)
+        handle, temporary = tempfile.mkstemp(dir=path.parent)
+        with os.fdopen(handle, "wb") as file:
+            file.write(content)
+            file.flush()
+            os.fsync(file.fileno())
+        Path(temporary).replace(path)
+    except OSError as error:
+        raise HomeError(f"{path} cannot be written: {error.strerror}") from error
 
 
 def _close_to_others(path: Path) -> None:

@@ -101,7 +101,7 @@ class Performer:
             self._mover.over.wait(utterance.duration_s)
             self._check()
             return
-        self._come_to_rest()
+        self.come_to_rest()
         score = Score(kind, self._body.controller.commanded_rad)
         score.speak(Line(0.0, text, utterance.duration_s))
         course = self._body.controller.go_along(self._mover.tenure, score.way())
@@ -112,7 +112,7 @@ class Performer:
         kind = self._body.robot_type
         keyframes = shows.named("behaviour", name, kind.behaviours)
         said = {one.say: self._body.speaker.prepare(one.say, "") for one in keyframes if one.say}
-        self._come_to_rest()
+        self.come_to_rest()
         score = Score(kind, self._body.controller.commanded_rad)
         lines = score.keyframes(keyframes, {text: utterance.duration_s for text, utterance in said.items()})
         course = self._body.controller.go_along(self._mover.tenure, score.way())
@@ -139,7 +139,7 @@ class Performer:
         """While servos change their strength their joints are commanded to where they are: nothing jumps or drops."""
         controller = self._body.controller
         held = before = controller.stiffness(joints)
-        self._come_to_rest()
+        self.come_to_rest()
         controller.stiffen(self._mover.tenure, dict.fromkeys(before, 0.0))
         try:
             self._mover.over.wait(_PERIODS * self._body.robot_type.period_ms / 1000)
@@ -151,8 +151,12 @@ class Performer:
 
     # ------------------------------------------------------------ for all of them
 
-    def _come_to_rest(self) -> None:
-        """What the action before left in motion brakes by itself."""
+    def come_to_rest(self) -> None:
+        """Wait for what the action before left in motion: it brakes by itself.
+
+        Raises:
+            Refused: The action has lost the device.
+        """
         until_s = time.monotonic() + _REST_WITHIN_S
         while self._body.controller.moving and time.monotonic() < until_s:
             self._mover.over.wait(self._body.robot_type.period_ms / 1000)

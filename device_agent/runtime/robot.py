@@ -17,6 +17,7 @@ from device_agent.runtime.lease import Refused
 from device_agent.runtime.performer import Performer, check_share
 from device_agent.runtime.room import Reading
 from device_agent.runtime.routes import Routes, quaternion_of
+from device_agent.runtime.timeline import FASTEST, Timeline
 
 
 class ScriptRobot:
@@ -67,6 +68,8 @@ class ScriptRobot:
         match call:
             case calls.MoveJoints(position_rad=position_rad, speed=speed, plan=plan):
                 self.move_joints(position_rad, speed, plan=plan)
+            case calls.Play():
+                self._play(call)
             case calls.Home(speed=speed):
                 self.move_joints(self._body.robot_type.home_rad, speed)
             case calls.MoveTo():
@@ -77,10 +80,8 @@ class ScriptRobot:
                 self._go_to(call)
             case calls.Look(position_m=position_m, speed=speed):
                 self._look(position_m, speed)
-            case calls.AskState():
-                return self._state()
-            case calls.AskLatest(device=device, stream=stream):
-                return self._latest(device, stream)
+            case calls.AskState() | calls.AskLatest():
+                return self._tell(call)
             case _:
                 self.performer.show(call)
         return None
@@ -100,6 +101,21 @@ class ScriptRobot:
             self.follow(controller.go_along(self.tenure, way))
         else:
             self.follow(controller.move(self.tenure, dict(position_rad), speed=speed))
+
+    def _play(self, call: calls.Play) -> None:
+        if not 0 < call.speed <= FASTEST:  # false for NaN
+            raise Refused("bad_speed", f"speed must be above 0 and at most {FASTEST:g}, not {call.speed}")
+        self.performer.come_to_rest()
+        controller = self._body.controller
+        timeline = Timeline(self._body.robot_type, controller.commanded_rad, call)
+        for number, pose in enumerate(timeline.poses(), call.first):
+            try:
+                controller.target(self.tenure, pose)
+            except Refused as refused:
+                raise Refused(refused.code, f"keyframe {number}: {refused.message}") from refused
+        passage = controller.go_along(self.tenure, timeline.way())
+        passage.note(timeline.limited)
+        self.follow(passage)
 
     def _move_to(self, call: calls.MoveTo) -> None:
         check_share("speed", call.speed, above_zero=True)
@@ -167,6 +183,9 @@ class ScriptRobot:
         if self._body.geometry is None:
             raise Refused("no_model", "this robot's type has no model")
         return self._body.geometry
+
+    def _tell(self, call: calls.AskState | calls.AskLatest) -> dict[str, Any] | None:
+        return self._state() if isinstance(call, calls.AskState) else self._latest(call.device, call.stream)
 
     def _state(self) -> dict[str, Any]:
         seen, kind = self._body.seen(), self._body.robot_type

@@ -108,13 +108,7 @@ class Score:
         moved = [_through(points, times) for points in self._points]
         shape = (len(moved), 3, len(times))
         position, velocity, acceleration = np.array(moved).reshape(shape).transpose(1, 2, 0)
-        before = position.copy()
-        self._couplings.confine(position)
-        for index in np.flatnonzero(np.any(position != before, axis=0)):
-            velocity[:, index] = np.gradient(position[:, index], step_s)
-            velocity[[0, -1], index] = 0.0
-            acceleration[:, index] = np.gradient(velocity[:, index], step_s)
-        return Way(step_s, position, velocity, acceleration)
+        return confined(self._couplings, Way(step_s, position, velocity, acceleration))
 
     def _needs_s(self, index: int, place: float) -> float:
         return _needs_s(self._type.joints[index], abs(place - self._points[index][-1][1]))
@@ -127,6 +121,18 @@ class Score:
 
     def _at(self, index: int, time_s: float) -> float:
         return float(_through(self._points[index], np.array([time_s]))[0][0])
+
+
+def confined(couplings: Couplings, way: Way) -> Way:
+    """A way on which joints that hang together stay together; ``way`` is changed."""
+    position, velocity, acceleration = way.position_rad, way.velocity_rad_s, way.acceleration_rad_s2
+    before = position.copy()
+    couplings.confine(position)
+    for index in np.flatnonzero(np.any(position != before, axis=0)):
+        velocity[:, index] = np.gradient(position[:, index], way.step_s)
+        velocity[[0, -1], index] = 0.0
+        acceleration[:, index] = np.gradient(velocity[:, index], way.step_s)
+    return way
 
 
 def _spread(shapes: list[tuple[float, str]]) -> list[tuple[float, str]]:

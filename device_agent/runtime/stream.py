@@ -147,6 +147,9 @@ class Stream:
     def steer(self, base: BaseMotion, now_s: float, *, late_s: float, allowed: float) -> None:
         """Set the base in motion as the newest setpoint for it asks, while that is fresh; else brake it.
 
+        One that asks for rest has been let go: the base then brakes as it does without setpoints, and not as gently as
+        it speeds up.
+
         Args:
             base: The base's motion.
             now_s: Monotonic clock [s].
@@ -154,7 +157,8 @@ class Stream:
             allowed: Share of the speed that the room leaves, above 0.
         """
         self._driven = ()
-        if not _fresh(now_s - self._drive_at_s, base.braking_time_s(), late_s, _SOONEST_BASE_BRAKING_S):
+        fresh = _fresh(now_s - self._drive_at_s, base.braking_time_s(), late_s, _SOONEST_BASE_BRAKING_S)
+        if not fresh or self._drive == REST:
             base.brake()
             return
         limits = base.limits_to_stop_within(WATCHDOG_S - _SOONEST_BASE_BRAKING_S)

@@ -15,6 +15,7 @@ from device_agent.protocol.messages import (
     Ack,
     AckStatus,
     ActionState,
+    BaseLimits,
     Description,
     Fault,
     InterlockRule,
@@ -31,6 +32,7 @@ from device_agent.protocol.messages import (
 from device_agent.protocol.robot_type import RobotType
 from device_agent.protocol.room import RoomDevice
 from device_agent.runtime.audit import Happened, event_of
+from device_agent.runtime.base import limits_of
 from device_agent.runtime.handover import Asked
 from device_agent.runtime.journal import Journal
 from device_agent.runtime.lease import Lease
@@ -239,6 +241,8 @@ class Voice:
             robot_type=kind.type,
             label=self._label,
             joints=kind.joints,
+            mirrors=kind.mirrors,
+            narrowing=kind.narrowing,
             frames=kind.frames,
             capabilities=kind.capabilities,
             actions=self._actions,
@@ -246,7 +250,7 @@ class Voice:
             expressions=tuple(kind.expressions),
             behaviours=tuple(kind.behaviours),
             streams=kind.streams,
-            cameras=() if fitted is None else fitted.cameras,
+            cameras=kind.cameras if fitted is None else fitted.cameras,
             captures=() if fitted is None else fitted.captures,
             controls=() if fitted is None else fitted.controls,
             watchdog_ms=round(WATCHDOG_S * 1000),
@@ -255,6 +259,9 @@ class Voice:
             limits=self._limits,
             interlocks=self._interlocks,
             diagnostics=() if fitted is None else fitted.diagnostics,
+            # In the origin of the floor is what the manifest gives no place.
+            position_m=fitted.position_m if fitted is not None and any(fitted.position_m) else None,
+            base=None if kind.base is None else BaseLimits(**limits_of(kind.base)._asdict()),
             scripts=self.scripts.how,
             scripts_note=self.scripts.why[:2000],
         )
