@@ -52,6 +52,7 @@ class ApiKey:
             key=self.id,
             most=self.most,
             only=self.only,
+            until_ms=self.expires_ms,
         )
 
     def opened_by(self, secret: str) -> bool:
@@ -62,6 +63,11 @@ class ApiKey:
 def new_key_id() -> str:
     """The id of a new key."""
     return new_id(16)
+
+
+def key_of(session: str) -> str:
+    """The id of the key whose session this is; empty for a person's."""
+    return session.removeprefix(_SESSION) if session.startswith(_SESSION) else ""
 
 
 def token(key: str, secret: str) -> str:

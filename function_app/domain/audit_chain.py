@@ -41,6 +41,7 @@ class Deed(StrEnum):
     CLAIM_REFUSED = "claim-refused"
     AGENT_UNPAIRED = "agent-unpaired"
     AGENT_MOVED = "agent-moved"
+    DEVICE_RENAMED = "device-renamed"
     SHARED = "shared"
     UNSHARED = "unshared"
     INVITED = "invited"

@@ -1,9 +1,10 @@
 """Agents, their devices, and what is known of them at this moment."""
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Any, Literal
 
 from function_app.domain.accounts import Role
+from function_app.domain.times import NEVER_MS
 
 SILENT_MS = 90_000
 """An agent sends state every 30 s; after three missed ones a last word of "online" is no longer believed."""
@@ -12,7 +13,6 @@ POLL_SILENT_MS = 45_000
 POLL_MARK_MS = 15_000
 """How often at most it is written down that an agent has polled."""
 
-NEVER_MS = 2**53
 _MOST_LEAVING = 16
 """Only a broker that is away for long lets so many come together; the oldest then keep what is retained of them."""
 
@@ -50,6 +50,7 @@ class Agent:
         claim_code: The code that claims it now; empty when claimed.
         leaving: What ``services/leave.py`` has to tidy up.
         expires_ms: From then on it may be forgotten, if nobody has claimed it [ms since 1970].
+        labels: What its owner calls its devices, by their names; the others are called as it says itself.
     """
 
     id: str
@@ -67,6 +68,7 @@ class Agent:
     transport: Transport = "mqtt"
     leaving: tuple[Leaving, ...] = ()
     expires_ms: int = 0
+    labels: dict[str, str] = field(default_factory=dict)
 
     @property
     def claimed(self) -> bool:
@@ -117,7 +119,14 @@ def claim(agent: Agent, *, account: str, space: str, pairing: str, now_ms: int) 
         claim_code="",
         claim_expires_ms=0,
         expires_ms=NEVER_MS,
+        labels={},
     )
+
+
+def call(agent: Agent, name: str, label: str | None) -> Agent:
+    """The agent with one of its devices called ``label``; ``None``: as it says itself."""
+    others = {known: given for known, given in agent.labels.items() if known != name}
+    return replace(agent, labels=others if label is None else {**others, name: label})
 
 
 def unpair(agent: Agent) -> Agent:
@@ -130,6 +139,7 @@ def unpair(agent: Agent) -> Agent:
         claimed_ms=0,
         claim_code="",
         claim_expires_ms=0,
+        labels={},
     )
 
 
@@ -151,7 +161,8 @@ def introduced(agent: Agent, devices: tuple[DeviceSpec, ...]) -> Agent:
     """The agent with the devices that it says it has now."""
     names = {spec.name for spec in devices}
     removed = [spec.name for spec in agent.devices if spec.name not in names]
-    return replace(_leaves(agent, "removed", removed), devices=devices)
+    labels = {name: label for name, label in agent.labels.items() if name in names}
+    return replace(_leaves(agent, "removed", removed), devices=devices, labels=labels)
 
 
 def _leaves(agent: Agent, why: Literal["unpaired", "moved", "removed"], names: list[str]) -> Agent:

@@ -7,6 +7,8 @@ from enum import StrEnum
 from function_app.domain.detectors import CHANGE, LEVEL, NEAR, OUTLIER, TREND, Limits, Watch, scale
 from function_app.domain.faults import Fault, Report, Severity, Source
 
+_FIVE_DIGITS = 10_000.0
+
 
 class Health(StrEnum):
     """How a device is: unknown when nothing is heard of it."""
@@ -112,4 +114,5 @@ def _words(kind: str, rule: Rule, name: str, watch: Watch, limit: float | None) 
 
 
 def _show(value: float, unit: str) -> str:
-    return f"{value:.4g} {unit}".strip()
+    """Four digits; what has more is not written in powers of ten, which people would have to count."""
+    return f"{value:.0f} {unit}".strip() if abs(value) >= _FIVE_DIGITS else f"{value:.4g} {unit}".strip()

@@ -4,7 +4,7 @@ from dataclasses import dataclass, replace
 from typing import Final
 
 from function_app.domain.accounts import Role
-from function_app.domain.devices import NEVER_MS
+from function_app.domain.times import NEVER_MS
 
 MOST: Final = 20
 """Open invitations to one thing."""

@@ -19,6 +19,8 @@ UNPAIRED = "unpaired"
 MOVED = "moved"
 REMOVED = "removed"
 UNSHARED = "unshared"
+KEY_ENDED = "api-key-ended"
+SIGNED_OUT = "signed-out"
 DROPPED: Final = {
     FAILED_BEFORE: (
         Status.CANCELLED,
@@ -32,6 +34,11 @@ DROPPED: Final = {
     MOVED: (Status.FAILED, "The device's agent was moved to another space before it ended. Start it again."),
     REMOVED: (Status.FAILED, "Its agent no longer has this device."),
     UNSHARED: (Status.FAILED, "The device is no longer shared with who started it."),
+    KEY_ENDED: (
+        Status.FAILED,
+        "The API key that started it has ended, or may not operate this device any more. Make another one.",
+    ),
+    SIGNED_OUT: (Status.FAILED, "Who started it has signed out, which ends what they had begun. Start it again."),
 }
 """Why a waiting action ends without its turn: code → its end and what people read."""
 

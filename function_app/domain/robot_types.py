@@ -23,7 +23,8 @@ class TypeVersion:
         state: ``uploading`` until all files are stored, ``checking`` until a checker has a verdict.
         manifest: The fields of ``RobotType``.
         files: Name → bytes.
-        errors: Why it is refused.
+        errors: Why it is refused; until there is a verdict what was found before it.
+        warnings: What its author may want to know.
         checked_ms: When the verdict came [ms since 1970].
         seal: On manifest and files.
     """
@@ -36,6 +37,7 @@ class TypeVersion:
     errors: tuple[str, ...] = ()
     checked_ms: int = 0
     seal: Seal = field(default_factory=Seal)
+    warnings: tuple[str, ...] = ()
 
     @property
     def open(self) -> bool:

@@ -10,9 +10,10 @@ from dataclasses import dataclass
 from typing import Final, Literal
 
 from function_app.domain.accounts import Identity, Role
-from function_app.domain.devices import NEVER_MS, Agent
+from function_app.domain.devices import Agent
 from function_app.domain.ids import device_id
 from function_app.domain.problems import invalid
+from function_app.domain.times import NEVER_MS
 
 Kind = Literal["device", "space", "agent"]
 """What is shared is a device or a space; what is handed over is an agent."""
@@ -61,7 +62,7 @@ class Standing:
 
     Attributes:
         role: The highest that it has.
-        until_ms: When that changes by itself [ms since 1970].
+        until_ms: When that changes by itself, or who asks is signed in no longer [ms since 1970].
         space: Its role in the whole space; ``None`` where it has a part in this device alone.
     """
 
@@ -147,4 +148,4 @@ def _capped(who: Identity, found: Standing, device: str, space: str) -> Standing
     if not whole and device not in who.only:
         return None
     in_space = capped(who, found.space) if found.space is not None and whole else None
-    return Standing(capped(who, found.role), found.until_ms, in_space)
+    return Standing(capped(who, found.role), min(found.until_ms, who.until_ms), in_space)

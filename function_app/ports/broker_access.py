@@ -4,6 +4,7 @@ A grant (``device_agent.protocol.grants``) names one connection's exact topics. 
 embedded broker reads a signed token, mosquitto gets a client and a role written into it. Callers see neither.
 """
 
+from collections.abc import Sequence
 from typing import NamedTuple, Protocol
 
 from device_agent.protocol.grants import Grant
@@ -50,6 +51,9 @@ class BrokerAccess(Protocol):
             ProtocolError: The grant holds a client id or filter that not every broker takes. Nothing was written.
             BrokerAccessError: The broker cannot be told. Nothing usable was left behind; ask again.
         """
+
+    def takes(self, publish: Sequence[str], subscribe: Sequence[str]) -> bool:
+        """Whether one grant may hold so much on this broker; nobody is asked."""
 
     async def revoke(self, *, client_id: str | None = None, principal: str | None = None) -> None:
         """Cut the live connections of a client id or of a principal, and refuse what was issued for it so far.

@@ -34,3 +34,6 @@ class Catalogue(Protocol):
 
     async def movements(self, robot_type: str) -> Mapping[str, BuiltIn]:
         """Movements of a type by name; empty for a type that is not known."""
+
+    async def drawing(self, robot_type: str) -> bytes | None:
+        """What a checker finds in a type's model (``Looked`` as JSON); ``None`` where nobody has drawn it."""

@@ -15,10 +15,12 @@ from function_app.domain.problems import Problem, invalid, not_found, unauthoriz
 from function_app.ports.clock import Clock
 from function_app.ports.tables import Conflict, Row, StoreError, Tables
 from function_app.services import store
+from function_app.services.acting import API_KEY
 from function_app.services.audit_chain import AuditChain
 from function_app.services.devices import Devices
 from function_app.services.forget import DAY_MS, Forget
 from function_app.services.identity import RECHECK_MS, new_secret
+from function_app.services.pending import Pending
 from function_app.services.sign_in import SignIn
 from function_app.services.sign_out import SignOut
 
@@ -28,8 +30,8 @@ SHOWN_MS: Final = 30 * DAY_MS
 """A key that has run out stays on the list so long: somebody will ask why their program stopped."""
 USED_EVERY_MS: Final = 3_600_000
 _KNOWN: Final = 4096
-_KEY: Final = "key"
 _INDEX: Final = "api-key:"
+_EXPIRES: Final = "key-expires:"
 _REFUSED: Final = "This API key is unknown, revoked or expired. Make a new one."
 
 _log = logging.getLogger(__name__)
@@ -63,6 +65,7 @@ class ApiKeys:
         sign_out: SignOut,
         chain: AuditChain,
         forget: Forget,
+        pending: Pending,
         clock: Clock,
     ) -> None:
         self._tables = tables
@@ -71,6 +74,7 @@ class ApiKeys:
         self._sign_out = sign_out
         self._chain = chain
         self._forget = forget
+        self._pending = pending
         self._clock = clock
         self._known: OrderedDict[str, _Checked] = OrderedDict()
 
@@ -103,18 +107,19 @@ class ApiKeys:
         )
         # Forgotten on time whatever becomes of this, and on the list before it is any use.
         due_ms = key.expires_ms + SHOWN_MS
-        await self._forget.row(store.API_KEYS, key.id, _KEY, due_ms=due_ms)
+        await self._forget.row(store.API_KEYS, key.id, API_KEY, due_ms=due_ms)
         await self._forget.row(store.MEMBERS, who.account, _INDEX + key.id, due_ms=due_ms)
+        await self._pending.note(_EXPIRES + key.id, key.expires_ms)
         about = {"name": key.label, "role": key.most.value, "only": list(only), "expires_ms": key.expires_ms}
         async with self._chain.change(who.account, Deed.API_KEY_MADE, who, on=f"key:{key.id}", **about) as change:
             await change.noted()
             await self._tables.create(store.MEMBERS, Row(who.account, _INDEX + key.id, {}))
-            await self._tables.create(store.API_KEYS, Row(key.id, _KEY, store.fields(key)))
+            await self._tables.create(store.API_KEYS, Row(key.id, API_KEY, store.fields(key)))
         return key, rules.token(key.id, secret)
 
     async def of(self, account: str) -> tuple[ApiKey, ...]:
         """Those of an account, the newest first."""
-        rows = [await self._tables.get(store.API_KEYS, key, _KEY) for key in await self._ids(account)]
+        rows = [await self._tables.get(store.API_KEYS, key, API_KEY) for key in await self._ids(account)]
         found = [store.read(row, ApiKey) for row in rows if row is not None]
         return tuple(sorted((key for key in found if key.account == account), key=lambda key: -key.created_ms))
 
@@ -124,7 +129,7 @@ class ApiKeys:
         Raises:
             Problem: ``api-key-unknown``.
         """
-        row = await self._tables.get(store.API_KEYS, key_id, _KEY)
+        row = await self._tables.get(store.API_KEYS, key_id, API_KEY)
         key = store.read(row, ApiKey) if row else None
         if row is None or key is None or key.account != who.account:
             raise not_found("api-key", key_id)
@@ -134,7 +139,7 @@ class ApiKeys:
                 await self._tables.delete(store.API_KEYS, row)
             except Conflict:
                 change.came_to_nothing = True  # it was used just now, or somebody else revokes it too
-        if await self._tables.get(store.API_KEYS, key_id, _KEY) is not None:
+        if await self._tables.get(store.API_KEYS, key_id, API_KEY) is not None:
             await self.revoke(who, key_id)
             return
         self._known.pop(key_id, None)
@@ -143,6 +148,14 @@ class ApiKeys:
         if index is not None:
             with contextlib.suppress(Conflict):
                 await self._tables.delete(store.MEMBERS, index)
+
+    async def look(self, what: str, note: Row) -> None:
+        """The timer's look at a key whose time may be over: what is done with it ends, as when it is revoked."""
+        row = await self._tables.get(store.API_KEYS, what.removeprefix(_EXPIRES), API_KEY)
+        key = store.read(row, ApiKey) if row else None
+        if key is not None and self._clock.now_ms() >= key.expires_ms:
+            await self._sign_out.end(key.identity)
+        await self._pending.drop(note)
 
     async def identify(self, token: str) -> Identity:
         """Who asks by this token.
@@ -164,7 +177,7 @@ class ApiKeys:
         return known.key.identity
 
     async def _look(self, key_id: str, now_ms: int) -> _Checked | None:
-        row = await self._tables.get(store.API_KEYS, key_id, _KEY)
+        row = await self._tables.get(store.API_KEYS, key_id, API_KEY)
         if row is None:
             self._known.pop(key_id, None)
             return None
@@ -178,7 +191,7 @@ class ApiKeys:
         """The key, once it is noted that it was used; at most once an hour, and without insisting."""
         used = replace(key, used_ms=now_ms)
         try:
-            row = await self._tables.get(store.API_KEYS, key.id, _KEY)
+            row = await self._tables.get(store.API_KEYS, key.id, API_KEY)
             if row is not None:
                 await self._tables.replace(store.API_KEYS, Row(row.partition, row.key, store.fields(used), row.etag))
         except (Conflict, StoreError) as error:
@@ -202,3 +215,8 @@ class ApiKeys:
     async def _ids(self, account: str) -> list[str]:
         page = await self._tables.query(store.MEMBERS, account, first=_INDEX, last="api-key;", limit=1000)
         return [row.key.removeprefix(_INDEX) for row in page.rows]
+
+
+def about_key(note: str) -> bool:
+    """Whether a note of the timer is about an API key."""
+    return note.startswith(_EXPIRES)

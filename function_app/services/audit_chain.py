@@ -32,6 +32,7 @@ from function_app.ports.clock import Clock
 from function_app.ports.keys import Keys
 from function_app.ports.tables import Conflict, Row, StoreError, Tables, Write
 from function_app.services import store
+from function_app.services.batches import Batches
 from function_app.services.forget import DAY_MS, Forget
 from function_app.services.pending import Pending
 
@@ -69,14 +70,6 @@ class _Job:
     fields: dict[str, Any]
     waiting: Row | None = None
     once: str = ""
-
-
-class _Line:
-    """Those of one process who wait for one chain."""
-
-    def __init__(self) -> None:
-        self.lock = asyncio.Lock()
-        self.jobs: list[tuple[_Job, asyncio.Future[None]]] = []
 
 
 class Change:
@@ -120,7 +113,7 @@ class AuditChain:
         self._forget = forget
         self._pending = pending
         self._clock = clock
-        self._lines: dict[str, _Line] = {}
+        self._batches = Batches(self._write, most=_AT_ONCE)
         self._noted: OrderedDict[tuple[str, str, int], None] = OrderedDict()
         self._refused: OrderedDict[tuple[str, ...], int] = OrderedDict()
 
@@ -190,7 +183,7 @@ class AuditChain:
             StoreError: The tables cannot be used.
         """
         try:
-            await self._append(owner, [_Job(entry.fields())])
+            await self._batches.add(owner, [_Job(entry.fields())])
         except Problem:
             await self.open(owner, entry)
 
@@ -210,7 +203,7 @@ class AuditChain:
                 due_ms = (self._clock.now_ms() // DAY_MS + 1) * DAY_MS + KEEP_IDS_MS
                 await self._forget.rows(store.AUDIT, owner, first=span[0], last=span[1], due_ms=due_ms)
             jobs.append(_Job(each.fields(), once=f"{_ONCE}{day:08d}:{each.id}"))
-        await self._append(owner, jobs)
+        await self._batches.add(owner, jobs)
 
     async def look(self, owner: str) -> None:
         """The timer's look: record what was left.
@@ -223,7 +216,7 @@ class AuditChain:
         now_ms = self._clock.now_ms()
         since_ms = now_ms - ABANDON_MS
         left = [row for row in page.rows if row.data["outcome"] != "unknown" or row.data["at_ms"] <= since_ms]
-        await self._append(owner, [_Job(dict(row.data), waiting=row) for row in left])
+        await self._batches.add(owner, [_Job(dict(row.data), waiting=row) for row in left])
         if len(left) < len(page.rows) or page.cursor is not None:
             await self._pending.note(f"{_NOTE}{owner}", now_ms + LOOK_MS)
 
@@ -256,7 +249,7 @@ class AuditChain:
         """Record how a noted change ended. It is made: whatever goes wrong here, the timer records it."""
         fields = entry.fields()
         try:
-            await self._append(owner, [_Job(fields, waiting=waiting)])
+            await self._batches.add(owner, [_Job(fields, waiting=waiting)])
         except (Problem, StoreError) as error:
             _log.warning("audit of %s: %s", entry.what, error)
             with contextlib.suppress(Conflict, StoreError):
@@ -275,40 +268,6 @@ class AuditChain:
         _bound(self._noted, key)
         return fresh
 
-    async def _append(self, owner: str, jobs: Sequence[_Job]) -> None:
-        """Record ``jobs``, in order, together with what others in this process want to record."""
-        if not jobs:
-            return
-        loop = asyncio.get_running_loop()
-        line = self._lines.setdefault(owner, _Line())
-        own = [(job, loop.create_future()) for job in jobs]
-        line.jobs += own
-        try:
-            while not own[-1][1].done():
-                async with line.lock:
-                    if own[-1][1].done():
-                        break
-                    batch, line.jobs = line.jobs[:_AT_ONCE], line.jobs[_AT_ONCE:]
-                    # Whoever is called off does not take the others' records along.
-                    await asyncio.shield(asyncio.ensure_future(self._settle(owner, batch)))
-        finally:
-            line.jobs = [each for each in line.jobs if each not in own]
-            if not line.jobs and not line.lock.locked():
-                self._lines.pop(owner, None)
-        for _, done in own:
-            done.result()
-
-    async def _settle(self, owner: str, batch: list[tuple[_Job, "asyncio.Future[None]"]]) -> None:
-        try:
-            await self._write(owner, [job for job, _ in batch])
-        except (Problem, StoreError, ValueError) as error:
-            for _, done in batch:
-                done.set_exception(error)
-                done.exception()  # whoever waits may have gone
-        else:
-            for _, done in batch:
-                done.set_result(None)
-
     async def _write(self, owner: str, jobs: list[_Job]) -> None:
         await self._note_anchor(owner)
         jobs = _each_once(jobs)
@@ -318,10 +277,22 @@ class AuditChain:
                 jobs = await self._open(owner, jobs)
             if not jobs:
                 return
-            with contextlib.suppress(Conflict):
-                await self._try(owner, jobs)
-                return
+            row = await self._tables.get(store.AUDIT, owner, _HEAD)
+            head = rules.start(owner) if row is None else Head(row.data["seq"], row.data["hash"])
+            try:
+                await self._try(owner, row, head, jobs)
+            except Conflict:
+                if not await self._are_there(owner, head.seq + 1, jobs):
+                    continue
+            return
         raise busy_store()
+
+    async def _are_there(self, owner: str, seq: int, jobs: list[_Job]) -> bool:
+        """Whether a batch that was refused is there: its answer was lost, and what was sent again came too late."""
+        first, last = record_key(seq), record_key(seq + len(jobs))
+        page = await self._tables.query(store.AUDIT, owner, first=first, last=last, limit=len(jobs))
+        there = [(row.data.get("id"), row.data.get("outcome")) for row in page.rows]
+        return there == [(job.fields["id"], job.fields["outcome"]) for job in jobs]
 
     async def _open(self, owner: str, jobs: list[_Job]) -> list[_Job]:
         """Those that nobody else has recorded meanwhile."""
@@ -339,9 +310,8 @@ class AuditChain:
                 still.append(job)
         return still
 
-    async def _try(self, owner: str, jobs: list[_Job]) -> None:
-        row = await self._tables.get(store.AUDIT, owner, _HEAD)
-        head = rules.start(owner) if row is None else Head(row.data["seq"], row.data["hash"])
+    async def _try(self, owner: str, row: Row | None, head: Head, jobs: list[_Job]) -> None:
+        """Write ``jobs`` behind ``head``, which is what ``row`` says, all or none."""
         writes = []
         for job in jobs:
             head, record = rules.follow(head, job.fields)

@@ -16,6 +16,7 @@ from function_app.domain.sharing import OWNERS, Share, Standing, device_target, 
 from function_app.ports.clock import Clock
 from function_app.ports.tables import Row, Tables
 from function_app.services import store
+from function_app.services.acting import acting
 from function_app.services.control import read_lease
 
 T = TypeVar("T")
@@ -84,12 +85,30 @@ class Devices:
 
         Whoever un-shares deletes the share first and then ends what it finds; whoever uses a share writes first and
         then looks here: of the two at least one sees the other. An owner is told apart by the pairing, and not read.
+        An API key is looked at in the same way, whoever's it is: whoever revokes it deletes its row first.
 
         Raises:
             Problem: ``device-unknown``, ``forbidden``.
         """
-        if device.owner != who.account:
+        if who.key:
+            who = await self.require_key(who)
+        if who.key or device.owner != who.account:
             require_operator(await self.get(who, device.id))
+
+    async def require_key(self, who: Identity) -> Identity:
+        """``who`` as their API key stands now; a person as they are.
+
+        Raises:
+            Problem: ``forbidden``.
+        """
+        now = await self.acting(who) if who.key else who
+        if now is None:
+            raise forbidden("This API key was revoked or has run out. Make a new one.")
+        return now
+
+    async def acting(self, who: Identity) -> Identity | None:
+        """As ``acting``: what they may do now, and ``None`` once their key or session was ended."""
+        return await acting(self._tables, who, self._clock.now_ms())
 
     async def view(self, who: Identity, device: str) -> DeviceView:
         """One device with what is known of it now.
@@ -351,7 +370,7 @@ def _device(agent: Agent, spec: DeviceSpec, allowed: Standing = OWNERS) -> Devic
     return Device(
         id=device_id(agent.id, spec.name),
         name=spec.name,
-        label=spec.label,
+        label=agent.labels.get(spec.name, spec.label),
         kind=spec.kind,
         robot_type=spec.robot_type,
         agent=agent.id,

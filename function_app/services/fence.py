@@ -15,6 +15,7 @@ from function_app.services import store
 from function_app.services.audit import told
 from function_app.services.commands import Commands
 from function_app.services.control import read_control_rows
+from function_app.services.identity import everything
 
 _log = logging.getLogger(__name__)
 
@@ -28,7 +29,7 @@ class Fence:
         self._access = access
         self._clock = clock
 
-    async def end(self, device: Device, why: str, *, account: str | None = None) -> bool:
+    async def end(self, device: Device, why: str, *, account: str | None = None, until_s: float | None = None) -> bool:
         """Raise the epoch, so that the holder's setpoints and orders are old, and have the device hold.
 
         A lease that has run out is fenced too: what was ordered under it may still be on its way.
@@ -37,6 +38,7 @@ class Fence:
             device: Whose lease; of which pairing.
             why: What has happened to the device.
             account: Only if this account has it; ``None``: whoever has.
+            until_s: When to give up telling others, by the loop's clock [s]; ``None``: as soon as they do.
 
         Returns:
             Whether everybody who had to be told has been. The lease has ended in any case.
@@ -59,19 +61,36 @@ class Fence:
             return lease
 
         lease = await store.retry(once)
-        return lease is None or await self._tell(device, lease)
+        return lease is None or await self._tell(device, lease, until_s)
 
-    async def repeat(self, device: Device) -> bool:
-        """Tell again of the end of a lease that nobody has had since; whether it could be told."""
+    async def repeat(self, device: Device, account: str, *, until_s: float) -> bool:
+        """Tell again of the end of a lease that ``account`` had; whether it could be told, until ``until_s``.
+
+        Where somebody else has control by now, the device is told of them; until it has heard that, what counts is that
+        nothing of the account reaches it. Which epochs it had nobody knows any more, so all of its connections are cut.
+        """
         control = await read_control_rows(self._tables, device.id)
         lease = control.lease
-        if lease is None or lease.account or lease.pairing != device.pairing:
+        if lease is None or lease.pairing != device.pairing:
             return True
-        return await self._tell(device, lease)
+        if not lease.account:
+            return await self._tell(device, lease, until_s)
+        try:
+            async with asyncio.timeout_at(until_s):
+                await self._access.revoke(principal=everything(account))
+        except (BrokerAccessError, TimeoutError) as error:
+            _log.warning("sessions of %s: %s", account, str(error) or "the broker did not answer in time")
+            return False
+        return True
 
-    async def _tell(self, device: Device, lease: Lease) -> bool:
+    async def _tell(self, device: Device, lease: Lease, until_s: float | None) -> bool:
         """Cut the connection that carries the setpoints of the epoch before, and tell the device, both at once."""
-        return all(await asyncio.gather(self._cut(device, lease.epoch - 1), self._release(device, lease.epoch)))
+        try:
+            async with asyncio.timeout_at(until_s):
+                return all(await asyncio.gather(self._cut(device, lease.epoch - 1), self._release(device, lease.epoch)))
+        except TimeoutError:
+            _log.warning("end of control of %s: the broker did not answer in time", device.id)
+            return False
 
     async def _cut(self, device: Device, epoch: int) -> bool:
         try:

@@ -7,6 +7,7 @@ from collections.abc import Callable
 from device_agent.protocol.messages import AskLease, DropRequest
 from function_app.domain import handover as rules
 from function_app.domain.accounts import Identity
+from function_app.domain.api_keys import key_of
 from function_app.domain.devices import Device
 from function_app.domain.ids import new_id
 from function_app.domain.lease import Asked, Lease
@@ -18,7 +19,6 @@ from function_app.services.audit import Audit
 from function_app.services.commands import Commands
 from function_app.services.control import read_lease
 from function_app.services.devices import Devices, require_operator
-from function_app.services.identity import Identify
 from function_app.services.lease import Leases
 from function_app.services.lease_rows import LeaseRows
 
@@ -36,7 +36,6 @@ class Handovers:
         leases: Leases,
         rows: LeaseRows,
         commands: Commands,
-        identify: Identify,
         audit: Audit,
         clock: Clock,
     ) -> None:
@@ -45,7 +44,6 @@ class Handovers:
         self._leases = leases
         self._rows = rows
         self._commands = commands
-        self._identify = identify
         self._audit = audit
         self._clock = clock
 
@@ -160,13 +158,13 @@ class Handovers:
         lease, asked = rules.find(await read_lease(self._tables, device), request)
         if asked.how(lease, self._clock.now_ms()) != "open":
             return
-        asker = Identity(asked.account, asked.by, asked.session)
-        found, _ = await self._devices.find(asker, device.id)
-        if found is None or not found.role.may_operate or await self._identify.signed_out(asker):
+        asker = await self._devices.acting(Identity(asked.account, asked.by, asked.session))
+        found = (await self._devices.find(asker, device.id))[0] if asker is not None else None
+        if found is None or not found.role.may_operate:
             raise _asker_gone(asked.by, "Control stays with you.")
 
     async def _require_asker_still(self, device: Device, lease: Lease) -> None:
-        asker = Identity(lease.account, lease.holder, lease.session)
+        asker = Identity(lease.account, lease.holder, lease.session, key=key_of(lease.session))
         try:
             await self._leases.require_still(asker, device)
         except Problem as problem:

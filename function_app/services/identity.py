@@ -12,7 +12,7 @@ from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PublicKey
 from device_agent.protocol import signing
 from device_agent.protocol.errors import ProtocolError
 from device_agent.protocol.topics import ANY
-from function_app.domain.accounts import Account, Identity
+from function_app.domain.accounts import Identity
 from function_app.domain.devices import Agent
 from function_app.domain.ids import agent_id, new_id
 from function_app.domain.problems import unauthorized
@@ -20,6 +20,7 @@ from function_app.ports.clock import Clock
 from function_app.ports.keys import Keys
 from function_app.ports.tables import Conflict, Row, Tables
 from function_app.services import store
+from function_app.services.acting import signed_out_key
 from function_app.services.forget import Forget
 
 ALGORITHM = "EdDSA"
@@ -57,20 +58,26 @@ class Identify:
         self._clock = clock
         self._known: OrderedDict[tuple[str, str], _Known] = OrderedDict()
 
-    async def issue(
-        self, account: Account, session: str, audience: Audience, lifetime_s: int, *, csrf: str | None = None
-    ) -> str:
-        """A token of one sign-in session; in a cookie, with what a page has to show beside it (``csrf``)."""
+    async def issue(self, who: Identity, audience: Audience, lifetime_s: int, *, csrf: str | None = None) -> str:
+        """A token of one sign-in session, good no longer than that.
+
+        Args:
+            who: Account, session, and when that ends.
+            audience: What it is for.
+            lifetime_s: How long it is good for at most [s].
+            csrf: In a cookie, what a page has to show beside it.
+        """
         key = await self._keys.current()
-        now_s = self._clock.now_ms() // 1000
+        now_ms = self._clock.now_ms()
         claims = {
             "iss": "telescope",
             "aud": audience,
-            "sub": account.id,
-            "name": account.name,
-            "sid": session,
-            "iat": now_s,
-            "exp": now_s + lifetime_s,
+            "sub": who.account,
+            "name": who.name,
+            "sid": who.session,
+            "iat": now_ms // 1000,
+            "exp": now_ms // 1000 + who.lasting_s(lifetime_s, now_ms),
+            "until": who.until_ms // 1000,
             "jti": new_id(),
         }
         if csrf is not None:
@@ -113,7 +120,7 @@ class Identify:
     async def sign_out(self, who: Identity) -> None:
         """End the session: its tokens are refused from now on, by other instances within ``RECHECK_MS``."""
         ends_ms = self._clock.now_ms() + SESSION_S * 1000
-        row = Row(who.account, f"signed-out:{who.session}", {"expires_ms": ends_ms})
+        row = Row(who.account, signed_out_key(who.session), {"expires_ms": ends_ms})
         await self._forget.row(store.ACCOUNTS, row.partition, row.key, due_ms=ends_ms)
         try:
             await self._tables.create(store.ACCOUNTS, row)
@@ -161,18 +168,20 @@ class Identify:
             if key is None:
                 raise unauthorized("The access token was not issued here. Sign in again.")
             claims = decode(token, key, audience, now_s=self._now_s(), leeway_s=0)
-            identity = Identity(account=str(claims["sub"]), name=str(claims["name"]), session=str(claims["sid"]))
+            identity = Identity(
+                account=str(claims["sub"]),
+                name=str(claims["name"]),
+                session=str(claims["sid"]),
+                # A token from before sessions told their end ends what it gives with itself.
+                until_ms=int(claims.get("until", claims["exp"])) * 1000,
+            )
         except (jwt.PyJWTError, KeyError) as error:
             raise unauthorized(f"The access token is refused: {error}. Sign in again.") from error
         await self._check_signed_out(identity)
         return _Known(identity, int(claims["exp"]) * 1000, self._clock.now_ms(), str(claims.get("csrf", "")))
 
-    async def signed_out(self, who: Identity) -> bool:
-        """Whether somebody has ended this session."""
-        return await self._tables.get(store.ACCOUNTS, who.account, f"signed-out:{who.session}") is not None
-
     async def _check_signed_out(self, who: Identity) -> None:
-        if await self.signed_out(who):
+        if await self._tables.get(store.ACCOUNTS, who.account, signed_out_key(who.session)) is not None:
             raise unauthorized("This session was signed out. Sign in again.")
 
     def _check_agent(self, token: str, key: Ed25519PublicKey) -> None:
@@ -205,6 +214,11 @@ def watch_principal(who: Identity) -> str:
 def watchers(account: str) -> str:
     """All sessions of an account that watch, as a pattern for ``BrokerAccess.revoke``."""
     return f"account:{account}:{ANY}:watch"
+
+
+def everything(account: str) -> str:
+    """All connections of an account, for ``BrokerAccess.revoke``."""
+    return f"account:{account}"
 
 
 def new_secret() -> str:

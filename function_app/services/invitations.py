@@ -24,7 +24,7 @@ from function_app.services.audit_chain import AuditChain
 from function_app.services.forget import Forget
 from function_app.services.identity import new_secret
 from function_app.services.pending import Pending
-from function_app.services.sharing import Shared, Sharing, require_person
+from function_app.services.sharing import Shared, Sharing, require_person, yours
 from function_app.services.sign_in import SignIn
 from function_app.services.transfer import Transfer, void
 
@@ -110,16 +110,17 @@ class Invitations:
         shared = await self._sharing.of(who, "space", space)
         require_person(who)
         if len(await self._sign_in.spaces(who.account)) == 1:
-            detail = "It is this account's only space. Make another one first."
-            raise Problem("last-space", 409, "The last space", detail)
+            raise _last_space("It is this account's only space. Make another one first.")
         return shared
 
     async def make(self, who: Identity, shared: Shared, offer: Offer) -> tuple[str, Known]:
         """A new invitation, and its secret, which nobody can be told again.
 
         Raises:
-            Problem: ``too-many-invitations``.
+            Problem: ``already-yours``, ``too-many-invitations``.
         """
+        if offer.role is Role.OWNER and offer.account == shared.owner.id:
+            raise yours("It belongs to this account already. Name another one, or none for whoever has the link.")
         if len(await self.open(shared)) >= rules.MOST:
             detail = f"There are {rules.MOST} open invitations to it, the most there can be. Take one back."
             raise Problem("too-many-invitations", 409, "Too many invitations", detail)
@@ -191,30 +192,37 @@ class Invitations:
         Raises:
             Problem: ``invitation-unknown``: wrong, used, expired, taken back or void, all the same.
         """
-        row, known = await self._get(_hash(secret))
+        return await self.find(_hash(secret))
+
+    async def find(self, invitation: str) -> Known:
+        """The same by the id, for whoever has shown the secret before.
+
+        Raises:
+            Problem: ``invitation-unknown``.
+        """
+        row, known = await self._get(invitation)
         if row is None or known is None or not known.open(self._clock.now_ms()) or not await self._good(known):
             raise _unknown()
         return Known(row.key, known)
 
-    async def redeem(self, who: Identity, secret: str, *, space: str | None = None) -> Known:
+    async def redeem(self, who: Identity, known: Known, *, space: str | None = None) -> None:
         """Take what an invitation offers.
 
         Args:
             who: Who takes it.
-            secret: The invitation's.
+            known: The invitation, which they have shown the secret of.
             space: The space of theirs for an agent that is handed over; ``None``: their first.
 
         Raises:
             Problem: ``invitation-unknown``; ``forbidden``: it is for another account, or an API key asks;
-                ``already-yours``, ``space-unknown``, ``too-many-shares``, ``transfer-void``, ``busy``.
+                ``already-yours``, ``last-space``, ``space-unknown``, ``too-many-shares``, ``transfer-void``, ``busy``.
         """
         require_person(who)
-        known = await self.look(secret)
         offered = known.invitation
         if offered.account and offered.account != who.account:
             raise forbidden("This invitation is for another account. Sign in as the one it was made for.")
         if offered.owner == who.account:
-            raise Problem("already-yours", 409, "It is yours", "It belongs to this account: there is nothing to take.")
+            raise yours("It belongs to this account: there is nothing to take. Send the link to somebody else.")
         if offered.role is Role.OWNER:
             await self._take(who, known, space)
         else:
@@ -224,7 +232,6 @@ class Invitations:
             giver = Identity(offered.owner, offered.by, "")
             ends_ms = offered.ends_ms(self._clock.now_ms())
             await self._sharing.give(giver, shared, Account(who.account, who.name), offered.role, ends_ms)
-        return known
 
     async def go_on(self, what: str, note: Row) -> None:
         """The timer's look at a transfer that was accepted."""
@@ -244,6 +251,9 @@ class Invitations:
             if chosen is None:
                 raise not_found("space", space or "")
             goal = chosen
+        elif len(await self._sign_in.spaces(known.invitation.owner)) == 1:
+            # It was not when it was offered: another one was handed over since.
+            raise _last_space(f"It is {known.invitation.by}'s only space by now. Ask them to make another one first.")
         note = await self._pending.note(f"{_NOTE}{known.id}", self._clock.now_ms() + LOOK_MS)
 
         async def once() -> Invitation:
@@ -334,6 +344,10 @@ class _Void(Exception):  # noqa: N818 (an outcome)
 def about_transfer(note: str) -> bool:
     """Whether a note of the timer is about a transfer."""
     return note.startswith(_NOTE)
+
+
+def _last_space(detail: str) -> Problem:
+    return Problem("last-space", 409, "The last space", detail)
 
 
 def _hash(secret: str) -> str:

@@ -5,22 +5,24 @@ A note is taken for a time by its ETag: two checkers never hold the same one, an
 
 import asyncio
 import logging
+from collections.abc import Sequence
 from dataclasses import replace
 
 import msgspec
 
 from device_agent.protocol.robot_type import MANIFEST, RobotType
-from function_app.domain.robot_types import TypeVersion, with_ready
+from function_app.domain.robot_types import State, TypeVersion, with_ready
 from function_app.ports.blobs import Blobs
 from function_app.ports.clock import Clock
-from function_app.ports.model_compiler import CompilerMissingError, ModelCompiler
+from function_app.ports.model_compiler import CompilerMissingError, Looked, ModelCompiler
 from function_app.ports.tables import Conflict, Row, Tables, Write
 from function_app.services import store
 from function_app.services.forget import DAY_MS
-from function_app.services.model_files import malformed
+from function_app.services.model_files import malformed, missing
 from function_app.services.robot_type_rows import (
     CHECKS,
     HEAD,
+    LOOKED,
     Place,
     note_look,
     read_head,
@@ -88,28 +90,45 @@ class ModelChecks:
     async def _check(self, note: Row) -> None:
         where, number = _target(note)
         _, upload = await read_version(self._tables, where, number)
-        if upload is None or upload.state != "checking":
-            return
-        if note.data["tries"] > MAX_TRIES:
-            errors: tuple[str, ...] = (f"The check was cut off {MAX_TRIES} times. Simplify the model.",)
-        else:
-            errors = await self._errors(where, upload)
-        sentences = tuple(_sentence(error) for error in errors[:MAX_ERRORS])
-        await give_verdict(self._tables, where, number, sentences, self._clock.now_ms())
+        if upload is not None and upload.state == "checking":
+            if note.data["tries"] > MAX_TRIES:
+                looked = Looked((f"The check was cut off {MAX_TRIES} times. Simplify the model.",))
+            else:
+                looked = await self._look(where, upload)
+            # The drawing first: a version that is ready has one.
+            await self._blobs.put(where.prefix(number) + LOOKED, msgspec.json.encode(looked))
+            warnings = _sentences(looked.warnings)
+            await give_verdict(self._tables, where, number, looked.errors, self._clock.now_ms(), warnings=warnings)
+            _, upload = await read_version(self._tables, where, number)
+        if upload is None:
+            await drop_files(self._blobs, where, number)  # the timer may have been here in between
 
-    async def _errors(self, where: Place, upload: TypeVersion) -> tuple[str, ...]:
+    async def _look(self, where: Place, upload: TypeVersion) -> Looked:
         names = list(upload.files)
         contents = await asyncio.gather(*(self._blobs.get(where.prefix(upload.version) + name) for name in names))
         files = {name: content for name, content in zip(names, contents, strict=True) if content is not None}
         if len(files) < len(names):
-            return ("A file of the upload is gone. Upload it again.",)
+            return Looked(("A file of the upload is gone. Upload it again.",))
         manifest = msgspec.convert(upload.manifest, RobotType)
         del files[MANIFEST]
-        return await self._compiler.check(manifest, files) or malformed(files)
+        lost = missing(files)
+        looked = await self._compiler.check(manifest, files, [name for _, name, _ in lost])
+        told = [error for error in looked.errors if not any(name in error for _, name, _ in lost)]
+        torn = [error for error in malformed(files) if not any(_file(one) == _file(error) for one in told)]
+        named = [f"{file}: '{name}' is not among the files (line {line})" for file, name, line in lost]
+        return replace(looked, errors=(*told, *named, *torn))
 
 
-async def give_verdict(tables: Tables, where: Place, number: int, errors: tuple[str, ...], now_ms: int) -> None:
-    """Write what was found; what nobody waits for any more stays as it is.
+async def drop_files(blobs: Blobs, where: Place, number: int) -> None:
+    """Delete all files of a version."""
+    for name in await blobs.list(where.prefix(number)):
+        await blobs.delete(name)
+
+
+async def give_verdict(
+    tables: Tables, where: Place, number: int, errors: Sequence[str], now_ms: int, *, warnings: tuple[str, ...] = ()
+) -> None:
+    """Write what was found, beside what was known before; what nobody waits for any more stays as it is.
 
     A version that is ready takes the place of those before it in the same batch; these are looked at a day later.
     """
@@ -121,16 +140,26 @@ async def give_verdict(tables: Tables, where: Place, number: int, errors: tuple[
             return
         if not upload.open or not head.needs(number):
             return
-        done = replace(upload, state="refused" if errors else "ready", errors=errors, checked_ms=now_ms)
+        wrong = _sentences((*upload.errors, *errors))
+        state: State = "refused" if wrong else "ready"
+        done = replace(upload, state=state, errors=wrong, warnings=warnings, checked_ms=now_ms)
         version_row = Row(row.partition, row.key, store.fields(done), row.etag)
         writes = [Write("replace", version_row)]
-        if not errors:
+        if not wrong:
             await note_look(tables, where, now_ms + DAY_MS)
             head_data = store.fields(with_ready(head, done))
             writes.append(Write("replace", Row(row.partition, HEAD, head_data, head_row.etag)))
         await tables.batch(store.ROBOT_TYPES, writes)
 
     await store.retry(once)
+
+
+def _sentences(texts: Sequence[str]) -> tuple[str, ...]:
+    return tuple(_sentence(text) for text in texts[:MAX_ERRORS])
+
+
+def _file(error: str) -> str:
+    return error.partition(":")[0]
 
 
 def _sentence(error: str) -> str:

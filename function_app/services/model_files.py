@@ -4,8 +4,10 @@ import base64
 import binascii
 import contextlib
 import re
-from collections.abc import Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
+from functools import partial
+from typing import TypeVar
 from xml.parsers import expat
 
 from device_agent.protocol import robot_type as manifests
@@ -19,11 +21,14 @@ MAX_BYTES = 6_000_000
 """Of all files together."""
 MAX_MANIFEST = 48_000
 MAX_VERSION = 1_000_000
+MAX_TOLD = 20
+"""Of things that are wrong so many are told."""
 TEXT = ".xml"
 BINARY = (".stl", ".obj", ".png")
 _NAME = re.compile(r"\A(?=.{1,120}\Z)([A-Za-z0-9_-][A-Za-z0-9_.-]*/){0,3}[A-Za-z0-9_-][A-Za-z0-9_.-]*\.[a-z]{3}\Z")
 _FILE = re.compile(r"\Afile", re.IGNORECASE)
 _FOLDERS = frozenset({"meshdir", "texturedir", "assetdir"})
+T = TypeVar("T")
 _OUTSIDE = re.compile(r"\A[/~]|[\\:\x00]|(\A|/)\.\.(/|\Z)")
 
 
@@ -43,26 +48,51 @@ def read_upload(manifest: str, files: Mapping[str, str]) -> Upload:
         files: Name → text of an ``.xml``; base64 of any other.
 
     Raises:
-        Problem: ``manifest-invalid`` with the field, ``robot-type-invalid`` with the file.
+        Problem: ``manifest-invalid`` with the field, ``robot-type-invalid`` with the file; of several things that are
+            wrong the first, and all in ``errors``.
     """
-    robot_type = _manifest(manifest)
     if not 1 <= len(files) <= MAX_FILES:
         raise _bad(f"A robot type has 1 to {MAX_FILES} files, not {len(files)}.")
-    content = {name: _content(name, text) for name, text in files.items()}
-    if sum(map(len, content.values())) > MAX_BYTES:
-        raise _bad(f"The files have at most {MAX_BYTES} bytes together. Simplify the meshes.")
-    for name in content:
-        folder = next((other for other in content if name.startswith(other + "/")), None)
-        if folder is not None:
-            raise _bad(f"'{folder}' cannot be a file and a folder.")
-    for field in ("model", "scene"):
-        named = getattr(robot_type, field)
-        if named not in content or not named.endswith(TEXT):
-            raise _bad_manifest(f"{field} is '{named[:120]}'; it must be one of the .xml files: {_xml_names(content)}.")
-    for name, text in content.items():
+    wrong: list[Problem] = []
+    robot_type = _or_note(wrong, partial(_manifest, manifest))
+    content: dict[str, bytes] = {}
+    for name, text in files.items():
+        read = _or_note(wrong, partial(_content, name, text))
+        if read is not None:
+            content[name] = read
+    wrong += _unfit(content)
+    if robot_type is not None:
+        wrong += _unnamed(robot_type, content)
+    for name, given in content.items():
         if name.endswith(TEXT):
-            _check_references(name, text)
+            _or_note(wrong, partial(_check_references, name, given))
+    if wrong or robot_type is None:
+        errors = [problem.detail for problem in wrong][:MAX_TOLD]
+        raise invalid(errors[0], code=wrong[0].code, errors=errors)
     return Upload(robot_type, {manifests.MANIFEST: manifest.encode(), **content})
+
+
+def missing(files: Mapping[str, bytes]) -> tuple[tuple[str, str, int], ...]:
+    """Files that the XML names and that are in no folder of the upload: who names it, what, and in which line."""
+    known = {name.rpartition("/")[2] for name in files}
+    found: list[tuple[str, str, int]] = []
+
+    def look(name: str, parser: expat.XMLParserType) -> None:
+        def element(_: str, attributes: dict[str, str]) -> None:
+            for attribute, value in attributes.items():
+                wanted = value.rpartition("/")[2]
+                if _FILE.match(attribute) and wanted and wanted not in known:
+                    found.append((name, wanted, parser.CurrentLineNumber))
+
+        parser.StartElementHandler = element
+
+    for name, text in files.items():
+        if name.endswith(TEXT):
+            parser = _parser()
+            look(name, parser)
+            with contextlib.suppress(expat.ExpatError):
+                parser.Parse(text, True)
+    return tuple(found)
 
 
 def malformed(files: Mapping[str, bytes]) -> tuple[str, ...]:
@@ -75,6 +105,32 @@ def malformed(files: Mapping[str, bytes]) -> tuple[str, ...]:
             except expat.ExpatError as error:
                 errors.append(f"{name}: {error}.")
     return tuple(errors)
+
+
+def _unfit(content: Mapping[str, bytes]) -> Iterator[Problem]:
+    if sum(map(len, content.values())) > MAX_BYTES:
+        yield _bad(f"The files have at most {MAX_BYTES} bytes together. Simplify the meshes.")
+    for name in content:
+        folder = next((other for other in content if name.startswith(other + "/")), None)
+        if folder is not None:
+            yield _bad(f"'{folder}' cannot be a file and a folder.")
+
+
+def _unnamed(robot_type: RobotType, content: Mapping[str, bytes]) -> Iterator[Problem]:
+    for field in ("model", "scene"):
+        named = getattr(robot_type, field)
+        if named not in content or not named.endswith(TEXT):
+            known = _xml_names(content)
+            yield _bad_manifest(f"{field} is '{named[:120]}'; it must be one of the .xml files: {known}.")
+
+
+def _or_note(wrong: list[Problem], read: Callable[[], T]) -> T | None:
+    """What ``read`` gives; ``None`` where it refuses, which is noted."""
+    try:
+        return read()
+    except Problem as problem:
+        wrong.append(problem)
+        return None
 
 
 def _manifest(text: str) -> RobotType:

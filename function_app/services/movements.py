@@ -40,11 +40,16 @@ _LAST_VERSION = 10**8
 
 @dataclass(frozen=True, slots=True)
 class Draft:
-    """What somebody saves. Without description or schema the script's own count."""
+    """What somebody saves. Without description or schema the script's own count.
+
+    Attributes:
+        based_on: The version that it was made from, which has to be the newest still; 0: there has to be none.
+    """
 
     source: str
     description: str | None = None
     parameters_schema: dict[str, Any] | None = None
+    based_on: int | None = None
 
 
 class Movements:
@@ -150,7 +155,8 @@ class Movements:
         The script is stored before the rows that name it: a row without its script cannot be.
 
         Raises:
-            Problem: ``robot-type-unknown``, ``movement-invalid`` with the line, ``schema-invalid``, ``movements-full``.
+            Problem: ``robot-type-unknown``, ``movement-invalid`` with the line, ``schema-invalid``, ``movements-full``,
+                ``movement-changed`` with the newest version.
         """
         await self._types.get(who, robot_type)
         if not ID.match(name):
@@ -170,6 +176,7 @@ class Movements:
         async def once() -> tuple[Movement, bool]:
             row = await self._row(who, robot_type, name)
             old = store.read(row, Movement) if row else None
+            await self._check_newest(robot_type, name, old, draft.based_on)
             if row is None:
                 await self._check_room(who, robot_type)
             elif old is not None and old.deleted:
@@ -257,6 +264,16 @@ class Movements:
         if not ID.match(name):
             return None
         return await self._tables.get(store.MOVEMENTS, _partition(who, robot_type), name)
+
+    async def _check_newest(self, robot_type: str, name: str, old: Movement | None, based_on: int | None) -> None:
+        """Refuse to save over what somebody has saved meanwhile."""
+        built_in = (await self._catalogue.movements(robot_type)).get(name)
+        newest = old.version if old and not old.deleted else built_in.version if built_in else 0
+        if based_on is None or based_on == newest:
+            return
+        made = f"Version {newest} of '{name}' is the newest" if newest else f"'{name}' has been deleted meanwhile"
+        detail = f"{made}, and this was made from version {based_on}." if based_on else f"There is a '{name}' already."
+        raise Problem("movement-changed", 409, "Somebody has saved it meanwhile", detail, extras={"version": newest})
 
     async def _check_room(self, who: Identity, robot_type: str) -> None:
         partition = _partition(who, robot_type)

@@ -1,6 +1,7 @@
 """Short-lived broker credentials, for exactly what their holder may do."""
 
-from dataclasses import dataclass
+from collections.abc import Awaitable
+from dataclasses import dataclass, field
 
 from device_agent.protocol import grants, topics
 from device_agent.protocol.grants import Grant
@@ -23,9 +24,6 @@ AGENT_S = 3600
 CONTROL_MIN_S = 60
 TOPIC_BYTES = 10_000
 """Filters in one grant [bytes]: signed and in base 64 they fit into the 16 KiB that a CONNECT may have."""
-
-_WATCHED = (topics.DESC, topics.STATE, topics.EVENT, topics.ACK)
-_WATCHED_NAMED = ((topics.DESC, topics.TWIN), (topics.TELE, topics.ANY), (topics.CAM, topics.ANY))
 
 
 @dataclass(frozen=True, slots=True)
@@ -55,7 +53,7 @@ class MqttCredentials:
 
         Where the account has a part in a whole space, what the broker is told is said by space and stays small however
         many devices there are; a device that is shared by itself is named, topic by topic. The answer names each topic.
-        The credentials end with the first share that they rest on.
+        The credentials end with the first share that they rest on, and with the session or API key that asks.
 
         Raises:
             Problem: ``broker-unavailable``, ``busy``.
@@ -68,25 +66,27 @@ class MqttCredentials:
             # Something was un-shared meanwhile: its sessions were cut before these credentials were there to be cut.
             await self._take_back(issued)
             raise busy_store()
+        await self._require(issued, self._devices.require_key(who))
         return issued
 
     async def _watch(self, who: Identity, devices: list[Device]) -> Issued:
-        said, heard, seen = _watching(devices)
+        watched = _watching(devices, self._access)
+        seen = watched.devices
         now_ms = self._clock.now_ms()
-        ends_ms = min([now_ms + WATCH_S * 1000, *(device.until_ms for device in seen)])
+        ends_ms = min([now_ms + WATCH_S * 1000, who.until_ms, *(device.until_ms for device in seen)])
         grant = Grant(
             principal=watch_principal(who),
             client_id=f"w-{who.session}-{new_id(10)}",
-            publish=said,
-            subscribe=heard,
+            publish=tuple(watched.publish),
+            subscribe=tuple(watched.subscribe),
             token_id=new_id(),
             expires_at=max(now_ms // 1000 + 1, ends_ms // 1000),
         )
-        publish = tuple(f"{device.topic}/{topics.STOP}" for device in seen if device.role.may_operate)
         subscribe = [topics.conn(space, agent) for space, agent in sorted({(one.space, one.agent) for one in seen})]
         for device in seen:
-            subscribe += _topics(device)
-        return await self._issue(grant, max(1, (ends_ms - now_ms) // 1000), publish, tuple(subscribe))
+            subscribe += grants.heard(device.space, device.agent, device.name)
+        lifetime_s = max(1, (ends_ms - now_ms) // 1000)
+        return await self._issue(grant, lifetime_s, tuple(watched.stops), tuple(dict.fromkeys(subscribe)))
 
     async def _take_back(self, issued: Issued) -> None:
         try:
@@ -105,7 +105,8 @@ class MqttCredentials:
         async with self._audit.refusals(device, who, "steer"):
             require_operator(device)
             lease = rules.hold(await read_lease(self._tables, device), who, epoch=epoch, now_ms=now_ms)
-        lifetime_s = max(CONTROL_MIN_S, lease.lease_ms // 1000)
+        # Longer than the lease, which may be renewed; not than the right to it.
+        lifetime_s = min(max(CONTROL_MIN_S, lease.lease_ms // 1000), max(1, (device.until_ms - now_ms) // 1000))
         publish = (f"{device.topic}/{topics.CTL}/{epoch}",)
         grant = Grant(
             principal=principal(who),
@@ -116,12 +117,16 @@ class MqttCredentials:
             expires_at=now_ms // 1000 + lifetime_s,
         )
         issued = await self._issue(grant, lifetime_s, publish, ())
+        await self._require(issued, self._devices.require_still(who, device))
+        return issued
+
+    async def _require(self, issued: Issued, still: Awaitable[object]) -> None:
+        """Take credentials back that were made while the right to them was ended: nobody found them to be cut then."""
         try:
-            await self._devices.require_still(who, device)
+            await still
         except Problem:
             await self._take_back(issued)
             raise
-        return issued
 
     async def agent(self, agent: Agent) -> Issued:
         """To speak for an agent's own devices and hear what is addressed to them.
@@ -145,54 +150,64 @@ class MqttCredentials:
         return Issued(grant.client_id, credentials, grant.expires_at * 1000, lifetime_s, publish, subscribe)
 
 
-def _watching(devices: list[Device]) -> tuple[tuple[str, ...], tuple[str, ...], list[Device]]:
+@dataclass(slots=True)
+class _Watched:
+    """What one connection is given, and the devices that it reaches with that.
+
+    Attributes:
+        publish: Filters.
+        subscribe: Filters.
+        devices: Which are heard.
+        stops: Topics, one for each of them that may be stopped.
+    """
+
+    publish: list[str] = field(default_factory=list)
+    subscribe: list[str] = field(default_factory=list)
+    devices: list[Device] = field(default_factory=list)
+    stops: list[str] = field(default_factory=list)
+
+    def add(self, says: list[str], hears: tuple[str, ...], access: BrokerAccess) -> bool:
+        """Whether there was room for them."""
+        publish = list(dict.fromkeys([*self.publish, *says]))
+        subscribe = list(dict.fromkeys([*self.subscribe, *hears]))
+        size = sum(len(pattern) + 3 for pattern in (*publish, *subscribe))
+        if size > TOPIC_BYTES or not access.takes(publish, subscribe):
+            return False
+        self.publish, self.subscribe = publish, subscribe
+        return True
+
+
+def _watching(devices: list[Device], access: BrokerAccess) -> _Watched:
     """What may be said and heard in order to watch these devices, and those of them that fit.
 
-    Whole spaces come first. All filters travel in one CONNECT, which brokers bound: devices that are shared one by one
-    beyond ``TOPIC_BYTES`` are left out. Whoever has so many in one room is better given the room.
+    Whole spaces come first. All filters travel in one CONNECT, which brokers bound, some more than others: devices
+    beyond what the broker takes are left out. Whoever has so many in one room is better given the room.
     """
-    publish: list[str] = []
-    subscribe: list[str] = []
-    seen: list[Device] = []
-    room = TOPIC_BYTES
+    found = _Watched()
+    whole: set[str] = set()
     for space, role in sorted({(device.space, device.space_role) for device in devices if device.space_role}):
-        anyone = topics.ANY
-        says = [topics.device(space, anyone, anyone, topics.STOP)] if role.may_operate else []
-        hears = [topics.conn(space, anyone), *_topics_at(f"{topics.ROOT}/{space}/{anyone}/{anyone}")]
-        if (room := room - _size(says, hears)) < 0:
+        says = [topics.device(space, topics.ANY, topics.ANY, topics.STOP)] if role.may_operate else []
+        if not found.add(says, grants.heard(space, topics.ANY, topics.ANY), access):
             break
-        publish += says
-        subscribe += hears
-        seen += [device for device in devices if device.space == space and device.space_role]
-    more = {device.id for device in seen}
+        inside = [device for device in devices if device.space == space and device.space_role]
+        found.devices += inside
+        whole |= {device.id for device in inside}
+        found.stops += [_stop(device) for device in inside if role.may_operate]
+    stoppable = set(found.stops)
     for device in devices:
-        says = [f"{device.topic}/{topics.STOP}"] if device.role.may_operate else []
-        hears = [] if device.id in more else [topics.conn(device.space, device.agent), *_topics(device)]
-        says = [] if device.space_role and device.space_role.may_operate else says
+        says = [_stop(device)] if device.role.may_operate and _stop(device) not in stoppable else []
+        hears = () if device.id in whole else grants.heard(device.space, device.agent, device.name)
         if not says and not hears:
             continue
-        if (room := room - _size(says, hears)) < 0:
+        if not found.add(says, hears, access):
             break
-        publish += says
-        subscribe += hears
-        seen += [device] if device.id not in more else []
-    return tuple(publish), tuple(dict.fromkeys(subscribe)), seen
+        found.stops += says
+        found.devices += [device] if hears else []
+    return found
 
 
-def _topics(device: Device) -> list[str]:
-    return _topics_at(device.topic)
-
-
-def _topics_at(base: str) -> list[str]:
-    """What whoever watches a device hears. Never ``cmd``, ``ctl`` or ``stop``."""
-    return [
-        *(f"{base}/{kind}" for kind in _WATCHED),
-        *(f"{base}/{kind}/{name}" for kind, name in _WATCHED_NAMED),
-    ]
-
-
-def _size(*lists: list[str]) -> int:
-    return sum(len(pattern) + 3 for patterns in lists for pattern in patterns)
+def _stop(device: Device) -> str:
+    return f"{device.topic}/{topics.STOP}"
 
 
 def _rights(devices: list[Device]) -> set[tuple[object, ...]]:

@@ -9,14 +9,18 @@ import hashlib
 import hmac
 import logging
 from dataclasses import dataclass
-from typing import Final
+from typing import Final, NoReturn
 
+from function_app.domain.accounts import Identity
+from function_app.domain.audit_chain import CLOUD, Deed
 from function_app.domain.problems import Problem
 from function_app.ports.clock import Clock
-from function_app.ports.open_id import OpenId, OpenIdError
+from function_app.ports.open_id import OpenId, OpenIdError, Subject
 from function_app.ports.tables import Conflict, Row, Tables
 from function_app.services import store
+from function_app.services.audit_chain import AuditChain
 from function_app.services.identity import new_secret
+from function_app.services.invitations import Invitations, Known
 from function_app.services.sessions import From, Sessions, SignedIn
 from function_app.services.sign_in import SignIn
 
@@ -52,7 +56,10 @@ class Returned:
 
 
 class OpenIdSignIn:
-    """Signing in at one provider, where there is one."""
+    """Signing in at one provider, where there is one.
+
+    An account is made for who brings an invitation; for ``anyone`` else only where that is wanted.
+    """
 
     def __init__(
         self,
@@ -60,29 +67,38 @@ class OpenIdSignIn:
         tables: Tables,
         provider: OpenId | None,
         redirect: str,
+        anyone: bool,
         sign_in: SignIn,
         sessions: Sessions,
+        invitations: Invitations,
+        chain: AuditChain,
         clock: Clock,
     ) -> None:
         self._tables = tables
         self._provider = provider
         self._redirect = redirect
+        self._anyone = anyone
         self._sign_in = sign_in
         self._sessions = sessions
+        self._invitations = invitations
+        self._chain = chain
         self._clock = clock
 
-    async def begin(self) -> Begun:
+    async def begin(self, invitation: str = "") -> Begun:
         """Begin in one browser.
 
+        Args:
+            invitation: The secret of one that whoever signs in brings along.
+
         Raises:
-            Problem: ``open-id-unknown``: there is no provider; ``open-id-unavailable``.
+            Problem: ``open-id-unknown``: there is no provider; ``open-id-unavailable``; ``invitation-unknown``.
         """
+        provider = self._known()
+        brought = (await self._invitations.look(invitation)).id if invitation else ""
         state, nonce, verifier, secret = (new_secret() for _ in range(4))
         challenge = base64.urlsafe_b64encode(hashlib.sha256(verifier.encode()).digest()).rstrip(b"=").decode()
         try:
-            address = await self._known().address(
-                state=state, nonce=nonce, challenge=challenge, redirect=self._redirect
-            )
+            address = await provider.address(state=state, nonce=nonce, challenge=challenge, redirect=self._redirect)
         except OpenIdError as error:
             _log.error("sign-in elsewhere: %s", error)
             detail = "The sign-in provider cannot be used now; the log of this server says why."
@@ -92,6 +108,7 @@ class OpenIdSignIn:
             "nonce": nonce,
             "verifier": verifier,
             "secret": _hash(secret),
+            "invitation": brought,
             "expires_ms": self._clock.now_ms() + BEGUN_S * 1000,
         }
         await self._tables.create(store.SIGN_INS, Row(hashed[0], hashed, data))
@@ -102,7 +119,8 @@ class OpenIdSignIn:
 
         Raises:
             Problem: ``open-id-unknown``: there is no provider; ``open-id-expired``: this was not begun here, in this
-                browser, just now; ``open-id-refused``: the provider, or what came from it, does not sign them in.
+                browser, just now; ``open-id-refused``: the provider, or what came from it, does not sign them in;
+                ``open-id-uninvited``: they have no account here, and none is made for them.
         """
         provider = self._known()
         begun = await self._begun(returned)
@@ -120,8 +138,39 @@ class OpenIdSignIn:
         except OpenIdError as error:
             _log.error("sign-in elsewhere: %s", error)
             raise _refused() from error
+        is_new = not await self._sign_in.is_known_elsewhere(subject.issuer, subject.id)
+        known = await self._invited(begun["invitation"]) if is_new else None
+        if is_new and known is None and not self._anyone:
+            await self._refuse_stranger(subject, whence)
         account = await self._sign_in.account_elsewhere(subject.issuer, subject.id, subject.name)
-        return await self._sessions.begin(account, "open-id", whence)
+        done = await self._sessions.begin(account, "open-id", whence)
+        if known is not None:
+            await self._take(Identity(account.id, account.name, done.session), known)
+        return done
+
+    async def _invited(self, invitation: str) -> Known | None:
+        """What a newcomer brings along, if it is still good and for nobody else."""
+        if not invitation:
+            return None
+        try:
+            known = await self._invitations.find(invitation)
+        except Problem:
+            return None
+        return None if known.invitation.account else known
+
+    async def _take(self, who: Identity, known: Known) -> None:
+        try:
+            await self._invitations.redeem(who, known)
+        except Problem as problem:
+            # Somebody else was first with its last use. The account is there all the same, and empty.
+            _log.warning("sign-in elsewhere: the invitation of a new account came to nothing: %s", problem.detail)
+
+    async def _refuse_stranger(self, subject: Subject, whence: From) -> NoReturn:
+        code = "open-id-uninvited"
+        _log.warning("sign-in elsewhere: %r (%r) has no account here and was not invited", subject.name, subject.id)
+        await self._chain.refused(CLOUD, Deed.SIGN_IN_REFUSED, None, code=code, address=whence.address)
+        detail = "Nobody has invited you here. Ask somebody for an invitation, or whoever runs this server."
+        raise Problem(code, 403, "Not invited", detail)
 
     async def _begun(self, returned: Returned) -> dict[str, str]:
         hashed = _hash(returned.state)
@@ -137,7 +186,7 @@ class OpenIdSignIn:
             raise expired from conflict
         if self._clock.now_ms() >= row.data["expires_ms"]:
             raise expired
-        return {name: str(row.data[name]) for name in ("verifier", "nonce")}
+        return {name: str(row.data.get(name, "")) for name in ("verifier", "nonce", "invitation")}
 
     def _known(self) -> OpenId:
         if self._provider is None:

@@ -15,7 +15,7 @@ from function_app.services import store
 from function_app.services.attempts import Attempts, Guess, by_address
 from function_app.services.audit_chain import AuditChain
 from function_app.services.sessions import From, Sessions, SignedIn
-from function_app.services.sign_in import SignIn, named_partition
+from function_app.services.sign_in import SignIn, named_partition, new_name
 from function_app.services.sign_out import SignOut
 
 GUESS: Final = Guess("password", 300_000, "Too many wrong passwords.")
@@ -73,20 +73,20 @@ class Passwords:
         except Problem as problem:
             await self._refused("", whence, problem.code)
             raise
-        named = await self._tables.get(store.ACCOUNTS, named_partition(name), "account")
-        account = str(named.data["account"]) if named else ""
+        named = await self._sign_in.known(name)
+        account = named.id if named else ""
         row = await self._tables.get(store.ACCOUNTS, account or _NOBODY, _PASSWORD)
         stored = store.read(row, _Stored) if row else None
         right = await self._hashes.check(stored.hash if stored else None, normal(password))
-        if row is None or stored is None or not right:
+        if named is None or row is None or stored is None or not right:
             await self._refused(account, whence, WRONG)
             raise unauthorized("This name and password do not belong together.")
         await self._attempts.uncount(GUESS, counters)
-        done = await self._sessions.begin(Account(account, name), "password", whence)
+        done = await self._sessions.begin(named, "password", whence)
         again = await self._tables.get(store.ACCOUNTS, account, _PASSWORD)
         if again is None or store.read(again, _Stored) != stored:
             # It was changed while this was looked at: that ended the sessions that it saw, not this one.
-            await self._sign_out.end(Identity(account, name, done.session))
+            await self._sign_out.end(Identity(account, named.name, done.session))
             raise unauthorized("The password was changed just now. Sign in with the new one.")
         if self._hashes.outdated(stored.hash):
             await self._renew(again, password)
@@ -101,8 +101,8 @@ class Passwords:
         Raises:
             Problem: ``password-elsewhere``, ``forbidden``, ``password-weak``, ``too-many-tries``.
         """
-        named = await self._tables.get(store.ACCOUNTS, named_partition(who.name), "account")
-        if named is None or named.data["account"] != who.account:
+        named = await self._sign_in.known(who.name)
+        if named is None or named.id != who.account:
             detail = "This account signs in elsewhere and has no password here. Change it there."
             raise Problem("password-elsewhere", 409, "No password here", detail)
         row = await self._tables.get(store.ACCOUNTS, who.account, _PASSWORD)
@@ -126,19 +126,21 @@ class Passwords:
         Raises:
             Problem: ``name-taken``, ``password-weak``.
         """
+        taken = Problem("name-taken", 409, "The name is taken", "Somebody has this name. Choose another.")
+        if await self._sign_in.known(name) is not None:
+            raise taken
         stored = await self._store(password, name)
         account = new_id(12)
         row = await self._tables.create(store.ACCOUNTS, Row(account, _PASSWORD, store.fields(stored)))
         try:
-            ids = {"account": account, "space": new_id(12)}
             async with self._chain.change(account, Deed.ACCOUNT_MADE, Identity(account, name, "")) as change:
                 await change.noted()
-                await self._tables.create(store.ACCOUNTS, Row(named_partition(name), "account", ids))
+                await self._tables.create(
+                    store.ACCOUNTS, Row(named_partition(name), "account", new_name(account, name))
+                )
         except Conflict as conflict:
             await self._tables.delete(store.ACCOUNTS, row)
-            raise Problem(
-                "name-taken", 409, "The name is taken", "Somebody has this name. Choose another."
-            ) from conflict
+            raise taken from conflict
         return await self._sign_in.account(name)
 
     async def _refused(self, account: str, whence: From, code: str) -> None:

@@ -16,7 +16,7 @@ from function_app.domain.actions import REPEAT_MS, Action, Status, end, give_tur
 from function_app.domain.devices import Device
 from function_app.domain.lease import Lease
 from function_app.domain.problems import Problem
-from function_app.domain.queue import DROPPED, UNPAIRED, UNSHARED, Queue
+from function_app.domain.queue import DROPPED, Queue
 from function_app.ports.clock import Clock
 from function_app.ports.command_bus import BusUnavailable
 from function_app.ports.tables import Row, Tables, Write
@@ -26,7 +26,7 @@ from function_app.services.audit import Audit, lease_change
 from function_app.services.control import heed_device, read_control, read_control_rows
 from function_app.services.devices import Devices
 from function_app.services.pending import Pending
-from function_app.services.send_action import MovementChanged, NotShared, SendAction
+from function_app.services.send_action import MovementChanged, NoLonger, SendAction
 
 LOOK_MS: Final = 2_000
 """A queue is looked at so often, for the case that whoever freed the slot was killed before it saw to the queue."""
@@ -157,11 +157,11 @@ class Queues:
         if now_ms >= action.queued_until_ms:
             await self._refuse(found, Status.EXPIRED, "queue-timeout", TIMEOUT)
             return True
-        who = Identity(action.account, action.who, action.session)
-        device, _ = await self._devices.find(who, action.device)
-        if device is None or device.pairing != action.pairing or not device.role.may_operate:
-            paired = await self._sending.device(action) is not None
-            await self._refuse(found, *_reason(UNSHARED if paired else UNPAIRED))
+        try:
+            who, device = await self._sending.standing(action)
+        except NoLonger as ended:
+            status, message = DROPPED[ended.why]
+            await self._refuse(found, status, ended.why, message)
             return True
         try:
             started = await self._start(found, device, who)
@@ -177,8 +177,8 @@ class Queues:
             await self._sending.send(started, device)
         except MovementChanged:
             _log.warning("action %s: its script is gone; the timer ends it", action.id)
-        except NotShared:
-            _log.warning("action %s: the device is shared no longer; the timer ends it", action.id)
+        except NoLonger as ended:
+            _log.warning("action %s: %s; the timer ends it", action.id, ended.why)
         return False
 
     async def _start(self, found: Found, device: Device, who: Identity) -> Found | None:
@@ -245,11 +245,6 @@ def run_lease(
     if lease is not None and lease.live(now_ms) and lease.mine(who):
         return lease
     return rules.take(lease, who, lease_ms=lease_ms, now_ms=now_ms, pairing=pairing, action=action)
-
-
-def _reason(code: str) -> tuple[Status, str, str]:
-    status, message = DROPPED[code]
-    return status, code, message
 
 
 def _if_queued(action: Action, status: Status, code: str, message: str, now_ms: int) -> Action:

@@ -18,6 +18,10 @@ VERSIONS = "version:"
 CHECKS = "checks"
 LOOKS = "looks"
 INDEX = "type:"
+LOOKED = "looked.json"
+"""Beside a version's files: what its checker has found (``Looked``). No uploaded file has such a name."""
+TRIALS = "type-look:"
+_TRIAL = "~"
 
 
 @dataclass(frozen=True, slots=True)
@@ -26,6 +30,11 @@ class Place:
 
     account: str
     type: str
+
+    @property
+    def trial(self) -> bool:
+        """Whether it is a look at an upload that is not saved: no robot type has such an id."""
+        return self.type.startswith(_TRIAL)
 
     @property
     def partition(self) -> str:
@@ -40,6 +49,16 @@ class Place:
 def place(who: Identity, robot_type: str) -> Place | None:
     """Where the type is, or ``None`` where the text cannot be one."""
     return Place(who.account, robot_type) if ID.match(robot_type) else None
+
+
+def trial_place(who: Identity, look: str) -> Place | None:
+    """Where a look at an upload is: like a robot type, where nobody finds it who asks for robot types."""
+    return Place(who.account, _TRIAL + look) if ID.match(look) else None
+
+
+def trial_index(where: Place) -> str:
+    """Of the row that lists a look for its account."""
+    return TRIALS + where.type.removeprefix(_TRIAL)
 
 
 def version_key(version: int) -> str:

@@ -9,6 +9,7 @@ from typing import Any
 
 import msgspec
 
+from device_agent.protocol.messages import Twin
 from device_agent.protocol.robot_type import RobotType
 from function_app.domain.accounts import Identity
 from function_app.domain.ids import ID
@@ -16,9 +17,10 @@ from function_app.domain.problems import Problem, invalid, not_found
 from function_app.domain.robot_types import TypeHead, TypeVersion
 from function_app.ports.blobs import Blobs
 from function_app.ports.catalogue import Catalogue
+from function_app.ports.model_compiler import Looked
 from function_app.ports.tables import Tables
 from function_app.services import store
-from function_app.services.robot_type_rows import INDEX, Place, place, read_head, read_version
+from function_app.services.robot_type_rows import INDEX, LOOKED, Place, place, read_head, read_version
 from function_app.services.seals import Seals, require_whole
 
 _ZIP_TIME = (1980, 1, 1, 0, 0, 0)
@@ -46,6 +48,15 @@ class KnownType:
     def built_in(self) -> bool:
         """Whether it comes with the installation."""
         return self.upload is None
+
+
+@dataclass(frozen=True, slots=True)
+class Model:
+    """The model of a robot type as a page can draw it, and what is in it."""
+
+    twin: Twin
+    actuators: tuple[str, ...]
+    cameras: tuple[str, ...]
 
 
 class RobotTypes:
@@ -125,6 +136,36 @@ class RobotTypes:
             raise not_found("file", name)
         return content
 
+    async def model(self, who: Identity, robot_type: str) -> Model:
+        """The drawing of the version in use.
+
+        Raises:
+            Problem: ``robot-type-unknown``, ``robot-type-not-ready``, ``model-unknown``: it cannot be drawn, or was
+                checked before checkers drew.
+        """
+        if robot_type in await self._catalogue.types():
+            drawing = await self._catalogue.drawing(robot_type)
+            if drawing is None:
+                raise not_found("model", robot_type)
+            return _model(robot_type, msgspec.json.decode(drawing, type=Looked))
+        await self.get(who, robot_type)
+        where, head = await self._head(who, robot_type)
+        _, version = await read_version(self._tables, where, head.ready)
+        if version is None:
+            raise not_found("model", robot_type)
+        return await self.checked_model(where, version)
+
+    async def checked_model(self, where: Place, version: TypeVersion) -> Model:
+        """What a checker has drawn.
+
+        Raises:
+            Problem: ``model-unknown``.
+        """
+        content = await self._blobs.get(where.prefix(version.version) + LOOKED)
+        if content is None:
+            raise not_found("model", version.manifest["type"])
+        return _model(version.manifest["type"], msgspec.json.decode(content, type=Looked))
+
     async def archive(self, who: Identity, robot_type: str) -> bytes:
         """All files of the version in use as a zip, in a folder of the type's name.
 
@@ -163,6 +204,12 @@ class RobotTypes:
         if where is None or head is None or head.deleted:
             raise not_found("robot-type", robot_type)
         return where, head
+
+
+def _model(robot_type: str, looked: Looked) -> Model:
+    if looked.twin is None:
+        raise not_found("model", robot_type)
+    return Model(looked.twin, looked.actuators, looked.cameras)
 
 
 def _zip(files: Mapping[str, bytes]) -> bytes:

@@ -5,9 +5,10 @@ import msgspec
 from device_agent.protocol.messages import RunMovement, Task
 from function_app.domain.accounts import Identity
 from function_app.domain.actions import Action, mark_published
+from function_app.domain.api_keys import key_of
 from function_app.domain.devices import Agent, Device
 from function_app.domain.ids import split_command, split_device
-from function_app.domain.problems import Problem
+from function_app.domain.queue import DROPPED, KEY_ENDED, SIGNED_OUT, UNPAIRED, UNSHARED
 from function_app.ports.clock import Clock
 from function_app.ports.tables import Tables
 from function_app.services import store
@@ -21,8 +22,12 @@ class MovementChanged(Exception):  # noqa: N818 (an outcome that callers expect)
     """The script that the action pinned is gone."""
 
 
-class NotShared(Exception):  # noqa: N818 (an outcome that callers expect)
-    """Who started the action may not operate its device any more."""
+class NoLonger(Exception):  # noqa: N818 (an outcome that callers expect)
+    """Who started the action may not have it carried out any more; ``why`` is one of ``DROPPED``."""
+
+    def __init__(self, why: str) -> None:
+        super().__init__(DROPPED[why][1])
+        self.why = why
 
 
 class SendAction:
@@ -56,19 +61,33 @@ class SendAction:
             return None
         return next((device for device in devices_of(agent) if device.id == action.device), None)
 
+    async def standing(self, action: Action) -> tuple[Identity, Device]:
+        """For whom the action would begin now, and on what. It is looked up anew: it may have waited for long.
+
+        Raises:
+            NoLonger: The device is another's or gone, the share has ended or is a viewer's, its key has ended or
+                may do less, or whoever started it has signed out.
+        """
+        who = await self._devices.acting(Identity(action.account, action.who, action.session))
+        device, _ = (None, None) if who is None else await self._devices.find(who, action.device)
+        if who is not None and device is not None and device.pairing == action.pairing and device.role.may_operate:
+            return who, device
+        if await self.device(action) is None:
+            raise NoLonger(UNPAIRED)
+        if key_of(action.session):
+            raise NoLonger(KEY_ENDED)
+        raise NoLonger(SIGNED_OUT if who is None else UNSHARED)
+
     async def send(self, found: Found, device: Device) -> None:
         """Publish it and write that down.
 
         Raises:
             MovementChanged: There is nothing to send.
-            NotShared: Who started it may not operate the device any more.
+            NoLonger: Who started it may not have it carried out any more.
             BusUnavailable: The broker did not confirm it.
         """
         action = found.action
-        try:
-            await self._devices.require_still(Identity(action.account, action.who, action.session), device)
-        except Problem as problem:
-            raise NotShared from problem
+        await self.standing(action)
         signed = await self._commands.signed(
             device,
             action.id,

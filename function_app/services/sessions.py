@@ -83,7 +83,7 @@ class Sessions:
         begun = Session(new_session(), how, now_ms, ends_ms, address=whence.address, program=whence.program[:_SHOWN])
         row = Row(account.id, _ROW + begun.id, store.fields(begun))
         await self._forget.row(store.ACCOUNTS, row.partition, row.key, due_ms=ends_ms)
-        who = Identity(account.id, account.name, begun.id)
+        who = Identity(account.id, account.name, begun.id, until_ms=ends_ms)
         async with self._chain.change(account.id, Deed.SIGNED_IN, who, how=how, address=whence.address) as change:
             await change.noted()
             await self._tables.create(store.ACCOUNTS, row)
@@ -91,14 +91,15 @@ class Sessions:
         return SignedIn(
             account=account,
             session=begun.id,
-            access_token=await self._identify.issue(account, begun.id, API, ACCESS_S),
-            cookie=await self._identify.issue(account, begun.id, SESSION, SESSION_S, csrf=csrf),
+            access_token=await self._identify.issue(who, API, ACCESS_S),
+            cookie=await self._identify.issue(who, SESSION, SESSION_S, csrf=csrf),
             csrf=csrf,
         )
 
-    async def access_token(self, who: Identity) -> str:
-        """The next access token of a session; no longer good than the first one."""
-        return await self._identify.issue(Account(who.account, who.name), who.session, API, ACCESS_S)
+    async def access_token(self, who: Identity) -> tuple[str, int]:
+        """The next access token of a session, and how long it is good [s]: not longer than the session."""
+        lifetime_s = who.lasting_s(ACCESS_S, self._clock.now_ms())
+        return await self._identify.issue(who, API, lifetime_s), lifetime_s
 
     async def list(self, account: str) -> tuple[Session, ...]:
         """The sessions of an account that have not ended, the newest first."""

@@ -12,7 +12,6 @@ from typing import Final, Literal
 from function_app.domain.accounts import Account, Identity, Role
 from function_app.domain.audit_chain import Deed
 from function_app.domain.authority import Fact
-from function_app.domain.devices import NEVER_MS
 from function_app.domain.problems import Problem, forbidden, invalid, not_found
 from function_app.domain.sharing import (
     MOST_SHARES,
@@ -24,6 +23,7 @@ from function_app.domain.sharing import (
     space_target,
     split_target,
 )
+from function_app.domain.times import NEVER_MS
 from function_app.ports.clock import Clock
 from function_app.ports.tables import Conflict, Row, Tables
 from function_app.services import store
@@ -111,8 +111,12 @@ class Sharing:
 
     async def put(
         self, who: Identity, shared: Shared, account: Account, role: Role, for_s: int | None
-    ) -> tuple[Share, bool]:
-        """Share it with an account, or change that; and whether it is new.
+    ) -> tuple[Share, bool, bool]:
+        """Share it with an account, or change that.
+
+        Returns:
+            The share, whether it is new, and whether everybody has been told of what was taken away, if anything was;
+            else the timer tells them.
 
         Raises:
             Problem: ``invalid``, ``too-many-shares``, ``busy``.
@@ -126,8 +130,8 @@ class Sharing:
         share = self._share(shared, account.id, role, who.name, expires_ms)
         return (await self._write(who, shared, account, share, keep_more=True))[0]
 
-    async def end(self, who: Identity, shared: Shared, account: str) -> None:
-        """Un-share.
+    async def end(self, who: Identity, shared: Shared, account: str) -> bool:
+        """Un-share; whether everybody has been told. Else the timer tells them as soon as the broker answers.
 
         Raises:
             Problem: ``share-unknown``, ``busy``.
@@ -135,7 +139,7 @@ class Sharing:
         row = await self._tables.get(store.SHARES, shared.on, share_key(account))
         if row is None or not _holds(store.read(row, Share), shared, self._clock.now_ms()):
             raise not_found("share", account)
-        await self._end(who, row)
+        return await self._end(who, row)
 
     async def end_all(self, on: str) -> None:
         """End all shares of something that its owner has given away.
@@ -147,17 +151,19 @@ class Sharing:
         for row in page.rows:
             await self._end(None, row)
 
-    async def leave(self, who: Identity, on: str) -> None:
-        """Give one's own part in something of another's back.
+    async def leave(self, who: Identity, on: str) -> bool:
+        """Give one's own part in something of another's back; whether everybody has been told, as ``end``.
 
         Raises:
-            Problem: ``share-unknown``, ``forbidden``, ``busy``.
+            Problem: ``share-unknown``, ``already-yours``, ``forbidden``, ``busy``.
         """
         require_person(who)
         row = await self._tables.get(store.SHARES, on, share_key(who.account))
+        if row is None and await self._owns(who, on):
+            raise yours("It is this account's own, which has no share in it. To be rid of it, transfer or un-pair it.")
         if row is None:
             raise not_found("share", who.account)
-        await self._end(who, row)
+        return await self._end(who, row)
 
     async def person(self, name: str) -> Account:
         """The account of this name.
@@ -167,14 +173,22 @@ class Sharing:
         """
         found = await self._sign_in.known(name)
         if found is None:
-            raise not_found("account", name)
+            detail = f"There is no account '{name[:80]}'. Ask for the name they sign in with, or make an invitation."
+            raise Problem("account-unknown", 404, "No such account", detail)
         return found
+
+    async def _owns(self, who: Identity, on: str) -> bool:
+        kind, name = split_target(on)
+        if kind == "space":
+            return name in {space.id for space in await self._sign_in.spaces(who.account)}
+        device, _ = await self._devices.find(who, name)
+        return device is not None and device.owner == who.account
 
     # ------------------------------------------------------------ writing
 
     def _share(self, shared: Shared, account: str, role: Role, by: str, expires_ms: int) -> Share:
         if account == shared.owner.id:
-            raise invalid("It is this account's own: there is nothing to share with it.")
+            raise invalid("It is this account's own: there is nothing to share with it. To give it away, transfer it.")
         return Share(
             on=shared.on,
             account=account,
@@ -188,7 +202,7 @@ class Sharing:
 
     async def _write(
         self, who: Identity, shared: Shared, account: Account, share: Share, *, keep_more: bool
-    ) -> tuple[Share, bool]:
+    ) -> tuple[Share, bool, bool]:
         note = await self._pending.note(_note(_CHANGED, share), self._clock.now_ms() + LOOK_MS)
         if share.expires_ms < NEVER_MS:
             await self._pending.note(_note(_EXPIRES, share), share.expires_ms)
@@ -213,15 +227,13 @@ class Sharing:
                 await self._tables.replace(store.SHARES, replace(row, data=store.fields(share)))
             return share, before is None
 
-        terms = {"with": account.id, "role": share.role.value, "expires_ms": share.expires_ms}
+        terms = {"with": account.id, "name": account.name, "role": share.role.value, "expires_ms": share.expires_ms}
         async with self._chain.change(share.owner, Deed.SHARED, who, on=share.on, **terms) as change:
             written, fresh = await store.retry(once)
         if written is share:
             message = f"{who.name} shared it with {account.name} as {share.role}."
             await self._tell(share, Fact.SHARED, message, by=who.name, account=account.id, role=share.role.value)
-        if not lowered or await self._unshare.settle(share):
-            await self._drop(note)
-        return written, fresh
+        return written, fresh, not lowered or await self._settle(share, note)
 
     async def _check_room(self, on: str) -> None:
         page = await self._tables.query(store.SHARES, on, first="account:", last="account;", limit=MOST_SHARES)
@@ -231,11 +243,12 @@ class Sharing:
             detail = f"It is shared with {MOST_SHARES} accounts, the most there can be. End one of these shares."
             raise Problem("too-many-shares", 409, "Too many shares", detail)
 
-    async def _end(self, who: Identity | None, row: Row) -> None:
-        """Delete the share's row, which decides, and end what was done under it."""
+    async def _end(self, who: Identity | None, row: Row) -> bool:
+        """Delete the share's row, which decides, and end what was done under it; whether everybody has been told."""
         share = store.read(row, Share)
         note = await self._pending.note(_note(_CHANGED, share), self._clock.now_ms() + LOOK_MS)
-        on = {"on": share.on, "with": share.account}
+        name = await self._sign_in.named(share.account)
+        on = {"on": share.on, "with": share.account, "name": name}
         async with self._chain.change(share.owner, Deed.UNSHARED, who, **on) as change:
             await change.noted()
             try:
@@ -246,26 +259,30 @@ class Sharing:
             fresh = await self._tables.get(store.SHARES, row.partition, row.key)
             # What time has ended, and somebody has shared anew at that moment, goes on.
             if fresh is not None and (who is not None or not store.read(fresh, Share).live(self._clock.now_ms())):
-                await self._end(who, fresh)
-            return
-        if await self._unshare.settle(share):
-            await self._drop(note)
-        name = await self._sign_in.named(share.account)
+                return await self._end(who, fresh)
+            return True
+        done = await self._settle(share, note)
         if who is None:
             await self._tell(share, Fact.UNSHARED, f"{name}'s share is over.", account=share.account)
         else:
             message = f"{who.name} ended {name}'s share."
             await self._tell(share, Fact.UNSHARED, message, by=who.name, account=share.account)
+        return done
+
+    async def _settle(self, share: Share, note: Row | None) -> bool:
+        """End what is over the role that is left; what could not be told the timer tells soon, until it is."""
+        done = await self._unshare.settle(share)
+        if not done:
+            await self._pending.note(_note(_CHANGED, share), self._clock.now_ms() + AGAIN_MS)
+        if note is not None:
+            await self._pending.drop(note)
+        return done
 
     async def _tell(self, share: Share, fact: Fact, message: str, **data: str) -> None:
         kind, name = split_target(share.on)
         device = await self._devices.owned(name) if kind == "device" else None
         if device is not None and device.pairing == share.pairing:
             await self._audit.event(device, fact, message, **data)
-
-    async def _drop(self, note: Row | None) -> None:
-        if note is not None:
-            await self._pending.drop(note)
 
     async def look(self, what: str, note: Row) -> None:
         """The timer's look at a share that was changed, or whose time may be over."""
@@ -290,6 +307,11 @@ def require_person(who: Identity) -> None:
     """
     if who.key:
         raise forbidden("An API key shares nothing, gives nothing away and takes nothing. Sign in for that.")
+
+
+def yours(detail: str) -> Problem:
+    """The refusal of what nobody can do with what is their own."""
+    return Problem("already-yours", 409, "It is yours", detail)
 
 
 def about_share(note: str) -> bool:

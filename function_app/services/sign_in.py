@@ -2,7 +2,7 @@
 
 import hashlib
 
-from function_app.domain.accounts import Account, Identity, Space
+from function_app.domain.accounts import Account, Identity, Space, folded
 from function_app.domain.audit_chain import CLOUD, Deed
 from function_app.domain.ids import new_id
 from function_app.domain.problems import Problem, unauthorized
@@ -15,6 +15,7 @@ from function_app.services.sessions import From, Sessions, SignedIn
 
 LINK_MS = 24 * 3600 * 1000
 FIRST_SPACE = "Home"
+_NAME = "name:"
 MOST_SPACES = 100
 """More or less: two that are made at once may both be the last."""
 
@@ -29,16 +30,16 @@ class SignIn:
         self._clock = clock
 
     async def account(self, name: str) -> Account:
-        """The local account of this name, made with its first space when there is none."""
-        return await self._account(named_partition(name), name)
+        """The local account of this name, made with its first space when there is none. It keeps its first spelling."""
+        row = await self._named(name)
+        return await self._account(row.partition if row else named_partition(name), name, keep=True)
 
     async def account_elsewhere(self, issuer: str, subject: str, name: str) -> Account:
         """The account of somebody who signs in elsewhere: by who says so and who they are there, never by a name.
 
         Names and e-mail addresses are given away again, and not every provider looks whose they are.
         """
-        digest = hashlib.sha256(f"{issuer}\n{subject}".encode()).hexdigest()
-        account = await self._account(f"open-id:{digest}", name)
+        account = await self._account(_elsewhere(issuer, subject), name, keep=False)
         await store.upsert(
             self._tables,
             store.ACCOUNTS,
@@ -49,16 +50,26 @@ class SignIn:
         )
         return account
 
-    async def _account(self, partition: str, name: str) -> Account:
-        """Written so that a stop after any step leaves something the next call completes."""
+    async def is_known_elsewhere(self, issuer: str, subject: str) -> bool:
+        """Whether somebody who signs in elsewhere has an account here."""
+        return await self._tables.get(store.ACCOUNTS, _elsewhere(issuer, subject), "account") is not None
+
+    async def _account(self, partition: str, name: str, *, keep: bool) -> Account:
+        """Written so that a stop after any step leaves something the next call completes.
+
+        Args:
+            partition: Where it is written which account it is.
+            name: What it is called.
+            keep: It goes on being called what it was.
+        """
         row = await self._tables.get(store.ACCOUNTS, partition, "account")
         if row is None:
-            ids = {"account": new_id(12), "space": new_id(12)}
+            ids = new_name(new_id(12), name)
             try:
                 row = await self._tables.create(store.ACCOUNTS, Row(partition, "account", ids))
             except Conflict:
-                return await self._account(partition, name)
-        account = Account(id=str(row.data["account"]), name=name)
+                return await self._account(partition, name, keep=keep)
+        account = _of(row, name) if keep else Account(id=str(row.data["account"]), name=name)
         spaces = await self.spaces(account.id)
         if not spaces:
             space = Space(id=str(row.data["space"]), name=FIRST_SPACE)
@@ -88,9 +99,9 @@ class SignIn:
         return space
 
     async def known(self, name: str) -> Account | None:
-        """The account of this name, if there is one."""
-        row = await self._tables.get(store.ACCOUNTS, f"name:{name}", "account")
-        return Account(id=str(row.data["account"]), name=name) if row else None
+        """The local account of this name, in whatever spelling; under the one that it was made with."""
+        row = await self._named(name)
+        return _of(row, name) if row else None
 
     async def named(self, account: str) -> str:
         """The name of an account; empty when it is gone."""
@@ -127,6 +138,14 @@ class SignIn:
         account = Account(id=row.data["account"], name=row.data["name"])
         return await self._sessions.begin(account, "link", whence or From())
 
+    async def _named(self, name: str) -> Row | None:
+        """Rows from before names were folded are under their own spelling: by that they are found, and first."""
+        for partition in dict.fromkeys((f"{_NAME}{name}", named_partition(name))):
+            row = await self._tables.get(store.ACCOUNTS, partition, "account")
+            if row is not None:
+                return row
+        return None
+
     async def _create(self, row: Row) -> None:
         try:
             await self._tables.create(store.ACCOUNTS, row)
@@ -136,7 +155,22 @@ class SignIn:
 
 def named_partition(name: str) -> str:
     """Where it is written which local account has a name."""
-    return f"name:{name}"
+    return f"{_NAME}{folded(name)}"
+
+
+def new_name(account: str, name: str) -> dict[str, str]:
+    """What is written there of a new account."""
+    return {"account": account, "space": new_id(12), "name": name}
+
+
+def _of(row: Row, name: str) -> Account:
+    """The account that a name leads to. Where the row does not say how it is spelt, it was found by its spelling."""
+    return Account(id=str(row.data["account"]), name=str(row.data.get("name", name)))
+
+
+def _elsewhere(issuer: str, subject: str) -> str:
+    digest = hashlib.sha256(f"{issuer}\n{subject}".encode()).hexdigest()
+    return f"open-id:{digest}"
 
 
 def _hash(token: str) -> str:

@@ -17,7 +17,7 @@ from function_app.domain.devices import Device, Link
 from function_app.domain.ids import command_id
 from function_app.domain.lease import Lease
 from function_app.domain.problems import Problem, busy_store, invalid
-from function_app.domain.queue import DROPPED, UNSHARED
+from function_app.domain.queue import DROPPED, KEY_ENDED, UNSHARED
 from function_app.ports.clock import Clock
 from function_app.ports.command_bus import BusUnavailable
 from function_app.ports.tables import Row, Tables, Write
@@ -206,7 +206,7 @@ class StartAction:
         return _Begun(found, acks, published=True)
 
     async def _require_still(self, who: Identity, device: Device, found: Found) -> None:
-        """End an action of somebody with whom the device was un-shared while it was written.
+        """End an action of somebody with whom the device was un-shared, or whose key was ended, while it was written.
 
         Raises:
             Problem: ``device-unknown``, ``forbidden``.
@@ -214,10 +214,11 @@ class StartAction:
         try:
             await self._devices.require_still(who, device)
         except Problem:
-            status, message = DROPPED[UNSHARED]
+            why = KEY_ENDED if who.key else UNSHARED
+            status, message = DROPPED[why]
             now_ms = self._clock.now_ms()
             await self._queues.change(
-                found.action.id, lambda known: end(known, status, UNSHARED, message, now_ms), known=found
+                found.action.id, lambda known: end(known, status, why, message, now_ms), known=found
             )
             raise
 

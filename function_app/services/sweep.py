@@ -9,13 +9,14 @@ from device_agent.protocol.messages import CancelAction
 from function_app.domain.actions import Action, Status, Verdict, end, judge, next_look_ms
 from function_app.domain.ids import CLAIM_ALPHABET
 from function_app.domain.problems import Problem
-from function_app.domain.queue import DROPPED, UNSHARED
+from function_app.domain.queue import DROPPED
 from function_app.ports.broker_access import BrokerAccess, BrokerAccessError
 from function_app.ports.clock import Clock
 from function_app.ports.command_bus import BusUnavailable
 from function_app.ports.tables import Conflict, Row, Tables
 from function_app.services import store
 from function_app.services.action_rows import ActionRows, Found, place
+from function_app.services.api_keys import ApiKeys, about_key
 from function_app.services.audit import Audit, lease_of
 from function_app.services.audit_chain import AuditChain, anchor_of, chain_of
 from function_app.services.commands import Commands
@@ -26,7 +27,7 @@ from function_app.services.invitations import Invitations, about_transfer
 from function_app.services.leave import Leave, leaver_of
 from function_app.services.pending import SHARDS, Pending
 from function_app.services.queue import TIMEOUT, Queues, queue_of
-from function_app.services.send_action import MovementChanged, NotShared, SendAction
+from function_app.services.send_action import MovementChanged, NoLonger, SendAction
 from function_app.services.sharing import Sharing, about_share
 from function_app.services.start_action import ABANDON_MS
 from function_app.services.tend_robot_types import TendRobotTypes
@@ -57,6 +58,7 @@ class Sweep:
         leave: Leave,
         sharing: Sharing,
         invitations: Invitations,
+        api_keys: ApiKeys,
         audit: Audit,
         chain: AuditChain,
         access: BrokerAccess,
@@ -77,6 +79,7 @@ class Sweep:
         self._leave = leave
         self._sharing = sharing
         self._invitations = invitations
+        self._api_keys = api_keys
         self._audit = audit
         self._chain = chain
         self._access = access
@@ -122,6 +125,8 @@ class Sweep:
             await self._look_at_leaver(agent, note)
         elif about_share(what):
             await self._sharing.look(what, note)
+        elif about_key(what):
+            await self._api_keys.look(what, note)
         elif about_transfer(what):
             await self._invitations.go_on(what, note)
         elif device := lease_of(what):
@@ -223,9 +228,9 @@ class Sweep:
         except MovementChanged:
             message = "The movement's script was changed before the command could be sent. Start it again."
             await self._end(found, Status.FAILED, "movement-changed", message, now_ms)
-        except NotShared:
-            status, message = DROPPED[UNSHARED]
-            await self._end(found, status, UNSHARED, message, now_ms)
+        except NoLonger as ended:
+            status, message = DROPPED[ended.why]
+            await self._end(found, status, ended.why, message, now_ms)
 
     async def _cancel(self, action: Action) -> None:
         device = await self._sending.device(action)

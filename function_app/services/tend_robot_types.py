@@ -2,6 +2,7 @@
 
 import contextlib
 import logging
+from collections.abc import Sequence
 
 from function_app.domain.problems import Problem
 from function_app.domain.robot_types import TypeHead, TypeVersion
@@ -10,9 +11,18 @@ from function_app.ports.clock import Clock
 from function_app.ports.tables import Conflict, Row, Tables
 from function_app.services import store
 from function_app.services.forget import DAY_MS
-from function_app.services.model_checks import give_verdict
-from function_app.services.robot_type_rows import CHECKS, LOOKS, VERSIONS, Place, note_look, place_of, read_head
-from function_app.services.upload_robot_type import GIVE_UP_MS
+from function_app.services.model_checks import drop_files, give_verdict
+from function_app.services.robot_type_rows import (
+    CHECKS,
+    LOOKS,
+    VERSIONS,
+    Place,
+    note_look,
+    place_of,
+    read_head,
+    trial_index,
+)
+from function_app.services.type_versions import GIVE_UP_MS, KEEP_LOOK_MS
 
 AGAIN_MS = 30_000
 LONGEST_MS = 5 * GIVE_UP_MS
@@ -55,12 +65,41 @@ class TendRobotTypes:
     async def _look(self, where: Place) -> None:
         _, head = await read_head(self._tables, where)
         if head is None:
+            if where.trial:
+                await self._forget(where)
             return
         page = await self._tables.query(
             store.ROBOT_TYPES, where.partition, first=VERSIONS, last=VERSIONS + "\x7f", limit=1000
         )
+        if where.trial:
+            await self._look_at_trial(where, head, page.rows)
+            return
         for row in page.rows:
             await self._look_at(where, head, row)
+
+    async def _look_at_trial(self, where: Place, head: TypeHead, rows: Sequence[Row]) -> None:
+        """One version, for a while; then all of it goes, what leads to it last."""
+        now_ms = self._clock.now_ms()
+        versions = [store.read(row, TypeVersion) for row in rows]
+        if not head.deleted and any(now_ms < version.created_ms + KEEP_LOOK_MS for version in versions):
+            for version in versions:
+                if version.open:
+                    await self._judge(where, version, now_ms)
+            return
+        for row, version in zip(rows, versions, strict=True):
+            await self._drop(where, row, version)
+        last, _ = await read_head(self._tables, where)
+        if last is not None:
+            with contextlib.suppress(Conflict):
+                await self._tables.delete(store.ROBOT_TYPES, last)
+        await self._forget(where)
+
+    async def _forget(self, where: Place) -> None:
+        """Take a look off its account's list."""
+        row = await self._tables.get(store.MEMBERS, where.account, trial_index(where))
+        if row is not None:
+            with contextlib.suppress(Conflict):
+                await self._tables.delete(store.MEMBERS, row)
 
     async def _look_at(self, where: Place, head: TypeHead, row: Row) -> None:
         version = store.read(row, TypeVersion)
@@ -94,7 +133,6 @@ class TendRobotTypes:
 
     async def _drop(self, where: Place, row: Row, version: TypeVersion) -> None:
         """Files first: a row without its files is dropped again, files without a row are never found."""
-        for name in await self._blobs.list(where.prefix(version.version)):
-            await self._blobs.delete(name)
+        await drop_files(self._blobs, where, version.version)
         with contextlib.suppress(Conflict):
             await self._tables.delete(store.ROBOT_TYPES, row)

@@ -6,6 +6,9 @@ and a script may go on for minutes: the device holds, and nothing that waits beg
 
 Who acts under a share looks again after something was written (``Devices.require_still``), and here is looked after the
 share was deleted: of the two at least one sees the other. All of it is safe to repeat.
+
+What the tables decide is done in any case. The broker is waited for a moment: whoever asked is told that it did not
+answer, and the timer goes on telling it.
 """
 
 import asyncio
@@ -32,6 +35,10 @@ from function_app.services.fence import Fence
 from function_app.services.identity import watchers
 from function_app.services.queue import Queues
 
+TELL_S: Final = 1.5
+"""How long somebody who un-shares waits for the broker [s],"""
+TELL_AGAIN_S: Final = 10.0
+"""and how long the timer does."""
 INDEX: Final = "share:"
 """Begins the keys of shares in an account's partition of ``Members``."""
 
@@ -72,35 +79,37 @@ class Unshare:
         Raises:
             Problem: ``busy``.
         """
+        devices = await self._devices_on(share)
+        until_s = asyncio.get_running_loop().time() + (TELL_AGAIN_S if again else TELL_S)
         done = await asyncio.gather(
-            self._cut(share.account),
-            *(self._end_at(device, share.account, again=again) for device in await self._devices_on(share)),
+            self._cut(share.account, until_s),
+            *(self._end_at(device, share.account, until_s, again=again) for device in devices),
         )
         if await self._tables.get(store.SHARES, share.on, share_key(share.account)) is None:
             await self._unindex(share)
         return all(done)
 
-    async def _cut(self, account: str) -> bool:
+    async def _cut(self, account: str, until_s: float) -> bool:
         """End the account's watching sessions: who has lost one device watches the others with new credentials."""
         try:
-            await self._access.revoke(principal=watchers(account))
-        except BrokerAccessError as error:
-            _log.warning("sessions of %s: %s", account, error)
+            async with asyncio.timeout_at(until_s):
+                await self._access.revoke(principal=watchers(account))
+        except (BrokerAccessError, TimeoutError) as error:
+            _log.warning("sessions of %s: %s", account, str(error) or "the broker did not answer in time")
             return False
         return True
 
-    async def _end_at(self, device: Device, account: str, *, again: bool) -> bool:
+    async def _end_at(self, device: Device, account: str, until_s: float, *, again: bool) -> bool:
         who = Identity(account, "", "")
         found, _ = await self._devices.find(who, device.id)
         if found is not None and found.role.may_operate:
             return True
-        done = await self._fence.end(device, UNSHARED, account=account)
+        done = await self._fence.end(device, UNSHARED, account=account, until_s=until_s)
         if again:
-            done = await self._fence.repeat(device) and done
-        await self._end_actions(device, account)
-        return done
+            done = await self._fence.repeat(device, account, until_s=until_s) and done
+        return await self._end_actions(device, account, until_s) and done
 
-    async def _end_actions(self, device: Device, account: str) -> None:
+    async def _end_actions(self, device: Device, account: str, until_s: float) -> bool:
         control = await read_control_rows(self._tables, device.id)
         waiting = []
         for action in control.queue.actions:
@@ -111,17 +120,19 @@ class Unshare:
             await self._queues.drop(device.id, waiting, UNSHARED)
         found = await self._rows.get(control.action) if control.action else None
         if found is None or found.action.account != account or found.action.pairing != device.pairing:
-            return
-        epoch = control.lease.epoch if control.lease else 0
-        try:
-            await self._commands.send(
-                device, CancelAction(action=found.action.id), who="telescope", epoch=max(epoch, found.action.epoch)
-            )
-        except BusUnavailable as error:
-            _log.warning("end of action %s: %s", found.action.id, error)
+            return True
+        # Written before it is told. Where this is not heard, the lease's release is told until it is: it holds, too.
         status, message = DROPPED[UNSHARED]
         now_ms = self._clock.now_ms()
         await self._queues.change(found.action.id, lambda known: end(known, status, UNSHARED, message, now_ms))
+        epoch = max(control.lease.epoch if control.lease else 0, found.action.epoch)
+        try:
+            async with asyncio.timeout_at(until_s):
+                await self._commands.send(device, CancelAction(action=found.action.id), who="telescope", epoch=epoch)
+        except (BusUnavailable, TimeoutError) as error:
+            _log.warning("end of action %s: %s", found.action.id, str(error) or "the broker did not answer in time")
+            return False
+        return True
 
     async def _devices_on(self, share: Share) -> list[Device]:
         kind, name = split_target(share.on)

@@ -1,17 +1,14 @@
 """Adding a robot type: stored first, then compiled by a checker somewhere, then in use."""
 
-import asyncio
 import contextlib
-import time
 from collections.abc import Mapping
 
 import msgspec
 
 from function_app.domain.accounts import Identity
 from function_app.domain.audit_chain import Deed
-from function_app.domain.problems import Problem, busy_store, invalid
+from function_app.domain.problems import Problem
 from function_app.domain.robot_types import TypeHead, TypeVersion, next_version
-from function_app.ports.blobs import Blobs
 from function_app.ports.catalogue import Catalogue
 from function_app.ports.clock import Clock
 from function_app.ports.tables import Conflict, Row, Tables, Write
@@ -19,7 +16,6 @@ from function_app.services import store
 from function_app.services.audit_chain import AuditChain, Change
 from function_app.services.model_files import Upload, read_upload
 from function_app.services.robot_type_rows import (
-    CHECKS,
     HEAD,
     INDEX,
     Place,
@@ -30,12 +26,10 @@ from function_app.services.robot_type_rows import (
 )
 from function_app.services.robot_types import KnownType, RobotTypes
 from function_app.services.seals import Seals
+from function_app.services.type_versions import GIVE_UP_MS, TypeVersions, refused
 
 MAX_OWN = 100
 """Robot types an account may have."""
-GIVE_UP_MS = 120_000
-"""From then on an upload without a verdict is refused."""
-_LOOK_S = 0.1
 
 
 class UploadRobotType:
@@ -45,7 +39,7 @@ class UploadRobotType:
         self,
         *,
         tables: Tables,
-        blobs: Blobs,
+        versions: TypeVersions,
         catalogue: Catalogue,
         robot_types: RobotTypes,
         seals: Seals,
@@ -53,7 +47,7 @@ class UploadRobotType:
         clock: Clock,
     ) -> None:
         self._tables = tables
-        self._blobs = blobs
+        self._versions = versions
         self._catalogue = catalogue
         self._types = robot_types
         self._seals = seals
@@ -72,20 +66,19 @@ class UploadRobotType:
             Problem: ``manifest-invalid``, ``robot-type-invalid``, ``robot-type-built-in``, ``robot-types-full``,
                 ``robot-type-checking``, ``robot-type-refused`` with ``errors``.
         """
-        given = read_upload(manifest, files)
+        return await self.add(who, read_upload(manifest, files), wait_ms=wait_ms)
+
+    async def add(self, who: Identity, given: Upload, *, wait_ms: int) -> tuple[KnownType, bool]:
+        """As ``upload``, of files that have been read."""
         where = Place(who.account, given.robot_type.type)
-        if where.type in await self._catalogue.types():
-            detail = f"'{where.type}' comes with the installation. Give your robot type another id."
-            raise Problem("robot-type-built-in", 409, "Built-in", detail)
+        await require_own(self._catalogue, where.type)
         await note_look(self._tables, where, self._clock.now_ms() + GIVE_UP_MS)
         await self._index(where)
         async with self._chain.change(who.account, Deed.ROBOT_TYPE_UPLOADED, who, on=where.type) as change:
             version, new = await self._number(where, given, change)
         await self._index(where)
-        for name, content in given.files.items():
-            await self._blobs.put(where.prefix(version) + name, content)
-        await self._ask_for_check(where, version)
-        done = await self._verdict(where, version, wait_ms)
+        await self._versions.store(where, version, given.files)
+        done = await self._versions.verdict(where, version, wait_ms)
         if done is not None and done.state == "refused":
             raise refused(done)
         return await self._types.view(who, where.type), new
@@ -134,33 +127,13 @@ class UploadRobotType:
             detail = f"Version {newest.version} of '{where.type}' is still being checked. Wait for its verdict."
             raise Problem("robot-type-checking", 409, "Still being checked", detail)
 
-    async def _ask_for_check(self, where: Place, version: int) -> None:
-        row, upload = await read_version(self._tables, where, version)
-        there = False
-        if row is not None and upload is not None and upload.state == "uploading":
-            data = {**row.data, "state": "checking"}
-            with contextlib.suppress(Conflict):
-                await self._tables.replace(store.ROBOT_TYPES, Row(row.partition, row.key, data, row.etag))
-                there = True
-        if not there:
-            # It took so long that the timer gave it up, or the type was deleted: nobody needs the files.
-            for name in await self._blobs.list(where.prefix(version)):
-                await self._blobs.delete(name)
-            raise busy_store()
-        key = f"{self._clock.now_ms():013d}:{where.partition}:{version}"
-        await self._tables.create(store.MODEL_CHECKS, Row(CHECKS, key, {"version": version, "until_ms": 0, "tries": 0}))
 
-    async def _verdict(self, where: Place, version: int, wait_ms: int) -> TypeVersion | None:
-        end_s = time.monotonic() + wait_ms / 1000
-        while True:
-            _, upload = await read_version(self._tables, where, version)
-            left_s = end_s - time.monotonic()
-            if upload is None or not upload.open or left_s <= 0:
-                return upload
-            await asyncio.sleep(min(_LOOK_S, left_s))
+async def require_own(catalogue: Catalogue, robot_type: str) -> None:
+    """An id that an account's own robot type may have.
 
-
-def refused(upload: TypeVersion) -> Problem:
-    """The refusal with all that is wrong."""
-    detail = " ".join(upload.errors) or "The model was refused."
-    return invalid(detail, code="robot-type-refused", errors=list(upload.errors), version=upload.version)
+    Raises:
+        Problem: ``robot-type-built-in``.
+    """
+    if robot_type in await catalogue.types():
+        detail = f"'{robot_type}' comes with the installation. Give your robot type another id."
+        raise Problem("robot-type-built-in", 409, "Built-in", detail)

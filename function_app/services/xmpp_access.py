@@ -12,7 +12,7 @@ import jwt
 
 from device_agent.protocol import jids, signing
 from device_agent.protocol.topics import is_id
-from function_app.domain.accounts import Account, Identity
+from function_app.domain.accounts import Identity
 from function_app.domain.devices import Agent
 from function_app.domain.ids import AGENT_LENGTH, new_id
 from function_app.domain.problems import Problem, unauthorized
@@ -110,8 +110,10 @@ class XmppAccess:
             Problem: ``xmpp-unavailable``.
         """
         self._require()
-        token = await self._identify.issue(Account(who.account, who.name), who.session, XMPP, SESSION_S)
-        return Password(who.account, token, self._clock.now_ms() + SESSION_S * 1000, SESSION_S)
+        now_ms = self._clock.now_ms()
+        lifetime_s = who.lasting_s(SESSION_S, now_ms)
+        token = await self._identify.issue(who, XMPP, lifetime_s)
+        return Password(who.account, token, now_ms + lifetime_s * 1000, lifetime_s)
 
     async def cloud(self) -> Password:
         """For the program that speaks for the cloud.
@@ -160,7 +162,8 @@ class XmppAccess:
             agents, cursor = await self._devices.agents(who, cursor=cursor, limit=_PAGE)
             contacts += [Contact(agent.id, agent.name) for agent in agents if agent.transport == "xmpp"]
             if cursor is None:
-                return Admitted(user, who.name, "account", LOGIN_S, tuple(contacts))
+                left_s = who.lasting_s(LOGIN_S, self._clock.now_ms())
+                return Admitted(user, who.name, "account", left_s, tuple(contacts))
 
     def _require(self) -> None:
         if not self._domain:
