@@ -4,13 +4,11 @@ As long as there are services: each is made here once, with all that it is given
 """
 
 from dataclasses import dataclass
-from typing import Any
 
 from function_app import choices
 from function_app.adapters.local.blobs import FileBlobs
 from function_app.adapters.local.catalogue import FolderCatalogue
 from function_app.adapters.local.clock import SystemClock
-from function_app.adapters.local.feed import MqttFeed, MqttLate, MqttTelemetry
 from function_app.adapters.local.model_compiler import MujocoCompiler
 from function_app.adapters.local.orders import MqttOrders
 from function_app.adapters.local.password_hashes import Argon2Hashes
@@ -57,6 +55,7 @@ from function_app.services.lease import Leases
 from function_app.services.lease_rows import LeaseRows
 from function_app.services.leave import Leave
 from function_app.services.limits import Limits
+from function_app.services.look_at_robot_type import LookAtRobotType
 from function_app.services.mailbox import Mailbox
 from function_app.services.model_checks import ModelChecks
 from function_app.services.movements import Movements
@@ -68,6 +67,7 @@ from function_app.services.polling import Polling
 from function_app.services.presence import PresenceIngest
 from function_app.services.queue import Queues
 from function_app.services.relay import Relay
+from function_app.services.rename import Rename
 from function_app.services.robot_types import RobotTypes
 from function_app.services.seals import Seals
 from function_app.services.send_action import SendAction
@@ -84,10 +84,12 @@ from function_app.services.sweep import Sweep
 from function_app.services.tell_keys import TellKeys
 from function_app.services.tend_robot_types import TendRobotTypes
 from function_app.services.transfer import Transfer
+from function_app.services.type_versions import TypeVersions
 from function_app.services.unpair import Unpair
 from function_app.services.unshare import Unshare
 from function_app.services.upload_robot_type import UploadRobotType
 from function_app.services.uploads import Uploads
+from function_app.services.watchers import Watchers
 from function_app.services.xmpp_access import XmppAccess
 from function_app.settings import Settings, SettingsError
 
@@ -121,6 +123,8 @@ class Functions:
     enroll: Enroll
     claim: Claim
     unpair: Unpair
+    rename: Rename
+    watchers: Watchers
     devices: Devices
     spaces: Spaces
     sharing: Sharing
@@ -129,6 +133,7 @@ class Functions:
     handovers: Handovers
     robot_types: RobotTypes
     upload_robot_type: UploadRobotType
+    look_at_robot_type: LookAtRobotType
     delete_robot_type: DeleteRobotType
     model_checks: ModelChecks
     movements: Movements
@@ -186,15 +191,7 @@ def build(settings: Settings, *, clock: Clock | None = None) -> Functions:
 
     access = choices.access(settings, keys, tables, publish)
     bus = choices.bus(settings, access)
-    heard: Any = {
-        "host": settings.mqtt_host,
-        "port": settings.mqtt_port,
-        "credentials": access.service_credentials,
-        "tls": choices.broker_tls(settings),
-    }
-    feed = MqttFeed(**heard)
-    telemetry = MqttTelemetry(**heard)
-    late = MqttLate(**heard)
+    feed, telemetry, late = choices.feeds(settings, access)
 
     forget = Forget(tables=tables, blobs=blobs)
     pending = Pending(tables=tables)
@@ -216,6 +213,16 @@ def build(settings: Settings, *, clock: Clock | None = None) -> Functions:
     delivery = Delivery(bus=bus, mailbox=mailbox, relay=relay)
     commands = Commands(delivery=delivery, keys=keys, clock=now)
     robot_types = RobotTypes(tables=tables, blobs=blobs, catalogue=catalogue, seals=Seals(keys=keys))
+    versions = TypeVersions(tables=tables, blobs=blobs, clock=now)
+    upload_robot_type = UploadRobotType(
+        tables=tables,
+        versions=versions,
+        catalogue=catalogue,
+        robot_types=robot_types,
+        seals=Seals(keys=keys),
+        chain=chain,
+        clock=now,
+    )
     diagnostics = Diagnostics(
         tables=tables, devices=devices, faults=faults, robot_types=robot_types, spaces=spaces, clock=now
     )
@@ -252,6 +259,16 @@ def build(settings: Settings, *, clock: Clock | None = None) -> Functions:
         devices=devices,
         leases=leases,
         chain=chain,
+        clock=now,
+    )
+    api_keys = ApiKeys(
+        tables=tables,
+        devices=devices,
+        sign_in=sign_in,
+        sign_out=sign_out,
+        chain=chain,
+        forget=forget,
+        pending=pending,
         clock=now,
     )
     sending = SendAction(tables=tables, devices=devices, rows=rows, commands=commands, movements=movements, clock=now)
@@ -332,15 +349,16 @@ def build(settings: Settings, *, clock: Clock | None = None) -> Functions:
         sign_in=sign_in,
         sessions=sessions,
         sign_out=sign_out,
-        api_keys=ApiKeys(
-            tables=tables, devices=devices, sign_in=sign_in, sign_out=sign_out, chain=chain, forget=forget, clock=now
-        ),
+        api_keys=api_keys,
         open_id=OpenIdSignIn(
             tables=tables,
             provider=choices.open_id(settings, now),
             redirect=f"{settings.public_url}{OPEN_ID_PATH}",
+            anyone=settings.open_id is not None and settings.open_id.anyone,
             sign_in=sign_in,
             sessions=sessions,
+            invitations=invitations,
+            chain=chain,
             clock=now,
         ),
         passwords=Passwords(
@@ -356,6 +374,8 @@ def build(settings: Settings, *, clock: Clock | None = None) -> Functions:
         enroll=Enroll(tables=tables, leave=leave, forget=forget, clock=now),
         claim=Claim(tables=tables, sign_in=sign_in, attempts=attempts, leave=leave, chain=chain, clock=now),
         unpair=Unpair(tables=tables, sign_in=sign_in, leave=leave, chain=chain),
+        rename=Rename(tables=tables, devices=devices, chain=chain),
+        watchers=Watchers(tables=tables, devices=devices, forget=forget, clock=now),
         devices=devices,
         spaces=spaces,
         sharing=sharing,
@@ -367,18 +387,19 @@ def build(settings: Settings, *, clock: Clock | None = None) -> Functions:
             leases=leases,
             rows=lease_rows,
             commands=commands,
-            identify=identify,
             audit=audit,
             clock=now,
         ),
         robot_types=robot_types,
-        upload_robot_type=UploadRobotType(
+        upload_robot_type=upload_robot_type,
+        look_at_robot_type=LookAtRobotType(
             tables=tables,
             blobs=blobs,
+            versions=versions,
             catalogue=catalogue,
-            seals=Seals(keys=keys),
             robot_types=robot_types,
-            chain=chain,
+            upload=upload_robot_type,
+            seals=Seals(keys=keys),
             clock=now,
         ),
         delete_robot_type=DeleteRobotType(
@@ -453,6 +474,7 @@ def build(settings: Settings, *, clock: Clock | None = None) -> Functions:
             leave=leave,
             sharing=sharing,
             invitations=invitations,
+            api_keys=api_keys,
             audit=audit,
             chain=chain,
             access=access,

@@ -1,4 +1,4 @@
-"""The adapters that settings choose between: signing keys, stores, the bus for commands, the broker's access.
+"""The adapters that settings choose between: signing keys, stores, the broker's access, what goes there and comes.
 
 Of the stores, and of the clouds' adapters, only those in use are imported, and they their SDKs only when needed.
 """
@@ -12,7 +12,9 @@ from function_app.adapters.local.broker_access import MosquittoBrokerAccess, Tok
 from function_app.adapters.local.certificates import FileCertificates, NoCertificates
 from function_app.adapters.local.clock import SystemClock
 from function_app.adapters.local.command_bus import MqttCommandBus
+from function_app.adapters.local.feed import MqttFeed, MqttLate, MqttTelemetry
 from function_app.adapters.local.keys import FileKeys
+from function_app.adapters.local.mqtt_link import Broker
 from function_app.adapters.local.tls import client_context
 from function_app.adapters.ring_keys import RingKeys
 from function_app.adapters.vault_keys import VaultKeys
@@ -21,6 +23,7 @@ from function_app.ports.broker_access import BrokerAccess, BrokerAccessError
 from function_app.ports.certificates import Certificates
 from function_app.ports.clock import Clock
 from function_app.ports.command_bus import CommandBus
+from function_app.ports.feed import Feed, Telemetry
 from function_app.ports.open_id import OpenId
 from function_app.ports.tables import StoreError, Tables
 from function_app.settings import AwsStore, AzureStore, EventGridBus, IotBus, KeyVault, SecretsManager, Settings
@@ -108,6 +111,8 @@ def access(
         iot = settings.bus
         assert isinstance(iot, IotBus)  # noqa: S101 (the settings see to it)
         return IotBrokerAccess(keys=signing, tables=tables, region=iot.region, endpoint=iot.endpoint)
+    if settings.broker == "eventgrid":
+        return _event_grid(settings, signing, tables)
     if settings.broker == "amqtt":
         return TokenBrokerAccess(signer=signing.signer, publish=publish)
     return MosquittoBrokerAccess(
@@ -117,6 +122,21 @@ def access(
         password_file=settings.home / "mosquitto" / "service.password",
         tls=broker_tls(settings),
     )
+
+
+def _event_grid(settings: Settings, signing: RingKeys, tables: Tables) -> BrokerAccess:
+    from function_app.adapters.azure.broker_access import EventGridBrokerAccess  # noqa: PLC0415 (only where in use)
+    from function_app.adapters.azure.callers import EntraCallers  # noqa: PLC0415
+    from function_app.adapters.azure.session_taker import SessionTaker  # noqa: PLC0415
+
+    grid = settings.bus
+    assert isinstance(grid, EventGridBus)  # noqa: S101 (the settings see to it)
+    assert grid.webhook is not None  # noqa: S101
+    webhook = grid.webhook
+    callers = EntraCallers(tenant=webhook.tenant, audience=webhook.audience, identity=webhook.caller)
+    # Its certificate is of an authority that every machine knows, whoever made ours.
+    taker = SessionTaker(host=settings.mqtt_host, port=settings.mqtt_port, tls=client_context(None))
+    return EventGridBrokerAccess(keys=signing, tables=tables, take=taker, known=callers.knows)
 
 
 def bus(settings: Settings, granted: BrokerAccess) -> CommandBus:
@@ -131,12 +151,13 @@ def bus(settings: Settings, granted: BrokerAccess) -> CommandBus:
 
             return EventGridCommandBus(endpoint=grid.endpoint, identity=grid.identity)
         case None:
-            return MqttCommandBus(
-                host=settings.mqtt_host,
-                port=settings.mqtt_port,
-                credentials=granted.service_credentials,
-                tls=broker_tls(settings),
-            )
+            return MqttCommandBus(_broker(settings, granted))
+
+
+def feeds(settings: Settings, granted: BrokerAccess) -> tuple[Feed, Telemetry, Telemetry]:
+    """What brings what devices say, what they measure, and what they measured while their link was down."""
+    broker = _broker(settings, granted)
+    return MqttFeed(broker), MqttTelemetry(broker), MqttLate(broker)
 
 
 def certificates(settings: Settings) -> Certificates:
@@ -197,6 +218,16 @@ async def prepare(settings: Settings) -> None:
                 await store.prepare()
             finally:
                 await store.close()
+
+
+def _broker(settings: Settings, granted: BrokerAccess) -> Broker:
+    """The broker, as the functions themselves meet it."""
+    return Broker(
+        host=settings.mqtt_host,
+        port=settings.mqtt_port,
+        credentials=granted.service_credentials,
+        tls=broker_tls(settings),
+    )
 
 
 def _files(settings: Settings, signing: RingKeys | None) -> FileBlobs:

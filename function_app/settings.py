@@ -3,13 +3,13 @@
 import os
 import re
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Literal, cast
 from urllib.parse import urlsplit
 
 ROOT = Path(__file__).resolve().parents[1]
-Broker = Literal["amqtt", "mosquitto", "iot"]
+Broker = Literal["amqtt", "mosquitto", "iot", "eventgrid"]
 _LAST_PORT = 65_535
 _NUMBER = re.compile(r"\A[0-9]{1,9}\Z")
 _HOST = re.compile(r"\A[A-Za-z0-9._:%-]{1,255}\Z")
@@ -19,6 +19,8 @@ _TABLE = re.compile(r"\A[A-Za-z0-9_.-]{3,255}\Z")
 _BUCKET = re.compile(r"\A(?=.{3,63}\Z)[a-z0-9][a-z0-9.-]*[a-z0-9]\Z")
 _REGION = re.compile(r"\A[a-z]{2,}(-[a-z]+)+-[0-9]+\Z")
 _IDENTITY = re.compile(r"\A([0-9A-Fa-f]{8}(-[0-9A-Fa-f]{4}){3}-[0-9A-Fa-f]{12})?\Z")
+_ENTRA_ID = re.compile(r"\A[0-9A-Fa-f]{8}(-[0-9A-Fa-f]{4}){3}-[0-9A-Fa-f]{12}\Z")
+_AUDIENCE = re.compile(r"\A[!-~]{1,255}\Z")
 _SECRET = re.compile(r"\A[A-Za-z0-9-]{1,127}\Z")
 _KMS_KEY = re.compile(r"\A[A-Za-z0-9:/_-]{0,256}\Z")
 _IOT_POLICY = re.compile(r"\A[A-Za-z0-9_+=,.@-]{0,128}\Z")
@@ -88,16 +90,33 @@ class IotBus:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
+class EventGridWebhook:
+    """Who asks about connections to an Event Grid namespace.
+
+    Attributes:
+        tenant: Id of the Entra tenant that its tokens are from.
+        audience: The id URI of the application that they are for.
+        caller: Object id of the namespace's managed identity.
+    """
+
+    tenant: str
+    audience: str
+    caller: str
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
 class EventGridBus:
     """An Event Grid namespace, as the way to devices.
 
     Attributes:
         endpoint: The namespace's address.
         identity: The client id of the functions' identity, where they have not only the one that the host gives them.
+        webhook: Who asks our webhook, where it is also the broker that agents and pages connect to.
     """
 
     endpoint: str
     identity: str = ""
+    webhook: EventGridWebhook | None = None
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -158,12 +177,14 @@ class OpenIdClient:
         client_id: Ours there.
         client_secret: Ours there; empty where it gives none to a client with PKCE.
         name: What people call it.
+        anyone: Whoever it signs in gets an account here; else who was invited, alone.
     """
 
     issuer: str
     client_id: str
     client_secret: str = field(default="", repr=False)
     name: str
+    anyone: bool = False
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -242,9 +263,11 @@ def read(environment: Mapping[str, str] | None = None) -> Settings:
     mqtt_host = _host(given, "TELESCOPE_MQTT_HOST", host)
     websocket_port = _port(given, "TELESCOPE_WEBSOCKET_PORT", port + 2)
     broker = given.get("TELESCOPE_BROKER", "amqtt")
-    if broker not in ("amqtt", "mosquitto", "iot"):
-        raise SettingsError(f"TELESCOPE_BROKER is '{broker[:_SHOWN]}'; it must be amqtt, mosquitto or iot")
+    if broker not in ("amqtt", "mosquitto", "iot", "eventgrid"):
+        raise SettingsError(f"TELESCOPE_BROKER is '{broker[:_SHOWN]}'; it must be amqtt, mosquitto, iot or eventgrid")
     bus = _bus(given)
+    if broker == "eventgrid":
+        bus = _with_webhook(given, bus)
     if broker == "iot" and not (isinstance(bus, IotBus) and bus.policy):
         raise SettingsError(
             "TELESCOPE_BROKER is iot; set TELESCOPE_BUS=iot, and TELESCOPE_IOT_POLICY to agents' certificates' policy"
@@ -373,6 +396,21 @@ def _bus(given: Mapping[str, str]) -> IotBus | EventGridBus | None:
             raise SettingsError(f"TELESCOPE_BUS is '{other[:_SHOWN]}'; it must be mqtt, iot or eventgrid")
 
 
+def _with_webhook(given: Mapping[str, str], bus: IotBus | EventGridBus | None) -> EventGridBus:
+    if not isinstance(bus, EventGridBus):
+        raise SettingsError("TELESCOPE_BROKER is eventgrid; set TELESCOPE_BUS=eventgrid too")
+    for name in ("TELESCOPE_MQTT_HOST", "TELESCOPE_MQTT_PORT", "TELESCOPE_WEBSOCKET_URL"):
+        if not given.get(name):
+            raise SettingsError(f"TELESCOPE_BROKER is eventgrid; set {name} to the namespace's own")
+    names = ("TELESCOPE_EVENTGRID_TENANT", "TELESCOPE_EVENTGRID_AUDIENCE", "TELESCOPE_EVENTGRID_CALLER")
+    webhook = EventGridWebhook(
+        tenant=_matching(given, names[0], "", _ENTRA_ID, "the id of an Entra tenant"),
+        audience=_matching(given, names[1], "", _AUDIENCE, "the id URI of an application, such as api://…"),
+        caller=_matching(given, names[2], "", _ENTRA_ID, "the object id of the namespace's managed identity"),
+    )
+    return replace(bus, webhook=webhook)
+
+
 def _open_id(given: Mapping[str, str]) -> OpenIdClient | None:
     names = ("TELESCOPE_OIDC_ISSUER", "TELESCOPE_OIDC_CLIENT_ID")
     issuer, client_id = (given.get(name, "") for name in names)
@@ -384,6 +422,9 @@ def _open_id(given: Mapping[str, str]) -> OpenIdClient | None:
         there, missing = names if issuer else names[::-1]
         raise SettingsError(f"{there} is set; set {missing} too, or neither")
     parts = urlsplit(_url(given, names[0], "", ("https", "http")))
+    accounts = given.get("TELESCOPE_OIDC_ACCOUNTS", "invited")
+    if accounts not in {"invited", "anyone"}:
+        raise SettingsError(f"TELESCOPE_OIDC_ACCOUNTS is '{accounts[:_SHOWN]}'; it must be invited or anyone")
     if parts.scheme == "http" and parts.hostname not in _LOOPBACK:
         raise SettingsError(f"{names[0]} is '{issuer[:_SHOWN]}'; it must be an address that begins with https://")
     return OpenIdClient(
@@ -393,6 +434,7 @@ def _open_id(given: Mapping[str, str]) -> OpenIdClient | None:
         name=_matching(
             given, "TELESCOPE_OIDC_NAME", parts.hostname or "", _PROVIDER, "a name of at most 60 characters"
         ),
+        anyone=accounts == "anyone",
     )
 
 

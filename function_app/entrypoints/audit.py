@@ -6,7 +6,6 @@ from typing import Any
 from function_app.bootstrap import Functions
 from function_app.domain.audit_chain import CLOUD, Head, read_head
 from function_app.ports.tables import StoreError
-from function_app.services import store
 
 _EXIT_BROKEN = 1
 _EXIT_WRONG = 2
@@ -69,5 +68,5 @@ async def _chain(functions: Functions, account: str) -> str:
     """The chain of an account that is named by its name or its id."""
     if not account:
         raise StoreError("--account is empty; give an account's name or id")
-    row = await functions.tables.get(store.ACCOUNTS, f"name:{account}", "account")
-    return account if row is None else str(row.data["account"])
+    known = await functions.sign_in.known(account)
+    return account if known is None else known.id

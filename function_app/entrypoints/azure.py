@@ -1,4 +1,4 @@
-"""Azure Functions: one catch-all HTTP route to the ASGI application, the timer, and what devices say.
+"""Azure Functions: a catch-all HTTP route to the ASGI application, the timer, what devices say, and who may connect.
 
 A native route with the ASGI middleware inside, because the framework's own ASGI app breaks a route prefix; built at the
 first request, because a worker imports this file to index it.
@@ -26,6 +26,16 @@ def _functions() -> Functions:
 @functools.cache
 def _http() -> func.AsgiMiddleware:
     return func.AsgiMiddleware(create_app(_functions()))  # type: ignore[no-untyped-call]
+
+
+@app.function_name("admission")
+@app.route(route="eventgrid/admission", methods=["POST"])
+async def admission(req: func.HttpRequest) -> func.HttpResponse:
+    """Where an Event Grid namespace asks who may connect. Azure prefers this route to the one that takes everything."""
+    from function_app.entrypoints.admission import admit  # noqa: PLC0415 (only where Event Grid is the broker)
+
+    status, answer = await admit(_functions(), req.headers.get("Authorization", ""), req.get_body())
+    return func.HttpResponse(json.dumps(answer), status_code=status, mimetype="application/json")
 
 
 @app.function_name("http")

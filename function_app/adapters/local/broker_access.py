@@ -58,6 +58,10 @@ class TokenBrokerAccess:
         grants.check(grant)
         return Credentials(grant.principal, grants.issue(grant, self._signer()))
 
+    def takes(self, publish: Sequence[str], subscribe: Sequence[str]) -> bool:  # noqa: ARG002
+        """As the port says: a token has no bound of its own."""
+        return True
+
     async def revoke(self, *, client_id: str | None = None, principal: str | None = None) -> None:
         """As the port says; tokens made until now are refused, by the clock that stamps them."""
         _exactly_one(client_id, principal)
@@ -161,6 +165,10 @@ class MosquittoBrokerAccess:
                 await self._delete([username])
                 raise BrokerAccessError(f"mosquitto refused to {answer.command}: {answer.error}")
         return Credentials(username, password)
+
+    def takes(self, publish: Sequence[str], subscribe: Sequence[str]) -> bool:  # noqa: ARG002
+        """As the port says: a role has none."""
+        return True
 
     async def revoke(self, *, client_id: str | None = None, principal: str | None = None) -> None:
         """As the port says; deleting a client cuts its connection."""

@@ -12,6 +12,8 @@ from device_agent.protocol.topics import is_id
 from function_app.ports.catalogue import BuiltIn
 from function_app.ports.tables import StoreError
 
+DRAWING = "drawing.json"
+"""In each type's folder; made by ``python -m robots.draw``."""
 _SUFFIXES = frozenset({".toml", ".xml", ".stl", ".obj", ".png", ".md", ".py"})
 
 
@@ -56,6 +58,17 @@ class FolderCatalogue:
             scripts = sorted((self._folder / robot_type / manifest.MOVEMENTS).glob("*.py"))
             self._movements[robot_type] = {path.stem: _read(path, known.version) for path in scripts}
         return self._movements[robot_type]
+
+    async def drawing(self, robot_type: str) -> bytes | None:
+        """See ``Catalogue``."""
+        if robot_type not in await self.types():
+            return None
+        try:
+            return (self._folder / robot_type / DRAWING).read_bytes()
+        except FileNotFoundError:
+            return None
+        except OSError as error:
+            raise StoreError(str(error)) from error
 
 
 def _read(path: Path, version: int) -> BuiltIn:

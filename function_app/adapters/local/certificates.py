@@ -7,13 +7,12 @@ import asyncio
 import contextlib
 import datetime as dt
 import json
-import os
-import secrets
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 from function_app.adapters import certificate_requests
+from function_app.adapters.local import files
 from function_app.ports.broker_access import BrokerAccessError
 from function_app.ports.certificates import Issued
 
@@ -117,7 +116,7 @@ class FileCertificates:
                     .build()
                 )
             content = listed.sign(signer, hashes.SHA256()).public_bytes(serialization.Encoding.PEM)
-            self._write(REVOKED, content, mode=0o644)
+            files.write(self._folder / REVOKED, content, mode=0o644)
 
     def _authority(self) -> tuple[Any, Any]:
         from cryptography import x509  # noqa: PLC0415
@@ -138,18 +137,9 @@ class FileCertificates:
                 path = self._folder / LEDGER
                 ledger: dict[str, list[dict[str, Any]]] = json.loads(path.read_bytes()) if path.exists() else {}
                 yield ledger
-                self._write(LEDGER, json.dumps(ledger, indent=1).encode(), mode=0o600)
+                files.write(path, json.dumps(ledger, indent=1).encode(), mode=0o600)
         except (OSError, ValueError, sqlite3.Error) as error:
             raise BrokerAccessError(
                 f"the authority for agents in {self._folder} cannot be used: {error}; "
                 "`python -m infra.tls --devices` makes one"
             ) from error
-
-    def _write(self, name: str, content: bytes, *, mode: int) -> None:
-        path = self._folder / f"{name}.{secrets.token_hex(4)}.new"
-        descriptor = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL, mode)
-        with os.fdopen(descriptor, "wb") as file:
-            file.write(content)
-            file.flush()
-            os.fsync(file.fileno())
-        path.replace(self._folder / name)

@@ -2,16 +2,14 @@
 
 import asyncio
 import contextlib
-import ssl
-from collections.abc import AsyncGenerator, AsyncIterator, Callable
+from collections.abc import AsyncGenerator, AsyncIterator
 
 from paho.mqtt.client import MQTTMessage
 
 from device_agent.protocol import codec, topics
 from device_agent.protocol.errors import ProtocolError
 from device_agent.protocol.messages import Ack
-from function_app.adapters.local.mqtt_link import MqttLink
-from function_app.ports.broker_access import ServiceCredentials
+from function_app.adapters.local.mqtt_link import Broker, MqttLink
 
 _READY_S = 2.0
 
@@ -19,19 +17,9 @@ _READY_S = 2.0
 class MqttCommandBus:
     """``CommandBus`` over MQTT. Every instance hears all acks and hands on those that somebody here waits for."""
 
-    def __init__(
-        self,
-        *,
-        host: str,
-        port: int,
-        credentials: Callable[[], ServiceCredentials],
-        tls: ssl.SSLContext | None = None,
-    ) -> None:
+    def __init__(self, broker: Broker) -> None:
         self._link = MqttLink(
-            host=host,
-            port=port,
-            credentials=credentials,
-            tls=tls,
+            broker,
             subscriptions=(topics.device(topics.ANY, topics.ANY, topics.ANY, topics.ACK),),
             receive=self._dispatch,
         )

@@ -2,17 +2,14 @@
 
 import asyncio
 import logging
-import ssl
-from collections.abc import Callable
 from typing import NamedTuple
 
 from paho.mqtt.client import MQTTMessage
 
 from device_agent.protocol import topics
 from device_agent.protocol.topics import ANY
-from function_app.adapters.local.mqtt_link import MqttLink
+from function_app.adapters.local.mqtt_link import Broker, MqttLink
 from function_app.domain.problems import Problem
-from function_app.ports.broker_access import ServiceCredentials
 from function_app.ports.feed import BatchHandler, Handler
 from function_app.ports.tables import StoreError
 
@@ -50,20 +47,10 @@ class _Arrived(NamedTuple):
 class MqttFeed:
     """``Feed`` over MQTT: one connection, one message at a time, so that every topic keeps its order."""
 
-    def __init__(
-        self,
-        *,
-        host: str,
-        port: int,
-        credentials: Callable[[], ServiceCredentials],
-        tls: ssl.SSLContext | None = None,
-    ) -> None:
+    def __init__(self, broker: Broker) -> None:
         self._waiting: asyncio.Queue[_Arrived] = asyncio.Queue(MAX_WAITING)
         self._link = MqttLink(
-            host=host,
-            port=port,
-            credentials=credentials,
-            tls=tls,
+            broker,
             subscriptions=FILTERS,
             receive=self._arrived,
             manual_ack=True,
@@ -114,21 +101,11 @@ class MqttFeed:
 class MqttLate:
     """``Telemetry`` over MQTT for what was measured while a link was down: each is confirmed once it is stored."""
 
-    def __init__(
-        self,
-        *,
-        host: str,
-        port: int,
-        credentials: Callable[[], ServiceCredentials],
-        tls: ssl.SSLContext | None = None,
-    ) -> None:
+    def __init__(self, broker: Broker) -> None:
         self._collected: list[_Arrived] = []
         self._some = asyncio.Event()
         self._link = MqttLink(
-            host=host,
-            port=port,
-            credentials=credentials,
-            tls=tls,
+            broker,
             subscriptions=(topics.device(ANY, ANY, ANY, topics.LATE, ANY),),
             receive=self._arrived,
             manual_ack=True,
@@ -172,23 +149,13 @@ class MqttLate:
 class MqttTelemetry:
     """``Telemetry`` over MQTT, by a connection of its own: measurements that queue up hold up no ack."""
 
-    def __init__(
-        self,
-        *,
-        host: str,
-        port: int,
-        credentials: Callable[[], ServiceCredentials],
-        tls: ssl.SSLContext | None = None,
-    ) -> None:
+    def __init__(self, broker: Broker) -> None:
         self._collected: list[tuple[str, bytes]] = []
         self._bytes = 0
         self._dropped = 0
         self._some = asyncio.Event()
         self._link = MqttLink(
-            host=host,
-            port=port,
-            credentials=credentials,
-            tls=tls,
+            broker,
             subscriptions=(topics.device(ANY, ANY, ANY, topics.TELE, ANY),),
             receive=self._arrived,
             qos=0,

@@ -8,7 +8,6 @@ import contextlib
 import json
 import logging
 import os
-import secrets
 import stat
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -19,6 +18,7 @@ from device_agent.protocol import signing
 from device_agent.protocol.errors import ProtocolError
 from function_app.adapters import key_ring
 from function_app.adapters.key_ring import Ring, RingError
+from function_app.adapters.local import files
 from function_app.adapters.ring_keys import RingKeys, wall_ms
 from function_app.ports.tables import StoreError
 
@@ -96,21 +96,21 @@ class FileKeys(RingKeys):
         self._folder.mkdir(parents=True, exist_ok=True, mode=0o700)
         former = self._folder / FORMER
         key = key_ring.from_pem(former.read_bytes()) if former.exists() else signing.generate()
-        temporary = self._write_temporary(Ring.first(key).text.encode(), 0o600)
+        temporary = files.write_beside(self._folder / RING, Ring.first(key).text.encode(), mode=0o600)
         with contextlib.suppress(FileExistsError):
             os.link(temporary, self._folder / RING)
         temporary.unlink()
         former.unlink(missing_ok=True)
 
     def _write(self, ring: Ring) -> None:
-        self._write_temporary(ring.text.encode(), 0o600).replace(self._folder / RING)
+        files.write(self._folder / RING, ring.text.encode(), mode=0o600)
 
     def _publish(self, ring: Ring) -> None:
         """Tell the embedded broker which keys' tokens count."""
         path = self._folder / PUBLIC
         wanted = {key.id: key.public for key in ring.live(self._now_ms())}
         if not path.exists() or json.loads(path.read_bytes()) != wanted:
-            self._write_temporary(json.dumps(wanted, indent=1).encode(), 0o644).replace(path)
+            files.write(path, json.dumps(wanted, indent=1).encode(), mode=0o644)
 
     def _close_to_others(self) -> None:
         """Keep others of this machine from the keys. Windows has no such rights: there it is the folder's own."""
@@ -148,12 +148,3 @@ class FileKeys(RingKeys):
             except sqlite3.Error as error:
                 raise OSError(f"{self._folder / _LOCK}: {error}") from error
             yield
-
-    def _write_temporary(self, content: bytes, mode: int) -> Path:
-        path = self._folder / f"{secrets.token_hex(8)}.part"
-        descriptor = os.open(path, os.O_CREAT | os.O_EXCL | os.O_WRONLY, mode)
-        with os.fdopen(descriptor, "wb") as file:
-            file.write(content)
-            file.flush()
-            os.fsync(file.fileno())
-        return path

@@ -9,13 +9,13 @@ import shutil
 import signal
 import sys
 import tempfile
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import msgspec
 
 from device_agent.protocol.robot_type import RobotType
-from function_app.ports.model_compiler import CompilerMissingError
+from function_app.ports.model_compiler import CompilerMissingError, Looked
 
 CPU_S = 15
 WALL_S = 30
@@ -45,30 +45,32 @@ class MujocoCompiler:
         if importlib.util.find_spec("mujoco") is None:
             raise CompilerMissingError(_MISSING)
 
-    async def check(self, robot_type: RobotType, files: Mapping[str, bytes]) -> tuple[str, ...]:
+    async def check(self, robot_type: RobotType, files: Mapping[str, bytes], missing: Sequence[str] = ()) -> Looked:
         """See ``ModelCompiler``."""
         self.require()
         folder = await asyncio.to_thread(_write, files)
         try:
-            code, answer = await self._run(folder, self._task(robot_type))
+            code, answer = await self._run(folder, self._task(robot_type, missing))
         finally:
             await asyncio.shield(asyncio.to_thread(shutil.rmtree, folder, ignore_errors=True))
         if code == _NO_MUJOCO:
             raise CompilerMissingError(_MISSING)
         if code in {-signal.SIGKILL, -signal.SIGXCPU, -signal.SIGALRM}:
-            return (_TOO_LONG,)
+            return Looked((_TOO_LONG,))
         try:
-            return tuple(msgspec.json.decode(answer, type=list[str])) if code == 0 else (_CRASHED,)
+            return msgspec.json.decode(answer, type=Looked) if code == 0 else Looked((_CRASHED,))
         except msgspec.DecodeError:
-            return (_CRASHED,)
+            return Looked((_CRASHED,))
 
-    def _task(self, robot_type: RobotType) -> bytes:
+    def _task(self, robot_type: RobotType, missing: Sequence[str]) -> bytes:
         told = msgspec.to_builtins(robot_type)
-        names = ("model", "scene", "joints", "frames", "home_rad")
+        names = ("type", "model", "scene", "joints", "frames", "home_rad")
         wheels = (told["simulation"] or {}).get("wheels") or {}
         limits = {"cpu_s": self._cpu_s, "wall_s": self._wall_s + 5, "memory_mb": MEMORY_MB}
         sides = [wheels[side] for side in ("left", "right") if side in wheels]
-        return json.dumps({**{name: told[name] for name in names}, "wheels": sides, **limits}).encode()
+        return json.dumps(
+            {**{name: told[name] for name in names}, "wheels": sides, "missing": missing, **limits}
+        ).encode()
 
     async def _run(self, folder: Path, task: bytes) -> tuple[int, bytes]:
         process = await asyncio.create_subprocess_exec(

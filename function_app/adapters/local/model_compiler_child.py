@@ -1,7 +1,8 @@
 """The other side of ``model_compiler``: compiles one robot type with MuJoCo in a process of its own.
 
 Started as ``python -I -B model_compiler_child.py`` in a folder that holds the uploaded files alone. Reads the task from
-standard input, limits itself before it looks at any file, and writes what is wrong as a JSON list.
+standard input, limits itself before it looks at any file, and writes what it has found as JSON: ``Looked`` of
+``model_compiler``.
 """
 
 import ctypes
@@ -10,7 +11,8 @@ import os
 import resource
 import signal
 import sys
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from pathlib import Path
 from typing import Any
 
 NO_MUJOCO = 3
@@ -18,6 +20,13 @@ _MEGABYTE = 2**20
 _STEPS = 100
 _TIMESTEP_S = 0.002
 _SLACK_RAD = 1e-3
+_LAST_VISIBLE_GROUP = 2
+_OF_ATTACHING = "Attach conflict"
+"""What a robot has in its options besides: the room has the say there."""
+_MAX_BODIES = 500
+_MAX_SHAPES = 2000
+_MAX_NAMES = 200
+_LEAST_MASS_KG, _LEAST_INERTIA_KG_M2 = 1e-3, 1e-6
 _LANDLOCK_CREATE, _LANDLOCK_ADD, _LANDLOCK_RESTRICT = 444, 445, 446
 _NO_NEW_PRIVILEGES = 38
 _ALL_FILE_RIGHTS = 2**13 - 1
@@ -58,28 +67,38 @@ def confine(folder: str) -> None:
 class Check:
     """One robot type against its manifest, as the agent's ``mujoco`` driver will use it."""
 
-    def __init__(self, mujoco: Any, task: dict[str, Any]) -> None:
+    def __init__(self, mujoco: Any, draw: Callable[..., Any], task: dict[str, Any]) -> None:
         self._mujoco = mujoco
+        self._draw = draw
         self._task = task
+        self.warnings: list[str] = []
+        self.drawn: dict[str, Any] = {}
+        """With what else a page may want to know of the model; empty where there are errors."""
 
     def errors(self) -> list[str]:
         """Everything that is wrong; what cannot be compiled is not looked at any further."""
         model_file, scene_file = self._task["model"], self._task["scene"]
+        robot = None
         for name, placed in ((model_file, False), (model_file, True), (scene_file, False)):
             try:
                 model = self._compile(name, placed=placed)
             except (ValueError, OSError, self._mujoco.FatalError) as error:
                 return [f"{name}: {' '.join(str(error).split())}"]
             if not placed:
+                robot = model if robot is None else robot
                 found = [f"{name}: {error}" for error in self._compare(model)]
-                if found:
+                if found or self._task["missing"]:
                     return found
-        return [f"{scene_file}: {error}" for error in self._play(model)]
+        found = [f"{scene_file}: {error}" for error in self._play(model)]
+        if not found:
+            self._look(robot, model)
+        return found
 
     def _compile(self, name: str, *, placed: bool) -> Any:
         """A file alone, or put into an empty world, as robots in one room are."""
         mujoco = self._mujoco
         spec = mujoco.MjSpec.from_file(name)
+        self._do_without(spec)
         if placed:
             robot, spec = spec, mujoco.MjSpec()
             spec.attach(robot, prefix="robot/", frame=spec.worldbody.add_frame())
@@ -87,6 +106,49 @@ class Check:
         spec.option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
         spec.option.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_AUTORESET)
         return spec.compile()
+
+    def _do_without(self, spec: Any) -> None:
+        """Take out what needs files that are not there: they are told of; what else is wrong shall be told as well."""
+        missing = set(self._task["missing"])
+        if not missing:
+            return
+        gone = {mesh.name for mesh in spec.meshes if Path(mesh.file).name in missing}
+        for geom in [geom for geom in spec.geoms if geom.meshname in gone]:
+            spec.delete(geom)
+        for mesh in [mesh for mesh in spec.meshes if mesh.name in gone]:
+            spec.delete(mesh)
+        spec.compiler.boundmass = max(spec.compiler.boundmass, _LEAST_MASS_KG)
+        spec.compiler.boundinertia = max(spec.compiler.boundinertia, _LEAST_INERTIA_KG_M2)
+
+    def _look(self, model: Any, scene: Any) -> None:
+        """Draw the robot as a page will, and say what is well to know."""
+        kinds, file = self._mujoco.mjtObj, self._task["model"]
+        joints = [self._find(model, kinds.mjOBJ_JOINT, name) for name in self._known()]
+        base = int(model.body_rootid[model.jnt_bodyid[joints[0]]]) if joints else 1
+        shapes = [geom for geom in range(model.ngeom) if model.geom_group[geom] <= _LAST_VISIBLE_GROUP]
+        self.drawn = {
+            "actuators": self._named(model, kinds.mjOBJ_ACTUATOR, model.nu),
+            "cameras": self._named(scene, kinds.mjOBJ_CAMERA, scene.ncam),
+            "twin": None,
+        }
+        if model.nbody > _MAX_BODIES or len(shapes) > _MAX_SHAPES:
+            self.warnings.append(
+                f"{file}: it has too many parts to be drawn ({model.nbody} bodies, {len(shapes)} shapes)"
+            )
+        else:
+            self.drawn["twin"] = self._draw(model, base=base, device=self._task["type"])
+        if not shapes:
+            self.warnings.append(f"{file}: nothing of it can be seen: all shapes are in groups 3 and up")
+        if any(model.geom_dataid[geom] >= 0 for geom in shapes):
+            self.warnings.append(f"{file}: meshes are shown as boxes")
+        for name in self._named(model, kinds.mjOBJ_ACTUATOR, model.nu):
+            if name not in {*self._known(), *self._task["wheels"]}:
+                self.warnings.append(f"{file}: actuator '{name}' is not in robot.toml: nobody can move it")
+        if not scene.ncam:
+            self.warnings.append(f"{self._task['scene']}: there is no camera")
+
+    def _known(self) -> list[str]:
+        return [joint["name"] for joint in self._task["joints"]]
 
     def _compare(self, model: Any) -> Iterator[str]:
         kinds = self._mujoco.mjtObj
@@ -185,8 +247,11 @@ class Check:
         return int(self._mujoco.mj_name2id(model, kind, name))
 
     def _names(self, model: Any, kind: Any, count: int) -> str:
+        return ", ".join(self._named(model, kind, count)) or "none with a name"
+
+    def _named(self, model: Any, kind: Any, count: int) -> list[str]:
         names = (self._mujoco.mj_id2name(model, kind, index) for index in range(count))
-        return ", ".join(filter(None, names)) or "none with a name"
+        return [name[:_MAX_NAMES] for name in names if name][:_MAX_NAMES]
 
 
 def _inside(what: str, known: Any, joint: dict[str, Any]) -> Iterator[str]:
@@ -202,17 +267,34 @@ def main() -> int:
     limit(task["cpu_s"], task["wall_s"], task["memory_mb"])
     answers = os.dup(1)
     os.dup2(os.open(os.devnull, os.O_WRONLY), 1)  # nothing of MuJoCo's own may mix into the answer
+    sys.path.append(str(Path(__file__).resolve().parents[3]))
     try:
+        import msgspec  # noqa: PLC0415
         import mujoco  # noqa: PLC0415 (within the limits)
+
+        from device_agent.mjcf.twin import draw  # noqa: PLC0415 (needs MuJoCo)
     except ImportError:
         return NO_MUJOCO
-    mujoco.set_mju_user_warning(lambda _: None)  # else it writes a file
+    warned: list[str] = []
+
+    def warn(text: object) -> None:  # else it writes a file
+        if _OF_ATTACHING not in str(text):
+            warned.append(str(text))
+
+    mujoco.set_mju_user_warning(warn)
     confine(".")
+    check = Check(mujoco, draw, task)
     try:
-        errors = Check(mujoco, task).errors()
+        errors = check.errors()
     except MemoryError:
         errors = [f"The model needs more than {task['memory_mb']} MB of memory."]
-    os.write(answers, json.dumps([error[:2000] for error in errors[:50]]).encode())
+    found = {
+        "errors": [error[:2000] for error in errors[:50]],
+        "warnings": [text[:2000] for text in (*check.warnings, *warned)[:50]],
+        **check.drawn,
+    }
+    with os.fdopen(answers, "wb") as answer:
+        answer.write(msgspec.json.encode(found))
     return 0
 
 

@@ -1,4 +1,4 @@
-"""One warm MQTT connection inside an event loop: paho without a thread of its own.
+"""One warm MQTT connection inside an event loop.
 
 A message goes out, and comes in, on the loop's own thread: no hand-over between threads lies in a command's way. A
 connection lives as long as its credentials; then, or when it breaks, a new client with new ones takes over.
@@ -11,16 +11,17 @@ import asyncio
 import contextlib
 import logging
 import random
-import socket
 import ssl
 import time
 from collections.abc import Awaitable, Callable, Iterable, Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import paho.mqtt.client as mqtt
 from paho.mqtt.enums import CallbackAPIVersion, MQTTErrorCode, MQTTProtocolVersion
 from paho.mqtt.reasoncodes import ReasonCode
 
+from function_app.adapters.local import mqtt_socket
 from function_app.ports.broker_access import BrokerAccessError, ServiceCredentials
 from function_app.ports.command_bus import BusUnavailable
 
@@ -46,29 +47,36 @@ _VERSIONS = (MQTTProtocolVersion.MQTTv5, MQTTProtocolVersion.MQTTv311)
 _UNSUPPORTED = "Unsupported protocol version"
 
 
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Broker:
+    """Where a broker is, and how to be let in. ``credentials`` is asked for each connection; may raise the port's."""
+
+    host: str
+    port: int
+    credentials: Callable[[], ServiceCredentials | Awaitable[ServiceCredentials]]
+    tls: ssl.SSLContext | None = None
+
+
 class MqttLink:
     """Connects at ``start`` and stays connected until ``close``."""
 
     def __init__(
         self,
+        broker: Broker,
         *,
-        host: str,
-        port: int,
-        credentials: Callable[[], ServiceCredentials | Awaitable[ServiceCredentials]],
         subscriptions: Sequence[str] = (),
         receive: Callable[[mqtt.MQTTMessage], None] | None = None,
         manual_ack: bool = False,
         qos: int = 1,
-        tls: ssl.SSLContext | None = None,
     ) -> None:
-        self._host = host
-        self._port = port
-        self._credentials = credentials
+        self._host = broker.host
+        self._port = broker.port
+        self._credentials = broker.credentials
         self._subscriptions = tuple(subscriptions)
         self._receive = receive
         self._manual_ack = manual_ack
         self._qos = qos
-        self._tls = tls
+        self._tls = broker.tls
         self._version = 0
         self._client: mqtt.Client | None = None
         self._keeper: asyncio.Task[None] | None = None
@@ -142,7 +150,7 @@ class MqttLink:
         if client is None:
             raise BusUnavailable(f"the broker at {self._host}:{self._port} went away")
         information = client.publish(topic, payload, qos, retain)
-        self._flush(client)
+        mqtt_socket.flush(client)
         if information.rc != MQTTErrorCode.MQTT_ERR_SUCCESS:
             raise BusUnavailable(f"the broker at {self._host}:{self._port} went away: {information.rc.name}")
         if qos == 0:
@@ -162,7 +170,7 @@ class MqttLink:
         """Confirm a message that came with ``manual_ack``; nothing happens when its connection is gone."""
         if self._client is not None and generation == self.generation:
             self._client.ack(message.mid, message.qos)
-            self._flush(self._client)
+            mqtt_socket.flush(self._client)
 
     async def hear(self, patterns: Sequence[str]) -> None:
         """Subscribe to these too, on this connection and on those that follow."""
@@ -181,7 +189,7 @@ class MqttLink:
         self._subscriptions = tuple(pattern for pattern in self._subscriptions if pattern not in gone)
         if self._client is not None and gone:
             self._client.unsubscribe(sorted(gone))
-            self._flush(self._client)
+            mqtt_socket.flush(self._client)
 
     async def close(self) -> None:
         """Disconnect. May be called twice."""
@@ -216,15 +224,11 @@ class MqttLink:
     async def _connect(self, credentials: ServiceCredentials) -> mqtt.Client:
         """A connected and subscribed client; speaks MQTT 5, or 3.1.1 where the broker does not."""
         while True:
-            loop = asyncio.get_running_loop()
-            answered: asyncio.Future[ReasonCode] = loop.create_future()
+            answered: asyncio.Future[ReasonCode] = asyncio.get_running_loop().create_future()
             client = self._make(credentials, answered)
             try:
                 await asyncio.to_thread(client.connect, self._host, self._port, KEEP_ALIVE_S)
-                sock = client.socket()
-                if sock is None:
-                    raise BusUnavailable("the broker closed the connection")  # noqa: TRY301 (cleaned up below)
-                loop.add_reader(sock, self._read, client)
+                mqtt_socket.listen(client)
                 async with asyncio.timeout(CONNECT_TIMEOUT_S):
                     reason = await answered
                 if not reason.is_failure:
@@ -236,14 +240,14 @@ class MqttLink:
                     self._tried.set()
                     return client
             except TimeoutError as error:
-                self._drop(client)
+                mqtt_socket.drop(client)
                 if not self._next_version():
                     raise BusUnavailable(f"no answer from the broker at {self._host}:{self._port}") from error
                 continue
             except BaseException:
-                self._drop(client)
+                mqtt_socket.drop(client)
                 raise
-            self._drop(client)
+            mqtt_socket.drop(client)
             if reason.getName() != _UNSUPPORTED or not self._next_version():
                 raise BusUnavailable(f"the broker at {self._host}:{self._port} refused us: {reason.getName()}")
 
@@ -268,15 +272,7 @@ class MqttLink:
             client.tls_set_context(self._tls)
         client.connect_timeout = CONNECT_TIMEOUT_S
         client.max_inflight_messages_set(1000)
-        loop = asyncio.get_running_loop()
-
-        def opened(_client: mqtt.Client, _data: Any, sock: Any) -> None:
-            sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
-
-        def closing(_client: mqtt.Client, _data: Any, sock: Any) -> None:
-            # The last moment at which the event loop can still be told to forget it.
-            loop.remove_reader(sock)
-            loop.remove_writer(sock)
+        mqtt_socket.prepare(client)
 
         def connected(_client: mqtt.Client, _data: Any, _flags: Any, reason: ReasonCode, _properties: Any) -> None:
             if not answered.done():
@@ -304,8 +300,6 @@ class MqttLink:
             else:
                 waiting.set_result(None)
 
-        client.on_socket_open = opened
-        client.on_socket_close = closing
         client.on_connect = connected
         client.on_disconnect = disconnected
         client.on_publish = published
@@ -323,7 +317,7 @@ class MqttLink:
                 raise BusUnavailable("the broker went away")
             done: asyncio.Future[None] = asyncio.get_running_loop().create_future()
             self._subscribed[mid] = done
-            self._flush(client)
+            mqtt_socket.flush(client)
             async with asyncio.timeout(CONNECT_TIMEOUT_S):
                 await done
 
@@ -332,7 +326,7 @@ class MqttLink:
         while not self._lost.is_set():
             self._notice_frost()
             client.loop_misc()
-            self._flush(client)
+            mqtt_socket.flush(client)
             if time.time() > expires_at - RENEW_BEFORE_S:
                 return
             with contextlib.suppress(TimeoutError):
@@ -372,34 +366,4 @@ class MqttLink:
         self._waiting.clear()
         self._subscribed.clear()
         if client is not None:
-            self._drop(client)
-
-    def _drop(self, client: mqtt.Client) -> None:
-        sock = client.socket()
-        if sock is None:
-            return
-        loop = asyncio.get_running_loop()
-        loop.remove_reader(sock)
-        loop.remove_writer(sock)
-        client.disconnect()
-        client.loop_write()
-        # paho closes the socket only once the broker has; the connection is ours to close.
-        sock.close()
-
-    def _read(self, client: mqtt.Client) -> None:
-        client.loop_read()
-        # With TLS a message may have been decrypted with the one before it: then the socket has nothing more to tell.
-        while isinstance(sock := client.socket(), ssl.SSLSocket) and sock.pending():
-            client.loop_read()
-        self._flush(client)
-
-    def _flush(self, client: mqtt.Client) -> None:
-        """What did not fit into the socket goes out as soon as it does."""
-        sock = client.socket()
-        if sock is not None and client.want_write():
-            asyncio.get_running_loop().add_writer(sock, self._write, client, sock)
-
-    def _write(self, client: mqtt.Client, sock: Any) -> None:
-        client.loop_write()
-        if client.socket() is not None and not client.want_write():
-            asyncio.get_running_loop().remove_writer(sock)
+            mqtt_socket.drop(client)

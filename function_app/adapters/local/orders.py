@@ -9,7 +9,7 @@ from paho.mqtt.client import MQTTMessage
 
 from device_agent.protocol import grants, topics
 from device_agent.protocol.topics import ANY
-from function_app.adapters.local.mqtt_link import MqttLink
+from function_app.adapters.local.mqtt_link import Broker, MqttLink
 from function_app.ports.broker_access import BrokerAccess, ServiceCredentials
 from function_app.ports.orders import Hear
 
@@ -22,7 +22,9 @@ class MqttOrders:
     def __init__(self, *, host: str, port: int, access: BrokerAccess, tls: ssl.SSLContext | None = None) -> None:
         self._hear: Hear | None = None
         self._wanted: dict[tuple[str, str], tuple[str, ...]] = {}
-        self._link = MqttLink(host=host, port=port, credentials=_credentials(access), receive=self._arrived, tls=tls)
+        self._link = MqttLink(
+            Broker(host=host, port=port, credentials=_credentials(access), tls=tls), receive=self._arrived
+        )
 
     @property
     def up(self) -> bool:

@@ -10,7 +10,6 @@ from function_app.entrypoints.http.caller import Caller, refuse_other_sites
 from function_app.entrypoints.http.contract import auth as contract
 from function_app.entrypoints.http.cookies import clear_session, signed_in, whence
 from function_app.entrypoints.http.routing import Routes
-from function_app.services.identity import ACCESS_S
 from function_app.services.spaces import SpaceView
 
 
@@ -71,7 +70,7 @@ def router(functions: Functions, caller: Caller) -> Routes:
             raise forbidden("This invitation is for somebody who has an account. Sign in as the one it was made for.")
         account = await functions.passwords.register(asked.name, asked.password)
         done = await functions.sessions.begin(account, "password", whence(request, settings))
-        await functions.invitations.redeem(Identity(account.id, account.name, done.session), asked.invitation)
+        await functions.invitations.redeem(Identity(account.id, account.name, done.session), known)
         return signed_in(settings, done, 201)
 
     @routes.add(
@@ -83,10 +82,11 @@ def router(functions: Functions, caller: Caller) -> Routes:
         Needs the cookie, and the session's CSRF token in ``X-CSRF-Token``: no access token lives on by itself.
         """
         who, _ = await caller.page(request)
+        token, lifetime_s = await functions.sessions.access_token(who)
         body = contract.AccessToken(
-            access_token=await functions.sessions.access_token(who),
+            access_token=token,
             token_type="Bearer",  # noqa: S106 (a scheme's name)
-            expires_in_s=ACCESS_S,
+            expires_in_s=lifetime_s,
         )
         return answer(body, headers={"Cache-Control": "no-store"})
 

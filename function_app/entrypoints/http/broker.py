@@ -47,7 +47,7 @@ def router(functions: Functions, caller: Caller) -> Routes:
             tcp=contract.TcpAddress(
                 host=settings.mqtt_host,
                 port=settings.mqtt_port,
-                tls=settings.tls is not None or settings.broker == "iot",
+                tls=settings.tls is not None or settings.broker in {"iot", "eventgrid"},
                 certificate_after_ms=certificate_after_ms,
             ),
             websocket_url=settings.websocket_url,

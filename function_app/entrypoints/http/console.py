@@ -7,6 +7,8 @@ from starlette.responses import Response
 from starlette.staticfiles import StaticFiles
 from starlette.types import Scope
 
+_ICON = "favicon.ico"
+"""Where browsers look for a picture of what is no page of the console's: an answer of the API, say."""
 _FOR_EVER = "public, max-age=31536000, immutable"
 
 
@@ -24,6 +26,11 @@ class Console(StaticFiles):
             raise HTTPException(404, "There is no such resource; see /api/docs")
         if not (self._folder / "index.html").is_file():
             raise HTTPException(404, "The console is not built; run `make console`")
-        response = await super().get_response(path, scope)
+        response = await super().get_response(self._icon() if path == _ICON else path, scope)
         response.headers["Cache-Control"] = _FOR_EVER if path.startswith("assets") else "no-cache"
         return response
+
+    def _icon(self) -> str:
+        """The file with the console's own picture, which has a hash in its name."""
+        found = next(self._folder.glob("assets/icon-*.svg"), None)
+        return _ICON if found is None else f"assets/{found.name}"

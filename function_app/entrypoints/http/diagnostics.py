@@ -102,6 +102,7 @@ def _field(known: FieldView) -> contract.FieldOut:
         field=known.name,
         label=known.rule.label,
         unit=known.rule.unit,
+        advice=known.rule.advice,
         value=watch.value,
         baseline=watch.baseline.mean,
         usual_low=usual[0] if usual else None,

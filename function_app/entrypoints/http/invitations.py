@@ -49,7 +49,8 @@ def router(functions: Functions, caller: Caller) -> Routes:
         """Of several who bring the last use at once one gets it. Gives what it offered."""
         who = await caller.account(request)
         asked: contract.RedeemRequest = await read(request, contract.RedeemRequest)
-        known = await functions.invitations.redeem(who, asked.secret, space=asked.space)
+        known = await functions.invitations.look(asked.secret)
+        await functions.invitations.redeem(who, known, space=asked.space)
         return answer(contract.InvitationOut(**_shown(known)))
 
     return routes

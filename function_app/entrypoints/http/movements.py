@@ -80,7 +80,7 @@ def router(functions: Functions, caller: Caller) -> Routes:
         if asked.parameters_schema is not None:
             parameters.check_schema(asked.parameters_schema)
             schema = parameters.plain(asked.parameters_schema)
-        draft = Draft(asked.source, asked.description, schema)
+        draft = Draft(asked.source, asked.description, schema, asked.based_on)
         found, new = await functions.movements.put(who, robot_type, name, draft)
         return answer(show.movement(found), 201 if new else 200)
 

@@ -6,11 +6,13 @@ from fastapi import Query, Request, Response
 
 from function_app.bootstrap import Functions
 from function_app.domain.problems import Problem
-from function_app.entrypoints.http.answers import answer
+from function_app.entrypoints.http.answers import answer, read
+from function_app.entrypoints.http.caller import refuse_other_sites
 from function_app.entrypoints.http.contract import auth as contract
 from function_app.entrypoints.http.cookies import secure, set_session, whence
 from function_app.entrypoints.http.routing import PREFIX, Routes
-from function_app.services.open_id import BEGUN_S, Returned
+from function_app.services.open_id import BEGUN_S, Begun, Returned
+from function_app.settings import Settings
 
 COOKIE = "telescope_sign_in"
 _PATH = "/auth/oidc"
@@ -44,8 +46,28 @@ def router(functions: Functions) -> Routes:
         That cookie is ``SameSite=Lax``, for the browser comes back from another site, and is good for that alone.
         """
         begun = await functions.open_id.begin()
-        mark = f"{COOKIE}={begun.secret}; Path={PREFIX}{_PATH}; Max-Age={BEGUN_S}; HttpOnly; SameSite=Lax"
-        return _redirect(begun.address, mark + secure(settings))
+        return _redirect(begun.address, _mark(settings, begun))
+
+    @routes.add(
+        "POST",
+        f"{_PATH}/start",
+        summary="Sign in elsewhere with an invitation",
+        body=contract.SignInElsewhere,
+        answers={200: contract.Begun},
+        problems=(403, 404),
+        caller="nobody",
+    )
+    async def start_open_id_invited(request: Request) -> Response:
+        """For who was invited and has no account: as above, and the account that is then made redeems the invitation.
+
+        The page goes on to ``address`` by itself: an invitation's secret belongs in no address. Who has an account
+        already is signed in, and redeems it afterwards as always.
+        """
+        refuse_other_sites(request)
+        asked: contract.SignInElsewhere = await read(request, contract.SignInElsewhere)
+        begun = await functions.open_id.begin(asked.invitation)
+        headers = {"Set-Cookie": _mark(settings, begun), "Cache-Control": "no-store"}
+        return answer(contract.Begun(address=begun.address), headers=headers)
 
     @routes.add(
         "GET",
@@ -75,6 +97,11 @@ def router(functions: Functions) -> Routes:
         return _redirect(f"{settings.public_url}/#/", set_session(settings, done))
 
     return routes
+
+
+def _mark(settings: Settings, begun: Begun) -> str:
+    mark = f"{COOKIE}={begun.secret}; Path={PREFIX}{_PATH}; Max-Age={BEGUN_S}; HttpOnly; SameSite=Lax"
+    return mark + secure(settings)
 
 
 def _redirect(address: str, cookie: str | None = None) -> Response:

@@ -74,6 +74,17 @@ def router(functions: Functions, caller: Caller) -> Routes:
         body = await functions.robot_types.file(who, robot_type, name)
         return content(body, _BYTES, name.rpartition("/")[2])
 
+    @routes.add(
+        "GET",
+        _ONE + "/twin",
+        summary="The drawing of a robot type",
+        answers={200: contract.RobotTypeTwin},
+        problems=(404, 409),
+    )
+    async def get_robot_type_twin(request: Request, robot_type: str) -> Response:
+        """What a page needs to show and move the version in use, where there is no robot of it."""
+        return answer(show.twin(await functions.robot_types.model(await caller.account(request), robot_type)))
+
     @routes.add("DELETE", _ONE, summary="Delete a robot type of one's own", answers={204: None}, problems=(404, 409))
     async def delete_robot_type(request: Request, robot_type: str) -> Response:
         """All its versions, unless a device or a movement of the account needs it."""

@@ -6,9 +6,8 @@ from fastapi import Request, Response
 
 from function_app.bootstrap import Functions
 from function_app.domain.accounts import Role
-from function_app.domain.devices import NEVER_MS
 from function_app.domain.sharing import Share
-from function_app.domain.times import rfc3339
+from function_app.domain.times import NEVER_MS, rfc3339
 from function_app.entrypoints.http.answers import answer, empty, read
 from function_app.entrypoints.http.caller import Caller
 from function_app.entrypoints.http.contract import sharing as contract
@@ -16,6 +15,10 @@ from function_app.entrypoints.http.contract.auth import AccountRef
 from function_app.entrypoints.http.routing import Routes
 
 Kind = Literal["device", "space"]
+_UNTOLD: Final = (
+    "The share has ended, and control under it. The broker did not answer: live sessions are cut, and the device is "
+    "told, as soon as it does."
+)
 _ROLES: Final[dict[Role, contract.SharedRole]] = {Role.OPERATOR: "operator", Role.VIEWER: "viewer"}
 
 
@@ -50,11 +53,14 @@ def router(functions: Functions, caller: Caller) -> Routes:
         "/devices/{device}/shares",
         summary="Share a device",
         body=contract.ShareRequest,
-        answers={200: contract.ShareOut, 201: contract.ShareOut},
+        answers={200: contract.ShareOut, 201: contract.ShareOut, 202: contract.ShareOut},
         problems=(404, 409),
     )
     async def share_device(request: Request, device: str) -> Response:
-        """With another account, until it is ended, its time runs out, or the agent is un-paired."""
+        """With another account, until it is ended, its time runs out, or the agent is un-paired.
+
+        202: it was lowered, which ends live sessions, and the broker has not answered yet; see un-sharing.
+        """
         return await shares.put(request, "device", device)
 
     @routes.add(
@@ -62,33 +68,36 @@ def router(functions: Functions, caller: Caller) -> Routes:
         "/spaces/{space}/shares",
         summary="Share a space",
         body=contract.ShareRequest,
-        answers={200: contract.ShareOut, 201: contract.ShareOut},
+        answers={200: contract.ShareOut, 201: contract.ShareOut, 202: contract.ShareOut},
         problems=(404, 409),
     )
     async def share_space(request: Request, space: str) -> Response:
-        """With another account: every device that is in it, or comes into it."""
+        """With another account: every device that is in it, or comes into it. 202: as for a device."""
         return await shares.put(request, "space", space)
 
     @routes.add(
         "DELETE",
         "/devices/{device}/shares/{account}",
         summary="Un-share a device",
-        answers={204: None},
-        problems=(404,),
+        answers={202: contract.ShareEnding, 204: None},
+        problems=(404, 409),
     )
     async def unshare_device(request: Request, device: str, account: str) -> Response:
-        """By its owner, or by who gives it back. Ends at once what was done with it: see the architecture page."""
+        """By its owner, or by who gives it back. Ends at once what was done with it: see the architecture page.
+
+        202: it has ended, and the broker has not answered yet; its live sessions are cut as soon as it does.
+        """
         return await shares.end(request, "device", device, account)
 
     @routes.add(
         "DELETE",
         "/spaces/{space}/shares/{account}",
         summary="Un-share a space",
-        answers={204: None},
-        problems=(404,),
+        answers={202: contract.ShareEnding, 204: None},
+        problems=(404, 409),
     )
     async def unshare_space(request: Request, space: str, account: str) -> Response:
-        """By its owner, or by who gives it back. Ends at once what was done in it: see the architecture page."""
+        """By its owner, or by who gives it back. Ends at once what was done in it. 202: as for a device."""
         return await shares.end(request, "space", space, account)
 
     return routes
@@ -111,16 +120,18 @@ class _Shares:
         asked: contract.ShareRequest = await read(request, contract.ShareRequest)
         shared = await self._functions.sharing.of(who, kind, name)
         person = await self._functions.sharing.person(asked.account)
-        share, fresh = await self._functions.sharing.put(who, shared, person, Role(asked.role), asked.expires_in_s)
-        return answer(show(share, person.name), 201 if fresh else 200)
+        sharing = self._functions.sharing
+        share, fresh, told = await sharing.put(who, shared, person, Role(asked.role), asked.expires_in_s)
+        return answer(show(share, person.name), 202 if not told else 201 if fresh else 200)
 
     async def end(self, request: Request, kind: Kind, name: str, account: str) -> Response:
         who = await self._caller.account(request)
+        sharing = self._functions.sharing
         if account == who.account:
-            await self._functions.sharing.leave(who, f"{kind}:{name}")
+            told = await sharing.leave(who, f"{kind}:{name}")
         else:
-            await self._functions.sharing.end(who, await self._functions.sharing.of(who, kind, name), account)
-        return empty()
+            told = await sharing.end(who, await sharing.of(who, kind, name), account)
+        return empty() if told else answer(contract.ShareEnding(detail=_UNTOLD), 202)
 
 
 def show(share: Share, name: str) -> contract.ShareOut:

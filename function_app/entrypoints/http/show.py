@@ -15,8 +15,9 @@ from function_app.entrypoints.http.contract import actions, devices, movements, 
 from function_app.entrypoints.http.contract import lease as leases
 from function_app.entrypoints.http.contract.auth import AccountRef
 from function_app.services.devices import DeviceView
+from function_app.services.look_at_robot_type import Look
 from function_app.services.parameters import ObjectSchema
-from function_app.services.robot_types import KnownType
+from function_app.services.robot_types import KnownType, Model
 from function_app.services.script_store import signed_text
 
 
@@ -110,11 +111,26 @@ def robot_type(found: KnownType) -> robot_types.RobotTypeOut:
     )
 
 
+def twin(found: Model) -> robot_types.RobotTypeTwin:
+    """The drawing of a robot type."""
+    return robot_types.RobotTypeTwin(
+        device=found.twin.device, bodies=found.twin.bodies, actuators=found.actuators, cameras=found.cameras
+    )
+
+
+def look(found: Look) -> robot_types.TypeLookOut:
+    """An upload that is looked at."""
+    upload = found.upload
+    known = KnownType(found.manifest, upload.version, upload.files, usable=upload.state == "ready", upload=upload)
+    return robot_types.TypeLookOut(id=found.id, expires_at=rfc3339(found.expires_ms), robot_type=robot_type(known))
+
+
 def _upload(upload: TypeVersion) -> robot_types.TypeUploadOut:
     return robot_types.TypeUploadOut(
         version=upload.version,
         state=_upload_state(upload),
-        errors=upload.errors,
+        errors=() if upload.open else upload.errors,
+        warnings=upload.warnings,
         uploaded_at=rfc3339(upload.created_ms),
     )
 

@@ -73,6 +73,18 @@ class Methods(Answer, frozen=True, kw_only=True):
     open_id: Elsewhere | None
 
 
+class SignInElsewhere(Request, frozen=True, kw_only=True):
+    """The secret of an invitation, for who was invited and has no account yet."""
+
+    invitation: Annotated[str, Meta(min_length=1, max_length=200)]
+
+
+class Begun(Answer, frozen=True, kw_only=True):
+    """Where a browser goes on to sign in."""
+
+    address: str
+
+
 class AccessToken(Answer, frozen=True, kw_only=True):
     """The next access token of a session."""
 

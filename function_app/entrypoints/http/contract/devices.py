@@ -1,11 +1,16 @@
 """``devices``: what they are, and how they are now."""
 
-from typing import Literal
+from typing import Annotated, Literal
+
+from msgspec import Meta
 
 from device_agent.protocol.messages import State
 from function_app.entrypoints.http.contract.auth import AccountRef
-from function_app.entrypoints.http.contract.base import Answer, Moment
+from function_app.entrypoints.http.contract.base import Answer, Moment, Request
 from function_app.entrypoints.http.contract.lease import LeaseOut
+
+LABEL_PATTERN = r"^[^\x00-\x08\x0e-\x1f\x7f]*[^\s\x00-\x1f\x7f][^\x00-\x08\x0e-\x1f\x7f]*$"
+"""Something to read, and nothing that a terminal would obey."""
 
 
 class DeviceOut(Answer, frozen=True, kw_only=True):
@@ -32,3 +37,25 @@ class DeviceList(Answer, frozen=True, kw_only=True):
 
     items: tuple[DeviceOut, ...]
     cursor: str | None
+
+
+class RenameRequest(Request, frozen=True, kw_only=True):
+    """What a device is to be called, without the blanks around it; null: as its agent calls it."""
+
+    label: Annotated[str, Meta(min_length=1, max_length=80, pattern=LABEL_PATTERN)] | None
+
+
+class WatcherOut(Answer, frozen=True, kw_only=True):
+    """Somebody who looks at a device. ``mine``: the caller's own account, in another sign-in."""
+
+    name: str
+    role: Literal["owner", "operator", "viewer"]
+    mine: bool
+    since: Moment
+
+
+class WatchersOut(Answer, frozen=True, kw_only=True):
+    """Who else looks at it now, the longest first. To be asked again within ``again_ms``."""
+
+    items: tuple[WatcherOut, ...]
+    again_ms: int

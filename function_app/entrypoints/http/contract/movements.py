@@ -35,16 +35,9 @@ class MovementOut(Answer, frozen=True, kw_only=True):
     parameters_schema: ObjectSchema | None
 
 
-class MovementSource(Answer, frozen=True, kw_only=True):
+class MovementSource(MovementOut, frozen=True, kw_only=True):
     """One version of a movement, with its script."""
 
-    name: str
-    description: str
-    version: int
-    sha256: str
-    updated_at: Moment
-    built_in: bool
-    parameters_schema: ObjectSchema | None
     source: str
     signature: SignatureOut
 
@@ -60,9 +53,11 @@ class MovementRequest(Request, frozen=True, kw_only=True):
     """A script.
 
     Without a description the first line of its docstring serves; without a schema its ``PARAMETERS = {…}``: a literal,
-    name → schema, where a parameter without a default must be given.
+    name → schema, where a parameter without a default must be given. ``based_on``: the version that it was made from, 0
+    for none; 409 ``movement-changed`` where another is the newest now.
     """
 
     source: Annotated[str, Meta(min_length=1, max_length=MAX_SOURCE)]
     description: Label | None = None
     parameters_schema: ObjectSchema | None = None
+    based_on: Annotated[int, Meta(ge=0, le=2**31)] | None = None

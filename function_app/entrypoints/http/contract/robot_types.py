@@ -2,9 +2,9 @@
 
 from typing import Annotated, Literal
 
-from msgspec import Meta
+from msgspec import Meta, field
 
-from device_agent.protocol.messages import Joint, Stream
+from device_agent.protocol.messages import Body, Joint, Stream
 from function_app.entrypoints.http.contract.base import Answer, Moment, Request, WaitMs
 from function_app.services.model_files import MAX_FILES, MAX_MANIFEST
 
@@ -14,11 +14,12 @@ State = Literal["checking", "ready", "refused"]
 
 
 class TypeUploadOut(Answer, frozen=True, kw_only=True):
-    """The newest upload. ``errors`` are those of the manifest's check and MuJoCo's own."""
+    """The newest upload. ``errors`` are those of the manifest's check and MuJoCo's own; ``warnings`` refuse nothing."""
 
     version: int
     state: State
     errors: tuple[str, ...]
+    warnings: tuple[str, ...]
     uploaded_at: Moment
 
 
@@ -60,4 +61,46 @@ class RobotTypeRequest(Request, frozen=True, kw_only=True):
 
     manifest: Annotated[str, Meta(min_length=1, max_length=MAX_MANIFEST)]
     files: Annotated[dict[str, str], Meta(min_length=1, max_length=MAX_FILES)]
+    wait_ms: WaitMs = 10_000
+
+
+class RobotTypeTwin(Answer, frozen=True, kw_only=True):
+    """The model as a page can draw it: ``device`` and ``bodies`` as in ``desc/twin``, here for every robot of a type.
+
+    ``actuators`` are the model's, ``cameras`` those of its scene.
+    """
+
+    device: str
+    bodies: tuple[Body, ...]
+    actuators: tuple[str, ...]
+    cameras: tuple[str, ...]
+
+
+MAX_SCRIPTS = 20
+"""Movements that can be looked at with a robot type."""
+
+
+class TypeLookRequest(Request, frozen=True, kw_only=True):
+    """As to add a robot type. ``movements``: name → script; they are looked at, and not stored."""
+
+    manifest: Annotated[str, Meta(min_length=1, max_length=MAX_MANIFEST)]
+    files: Annotated[dict[str, str], Meta(min_length=1, max_length=MAX_FILES)]
+    movements: Annotated[dict[str, str], Meta(max_length=MAX_SCRIPTS)] = field(default_factory=dict)
+    wait_ms: WaitMs = 10_000
+
+
+class TypeLookOut(Answer, frozen=True, kw_only=True):
+    """An upload that is looked at before it is saved; nobody else sees it, and it goes by itself.
+
+    ``robot_type`` is as it would be; its ``upload`` says whether it is good.
+    """
+
+    id: str
+    expires_at: Moment
+    robot_type: RobotTypeOut
+
+
+class SaveTypeLookRequest(Request, frozen=True, kw_only=True):
+    """Waits at most ``wait_ms`` for the verdict."""
+
     wait_ms: WaitMs = 10_000

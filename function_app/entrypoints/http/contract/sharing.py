@@ -30,6 +30,12 @@ class ShareOut(Answer, frozen=True, kw_only=True):
     expires_at: Moment | None
 
 
+class ShareEnding(Answer, frozen=True, kw_only=True):
+    """The share has ended and control with it; ``detail``: who could not be told yet, and what becomes of that."""
+
+    detail: str
+
+
 class ShareList(Answer, frozen=True, kw_only=True):
     """Shares, oldest first: all of them."""
 

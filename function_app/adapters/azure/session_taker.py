@@ -1,0 +1,78 @@
+"""Ends a connection by connecting with its client id: any broker then ends the one before (MQTT, 3.1.4)."""
+
+import asyncio
+import ssl
+from typing import Any
+
+import paho.mqtt.client as paho
+from paho.mqtt.enums import CallbackAPIVersion
+from paho.mqtt.reasoncodes import ReasonCode
+
+from function_app.ports.broker_access import BrokerAccessError, Credentials
+
+WITHIN_S = 10.0
+_KEEP_ALIVE_S = 30
+
+
+class SessionTaker:
+    """Connects and goes, each time anew.
+
+    Args:
+        host: The broker's address.
+        port: Its MQTT port.
+        tls: How the connection is kept from others.
+        within_s: How long it may take [s].
+    """
+
+    def __init__(self, *, host: str, port: int, tls: ssl.SSLContext | None, within_s: float = WITHIN_S) -> None:
+        self._host = host
+        self._port = port
+        self._tls = tls
+        self._within_s = within_s
+
+    async def __call__(self, client_id: str, credentials: Credentials) -> None:
+        """Take over a client id's session and end it.
+
+        Raises:
+            BrokerAccessError: The broker is not reached, or does not let us in.
+        """
+        loop = asyncio.get_running_loop()
+        answered: asyncio.Future[str] = loop.create_future()
+        client = paho.Client(
+            CallbackAPIVersion.VERSION2,
+            client_id=client_id,
+            protocol=paho.MQTTv311,
+            clean_session=True,
+            reconnect_on_failure=False,
+        )
+        client.username_pw_set(*credentials)
+        client.connect_timeout = self._within_s
+        if self._tls is not None:
+            client.tls_set_context(self._tls)
+
+        def settle(trouble: str) -> None:
+            if not answered.done():
+                answered.set_result(trouble)
+
+        def connected(_: Any, __: Any, ___: Any, reason: ReasonCode, ____: Any) -> None:
+            loop.call_soon_threadsafe(settle, str(reason) if reason.is_failure else "")
+
+        def disconnected(_: Any, __: Any, ___: Any, reason: ReasonCode, ____: Any) -> None:
+            loop.call_soon_threadsafe(settle, f"the connection broke: {reason}")
+
+        client.on_connect, client.on_disconnect = connected, disconnected
+        where = f"the broker at {self._host}:{self._port}"
+        try:
+            async with asyncio.timeout(self._within_s):
+                await asyncio.to_thread(client.connect, self._host, self._port, _KEEP_ALIVE_S)
+                client.loop_start()
+                trouble = await answered
+        except TimeoutError as error:
+            raise BrokerAccessError(f"{where} did not answer in {self._within_s:.0f} s") from error
+        except OSError as error:
+            raise BrokerAccessError(f"{where} cannot be reached: {error}") from error
+        finally:
+            client.disconnect()
+            await asyncio.to_thread(client.loop_stop)
+        if trouble:
+            raise BrokerAccessError(f"{where} does not let the functions end the connection of {client_id}: {trouble}")
