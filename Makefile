@@ -12,7 +12,7 @@ SECONDS_EACH ?= 60
 # Most tests wait for processes of their own, so three run side by side on two cores; a file's tests stay together.
 SIDE_BY_SIDE = -n 3 --dist loadfile --no-loadscope-reorder
 # Those run one at a time that have a browser or a robot in motion before them, or an answer that must come in time.
-ALONE = tests/api tests/e2e tests/faults
+ALONE = tests/api tests/e2e tests/faults tests/leaks/test_secrets.py
 
 .PHONY: help up link env console test test-long coverage fuzz check audit-packages contract requirements clean
 .DELETE_ON_ERROR:
@@ -20,20 +20,20 @@ ALONE = tests/api tests/e2e tests/faults
 help:
 	@echo "make up            run Telescope on this machine"
 	@echo "make link          print another one-time sign-in link"
-	@echo "make test          check and test everything (about twenty-five minutes on two cores, most of it in real processes)"
+	@echo "make test          check and test everything (about thirty-five minutes on two cores, most of it in real processes)"
 	@echo "make test-long     the same with every suite at full size"
 	@echo "make coverage      every branch of the agent's runtime, by its unit tests alone"
 	@echo "make fuzz          each parser under a fuzzer, SECONDS_EACH=60"
 	@echo "make check         linters, types, import contracts, generated files, unsafe code, committed secrets"
 	@echo "make audit-packages  ask osv.dev what is known against the pinned packages (needs a network)"
-	@echo "make contract      regenerate docs/asyncapi.json and web/src/core/protocol.ts"
+	@echo "make contract      regenerate docs/asyncapi.json, protocol/script_api.json and web/src/core/protocol.ts"
 	@echo "make requirements  regenerate requirements.txt and requirements/*.txt"
 
 up: env console
 	@exec $(BIN)/python -m infra.local
 
 link: env
-	@$(BIN)/python -m function_app sign-in-link
+	@$(BIN)/python -m infra.local.link
 
 env: .venv/.local
 
@@ -114,10 +114,13 @@ check: .venv/.dev web/node_modules/.installed
 	@git ls-files -z | grep -zvE '\.(png|npz)$$' | xargs -0 -n 300 -P 2 $(BIN)/detect-secrets-hook --baseline .secrets.baseline
 	@$(BIN)/python requirements/export.py --check
 	@$(BIN)/python -m device_agent.protocol.document | cmp - docs/asyncapi.json || { echo "docs/asyncapi.json is stale; run \`make contract\`" >&2; exit 1; }
+	@$(BIN)/python -m device_agent.jail.document | cmp - device_agent/protocol/script_api.json || { echo "script_api.json is stale; run \`make contract\`" >&2; exit 1; }
 	@$(NPM) run --silent check
 
 contract: .venv/.dev web/node_modules/.installed
 	@$(BIN)/python -m device_agent.protocol.document > docs/asyncapi.json
+	@$(BIN)/python -m device_agent.jail.document > device_agent/protocol/script_api.json.new
+	@mv device_agent/protocol/script_api.json.new device_agent/protocol/script_api.json
 	@$(NPM) run --silent contract
 
 # Apart from `check`, which needs no network. It says so where it could not ask, and is not green then.

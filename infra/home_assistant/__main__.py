@@ -10,14 +10,17 @@ import argparse
 import logging
 import os
 import signal
+import ssl
 import sys
 import threading
+from pathlib import Path
 from typing import Any
 
 import paho.mqtt.client as mqtt
 import requests
 from paho.mqtt.enums import CallbackAPIVersion
 
+from device_agent.transports import trust
 from infra import programs
 from infra.home_assistant import discovery
 from infra.home_assistant.bridge import Bridge
@@ -40,11 +43,16 @@ class Telescope:
     Args:
         server: ``https://host``.
         key: ``ts_…``.
+        ca: The authority (PEM) that alone may speak for the server and its broker; ``None``: those of the machine.
     """
 
-    def __init__(self, server: str, key: str) -> None:
+    def __init__(self, server: str, key: str, ca: Path | None = None) -> None:
+        self._server = server
         self._base = server.rstrip("/") + "/api/v1"
+        self._ca = ca
         self._http = requests.Session()
+        self._http.trust_env = ca is None  # else a variable of the environment would name other authorities
+        self._http.verify = True if ca is None else str(ca)
         self._http.headers["Authorization"] = f"Bearer {key}"
 
     def watch(self) -> dict[str, Any]:
@@ -54,6 +62,15 @@ class Telescope:
             OSError: Not reached, or refused.
         """
         return self._post("/mqtt/credentials", {"purpose": "watch"})
+
+    def tls(self, given: dict[str, Any]) -> ssl.SSLContext | None:
+        """How to connect to the broker that the credentials name.
+
+        Raises:
+            OSError: The authority cannot be read.
+            ValueError: The broker does not speak TLS, though the server does.
+        """
+        return trust.broker(tls=given["tcp"]["tls"], server=self._server, ca=self._ca, own=None)
 
     def set(self, device: str, control: str, value: float) -> str:
         """Set a control; why not, or nothing."""
@@ -84,7 +101,12 @@ def main() -> int:
     if not key.isascii() or not key:
         print("home assistant: TELESCOPE_KEY is empty; make a key with `function_app api-key`", file=sys.stderr)
         return programs.BAD_INPUT
-    telescope = Telescope(arguments.server, key)
+    try:
+        _check(arguments)
+    except OSError as error:
+        print(f"home assistant: {error}", file=sys.stderr)
+        return programs.BAD_INPUT
+    telescope = Telescope(arguments.server, key, arguments.ca)
     ending = threading.Event()
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, lambda *_: ending.set())
@@ -112,6 +134,22 @@ def main() -> int:
     return 0
 
 
+def _check(arguments: argparse.Namespace) -> None:
+    """See at the start that the authorities can be used.
+
+    Raises:
+        OSError: One cannot, or does not fit.
+    """
+    if arguments.ca is not None and not arguments.server.startswith("https://"):
+        raise OSError("--ca says who may speak for an https server; this one speaks http, which nobody vouches for")
+    for ca in (arguments.ca, arguments.broker_ca):
+        if ca is not None:
+            try:
+                trust.context(ca)
+            except FileNotFoundError as error:
+                raise OSError(f"there is no file {ca}") from error
+
+
 def _connect_there(there: mqtt.Client, bridge: Bridge, arguments: argparse.Namespace) -> None:
     """Home Assistant's broker; paho makes the connection anew where it is lost."""
 
@@ -129,6 +167,8 @@ def _connect_there(there: mqtt.Client, bridge: Bridge, arguments: argparse.Names
     there.on_message = heard
     if arguments.user:
         there.username_pw_set(arguments.user, os.environ.get("HOME_ASSISTANT_PASSWORD", ""))
+    if arguments.broker_ca is not None:
+        there.tls_set_context(trust.context(arguments.broker_ca))
     there.connect(arguments.broker, arguments.port)
     there.loop_start()
 
@@ -139,6 +179,9 @@ def _watch(telescope: Telescope, bridge: Bridge, ending: threading.Event) -> Non
     lost = threading.Event()
     here = mqtt.Client(CallbackAPIVersion.VERSION2, given["client_id"], reconnect_on_failure=False)
     here.username_pw_set(given["username"], given["password"])
+    tls = telescope.tls(given)
+    if tls is not None:
+        here.tls_set_context(tls)
 
     def connected(client: mqtt.Client, _data: object, _flags: object, code: Any, _properties: object) -> None:
         if code.is_failure:
@@ -170,9 +213,18 @@ def _arguments() -> argparse.Namespace:
         prog="python -m infra.home_assistant", description="Shows an account's room devices in Home Assistant."
     )
     parser.add_argument("--server", required=True, help="Telescope, https://host")
+    parser.add_argument(
+        "--ca", type=Path, metavar="FILE", help="the authority (PEM) that alone may speak for an https server"
+    )
     parser.add_argument("--broker", default="127.0.0.1", help="host of Home Assistant's MQTT broker")
     parser.add_argument("--port", type=int, default=1883, help="its port")
     parser.add_argument("--user", default="", help="its user; the password is in HOME_ASSISTANT_PASSWORD")
+    parser.add_argument(
+        "--broker-ca",
+        type=Path,
+        metavar="FILE",
+        help="speak TLS to it; the authority (PEM) that speaks for it",
+    )
     return parser.parse_args()
 
 

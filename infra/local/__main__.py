@@ -105,6 +105,7 @@ class Machine:
                 )
         try:
             self._logs.mkdir(parents=True, exist_ok=True, mode=0o700)
+            settings.remember(chosen, os.environ)
             former = self._agent_home.with_name("ur5")  # its name before there were rooms; its devices keep their ids
             if former.exists() and not self._agent_home.exists():
                 former.rename(self._agent_home)

@@ -1,5 +1,6 @@
 """Settings of one machine, from the environment."""
 
+import json
 import os
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -10,6 +11,17 @@ XMPP_DOMAIN = "telescope.localhost"
 """Of one machine: no name that anybody could look up."""
 ROOMS = Path(__file__).resolve().parents[2] / "robots" / "rooms"
 NO_ROOM = "none"
+_STARTED = "started.json"
+_REMEMBERED = (
+    "TELESCOPE_PORT",
+    "TELESCOPE_BROKER",
+    "TELESCOPE_XMPP",
+    "TELESCOPE_TLS",
+    "TELESCOPE_AGENT_CERTIFICATES",
+    "TELESCOPE_ROOM",
+    "TELESCOPE_PUBLIC_URL",
+)
+"""Settings that somebody else's command at the same folder needs as well. None of them is a secret."""
 
 
 class SettingsError(Exception):
@@ -95,6 +107,41 @@ class Settings:
         }
 
 
+def remember(chosen: Settings, environment: Mapping[str, str]) -> None:
+    """Note in the folder how it was started.
+
+    Raises:
+        OSError: The folder cannot be written.
+    """
+    given = {name: environment[name] for name in _REMEMBERED if name in environment}
+    chosen.home.mkdir(parents=True, exist_ok=True, mode=0o700)
+    fresh = chosen.home / f"{_STARTED}.new"
+    fresh.write_text(json.dumps(given, indent=1) + "\n")
+    fresh.replace(chosen.home / _STARTED)
+
+
+def recall(environment: Mapping[str, str]) -> dict[str, str]:
+    """The environment, with how its folder was started last in place of what it does not say.
+
+    Raises:
+        SettingsError: What was noted there cannot be read.
+    """
+    note = _home(environment) / _STARTED
+    try:
+        noted = json.loads(note.read_text())
+    except FileNotFoundError:
+        return dict(environment)
+    except (OSError, ValueError) as error:
+        raise SettingsError(f"{note} cannot be read ({error}); delete it, and run `make up` once") from error
+    if not isinstance(noted, dict):
+        raise SettingsError(f"{note} is not what `make up` writes; delete it, and run `make up` once")
+    return {name: str(noted[name]) for name in _REMEMBERED if name in noted} | dict(environment)
+
+
+def _home(environment: Mapping[str, str]) -> Path:
+    return Path(environment.get("TELESCOPE_HOME", ".telescope")).expanduser().resolve()
+
+
 def read(environment: Mapping[str, str]) -> Settings:
     """The settings in force.
 
@@ -125,9 +172,8 @@ def read(environment: Mapping[str, str]) -> Settings:
     known = sorted(path.parent.name for path in ROOMS.glob("*/room.toml"))
     if room not in (*known, NO_ROOM):
         raise SettingsError(f"TELESCOPE_ROOM is '{room}'; it must be {', '.join(known)}, or {NO_ROOM} for an arm alone")
-    home = Path(environment.get("TELESCOPE_HOME", ".telescope")).expanduser().resolve()
     return Settings(
-        home=home,
+        home=_home(environment),
         port=int(port),
         broker=cast("Literal['amqtt', 'mosquitto']", broker),
         xmpp=xmpp == "1",

@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from device_agent.protocol import codec, control, grants
-from infra import programs
+from infra import files, programs
 
 SERVICE = "service"
 """User name of the functions' own client, and of its role."""
@@ -42,6 +42,8 @@ _HEADER_BYTES = 600
 """Fixed header, packet id and the longest topic in a PUBLISH [bytes]."""
 _MAX_INFLIGHT = 100
 _MAX_QUEUED = 10_000
+_SECRET = 0o600
+"""Mode of a file that nobody else may read."""
 
 
 def binary() -> str:
@@ -90,8 +92,8 @@ def write(
     security = home / SECURITY_FILE
     if not security.exists():
         password = secrets.token_urlsafe(32)
-        _write_secret(home / PASSWORD_FILE, f"{password}\n")
-        _write_secret(security, json.dumps(first_security(password), indent=1))
+        files.write(home / PASSWORD_FILE, f"{password}\n".encode(), mode=_SECRET)
+        files.write(security, json.dumps(first_security(password), indent=1).encode(), mode=_SECRET)
     elif not (home / PASSWORD_FILE).exists():
         raise FileNotFoundError(
             errno.ENOENT,
@@ -189,7 +191,7 @@ def _renew_service_rights(security: Path) -> None:
             role["acls"] = _service_acls()
             changed = True
     if changed:
-        _write_secret(security, json.dumps(known, indent=1))
+        files.write(security, json.dumps(known, indent=1).encode(), mode=_SECRET)
 
 
 def _by_topic(acls: Iterable[dict[str, Any]]) -> set[tuple[str, str, bool]]:
@@ -203,15 +205,3 @@ def _service_acls() -> list[dict[str, Any]]:
     for pattern in (*grants.SERVICE_SUBSCRIBE, mine):
         acls += [(kind, pattern) for kind in ("subscribePattern", "unsubscribePattern", "publishClientReceive")]
     return [{"acltype": kind, "topic": topic, "priority": 0, "allow": True} for kind, topic in acls]
-
-
-def _write_secret(path: Path, text: str) -> None:
-    """Write a file that nobody else can read at any moment, whole or not at all."""
-    new = path.with_name(f"{path.name}.new")
-    new.unlink(missing_ok=True)
-    descriptor = os.open(new, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600)
-    with os.fdopen(descriptor, "w") as file:
-        file.write(text)
-        file.flush()
-        os.fsync(file.fileno())
-    new.replace(path)

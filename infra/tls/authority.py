@@ -6,7 +6,6 @@ steals its key can pretend to be this site, not a bank. Keys are on P-256, which
 
 import datetime as dt
 import ipaddress
-import os
 import secrets
 from dataclasses import dataclass
 from pathlib import Path
@@ -16,6 +15,8 @@ from cryptography.exceptions import InvalidSignature
 from cryptography.hazmat.primitives import hashes, serialization
 from cryptography.hazmat.primitives.asymmetric import ec
 from cryptography.x509.oid import ExtendedKeyUsageOID, NameOID
+
+from infra import files
 
 CA_CERTIFICATE, CA_KEY = "ca.crt", "ca.key"
 CERTIFICATE, KEY = "server.crt", "server.key"
@@ -99,8 +100,8 @@ def make(folder: Path, site: Names, *, now: dt.datetime) -> None:
         .sign(key, hashes.SHA256())
     )
     folder.mkdir(parents=True, exist_ok=True, mode=0o700)
-    write(folder / CA_KEY, key_pem(key), mode=0o600)
-    write(folder / CA_CERTIFICATE, pem(certificate), mode=0o644)
+    files.write(folder / CA_KEY, key_pem(key), mode=0o600)
+    files.write(folder / CA_CERTIFICATE, pem(certificate), mode=0o644)
     _issue(folder, certificate, key, site.alternatives, now)
 
 
@@ -140,10 +141,10 @@ def take(folder: Path, *, certificate: Path, key: Path, ca: Path | None, now: dt
     if ca is not None:
         load(ca)
     folder.mkdir(parents=True, exist_ok=True, mode=0o700)
-    write(folder / KEY, key.read_bytes(), mode=0o600)
-    write(folder / CERTIFICATE, certificate.read_bytes(), mode=0o644)
+    files.write(folder / KEY, key.read_bytes(), mode=0o600)
+    files.write(folder / CERTIFICATE, certificate.read_bytes(), mode=0o644)
     if ca is not None:
-        write(folder / CA_CERTIFICATE, ca.read_bytes(), mode=0o644)
+        files.write(folder / CA_CERTIFICATE, ca.read_bytes(), mode=0o644)
 
 
 def describe(folder: Path, *, now: dt.datetime) -> str:
@@ -191,17 +192,6 @@ def key_pem(key: ec.EllipticCurvePrivateKey) -> bytes:
     )
 
 
-def write(path: Path, content: bytes, *, mode: int) -> None:
-    """Write a file whole or not at all, at no moment readable by more than ``mode`` says."""
-    new = path.with_name(f"{path.name}.{secrets.token_hex(4)}.new")
-    descriptor = os.open(new, os.O_WRONLY | os.O_CREAT | os.O_EXCL, mode)
-    with os.fdopen(descriptor, "wb") as file:
-        file.write(content)
-        file.flush()
-        os.fsync(file.fileno())
-    new.replace(path)
-
-
 def usage(*, authority: bool) -> x509.KeyUsage:
     """What a key may be used for."""
     return x509.KeyUsage(
@@ -246,8 +236,8 @@ def _issue(
         certificate.verify_directly_issued_by(authority)
     except (ValueError, TypeError, InvalidSignature) as error:
         raise TlsError(f"{folder / CA_KEY} is not the key of {folder / CA_CERTIFICATE}") from error
-    write(folder / KEY, key_pem(key), mode=0o600)
-    write(folder / CERTIFICATE, pem(certificate) + pem(authority), mode=0o644)
+    files.write(folder / KEY, key_pem(key), mode=0o600)
+    files.write(folder / CERTIFICATE, pem(certificate) + pem(authority), mode=0o644)
 
 
 def _public(key: object) -> bytes:

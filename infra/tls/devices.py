@@ -13,6 +13,7 @@ from cryptography.hazmat.primitives import hashes, serialization
 from cryptography.hazmat.primitives.asymmetric import ec
 from cryptography.x509.oid import ExtendedKeyUsageOID, NameOID
 
+from infra import files
 from infra.tls import authority
 from infra.tls.authority import TlsError
 
@@ -49,12 +50,12 @@ def make(folder: Path, *, now: dt.datetime) -> None:
     )
     none = x509.CertificateRevocationListBuilder().issuer_name(name).last_update(now).next_update(end)
     folder.mkdir(parents=True, exist_ok=True, mode=0o700)
-    authority.write(folder / CA_KEY, authority.key_pem(key), mode=0o600)
-    authority.write(folder / SERVICE_KEY, authority.key_pem(service_key), mode=0o600)
-    authority.write(folder / SERVICE_CERTIFICATE, authority.pem(service), mode=0o644)
+    files.write(folder / CA_KEY, authority.key_pem(key), mode=0o600)
+    files.write(folder / SERVICE_KEY, authority.key_pem(service_key), mode=0o600)
+    files.write(folder / SERVICE_CERTIFICATE, authority.pem(service), mode=0o644)
     crl = none.sign(key, hashes.SHA256()).public_bytes(serialization.Encoding.PEM)
-    authority.write(folder / REVOKED, crl, mode=0o644)
-    authority.write(folder / CA_CERTIFICATE, authority.pem(own), mode=0o644)
+    files.write(folder / REVOKED, crl, mode=0o644)
+    files.write(folder / CA_CERTIFICATE, authority.pem(own), mode=0o644)
 
 
 def _begun(
