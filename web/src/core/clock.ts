@@ -35,3 +35,8 @@ export function learnServerTime(serverMs: number, askedAt: number, answeredAt: n
 export function onThisClock(serverMs: number): number {
   return serverMs - (serverOffsetMs ?? Date.now() - now());
 }
+
+/** The server's wall clock now [ms since 1970], as far as it is known. */
+export function serverNow(): number {
+  return now() + (serverOffsetMs ?? Date.now() - now());
+}

@@ -1,8 +1,10 @@
 /** Control of one device from this page: the lease, its renewal, its loss, and the stream of setpoints it allows. */
-import { batch, effect, signal, type ReadonlySignal } from "@preact/signals-core";
-import { ApiError, sentence, type Api, type Granted } from "./api";
+import { batch, computed, effect, signal, type ReadonlySignal } from "@preact/signals-core";
+import type { Api, Granted } from "./api";
+import { Asking } from "./asking";
+import { ApiError, sentence } from "./http";
 import { now } from "./clock";
-import type { DeviceStore } from "./device";
+import type { DeviceStore, OpenRequestHere } from "./device";
 import { MqttLink, type Link, type LinkStatus } from "./link";
 import { RoundTrip } from "./round-trip";
 import { SetpointStreamer } from "./streamer";
@@ -15,7 +17,16 @@ export type ControlState =
   | { kind: "taking" }
   | { kind: "held"; epoch: number; confirmed: boolean }
   | { kind: "lost"; why: string }
+  /** Given to who asked for it. */
+  | { kind: "handed"; to: string }
   | { kind: "refused"; why: string };
+
+/** The holder's answer to who asks for control. */
+export type AnswerState =
+  | { kind: "none" }
+  | { kind: "sending"; accept: boolean }
+  | { kind: "kept"; from: string }
+  | { kind: "failed"; why: string };
 
 /** Makes the connection over which setpoints go. */
 export type OpenControlLink = (device: string, epoch: number) => Link;
@@ -33,7 +44,14 @@ export class Control {
   #expiry: ReturnType<typeof setTimeout> | undefined;
   #cleanups: (() => void)[] = [];
   #obeyed = false;
+  /** To whom control is being handed over: its end is no loss then. */
+  #handingTo: string | null = null;
+  readonly #answer = signal<AnswerState>({ kind: "none" });
 
+  /** Asking somebody else for it. */
+  readonly asking: Asking;
+  /** Answering somebody who asks for it. */
+  readonly answered: ReadonlySignal<AnswerState> = this.#answer;
   readonly state: ReadonlySignal<ControlState> = this.#state;
   /** There while the lease is held. */
   readonly streamer: ReadonlySignal<SetpointStreamer | null> = this.#streamer;
@@ -45,18 +63,64 @@ export class Control {
     this.#device = device;
     this.#openLink =
       openLink ?? ((id, epoch) => new MqttLink(() => api.credentials({ purpose: "control", device: id, epoch })));
+    // What was accepted is this session's already: to renew it is all there is to do.
+    this.asking = new Asking(api, device, (epoch) => {
+      void this.#begin(() => api.renewLease(device.id, LEASE_MS, epoch));
+    });
   }
+
+  /** Who asks this page for control. */
+  readonly asked = computed<OpenRequestHere | null>(() =>
+    this.#state.value.kind === "held" ? this.#device.request.value : null,
+  );
 
   get epoch(): number | null {
     return this.#state.value.kind === "held" ? this.#state.value.epoch : null;
   }
 
   async take(): Promise<void> {
+    this.asking.clear();
+    await this.#begin(() => this.#api.takeLease(this.#device.id, LEASE_MS));
+  }
+
+  /** Take it from whoever has it, who reads why. For owners. */
+  async takeOver(reason: string): Promise<void> {
+    this.asking.clear();
+    await this.#begin(() => this.#api.takeOver(this.#device.id, LEASE_MS, reason));
+  }
+
+  /** What became of an answer, or of asking, has been read. */
+  read(): void {
+    this.asking.clear();
+    if (this.#answer.value.kind !== "sending") this.#answer.value = { kind: "none" };
+    const { kind } = this.#state.value;
+    if (kind === "handed" || kind === "lost" || kind === "refused") this.#state.value = { kind: "none" };
+  }
+
+  /** Hand control to who asks, or keep it. */
+  async answer(accept: boolean): Promise<void> {
+    const asked = this.asked.value;
+    if (asked === null || this.#answer.value.kind === "sending") return;
+    this.#answer.value = { kind: "sending", accept };
+    if (accept) this.#handingTo = asked.by;
+    try {
+      await this.#api.answerRequest(this.#device.id, asked.id, accept);
+      this.#answer.value = accept ? { kind: "none" } : { kind: "kept", from: asked.by };
+      if (accept) this.#handed(asked.by);
+    } catch (error) {
+      this.#answer.value = { kind: "failed", why: sentence(error) };
+      void this.#device.refreshLease();
+    } finally {
+      this.#handingTo = null;
+    }
+  }
+
+  async #begin(grant: () => Promise<Granted>): Promise<void> {
     if (this.#state.value.kind === "taking" || this.#state.value.kind === "held") return;
     this.#state.value = { kind: "taking" };
     const askedAt = now();
     try {
-      this.#hold(await this.#api.takeLease(this.#device.id, LEASE_MS), askedAt);
+      this.#hold(await grant(), askedAt);
     } catch (error) {
       this.#state.value = { kind: "refused", why: sentence(error) };
       void this.#device.refreshLease();
@@ -90,6 +154,7 @@ export class Control {
   }
 
   dispose(): void {
+    this.asking.dispose();
     void this.release(true);
     this.#letGo({ kind: "none" });
   }
@@ -97,6 +162,7 @@ export class Control {
   #hold(granted: Granted, askedAt: number): void {
     const { epoch } = granted;
     this.#obeyed = false;
+    this.#answer.value = { kind: "none" };
     this.#device.setLease({ holder: granted.holder, epoch, expires_at: granted.expires_at, mine: true });
     this.roundTrip.restart();
     const link = this.#openLink(this.#device.id, epoch);
@@ -130,6 +196,10 @@ export class Control {
     queueMicrotask(() => {
       const current = this.#state.peek();
       if (current.kind !== "held" || current.epoch !== epoch) return;
+      if (this.#handingTo !== null) {
+        if (heard > epoch) this.#handed(this.#handingTo);
+        return;
+      }
       if (heard > epoch) {
         this.#lose("Somebody else has control now.");
         return;
@@ -180,6 +250,12 @@ export class Control {
     }
   }
 
+  #handed(to: string): void {
+    if (this.epoch === null) return;
+    this.#letGo({ kind: "handed", to });
+    void this.#device.refreshLease();
+  }
+
   #lose(why: string): void {
     if (this.epoch === null) return;
     this.#letGo({ kind: "lost", why });
@@ -194,6 +270,7 @@ export class Control {
     this.#streamer.value?.dispose();
     this.#link?.close();
     this.#link = null;
+    this.asking.clear();
     batch(() => {
       this.#streamer.value = null;
       this.#linkStatus.value = null;

@@ -1,6 +1,7 @@
 /** One device as the page knows it: only what it or the cloud has said, with the time at which it was heard. */
-import { computed, signal, type ReadonlySignal } from "@preact/signals-core";
-import { ApiError, type Api, type Device, type Lease } from "./api";
+import { computed, signal, type ReadonlySignal, type Signal } from "@preact/signals-core";
+import type { Api, Device, Lease } from "./api";
+import { ApiError } from "./http";
 import { clock, now, onThisClock } from "./clock";
 import { History } from "./history";
 import type { Link } from "./link";
@@ -9,6 +10,7 @@ import {
   readAck,
   readDescription,
   readEvent,
+  readMeasurements,
   readPresence,
   readState,
   readTelemetry,
@@ -20,7 +22,8 @@ import {
   type KnownTelemetry,
   type KnownTwin,
 } from "./messages";
-import type { Presence } from "./protocol";
+import { readFrame, type CameraFrame } from "./frames";
+import type { Measurements, Presence } from "./protocol";
 import { deviceTopics, type DeviceTopics } from "./topics";
 
 /** `unknown`: this page has no connection of its own, so it cannot say. */
@@ -38,6 +41,24 @@ export interface Timed<T> {
   receivedAt: number;
 }
 
+/** `receivedAt`: on the page's clock, when it came [ms]. */
+export type AckReceiver = (ack: KnownAck, receivedAt: number) => void;
+
+/** The newest of one stream; `everyMs`: how long after the one before it came, `null` for the first. */
+export interface Measured extends Timed<Measurements> {
+  everyMs: number | null;
+}
+
+export interface OpenRequestHere {
+  id: string;
+  by: string;
+  until: number;
+}
+
+/** What is measured on its own page and comes this much later than it should is stale [ms]. */
+const LATE_MS = 1_000;
+const PERIODS = 3;
+
 export class DeviceStore {
   readonly id: string;
   readonly topics: DeviceTopics;
@@ -49,15 +70,17 @@ export class DeviceStore {
   readonly #description = signal<KnownDescription | null>(null);
   readonly #twin = signal<KnownTwin | null>(null);
   readonly #state = signal<KnownState | null>(null);
+  #stateAt = 0;
   readonly #telemetry = signal<Timed<KnownTelemetry> | null>(null);
+  readonly #measured = new Map<string, Signal<Measured | null>>();
   readonly #events = signal<readonly KnownEvent[]>([]);
   readonly #lease;
   readonly #heardAt = signal<number | null>(null);
   readonly #troubles = signal<ReadonlyMap<string, string>>(new Map());
   readonly #close = signal(false);
   readonly #retained = new Map<string, Uint8Array>();
-  readonly #ackReceivers = new Set<(ack: KnownAck) => void>();
-  readonly #recentAcks = new Map<string, KnownAck[]>();
+  readonly #ackReceivers = new Set<AckReceiver>();
+  readonly #recentAcks = new Map<string, Timed<KnownAck>[]>();
 
   readonly info: ReadonlySignal<Device>;
   readonly presence: ReadonlySignal<Required<Presence> | null> = this.#presence;
@@ -123,6 +146,21 @@ export class DeviceStore {
     return current === null ? null : { name: current.holder, mine: current.mine };
   });
 
+  /**
+   * Who asks the holder for control; `until`: on the page's clock. By the word of the device where it shows the lease
+   * that is in force, else by the cloud's.
+   */
+  readonly request = computed<OpenRequestHere | null>(() => {
+    const told = this.#state.value?.lease ?? null;
+    const lease = this.#lease.value;
+    if (told !== null && told.epoch >= (lease?.epoch ?? 0)) {
+      const { request } = told;
+      return request ? { id: request.id, by: request.by, until: this.#stateAt + request.expires_in_ms } : null;
+    }
+    const request = lease?.request ?? null;
+    return request === null ? null : { id: request.id, by: request.by, until: onThisClock(Date.parse(request.expires_at)) };
+  });
+
   constructor(info: Device, api: Api, link: Link) {
     this.id = info.id;
     this.topics = deviceTopics(info.topic);
@@ -158,6 +196,7 @@ export class DeviceStore {
       [this.topics.conn]: (payload, _, retained) => this.#hearPresence(readPresence(payload), retained),
       [this.topics.state]: (payload, _, retained) => {
         const state = readState(payload);
+        this.#stateAt = retained ? Math.min(now(), onThisClock(state.at_ms)) : now();
         this.#state.value = state;
         this.#noteHeard(state.at_ms, retained);
       },
@@ -176,6 +215,7 @@ export class DeviceStore {
       },
       [this.topics.tele]: (payload, topic) => {
         if (topic === this.topics.joints) this.#hearTelemetry(readTelemetry(payload));
+        else this.#hearMeasurements(topic, readMeasurements(payload));
       },
       [this.topics.event]: (payload) => this.#hearEvent(readEvent(payload)),
       [this.topics.ack]: (payload) => this.#hearAck(readAck(payload)),
@@ -187,12 +227,57 @@ export class DeviceStore {
     };
   }
 
+  /** The newest measurements of a stream other than the joints'; `null` before the first. */
+  measured(stream: string): ReadonlySignal<Measured | null> {
+    return this.#measuredOf(stream);
+  }
+
+  /** Whether a stream is older than three of its periods and a second: the description's period, or the one seen. */
+  late(stream: string): boolean {
+    const newest = this.#measuredOf(stream).value;
+    if (newest === null || !this.#link.up.value) return true;
+    const rate = this.#description.value?.streams.find((one) => one.name === stream)?.rate_hz ?? 1;
+    const periodMs = Math.max(1000 / rate, newest.everyMs ?? 0);
+    return clock.value - newest.receivedAt > LATE_MS + PERIODS * periodMs;
+  }
+
+  /** Hear what a device is, and no more: enough to offer what it has. Returns what ends it. */
+  watchDescription(): () => void {
+    return this.#subscribe({
+      [this.topics.desc]: (payload, topic) => {
+        if (this.#isNew(topic, payload)) this.#description.value = readDescription(payload);
+      },
+    });
+  }
+
+  /** Hear what a device is and what it measures: enough for a plan. Returns what ends it. */
+  watchMeasurements(): () => void {
+    return this.#subscribe({
+      [this.topics.desc]: (payload, topic) => {
+        if (this.#isNew(topic, payload)) this.#description.value = readDescription(payload);
+      },
+      [this.topics.tele]: (payload, topic) => {
+        if (topic !== this.topics.joints) this.#hearMeasurements(topic, readMeasurements(payload));
+      },
+    });
+  }
+
+  /** Hear the pictures of a camera. Nothing is sent to this page before, or after what is returned is called. */
+  watchCamera(name: string, receiver: (frame: CameraFrame) => void): () => void {
+    return this.#subscribe({
+      [this.topics.cam(name)]: (payload) => {
+        receiver(readFrame(payload));
+        this.#heardAt.value = now();
+      },
+    });
+  }
+
   /** Hear the acks of one command, from the first that this page has seen. Returns what ends it. */
-  onAck(id: string, receiver: (ack: KnownAck) => void): () => void {
-    const mine = (ack: KnownAck): void => {
-      if (ack.id === id) receiver(ack);
+  onAck(id: string, receiver: AckReceiver): () => void {
+    const mine: AckReceiver = (ack, receivedAt) => {
+      if (ack.id === id) receiver(ack, receivedAt);
     };
-    this.#recentAcks.get(id)?.forEach(receiver);
+    for (const { message, receivedAt } of this.#recentAcks.get(id) ?? []) receiver(message, receivedAt);
     this.#ackReceivers.add(mine);
     return () => this.#ackReceivers.delete(mine);
   }
@@ -253,6 +338,25 @@ export class DeviceStore {
     this.history.add(message, at);
   }
 
+  #measuredOf(stream: string): Signal<Measured | null> {
+    let found = this.#measured.get(stream);
+    if (found === undefined) {
+      found = signal(null);
+      this.#measured.set(stream, found);
+    }
+    return found;
+  }
+
+  #hearMeasurements(topic: string, message: Measurements): void {
+    const newest = this.#measuredOf(topic.slice(topic.lastIndexOf("/") + 1));
+    const known = newest.value;
+    // The same twice, or out of order, unless the agent has started again.
+    if (known !== null && message.tick_ms <= known.message.tick_ms && message.at_ms <= known.message.at_ms) return;
+    const at = now();
+    newest.value = { message, receivedAt: at, everyMs: known === null ? null : at - known.receivedAt };
+    this.#heardAt.value = at;
+  }
+
   #hearEvent(event: KnownEvent): void {
     if (this.#events.value.some((known) => known.id === event.id)) return;
     this.#events.value = [event, ...this.#events.value].slice(0, EVENTS_KEPT);
@@ -260,9 +364,10 @@ export class DeviceStore {
 
   #hearAck(ack: KnownAck): void {
     const known = this.#recentAcks.get(ack.id) ?? [];
-    this.#recentAcks.set(ack.id, [...known, ack]);
+    const receivedAt = now();
+    this.#recentAcks.set(ack.id, [...known, { message: ack, receivedAt }]);
     for (const oldest of [...this.#recentAcks.keys()].slice(0, -EVENTS_KEPT)) this.#recentAcks.delete(oldest);
-    for (const receiver of this.#ackReceivers) receiver(ack);
+    for (const receiver of this.#ackReceivers) receiver(ack, receivedAt);
   }
 
   /** A retained message was said some time ago: its own time counts, never a later one than now. */

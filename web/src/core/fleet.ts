@@ -1,6 +1,7 @@
 /** All devices that this account may see. */
-import { signal, type ReadonlySignal } from "@preact/signals-core";
-import { sentence, type Api, type Device } from "./api";
+import { effect, signal, type ReadonlySignal } from "@preact/signals-core";
+import type { Api, Device } from "./api";
+import { sentence } from "./http";
 import { DeviceStore } from "./device";
 import { MqttLink, type Link } from "./link";
 
@@ -14,6 +15,8 @@ export class Fleet {
   readonly #spaces = signal<ReadonlyMap<string, string>>(new Map());
   readonly #ends = new Map<string, () => void>();
   readonly #timer: ReturnType<typeof setInterval>;
+  readonly #forget: () => void;
+  #cut = false;
 
   /** By id, in the order of the list; `null` until the first answer. */
   readonly devices: ReadonlySignal<ReadonlyMap<string, DeviceStore> | null> = this.#devices;
@@ -25,6 +28,7 @@ export class Fleet {
     this.link = link ?? new MqttLink(() => api.credentials({ purpose: "watch" }));
     void this.refresh();
     this.#timer = setInterval(() => void this.refresh(), REFRESH_MS);
+    this.#forget = this.#askWhenCut();
   }
 
   /** The name of a space, or its id while that is all that is known. */
@@ -43,17 +47,32 @@ export class Fleet {
   }
 
   /** Pair an agent with this account by the code it shows; its devices. Throws `ApiError`. */
-  async claim(code: string): Promise<Device[]> {
-    const devices = await this.#api.claim(code);
+  async claim(code: string, space: string | null = null): Promise<Device[]> {
+    const devices = await this.#api.claim(code, space);
     await this.refresh();
     return devices;
   }
 
   dispose(): void {
     clearInterval(this.#timer);
+    this.#forget();
     for (const end of this.#ends.values()) end();
     this.#ends.clear();
     this.link.close();
+  }
+
+  /** A share that ends or changes cuts the connection: what may be seen now is asked for at once, and when it is back. */
+  #askWhenCut(): () => void {
+    let was = this.link.status.value.state;
+    return effect(() => {
+      const { state } = this.link.status.value;
+      const cut = was === "up" && state !== "up" && state !== "closed";
+      const back = was !== "up" && state === "up" && this.#cut;
+      was = state;
+      if (cut) this.#cut = true;
+      if (back) this.#cut = false;
+      if (cut || back) queueMicrotask(() => void this.refresh());
+    });
   }
 
   #unnamed(): boolean {

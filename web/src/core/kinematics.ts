@@ -88,6 +88,17 @@ export function forward(twin: KnownTwin, positions: Readonly<Record<string, numb
   return world;
 }
 
+/** Where each joint is: its anchor, and how the body that it turns stands; in the order of the twin. */
+export function jointFrames(twin: KnownTwin, positions: Readonly<Record<string, number>>): (Placement & { name: string })[] {
+  const world = forward(twin, positions);
+  return twin.bodies.flatMap(({ joint }, index) => {
+    const placement = world[index];
+    if (joint === null || placement === undefined) return [];
+    const { position_m: at, quaternion } = placement;
+    return [{ name: joint.name, position_m: add(at, rotate(quaternion, joint.anchor_m)), quaternion }];
+  });
+}
+
 /** Nearer than this to a pitch of a quarter turn, roll and yaw turn about the same axis: all of it is called roll. */
 const LOCKED = 1 - 1e-9;
 

@@ -4,7 +4,8 @@
  */
 import { computed, signal, type ReadonlySignal } from "@preact/signals-core";
 import type { MqttClient } from "mqtt";
-import { ApiError, sentence, type Credentials } from "./api";
+import type { Credentials } from "./api";
+import { ApiError, sentence } from "./http";
 import { now } from "./clock";
 import { matches } from "./topics";
 
@@ -27,6 +28,8 @@ export interface Link {
   subscribe(filter: string, receiver: Receiver): () => void;
   /** Send now or fail: nothing is ever kept for later. Resolves when sent (QoS 0) or acknowledged (QoS 1). */
   publish(topic: string, message: object, qos: 0 | 1): Promise<void>;
+  /** There to the broker and back: resolves when it has answered. */
+  ping(): Promise<void>;
   /** Fetch new credentials, for what has become visible since, and move to them. */
   renew(): void;
   close(): void;
@@ -38,6 +41,7 @@ const KEEPALIVE_S = 60;
 const PING_AFTER_SILENCE_MS = 5_000;
 const DEAD_AFTER_SILENCE_MS = 12_000;
 const CONNECT_TIMEOUT_MS = 8_000;
+const NO_CONNECTION = "There is no connection to the broker.";
 const BACKOFF_MS = [250, 500, 1_000, 2_000, 4_000] as const;
 const REFRESH_MARGIN_MS = 60_000;
 
@@ -47,6 +51,8 @@ interface Connection {
   obtainedAt: number;
   heardAt: number;
   retired: boolean;
+  /** How many pings the broker has not answered yet: it answers them in their order. */
+  pings: number;
 }
 
 export class MqttLink implements Link {
@@ -91,12 +97,41 @@ export class MqttLink implements Link {
 
   publish(topic: string, message: object, qos: 0 | 1): Promise<void> {
     const client = this.#current?.client;
-    if (!client?.connected) return Promise.reject(new Error("There is no connection to the broker."));
+    if (!client?.connected) return Promise.reject(new Error(NO_CONNECTION));
     return new Promise((resolve, reject) => {
       client.publish(topic, JSON.stringify(message), { qos }, (error) => {
         if (error) reject(error);
         else resolve();
       });
+    });
+  }
+
+  ping(): Promise<void> {
+    const connection = this.#current;
+    if (!connection?.client.connected) return Promise.reject(new Error(NO_CONNECTION));
+    const { client } = connection;
+    return new Promise((resolve, reject) => {
+      let before = connection.pings;
+      const settle = (): void => {
+        clearTimeout(timer);
+        client.off("packetreceive", heard);
+        client.off("close", lost);
+      };
+      const heard = ({ cmd }: { cmd: string }): void => {
+        if (cmd !== "pingresp") return;
+        before -= 1;
+        if (before >= 0) return;
+        settle();
+        resolve();
+      };
+      const lost = (): void => {
+        settle();
+        reject(new Error("The broker did not answer."));
+      };
+      const timer = setTimeout(lost, CONNECT_TIMEOUT_MS);
+      client.on("packetreceive", heard);
+      client.on("close", lost);
+      client.sendPing();
     });
   }
 
@@ -128,7 +163,7 @@ export class MqttLink implements Link {
       const obtainedAt = now();
       const credentials = await this.#obtain();
       const client = await connect(credentials, this.#closing.signal);
-      await this.#adopt({ client, credentials, obtainedAt, heardAt: now(), retired: false });
+      await this.#adopt({ client, credentials, obtainedAt, heardAt: now(), retired: false, pings: 0 });
     } catch (error) {
       this.#failed(error);
     } finally {
@@ -151,7 +186,13 @@ export class MqttLink implements Link {
       // Two connections may deliver for a moment: every receiver takes a message twice without harm.
       if (!next.retired) this.#deliver(topic, payload, packet.retain);
     });
-    client.on("packetreceive", () => (next.heardAt = now()));
+    client.on("packetreceive", ({ cmd }) => {
+      next.heardAt = now();
+      if (cmd === "pingresp") next.pings -= 1;
+    });
+    client.on("packetsend", ({ cmd }) => {
+      if (cmd === "pingreq") next.pings += 1;
+    });
     client.on("close", () => this.#lost(next));
     client.on("error", () => undefined); // 'close' follows, and says what there is to say.
     const previous = this.#current;

@@ -7,9 +7,11 @@ import type {
   Ack,
   AckStatus,
   ActionState,
+  BaseLimits,
   Body,
   Control,
   Description,
+  Diagnostic,
   Event,
   Fault,
   Geometry,
@@ -17,7 +19,10 @@ import type {
   Joint,
   JointTelemetry,
   LeaseState,
+  Measurements,
+  Mirror,
   Mode,
+  Narrowing,
   OpenRequest,
   Presence,
   Reason,
@@ -129,6 +134,9 @@ const joint = object<Joint>({
   max_effort_nm: number,
 });
 
+const mirror = object<Required<Mirror>>({ joint: text, of: text, factor: optional(number, 1) });
+const narrowing = object<Narrowing>({ joint: text, by: text, table: list(vector3, 200) });
+
 const stream = object<Stream>({ name: text, rate_hz: number });
 
 const control = object<Required<Control>>({
@@ -139,12 +147,29 @@ const control = object<Required<Control>>({
   upper: number,
 });
 
+const diagnostic = object<Required<Diagnostic>>({
+  stream: optional(text, ""),
+  fields: text,
+  label: text,
+  unit: optional(text, ""),
+  advice: optional(text, ""),
+  low: nullable(number),
+  high: nullable(number),
+  warning_low: nullable(number),
+  warning_high: nullable(number),
+  change: nullable(number),
+  horizon_s: optional(number, 0),
+  questions: optional(list(text, MAX_JOINTS), []),
+});
+
 const description = object<KnownDescription>({
   device: text,
   kind: text,
   robot_type: text,
   label: text,
   joints: optional(list(joint, MAX_JOINTS), []),
+  mirrors: optional(list(mirror, MAX_JOINTS), []),
+  narrowing: optional(list(narrowing, MAX_JOINTS), []),
   frames: optional(list(text, MAX_JOINTS), []),
   capabilities: optional(list(text, MAX_JOINTS), []),
   actions: optional(list(text, MAX_JOINTS), []),
@@ -165,6 +190,9 @@ const description = object<KnownDescription>({
     list(object<InterlockRule>({ name: text, action: oneOf("slow", "hold"), speed: number, stale_ms: count }), MAX_JOINTS),
     [],
   ),
+  diagnostics: optional(list(diagnostic, MAX_JOINTS), []),
+  position_m: nullable(vector3),
+  base: nullable(object<BaseLimits>({ forward_m_s: number, left_m_s: number, turn_rad_s: number })),
 });
 
 const geometry = object<Geometry>({
@@ -244,6 +272,17 @@ const jointTelemetry = object<Required<JointTelemetry>>({
   limited: optional(list(text, MAX_JOINTS), []),
 });
 
+/** Numbers and states by name. */
+const values: Check<Record<string, number | boolean>> = (value, at) => {
+  const entries = Object.entries(anything(value, at));
+  if (entries.length > MAX_JOINTS) fail(at, `at most ${MAX_JOINTS} values`);
+  return Object.fromEntries(
+    entries.map(([name, entry]) => [name, typeof entry === "boolean" ? entry : number(entry, `${at}.${name}`)]),
+  );
+};
+
+const measurements = object<Measurements>({ tick_ms: count, at_ms: count, sequence: count, values });
+
 const event = object<Required<Event>>({
   id: text,
   device: text,
@@ -279,8 +318,11 @@ function read<T>(payload: Uint8Array, check: Check<T>, name: string): T {
   return check(value, name);
 }
 
-/** Without what only the cloud goes by. */
-export type KnownDescription = Required<Omit<Description, "diagnostics">>;
+export type KnownDiagnostic = Required<Diagnostic>;
+export type KnownDescription = Required<Omit<Description, "diagnostics" | "mirrors">> & {
+  diagnostics: KnownDiagnostic[];
+  mirrors: Required<Mirror>[];
+};
 export type KnownBody = Required<Body>;
 export interface KnownTwin {
   device: string;
@@ -331,6 +373,50 @@ export function readTelemetry(payload: Uint8Array): KnownTelemetry {
   for (const name of ["velocity_rad_s", "effort_nm", "commanded_rad"] as const) {
     if (found[name].length !== length) fail(`telemetry.${name}`, `a list of ${length} numbers`);
   }
+  return found;
+}
+
+/** `tele/{stream}` of every stream but `joints`. Throws `MessageError`. */
+export function readMeasurements(payload: Uint8Array): Measurements {
+  return read(payload, measurements, "measurements");
+}
+
+/** What a `shoot` answers: the values of each stream. Throws `MessageError`. */
+export function readShot(result: unknown): Record<string, Record<string, number | boolean>> {
+  const streams = Object.entries(anything(anything(result, "result")["values"], "result.values"));
+  return Object.fromEntries(streams.map(([name, entry]) => [name, values(entry, `result.values.${name}`)]));
+}
+
+/** What a `set_control` answers: what was applied. Throws `MessageError`. */
+export function readApplied(result: unknown): Record<string, number> {
+  return byName(anything(result, "result")["applied"], "result.applied");
+}
+
+/** One turn of a lidar, as its capture `scan` tells it. `range_m` is `null` where a beam met nothing. */
+export interface LidarScan {
+  at_ms: number;
+  angle_rad: number[];
+  range_m: (number | null)[];
+  furthest_m: number;
+}
+
+const MAX_BEAMS = 100_000;
+
+/** A file `scan`. Throws `MessageError`. */
+export function readScan(content: string): LidarScan {
+  let given: unknown;
+  try {
+    given = JSON.parse(content);
+  } catch {
+    throw new MessageError("scan is not JSON");
+  }
+  const found = object<LidarScan>({
+    at_ms: count,
+    angle_rad: list(number, MAX_BEAMS),
+    range_m: list(nullable(number), MAX_BEAMS),
+    furthest_m: number,
+  })(given, "scan");
+  if (found.angle_rad.length !== found.range_m.length) fail("scan.range_m", "as long as angle_rad");
   return found;
 }
 

@@ -21,9 +21,12 @@ export interface Presence {
  *
  * `actions` names the kinds of action that it takes; `postures`, `expressions` and `behaviours` what those of
  * these kinds may name. An agent that names no actions is an older one.
+ * `mirrors` and `narrowing`: how its joints hang together.
  * `cameras`: what `cam/{name}` shows; `captures`: what raw data can be had; `controls`: what can be set.
  *
  * `diagnostics`: how what it measures is to be judged, where that is said by no robot type, but by its room.
+ * `position_m`: where a room device is, in its room's frame; of a robot its room tells (`positions`).
+ * `base`: the limits of one that drives or walks; missing where it stays in its place.
  *
  * `scripts`: movement scripts run in the jail, run with less (`trusted`, as the agent's owner wants it), or are
  * refused; `scripts_note` says why, and what to do.
@@ -36,6 +39,8 @@ export interface Description {
   robot_type: string;
   label: string;
   joints?: Joint[];
+  mirrors?: Mirror[];
+  narrowing?: Narrowing[];
   frames?: string[];
   capabilities?: string[];
   actions?: string[];
@@ -52,6 +57,8 @@ export interface Description {
   limits?: string[];
   interlocks?: InterlockRule[];
   diagnostics?: Diagnostic[];
+  position_m?: [number, number, number] | null;
+  base?: BaseLimits | null;
   scripts?: "jailed" | "refused" | "trusted";
   scripts_note?: string;
 }
@@ -66,6 +73,33 @@ export interface Joint {
   max_acceleration_rad_s2: number;
   max_jerk_rad_s3: number;
   max_effort_nm: number;
+}
+
+/**
+ * One motor moves two joints.
+ *
+ * Attributes:
+ * joint: The one that only follows: at `factor` times the position of
+ * of: the joint that counts. Whoever names either moves both.
+ */
+export interface Mirror {
+  joint: string;
+  of: string;
+  factor?: number;
+}
+
+/**
+ * The range of one joint depends on where another one is.
+ *
+ * Attributes:
+ * joint: Whose range; `by`: the other.
+ * table: Rows of `by`'s position and the range there, lower and upper [rad]; linear in between. It reaches over
+ * all of `by`'s range.
+ */
+export interface Narrowing {
+  joint: string;
+  by: string;
+  table: [number, number, number][];
 }
 
 /** One stream at `tele/{name}`: `joints` carries `JointTelemetry`, all others `Measurements`. */
@@ -125,6 +159,13 @@ export interface Diagnostic {
   change?: number | null;
   horizon_s?: number;
   questions?: string[];
+}
+
+/** How fast a base may be driven: forward or back, to a side (0: it cannot), turning. */
+export interface BaseLimits {
+  forward_m_s: number;
+  left_m_s: number;
+  turn_rad_s: number;
 }
 
 /** `desc/twin`: the drawing from which a page builds its live view. Retained. */

@@ -1,6 +1,7 @@
 /** Who is signed in. The token of a sign-in link is used once and kept nowhere. */
 import { signal, type ReadonlySignal } from "@preact/signals-core";
-import { ApiError, sentence, type Account, type Api } from "./api";
+import type { Account, Api } from "./api";
+import { ApiError, sentence } from "./http";
 
 export type SessionState =
   | { kind: "checking" }
@@ -37,6 +38,12 @@ export class Session {
   /** Sign in by name and password. Throws what the server says against it. */
   async enter(name: string, password: string): Promise<void> {
     await this.#api.signInByPassword(name, password);
+    this.#state.value = { kind: "in", account: await this.#api.me() };
+  }
+
+  /** Make an account with an invitation, and be signed in to it. Throws what the server says against it. */
+  async join(invitation: string, name: string, password: string): Promise<void> {
+    await this.#api.makeAccount(invitation, name, password);
     this.#state.value = { kind: "in", account: await this.#api.me() };
   }
 

@@ -1,6 +1,7 @@
 /** Stop: told to the robot by every way there is, again and again, until the robot itself says that it has stopped. */
 import { computed, effect, signal, type ReadonlySignal } from "@preact/signals-core";
-import { sentence, type Api } from "./api";
+import type { Api } from "./api";
+import { sentence } from "./http";
 import { now } from "./clock";
 import type { DeviceStore } from "./device";
 import { newId } from "./ids";

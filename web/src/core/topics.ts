@@ -8,6 +8,7 @@ export interface DeviceTopics {
   /** The filter; the joints' stream is `tele/joints`. */
   tele: string;
   joints: string;
+  cam: (name: string) => string;
   event: string;
   ack: string;
   stop: string;
@@ -22,6 +23,7 @@ export function deviceTopics(base: string): DeviceTopics {
     state: `${base}/state`,
     tele: `${base}/tele/+`,
     joints: `${base}/tele/joints`,
+    cam: (name) => `${base}/cam/${name}`,
     event: `${base}/event`,
     ack: `${base}/ack`,
     stop: `${base}/stop`,

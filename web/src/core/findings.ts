@@ -1,0 +1,100 @@
+/** What a check has found wrong, taken apart: which file, which line, what kind, so that a page can say what to do. */
+
+export type FindingKind =
+  | "range"
+  | "missing"
+  | "torn"
+  | "word"
+  | "element"
+  | "unnamed"
+  | "servo"
+  | "shape"
+  | "unstable"
+  | "outside"
+  | "manifest"
+  | "field"
+  | "script"
+  | "builtIn"
+  | "heavy"
+  | "checker"
+  | "camera"
+  | "idle"
+  | "mesh"
+  | "invisible"
+  | "other";
+
+export interface Finding {
+  /** Name in the folder; empty where it is not about one file. */
+  file: string;
+  line: number | null;
+  kind: FindingKind;
+  /** What the check said, without file and line. */
+  said: string;
+  /** What it is about, such as a joint's or a file's name; empty where nothing is named. */
+  about: string;
+  /** Of a range: what the model allows [rad]. */
+  range_rad: readonly [number, number] | null;
+}
+
+const FILE = /^([\w./ -]+\.(?:xml|toml|py|stl|obj|png)):\s*/;
+const LINES = [/\(at line (\d+)[^)]*\)/, /\(line (\d+)\)/, /Line number=(\d+)/, /\bline (\d+)/i];
+const RANGE = /range of (?:joint|actuator) '[^']*' is (-?[\d.]+) to (-?[\d.]+)/;
+
+/** The first that fits; what is about a line alone comes last. */
+const KINDS: readonly (readonly [FindingKind, RegExp])[] = [
+  ["range", RANGE],
+  ["missing", /is not among the files/],
+  ["builtIn", /comes with the installation/],
+  ["outside", /leads out of the robot type's folder|DOCTYPE/],
+  ["unnamed", /^no (joint|actuator|site or body) '/],
+  ["servo", /servo/],
+  ["shape", /neither a hinge nor a slide/],
+  ["unstable", /unstable at home/],
+  ["heavy", /Simplify/],
+  ["checker", /checker|cut off|is gone/],
+  ["camera", /there is no camera/],
+  ["idle", /nobody can move it/],
+  ["mesh", /meshes are shown as boxes/],
+  ["invisible", /nothing of it can be seen|too many parts/],
+  ["element", /unrecognized element|Schema violation/i],
+  ["word", /invalid keyword|unrecognized attribute/i],
+  ["torn", /XML_ERROR|mismatched tag|not well-formed|unclosed token|no element found|undefined entity|XML parse error/i],
+];
+
+export function readFinding(error: string): Finding {
+  const file = FILE.exec(error)?.[1] ?? "";
+  const said = error.slice(FILE.exec(error)?.[0].length ?? 0);
+  const line = LINES.map((each) => each.exec(said)?.[1]).find((found) => found !== undefined);
+  const range = RANGE.exec(said);
+  return {
+    file,
+    line: line === undefined ? null : Number(line),
+    kind: kindOf(file, said),
+    said: tidy(said),
+    about: /'([^']*)'/.exec(said)?.[1] ?? "",
+    range_rad: range === null ? null : [Number(range[1]), Number(range[2])],
+  };
+}
+
+/** All that was found, by file; of one file by line. What is about no file comes first. */
+export function readFindings(errors: readonly string[]): Finding[] {
+  const found = errors.map(readFinding);
+  return found.sort((one, other) => one.file.localeCompare(other.file) || (one.line ?? 0) - (other.line ?? 0));
+}
+
+function kindOf(file: string, said: string): FindingKind {
+  const found = KINDS.find(([, words]) => words.test(said))?.[0];
+  if (found !== undefined && !(file.endsWith(".py") || file === "robot.toml") ) return found;
+  if (file.endsWith(".py")) return "script";
+  if (file === "robot.toml") return /at line \d+/.test(said) ? "manifest" : "field";
+  return "other";
+}
+
+/** The line is shown beside it. */
+function tidy(said: string): string {
+  return said
+    .replace(/\s*\((?:at )?line \d+[^)]*\)/, "")
+    .replace(/^Line \d+: /, "")
+    .replace(/^(?:XML )?Error: /, "")
+    .trim();
+}

@@ -1,0 +1,75 @@
+/** What this browser keeps for an account: text that is not saved yet, values that were used last. */
+
+/** As `localStorage` is. A browser may refuse it, and may be full: nothing is kept then, and nothing else happens. */
+export type Store = Pick<Storage, "getItem" | "setItem" | "removeItem">;
+
+export class Kept<T> {
+  readonly #store: Store | null;
+  readonly #key: string;
+  readonly #fits: (value: unknown) => value is T;
+
+  /** `fits`: whether what was found is what was kept: another version of this page may have written it. */
+  constructor(store: Store | null, key: string, fits: (value: unknown) => value is T) {
+    this.#store = store;
+    this.#key = `telescope.${key}`;
+    this.#fits = fits;
+  }
+
+  read(): T | null {
+    try {
+      const value: unknown = JSON.parse(this.#store?.getItem(this.#key) ?? "null");
+      return this.#fits(value) ? value : null;
+    } catch {
+      return null;
+    }
+  }
+
+  /** Whether it is kept. */
+  write(value: T): boolean {
+    try {
+      this.#store?.setItem(this.#key, JSON.stringify(value));
+      return this.#store !== null;
+    } catch {
+      return false;
+    }
+  }
+
+  drop(): void {
+    try {
+      this.#store?.removeItem(this.#key);
+    } catch {
+      // Then it was not kept either.
+    }
+  }
+}
+
+/** Text of a movement that is not saved. */
+export interface Draft {
+  source: string;
+  /** The version that it was made from; 0: none. */
+  basedOn: number;
+  /** [ms since 1970] */
+  at: number;
+}
+
+export function keptDraft(store: Store | null, account: string, robotType: string, name: string): Kept<Draft> {
+  return new Kept(store, `draft.${account}.${robotType}.${name}`, isDraft);
+}
+
+export function keptParameters(
+  store: Store | null,
+  account: string,
+  robotType: string,
+  name: string,
+): Kept<Record<string, unknown>> {
+  return new Kept(store, `parameters.${account}.${robotType}.${name}`, isRecord);
+}
+
+function isRecord(value: unknown): value is Record<string, unknown> {
+  return typeof value === "object" && value !== null && !Array.isArray(value);
+}
+
+function isDraft(value: unknown): value is Draft {
+  if (!isRecord(value)) return false;
+  return typeof value["source"] === "string" && typeof value["basedOn"] === "number" && typeof value["at"] === "number";
+}

@@ -1,0 +1,120 @@
+/** What a room says of itself by the streams of its perception: who is where, and which of its floor is taken. */
+
+export type Values = Readonly<Record<string, number | boolean>>;
+
+/** Somebody in the room, at the moment of the measurement. */
+export interface Place {
+  /** A robot's name at its agent, or `person`, `person-2`. */
+  name: string;
+  xM: number;
+  yM: number;
+  /** How long ago a sensor last saw them [s]. */
+  ageS: number;
+  speedMS: number;
+  /** The way they go, counter-clockwise from x; `null` before they have gone anywhere. */
+  yawRad: number | null;
+}
+
+export type Cell = "free" | "taken" | "unknown";
+
+/** The floor in squares; row 0 is the one with the lowest y. */
+export interface Floor {
+  lowerXM: number;
+  lowerYM: number;
+  sideM: number;
+  columns: number;
+  rows: number;
+  cell: (column: number, row: number) => Cell;
+}
+
+const MOST_PLACES = 128;
+/** A row's bits are exact in a number up to here. */
+const MOST_COLUMNS = 53;
+
+/** The stream `positions`, by name. Who lacks a coordinate is left out. */
+export function readPlaces(values: Values): Place[] {
+  const names = Object.keys(values).flatMap((field) => (field.startsWith("x_m.") ? [field.slice("x_m.".length)] : []));
+  return names.sort().flatMap((name) => {
+    const [xM, yM] = [numeric(values[`x_m.${name}`]), numeric(values[`y_m.${name}`])];
+    if (xM === null || yM === null) return [];
+    const ageS = numeric(values[`age_s.${name}`]) ?? 0;
+    const speedMS = numeric(values[`speed_m_s.${name}`]) ?? 0;
+    return [{ name, xM, yM, ageS, speedMS, yawRad: numeric(values[`yaw_rad.${name}`]) }];
+  });
+}
+
+/** The stream `occupancy`; `null` where it is none. */
+export function readFloor(values: Values): Floor | null {
+  const [lowerXM, lowerYM] = [numeric(values["lower_x_m"]), numeric(values["lower_y_m"])];
+  const [sideM, columns, rows] = [numeric(values["side_m"]), numeric(values["columns"]), numeric(values["rows"])];
+  if (lowerXM === null || lowerYM === null || sideM === null || columns === null || rows === null) return null;
+  if (!(sideM > 0) || !isCount(columns, MOST_COLUMNS) || !isCount(rows, MOST_PLACES)) return null;
+  const taken = bits(values, "taken_bits", rows);
+  const unknown = bits(values, "unknown_bits", rows);
+  const cell = (column: number, row: number): Cell => {
+    if (isSet(taken[row], column)) return "taken";
+    return unknown[row] === null || isSet(unknown[row], column) ? "unknown" : "free";
+  };
+  return { lowerXM, lowerYM, sideM, columns, rows, cell };
+}
+
+function bits(values: Values, name: string, rows: number): (number | null)[] {
+  return Array.from({ length: rows }, (_, row) => numeric(values[`${name}.${row}`]));
+}
+
+/** The bits are beyond 32, so no shift reaches them. */
+function isSet(row: number | null | undefined, column: number): boolean {
+  return typeof row === "number" && Math.floor(row / 2 ** column) % 2 === 1;
+}
+
+function isCount(value: number, most: number): boolean {
+  return Number.isInteger(value) && value >= 1 && value <= most;
+}
+
+function numeric(value: number | boolean | undefined): number | null {
+  return typeof value === "number" ? value : null;
+}
+
+/** A stretch of the room [m]. */
+export interface Extent {
+  lowX: number;
+  lowY: number;
+  highX: number;
+  highY: number;
+}
+
+/** What has to fit on a plan: the floor, and all that hangs or stands beyond it. `null`: nothing is known. */
+export function extent(floors: readonly Floor[], points: readonly (readonly [number, number])[]): Extent | null {
+  const xs = points.map(([x]) => x);
+  const ys = points.map(([, y]) => y);
+  for (const floor of floors) {
+    xs.push(floor.lowerXM, floor.lowerXM + floor.columns * floor.sideM);
+    ys.push(floor.lowerYM, floor.lowerYM + floor.rows * floor.sideM);
+  }
+  if (xs.length === 0) return null;
+  const found = { lowX: Math.min(...xs), lowY: Math.min(...ys), highX: Math.max(...xs), highY: Math.max(...ys) };
+  // A single thing has no stretch: a metre round it is shown.
+  const missing = Math.max(0, (1 - Math.max(found.highX - found.lowX, found.highY - found.lowY)) / 2);
+  return { lowX: found.lowX - missing, lowY: found.lowY - missing, highX: found.highX + missing, highY: found.highY + missing };
+}
+
+/** Pins that would cover one another, moved apart until none does [px]. Each stays as near to its place as it can. */
+export function apart(points: readonly (readonly [number, number])[], gap: number): [number, number][] {
+  const placed: [number, number][] = [];
+  for (const [x, y] of points) placed.push(free(x, y, placed, gap));
+  return placed;
+}
+
+function free(x: number, y: number, placed: readonly [number, number][], gap: number): [number, number] {
+  const clear = ([atX, atY]: [number, number]): boolean =>
+    placed.every(([otherX, otherY]) => Math.hypot(atX - otherX, atY - otherY) >= gap - 0.5);
+  for (let ring = 0; ring < 12; ring += 1) {
+    const steps = ring === 0 ? 1 : ring * 6;
+    for (let step = 0; step < steps; step += 1) {
+      const angle = (2 * Math.PI * step) / steps;
+      const at: [number, number] = [x + ring * gap * Math.cos(angle), y + ring * gap * Math.sin(angle)];
+      if (clear(at)) return at;
+    }
+  }
+  return [x, y];
+}

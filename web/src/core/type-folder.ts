@@ -1,0 +1,81 @@
+/** The files of a robot type as somebody chose them: what belongs to it, and how it is sent. */
+import type { TypeFolder } from "./robot-types";
+
+export const MANIFEST = "robot.toml";
+const SCRIPT = /^movements\/([^/]+)\.py$/;
+const MODEL = /\.(xml|stl|obj|png)$/;
+/** As much as the server takes, of all files together [bytes]. */
+export const MAX_BYTES = 6_000_000;
+const CHUNK = 0x8000;
+
+export type Files = ReadonlyMap<string, Uint8Array>;
+
+export interface Chosen {
+  files: Map<string, Uint8Array>;
+  /** What was chosen and is of no use to a robot type. */
+  left: string[];
+}
+
+/**
+ * The files below the folder that holds `robot.toml`, by their names in it. Without a manifest among them: below the
+ * folder that all of them are in.
+ */
+export function choose(entries: Files): Chosen {
+  const files = new Map<string, Uint8Array>();
+  const left: string[] = [];
+  const names = [...entries.keys()].filter((name) => !name.endsWith("/") && !hidden(name));
+  const root = rootOf(names);
+  for (const name of names) {
+    const inside = name.slice(root.length);
+    const content = entries.get(name);
+    if (content === undefined) continue;
+    if (name.startsWith(root) && belongs(inside)) files.set(inside, content);
+    else left.push(name);
+  }
+  return { files, left };
+}
+
+/** What a folder holds, as the server wants it; `null` without a manifest. */
+export function pack(files: Files): TypeFolder | null {
+  const text = new TextDecoder();
+  const manifest = files.get(MANIFEST);
+  if (manifest === undefined) return null;
+  const folder: TypeFolder = { manifest: text.decode(manifest), files: {}, movements: {} };
+  for (const [name, content] of files) {
+    const script = SCRIPT.exec(name)?.[1];
+    if (script !== undefined) folder.movements[script] = text.decode(content);
+    else if (name.endsWith(".xml")) folder.files[name] = text.decode(content);
+    else if (name !== MANIFEST) folder.files[name] = base64(content);
+  }
+  return folder;
+}
+
+export function size(files: Files): number {
+  return [...files.values()].reduce((sum, content) => sum + content.length, 0);
+}
+
+function belongs(name: string): boolean {
+  return name === MANIFEST || SCRIPT.test(name) || MODEL.test(name);
+}
+
+/** What file systems and archivers add by themselves. */
+function hidden(name: string): boolean {
+  return name.split("/").some((part) => part.startsWith(".") || part === "__MACOSX" || part === "__pycache__");
+}
+
+function rootOf(names: readonly string[]): string {
+  const manifests = names.filter((name) => name === MANIFEST || name.endsWith(`/${MANIFEST}`));
+  const nearest = manifests.sort((one, other) => one.length - other.length)[0];
+  if (nearest !== undefined) return nearest.slice(0, -MANIFEST.length);
+  const first = names[0] ?? "";
+  const folder = first.slice(0, first.indexOf("/") + 1);
+  return folder !== "" && folder !== "movements/" && names.every((name) => name.startsWith(folder)) ? folder : "";
+}
+
+function base64(content: Uint8Array): string {
+  let text = "";
+  for (let start = 0; start < content.length; start += CHUNK) {
+    text += String.fromCharCode(...content.subarray(start, start + CHUNK));
+  }
+  return btoa(text);
+}

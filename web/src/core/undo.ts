@@ -1,0 +1,56 @@
+/** A value whose changes can be taken back. */
+import { batch, computed, signal, type ReadonlySignal } from "@preact/signals-core";
+
+const KEPT = 200;
+
+export class Undoable<T> {
+  readonly #now;
+  readonly #before = signal<readonly T[]>([]);
+  readonly #after = signal<readonly T[]>([]);
+  #gesture = "";
+
+  readonly now: ReadonlySignal<T>;
+  readonly canUndo = computed(() => this.#before.value.length > 0);
+  readonly canRedo = computed(() => this.#after.value.length > 0);
+
+  constructor(first: T) {
+    this.#now = signal(first);
+    this.now = this.#now;
+  }
+
+  /** A change; those of one `gesture` (a slider that is dragged) after each other are one. */
+  change(next: T, gesture = ""): void {
+    if (Object.is(next, this.#now.value)) return;
+    const goesOn = gesture !== "" && gesture === this.#gesture;
+    this.#gesture = gesture;
+    batch(() => {
+      if (!goesOn) this.#before.value = [...this.#before.value, this.#now.value].slice(-KEPT);
+      this.#after.value = [];
+      this.#now.value = next;
+    });
+  }
+
+  /** The gesture has ended: what follows is another change. */
+  settle(): void {
+    this.#gesture = "";
+  }
+
+  undo(): void {
+    this.#step(this.#before, this.#after);
+  }
+
+  redo(): void {
+    this.#step(this.#after, this.#before);
+  }
+
+  #step(from: { value: readonly T[] }, to: { value: readonly T[] }): void {
+    const found = from.value.at(-1);
+    if (found === undefined) return;
+    this.#gesture = "";
+    batch(() => {
+      to.value = [...to.value, this.#now.value];
+      from.value = from.value.slice(0, -1);
+      this.#now.value = found;
+    });
+  }
+}
