@@ -1,7 +1,8 @@
 /** The lease's life on a clock that the test turns, with the server's answers in the test's hands. */
 import { signal } from "@preact/signals-core";
 import { afterEach, beforeEach, describe, expect, it, vi } from "vitest";
-import { Api, ApiError, type Device, type Granted, type Lease } from "../src/core/api";
+import { Api, type Device, type Granted, type Lease } from "../src/core/api";
+import { ApiError } from "../src/core/http";
 import { Control, LEASE_MS } from "../src/core/control";
 import { DeviceStore } from "../src/core/device";
 import type { Link, LinkStatus, Receiver } from "../src/core/link";
@@ -23,6 +24,10 @@ class Wire implements Link {
 
   publish(topic: string, message: object): Promise<void> {
     this.published.push({ topic, message });
+    return Promise.resolve();
+  }
+
+  ping(): Promise<void> {
     return Promise.resolve();
   }
 

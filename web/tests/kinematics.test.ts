@@ -1,5 +1,5 @@
 import { describe, expect, it } from "vitest";
-import { forward, multiply, placed, rollPitchYaw, rotate, standing } from "../src/core/kinematics";
+import { forward, jointFrames, multiply, placed, rollPitchYaw, rotate, standing } from "../src/core/kinematics";
 import type { Quaternion, Vector3 } from "../src/core/vectors";
 import { readTwin, type KnownBody } from "../src/core/messages";
 import fixture from "./fixtures/ur5.json";
@@ -41,6 +41,23 @@ describe("forward kinematics of a twin", () => {
         expect(Math.abs(dot)).toBeCloseTo(1, 9);
       }
     }
+  });
+
+  it("says where each joint of the UR5 is", () => {
+    const [first] = fixture.poses;
+    if (first === undefined) throw new Error("the fixture has no pose");
+    const frames = jointFrames(twin, first.position_rad);
+    expect(frames.map(({ name }) => name)).toEqual(fixture.description.joints.map(({ name }) => name));
+    const world = forward(twin, first.position_rad);
+    frames.forEach(({ name, position_m: at }) => {
+      const index = twin.bodies.findIndex(({ joint }) => joint?.name === name);
+      near(at, world[index]?.position_m ?? []); // the UR5's anchors are its bodies' origins
+    });
+  });
+
+  it("puts a joint at its anchor, which stays where it is", () => {
+    const only = { device: "d", bodies: [body({ anchor_m: [1, 0, 0] })] };
+    for (const position of [0, 1, 2]) near(jointFrames(only, { j: position })[0]?.position_m ?? [], [1, 0, 0]);
   });
 
   it("turns about an anchor that stays where it is", () => {

@@ -47,6 +47,19 @@ describe("the link to the broker", () => {
     expect(cloud.subscribes).toEqual([8, 8, 8, 4]);
   });
 
+  it("pings the broker and hears its answer, each its own, and fails without a connection", async () => {
+    await start();
+    const link = open();
+    await until(() => link.up.value, "the link");
+    const order: number[] = [];
+    await Promise.all([1, 2, 3].map((number) => link.ping().then(() => order.push(number))));
+    expect(order).toEqual([1, 2, 3]);
+    const lost = link.ping();
+    link.close();
+    await expect(lost).rejects.toThrow("The broker did not answer.");
+    await expect(link.ping()).rejects.toThrow("There is no connection");
+  });
+
   it("comes back with new credentials after the connection was cut", async () => {
     await start();
     const link = open();

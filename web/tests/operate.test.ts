@@ -1,13 +1,18 @@
 /** The core as a whole, against a broker over a real WebSocket and a small robot. */
 import { afterEach, beforeEach, describe, expect, it } from "vitest";
 import { ActionRunner } from "../src/core/action";
-import { Api, ApiError } from "../src/core/api";
+import { Api } from "../src/core/api";
+import { ApiError } from "../src/core/http";
 import { startClock } from "../src/core/clock";
 import { Control } from "../src/core/control";
 import type { DeviceStore } from "../src/core/device";
+import { Evidence } from "../src/core/evidence";
 import { Fleet } from "../src/core/fleet";
+import { RoundTrip } from "../src/core/round-trip";
+import { LatencySamples } from "../src/core/samples";
 import { Session } from "../src/core/session";
 import { StopSwitch } from "../src/core/stop";
+import { description } from "./support/arm";
 import { Cloud, DEVICE, problem } from "./support/cloud";
 import { until } from "./support/until";
 
@@ -313,7 +318,7 @@ describe("a movement", () => {
   it("is followed from the click to its end, with what it printed", async () => {
     const actions = new ActionRunner(api, device);
     ends.push(() => actions.dispose());
-    await actions.start("wave", null);
+    await actions.start({ kind: "run_movement", name: "wave" }, null);
     expect(actions.run.value?.status).toBe("started");
     await until(() => actions.run.value?.status === "done", "the end");
     // The cloud's answer may overtake the robot's acks: each step is there in the end, in its place.
@@ -325,7 +330,7 @@ describe("a movement", () => {
   it("can be cancelled", async () => {
     const actions = new ActionRunner(api, device);
     ends.push(() => actions.dispose());
-    await actions.start("wave", null);
+    await actions.start({ kind: "run_movement", name: "wave" }, null);
     await actions.cancel(null);
     await until(() => actions.run.value?.status === "cancelled", "the end");
   });
@@ -333,7 +338,7 @@ describe("a movement", () => {
   it("says why it was refused", async () => {
     cloud.instead.set(`POST /devices/${DEVICE}/actions`, () => problem(409, "device-busy", "The arm is running home."));
     const actions = new ActionRunner(api, device);
-    await actions.start("wave", null);
+    await actions.start({ kind: "run_movement", name: "wave" }, null);
     expect(actions.run.value).toMatchObject({ status: "refused", why: "The arm is running home." });
   });
 
@@ -341,9 +346,90 @@ describe("a movement", () => {
     const control = await takeControl();
     const actions = new ActionRunner(api, device);
     ends.push(() => actions.dispose());
-    await actions.start("home", control.epoch);
+    await actions.start({ kind: "run_movement", name: "home" }, control.epoch);
     const [call] = cloud.callsTo("POST", `/devices/${DEVICE}/actions`);
     expect(call?.body["epoch"]).toBe(control.epoch);
     expect(call?.headers["idempotency-key"]).toMatch(/^[0-9a-f]{32}$/);
+  });
+});
+
+describe("what became of a command", () => {
+  function evidence(control: Control, actions: ActionRunner): Evidence {
+    const made = new Evidence(device, control, actions);
+    ends.push(() => made.dispose(), () => actions.dispose());
+    return made;
+  }
+
+  it("is one line for a stream, from its first setpoint to where it was to go", async () => {
+    const control = await takeControl();
+    const told = evidence(control, new ActionRunner(api, device));
+    control.streamer.value?.setTarget("elbow", 1.2);
+    await until(() => told.lines.value[0]?.status === "done", "the end of the stream");
+    const [line, other] = told.lines.value;
+    expect(other).toBeUndefined();
+    expect(line).toMatchObject({ request: { kind: "stream" }, why: "reached", seenBy: "motion" });
+    expect(line?.steps.map(({ status }) => status)).toEqual(["sent", "accepted", "started", "observed", "done"]);
+    const times = line?.steps.map(({ afterMs }) => afterMs) ?? [];
+    expect(times).toEqual(times.toSorted((a, b) => a - b));
+  });
+
+  it("is heard from the robot, and seen by its own word where nothing moves", async () => {
+    const control = await takeControl();
+    const actions = new ActionRunner(api, device);
+    const told = evidence(control, actions);
+    void actions.start({ kind: "say", text: "Good morning." }, control.epoch);
+    expect(told.lines.value[0]?.status).toBe("sent");
+    await until(() => told.lines.value[0]?.status === "done", "the end");
+    const [line] = told.lines.value;
+    expect(line?.seenBy).toBe("state");
+    expect(line?.steps.filter(({ heard }) => heard === "device").length).toBeGreaterThan(2);
+  });
+
+  it("is not said to have moved where it has not", async () => {
+    const control = await takeControl();
+    const actions = new ActionRunner(api, device);
+    const told = evidence(control, actions);
+    await actions.start({ kind: "take_posture", name: "Sit" }, control.epoch);
+    await until(() => device.telemetry.value?.message.mode === "action", "the action");
+    expect(told.lines.value[0]?.seenBy).toBeNull();
+    await until(() => told.lines.value[0]?.seenBy === "state", "the end, and what was seen until then");
+  });
+});
+
+describe("what undoes a request", () => {
+  it("goes back to where every joint was at the click, around what is in between", async () => {
+    cloud.tell(`${TOPIC}/desc`, { ...description, actions: ["move_joints", "take_posture", "say"] }, { qos: 1, retain: true });
+    await until(() => device.description.value?.actions.includes("move_joints") === true, "what it takes");
+    const actions = new ActionRunner(api, device);
+    ends.push(() => actions.dispose());
+    const { back } = await actions.start({ kind: "take_posture", name: "Sit" }, null);
+    expect(back).toMatchObject({ kind: "move_joints", plan: true });
+    expect(back?.kind === "move_joints" && back.position_rad["elbow"]).toBeCloseTo(arm().positions["elbow"] ?? NaN, 3);
+    expect((await actions.start({ kind: "say", text: "Yes." }, null)).back).toBeNull();
+  });
+});
+
+describe("times", () => {
+  it("go to the cloud in one batch, and once: what did not arrive goes again with the same key", async () => {
+    const path = `/devices/${DEVICE}/latency`;
+    cloud.instead.set(`POST ${path}`, () => problem(503, "busy", "Later."));
+    const roundTrip = new RoundTrip();
+    const samples = new LatencySamples(api, DEVICE, roundTrip, 600_000);
+    ends.push(() => samples.dispose());
+    await samples.send();
+    expect(cloud.callsTo("POST", path)).toEqual([]);
+    roundTrip.seen(1, 1000, 1012);
+    roundTrip.seen(2, 1020, 1035);
+    await samples.send();
+    cloud.instead.set(`POST ${path}`, () => ({ status: 204, body: null }));
+    await samples.send();
+    const [first, again, ...more] = cloud.callsTo("POST", path);
+    expect(first?.body).toMatchObject({ transport: "websocket", path: "operator-device", samples: [{ ms: 12 }, { ms: 15 }] });
+    expect(again?.body).toEqual(first?.body);
+    expect(again?.headers["idempotency-key"]).toBe(first?.headers["idempotency-key"]);
+    expect(more).toEqual([]);
+    // Of the call that arrived the time is known too, and goes with the next.
+    await samples.send();
+    expect(cloud.callsTo("POST", path)[2]?.body).toMatchObject({ transport: "http", path: "operator-cloud" });
   });
 });

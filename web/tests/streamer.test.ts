@@ -1,7 +1,7 @@
 import { afterEach, beforeEach, describe, expect, it, vi } from "vitest";
 import type { KnownTelemetry } from "../src/core/messages";
-import type { Joint, Mode, Setpoint } from "../src/core/protocol";
-import { ABANDON_MS, FRESH_MS, PERIOD_MS, SetpointStreamer, STUCK_MS } from "../src/core/streamer";
+import type { DriveTarget, JogTarget, Joint, Mode, Setpoint } from "../src/core/protocol";
+import { ABANDON_MS, FRESH_MS, LOST_MS, PERIOD_MS, SETTLE_MS, SetpointStreamer, STUCK_MS } from "../src/core/streamer";
 
 const joint = (name: string): Joint => ({
   name,
@@ -240,5 +240,127 @@ describe("a stream of setpoints", () => {
     bench.streamer.setTarget("a", 1);
     await bench.run(40);
     expect(bench.sent[0]?.sequence).toBe(41);
+  });
+});
+
+const up: JogTarget = { kind: "jog", linear_m_s: [0, 0, 0.05], angular_rad_s: [0, 0, 0], frame: "tool", tool: false };
+const ahead: DriveTarget = { kind: "drive", forward_m_s: 0.2, left_m_s: 0, turn_rad_s: 0 };
+const standing: DriveTarget = { kind: "drive", forward_m_s: 0, left_m_s: 0, turn_rad_s: 0 };
+
+describe("a velocity", () => {
+  const kinds = (): (string | undefined)[] => bench.sent.map(({ target }) => target.kind);
+
+  it("is sent for as long as it is held, and then rest", async () => {
+    bench.streamer.hold(up);
+    expect(bench.sent).toHaveLength(1);
+    await bench.run(1_000);
+    expect(bench.sent.length).toBeGreaterThan(25);
+    expect(new Set(bench.sent.map(({ target }) => JSON.stringify(target)))).toEqual(new Set([JSON.stringify(up)]));
+    expect(bench.streamer.way.value).toBe("jog");
+    expect(bench.streamer.velocity.value).toEqual(up);
+
+    const before = bench.sent.length;
+    bench.streamer.letGo();
+    // At once, not with the next step.
+    expect(bench.sent).toHaveLength(before + 1);
+    expect(bench.sent.at(-1)?.target).toEqual({ ...up, linear_m_s: [0, 0, 0] });
+    expect(bench.streamer.velocity.value).toBeNull();
+    await bench.run(SETTLE_MS + 100);
+    expect(bench.sent.slice(before).every(({ target }) => target.kind === "jog" && target.linear_m_s?.[2] === 0)).toBe(true);
+    expect(bench.streamer.state.value).toBe("idle");
+    expect(bench.streamer.ended.value).toBe("let-go");
+    const count = bench.sent.length;
+    await bench.run(500);
+    expect(bench.sent).toHaveLength(count);
+  });
+
+  it("changes while it is held, and ends when it is changed to rest", async () => {
+    bench.streamer.hold(ahead);
+    await bench.run(60);
+    bench.streamer.hold({ ...ahead, turn_rad_s: 0.5 });
+    await bench.run(60);
+    expect(bench.sent.at(-1)?.target).toEqual({ ...ahead, turn_rad_s: 0.5 });
+    bench.streamer.hold(standing);
+    expect(bench.sent.at(-1)?.target).toEqual(standing);
+    expect(bench.streamer.velocity.value).toBeNull();
+  });
+
+  it("that is none, or no number, sends nothing", async () => {
+    bench.streamer.hold(standing);
+    bench.streamer.hold({ ...ahead, forward_m_s: NaN });
+    await bench.run(100);
+    expect(bench.sent).toEqual([]);
+  });
+
+  it.each(["hidden", "stopped", null] as const)("ends with rest when the stream ends (%s)", async (because) => {
+    bench.streamer.hold(ahead);
+    await bench.run(100);
+    bench.streamer.end(because);
+    expect(bench.sent.at(-1)?.target).toEqual(standing);
+    const count = bench.sent.length;
+    await bench.run(500);
+    expect(bench.sent).toHaveLength(count);
+    expect(bench.streamer.ended.value).toBe(because);
+  });
+
+  it("does not come back by itself when the robot was out of sight for longer than its watchdog waits", async () => {
+    bench.streamer.hold(ahead);
+    await bench.run(100);
+    bench.mute = true;
+    await bench.run(FRESH_MS + LOST_MS + 100);
+    expect(bench.streamer.ended.value).toBe("lost-sight");
+    const count = bench.sent.length;
+    bench.mute = false;
+    await bench.run(500);
+    expect(bench.sent).toHaveLength(count);
+  });
+
+  it("ends at the first setpoint that cannot be sent", async () => {
+    bench.streamer.hold(ahead);
+    await bench.run(100);
+    bench.connected = false;
+    await bench.run(60);
+    expect(bench.streamer.ended.value).toBe("no-connection");
+    bench.connected = true;
+    const count = bench.sent.length;
+    await bench.run(500);
+    expect(bench.sent).toHaveLength(count);
+  });
+
+  it("takes the place of joint targets, which stay where they have come to", async () => {
+    bench.streamer.setTarget("a", 2);
+    await bench.run(200);
+    const there = bench.position[0];
+    bench.streamer.hold(ahead);
+    // The robot would go on to the target as long as anything is streamed.
+    expect(bench.newest()?.["a"]).toBeCloseTo(there ?? NaN);
+    await bench.run(100);
+    const from = kinds().indexOf("drive");
+    expect(new Set(kinds().slice(from))).toEqual(new Set(["drive"]));
+    expect(bench.streamer.goal.value).toBeNull();
+  });
+
+  it("is replaced by joint targets, and by another kind, and rests before either", async () => {
+    bench.streamer.hold(up);
+    await bench.run(60);
+    bench.streamer.hold(ahead);
+    expect(bench.sent.at(-1)?.target).toEqual({ ...up, linear_m_s: [0, 0, 0] });
+    await bench.run(60);
+    expect(bench.sent.at(-1)?.target).toEqual(ahead);
+    bench.streamer.setTarget("a", 2);
+    expect(bench.sent.at(-1)?.target).toEqual(standing);
+    await bench.run(60);
+    expect(bench.newest()).toEqual({ a: 2, b: 0.25 });
+    bench.streamer.letGo(); // what is held no more ends nothing
+    await bench.run(60);
+    expect(bench.streamer.way.value).toBe("joints");
+  });
+
+  it("lets targets follow the robot meanwhile", async () => {
+    bench.streamer.hold(up);
+    bench.position = [1.25, -0.5];
+    await bench.run(40);
+    expect(bench.streamer.targets.value).toEqual({ a: 1.25, b: -0.5 });
+    expect(bench.streamer.goal.value).toBeNull();
   });
 });

@@ -1,16 +1,23 @@
 import { useEffect, useState } from "preact/hooks";
-import { sentence, type Api, type SignInSession } from "../core/api";
+import type { Api, SignInSession } from "../core/api";
+import { sentence } from "../core/http";
+import type { Fleet } from "../core/fleet";
 import { texts } from "../texts";
+import { ApiKeys } from "./api-keys";
 import { Card } from "./parts";
-import { fleetAddress } from "./route";
+import { activityAddress, fleetAddress } from "./route";
 
-/** One's own account: its password, and where else one is signed in. */
-export function AccountPage({ api }: { api: Api }) {
+/** One's own account: its password, where else one is signed in, its API keys, and what was done in it. */
+export function AccountPage({ api, fleet }: { api: Api; fleet: Fleet }) {
   const [changes, setChanges] = useState(0);
   return (
     <main class="page fleet" id="content">
-      <a href={fleetAddress}>{texts.device.back}</a>
+      <a href={fleetAddress}>← {texts.device.back}</a>
       <h1>{texts.account.title}</h1>
+      <p>
+        <a href={activityAddress}>{texts.activity.link}</a>
+      </p>
+      <ApiKeys api={api} fleet={fleet} />
       <PasswordForm api={api} onDone={() => setChanges((count) => count + 1)} />
       <Sessions key={changes} api={api} />
     </main>

@@ -1,21 +1,41 @@
 import { effect, useSignalEffect } from "@preact/signals";
 import { useEffect, useState } from "preact/hooks";
-import { ApiError, type Account, type Api } from "../core/api";
+import type { Account, Api } from "../core/api";
+import { ApiError } from "../core/http";
 import { Fleet } from "../core/fleet";
+import type { FollowedInvitation } from "../core/invitation";
+import type { FollowedCode } from "../core/pairing";
 import type { Session } from "../core/session";
 import { texts } from "../texts";
 import { AccountPage } from "./account-page";
+import { ActivityPage } from "./activity-page";
 import { DevicePage } from "./device-page";
 import { FleetPage } from "./fleet-page";
-import { accountAddress, fleetAddress, route } from "./route";
+import { InvitationPage } from "./invitation-page";
+import { later } from "./later";
+import { Navigation } from "./navigation";
+import { route } from "./route";
 import { SignIn } from "./sign-in";
+import { SpacePage } from "./space-page";
+
+const TogetherPage = later(() => import("./steer/together-page").then((page) => page.TogetherPage));
+const RobotTypesPage = later(() => import("./robot-types/list-page").then((page) => page.RobotTypesPage));
+const AddRobotTypePage = later(() => import("./robot-types/add-page").then((page) => page.AddRobotTypePage));
+const RobotTypePage = later(() => import("./robot-types/type-page").then((page) => page.RobotTypePage));
+const HealthPage = later(() => import("./health-page").then((part) => part.HealthPage));
+const TimesPage = later(() => import("./times-page").then((part) => part.TimesPage));
+const LibraryPage = later(() => import("./movements/library-page").then((found) => found.LibraryPage));
+const EditorPage = later(() => import("./movements/editor-page").then((found) => found.EditorPage));
+const PairingPage = later(async () => (await import("./pairing-page")).PairingPage);
 
 interface AppProps {
   api: Api;
   session: Session;
+  followed: FollowedInvitation;
+  pairing: FollowedCode;
 }
 
-export function App({ api, session }: AppProps) {
+export function App({ api, session, followed, pairing }: AppProps) {
   const state = session.state.value;
   switch (state.kind) {
     case "checking":
@@ -27,17 +47,28 @@ export function App({ api, session }: AppProps) {
         </main>
       );
     case "out":
-      return <SignIn api={api} session={session} why={state.why} />;
+      return <SignIn api={api} session={session} followed={followed} pairing={pairing.code.value !== null} why={state.why} />;
     case "in":
-      return <SignedIn key={state.account.session} api={api} session={session} account={state.account} />;
+      return (
+        <SignedIn
+          key={state.account.session}
+          api={api}
+          session={session}
+          followed={followed}
+          pairing={pairing}
+          account={state.account}
+        />
+      );
   }
 }
+
+const KeyframesPage = later(() => import("./keyframes/page").then((page) => page.KeyframesPage));
 
 interface SignedInProps extends AppProps {
   account: Account;
 }
 
-function SignedIn({ api, session, account }: SignedInProps) {
+function SignedIn({ api, session, followed, pairing, account }: SignedInProps) {
   const [fleet, setFleet] = useState<Fleet | null>(null);
   useEffect(() => {
     const made = new Fleet(api);
@@ -58,20 +89,42 @@ function SignedIn({ api, session, account }: SignedInProps) {
       <a class="skip" href="#content" onClick={focusContent}>
         {texts.skipToContent}
       </a>
-      <header class="top">
-        <a class="brand" href={fleetAddress}>
-          {texts.product}
-        </a>
-        <a class="account" data-testid="signed-in" href={accountAddress} title={texts.session.signedInAs(account.name)}>
-          {account.name}
-        </a>
-        <button type="button" class="plain" onClick={() => void session.signOut()}>
-          {texts.session.out}
-        </button>
-      </header>
+      <Navigation account={account} session={session} />
       <LinkBanner fleet={fleet} />
-      {at.page === "fleet" && <FleetPage fleet={fleet} />}
-      {at.page === "account" && <AccountPage api={api} />}
+      {at.page === "fleet" && <FleetPage api={api} fleet={fleet} />}
+      {at.page === "keyframes" && (
+        <KeyframesPage key={`${at.id}/${at.name}`} api={api} fleet={fleet} account={account} id={at.id} name={at.name} />
+      )}
+      {at.page === "account" && <AccountPage api={api} fleet={fleet} />}
+      {at.page === "activity" && <ActivityPage api={api} fleet={fleet} />}
+      {at.page === "invitation" && (
+        <InvitationPage api={api} fleet={fleet} account={account} followed={followed} />
+      )}
+      {at.page === "robot-types" && <RobotTypesPage api={api} fleet={fleet} />}
+      {at.page === "add-robot-type" && <AddRobotTypePage api={api} />}
+      {at.page === "robot-type" && <RobotTypePage key={at.id} api={api} fleet={fleet} id={at.id} />}
+      {at.page === "health" && (
+        <HealthPage key={at.device + at.space} api={api} fleet={fleet} account={account} device={at.device} space={at.space} />
+      )}
+      {at.page === "times" && (
+        <TimesPage key={at.device} api={api} fleet={fleet} account={account} device={at.device} />
+      )}
+      {at.page === "movements" && <LibraryPage api={api} fleet={fleet} />}
+      {at.page === "movement" && (
+        <EditorPage
+          key={`${at.robotType}/${at.name}`}
+          api={api}
+          fleet={fleet}
+          account={account}
+          robotType={at.robotType}
+          name={at.name}
+        />
+      )}
+      {at.page === "pair" && <PairingPage api={api} fleet={fleet} followed={pairing} />}
+      {at.page === "space" && <SpacePage key={at.id} api={api} fleet={fleet} account={account} id={at.id} />}
+      {at.page === "together" && (
+        <TogetherPage key={at.ids.join()} api={api} fleet={fleet} ids={at.ids} account={account} />
+      )}
       {at.page === "device" && <DevicePage key={at.id} api={api} fleet={fleet} id={at.id} account={account} />}
     </>
   );

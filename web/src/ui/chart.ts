@@ -8,6 +8,8 @@ import { colour } from "./theme";
 export interface Line {
   label: string;
   colour: string;
+  /** What it stays within, in the plot's unit. */
+  limits: readonly [number, number];
 }
 
 export interface Chart {
@@ -15,6 +17,8 @@ export interface Chart {
   dispose(): void;
 }
 
+/** A limit is shown where it does not make what is measured too small to be read: this many times its range away. */
+const LIMIT_WITHIN = 3;
 /** Ranges smaller than this are noise, and are drawn as what they are: a line. */
 const SMALLEST_RANGE = 2;
 
@@ -28,7 +32,7 @@ export function createChart(box: HTMLElement, lines: readonly Line[], unit: stri
       cursor: { show: false },
       scales: {
         x: { time: false, range: [-SPAN_MS / 1000, 0] },
-        y: { range: (_, low, high) => padded(low, high) },
+        y: { range: (_, low, high) => padded(low, high, lines) },
       },
       axes: [
         { ...axis, values: (_, ticks) => ticks.map((tick) => `${tick} ${texts.plot.seconds}`) },
@@ -38,6 +42,7 @@ export function createChart(box: HTMLElement, lines: readonly Line[], unit: stri
         {},
         ...lines.map((line) => ({ label: line.label, stroke: line.colour, width: 1.75, points: { show: false } })),
       ],
+      hooks: { drawClear: [(plot) => paintLimits(plot, lines)] },
     },
     [[], ...lines.map(() => [])],
     box,
@@ -55,10 +60,35 @@ export function createChart(box: HTMLElement, lines: readonly Line[], unit: stri
   };
 }
 
-function padded(low: number | null, high: number | null): [number, number] {
+function padded(low: number | null, high: number | null, lines: readonly Line[]): [number, number] {
   // Without a value there is nothing to fit; uPlot passes nulls then.
-  const from = low ?? -1;
-  const to = high ?? 1;
+  const measured: [number, number] = [low ?? -1, high ?? 1];
+  const reach = LIMIT_WITHIN * Math.max(SMALLEST_RANGE, measured[1] - measured[0]);
+  let [from, to] = measured;
+  for (const limit of lines.flatMap(({ limits }) => limits)) {
+    if (limit > measured[1] + reach || limit < measured[0] - reach) continue;
+    [from, to] = [Math.min(from, limit), Math.max(to, limit)];
+  }
   const pad = Math.max((SMALLEST_RANGE - (to - from)) / 2, (to - from) * 0.08);
   return [from - pad, to + pad];
+}
+
+/** Each joint's limits, dashed in its colour; those that several have in common once. */
+function paintLimits(plot: uPlot, lines: readonly Line[]): void {
+  const { ctx, bbox } = plot;
+  const { min = NaN, max = NaN } = plot.scales["y"] ?? {};
+  ctx.save();
+  ctx.setLineDash([6, 5]);
+  for (const { limits, colour: line } of lines) {
+    for (const limit of limits) {
+      if (!(limit >= min && limit <= max)) continue;
+      const y = plot.valToPos(limit, "y", true);
+      ctx.strokeStyle = line;
+      ctx.beginPath();
+      ctx.moveTo(bbox.left, y);
+      ctx.lineTo(bbox.left + bbox.width, y);
+      ctx.stroke();
+    }
+  }
+  ctx.restore();
 }

@@ -1,22 +1,31 @@
-import { useEffect, useState } from "preact/hooks";
-import { ActionRunner } from "../core/action";
+import type { ComponentChildren } from "preact";
+import { useRef } from "preact/hooks";
 import type { Account, Api } from "../core/api";
-import { Control } from "../core/control";
 import type { DeviceStore } from "../core/device";
 import type { Fleet } from "../core/fleet";
-import { StopSwitch } from "../core/stop";
+import type { Station } from "../core/station";
 import { texts } from "../texts";
+import { Access, goToAccess } from "./access";
+import { Acts } from "./acts/acts";
+import { RunStatus } from "./acts/run-status";
 import { ControlBar } from "./control-bar";
+import "./desk.css";
 import { Events } from "./events";
-import { JointSliders } from "./joint-sliders";
-import { Latency } from "./latency";
-import { Movements } from "./movements";
+import { Times } from "./evidence";
+import { Foldable } from "./fold";
+import { HealthChip } from "./health-chip";
+import { Movements } from "./movements/card";
+import { Naming } from "./naming";
 import { HeardAge, ReachChip } from "./parts";
 import { Plot } from "./plot";
 import { PoseTable } from "./pose-table";
-import { fleetAddress } from "./route";
+import { RoomDesk } from "./room-desk";
+import { fleetAddress, keyframesAddress, replaceWith, spaceAddress, timesAddressOf } from "./route";
+import { useStations } from "./stations";
+import { SteerCard } from "./steer/steer-card";
 import { StopBanner } from "./stop";
 import { View3D } from "./view-3d";
+import { useViews, Watching } from "./watching";
 
 interface DevicePageProps {
   api: Api;
@@ -28,6 +37,8 @@ interface DevicePageProps {
 export function DevicePage({ api, fleet, id, account }: DevicePageProps) {
   const devices = fleet.devices.value;
   const device = devices?.get(id);
+  const shown = useRef("");
+  if (device !== undefined) shown.current = device.info.value.label;
   if (devices === null) {
     return (
       <main class="page" id="content">
@@ -37,19 +48,24 @@ export function DevicePage({ api, fleet, id, account }: DevicePageProps) {
   }
   if (device === undefined) {
     return (
-      <main class="page" id="content">
-        <p>{texts.device.missing}</p>
-        <a href={fleetAddress}>{texts.device.back}</a>
+      <main class="narrow" id="content">
+        {shown.current === "" ? (
+          <p>{texts.device.missing}</p>
+        ) : (
+          <div role="alert" class="no-access" data-testid="no-access">
+            <h1>{texts.device.gone(shown.current)}</h1>
+            <p>{texts.device.goneWhy}</p>
+          </div>
+        )}
+        <p>
+          <a class="elsewhere" href={fleetAddress}>
+            {texts.device.back}
+          </a>
+        </p>
       </main>
     );
   }
   return <Operate key={device.id} api={api} fleet={fleet} device={device} account={account} />;
-}
-
-interface Tools {
-  control: Control;
-  stop: StopSwitch;
-  actions: ActionRunner;
 }
 
 interface OperateProps {
@@ -60,81 +76,100 @@ interface OperateProps {
 }
 
 function Operate({ api, fleet, device, account }: OperateProps) {
-  const [desk, setDesk] = useState<Tools | null>(null);
-
-  useEffect(() => {
-    const unwatch = device.watchClosely();
-    const control = new Control(api, device);
-    const stop = new StopSwitch(api, device, fleet.link, account.name);
-    const actions = new ActionRunner(api, device);
-    setDesk({ control, stop, actions });
-
-    const press = (event: KeyboardEvent): void => {
-      if (event.key !== "Escape" || event.repeat) return;
-      event.preventDefault();
-      control.stopped();
-      stop.press();
-    };
-    const visibility = (): void => {
-      if (document.visibilityState === "hidden") control.hidden();
-    };
-    const leave = (): void => void control.release(true);
-    // In the capture phase: no field or menu may keep the key from stopping the robot.
-    addEventListener("keydown", press, { capture: true });
-    document.addEventListener("visibilitychange", visibility);
-    addEventListener("pagehide", leave);
-    return () => {
-      removeEventListener("keydown", press, { capture: true });
-      document.removeEventListener("visibilitychange", visibility);
-      removeEventListener("pagehide", leave);
-      control.dispose();
-      stop.dispose();
-      actions.dispose();
-      unwatch();
-    };
-  }, [api, fleet, device, account]);
-
-  if (desk === null) return null;
-  const { control, stop, actions } = desk;
+  const [station] = useStations(api, fleet, [device], account);
+  if (station === undefined) return null;
+  const { control, stop } = station;
+  const robot = device.description.value?.joints.length !== 0;
+  const access = <DeviceAccess api={api} fleet={fleet} device={device} account={account} />;
   return (
     <>
-      <ControlBar device={device} control={control} stop={stop} />
+      <ControlBar device={device} control={control} stop={stop} watching={station.watching} />
       <main class="page operate" id="content">
-        <Heading device={device} fleet={fleet} />
+        <Heading api={api} device={device} fleet={fleet} />
         <StopBanner device={device} stop={stop} />
-        {device.description.value?.joints.length === 0 ? (
-          <>
-            <p class="quiet">{texts.device.still}</p>
-            <Events device={device} />
-          </>
+        {robot && <RunStatus device={device} control={control} actions={station.actions} />}
+        {robot ? (
+          <Desk api={api} fleet={fleet} station={station} account={account} access={access} />
         ) : (
-          <Desk api={api} device={device} control={control} actions={actions} />
+          <RoomDesk api={api} fleet={fleet} station={station} access={access} />
         )}
       </main>
     </>
   );
 }
 
-/** What moves joints, and shows how they move. */
-function Desk({ api, device, control, actions }: Omit<Tools, "stop"> & { api: Api; device: DeviceStore }) {
+interface DeskProps {
+  api: Api;
+  fleet: Fleet;
+  station: Station;
+  account: Account;
+  access: ComponentChildren;
+}
+
+/** What is seen of a robot, what steers it, and what it is asked to do: three columns, on a phone one below the other. */
+function Desk({ api, fleet, station, account, access }: DeskProps) {
+  const { device, control, actions } = station;
+  const views = useViews(fleet, device);
+  const type = device.info.value.robot_type;
   return (
-    <div class="desk">
+    <div class="desk robot">
       <div class="column">
-        <View3D device={device} control={control} />
-        <Plot device={device} />
-        <PoseTable device={device} />
+        <Foldable name="view" title={texts.view.title} type={type} always>
+          <View3D device={device} control={control} />
+        </Foldable>
+        {views.length > 0 && (
+          <Foldable name="camera" title={texts.watching.title} type={type}>
+            <Watching device={device} views={views} />
+          </Foldable>
+        )}
+        <Foldable name="plot" title={texts.plot.title} type={type}>
+          <Plot device={device} />
+        </Foldable>
+        <Foldable name="poses" title={texts.poses.title} type={type}>
+          <PoseTable device={device} />
+        </Foldable>
       </div>
       <div class="column">
-        <JointSliders device={device} control={control} />
-        <Movements api={api} device={device} control={control} actions={actions} />
-        <Latency device={device} control={control} />
-        <Events device={device} />
+        <Foldable name="steer" title={texts.steer.title} type={type} always>
+          <SteerCard station={station} onStop={() => station.stopNow()} />
+        </Foldable>
+        <Foldable name="times" title={texts.latency.title} type={type}>
+          <Times station={station} />
+        </Foldable>
+      </div>
+      <div class="column">
+        <Acts fleet={fleet} station={station} />
+        <Foldable name="movements" title={texts.movements.title} type={type}>
+          <Movements api={api} device={device} control={control} actions={actions} account={account.id} />
+        </Foldable>
+        <Foldable name="events" title={texts.events.title} type={type}>
+          <Events device={device} />
+        </Foldable>
+        {access}
       </div>
     </div>
   );
 }
 
-function Heading({ device, fleet }: { device: DeviceStore; fleet: Fleet }) {
+function DeviceAccess({ api, fleet, device, account }: OperateProps) {
+  const { id, owner, role, space } = device.info.value;
+  return (
+    <Access
+      api={api}
+      account={account}
+      target={{ kind: "device", id }}
+      owner={owner}
+      role={role}
+      space={{ id: space, name: fleet.spaceName(space) }}
+      onLeft={() => {
+        void fleet.refresh();
+        replaceWith(fleetAddress);
+      }}
+    />
+  );
+}
+
+function Heading({ api, device, fleet }: { api: Api; device: DeviceStore; fleet: Fleet }) {
   const info = device.info.value;
   const trouble = device.trouble.value;
   return (
@@ -142,14 +177,27 @@ function Heading({ device, fleet }: { device: DeviceStore; fleet: Fleet }) {
       <a href={fleetAddress}>← {texts.device.back}</a>
       <h1>{info.label}</h1>
       <p class="quiet">
-        {info.robot_type} · {fleet.spaceName(info.space)}
+        {info.robot_type.replaceAll("_", " ")} · <a href={spaceAddress(info.space)}>{fleet.spaceName(info.space)}</a>
         {device.description.value?.simulated === true && ` · ${texts.device.simulated}`}
       </p>
       <p class="reach">
         <ReachChip device={device} data-testid="online" />
+        <HealthChip api={api} device={device} />
+        <a class="chip" href={timesAddressOf(device.id)}>
+          {texts.parts.times}
+        </a>
         <span class="quiet">
           {texts.fleet.heard}: <HeardAge device={device} />
         </span>
+        {(device.description.value?.joints.length ?? 0) > 0 && (
+          <a href={keyframesAddress(info.id)} data-testid="to-keyframes">
+            {texts.keyframes.title}
+          </a>
+        )}
+        <Naming api={api} device={device} />
+        <button type="button" class="plain" onClick={goToAccess}>
+          {texts.access.title}
+        </button>
       </p>
       {trouble !== null && <p class="notice warn">{texts.device.unreadable(trouble)}</p>}
     </div>

@@ -20,7 +20,7 @@ export function Events({ device }: { device: DeviceStore }) {
         </ul>
       )}
       {events.length === 0 && faults.length === 0 && <p class="quiet">{texts.events.none}</p>}
-      <ul class="event-list">
+      <ul class="event-list" tabIndex={0} aria-label={texts.events.title}>
         {events.map((event) => (
           <li key={event.id} class={event.severity}>
             {event.message} <span class="quiet">{age(event.at_ms)}</span>

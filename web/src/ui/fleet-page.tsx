@@ -1,87 +1,130 @@
+import { useMemo, useState } from "preact/hooks";
+import type { Api } from "../core/api";
 import type { DeviceStore } from "../core/device";
 import type { Fleet } from "../core/fleet";
+import { fits, type Kinds, type Wanted, type Whose } from "../core/listing";
 import { texts } from "../texts";
-import { PairForm } from "./pair-form";
-import { HeardAge, ReachChip } from "./parts";
-import { deviceAddress } from "./route";
+import { DeviceLists, faultsOf } from "./device-lists";
+import "./fleet.css";
+import { Choice } from "./parts";
+import { usePolled } from "./polled";
+import { pairAddress, spaceAddress } from "./route";
+import { Spaces } from "./spaces";
+import { FirstSteps } from "./help/first-steps";
+import { OperateTogether } from "./steer/together";
 
-export function FleetPage({ fleet }: { fleet: Fleet }) {
+const EVERYTHING: Wanted = { search: "", kinds: "all", whose: "all", onlyTrouble: false };
+/** Fewer devices than this are seen at a glance. */
+const SEARCH_FROM = 5;
+/** Of each device the cloud reads what is open: seldom, for what the device says itself comes without asking. */
+const HEALTH_EVERY_MS = 30_000;
+
+export function FleetPage({ api, fleet }: { api: Api; fleet: Fleet }) {
   const devices = fleet.devices.value;
+  const [wanted, setWanted] = useState(EVERYTHING);
+  const lines = usePolled(() => api.health.all(null), HEALTH_EVERY_MS, [api]).value;
+  const health = useMemo(() => new Map(lines?.map((line) => [line.device, line])), [lines]);
+  const all = [...(devices?.values() ?? [])];
+  const shown = all.filter((device) =>
+    fits(device, fleet.spaceName(device.info.value.space), faultsOf(device, health.get(device.id)), wanted),
+  );
+  const shared = all.some((device) => device.info.value.role !== "owner");
   return (
     <main class="page fleet" id="content">
-      <h1>{texts.fleet.title}</h1>
+      <div class="fleet-head">
+        <h1>{texts.fleet.title}</h1>
+        <a class="elsewhere" href={pairAddress} data-testid="pair">
+          {texts.pair.open}
+        </a>
+      </div>
       {devices === null && <p class="quiet">{texts.loading}</p>}
-      {devices?.size === 0 && <p class="quiet">{texts.fleet.none}</p>}
-      {devices !== null && devices.size > 0 && (
-        <ul class="devices">
-          {[...devices.values()].map((device) => (
-            <DeviceRow key={device.id} device={device} fleet={fleet} />
-          ))}
-        </ul>
+      {devices?.size === 0 && <FirstSteps />}
+      {all.length >= SEARCH_FROM && <Search wanted={wanted} change={setWanted} shared={shared} shown={shown.length} all={all.length} />}
+      {all.length > 0 && shown.length === 0 && (
+        <p class="row">
+          {texts.list.nothing}
+          <button type="button" onClick={() => setWanted(EVERYTHING)}>
+            {texts.list.clear}
+          </button>
+        </p>
       )}
-      <PairForm fleet={fleet} />
+      <OperateTogether devices={all} />
+      {bySpace(shown, fleet).map(([space, found]) => (
+        <section key={space} class="space-group" aria-label={fleet.spaceName(space)} data-testid="space">
+          <header class="space-head">
+            <h2>{fleet.spaceName(space)}</h2>
+            <a href={spaceAddress(space)} aria-label={texts.list.planOf(fleet.spaceName(space))} data-testid="plan-link">
+              {texts.list.plan}
+            </a>
+          </header>
+          <DeviceLists devices={found} fleet={fleet} found={health} />
+        </section>
+      ))}
+      <Spaces api={api} fleet={fleet} />
     </main>
   );
 }
 
-function DeviceRow({ device, fleet }: { device: DeviceStore; fleet: Fleet }) {
-  const info = device.info.value;
+/** Rooms by name, devices in the order of the list. */
+function bySpace(devices: readonly DeviceStore[], fleet: Fleet): [string, DeviceStore[]][] {
+  const groups = new Map<string, DeviceStore[]>();
+  for (const device of devices) {
+    const { space } = device.info.value;
+    groups.set(space, [...(groups.get(space) ?? []), device]);
+  }
+  return [...groups].sort(([one], [other]) => fleet.spaceName(one).localeCompare(fleet.spaceName(other)));
+}
+
+interface SearchProps {
+  wanted: Wanted;
+  change: (wanted: Wanted) => void;
+  /** Some devices are other people's. */
+  shared: boolean;
+  shown: number;
+  all: number;
+}
+
+function Search({ wanted, change, shared, shown, all }: SearchProps) {
   return (
-    <li class="card device-row" data-testid="device-row" data-device={device.id}>
-      <a class="device-name" href={deviceAddress(device.id)}>
-        {info.label}
-        <span class="quiet">
-          {info.robot_type} · {fleet.spaceName(info.space)}
-        </span>
-      </a>
-      <dl>
-        <div>
-          <dt>{texts.fleet.status}</dt>
-          <dd>
-            <ReachChip device={device} data-testid="online" />
-          </dd>
-        </div>
-        <div>
-          <dt>{texts.fleet.heard}</dt>
-          <dd>
-            <HeardAge device={device} />
-          </dd>
-        </div>
-        <div>
-          <dt>{texts.fleet.doing}</dt>
-          <dd>
-            <Doing device={device} />
-          </dd>
-        </div>
-        <div>
-          <dt>{texts.fleet.control}</dt>
-          <dd>
-            <Holder device={device} />
-          </dd>
-        </div>
-      </dl>
-    </li>
+    <form class="row search" role="search" onSubmit={(event) => event.preventDefault()}>
+      <label class="visually-hidden" for="search">
+        {texts.list.search}
+      </label>
+      <input
+        id="search"
+        type="text"
+        value={wanted.search}
+        placeholder={texts.list.searchExample}
+        autocomplete="off"
+        spellcheck={false}
+        data-testid="search"
+        onInput={(event) => change({ ...wanted, search: event.currentTarget.value })}
+      />
+      <Choice
+        label={texts.list.show}
+        value={wanted.kinds}
+        onChange={(kinds) => change({ ...wanted, kinds })}
+        options={Object.entries(texts.list.kinds) as [Kinds, string][]}
+      />
+      {shared && (
+        <Choice
+          label={texts.list.whose}
+          value={wanted.whose}
+          onChange={(whose) => change({ ...wanted, whose })}
+          options={Object.entries(texts.list.whoses) as [Whose, string][]}
+        />
+      )}
+      <label class="check">
+        <input
+          type="checkbox"
+          checked={wanted.onlyTrouble}
+          onChange={(event) => change({ ...wanted, onlyTrouble: event.currentTarget.checked })}
+        />
+        {texts.list.onlyTrouble}
+      </label>
+      <span class="quiet small" role="status">
+        {texts.list.shown(shown, all)}
+      </span>
+    </form>
   );
-}
-
-function Doing({ device }: { device: DeviceStore }) {
-  const state = device.state.value;
-  if (state === null) return <span class="quiet">{texts.number.unknown}</span>;
-  const what = state.action === null ? texts.mode[state.mode] : texts.movements.running(nameOf(state.action));
-  return (
-    <span class={device.live.value ? "" : "old"}>
-      <span class={state.mode === "stopped" || state.mode === "fault" ? "chip bad" : ""}>{what}</span>
-      {state.faults.length > 0 && <span class="chip bad">{texts.fleet.faults(state.faults.length)}</span>}
-    </span>
-  );
-}
-
-function nameOf(action: { name?: string; kind: string }): string {
-  return action.name === undefined || action.name === "" ? action.kind : action.name;
-}
-
-function Holder({ device }: { device: DeviceStore }) {
-  const holder = device.holder.value;
-  if (holder === null) return <>{texts.fleet.nobody}</>;
-  return <>{holder.mine ? texts.fleet.you : holder.name}</>;
 }

@@ -1,13 +1,13 @@
 import type { Control } from "../core/control";
 import type { DeviceStore } from "../core/device";
 import { texts } from "../texts";
-import { Card } from "./parts";
 
 interface LatencyProps {
   device: DeviceStore;
   control: Control;
 }
 
+/** The round trip of what is streamed, and how fresh what comes back is. */
 export function Latency({ device, control }: LatencyProps) {
   const figures = control.roundTrip.figures.value;
   const telemetry = device.telemetry.value;
@@ -16,7 +16,7 @@ export function Latency({ device, control }: LatencyProps) {
   const ms = texts.number.milliseconds;
   const loopAge = telemetry !== null && telemetry.message.setpoint_sequence > 0 ? telemetry.message.loop_age_ms : null;
   return (
-    <Card title={texts.latency.title} class="latency">
+    <>
       <div
         class="figure"
         data-testid="round-trip"
@@ -53,7 +53,7 @@ export function Latency({ device, control }: LatencyProps) {
           value={watchdog === undefined || watchdog === 0 ? texts.number.unknown : ms(watchdog)}
         />
       </dl>
-    </Card>
+    </>
   );
 }
 

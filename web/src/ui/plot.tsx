@@ -3,6 +3,7 @@ import { degrees } from "../core/angles";
 import { now } from "../core/clock";
 import type { DeviceStore } from "../core/device";
 import type { Quantity } from "../core/history";
+import type { Joint } from "../core/protocol";
 import { texts } from "../texts";
 import type { Chart } from "./chart";
 import { Card, Choice } from "./parts";
@@ -44,7 +45,11 @@ export function Plot({ device }: { device: DeviceStore }) {
     import("./chart").then(
       ({ createChart }) => {
         if (!alive) return;
-        const lines = shown.map(({ joint, index }) => ({ label: joint.label, colour: seriesColour(index) }));
+        const lines = shown.map(({ joint, index }) => ({
+          label: joint.label,
+          colour: seriesColour(index),
+          limits: limitsOf(joint, quantity),
+        }));
         chart = createChart(element, lines, texts.plot.unit[quantity]);
         asked = requestAnimationFrame(draw);
       },
@@ -90,7 +95,7 @@ export function Plot({ device }: { device: DeviceStore }) {
         {joints.map((joint, index) => (
           <label key={joint.name} class={`series-${(index % 8) + 1}`}>
             <input type="checkbox" checked={!hidden.has(joint.name)} onChange={() => toggle(joint.name)} />
-            {joint.label}
+            {joint.label} <span class="quiet">{texts.plot.limits(limitsOf(joint, quantity), texts.plot.unit[quantity])}</span>
           </label>
         ))}
       </fieldset>
@@ -100,4 +105,16 @@ export function Plot({ device }: { device: DeviceStore }) {
 
 function toDegrees(value: number | null): number | null {
   return value === null ? null : degrees(value);
+}
+
+/** What the robot keeps a joint within, by its description, in the plot's unit. */
+function limitsOf(joint: Joint, quantity: Quantity): [number, number] {
+  switch (quantity) {
+    case "position_rad":
+      return [degrees(joint.lower_rad), degrees(joint.upper_rad)];
+    case "velocity_rad_s":
+      return [-degrees(joint.max_velocity_rad_s), degrees(joint.max_velocity_rad_s)];
+    case "effort_nm":
+      return [-joint.max_effort_nm, joint.max_effort_nm];
+  }
 }

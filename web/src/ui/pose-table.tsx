@@ -1,18 +1,24 @@
 import { useState } from "preact/hooks";
 import { degrees } from "../core/angles";
 import type { DeviceStore } from "../core/device";
-import { rollPitchYaw, unit } from "../core/kinematics";
+import { jointFrames, rollPitchYaw, unit } from "../core/kinematics";
 import type { Pose } from "../core/vectors";
 import { texts } from "../texts";
 import { Card, Choice } from "./parts";
 
 type Form = "degrees" | "quaternion";
+type Which = "told" | "joints";
+
+interface Frame {
+  name: string;
+  pose: Pose | undefined;
+}
 
 /** Position and rotation of every joint's frame in the robot's base, as the paper's application shows them. */
 export function PoseTable({ device }: { device: DeviceStore }) {
   const [form, setForm] = useState<Form>("degrees");
-  const names = device.description.value?.frames ?? [];
-  const poses = device.telemetry.value?.message.frames ?? [];
+  const [which, setWhich] = useState<Which>("told");
+  const frames = which === "told" ? told(device) : reckoned(device);
   return (
     <Card
       title={texts.poses.title}
@@ -29,10 +35,21 @@ export function PoseTable({ device }: { device: DeviceStore }) {
         />
       }
     >
-      {names.length === 0 ? (
+      {device.twin.value !== null && (
+        <Choice
+          label={texts.poses.which}
+          value={which}
+          onChange={setWhich}
+          options={[
+            ["told", texts.poses.told],
+            ["joints", texts.poses.joints],
+          ]}
+        />
+      )}
+      {frames.length === 0 ? (
         <p class="quiet">{texts.poses.none}</p>
       ) : (
-        <div class="scroll" tabIndex={0} role="region" aria-label={texts.poses.table}>
+        <div class="scroll poses-scroll" tabIndex={0} role="region" aria-label={texts.poses.table}>
           <table class={device.live.value ? "" : "old"} data-testid="poses">
             <thead>
               <tr>
@@ -42,15 +59,37 @@ export function PoseTable({ device }: { device: DeviceStore }) {
               </tr>
             </thead>
             <tbody>
-              {names.map((name, index) => (
-                <PoseRow key={name} name={name} pose={poses[index]} form={form} />
+              {frames.map(({ name, pose }) => (
+                <PoseRow key={name} name={name} pose={pose} form={form} />
               ))}
             </tbody>
           </table>
         </div>
       )}
+      {which === "joints" && <p class="quiet small">{texts.poses.reckoned}</p>}
+      {!device.live.value && frames.some(({ pose }) => pose !== undefined) && <p class="quiet small">{texts.poses.old}</p>}
     </Card>
   );
+}
+
+/** Those that the robot itself measures. */
+function told(device: DeviceStore): Frame[] {
+  const poses = device.telemetry.value?.message.frames ?? [];
+  return (device.description.value?.frames ?? []).map((name, index) => ({ name, pose: poses[index] }));
+}
+
+/** Where each joint is by the robot's own drawing, with its joints as they were measured last. */
+function reckoned(device: DeviceStore): Frame[] {
+  const [twin, description] = [device.twin.value, device.description.value];
+  const message = device.telemetry.value?.message;
+  if (twin === null || description === null || message === undefined) return [];
+  const positions: Record<string, number> = {};
+  description.joints.forEach((joint, index) => (positions[joint.name] = message.position_rad[index] ?? 0));
+  const labels = new Map(description.joints.map(({ name, label }) => [name, label]));
+  return jointFrames(twin, positions).map(({ name, position_m: at, quaternion }) => ({
+    name: labels.get(name) ?? name,
+    pose: [...at, ...quaternion],
+  }));
 }
 
 function PoseRow({ name, pose, form }: { name: string; pose: Pose | undefined; form: Form }) {

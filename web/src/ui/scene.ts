@@ -23,11 +23,12 @@ import {
   WebGLRenderer,
 } from "three";
 import { OrbitControls } from "three/examples/jsm/controls/OrbitControls.js";
-import { now } from "../core/clock";
-import { forward, placed, standing } from "../core/kinematics";
+import { add, forward, placed, rotate, standing } from "../core/kinematics";
 import type { KnownTwin } from "../core/messages";
 import type { Geometry } from "../core/protocol";
 import type { Targets } from "../core/streamer";
+import type { Vector3 as Vector } from "../core/vectors";
+import { Turn } from "./turns";
 
 /** No WebGL in this browser. */
 export class NoWebglError extends Error {
@@ -43,11 +44,6 @@ export interface LiveScene {
   dispose(): void;
 }
 
-/** Drawing takes at most one part in this many of the page's time: sliders and setpoints go first. */
-const TIME_SHARE = 4;
-const LONGEST_WAIT_MS = 400;
-/** Nobody feels a frame that costs less [ms]. */
-const FREE_MS = 6;
 /** Closer to the measured pose than this the target would only hide it [rad]. */
 const GHOST_FROM = 0.005;
 const GHOST_COLOUR = 0x2f8fe0;
@@ -85,31 +81,11 @@ export function createScene(canvas: HTMLCanvasElement, twin: KnownTwin, onFrame:
   light(scene, home.radius);
   let grid = floor(scene, home);
 
-  let asked = 0;
-  let waiting: ReturnType<typeof setTimeout> | undefined;
-  let again = false;
-  const draw = (): void => {
-    asked = 0;
-    const startedAt = now();
+  const turn = new Turn(() => {
     renderer.render(scene, camera);
     onFrame();
-    // Without a graphics card a frame can cost the page more than its share; then the next one waits.
-    waiting = setTimeout(() => {
-      const tookMs = now() - startedAt;
-      waiting = setTimeout(
-        () => {
-          waiting = undefined;
-          if (again) drawSoon();
-        },
-        Math.min((TIME_SHARE - 1) * Math.max(0, tookMs - FREE_MS), LONGEST_WAIT_MS),
-      );
-    }, 0);
-    again = false;
-  };
-  const drawSoon = (): void => {
-    again = true;
-    if (asked === 0 && waiting === undefined) asked = requestAnimationFrame(draw);
-  };
+  });
+  const drawSoon = (): void => turn.ask();
   const resetView = (): void => {
     controls.target.copy(home.centre);
     camera.position.copy(home.centre).add(new Vector3(1.15, -1.5, 0.75).normalize().multiplyScalar(home.radius * 3.2));
@@ -148,8 +124,7 @@ export function createScene(canvas: HTMLCanvasElement, twin: KnownTwin, onFrame:
     },
     resetView,
     dispose() {
-      cancelAnimationFrame(asked);
-      clearTimeout(waiting);
+      turn.dispose();
       observer.disconnect();
       controls.dispose();
       scene.traverse((object) => {
@@ -246,9 +221,11 @@ interface Frame {
 /** Where to look, so that the whole robot is in sight, also when it reaches out. */
 function frame(twin: KnownTwin): Frame {
   const parts = moving(twin);
-  const points = forward(twin, {})
-    .filter((_, index) => parts.has(index))
-    .map(({ position_m }) => new Vector3(...position_m));
+  const points = forward(twin, {}).flatMap(({ position_m, quaternion }, index) => {
+    if (!parts.has(index)) return [];
+    const ends = (twin.bodies[index]?.geometries ?? []).flatMap(endsOf);
+    return [position_m, ...ends.map((end) => add(position_m, rotate(quaternion, end)))].map((at) => new Vector3(...at));
+  });
   const base = points[0] ?? new Vector3();
   const reach = Math.max(0.2, ...points.map((point) => point.distanceTo(base)));
   // A robot on legs has its base in the middle: what hangs below it is to be seen as well.
@@ -259,6 +236,12 @@ function frame(twin: KnownTwin): Frame {
     radius: reach * 0.95,
     floor: planes[0]?.position_m[2] ?? 0,
   };
+}
+
+/** The two ends of a long shape, in its body; of another the middle twice. */
+function endsOf({ shape: kind, size_m, position_m, quaternion }: Geometry): Vector[] {
+  const half = kind === "capsule" || kind === "cylinder" ? size_m[1] : 0;
+  return [-half, half].map((along) => add(position_m, rotate(quaternion, [0, 0, along])));
 }
 
 function light(scene: Scene, radius: number): void {

@@ -1,31 +1,51 @@
 import { useEffect, useState } from "preact/hooks";
-import { sentence, type Api, type Methods } from "../core/api";
+import type { Api, Methods } from "../core/api";
+import { sentence } from "../core/http";
+import type { FollowedInvitation } from "../core/invitation";
 import { signInToken, type Session } from "../core/session";
 import { texts } from "../texts";
+import { JoinForm } from "./join-form";
 
 interface SignInProps {
   api: Api;
   session: Session;
+  followed: FollowedInvitation;
+  /** The link of an agent was followed, which is to be paired. */
+  pairing: boolean;
   /** What went wrong before; empty at a first visit. */
   why: string;
 }
 
-export function SignIn({ api, session, why }: SignInProps) {
+export function SignIn({ api, session, followed, pairing, why }: SignInProps) {
   const [methods, setMethods] = useState<Methods | null>(null);
   useEffect(() => {
     // Where that cannot be read, what always works is offered.
     api.methods().then(setMethods, () => setMethods({ password: true, open_id: null }));
   }, [api]);
   const elsewhere = methods?.open_id ?? null;
+  const invited = followed.state.value;
   return (
     <main class="narrow" id="content">
-      <h1>{texts.session.title}</h1>
+      {invited.kind === "open" ? (
+        <>
+          <h1>{texts.invitation.title}</h1>
+          <p>{texts.invitation.outside}</p>
+          {methods?.password === true && <JoinForm session={session} followed={followed} secret={invited.secret} />}
+          {elsewhere !== null && (
+            <InvitedElsewhere api={api} followed={followed} secret={invited.secret} name={elsewhere.name} />
+          )}
+          <h2>{texts.invitation.haveOne}</h2>
+        </>
+      ) : (
+        <h1>{texts.session.title}</h1>
+      )}
+      {pairing && invited.kind !== "open" && <p class="notice">{texts.pair.signInFirst}</p>}
       {why !== "" && (
         <p class="notice bad" role="alert">
           <strong>{texts.session.failed}.</strong> {why}
         </p>
       )}
-      {elsewhere !== null && (
+      {elsewhere !== null && invited.kind !== "open" && (
         <p>
           <a class="elsewhere" data-testid="sign-in-elsewhere" href={elsewhere.address}>
             {texts.session.elsewhere(elsewhere.name)}
@@ -39,6 +59,42 @@ export function SignIn({ api, session, why }: SignInProps) {
       <pre class="command">{texts.session.command}</pre>
       <LinkForm onToken={(token) => void session.start(token)} />
     </main>
+  );
+}
+
+interface InvitedElsewhereProps {
+  api: Api;
+  followed: FollowedInvitation;
+  secret: string;
+  /** Of the provider. */
+  name: string;
+}
+
+/** Sign in at the provider, and bring the invitation along: it belongs in no address, so this is no plain link. */
+function InvitedElsewhere({ api, followed, secret, name }: InvitedElsewhereProps) {
+  const [busy, setBusy] = useState(false);
+  const [wrong, setWrong] = useState("");
+  const go = async (): Promise<void> => {
+    setBusy(true);
+    setWrong("");
+    try {
+      const address = await api.beginElsewhere(secret);
+      followed.leave();
+      location.assign(address);
+    } catch (error) {
+      setWrong(sentence(error));
+      setBusy(false);
+    }
+  };
+  return (
+    <div>
+      <button type="button" class="primary" data-testid="sign-in-elsewhere" disabled={busy} onClick={() => void go()}>
+        {busy ? texts.session.leaving : texts.session.elsewhere(name)}
+      </button>
+      <p class="field-error" aria-live="polite">
+        {wrong}
+      </p>
+    </div>
   );
 }
 

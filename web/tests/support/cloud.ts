@@ -334,6 +334,7 @@ export class Cloud {
       reason: null,
       progress: null,
       output: "",
+      result: {},
     };
     this.actions.set(id, action);
     const { arm } = this;

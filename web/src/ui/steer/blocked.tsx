@@ -1,0 +1,50 @@
+/** Whether a page may move a robot now, and what has become of what it streams. */
+import type { Control } from "../../core/control";
+import type { DeviceStore } from "../../core/device";
+import type { SetpointStreamer } from "../../core/streamer";
+import { texts } from "../../texts";
+
+/** Why nothing here can move the robot now; `null` when it can. */
+export function whyBlocked(device: DeviceStore, control: Control): string | null {
+  if (control.streamer.value === null) return texts.joints.takeFirst;
+  const mode = device.telemetry.value?.message.mode;
+  if (device.stopped.value) return texts.joints.stopped;
+  if (!device.live.value) return texts.joints.waiting;
+  if (mode === "action") return texts.joints.busy;
+  if (control.linkStatus.value?.state !== "up") return texts.control.noWay;
+  return null;
+}
+
+interface StreamNoteProps {
+  device: DeviceStore;
+  streamer: SetpointStreamer | null;
+  blocked: string | null;
+}
+
+export function StreamNote({ device, streamer, blocked }: StreamNoteProps) {
+  const [state, text] = streamText(device, streamer, blocked);
+  const limited = state === "streaming" && limitsOf(device).length > 0;
+  return (
+    <span class={`quiet stream-${limited ? "limited" : state}`} data-testid="stream-state" data-state={state} role="status">
+      {text}
+    </span>
+  );
+}
+
+function streamText(device: DeviceStore, streamer: SetpointStreamer | null, blocked: string | null): [string, string] {
+  if (blocked !== null || streamer === null) return ["blocked", blocked ?? ""];
+  const state = streamer.state.value;
+  if (state === "waiting") return [state, texts.joints.waiting];
+  if (state === "streaming") {
+    const limited = limitsOf(device);
+    if (limited.length > 0) return [state, texts.joints.limited(limited.join(", "))];
+    return [state, streamer.way.value === "joints" ? texts.joints.streaming : texts.steer.holding];
+  }
+  const ended = streamer.ended.value;
+  return [state, ended === null ? "" : texts.joints.ended[ended]];
+}
+
+/** What makes the motion other than asked for, as the robot names it. */
+function limitsOf(device: DeviceStore): readonly string[] {
+  return device.telemetry.value?.message.limited ?? [];
+}

@@ -1,0 +1,146 @@
+import { effect, useSignalEffect } from "@preact/signals";
+import { useEffect, useMemo, useRef, useState } from "preact/hooks";
+import { clamp, radians } from "../../core/angles";
+import { Held } from "../../core/held";
+import { JOINT_KEYS, jointOfKey } from "../../core/keymap";
+import type { Joint } from "../../core/protocol";
+import type { SetpointStreamer } from "../../core/streamer";
+import { texts } from "../../texts";
+import { useHeldPad } from "./gamepad";
+import { JointRow } from "./joint-row";
+import { useHeldKeys, useKey } from "./keys";
+import type { PanelProps } from "./panel";
+
+/** How fast a held key moves the target [rad/s], and how far ahead of the joint at most [rad]. */
+const RATE_RAD_S = radians(20);
+const LEAD_RAD = radians(4);
+const STEP_MS = 40;
+
+export function JointsPanel({ device, streamer, active, pad }: PanelProps) {
+  const description = device.description.value;
+  const joints = description?.joints ?? [];
+  const [chosen, setChosen] = useState(0);
+  const rows = useRef<HTMLDivElement>(null);
+  useTurning({ device, streamer, active, pad }, chosen);
+
+  const choose = (index: number): void => {
+    const next = clamp(index, 0, joints.length - 1);
+    setChosen(next);
+    rows.current?.children[next]?.scrollIntoView({ block: "nearest" });
+  };
+  useKey(active && joints.length > 0, (event) => {
+    const index = jointOfKey(event.code);
+    if (index !== null && index < joints.length) choose(index);
+    else if (event.key === "[") choose(chosen - 1);
+    else if (event.key === "]") choose(chosen + 1);
+    else return false;
+    return true;
+  });
+  const cross = useRef(0);
+  useSignalEffect(() => {
+    const step = pad.reading.value?.cross[1] ?? 0;
+    if (step !== 0 && cross.current === 0) choose(chosen - step);
+    cross.current = step;
+  });
+
+  if (description === null) return <p class="quiet">{texts.joints.noDescription}</p>;
+  return (
+    <>
+      <div class="joint-head" aria-hidden="true">
+        <span>{texts.joints.heading.joint}</span>
+        <span>{texts.joints.heading.target}</span>
+        <span>{texts.joints.heading.measured}</span>
+      </div>
+      <div class="joint-rows" ref={rows}>
+        {joints.map((joint, index) => (
+          <LiveJoint
+            key={joint.name}
+            joint={joint}
+            index={index}
+            device={device}
+            streamer={streamer}
+            chosen={active && streamer !== null && index === chosen}
+          />
+        ))}
+      </div>
+      <p class="quiet small">{texts.joints.keys}</p>
+    </>
+  );
+}
+
+interface LiveJointProps extends Pick<PanelProps, "device" | "streamer"> {
+  joint: Joint;
+  index: number;
+  chosen: boolean;
+}
+
+/** Reads what changes many times a second by itself, so that the panel need not. */
+function LiveJoint({ joint, index, device, streamer, chosen }: LiveJointProps) {
+  const telemetry = device.telemetry.value?.message;
+  return (
+    <JointRow
+      joint={joint}
+      targetRad={streamer?.targets.value[joint.name] ?? telemetry?.commanded_rad[index]}
+      measuredRad={telemetry?.position_rad[index]}
+      old={!device.live.value}
+      chosen={chosen}
+      onSet={streamer === null ? null : (positionRad) => streamer.setTarget(joint.name, positionRad)}
+    />
+  );
+}
+
+/** Turns the chosen joint while a key, or the stick of a gamepad, is held: its target runs ahead by a little. */
+function useTurning({ device, streamer, active, pad }: PanelProps, chosen: number): void {
+  const amount = useRef(0);
+  const held = useMemo(
+    () =>
+      new Held<number>((parts) => {
+        amount.current = clamp(
+          parts.reduce((sum, part) => sum + part, 0),
+          -1,
+          1,
+        );
+      }),
+    [],
+  );
+  // Without control arrows scroll the page, as ever.
+  useHeldKeys(active && streamer !== null, held, JOINT_KEYS);
+  useHeldPad(pad, held, ({ left }) => left[1]);
+  useEffect(
+    () =>
+      effect(() => {
+        // As with a velocity: what has ended the stream ends what was held.
+        const ended = streamer?.ended.value ?? null;
+        if (streamer === null || (ended !== null && ended !== "reached")) held.releaseAll();
+      }),
+    [held, streamer],
+  );
+  useEffect(() => {
+    const drop = (): void => held.releaseAll();
+    addEventListener("blur", drop);
+    document.addEventListener("visibilitychange", drop);
+    return () => {
+      removeEventListener("blur", drop);
+      document.removeEventListener("visibilitychange", drop);
+      drop();
+    };
+  }, [held]);
+  const joint = device.description.value?.joints[chosen];
+  useEffect(() => {
+    if (streamer === null || joint === undefined) return;
+    held.releaseAll();
+    const timer = setInterval(() => {
+      if (amount.current !== 0) turn(streamer, joint, device.telemetry.peek()?.message.position_rad[chosen]);
+    }, STEP_MS);
+    const turn = (to: SetpointStreamer, one: Joint, measuredRad: number | undefined): void => {
+      if (measuredRad === undefined) return;
+      to.follow();
+      const target = (to.targets.peek()[one.name] ?? measuredRad) + (amount.current * RATE_RAD_S * STEP_MS) / 1000;
+      to.setTarget(one.name, clamp(target, measuredRad - LEAD_RAD, measuredRad + LEAD_RAD));
+    };
+    return () => {
+      clearInterval(timer);
+      held.releaseAll();
+    };
+  }, [streamer, joint, chosen, device, held]);
+}
