@@ -7,13 +7,11 @@ nothing of hers.
 
 import re
 from collections import Counter
-from collections.abc import Iterator
 from pathlib import Path
 
 import httpx
-import pytest
 
-from tests.leaks.world import TYPE_TOLD_OF_REFUSALS, Rows, World, make, texts
+from tests.leaks.world import TYPE_TOLD_OF_REFUSALS, Rows, World, texts
 
 TABLE = Path(__file__).with_name("routes.txt")
 REFUSED = {"401", "403", "404"}
@@ -32,15 +30,6 @@ def expected() -> dict[str, dict[str, str]]:
         assert name not in found, f"{name} stands there twice"
         found[name] = dict(zip(columns, cells, strict=True))
     return found
-
-
-@pytest.fixture(scope="module")
-def world(tmp_path_factory: pytest.TempPathFactory) -> Iterator[World]:
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("function_app.services.stop.CONFIRM_MS", 1)
-        world = make(tmp_path_factory.mktemp("home"))
-        with world.cloud:
-            yield world
 
 
 def operations(world: World) -> list[tuple[str, str, str]]:

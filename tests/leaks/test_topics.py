@@ -7,7 +7,7 @@ import json
 import shutil
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import pytest
 
@@ -15,7 +15,9 @@ from device_agent.protocol.grants import Grant
 from function_app.adapters.local.keys import FileKeys
 from function_app.ports.broker_access import Credentials
 from tests.support.brokers import BROKERS, ROOT, BrokerKind, Client, Message, RunningBroker, start_broker, wait_until
-from tests.support.cloud import Cloud, Robot, settings
+from tests.support.cloud import Cloud, settings
+from tests.support.event_grid import event_grid_cloud
+from tests.support.robot import Robot
 
 TABLE = Path(__file__).with_name("topics.txt")
 RETAINED = ("presence", "description", "twin", "state")
@@ -45,39 +47,43 @@ def channels() -> dict[str, str]:
     return {name: channel["address"] for name, channel in document["channels"].items()}
 
 
-@pytest.fixture(params=BROKERS, scope="module")
+@pytest.fixture(params=(*BROKERS, "eventgrid"), scope="module")
 def stage(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Stage]:
-    kind: BrokerKind = request.param
+    kind: BrokerKind | Literal["eventgrid"] = request.param
     home = tmp_path_factory.mktemp(f"{kind}-home")
+    if kind == "eventgrid":
+        with event_grid_cloud(home) as (cloud, broker, grid):
+            grid.everything = "ear"
+            with broker.connect("ear", None) as ear:
+                yield _stage(broker, cloud, ear)
+        return
     FileKeys(home / "keys").load()
     with start_broker(kind, tmp_path_factory.mktemp(kind), keys=home / "keys" / "public.json") as broker:
         if kind == "mosquitto":
             (home / "mosquitto").mkdir()
             shutil.copy(broker.home / "service.password", home / "mosquitto")
-        with Cloud(settings(home, broker)) as cloud:
-            robot, roles = _people(cloud)
-            names = {
-                "space": robot.space,
-                "agent": robot.id,
-                "device": "arm",
-                "stream": "x",
-                "camera": "x",
-                "epoch": "1",
-            }
-            topics = {name: address.format(**names) for name, address in channels().items()}
-            wide = (
-                "#",
-                "ts/#",
-                "+/+/+/+/+/+",
-                f"ts/v1/{robot.space}/#",
-                f"ts/v1/+/{robot.id}/#",
-                "ts/v1/+/+/conn",
-                *(f"ts/v1/+/+/+/{kind}" for kind in ("state", "desc", "event", "ack", "cmd", "stop")),
-                *(f"ts/v1/+/+/+/{kind}/+" for kind in ("tele", "cam", "ctl", "late", "desc")),
-            )
-            ear = _ear(cloud, broker, tuple(topics.values()))
-            with ear:
-                yield Stage(broker, roles, topics, wide, ear)
+        with Cloud(settings(home, broker)) as cloud, _ear(cloud, broker) as ear:
+            yield _stage(broker, cloud, ear)
+
+
+def _stage(broker: RunningBroker, cloud: Cloud, ear: Client) -> Stage:
+    robot, roles = _people(cloud)
+    topics = {name: address.format(**_names(robot)) for name, address in channels().items()}
+    wide = (
+        "#",
+        "ts/#",
+        "+/+/+/+/+/+",
+        f"ts/v1/{robot.space}/#",
+        f"ts/v1/+/{robot.id}/#",
+        "ts/v1/+/+/conn",
+        *(f"ts/v1/+/+/+/{kind}" for kind in ("state", "desc", "event", "ack", "cmd", "stop")),
+        *(f"ts/v1/+/+/+/{kind}/+" for kind in ("tele", "cam", "ctl", "late", "desc")),
+    )
+    return Stage(broker, roles, topics, wide, ear)
+
+
+def _names(robot: Robot) -> dict[str, str]:
+    return {"space": robot.space, "agent": robot.id, "device": "arm", "stream": "x", "camera": "x", "epoch": "1"}
 
 
 def _people(cloud: Cloud) -> tuple[Robot, dict[str, dict[str, Any]]]:
@@ -102,8 +108,9 @@ def _people(cloud: Cloud) -> tuple[Robot, dict[str, dict[str, Any]]]:
     return robot, roles
 
 
-def _ear(cloud: Cloud, broker: RunningBroker, topics: tuple[str, ...]) -> Client:
+def _ear(cloud: Cloud, broker: RunningBroker) -> Client:
     now_s = cloud.clock.now_ms() // 1000
+    topics = tuple(address.format_map(_Any()) for address in channels().values())
     grant = Grant(
         principal="service:ear",
         client_id="ear",
@@ -116,6 +123,11 @@ def _ear(cloud: Cloud, broker: RunningBroker, topics: tuple[str, ...]) -> Client
     ear = broker.connect("ear", credentials)
     assert ear.connected.is_set(), ear.answer
     return ear
+
+
+class _Any(dict[str, str]):
+    def __missing__(self, name: str) -> str:
+        return "+"
 
 
 def join(stage: Stage, role: str, **options: Any) -> Client:

@@ -15,7 +15,9 @@ import httpx
 from device_agent.protocol import codec
 from device_agent.protocol.messages import Fault, Measurements, Mode, Presence, State
 from function_app.services import store
-from tests.support.cloud import API, BASE, Cloud, Person, Robot, settings
+from tests.support.brokers import ROOT
+from tests.support.cloud import API, BASE, Cloud, Person, settings
+from tests.support.robot import Robot
 
 OWNER = "Anneliese Musterfrau"
 LABEL = "Kronjuwel"
@@ -96,6 +98,7 @@ def make(home: Path) -> World:
         "fault": fault,
         "upload": upload,
         "stream": "hidden",
+        "look": _look(anna),
         "robot_type": "ur5",
         "name": MOVEMENT,
         "get_robot_type_file.name": "ur5.xml",
@@ -121,7 +124,15 @@ def make(home: Path) -> World:
         marks={OWNER, LABEL, MOVEMENT, SOURCE, anna.account, anna.session, other.session, "geheim", "Kurzschluss"},
         foreign=(anna.account, robot.id, space),
     )
-    world.marks |= {made["secret"] for made in invitations.values()} | {action, request, fault, upload, robot.id, space}
+    world.marks |= {made["secret"] for made in invitations.values()} | {
+        action,
+        request,
+        fault,
+        upload,
+        robot.id,
+        space,
+        ids["look"],
+    }
     for caller in ("viewer key", "operator key"):
         assert world.callers[caller]("GET", "/accounts/me").status_code == 200, (
             "that a key is used is noted once an hour"
@@ -173,6 +184,14 @@ def _say(cloud: Cloud, robot: Robot, epoch: int) -> None:
     assert '"refused"' not in answer.text, answer.text
 
 
+def _look(anna: Person) -> str:
+    """A robot type that is looked at before it is saved, and that no checker has seen."""
+    folder = ROOT / "robots" / "ur5"
+    manifest = (folder / "robot.toml").read_text().replace('type = "ur5"', 'type = "mine"')
+    files = {name: (folder / name).read_text() for name in ("ur5.xml", "scene.xml")}
+    return str(_made(anna.post("/robot-type-looks", {"manifest": manifest, "files": files, "wait_ms": 0}))["id"])
+
+
 def _upload(cloud: Cloud, anna: Person, device: str) -> str:
     begun = _made(
         anna.post(
@@ -198,8 +217,10 @@ def _bodies(device: str, space: str, epoch: int, introduction: dict[str, Any]) -
         "make_api_key": {"name": "app", "role": "viewer", "days": 1},
         "enroll_agent": introduction,
         "make_account": {"name": "new", "password": "correct horse battery", "invitation": "x" * 43},
+        "start_open_id_invited": {"invitation": "x" * 43},
         "certify": {"request": "x"},
         "claim_agent": {"code": "BCDF-GHJK"},
+        "rename_device": {"label": "Elbow grease"},
         "move_agent": {"space": space},
         "tell_messages": {"messages": [{"topic": "t", "payload": {}}]},
         "share_device": {"account": "stranger", "role": "operator"},
@@ -219,7 +240,9 @@ def _bodies(device: str, space: str, epoch: int, introduction: dict[str, Any]) -
         "start_action": {"request": move, "epoch": epoch},
         "start_actions": {"devices": [device], "request": move},
         "add_robot_type": {"manifest": "x", "files": {}},
+        "add_robot_type_look": {"manifest": "x", "files": {}},
         "put_movement": {"source": "1"},
+        "check_movement": {"source": "1"},
         "mqtt_credentials": {"purpose": "control", "device": device, "epoch": epoch},
         "xmpp_credentials": {},
         "xmpp_verify": {"username": "x", "password": "x"},

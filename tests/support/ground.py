@@ -15,10 +15,12 @@ from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any, Protocol, Self
 
+from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
+
 from device_agent import links
 from device_agent.ports.clock import CloudClock
-from device_agent.protocol import codec, topics
-from device_agent.protocol.messages import Presence
+from device_agent.protocol import codec, signing, topics
+from device_agent.protocol.messages import Command, Presence, Request
 from device_agent.runtime.certificate import OwnCertificate
 from device_agent.runtime.home import Configuration, DeviceEntry, Pairing
 from device_agent.transports.http.api import CloudApi
@@ -30,10 +32,11 @@ from function_app.services import store
 from function_app.services.delivery import Delivery, Signed
 from function_app.services.devices import devices_of
 from tests.support.brokers import HOST, BrokerKind, Client, Message, RunningBroker, start_broker, wait_until
-from tests.support.cloud import Cloud, Robot, settings
+from tests.support.cloud import Cloud, settings
 from tests.support.hosts.host import Program, environment_of, start_program
 from tests.support.pins import pinned
 from tests.support.proxy import Proxy, start_proxy
+from tests.support.robot import Robot
 
 ORDER_MS = 30_000
 
@@ -131,12 +134,33 @@ class Ground:
 
     def send(self, robot: Robot, payload: bytes, *, in_ms: int = ORDER_MS, first: bool = False) -> str:
         """Send anything the way commands go; its id."""
-        (device,) = self.devices(robot.id)
         self._last_ms = max(self._last_ms + 1, self.cloud.clock.now_ms())
-        command = command_id(device.id, self._last_ms)
-        signed = Signed(command, payload, self.cloud.clock.now_ms() + in_ms, first)
-        self.cloud.run(self.delivery.send(device, signed))
+        command = command_id(robot.device, self._last_ms)
+        self.deliver(robot.id, Signed(command, payload, self.cloud.clock.now_ms() + in_ms, first))
         return command
+
+    def order(self, agent: str, request: Request, *, epoch: int, key: Ed25519PrivateKey | None = None) -> Signed:
+        """A command of Anna's to an agent's only device; signed by the cloud's key where no other is given."""
+        (device,) = self.devices(agent)
+        now_ms = self.cloud.clock.now_ms()
+        command = Command(
+            id=command_id(device.id, now_ms),
+            space=device.space,
+            agent=agent,
+            device=device.name,
+            issued_at_ms=now_ms,
+            ttl_ms=ORDER_MS,
+            who="anna",
+            epoch=epoch,
+            request=request,
+        )
+        payload = signing.sign(codec.encode(command), key or FileKeys(self.home / "keys").load())
+        return Signed(command.id, payload, now_ms + ORDER_MS)
+
+    def deliver(self, agent: str, order: Signed) -> None:
+        """Send an order to an agent's only device."""
+        (device,) = self.devices(agent)
+        self.cloud.run(self.delivery.send(device, order))
 
     def keep(self, topic: str, payload: bytes) -> None:
         """Have the broker keep a message."""

@@ -14,7 +14,8 @@ import httpx
 from device_agent.protocol import codec, topics
 from device_agent.protocol.messages import AckStatus
 from tests.support.brokers import PATIENCE_S, Message
-from tests.support.cloud import API, MovingClock, Robot
+from tests.support.cloud import API, MovingClock
+from tests.support.robot import Robot
 
 
 class Place(Protocol):

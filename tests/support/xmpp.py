@@ -26,7 +26,8 @@ from function_app.entrypoints.xmpp.speaker import Speaker
 from function_app.ports.broker_access import Credentials
 from function_app.settings import Settings
 from tests.support.brokers import HOST, PATIENCE_S, ROOT, Client, Message, RunningBroker, wait_until
-from tests.support.cloud import Cloud, Person, Robot
+from tests.support.cloud import Cloud, Person
+from tests.support.robot import Robot
 
 if TYPE_CHECKING:
     from xml.etree.ElementTree import Element

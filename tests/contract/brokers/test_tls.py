@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from device_agent.protocol import topics
-from function_app.adapters.local.mqtt_link import MqttLink
+from function_app.adapters.local.mqtt_link import Broker, MqttLink
 from function_app.adapters.local.tls import client_context
 from function_app.ports.broker_access import Credentials
 from infra.tls import authority
@@ -109,12 +109,9 @@ def test_nothing_is_left_lying_in_what_was_decrypted(
     """Several messages come in one record of TLS: the socket tells of the first alone."""
     heard: list[object] = []
     link = MqttLink(
-        host=HOST,
-        port=broker.tcp_port,
-        credentials=broker.access.service_credentials,
+        Broker(host=HOST, port=broker.tcp_port, credentials=broker.access.service_credentials, tls=trusting),
         subscriptions=(topics.conn(space, "+"),),
         receive=lambda message: heard.append(message.payload),
-        tls=trusting,
     )
 
     async def begin() -> None:

@@ -8,6 +8,7 @@ from itertools import count
 import pytest
 
 from function_app.adapters.local.command_bus import MqttCommandBus
+from function_app.adapters.local.mqtt_link import Broker
 from function_app.ports.broker_access import ServiceCredentials
 from tests.contract.bus.suite import BusContract, Heard, Stage
 from tests.support.brokers import BROKERS, HOST, SILENCE_S, BrokerKind, RunningBroker, start_broker
@@ -59,4 +60,4 @@ def _bus(broker: RunningBroker, port: int) -> MqttCommandBus:
     def credentials() -> ServiceCredentials:
         return broker.access.service_credentials()
 
-    return MqttCommandBus(host=HOST, port=port, credentials=credentials)
+    return MqttCommandBus(Broker(host=HOST, port=port, credentials=credentials))

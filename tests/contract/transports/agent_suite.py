@@ -14,13 +14,10 @@ import pytest
 from device_agent import bootstrap, catalogue
 from device_agent.links import SOFTWARE
 from device_agent.ports.clock import CloudClock
-from device_agent.protocol import codec, signing, topics
-from device_agent.protocol.messages import Ack, AckStatus, Command, MoveJoints, State
+from device_agent.protocol import codec, topics
+from device_agent.protocol.messages import Ack, AckStatus, MoveJoints, State
 from device_agent.runtime.home import Configuration, DeviceEntry, Home, Pairing
 from device_agent.transports.http.api import CloudApi
-from function_app.adapters.local.keys import FileKeys
-from function_app.domain.ids import command_id
-from function_app.services.delivery import Signed
 from tests.contract.transports.suite import Spoken
 from tests.support.brokers import wait_until
 from tests.support.ground import Ground
@@ -192,28 +189,15 @@ class AgentSuite:
 
     @staticmethod
     def _comes_twice_runs_once(ground: Ground, resident: Resident, epoch: int) -> int:
-        now_ms = ground.cloud.clock.now_ms()
-        (device,) = ground.devices(resident.agent)
-        order = Command(
-            id=command_id(device.id, now_ms),
-            space=resident.space,
-            agent=resident.agent,
-            device="arm",
-            issued_at_ms=now_ms,
-            ttl_ms=30_000,
-            who="anna",
-            epoch=epoch,
-            request=MoveJoints(position_rad={"shoulder_pan": 0.6}, speed=1.0),
-        )
-        payload = signing.sign(codec.encode(order), FileKeys(ground.home / "keys").load())
-        signed = Signed(order.id, payload, now_ms + 30_000)
-        ground.cloud.run(ground.delivery.send(device, signed))
-        wait_until(lambda: AckStatus.DONE in resident.acks(order.id), "its end", PATIENCE_S)
-        answers, ticks = resident.heard(order.id), len(resident.sent)
-        ground.cloud.run(ground.delivery.send(device, signed))
+        move = MoveJoints(position_rad={"shoulder_pan": 0.6}, speed=1.0)
+        order = ground.order(resident.agent, move, epoch=epoch)
+        ground.deliver(resident.agent, order)
+        wait_until(lambda: AckStatus.DONE in resident.acks(order.command), "its end", PATIENCE_S)
+        answers, ticks = resident.heard(order.command), len(resident.sent)
+        ground.deliver(resident.agent, order)
         after = resident.take()  # an agent that still says that it has this command is asked anew
-        wait_until(lambda: resident.heard(order.id) > answers, "the last answer, again", PATIENCE_S)
-        assert resident.acks(order.id)[-3:] == [AckStatus.ACCEPTED, AckStatus.STARTED, AckStatus.DONE]
+        wait_until(lambda: resident.heard(order.command) > answers, "the last answer, again", PATIENCE_S)
+        assert resident.acks(order.command)[-3:] == [AckStatus.ACCEPTED, AckStatus.STARTED, AckStatus.DONE]
         assert len({position for _, position in resident.sent[ticks:]}) <= 1, "it moved again"
         return after
 

@@ -7,12 +7,10 @@ from typing import Any
 import pytest
 from msgspec.structs import replace
 
-from device_agent.protocol import codec, signing
-from device_agent.protocol.messages import Command, GrantLease
+from device_agent.protocol import signing
+from device_agent.protocol.messages import GrantLease
 from function_app.adapters.key_ring import Ring
 from function_app.adapters.local.keys import FileKeys
-from function_app.domain.ids import command_id
-from function_app.services.delivery import Signed
 from tests.contract.transports.agent_suite import PATIENCE_S, Resident
 from tests.contract.transports.suite import Spoken
 from tests.support.brokers import wait_until
@@ -93,24 +91,11 @@ def refusals(resident: Resident) -> dict[str, int]:
 
 def send(ground: Ground, resident: Resident, key: Any) -> dict[str, int]:
     """Have the device hear a lease order signed with this key; what it has refused since."""
-    (device,) = ground.devices(resident.agent)
-    now_ms = ground.cloud.clock.now_ms()
     epoch = resident.device._controller.epochs[0] + 1
-    order = Command(
-        id=command_id(device.id, now_ms),
-        space=resident.space,
-        agent=resident.agent,
-        device="arm",
-        issued_at_ms=now_ms,
-        ttl_ms=30_000,
-        who="anna",
-        epoch=epoch,
-        request=GrantLease(holder="anna", lease_ms=30_000),
-    )
+    lease = GrantLease(holder="anna", lease_ms=30_000)
+    order = ground.order(resident.agent, lease, epoch=epoch, key=key)
     before = refusals(resident)
-    ground.cloud.run(
-        ground.delivery.send(device, Signed(order.id, signing.sign(codec.encode(order), key), now_ms + 30_000))
-    )
+    ground.deliver(resident.agent, order)
     wait_until(
         lambda: refusals(resident) != before or resident.device._controller.epochs[0] == epoch, "an answer", PATIENCE_S
     )

@@ -13,9 +13,10 @@ from function_app.adapters.local.tables import SqliteTables
 from tests.conftest import Emulators
 from tests.support.aws import use_credentials
 from tests.support.brokers import BrokerKind, RunningBroker, start_broker
-from tests.support.cloud import Cloud, MovingClock, Person, Robot, paired, settings
+from tests.support.cloud import Cloud, MovingClock, Person, paired, settings
 from tests.support.knife import CutTables, Knife
 from tests.support.processes import Place
+from tests.support.robot import Robot
 from tests.support.stores import StoreKind, empty_store, make_places
 
 Open = Callable[..., Cloud]

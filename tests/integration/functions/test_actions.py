@@ -15,7 +15,8 @@ from device_agent.protocol.messages import (
     TakePosture,
 )
 from tests.support.brokers import BROKERS, wait_until
-from tests.support.cloud import API, MOVE, Cloud, Person, Robot, paired, problem
+from tests.support.cloud import API, MOVE, Cloud, Person, paired, problem
+from tests.support.robot import Robot
 
 Pair = tuple[Person, Robot]
 both_brokers = pytest.mark.parametrize("broker", BROKERS, indirect=True)

@@ -16,7 +16,8 @@ from function_app.entrypoints.http.address import client_address
 from function_app.ports.broker_access import Credentials
 from infra.tls import devices
 from tests.support.brokers import BROKERS, RunningBroker, wait_until
-from tests.support.cloud import API, Cloud, MovingClock, Person, Robot, paired, problem, settings
+from tests.support.cloud import API, Cloud, MovingClock, Person, paired, problem, settings
+from tests.support.robot import Robot
 
 Pair = tuple[Person, Robot]
 

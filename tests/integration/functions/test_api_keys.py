@@ -10,7 +10,8 @@ from function_app.ports.broker_access import Credentials
 from function_app.services import store
 from tests.integration.functions.conftest import Open
 from tests.support.brokers import BROKERS, RunningBroker, wait_until
-from tests.support.cloud import API, MOVE, Cloud, MovingClock, Person, Robot, paired, problem
+from tests.support.cloud import API, MOVE, Cloud, MovingClock, Person, paired, problem
+from tests.support.robot import Robot
 
 KEYS = "/api-keys"
 Pair = tuple[Person, Robot]

@@ -14,7 +14,8 @@ import pytest
 from function_app.__main__ import main
 from function_app.bootstrap import Functions
 from function_app.domain.accounts import Identity
-from function_app.domain.audit_chain import CLOUD, Head
+from function_app.domain.audit_chain import CLOUD, Head, entry
+from function_app.ports.tables import Conflict
 from function_app.services import store
 from function_app.services.audit_chain import ABANDON_MS, ANCHOR_MS, LOOK_MS, anchors
 from tests.integration.functions.conftest import Open
@@ -316,6 +317,39 @@ class TestChanged:
         assert verdict(cloud, OWNER, head) == ""
 
 
+def test_what_is_sent_again_since_its_answer_was_lost_is_recorded_once(
+    home: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A store's client asks again by itself; not every store knows what it has done already."""
+    with Cloud(settings(home)) as cloud:
+        functions = cloud.functions
+        batch = functions.tables.batch
+        lost: list[str] = []
+
+        async def losing(table: str, writes: Any) -> Any:
+            done = await batch(table, writes)
+            if table == store.AUDIT:
+                lost.append(table)
+                if len(lost) % 2:
+                    raise Conflict("it is not as the writer believed")
+            return done
+
+        monkeypatch.setattr(functions.tables, "batch", losing)
+
+        async def work() -> list[str]:
+            async with functions.chain.change(OWNER, "changed", WHO) as change:
+                await change.noted()
+            await asyncio.gather(*(functions.chain.record(OWNER, f"did {number}", WHO) for number in range(3)))
+            told = entry("told", WHO, entry_id="told", at_ms=functions.clock.now_ms())
+            for _ in range(2):
+                await functions.chain.tell(OWNER, [told])
+            return [record["what"] for record in await everything(functions)]
+
+        assert sorted(cloud.run(work())) == ["changed", "did 0", "did 1", "did 2", "told"]
+        assert len(lost) > 2
+        assert verdict(cloud, OWNER) == ""
+
+
 def test_the_timer_notes_the_head_elsewhere_every_hour_with_something_new(home: Path) -> None:
     clock = MovingClock()
     with Cloud(settings(home), clock=clock) as cloud:
@@ -440,14 +474,15 @@ def test_killed_at_any_step_no_change_is_without_its_record(place: Place) -> Non
 def see_that_all_is_recorded(place: Place, *, stride: int) -> None:
     """The tables say what was changed; the chain has each of it, once, in the words of who did it or as unknown."""
 
-    async def prepare(functions: Functions) -> tuple[str, str, str]:
-        account = await functions.sign_in.account("anna")
+    async def prepare(functions: Functions, step: int) -> tuple[str, str, str]:
+        # Somebody else each time: who is killed while claiming has used up one of their few tries.
+        account = await functions.sign_in.account(f"anna {step}")
         agent, code = await show_code(functions)
         return account.id, agent, code
 
     ends = 0
     for step in itertools.count(1, stride):
-        account, agent, code = run_here(place, prepare)
+        account, agent, code = run_here(place, lambda functions, step=step: prepare(functions, step))  # type: ignore[misc]
         who = Identity(account, "anna", "s")
         before = run_here(place, lambda functions, chain=account: everything(functions, chain))  # type: ignore[misc]
         process = begin(place, _changes, who, agent, code, dies_at=step)

@@ -11,7 +11,8 @@ from function_app.services import store
 from function_app.services.series import Place
 from tests.integration.functions.conftest import Open
 from tests.support.brokers import wait_until
-from tests.support.cloud import Cloud, Person, Robot, paired, problem
+from tests.support.cloud import Cloud, Person, paired, problem
+from tests.support.robot import Robot
 
 
 def measure(robot: Robot, stream: str, at_ms: int, **values: float) -> None:

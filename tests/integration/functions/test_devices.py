@@ -11,7 +11,8 @@ from function_app.domain.devices import SILENT_MS
 from function_app.entrypoints.ingest import ingest
 from function_app.services import store
 from tests.support.brokers import BROKERS, wait_until
-from tests.support.cloud import Cloud, Person, Robot, paired
+from tests.support.cloud import Cloud, Person, paired
+from tests.support.robot import Robot
 
 Pair = tuple[Person, Robot]
 

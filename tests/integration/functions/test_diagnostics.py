@@ -13,7 +13,8 @@ from function_app.adapters.local import feed
 from function_app.entrypoints.ingest import ingest, ingest_telemetry
 from function_app.services import store
 from tests.support.brokers import wait_until
-from tests.support.cloud import Cloud, Person, Robot, paired, problem
+from tests.support.cloud import Cloud, Person, paired, problem
+from tests.support.robot import Robot
 
 Pair = tuple[Person, Robot]
 Temperature = Callable[[int], float]
@@ -203,7 +204,7 @@ def test_what_nobody_has_said_the_limits_of_is_worth_knowing_and_no_warning(clou
     assert health(cloud, anna, robot) == "ok"
     shown = field(anna, robot, "fan_hz")
     assert shown["usual_low"] > 20
-    assert (shown["high"], shown["low"]) == (None, None)
+    assert (shown["high"], shown["low"], shown["advice"]) == (None, None, "")
 
 
 def test_lasting_effort_is_told_and_positions_are_not_judged(cloud: Cloud, pair: Pair) -> None:

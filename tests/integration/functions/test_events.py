@@ -6,7 +6,8 @@ from device_agent.protocol import codec, topics
 from device_agent.protocol.events import EventKind
 from device_agent.protocol.messages import Event
 from function_app.entrypoints.ingest import ingest
-from tests.support.cloud import Cloud, Person, Robot
+from tests.support.cloud import Cloud, Person
+from tests.support.robot import Robot
 
 Pair = tuple[Person, Robot]
 

@@ -14,7 +14,8 @@ from function_app.entrypoints.ingest import ingest
 from function_app.services import store
 from function_app.services.faults import KEEP_FAULTS_MS, MAX_OPEN
 from tests.support.brokers import BROKERS, wait_until
-from tests.support.cloud import Cloud, Person, Robot, paired, problem
+from tests.support.cloud import Cloud, Person, paired, problem
+from tests.support.robot import Robot
 
 Pair = tuple[Person, Robot]
 

@@ -8,7 +8,8 @@ import pytest
 from device_agent.protocol.messages import AckStatus, MoveJoints
 from function_app.services.fleet import AT_ONCE, MOST
 from tests.support.brokers import wait_until
-from tests.support.cloud import MOVE, Cloud, Person, Robot, paired, problem
+from tests.support.cloud import MOVE, Cloud, Person, paired, problem
+from tests.support.robot import Robot
 
 Pair = tuple[Person, Robot]
 NAMES = tuple(f"arm{number}" for number in range(5))

@@ -13,7 +13,8 @@ from function_app.services import store
 from function_app.services.events import KEEP_EVENTS_MS
 from function_app.services.forget import DAY_MS, NOTES, ROWS, SHARDS, Forget
 from tests.support.brokers import wait_until
-from tests.support.cloud import Cloud, MovingClock, Person, Robot, settings
+from tests.support.cloud import Cloud, MovingClock, Person, settings
+from tests.support.robot import Robot
 
 Pair = tuple[Person, Robot]
 NOW_MS = 1_800_000_000_000

@@ -12,7 +12,8 @@ from function_app.ports.command_bus import BusUnavailable
 from function_app.ports.tables import StoreError
 from function_app.services import devices as devices_service
 from tests.support.brokers import BROKERS, RunningBroker, wait_until
-from tests.support.cloud import Cloud, Person, Robot, problem
+from tests.support.cloud import Cloud, Person, problem
+from tests.support.robot import Robot
 
 Three = tuple[Person, Person, Robot]
 WITHIN_MS = 30_000

@@ -15,7 +15,8 @@ from device_agent.protocol.messages import AckStatus, Measurements, Mode, MoveJo
 from function_app.entrypoints.ingest import ingest, ingest_telemetry
 from tests.integration.functions.test_diagnostics import MINUTE, Pair, field, open_faults
 from tests.support.bench import Bench, eventually
-from tests.support.cloud import Cloud, Robot
+from tests.support.cloud import Cloud
+from tests.support.robot import Robot
 from tests.unit.robots.folders import ROBOTS
 
 UR5 = robot_type.load(ROBOTS / "ur5")

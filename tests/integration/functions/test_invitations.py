@@ -9,8 +9,9 @@ from function_app.services import store
 from function_app.services.leave import LOOK_MS
 from tests.integration.functions.conftest import Mortal
 from tests.support.brokers import wait_until
-from tests.support.cloud import Cloud, Person, Robot, paired, problem
+from tests.support.cloud import Cloud, Person, paired, problem
 from tests.support.knife import elsewhere
+from tests.support.robot import Robot
 
 Three = tuple[Person, Person, Robot]
 DAY_S = 86_400

@@ -11,8 +11,9 @@ from function_app.adapters.local import feed
 from function_app.ports.broker_access import Credentials
 from function_app.ports.tables import StoreError
 from tests.support.brokers import Client, RunningBroker, wait_until
-from tests.support.cloud import Cloud, Person, Robot
+from tests.support.cloud import Cloud, Person
 from tests.support.polling import PollingRobot
+from tests.support.robot import Robot
 
 HOUR_MS = 3_600_000
 

@@ -16,7 +16,8 @@ from function_app.services import store
 from function_app.services.forget import DAY_MS
 from function_app.services.latency import HOUR_MS, KEEP_HOURS_MS
 from tests.support.brokers import wait_until
-from tests.support.cloud import Cloud, Person, Robot, paired, problem
+from tests.support.cloud import Cloud, Person, paired, problem
+from tests.support.robot import Robot
 
 Pair = tuple[Person, Robot]
 Samples = list[tuple[int, float]]

@@ -5,7 +5,8 @@ import pytest
 from device_agent.protocol.messages import AckStatus, GrantLease, ReleaseLease
 from function_app.ports.broker_access import Credentials
 from tests.support.brokers import BROKERS, RunningBroker, wait_until
-from tests.support.cloud import Cloud, Person, Robot, problem
+from tests.support.cloud import Cloud, Person, problem
+from tests.support.robot import Robot
 
 Pair = tuple[Person, Robot]
 

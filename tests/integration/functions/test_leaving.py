@@ -13,8 +13,9 @@ from function_app.services.pending import SHARDS
 from function_app.services.sweep import ORPHAN_MS
 from tests.integration.functions.conftest import Mortal, Open
 from tests.support.brokers import BROKERS, RunningBroker, wait_until
-from tests.support.cloud import Cloud, Person, Robot, paired, problem
+from tests.support.cloud import Cloud, Person, paired, problem
 from tests.support.knife import elsewhere
+from tests.support.robot import Robot
 
 Pair = tuple[Person, Robot]
 both_brokers = pytest.mark.parametrize("broker", BROKERS, indirect=True)

@@ -19,7 +19,8 @@ from function_app.services import store
 from function_app.services.movements import KEPT_MS
 from function_app.services.parameters import MAX_PARAMETERS_BYTES
 from function_app.services.scripts import MAX_SOURCE
-from tests.support.cloud import Cloud, Person, Robot, problem, settings
+from tests.support.cloud import Cloud, Person, problem, settings
+from tests.support.robot import Robot
 
 UR5 = "/robot-types/ur5"
 MINE = f"{UR5}/movements/mine"
@@ -87,6 +88,34 @@ def test_ones_own_shadows_a_built_in_one_for_oneself_only(alone: Cloud, anna: Pe
     assert anna.delete(WAVE).status_code == 204
     assert anna.get(WAVE).json() == built_in
     problem(anna.delete(WAVE), 409, "movement-built-in")
+
+
+def test_a_version_is_not_saved_over_one_that_its_author_has_not_seen(anna: Person) -> None:
+    assert anna.put(MINE, {"source": SOURCE, "based_on": 0}).status_code == 201
+    refused = problem(anna.put(MINE, {"source": SOURCE + "#", "based_on": 0}), 409, "movement-changed")
+    assert refused["version"] == 1
+    assert anna.put(MINE, {"source": SOURCE + "#", "based_on": 1}).json()["version"] == 2
+    assert problem(anna.put(MINE, {"source": "1", "based_on": 1}), 409, "movement-changed")["version"] == 2
+    assert anna.get(MINE).json()["source"] == SOURCE + "#"
+    assert anna.delete(MINE).status_code == 204
+    assert problem(anna.put(MINE, {"source": "1", "based_on": 2}), 409, "movement-changed")["version"] == 0
+    built_in = anna.get(WAVE).json()["version"]
+    problem(anna.put(WAVE, {"source": SOURCE, "based_on": 0}), 409, "movement-changed")
+    assert anna.put(WAVE, {"source": SOURCE, "based_on": built_in}).status_code == 201
+
+
+def test_a_script_is_checked_without_being_saved_and_an_editor_learns_what_there_is(anna: Person) -> None:
+    checked = anna.post(f"{UR5}/scripting/check", {"source": '"""Wave."""\nrobot.home(\n'}).json()
+    assert (checked["savable"], checked["marks"][0]["line"], checked["marks"][0]["severity"]) == (False, 2, "error")
+    good = '"""Wave."""\nPARAMETERS = {"speed": {"type": "number", "default": 1}}\nrobot.posture("x")\n'
+    checked = anna.post(f"{UR5}/scripting/check", {"source": good}).json()
+    assert (checked["savable"], checked["description"]) == (True, "Wave.")
+    assert checked["parameters_schema"]["properties"]["speed"]["default"] == 1
+    told = anna.get(f"{UR5}/scripting").json()
+    assert "elbow" in told["names"]["joints"]
+    assert "robot" in [each["name"] for each in told["api"]["values"]]
+    problem(anna.get("/robot-types/nothing/scripting"), 404, "robot-type-unknown")
+    problem(anna.post("/robot-types/nothing/scripting/check", {"source": ""}), 404, "robot-type-unknown")
 
 
 @pytest.mark.parametrize(

@@ -4,6 +4,7 @@ import asyncio
 import contextlib
 import json
 import re
+import sqlite3
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import replace
@@ -16,9 +17,11 @@ import jwt
 import pytest
 
 from function_app.adapters.local.open_id import HttpOpenId
+from function_app.domain.audit_chain import CLOUD
 from function_app.ports.open_id import OpenIdError, Subject
+from function_app.services import store
 from function_app.settings import OpenIdClient
-from tests.support.cloud import API, BASE, Cloud, MovingClock, problem, settings
+from tests.support.cloud import API, BASE, Cloud, MovingClock, Person, problem, settings
 from tests.support.open_id import (
     CLIENT_ID,
     CLIENT_SECRET,
@@ -47,8 +50,10 @@ def provider(key: SigningKey) -> Iterator[str]:
         yield address
 
 
-def opened(home: Path, issuer: str) -> Cloud:
-    client = OpenIdClient(issuer=issuer, client_id=CLIENT_ID, client_secret=CLIENT_SECRET, name="The lab's")
+def opened(home: Path, issuer: str, *, anyone: bool = True) -> Cloud:
+    client = OpenIdClient(
+        issuer=issuer, client_id=CLIENT_ID, client_secret=CLIENT_SECRET, name="The lab's", anyone=anyone
+    )
     return Cloud(replace(settings(home), public_url=BASE, open_id=client), clock=MovingClock())
 
 
@@ -56,6 +61,13 @@ def opened(home: Path, issuer: str) -> Cloud:
 def here(home: Path, provider: str) -> Iterator[Cloud]:
     """The functions, at which one may sign in at the real provider."""
     with opened(home, provider) as cloud:
+        yield cloud
+
+
+@pytest.fixture
+def closed(home: Path, provider: str) -> Iterator[Cloud]:
+    """The same, where a newcomer has to be invited."""
+    with opened(home, provider, anyone=False) as cloud:
         yield cloud
 
 
@@ -71,6 +83,13 @@ class Browser:
         assert answer.status_code == 303, answer.text
         assert answer.headers["cache-control"] == "no-store"
         return answer.headers["location"]
+
+    def start_with(self, invitation: str) -> str:
+        answer = self.cloud.run(self.page.post(START, json={"invitation": invitation}))
+        assert answer.status_code == 200, answer.text
+        assert answer.headers["cache-control"] == "no-store"
+        assert invitation not in answer.text + str(answer.headers)
+        return str(answer.json()["address"])
 
     def back(self, place: httpx.URL) -> httpx.Response:
         return self.cloud.run(self.page.get(place.raw_path.decode()))
@@ -110,6 +129,73 @@ def test_somebody_signs_in_and_is_the_same_account_the_next_time(here: Cloud) ->
     problem(
         here.run(browser.page.put(f"{API}/accounts/me/password", json=body, headers=headers)), 409, "password-elsewhere"
     )
+
+
+class TestWhoMayCome:
+    """A provider knows people whom nobody here has asked in."""
+
+    @staticmethod
+    def invite(owner: Person, **more: Any) -> str:
+        space = owner.get("/spaces").json()["items"][0]["id"]
+        answer = owner.post(f"/spaces/{space}/invitations", {"role": "viewer", **more})
+        assert answer.status_code == 201, answer.text
+        return str(answer.json()["secret"])
+
+    @staticmethod
+    def accounts(cloud: Cloud) -> set[str]:
+        with sqlite3.connect(cloud.functions.settings.home / "tables.sqlite") as tables:
+            return {row for (row,) in tables.execute("SELECT part FROM rows WHERE tab = ?", (store.ACCOUNTS,))}
+
+    def test_a_stranger_gets_no_account_and_leaves_nothing(self, closed: Cloud) -> None:
+        closed.sign_in("anna")
+        before = self.accounts(closed)
+        browser = Browser(closed)
+        failed(browser.sign_in("mallory"), "uninvited")
+        assert browser.me().status_code == 401
+        assert self.accounts(closed) == before
+        refused = closed.run(closed.functions.tables.query(store.AUDIT, CLOUD, first="record:", last="record;")).rows
+        assert "open-id-uninvited" in {row.data["data"].get("code") for row in refused}
+
+    def test_who_was_invited_has_an_account_and_what_was_offered_and_comes_again(self, closed: Cloud) -> None:
+        owner = closed.sign_in("anna")
+        secret = self.invite(owner)
+        browser = Browser(closed)
+        answer = browser.back(sign_in_there(browser.start_with(secret), "bert"))
+        assert answer.headers["location"] == f"{BASE}/#/"
+        me = browser.me().json()
+        assert me["name"] == "Name of bert"
+        roles = {each["role"] for each in closed.run(browser.page.get(f"{API}/spaces")).json()["items"]}
+        assert roles == {"owner", "viewer"}
+        again = Browser(closed)
+        again.sign_in("bert")
+        assert again.me().json()["id"] == me["id"]
+        # It had one use.
+        other = Browser(closed)
+        problem(closed.run(other.page.post(START, json={"invitation": secret})), 404, "invitation-unknown")
+        failed(other.sign_in("mallory"), "uninvited")
+
+    def test_an_invitation_that_ends_meanwhile_lets_nobody_in(self, closed: Cloud) -> None:
+        owner = closed.sign_in("anna")
+        browser = Browser(closed)
+        place = sign_in_there(browser.start_with(self.invite(owner, expires_in_s=300)), "bert")
+        closed.clock.advance(301)
+        failed(browser.back(place), "uninvited")
+
+    def test_an_invitation_for_somebody_with_an_account_lets_nobody_else_in(self, closed: Cloud) -> None:
+        owner, _ = closed.sign_in("anna"), closed.sign_in("carl")
+        browser = Browser(closed)
+        place = sign_in_there(browser.start_with(self.invite(owner, account="carl")), "bert")
+        failed(browser.back(place), "uninvited")
+
+    def test_another_sites_page_begins_nothing_with_an_invitation(self, closed: Cloud) -> None:
+        secret = self.invite(closed.sign_in("anna"))
+        headers = {"Sec-Fetch-Site": "cross-site"}
+        problem(closed.ask("POST", START, json={"invitation": secret}, headers=headers), 403, "forbidden")
+
+    def test_where_anyone_may_come_a_stranger_has_an_empty_account(self, here: Cloud) -> None:
+        browser = Browser(here)
+        assert browser.sign_in("stranger").headers["location"] == f"{BASE}/#/"
+        assert here.run(browser.page.get(f"{API}/devices")).json()["items"] == []
 
 
 def test_the_browser_is_sent_with_what_makes_the_way_back_its_own(here: Cloud, provider: str) -> None:

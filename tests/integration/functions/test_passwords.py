@@ -7,8 +7,11 @@ import httpx
 import pytest
 
 from function_app.adapters.local import password_hashes
+from function_app.domain.problems import Problem
+from function_app.ports.tables import Row
 from function_app.services import store
-from tests.support.cloud import API, Cloud, Person, Robot, problem
+from tests.support.cloud import API, Cloud, Person, problem
+from tests.support.robot import Robot
 
 GOOD, BETTER = "correct horse battery", "staple correct horse"
 PASSWORD = "/accounts/me/password"
@@ -65,7 +68,7 @@ def test_a_wrong_one_and_an_unknown_name_are_answered_the_same(cloud: Cloud, ann
     cloud.sign_in("carl")  # has none
     refused = [
         problem(sign_in(cloud, name, text), 401, "unauthorized")
-        for name, text in (("anna", BETTER), ("nobody", GOOD), ("carl", GOOD), ("Anna", GOOD), ("anna", GOOD + " "))
+        for name, text in (("anna", BETTER), ("nobody", GOOD), ("carl", GOOD), ("annna", GOOD), ("anna", GOOD + " "))
     ]
     assert all(each == refused[0] for each in refused)
     assert anna.get("/accounts/me").status_code == 200
@@ -87,6 +90,48 @@ def test_a_name_that_nobody_has_costs_a_whole_hash(cloud: Cloud, monkeypatch: py
         sign_in(cloud, name, BETTER)
     assert len(done) == 2
     assert done[0] == done[1]
+
+
+class TestNames:
+    """However somebody writes a name, it is one person's."""
+
+    def test_a_name_signs_in_in_any_spelling_and_is_shown_in_its_first(self, cloud: Cloud, anna: Person) -> None:
+        for name in ("ANNA", "Anna", "\uff21nna", " anna\u00a0"):
+            answer = sign_in(cloud, name, GOOD)
+            assert answer.status_code == 200, name
+            assert answer.json()["account"] == {"id": anna.account, "name": "anna"}
+        first = cloud.sign_in("J\u00fcrgen  Wei\u00df")
+        assert cloud.sign_in("JU\u0308RGEN WEISS").account == first.account
+        assert cloud.sign_in("ju\u0308rgen wei\u00df").get("/accounts/me").json()["name"] == "J\u00fcrgen  Wei\u00df"
+
+    def test_no_second_account_is_made_of_a_name_that_only_looks_other(self, cloud: Cloud, anna: Person) -> None:
+        with pytest.raises(Problem, match="Choose another"):
+            cloud.run(cloud.functions.passwords.register("ANNA", BETTER))
+        assert cloud.sign_in("aNNa").account == anna.account
+
+    def test_something_is_shared_with_a_name_in_any_spelling(self, pair: tuple[Person, Robot]) -> None:
+        owner, robot = pair
+        bert = owner.cloud.sign_in("Bert")
+        answer = owner.post(f"/devices/{robot.device}/shares", {"account": "BERT", "role": "viewer"})
+        assert answer.status_code == 201, answer.text
+        assert bert.get(f"/devices/{robot.device}").status_code == 200
+
+    @pytest.mark.usefixtures("anna")
+    def test_other_spellings_are_no_further_guesses(self, cloud: Cloud) -> None:
+        for number in range(10):
+            name = "".join(letter.upper() if number >> place & 1 else letter for place, letter in enumerate("anna"))
+            problem(sign_in(cloud, name, "wrong", address=f"192.0.2.{number}"), 401, "unauthorized")
+        problem(sign_in(cloud, "anna", GOOD), 429, "too-many-tries")
+
+    def test_an_account_from_before_is_found_by_its_own_spelling(self, cloud: Cloud) -> None:
+        """Names were once told apart by their case; nobody who had one loses it, or finds somebody else's there."""
+        old = {"account": "o" * 20, "space": "s" * 20}
+        cloud.run(cloud.functions.tables.create(store.ACCOUNTS, Row("name:Dora", "account", old)))
+        assert cloud.sign_in("Dora").account == old["account"]
+        with pytest.raises(Problem, match="Choose another"):
+            cloud.run(cloud.functions.passwords.register("Dora", BETTER))
+        assert cloud.sign_in("dora").account != old["account"]
+        assert cloud.sign_in("Dora").account == old["account"]
 
 
 class TestGuessing:

@@ -24,6 +24,7 @@ from tests.integration.functions.conftest import Open
 from tests.support.brokers import wait_until
 from tests.support.cloud import Cloud, Person, problem
 from tests.support.polling import PollingRobot
+from tests.support.robot import Robot
 
 BOTH = pytest.mark.parametrize("wait_ms", [0, 500], ids=["plain", "long"])
 MINE = "/robot-types/ur5/movements/mine"
@@ -105,8 +106,6 @@ class TestAllThatMqttDoes:
             assert anna.post(f"/devices/{robot.device}/stop").json() == {"confirmed": True}
 
     def test_an_agent_that_comes_back_on_mqtt_is_reached_there(self, anna: Person, robot: PollingRobot) -> None:
-        from tests.support.cloud import Robot
-
         robot.connect()
         assert anna.take(robot.device, wait_ms=10_000).json()["confirmed"]
         robot.__exit__()

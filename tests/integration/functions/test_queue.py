@@ -18,8 +18,9 @@ from function_app.services.queue import LOOK_MS
 from function_app.services.sweep import ORPHAN_MS
 from tests.integration.functions.conftest import Mortal, Open
 from tests.support.brokers import wait_until
-from tests.support.cloud import Cloud, Person, Robot, problem
+from tests.support.cloud import Cloud, Person, problem
 from tests.support.knife import Killed, elsewhere
+from tests.support.robot import Robot
 
 Pair = tuple[Person, Robot]
 QUEUE: dict[str, Any] = {"policy": "queue"}

@@ -21,7 +21,7 @@ from device_agent.protocol.robot_type import RobotType
 from function_app.adapters.local.model_compiler import MujocoCompiler
 from function_app.entrypoints.http.contract.robot_types import MAX_UPLOAD
 from function_app.entrypoints.worker import check_models
-from function_app.ports.model_compiler import CompilerMissingError
+from function_app.ports.model_compiler import CompilerMissingError, Looked
 from function_app.ports.tables import Row
 from function_app.services import store
 from function_app.services.delete_robot_type import AFTER_MS
@@ -30,7 +30,7 @@ from function_app.services.model_checks import LEASE_MS, MAX_TRIES
 from function_app.services.model_files import MAX_BYTES, MAX_FILES
 from function_app.services.robot_type_rows import Place
 from function_app.services.tend_robot_types import CUT_OFF, NO_CHECKER
-from function_app.services.upload_robot_type import GIVE_UP_MS
+from function_app.services.type_versions import GIVE_UP_MS
 from tests.support.brokers import PATIENCE_S, wait_until
 from tests.support.cloud import Cloud, MovingClock, Person, problem, settings
 
@@ -227,7 +227,7 @@ class TestLife:
         assert len(rows(cloud, store.ROBOT_TYPES, f"{anna.account}/lever")) == 5, "a day for who has begun a download"
         advance(cloud, DAY_MS + GIVE_UP_MS)
         assert rows(cloud, store.ROBOT_TYPES, f"{anna.account}/lever") == ["type", "version:00000008"]
-        assert len(blobs(cloud)) == 3
+        assert len(blobs(cloud)) == 4
         assert anna.cloud.sign_in("anna").get("/robot-types/lever").json()["version"] == 8
 
     def test_a_refused_version_leaves_the_one_before_in_use(self, cloud: Cloud, anna: Person) -> None:
@@ -367,10 +367,10 @@ class TestChecker:
     ) -> None:
         compiled: list[str] = []
 
-        async def counting(_: object, robot_type: RobotType, __: object) -> tuple[str, ...]:
+        async def counting(__: object, robot_type: RobotType, *_: object) -> Looked:
             compiled.append(robot_type.type)
             await asyncio.sleep(0.01)
-            return ()
+            return Looked()
 
         monkeypatch.setattr(MujocoCompiler, "check", counting)
         names = [f"lever-{number}" for number in range(12)]
@@ -726,7 +726,7 @@ class TestLimits:
         monkeypatch.setattr("function_app.adapters.local.model_compiler._CHILD", child)
         compiler = MujocoCompiler(wall_s=1)
         found = cloud.run(compiler.check(manifests.parse(manifest()), {"lever.xml": b""}))
-        assert "Simplify" in found[0]
+        assert "Simplify" in found.errors[0]
 
     def test_the_child_reads_nothing_but_the_upload(self, cloud: Cloud, tmp_path: Path) -> None:
         """Past the look at references: what the kernel itself refuses, where it can."""
@@ -736,7 +736,7 @@ class TestLimits:
         compiler = MujocoCompiler()
         found = cloud.run(compiler.check(manifests.parse(manifest()), {"lever.xml": xml, "scene.xml": xml}))
         # Where the kernel has no Landlock, the look at references has to do alone.
-        assert bool(found) == (ctypes.CDLL(None).syscall(444, None, 0, 1) > 0)
+        assert bool(found.errors) == (ctypes.CDLL(None).syscall(444, None, 0, 1) > 0)
 
 
 class TestSeal:

@@ -12,14 +12,16 @@ import pytest
 from device_agent.protocol import document
 from function_app.ports.broker_access import Credentials
 from tests.support.brokers import BROKERS, Client, Message, RunningBroker, wait_until
-from tests.support.cloud import MOVE, Cloud, Person, Robot, paired
+from tests.support.cloud import MOVE, Cloud, Person, paired
+from tests.support.robot import Robot
 
 NAMED = {"device", "agent", "action", "space"}
 """What a route names in its path when it is about something of somebody's."""
 SEEING = {
     "get_device", "get_lease", "list_actions", "get_action", "list_events", "list_faults",
     "get_latency", "list_uploads", "get_upload", "get_diagnostics", "list_space_diagnostics", "get_control_request",
-    "get_device_robot_type", "get_device_robot_type_file", "list_streams", "read_stream",
+    "get_device_robot_type", "get_device_robot_type_file", "list_streams", "read_stream", "watch_device",
+    "unwatch_device",
 }  # fmt: skip
 OPERATING = {
     "take_lease", "release_lease", "ask_for_control", "accept_control_request", "refuse_control_request",
@@ -31,6 +33,7 @@ OWNING = {
     "list_device_shares", "share_device", "unshare_device", "list_space_shares", "share_space", "unshare_space",
     "list_device_invitations", "invite_to_device", "withdraw_device_invitation",
     "list_space_invitations", "invite_to_space", "withdraw_space_invitation", "transfer_space", "delete_upload",
+    "rename_device",
 }  # fmt: skip
 OWN = {"unpair_agent", "move_agent", "list_agent_transfers", "transfer_agent", "withdraw_agent_transfer"}
 """About agents, which do not exist for anybody but their owner."""
@@ -42,6 +45,7 @@ BODIES: dict[str, Any] = {
     "stop_space": {},
     "add_latency": {"transport": "http", "path": "device-cloud", "samples": [{"at_ms": 1, "ms": 1}]},
     "begin_upload": {"stream": "camera", "length": 3, "content_type": "image/png"},
+    "rename_device": {"label": "x"},
     "move_agent": {"space": "x"},
     "share_device": {"account": "dora", "role": "viewer"},
     "share_space": {"account": "dora", "role": "viewer"},

@@ -16,7 +16,8 @@ from device_agent.sensors.mujoco import meters
 from function_app.entrypoints.ingest import ingest, ingest_telemetry
 from tests.integration.functions.test_diagnostics import MINUTE, diagnostics, open_faults
 from tests.support.bench import Bench, eventually
-from tests.support.cloud import Cloud, Person, Robot
+from tests.support.cloud import Cloud, Person
+from tests.support.robot import Robot
 from tests.support.rooms import LAB, StillWorld
 
 WINDOW_S = 10.0

@@ -10,8 +10,9 @@ from function_app.domain.accounts import Identity, Role
 from function_app.ports.broker_access import Credentials
 from function_app.services import store
 from tests.support.brokers import BROKERS, Client, RunningBroker, wait_until
-from tests.support.cloud import Cloud, Person, Robot, paired, problem
+from tests.support.cloud import Cloud, Person, paired, problem
 from tests.support.knife import elsewhere
+from tests.support.robot import Robot
 
 Three = tuple[Person, Person, Robot]
 SHARED_S = 120
@@ -479,7 +480,7 @@ def test_what_the_broker_could_not_be_told_the_timer_tells_it(
     away = elsewhere(open_cloud(at=None, clock=cloud.clock), anna)
     page, _ = watching(broker, bert)
     with page, steering(broker, bert, robot.device, epoch) as stick:
-        unshare(away, f"devices/{robot.device}", bert)
+        assert away.delete(f"/devices/{robot.device}/shares/{bert.account}").status_code == 202
         assert not page.disconnected.is_set()
         cloud.clock.advance(11)
         cloud.sweep()

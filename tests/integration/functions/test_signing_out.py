@@ -7,7 +7,8 @@ import pytest
 
 from function_app.ports.broker_access import Credentials
 from tests.support.brokers import BROKERS, Client, RunningBroker, wait_until
-from tests.support.cloud import Cloud, Person, Robot
+from tests.support.cloud import Cloud, Person
+from tests.support.robot import Robot
 
 
 def watching(broker: RunningBroker, person: Person) -> Client:

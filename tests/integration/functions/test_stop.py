@@ -7,8 +7,9 @@ import pytest
 
 from device_agent.protocol.messages import ResetStop, StopDevice
 from tests.support.brokers import BROKERS, wait_until
-from tests.support.cloud import Cloud, Person, Robot, paired, problem
+from tests.support.cloud import Cloud, Person, paired, problem
 from tests.support.knife import elsewhere
+from tests.support.robot import Robot
 
 Pair = tuple[Person, Robot]
 

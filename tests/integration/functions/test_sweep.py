@@ -15,8 +15,9 @@ from function_app.services.pending import SHARDS
 from function_app.services.sweep import ORPHAN_MS
 from tests.integration.functions.conftest import Mortal, Open
 from tests.support.brokers import start_broker, wait_until
-from tests.support.cloud import Answers, Cloud, Person, Robot, problem, settings
+from tests.support.cloud import Cloud, Person, problem, settings
 from tests.support.knife import CutTables, Killed, Knife, elsewhere
+from tests.support.robot import Answers, Robot
 
 Pair = tuple[Person, Robot]
 TTL_S, TIMEOUT_S = 2, 6

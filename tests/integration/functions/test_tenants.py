@@ -7,7 +7,8 @@ import pytest
 
 from device_agent.protocol.messages import Fault, Mode, State
 from tests.support.brokers import wait_until
-from tests.support.cloud import Cloud, Person, Robot, paired, problem
+from tests.support.cloud import Cloud, Person, paired, problem
+from tests.support.robot import Robot
 
 BODIES: dict[str, Any] = {
     "take_lease": {},
@@ -23,6 +24,7 @@ BODIES: dict[str, Any] = {
     },
     "move_agent": {"space": "x"},
     "share_device": {"account": "bert", "role": "operator"},
+    "rename_device": {"label": "mine"},
     "share_space": {"account": "bert", "role": "operator"},
     "invite_to_device": {"role": "operator"},
     "invite_to_space": {"role": "operator"},

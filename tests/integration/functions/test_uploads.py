@@ -10,7 +10,8 @@ from function_app.domain.devices import Agent
 from function_app.services import store, uploads
 from function_app.services.devices import devices_of
 from function_app.services.uploads import LIFETIME_S, SHARDS, UNREGISTERED_MS
-from tests.support.cloud import API, Cloud, Person, Robot, problem
+from tests.support.cloud import API, Cloud, Person, problem
+from tests.support.robot import Robot
 
 PICTURE = bytes(range(256)) * 100
 WANTED = {"stream": "camera", "length": len(PICTURE), "content_type": "image/png", "name": "Küche 1.png", "at_ms": 1000}

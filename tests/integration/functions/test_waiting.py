@@ -3,7 +3,8 @@
 import time
 
 from device_agent.protocol.messages import AckStatus
-from tests.support.cloud import Person, Robot
+from tests.support.cloud import Person
+from tests.support.robot import Robot
 
 ENDLESS_MS = 30_000
 

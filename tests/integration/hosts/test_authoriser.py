@@ -166,10 +166,10 @@ def test_what_has_run_out_is_forgotten(cloud: Cloud) -> None:
     assert isinstance(access, IotBrokerAccess)
     cloud.run(access.revoke(client_id="w-gone"))
     cloud.run(access.expire(time.time() + 1000))
-    assert len(cloud.run(access._rows("issued"))) == 0
-    assert len(cloud.run(access._rows("revoked"))) == 1
+    assert len(cloud.run(access._rights._rows("issued"))) == 0
+    assert len(cloud.run(access._rights._rows("revoked"))) == 1
     cloud.run(access.expire(time.time() + 100_000))
-    assert len(cloud.run(access._rows("revoked"))) == 0
+    assert len(cloud.run(access._rights._rows("revoked"))) == 0
 
 
 def test_another_broker_has_nothing_to_ask(tmp_path: Path) -> None:

@@ -45,7 +45,9 @@ class Frozen:
 
     def __init__(self, broker: RunningBroker, proxy: Proxy) -> None:
         self.loop = asyncio.new_event_loop()
-        self.bus = MqttCommandBus(host="127.0.0.1", port=proxy.port, credentials=broker.access.service_credentials)
+        self.bus = MqttCommandBus(
+            mqtt_link.Broker(host="127.0.0.1", port=proxy.port, credentials=broker.access.service_credentials)
+        )
 
     def publish(self, text: str, qos: int = 1) -> None:
         self.loop.run_until_complete(self.bus.publish(TOPIC, text.encode(), qos=qos))

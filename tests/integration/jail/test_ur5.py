@@ -5,14 +5,20 @@ import math
 from collections.abc import Iterator
 from pathlib import Path
 
+import msgspec
 import pytest
 
 from device_agent import drivers, geometry
 from device_agent.catalogue import ROBOTS, TYPES
 from device_agent.protocol.messages import AckStatus
+from function_app.services.script_checks import check_script
 from tests.support.bench import Bench
+from tests.support.brokers import ROOT
 
 UR5 = ROBOTS / "ur5"
+WRITTEN = ROOT / "web" / "tests" / "fixtures" / "keyframes.py"
+"""What the page's tests hold it to."""
+TELLS = "\nimport json\nprint(json.dumps(robot.state()['position_rad']))\n"
 
 
 @pytest.fixture
@@ -52,7 +58,7 @@ def test_a_frame_goes_where_it_is_sent(arm: Bench) -> None:
     [
         ("robot.move_to((5, 0, 0))", "line 1: RobotError"),
         ("robot.move_to((-0.4, 0.0, -0.2))", "line 1: RobotError"),
-        ("robot.say('hello')", "this robot has no say; it has move_joints, home, move_to, state, latest"),
+        ("robot.say('hello')", "this robot has no say; it has move_joints, play, home, move_to, state, latest"),
         ("robot.drive(1)", "this robot has no drive"),
         ("robot.look((1, 0, 0))", "this robot has no look"),
     ],
@@ -61,3 +67,14 @@ def test_what_the_arm_cannot_or_may_not_do_is_refused(arm: Bench, call: str, say
     reason = arm.end(arm.command(arm.script(call), epoch=1)).reason
     assert reason is not None
     assert says in reason.message
+
+
+def test_what_the_keyframe_editor_writes_is_good_and_is_played(arm: Bench) -> None:
+    source = WRITTEN.read_text()
+    assert check_script(source, TYPES.load("ur5")).marks == ()
+    order = msgspec.structs.replace(arm.script(source + TELLS), parameters={"speed": 2})
+    ack = arm.end(arm.command(order, epoch=1))
+    assert ack.status is AckStatus.DONE, ack.reason
+    there = json.loads(ack.output)
+    assert there["shoulder_pan"] == pytest.approx(0.5, abs=0.02)
+    assert there["elbow"] == pytest.approx(1.57, abs=0.02)

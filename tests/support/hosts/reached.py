@@ -8,8 +8,9 @@ import httpx
 
 from device_agent.protocol import signing
 from function_app import bootstrap, settings
-from tests.support.cloud import API, Cloud, MovingClock, Robot
+from tests.support.cloud import API, Cloud, MovingClock
 from tests.support.hosts.host import PATIENCE_S, Host
+from tests.support.robot import Robot
 
 
 class Reached:

@@ -105,5 +105,6 @@ def test_a_certificate_for_another_key_is_refused_and_nothing_written(
 
 
 def test_a_folder_that_cannot_be_written_is_named(tmp_path: Path, signer: Signer) -> None:
+    (tmp_path / "file").touch()
     with pytest.raises(HomeError, match="cannot be written"):
-        ready(OwnCertificate(tmp_path / "nowhere"), signer)
+        ready(OwnCertificate(tmp_path / "file"), signer)

@@ -165,6 +165,16 @@ def test_a_base_drives_while_setpoints_are_fresh_and_no_longer() -> None:
         rig.hold(DriveTarget(forward_m_s=0.3), 0.1)
 
 
+def test_a_base_that_is_let_go_brakes_at_once_and_its_operator_keeps_control() -> None:
+    rig = jogger(base=True)
+    rig.hold(DriveTarget(forward_m_s=0.5, turn_rad_s=0.4), 1.5)
+    rig.hold(DriveTarget(), 0.25)  # half of the time that it would take at the acceleration of a start
+    assert rig.twists[-1] == pytest.approx((0.0, 0.0, 0.0), abs=1e-6)
+    rig.rest(0.5)
+    rig.hold(DriveTarget(forward_m_s=0.3), 1.0)
+    assert rig.twists[-1] == pytest.approx((0.3, 0.0, 0.0), abs=1e-6)
+
+
 def test_a_drive_beyond_the_limits_is_bounded_and_says_so() -> None:
     rig = jogger(base=True)
     rig.hold(DriveTarget(forward_m_s=9.0, left_m_s=1.0), 1.5)

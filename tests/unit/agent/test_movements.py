@@ -170,6 +170,37 @@ def test_every_call_of_the_api_arrives_as_it_was_meant() -> None:
     ]
 
 
+def test_keyframes_are_played_up_to_each_at_which_something_is_done() -> None:
+    notes, _ = run(
+        "robot.play([\n"
+        "    {'time_s': 1, 'position_rad': {'elbow': 0.1}, 'say': 'off'},\n"
+        "    {'time_s': 2, 'position_rad': {'elbow': 0.2}},\n"
+        "    {'time_s': 3, 'express': 'smile', 'posture': 'Sit', 'drive': {'forward_m_s': 0.1, 'duration_s': 2}},\n"
+        "    {'time_s': 5},\n"
+        "    {'time_s': 5.5, 'position_rad': {'shoulder': 0.3}, 'go_to': {'x_m': 1, 'y_m': 2}, 'behaviour': 'nod'},\n"
+        "], speed=0.5)\n"
+        "robot.play([{'time_s': 0, 'say': 'end'}])\n"
+        "robot.play([])\n"
+    )
+    there = calls.Moment(time_s=1, position_rad={"elbow": 0.2})
+    assert notes.calls == [
+        ({"elbow": 0.1}, 0.25),
+        calls.Say(text="off", language=""),
+        calls.Play(keyframes=(there, calls.Moment(time_s=2)), first=2, speed=0.5),
+        calls.Posture(name="Sit", speed=0.5),
+        calls.Express(name="smile", strength=1),
+        calls.Drive(forward_m_s=0.1, left_m_s=0, turn_rad_s=0, duration_s=2),
+        calls.Play(
+            keyframes=(calls.Moment(time_s=2), calls.Moment(time_s=2.5, position_rad={"shoulder": 0.3})),
+            first=4,
+            speed=0.5,
+        ),
+        calls.Behaviour(name="nod"),
+        calls.GoTo(x_m=1, y_m=2),
+        calls.Say(text="end", language=""),
+    ]
+
+
 @pytest.mark.parametrize(
     ("source", "says"),
     [

@@ -367,4 +367,4 @@ def test_what_still_moves_is_waited_for_and_a_lost_action_does_not_wait() -> Non
     )
     threading.Timer(0.1, mover.over.set).start()
     with pytest.raises(Refused, match="the action ended"):
-        Performer(body, mover)._come_to_rest()
+        Performer(body, mover).come_to_rest()

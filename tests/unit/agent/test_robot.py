@@ -2,6 +2,7 @@
 
 import math
 import threading
+import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -17,6 +18,7 @@ from device_agent.ports.skills import Skill, SkillError, Stage
 from device_agent.protocol import codec, topics
 from device_agent.protocol.messages import (
     AckStatus,
+    BaseLimits,
     CancelAction,
     Description,
     Drive,
@@ -208,6 +210,16 @@ def test_a_frame_goes_straight_to_a_pose_and_says_where_it_cannot(bench: Bench) 
     assert "of the way there: face cannot come nearer than 0.5 m" in printed[1]
 
 
+def test_keyframes_are_played_in_their_time_and_what_takes_longer_is_said(bench: Bench) -> None:
+    keyframes = "{'time_s': 0, 'position_rad': {'elbow': 0.1}}, {'time_s': %s, 'position_rad': {'elbow': 0.3}}"
+    begun_s = time.monotonic()
+    play(bench, f"robot.play([{keyframes % 0.8}])")
+    assert time.monotonic() - begun_s >= 0.8
+    assert bench.driver.position[1] == pytest.approx(0.3, abs=1e-3)
+    ack = bench.end(bench.command(bench.script(f"robot.play([{keyframes % 0.001}])"), epoch=1))
+    assert ack.result["limited"] == ["keyframes: later"]
+
+
 def test_what_a_robot_cannot_do_is_refused_with_what_it_can(tmp_path: Path) -> None:
     bench = Bench(tmp_path)
     bench.device.start()
@@ -226,7 +238,7 @@ def test_what_a_robot_cannot_do_is_refused_with_what_it_can(tmp_path: Path) -> N
     assert [line.split(";")[0] for line in printed] == [
         f"this robot has no {call.removeprefix('robot.').split('(')[0]}" for call in asked
     ]
-    assert all(line.endswith("it has move_joints, home, state, latest") for line in printed)
+    assert all(line.endswith("it has move_joints, play, home, state, latest") for line in printed)
     bench.stop()
 
 
@@ -248,6 +260,10 @@ def test_what_a_robot_cannot_do_is_refused_with_what_it_can(tmp_path: Path) -> N
         ("robot.look((-1, -0.1, 0.9), speed=9)", "speed must be above 0"),
         ("robot.drive(99)", "forward_m_s can be up to 0.500"),
         ("room.latest('x', 'y')", "is not listened to"),
+        ("robot.play([{'time_s': 0}, {'time_s': 1, 'position_rad': {'elbow': 9}}])", "keyframe 2: elbow can go from"),
+        ("robot.play([{'time_s': 0}, {'time_s': 1, 'position_rad': {'nose': 9}}])", "keyframe 2: no joint 'nose'"),
+        ("robot.play([{'time_s': float('nan')}, {'time_s': 1}])", "the time of keyframe 1 is not a finite number"),
+        ("robot.play([{'time_s': 0}, {'time_s': 1}], speed=3)", "speed must be above 0 and at most 2, not 3.0"),
     ],
 )
 def test_what_is_not_done_says_why_and_in_which_line(bench: Bench, call: str, says: str) -> None:
@@ -472,7 +488,10 @@ def test_what_the_manifest_says_is_shown_without_a_driver_that_could(
     [
         (Express(name="sad"), "no expression 'sad'; there are glad, shy"),
         (TakePosture(name="Sit"), "no posture 'Sit'; there are Bow"),
-        (RunBehaviour(name="dance"), "this robot has no behaviour; it has move_joints, home, express, posture, state"),
+        (
+            RunBehaviour(name="dance"),
+            "this robot has no behaviour; it has move_joints, play, home, express, posture, state",
+        ),
         (SetStiffness(value=0.0), "this robot has no stiffness"),
         (LookAt(position_m=(1.0, 0.0, 0.0)), "this robot has no look"),
         (Drive(forward_m_s=0.1), "this robot has no drive"),
@@ -521,3 +540,4 @@ def test_orders_reach_the_skills_that_scripts_reach(bench: Bench) -> None:
         "look_at",
         "drive",
     )
+    assert described.base == BaseLimits(forward_m_s=0.5, left_m_s=0.0, turn_rad_s=1.0)

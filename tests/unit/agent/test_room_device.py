@@ -50,6 +50,7 @@ ENTRY = RoomDevice(
     cameras=(Stream(name="garden", rate_hz=20.0),),
     captures=("image",),
     controls=(RoomControl(name="opening", label="Opening", unit="m", lower=0.0, upper=0.5),),
+    position_m=(1.0, -2.0, 1.5),
 )
 
 
@@ -163,6 +164,7 @@ def test_it_says_what_it_has_and_which_actions_it_takes(bench: RoomBench) -> Non
     assert described.streams == ENTRY.streams
     assert described.cameras == ENTRY.cameras
     assert described.captures == ("image",)
+    assert described.position_m == (1.0, -2.0, 1.5)
     assert described.controls == (Control(name="opening", label="Opening", unit="m", lower=0.0, upper=0.5),)
     assert described.actions == ("gather", "shoot", "capture", "set_control")
     assert described.simulated

@@ -14,7 +14,7 @@ import pytest
 
 from device_agent.drivers.mujoco import Placement, Snapshot, World
 from device_agent.drivers.mujoco.assembly import TIMESTEP_S
-from device_agent.drivers.mujoco.world import MAX_CATCH_UP_S
+from device_agent.drivers.mujoco.world import LATE_STEPS, MAX_CATCH_UP_S
 from device_agent.ports.driver import DriverError
 from device_agent.protocol import robot_type
 
@@ -245,7 +245,9 @@ def test_trace_tells_the_truth_at_100_hz(tmp_path: Path):
     assert header == {"joints": list(HOME), "actuators": list(HOME)}
     assert len(rows) > 20
     times = np.array([row["time_s"] for row in rows])
-    assert np.diff(times) == pytest.approx(0.01, abs=0.0041)
+    # A line is written after a group of steps; a world that is late makes larger ones.
+    assert np.diff(times) == pytest.approx(0.01, abs=LATE_STEPS * TIMESTEP_S + 1e-4)
+    assert np.mean(np.diff(times)) == pytest.approx(0.01, abs=0.0025)
     ticks = [row["tick_ms"] for row in rows]
     assert ticks == sorted(ticks)
     assert abs(rows[-1]["at_ms"] / 1000 - time.time()) < 60

@@ -1,4 +1,4 @@
-"""What a Functions host sees: one app, three functions, and HTTP through the host's own types."""
+"""What a Functions host sees: one app, four functions, and HTTP through the host's own types."""
 
 import ast
 import asyncio
@@ -35,14 +35,17 @@ def azure(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Any]:
     azure._http.cache_clear()
 
 
-def test_a_host_finds_one_app_with_three_functions(functions: dict[str, Any]) -> None:
+def test_a_host_finds_one_app_with_four_functions(functions: dict[str, Any]) -> None:
     assert "app" in dir(function_app)
     apps = [name for name in dir(function_app) if isinstance(getattr(function_app, name), func.FunctionApp)]
     assert apps == ["app"]
-    assert set(functions) == {"http", "ingest", "sweep"}
+    assert set(functions) == {"admission", "http", "ingest", "sweep"}
     http, sweep = (json.loads(str(functions[name])) for name in ("http", "sweep"))
     trigger = next(each for each in http["bindings"] if each["type"] == "httpTrigger")
     assert (trigger["route"], trigger["authLevel"]) == ("{*path}", "ANONYMOUS")
+    asked = json.loads(str(functions["admission"]))["bindings"]
+    admission = next(each for each in asked if each["type"] == "httpTrigger")
+    assert (admission["route"], admission["authLevel"]) == ("eventgrid/admission", "ANONYMOUS")
     assert {"GET", "POST", "PUT", "DELETE"} <= {str(method).rpartition(".")[2] for method in trigger["methods"]}
     (timer,) = [each for each in sweep["bindings"] if each["type"] == "timerTrigger"]
     assert timer["schedule"] == "*/5 * * * * *"
@@ -94,16 +97,17 @@ def test_http_passes_through_the_hosts_own_types(azure: Any, functions: dict[str
                 ),
                 await called["http"](ask("GET", "/api/v1/devices", authorization="Bearer x"), None),
                 await called["http"](ask("GET", "/api/v1/nothing"), None),
+                await called["admission"](ask("POST", "/eventgrid/admission", b"{}")),
             ]
         finally:
             await azure._functions().close()
 
     called = {name: each.get_user_function() for name, each in functions.items()}
-    health, signed_in, refused, nothing = asyncio.run(talk())
+    health, signed_in, refused, nothing, admission = asyncio.run(talk())
     assert health.status_code == 200
     assert json.loads(health.get_body())["tables"] == "ok"
     assert signed_in.status_code == 200
     assert json.loads(signed_in.get_body())["account"]["name"] == "anna"
     assert "telescope_session=" in signed_in.headers["set-cookie"]
-    assert (refused.status_code, nothing.status_code) == (401, 404)
+    assert (refused.status_code, nothing.status_code, admission.status_code) == (401, 404, 404)
     assert refused.headers["content-type"] == "application/problem+json"

@@ -7,6 +7,7 @@ from pathlib import Path
 from function_app.adapters.local.blobs import FileBlobs
 from function_app.adapters.local.clock import SystemClock
 from function_app.adapters.local.command_bus import MqttCommandBus
+from function_app.adapters.local.mqtt_link import Broker
 from function_app.adapters.local.tables import SqliteTables
 from function_app.domain.accounts import Role
 from function_app.domain.devices import Device
@@ -34,7 +35,9 @@ async def confirmed(folder: Path, wait_ms: int) -> bool:
     tables = SqliteTables(folder / "tables.sqlite")
     forget = Forget(tables=tables, blobs=FileBlobs(folder / "blobs"))
     mailbox = Busy(tables=tables, forget=forget, clock=SystemClock())
-    bus = MqttCommandBus(host="127.0.0.1", port=1, credentials=lambda: ServiceCredentials("c", "u", "p", math.inf))
+    bus = MqttCommandBus(
+        Broker(host="127.0.0.1", port=1, credentials=lambda: ServiceCredentials("c", "u", "p", math.inf))
+    )
     signed = Signed("aaaaaaaaaa-arm-00000000000000000000", b"{}", SystemClock().now_ms() + 5_000)
     try:
         async with asyncio.timeout(20):

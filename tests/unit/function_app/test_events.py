@@ -14,7 +14,8 @@ from device_agent.protocol.messages import Measurements, Mode, State
 from function_app.entrypoints import events
 from function_app.ports.tables import Row, StoreError
 from function_app.services.presence import PresenceIngest
-from tests.support.cloud import Cloud, Person, Robot, settings
+from tests.support.cloud import Cloud, Person, settings
+from tests.support.robot import Robot
 
 
 @pytest.fixture

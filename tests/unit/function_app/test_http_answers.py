@@ -253,6 +253,11 @@ class TestConsole:
         assert asset.headers["cache-control"] == "public, max-age=31536000, immutable"
         assert cloud.ask("HEAD", "/").status_code == 200
 
+    def test_a_browser_finds_the_icon_where_no_page_names_it(self, cloud: Cloud) -> None:
+        icon = cloud.ask("GET", "/favicon.ico")
+        assert (icon.status_code, icon.headers["content-type"]) == (200, "image/svg+xml")
+        assert icon.headers["cache-control"] == "no-cache", "its address stays when it changes"
+
     @pytest.mark.parametrize(
         "path",
         [

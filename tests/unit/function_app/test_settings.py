@@ -172,6 +172,11 @@ def test_an_open_id_provider_is_as_it_calls_itself_and_its_secret_is_not_shown()
     assert (found.issuer, found.client_id, found.name) == ("https://id.example/tenant", "app", "id.example")
     assert found.client_secret == "hush"
     assert "hush" not in repr(found)
+    assert not found.anyone
+    for said, meant in (("anyone", True), ("invited", False)):
+        found = settings.read({**ISSUER, "TELESCOPE_OIDC_ACCOUNTS": said}).open_id
+        assert found is not None
+        assert found.anyone is meant
     assert settings.read({}).open_id is None
 
 
@@ -184,6 +189,8 @@ def test_an_open_id_provider_is_as_it_calls_itself_and_its_secret_is_not_shown()
         ({"TELESCOPE_OIDC_ISSUER": "http://id.example"}, "TELESCOPE_OIDC_ISSUER"),
         ({"TELESCOPE_OIDC_CLIENT_ID": "a b"}, "TELESCOPE_OIDC_CLIENT_ID"),
         ({"TELESCOPE_OIDC_NAME": ""}, "TELESCOPE_OIDC_NAME"),
+        ({"TELESCOPE_OIDC_ACCOUNTS": "all"}, "TELESCOPE_OIDC_ACCOUNTS"),
+        ({"TELESCOPE_OIDC_ACCOUNTS": ""}, "TELESCOPE_OIDC_ACCOUNTS"),
         (dict.fromkeys(ISSUER, "") | {"TELESCOPE_OIDC_CLIENT_SECRET": "hush"}, "TELESCOPE_OIDC_CLIENT_SECRET"),
     ],
     ids=str,

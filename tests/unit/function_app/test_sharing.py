@@ -6,9 +6,10 @@ import pytest
 
 from function_app.domain import sharing
 from function_app.domain.accounts import Identity, Role
-from function_app.domain.devices import NEVER_MS, Agent, DeviceSpec
+from function_app.domain.devices import Agent, DeviceSpec
 from function_app.domain.problems import Problem
 from function_app.domain.sharing import OWNERS, Share, Standing
+from function_app.domain.times import NEVER_MS
 
 NOW_MS = 1_000
 SPEC = DeviceSpec("arm", "arm", "ur5", "Arm")

@@ -12,13 +12,14 @@ import numpy as np
 import pytest
 
 from device_agent.drivers.mujoco import WalkingDriver, driver
+from device_agent.mjcf import studio
 from device_agent.ports.driver import Twist
 from device_agent.ports.sensor import Image, RoomDriver, Scan
 from device_agent.protocol import robot_type
 from device_agent.protocol.room import Room
 from device_agent.runtime.controller import Controller
 from device_agent.runtime.lease import LeaseGate
-from device_agent.sensors.mujoco import cameras, studio, view
+from device_agent.sensors.mujoco import cameras, view
 from device_agent.sensors.perception import PerceptionDriver
 from tests.support.rooms import LAB, ROBOTS, StillWorld
 

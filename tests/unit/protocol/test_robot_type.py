@@ -48,3 +48,16 @@ def test_limits_that_are_none_are_refused(was: str, now: str, says: str) -> None
     assert was in text
     with pytest.raises(ProtocolError, match=says):
         parse(text.replace(was, now))
+
+
+@pytest.mark.parametrize(
+    ("cameras", "says"),
+    [
+        ('[{ name = "eyes", rate_hz = 30.0 }]', "camera 'eyes': 30 pictures a second; 10 is the most"),
+        ('[{ name = "eyes", rate_hz = 0.0 }]', "rate_hz of camera 'eyes' is 0"),
+        ('[{ name = "eyes", rate_hz = 1.0 }, { name = "eyes", rate_hz = 1.0 }]', "two cameras"),
+    ],
+)
+def test_cameras_take_a_moderate_number_of_pictures(cameras: str, says: str) -> None:
+    with pytest.raises(ProtocolError, match=says):
+        parse(UR5.replace("period_ms = 8", f"period_ms = 8\ncameras = {cameras}"))

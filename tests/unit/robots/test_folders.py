@@ -1,6 +1,7 @@
 """What every robot folder must be."""
 
 import ast
+import runpy
 from pathlib import Path
 from xml.etree import ElementTree as ET
 
@@ -10,7 +11,7 @@ import pytest
 
 from device_agent import geometry
 from device_agent.protocol import robot_type, topics
-from tests.unit.robots.folders import FOLDERS, MOVEMENTS, SHIPPED, Bench
+from tests.unit.robots.folders import FOLDERS, MOVEMENTS, ROBOTS, SHIPPED, Bench
 
 pytestmark = pytest.mark.filterwarnings("error")
 folders = pytest.mark.parametrize("folder", FOLDERS, ids=lambda folder: folder.name)
@@ -144,3 +145,9 @@ def test_movement_is_a_script_with_a_description(path: Path):
     assert described[0].endswith(".")
     assert topics.is_id(path.stem)
     assert len(source) <= 64_000, "the wire contract's longest script"
+
+
+@pytest.mark.parametrize("folder", SHIPPED, ids=lambda folder: folder.name)
+def test_the_drawing_of_a_shipped_type_is_that_of_its_model(folder: Path):
+    draw = runpy.run_path(str(ROBOTS / "draw.py"))
+    assert (folder / "drawing.json").read_bytes() == draw["drawing"](folder), "run python robots/draw.py"

@@ -1,0 +1,98 @@
+"""What an owner does to what is theirs: what would leave nobody is refused, with what to do instead."""
+
+from typing import Any
+
+import pytest
+
+from tests.support.cloud import Cloud, Person, problem
+from tests.support.robot import Robot
+
+Three = tuple[Person, Person, Robot]
+
+
+@pytest.fixture
+def three(cloud: Cloud, pair: tuple[Person, Robot]) -> Three:
+    """Anna, Bert, and Anna's robot, which Bert operates."""
+    anna, robot = pair
+    bert = cloud.sign_in("bert")
+    assert anna.post(f"/devices/{robot.device}/shares", {"account": "bert", "role": "operator"}).status_code == 201
+    return anna, bert, robot
+
+
+def stands(anna: Person, bert: Person, robot: Robot) -> None:
+    """All is as it was."""
+    assert anna.get(f"/devices/{robot.device}").json()["role"] == "owner"
+    assert bert.get(f"/devices/{robot.device}").json()["role"] == "operator"
+    assert [each["account"]["name"] for each in anna.get(f"/devices/{robot.device}/shares").json()["items"]] == ["bert"]
+    assert anna.take(robot.device).status_code == 200
+
+
+@pytest.mark.parametrize("kind", ["devices", "spaces"])
+def test_an_owner_cannot_leave_or_lower_themselves_and_is_told_how_to_give_it_away(three: Three, kind: str) -> None:
+    anna, bert, robot = three
+    at = f"/{kind}/{robot.device if kind == 'devices' else robot.space}/shares"
+    left = problem(anna.delete(f"{at}/{anna.account}"), 409, "already-yours")
+    lowered = problem(anna.post(at, {"account": "anna", "role": "viewer"}), 422, "invalid")
+    for told in (left, lowered):
+        assert "transfer" in told["detail"].lower()
+    # Nor has anybody else a way to put the owner out.
+    assert bert.delete(f"{at}/{anna.account}").status_code in {403, 404}
+    stands(anna, bert, robot)
+
+
+def test_nothing_is_handed_to_an_account_that_there_is_not(three: Three) -> None:
+    anna, bert, robot = three
+    anna.post("/spaces", {"name": "second"})
+    for path, body in (
+        (f"/agents/{robot.id}/transfers", {}),
+        (f"/spaces/{robot.space}/transfers", {}),
+        (f"/devices/{robot.device}/invitations", {"role": "viewer"}),
+        (f"/devices/{robot.device}/shares", {"role": "viewer"}),
+    ):
+        told = problem(anna.post(path, {"account": "nobody", **body}), 404, "account-unknown")
+        assert "'nobody'" in told["detail"]
+        assert "invitation" in told["detail"], "who has no account gets one by a link"
+    assert anna.get(f"/agents/{robot.id}/transfers").json()["items"] == []
+    stands(anna, bert, robot)
+
+
+def test_nothing_is_handed_to_its_owner(three: Three) -> None:
+    anna, bert, robot = three
+    anna.post("/spaces", {"name": "second"})
+    for path in (f"/agents/{robot.id}/transfers", f"/spaces/{robot.space}/transfers"):
+        problem(anna.post(path, {"account": "anna"}), 409, "already-yours")
+        for_anybody = anna.post(path, {}).json()
+        problem(anna.post("/invitations/redeem", {"secret": for_anybody["secret"]}), 409, "already-yours")
+    stands(anna, bert, robot)
+
+
+@pytest.mark.parametrize("role", ["viewer", "owner"])
+def test_an_invitation_that_its_maker_tries_is_not_used_up(cloud: Cloud, three: Three, role: str) -> None:
+    anna, bert, robot = three
+    made: Any = (
+        anna.post(f"/agents/{robot.id}/transfers", {})
+        if role == "owner"
+        else anna.post(f"/devices/{robot.device}/invitations", {"role": role})
+    ).json()
+    for _ in range(2):
+        problem(anna.post("/invitations/redeem", {"secret": made["secret"]}), 409, "already-yours")
+    stands(anna, bert, robot)
+    anna.delete(f"/devices/{robot.device}/lease?epoch=1")
+    clara = cloud.sign_in("clara")
+    assert clara.post("/invitations/redeem", {"secret": made["secret"]}).status_code == 200
+    assert clara.get(f"/devices/{robot.device}").json()["role"] == role
+
+
+def test_nobody_is_left_without_a_space(three: Three) -> None:
+    anna, bert, robot = three
+    problem(anna.post(f"/spaces/{robot.space}/transfers", {}), 409, "last-space")
+    second = anna.post("/spaces", {"name": "second"}).json()["id"]
+    offers = [anna.post(f"/spaces/{space}/transfers", {}).json() for space in (second, robot.space)]
+    assert bert.post("/invitations/redeem", {"secret": offers[0]["secret"]}).status_code == 200
+    told = problem(bert.post("/invitations/redeem", {"secret": offers[1]["secret"]}), 409, "last-space")
+    assert "anna" in told["detail"]
+    stands(anna, bert, robot)
+    anna.post("/spaces", {"name": "third"})
+    assert bert.post("/invitations/redeem", {"secret": offers[1]["secret"]}).status_code == 200
+    assert bert.get(f"/devices/{robot.device}").json()["role"] == "owner"
+    assert [each["name"] for each in anna.get("/spaces").json()["items"]] == ["third"]
