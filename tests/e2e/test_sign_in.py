@@ -41,6 +41,7 @@ def environment(tmp_path_factory: pytest.TempPathFactory) -> Iterator[dict[str, 
             "TELESCOPE_OIDC_CLIENT_ID": CLIENT_ID,
             "TELESCOPE_OIDC_CLIENT_SECRET": CLIENT_SECRET,
             "TELESCOPE_OIDC_NAME": "the lab",
+            "TELESCOPE_OIDC_ACCOUNTS": "anyone",
         }
         with start_program(["-m", "function_app", "serve"], environment_of(settings)) as server:
             wait_until(lambda: _answers(port) or server.process.poll() is not None, "the server", 60)
@@ -95,3 +96,26 @@ def test_who_signs_in_at_another_site_comes_back_signed_in_and_stays_so(
     cookies = {each["name"]: each for each in page.context.cookies(f"{environment['TELESCOPE_PUBLIC_URL']}/api/v1")}
     assert cookies["telescope_session"]["sameSite"] == "Strict"
     assert cookies["telescope_session"]["httpOnly"] is True
+
+
+def test_who_was_invited_and_signs_in_at_another_site_comes_back_to_what_they_were_invited_to(
+    browser: Browser, environment: dict[str, str]
+) -> None:
+    url = environment["TELESCOPE_PUBLIC_URL"]
+    owner = page_of(browser)
+    owner.goto(f"{url}/#sign-in={sign_in_link(environment, 'dora')}")
+    owner.get_by_test_id("space-link").click()
+    owner.get_by_test_id("invite").click()
+    owner.get_by_test_id("invite-send").click()
+    page = page_of(browser)
+    page.goto(owner.get_by_test_id("invitation-link").input_value())
+    page.get_by_test_id("sign-in-elsewhere").click()
+    page.locator("input[name=login]").fill("eve")
+    page.locator("input[name=password]").fill("any")
+    page.locator("button[type=submit]").click()
+    page.locator("button[type=submit]").click()
+    signed_in(page, "Name of eve")
+    expect(page.get_by_test_id("shared-with-me")).to_contain_text("Home", timeout=30_000)
+    page.reload()
+    signed_in(page, "Name of eve")
+    expect(page.get_by_test_id("shared-with-me")).to_have_count(0)  # it is answered, and asked no more

@@ -1,0 +1,192 @@
+"""Each of the four robots operated from its page: what is asked for is done in the simulation, and seen to be done."""
+
+import math
+from collections.abc import Iterator
+from itertools import pairwise
+
+import pytest
+from playwright.sync_api import Browser, Page, expect, sync_playwright
+
+from tests.support.brokers import wait_until
+from tests.support.browser import PATIENCE_MS, chromium, pages
+from tests.support.machine import Machine
+from tests.support.pages import assert_good_page
+
+DONE_WITHIN_MS = 60_000
+STEPS = ("accepted", "started", "observed", "ended")
+
+
+@pytest.fixture(scope="module")
+def browser() -> Iterator[Browser]:
+    with sync_playwright() as playwright, chromium(playwright) as browser:
+        yield browser
+
+
+def open_robot(page: Page, machine: Machine, name: str) -> None:
+    """The page of a robot, once it is heard."""
+    with machine.api() as api:
+        device = api.device(name)["id"]
+    page.goto(f"{machine.url}/#/devices/{device}")
+    expect(page.get_by_test_id("online")).to_have_attribute("data-status", "online", timeout=PATIENCE_MS)
+
+
+def ask(page: Page, button: str) -> None:
+    """Press a button once it may be pressed: what was before has ended."""
+    expect(page.get_by_test_id(button)).to_be_enabled(timeout=DONE_WITHIN_MS)
+    page.get_by_test_id(button).click()
+
+
+def assert_done(page: Page, kind: str, *, seen: str = "motion", nth: int = 0) -> None:
+    """The newest command is done, and its line tells of every step, one after the other."""
+    row = page.get_by_test_id("evidence-row").nth(nth)
+    expect(row).to_have_attribute("data-kind", kind, timeout=PATIENCE_MS)
+    expect(page.get_by_test_id("action-status")).to_have_attribute("data-status", "done", timeout=DONE_WITHIN_MS)
+    expect(row).to_have_attribute("data-seen", seen, timeout=PATIENCE_MS)
+    times = {step: float(row.get_attribute(f"data-{step}") or "nan") for step in STEPS}
+    assert times["accepted"] > 0
+    # Where nothing has to move the robot's own word counts, which may come before its ack.
+    chains = [STEPS] if seen == "motion" else [("accepted", "started", "ended"), ("accepted", "observed", "ended")]
+    for chain in chains:
+        assert all(times[before] <= times[after] for before, after in pairwise(chain)), times
+
+
+def frame(page: Page, row: int) -> list[float]:
+    """The position in a row of the table of frames [m]."""
+    cell = page.get_by_test_id("poses").locator("tbody tr").nth(row).locator("td").first
+    return [float(number) for number in (cell.text_content() or "").split()]
+
+
+def joint(machine: Machine, device: str, name: str) -> float:
+    """Measured by the simulation [rad]."""
+    return float(machine.trace(device).now()["qpos"][name])
+
+
+def test_the_arm_moves_to_a_pose_and_back(browser: Browser, laboratory: Machine) -> None:
+    with pages(browser, laboratory) as (page,):
+        open_robot(page, laboratory, "ur5")
+        height = page.get_by_test_id("pose-2")
+        wait_until(lambda: height.input_value() != "", "the pose to be filled in", 30)
+        before = {name: joint(laboratory, "ur5", name) for name in ("shoulder_lift", "elbow", "wrist_1")}
+        height.fill(f"{float(height.input_value()) - 0.08:.3f}")
+        ask(page, "pose-go")
+        assert_done(page, "move_pose")
+        assert abs(joint(laboratory, "ur5", "elbow") - before["elbow"]) > 0.02
+        # The second joint is where the robot has the frame of the first, after Denavit and Hartenberg.
+        told = frame(page, 0)
+        page.get_by_text("Every joint", exact=True).click()
+        expect(page.get_by_test_id("poses").locator("tbody tr")).to_have_count(6)
+        assert frame(page, 1) == pytest.approx(told, abs=0.002)
+        assert_good_page(page, "arm")
+        assert_good_page(page, "times", part="evidence")
+        page.set_viewport_size({"width": 1440, "height": 900})
+
+        ask(page, "back")
+        assert_done(page, "move_joints")
+        for name, was in before.items():
+            assert joint(laboratory, "ur5", name) == pytest.approx(was, abs=0.02), name
+
+        # What cannot be is refused, and the robot's own reason is shown.
+        height.fill("3")
+        ask(page, "pose-go")
+        status = page.get_by_test_id("action-status")
+        expect(status).to_have_attribute("data-status", "failed", timeout=DONE_WITHIN_MS)
+        expect(status.locator(".field-error")).not_to_be_empty()
+        assert height.input_value() == "3"
+
+
+def test_the_humanoid_takes_a_posture_shows_a_behaviour_and_softens_a_joint(
+    browser: Browser, laboratory: Machine
+) -> None:
+    with pages(browser, laboratory) as (page,):
+        open_robot(page, laboratory, "nao")
+        knee = joint(laboratory, "nao", "LKneePitch")
+        ask(page, "posture-Crouch")
+        expect(page.get_by_test_id("behaviour-Hello")).to_be_disabled()
+        assert_done(page, "take_posture")
+        assert abs(joint(laboratory, "nao", "LKneePitch") - knee) > 0.2
+        ask(page, "back")
+        assert_done(page, "move_joints")
+        assert joint(laboratory, "nao", "LKneePitch") == pytest.approx(knee, abs=0.1)
+
+        ask(page, "behaviour-Hello")
+        expect(page.get_by_test_id("action-status")).to_have_attribute("data-status", "started", timeout=PATIENCE_MS)
+        page.get_by_test_id("cancel-action").click()
+        expect(page.get_by_test_id("action-status")).to_have_attribute("data-status", "cancelled", timeout=PATIENCE_MS)
+
+        page.get_by_test_id("stiffness-joint").select_option("LHand")
+        page.get_by_test_id("stiffness-value").fill("0.5")
+        ask(page, "stiffness-set")
+        assert_done(page, "set_stiffness", seen="state")
+        expect(page.get_by_test_id("stiffness-told")).to_have_attribute("data-less", "1", timeout=PATIENCE_MS)
+        assert_good_page(page, "humanoid")
+        ask(page, "back")
+        expect(page.get_by_test_id("stiffness-told")).to_have_attribute("data-less", "0", timeout=PATIENCE_MS)
+
+
+def test_the_robot_on_wheels_goes_to_a_place_on_the_plan(browser: Browser, laboratory: Machine) -> None:
+    with pages(browser, laboratory) as (page,):
+        open_robot(page, laboratory, "qbo")
+        mark = page.get_by_test_id("place-qbo")
+        expect(mark).to_be_visible(timeout=PATIENCE_MS)
+        was = tuple(float(mark.get_attribute(f"data-{axis}") or "nan") for axis in "xy")
+        box, at = page.get_by_test_id("pick").bounding_box(), mark.bounding_box()
+        assert box is not None
+        assert at is not None
+        # A little beside where it stands, and by the fields exactly there.
+        page.get_by_test_id("pick").click(
+            position={"x": at["x"] + at["width"] / 2 - box["x"] + 8, "y": at["y"] + at["height"] / 2 - box["y"]}
+        )
+        expect(page.get_by_test_id("goal")).to_be_visible()
+        assert float(page.get_by_test_id("place-x").input_value()) == pytest.approx(was[0], abs=0.6)
+        ask(page, "place-go")
+        assert_done(page, "go_to")
+        x_m, y_m = (float(page.get_by_test_id(f"place-{axis}").input_value()) for axis in "xy")
+        wait_until(
+            lambda: (
+                math.hypot(
+                    float(mark.get_attribute("data-x") or "nan") - x_m,
+                    float(mark.get_attribute("data-y") or "nan") - y_m,
+                )
+                < 0.3
+            ),
+            "the room to see it there",
+            30,
+        )
+        # Its own eyes are seen, and it is seen from the room.
+        for view in (0, 1):
+            page.get_by_test_id("watch-from").select_option(index=view)
+            page.get_by_test_id("camera-live").click()
+            wait_until(lambda: page.get_by_test_id("camera-picture").get_attribute("data-sequence"), "a picture", 30)
+        assert_good_page(page, "wheels")
+        assert_good_page(page, "place", part="plan")
+        ask(page, "back")
+        assert_done(page, "go_to")
+
+
+def test_the_head_shows_an_expression_and_says_a_sentence(browser: Browser, laboratory: Machine) -> None:
+    with pages(browser, laboratory, 2) as (page, other):
+        open_robot(page, laboratory, "hanson")
+        page.get_by_test_id("strength").fill("0.8")
+        ask(page, "expression-happy")
+        assert_done(page, "express")
+        assert abs(joint(laboratory, "hanson", "Smile-L")) > 0.02
+
+        open_robot(other, laboratory, "hanson")
+        other.get_by_test_id("say-text").fill("This waits.")
+        page.get_by_test_id("say-text").fill("Good morning.")
+        page.get_by_test_id("say-text").press("Enter")
+        assert_done(page, "say", seen="state")
+        assert page.get_by_test_id("say-text").input_value() == ""
+        expect(page.get_by_test_id("action-status")).to_contain_text("Good morning.")
+        assert_good_page(page, "head")
+        page.set_viewport_size({"width": 1440, "height": 900})
+
+        # Who has control elsewhere asks for nothing here, and what was typed stays.
+        page.get_by_test_id("take-control").click()
+        expect(page.get_by_test_id("control-state")).to_have_attribute("data-state", "mine", timeout=PATIENCE_MS)
+        expect(other.get_by_test_id("say")).to_be_disabled(timeout=PATIENCE_MS)
+        assert other.get_by_test_id("say").get_attribute("title")
+        assert other.get_by_test_id("say-text").input_value() == "This waits."
+        page.get_by_test_id("release-control").click()
+        ask(page, "expression-neutral")
+        assert_done(page, "express")

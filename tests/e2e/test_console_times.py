@@ -1,0 +1,26 @@
+"""The benchmark of the console measures what it says: every part of a press, in its order."""
+
+from itertools import pairwise
+
+from playwright.sync_api import sync_playwright
+
+from benchmarks import console
+from tests.support.browser import chromium, pages
+from tests.support.machine import Machine
+
+CLOCKS_AGREE_MS = 15.0
+"""The simulation's record has a line each 10 ms, and the wall clocks of two programs are read in between."""
+
+
+def test_every_part_of_a_press_is_measured_and_in_order(machine: Machine) -> None:
+    with sync_playwright() as playwright, chromium(playwright) as browser, pages(browser, machine) as (page,):
+        found = console.measure(page, machine, 2)
+        if page.get_by_test_id("release-control").count():
+            page.get_by_test_id("release-control").click()
+    assert len(found) == 2
+    for press in found:
+        assert tuple(press.at_ms) == console.PARTS
+        times = list(press.at_ms.values())
+        assert times[0] >= 0
+        assert all(after > before - CLOCKS_AGREE_MS for before, after in pairwise(times)), press
+    console.show(found)

@@ -1,0 +1,38 @@
+"""Somebody who is here for the first time: signs in, has nothing yet, and is told how to get going."""
+
+from playwright.sync_api import Page, expect, sync_playwright
+
+from tests.support.browser import PATIENCE_MS, chromium
+from tests.support.machine import Machine
+from tests.support.pages import assert_good_page
+
+
+def test_a_newcomer_is_told_how_to_get_going(machine: Machine) -> None:
+    with sync_playwright() as playwright, chromium(playwright) as browser:
+        page = browser.new_context(viewport={"width": 1440, "height": 900}).new_page()
+        page.set_default_timeout(PATIENCE_MS)
+        errors: list[str] = []
+        page.on("pageerror", lambda error: errors.append(str(error)))
+        page.goto(machine.url)
+        expect(page.get_by_role("heading", name="Sign in")).to_be_visible()
+        assert_good_page(page, "sign-in")
+
+        page.goto(machine.sign_in_link("newcomer"))
+        page.reload()  # the fragment alone loads nothing
+        expect(page.get_by_test_id("signed-in")).to_be_visible()
+        steps = page.get_by_test_id("first-steps")
+        expect(steps).to_contain_text("Pair it")
+        assert command(page, "enroll").endswith(f"--server {machine.url} --device arm=ur5 --no-wait")
+        assert command(page, "run") == "python -m device_agent run --home ~/arm-agent"
+        page.get_by_test_id("what-do-i-see").get_by_text("What do I see?").click()
+        expect(page.get_by_text("One person at a time has control")).to_be_visible()
+        assert_good_page(page, "first-steps")
+
+        page.goto(f"{machine.url}/#/account")
+        expect(page.get_by_role("heading", level=1)).to_be_visible()
+        assert_good_page(page, "account")
+        assert errors == []
+
+
+def command(page: Page, name: str) -> str:
+    return page.get_by_test_id(f"command-{name}").input_value()

@@ -1,0 +1,137 @@
+"""Two people, a browser each, one arm: control goes from hand to hand, and who watches is seen."""
+
+from collections.abc import Iterator
+
+import pytest
+from playwright.sync_api import Browser, Page, expect, sync_playwright
+
+from tests.support.brokers import wait_until
+from tests.support.browser import FLAT, PATIENCE_MS, chromium, person
+from tests.support.machine import Machine
+from tests.support.pages import assert_good_page
+
+
+@pytest.fixture(scope="module")
+def browser() -> Iterator[Browser]:
+    with sync_playwright() as playwright, chromium(playwright, FLAT) as browser:
+        yield browser
+
+
+@pytest.fixture
+def two(browser: Browser, machine: Machine) -> Iterator[tuple[Page, Page]]:
+    """Demo, who owns the arm, and Carol, who may operate it; both look at it."""
+    with machine.api("carol") as carol, machine.api() as owner:
+        device = owner.device()["id"]
+        account = carol.get("/accounts/me")["id"]
+        owner.post(f"/devices/{device}/shares", {"account": "carol", "role": "operator"})
+        with (
+            person(browser, machine.sign_in_link()) as demo_page,
+            person(browser, machine.sign_in_link("carol")) as carol_page,
+        ):
+            for page in (demo_page, carol_page):
+                open_arm(page)
+            yield demo_page, carol_page
+        owner.http.delete(f"/devices/{device}/shares/{account}").raise_for_status()
+
+
+def open_arm(page: Page) -> None:
+    page.get_by_test_id("device-row").filter(has_text="UR5").get_by_role("link").first.click()
+    expect(page.get_by_test_id("slider-elbow")).to_be_attached(timeout=PATIENCE_MS)
+
+
+def expect_state(page: Page, state: str) -> None:
+    expect(page.get_by_test_id("control-state")).to_have_attribute("data-state", state, timeout=PATIENCE_MS)
+
+
+def take(page: Page) -> None:
+    """Where the robot has ended control by itself, on a machine so busy that it had to hold, take it again."""
+    if page.get_by_test_id("control-state").get_attribute("data-state") != "mine":
+        page.get_by_test_id("take-control").click()
+    expect_state(page, "mine")
+    expect(page.get_by_test_id("slider-elbow")).to_be_enabled(timeout=PATIENCE_MS)
+
+
+def ask(asker: Page, holder: Page) -> None:
+    take(holder)
+    asker.get_by_test_id("ask-control").click()
+    expect(holder.get_by_test_id("asks")).to_contain_text("asks you for control", timeout=PATIENCE_MS)
+    expect(asker.get_by_test_id("asked")).to_contain_text("You ask demo for control", timeout=PATIENCE_MS)
+
+
+def elbow(machine: Machine) -> float:
+    """Measured by the simulation [rad]."""
+    return float(machine.trace().now()["qpos"]["elbow"])
+
+
+def move_the_elbow(page: Page, machine: Machine) -> None:
+    before = elbow(machine)
+
+    def moved() -> bool:
+        if page.get_by_test_id("control-state").get_attribute("data-state") == "mine":
+            page.get_by_test_id("slider-elbow").press("Shift+ArrowLeft")
+        elif page.get_by_test_id("take-control").is_visible():
+            page.get_by_test_id("take-control").click()
+        page.wait_for_timeout(200)
+        return abs(elbow(machine) - before) > 0.1
+
+    wait_until(moved, "the elbow moving", 45)
+
+
+def test_control_goes_from_hand_to_hand_and_who_watches_is_seen(two: tuple[Page, Page], machine: Machine) -> None:
+    demo, carol = two
+    # Each sees that the other looks.
+    for page, name in ((demo, "carol"), (carol, "demo")):
+        button = page.get_by_test_id("watchers")
+        expect(button).to_be_visible(timeout=PATIENCE_MS)
+        button.click()
+        expect(page.get_by_test_id("watcher-names")).to_contain_text(name)
+    assert_good_page(demo, "watchers")
+    demo.get_by_test_id("watchers").press("Enter")
+
+    # Asked, and kept; by keys alone.
+    ask(carol, demo)
+    assert_good_page(demo, "asked-for-control")
+    assert_good_page(carol, "asking-for-control")
+    demo.get_by_test_id("refuse-request").press("Enter")
+    expect(carol.get_by_test_id("asked")).to_contain_text("demo keeps control", timeout=PATIENCE_MS)
+    expect(demo.get_by_test_id("answered")).to_contain_text("You keep control")
+
+    # Asked, and asked no longer.
+    ask(carol, demo)
+    carol.get_by_test_id("withdraw-request").press("Enter")
+    expect(demo.get_by_test_id("accept-request")).to_have_count(0, timeout=PATIENCE_MS)
+    expect(carol.get_by_test_id("asked")).to_contain_text("You ask no longer", timeout=PATIENCE_MS)
+
+    # Asked, and handed over: the one's sliders are dead, the other's move the arm without another click.
+    ask(carol, demo)
+    demo.get_by_test_id("accept-request").press("Enter")
+    expect_state(demo, "handed")
+    expect(demo.get_by_test_id("slider-elbow")).to_be_disabled()
+    expect_state(carol, "mine")
+    expect(carol.get_by_test_id("asked")).to_contain_text("demo handed control to you")
+    move_the_elbow(carol, machine)
+    expect(demo.get_by_test_id("slider-elbow")).to_be_disabled()
+
+    # The owner takes over, and Carol, who may not, reads why.
+    take(carol)
+    expect(carol.get_by_test_id("take-over")).to_have_count(0)
+    demo.get_by_test_id("take-over").click()
+    demo.get_by_test_id("take-over-reason").fill("the arm is needed here")
+    assert_good_page(demo, "taking-over")
+    demo.get_by_test_id("take-over-reason").press("Enter")
+    expect_state(demo, "mine")
+    expect(carol.get_by_test_id("control-state")).to_contain_text("the arm is needed here", timeout=PATIENCE_MS)
+    expect(carol.get_by_test_id("slider-elbow")).to_be_disabled()
+    demo.get_by_test_id("release-control").click()
+    expect_state(demo, "free")
+    # Who goes is no longer seen.
+    carol.goto("about:blank")
+    expect(demo.get_by_test_id("watchers")).to_have_count(0, timeout=2 * PATIENCE_MS)
+
+
+def test_silence_takes_control_from_nobody(two: tuple[Page, Page]) -> None:
+    demo, carol = two
+    ask(carol, demo)
+    expect(carol.get_by_test_id("asked")).to_contain_text("did not answer in time", timeout=45_000)
+    expect(demo.get_by_test_id("accept-request")).to_have_count(0, timeout=PATIENCE_MS)
+    demo.get_by_test_id("release-control").click()

@@ -1,0 +1,160 @@
+"""Health and times as a person sees them: a fault put into the simulation, seen, ended; times measured and saved."""
+
+import contextlib
+from collections import defaultdict
+from collections.abc import Iterator
+from pathlib import Path
+
+from playwright.sync_api import Page, expect, sync_playwright
+
+from tests.support.brokers import wait_until
+from tests.support.browser import PATIENCE_MS, chromium, pages
+from tests.support.machine import Api, Machine
+from tests.support.pages import assert_good_page
+
+MEASURED = 20
+UR5_HTTP_MS, UR5_XMPP_MS = "2994.6", "824.25"
+
+
+@contextlib.contextmanager
+def ill(machine: Machine, device: str, ailment: str) -> Iterator[Path]:
+    """A device of the simulation that suffers from something until the end of the ``with``, or of the file."""
+    (folder,) = {path.parent / "faults" for path in machine.home.rglob("agent.toml")}
+    folder.mkdir(exist_ok=True)
+    file = folder / f"{device}.toml"
+    file.write_text(ailment)
+    try:
+        yield file
+    finally:
+        file.unlink(missing_ok=True)
+
+
+def go(page: Page, machine: Machine, address: str) -> None:
+    """Go to a page of the console as a link does: without loading it anew."""
+    page.evaluate("address => { location.hash = address; }", address)
+    assert page.url.startswith(machine.url)
+
+
+def test_a_fault_is_raised_seen_and_ended_and_a_trend_shows_what_was_measured(laboratory: Machine) -> None:
+    with laboratory.api() as api, sync_playwright() as playwright, chromium(playwright) as browser:
+        ids = {name: api.device(name)["id"] for name in ("thermometer", "co2")}
+        # A meter that goes wild shows in its trend at once, and is found by the detectors while the rest is looked at.
+        with (
+            ill(laboratory, "co2", "drift = { co2_ppm = 90000.0 }"),
+            pages(browser, laboratory) as (ann,),
+            ill(laboratory, "thermometer", "unreachable = true") as file,
+        ):
+            raised(ann, laboratory, ids["thermometer"])
+            seen_and_ended(ann, file)
+            trend(ann, laboratory, ids["co2"])
+
+
+def raised(page: Page, machine: Machine, device: str) -> None:
+    """The list of devices, all health and the device's own page say so, without being loaded anew."""
+    row = page.locator(f"[data-testid=device-row][data-device='{device}']")
+    expect(row.get_by_text("1 fault")).to_be_visible(timeout=PATIENCE_MS)
+    row.get_by_role("link").first.click()
+    chip = page.get_by_test_id("health-chip")
+    expect(chip).to_have_attribute("data-count", "1", timeout=PATIENCE_MS)
+    page.get_by_role("link", name="Health", exact=True).click()
+    line = page.locator(f"[data-testid=health-row][data-device='{device}']")
+    expect(line).to_have_attribute("data-health", "fault", timeout=PATIENCE_MS)
+    expect(line).to_contain_text("does not answer")
+    assert page.get_by_test_id("health-row").first.get_attribute("data-health") == "fault", "the worst stands first"
+    assert_good_page(page, "health")
+    go(page, machine, f"#/devices/{device}/health")
+
+
+def seen_and_ended(page: Page, cause: Path) -> None:
+    """By the keyboard alone; then the cause ends, and the fault with it."""
+    fault = page.get_by_test_id("fault")
+    expect(fault).to_have_attribute("data-state", "raised", timeout=PATIENCE_MS)
+    button = page.get_by_test_id("acknowledge")
+    button.focus()
+    page.keyboard.press("Enter")
+    expect(fault).to_have_attribute("data-state", "acknowledged", timeout=PATIENCE_MS)
+    expect(fault).to_contain_text("Seen by demo")
+    assert page.evaluate("() => document.activeElement.closest('[data-testid=fault]') !== null"), "the focus is lost"
+    assert_good_page(page, "health-fault")
+    cause.unlink()
+    expect(page.get_by_test_id("open-faults")).to_have_attribute("data-count", "0", timeout=PATIENCE_MS)
+    expect(fault).to_have_count(0, timeout=PATIENCE_MS)
+    page.get_by_text("Past", exact=True).click()
+    past = page.get_by_test_id("faults-past").get_by_test_id("fault").first
+    expect(past).to_have_attribute("data-state", "cleared", timeout=PATIENCE_MS)
+    expect(past).to_contain_text("Seen by demo")
+    past.locator("summary").click()
+    expect(past.locator(".event-list")).to_contain_text("Fault seen", timeout=PATIENCE_MS)
+
+
+def trend(page: Page, machine: Machine, device: str) -> None:
+    """The excursion, the band, and the fault that was found in it; read by the keyboard, and as a table."""
+    go(page, machine, f"#/devices/{device}/health")
+    page.get_by_text("10 min", exact=True).click()
+    now = page.get_by_test_id("trend-now")
+    wait_until(lambda: float(now.get_attribute("data-value") or "0") > 2000, "a wild value", 30)
+    expect(now).to_contain_text("out of its limits")
+    expect(page.get_by_test_id("trend-fault")).to_have_attribute("data-code", "co2.co2_ppm", timeout=2 * PATIENCE_MS)
+    row = page.get_by_test_id("watched-row").first
+    expect(row).to_have_attribute("data-field", "co2.co2_ppm")
+    expect(row).to_contain_text("Beyond a limit")
+    expect(row).to_contain_text("Open door or window")  # as the room's manifest advises
+    chart = page.get_by_test_id("series")
+    wait_until(lambda: int(chart.get_attribute("data-points") or "0") > 5, "points", 30)
+    chart.focus()
+    page.keyboard.press("ArrowLeft")
+    before = chart.get_attribute("aria-valuetext")
+    assert "ppm" in (before or "")
+    expect(page.get_by_test_id("reading-at")).to_have_text(before or "")
+    page.keyboard.press("Home")
+    assert chart.get_attribute("aria-valuetext") != before
+    assert_good_page(page, "trend")
+    page.get_by_text("Table", exact=True).click()
+    expect(page.get_by_test_id("trend-table").get_by_role("row")).not_to_have_count(1)
+
+
+def test_times_are_measured_drawn_beside_the_papers_and_saved(laboratory: Machine) -> None:
+    with laboratory.api() as api, sync_playwright() as playwright, chromium(playwright) as browser:
+        device = api.device("light")["id"]
+        with pages(browser, laboratory) as (ann,):
+            go(ann, laboratory, f"#/devices/{device}/times")
+            ann.get_by_test_id("measure").click()
+            measured = ann.get_by_test_id("measured")
+            chart = ann.get_by_test_id("times-samples")
+            wait_until(lambda: int(chart.get_attribute("data-samples") or "0") > 0, "samples while it measures", 30)
+            expect(measured).to_have_attribute("data-busy", "false", timeout=2 * PATIENCE_MS)
+            expect(measured).to_have_attribute("data-count", str(3 * MEASURED))
+
+            # Everything is stored, and drawn once.
+            ann.get_by_test_id("times-path").select_option("operator-cloud")
+            for transport in ("http", "websocket"):
+                line = ann.locator(f"[data-testid=times-line][data-transport={transport}]")
+                assert int(line.get_attribute("data-count") or "0") >= MEASURED
+            # The cloud has measured the same requests on its own clock; nothing waits for it to note them.
+            kinds = (("http", "operator-device"), ("mqtt", "command-started"))
+            wait_until(lambda: all(counted(api, device)[kind] >= MEASURED for kind in kinds), "all to be stored", 30)
+            counts = counted(api, device)
+            ann.get_by_test_id("times-path").select_option("operator-device")
+            assert chart.get_attribute("data-samples") == str(counts["http", "operator-device"])
+            for ms in (UR5_HTTP_MS, UR5_XMPP_MS):
+                expect(ann.locator(f"[data-testid=published][data-ms='{ms}']")).to_be_visible()
+            assert int(chart.get_attribute("data-references") or "0") > 0
+
+            # What is saved is what is drawn.
+            ann.get_by_test_id("times-path").select_option("")
+            drawn = int(chart.get_attribute("data-samples") or "0")
+            with ann.expect_download() as download:
+                ann.get_by_test_id("times-csv").click()
+            rows = Path(download.value.path()).read_text().splitlines()
+            assert rows[0] == "device,label,transport,path,at,ms"
+            assert len(rows) - 1 == drawn >= 3 * MEASURED
+            assert_good_page(ann, "times-device")
+            go(ann, laboratory, "#/times")
+            expect(ann.get_by_test_id("times-line").first).to_be_visible(timeout=PATIENCE_MS)
+            assert_good_page(ann, "times")
+
+
+def counted(api: Api, device: str) -> dict[tuple[str, str], int]:
+    """How many samples are stored of each transport and path."""
+    items = api.get(f"/devices/{device}/latency")["items"]
+    return defaultdict(int, {(item["transport"], item["path"]): item["count"] for item in items})

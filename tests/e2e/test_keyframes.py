@@ -1,0 +1,220 @@
+"""Keyframes in a real Chromium: set, mended, seen, saved, run, recorded; for an arm, a humanoid, a base, a head."""
+
+import ast
+from typing import Any
+
+import pytest
+from playwright.sync_api import Page, expect, sync_playwright
+
+from tests.support.brokers import wait_until
+from tests.support.browser import PATIENCE_MS, chromium, pages
+from tests.support.machine import Machine
+from tests.support.pages import assert_good_page
+
+pytestmark = pytest.mark.timeout(300)
+"""Drawing in three dimensions without a graphics card takes its time."""
+
+
+def open_editor(page: Page, laboratory: Machine, name: str) -> None:
+    """The keyframe editor of a robot, by its page, once it knows the robot."""
+    with laboratory.api() as api:
+        device = api.device(name)["id"]
+    page.goto(f"{laboratory.url}/#/devices/{device}")
+    page.get_by_test_id("to-keyframes").click()
+    expect(page.get_by_test_id("kf-track")).to_be_visible(timeout=PATIENCE_MS)
+    wait_until(lambda: number(page, "kf-view", "frames") > 0, "the twin to be drawn", 60)
+
+
+def number(page: Page, test_id: str, name: str) -> float:
+    return float(page.get_by_test_id(test_id).get_attribute(f"data-{name}") or "nan")
+
+
+def set_joint(page: Page, joint: str, deg: float) -> None:
+    field = page.get_by_test_id(f"target-{joint}")
+    field.fill(str(deg))
+    field.press("Enter")
+
+
+def keyframes(page: Page) -> list[dict[str, Any]]:
+    """Those in the script that is written."""
+    source = page.get_by_test_id("kf-source").text_content() or ""
+    tree = ast.parse(source)
+    found = next(
+        each for each in tree.body if isinstance(each, ast.Assign) and ast.unparse(each.targets[0]) == "KEYFRAMES"
+    )
+    read: list[dict[str, Any]] = ast.literal_eval(found.value)
+    return read
+
+
+def save(page: Page, name: str) -> None:
+    page.get_by_test_id("kf-name").fill(name)
+    page.get_by_test_id("kf-save").click()
+    expect(page.get_by_test_id("kf-said")).to_contain_text("Saved as version", timeout=PATIENCE_MS)
+
+
+def run(page: Page) -> None:
+    page.get_by_test_id("kf-run").click()
+    status = page.get_by_test_id("action-status")
+    wait_until(lambda: status.get_attribute("data-status") in {"done", "failed", "refused"}, "the run to end", 60)
+    assert status.get_attribute("data-status") == "done", status.text_content()
+
+
+def test_an_arm_s_movement_from_keyframes_to_the_robot(laboratory: Machine) -> None:
+    with sync_playwright() as playwright, chromium(playwright) as browser, pages(browser, laboratory) as (page,):
+        open_editor(page, laboratory, "ur5")
+
+        # Two poses by number and by slider; the way between them is too fast, and one click mends it.
+        start = keyframes(page)[0]["position_rad"]
+        page.get_by_test_id("kf-add").click()
+        expect(page.get_by_test_id("kf-marker-2")).to_be_visible()
+        set_joint(page, "shoulder_pan", 60)
+        slider = page.get_by_test_id("slider-wrist_1")
+        slider.focus()
+        for _ in range(2):
+            page.keyboard.press("PageUp")
+        page.get_by_test_id("kf-lasts").fill("0.3")
+        page.get_by_test_id("kf-lasts").press("Enter")
+        problem = page.get_by_test_id("kf-problem-too-fast")
+        expect(problem).to_contain_text("too fast", timeout=PATIENCE_MS)
+        expect(page.get_by_test_id("kf-run")).to_be_disabled()
+        page.get_by_test_id("kf-name").fill("kf-turn")
+        assert_good_page(page, "keyframes-too-fast")
+        page.set_viewport_size({"width": 1440, "height": 900})
+        problem.get_by_test_id("kf-mend").click()
+        expect(page.get_by_test_id("kf-problems")).to_have_attribute("data-count", "0")
+        assert number(page, "kf-marker-2", "time") > 0.6
+
+        undone_and_done_again(page)
+        page.get_by_test_id("kf-duplicate").click()
+        set_joint(page, "shoulder_pan", 75)
+        set_joint(page, "shoulder_lift", -80)
+        expect(page.get_by_test_id("kf-problems")).to_have_attribute("data-count", "0")
+
+        # The preview moves the drawing and nothing else.
+        before = laboratory.trace().now()["qpos"]["shoulder_pan"]
+        frames = number(page, "kf-view", "frames")
+        page.get_by_test_id("kf-play").click()
+        expect(page.get_by_test_id("kf-play")).to_have_attribute("aria-pressed", "false", timeout=PATIENCE_MS)
+        assert number(page, "kf-view", "frames") > frames + 3
+        assert abs(laboratory.trace().now()["qpos"]["shoulder_pan"] - before) < 1e-3
+
+        # A draft outlives the page.
+        page.reload()
+        expect(page.get_by_test_id("kf-restored")).to_be_visible(timeout=PATIENCE_MS)
+        made = keyframes(page)
+        assert [len(made), made[0]["position_rad"]] == [3, start]
+        page.get_by_test_id("kf-description").fill("Turns and looks around.")
+        save(page, "kf-turn")
+        page.get_by_test_id("kf-marker-2").focus()
+        wait_until(lambda: number(page, "kf-view", "frames") > 0, "the twin to be drawn", 60)
+        assert_good_page(page, "keyframes")
+        page.set_viewport_size({"width": 1440, "height": 900})
+
+        # On the robot it gets to the poses, one after the other.
+        run(page)
+        reached = laboratory.trace().rows(3000)
+        for one in made[1:]:
+            wanted = one["position_rad"]
+            assert any(all(abs(row["qpos"][joint] - at) < 0.05 for joint, at in wanted.items()) for row in reached), (
+                wanted
+            )
+
+        opened_again(page, laboratory, made)
+
+
+def undone_and_done_again(page: Page) -> None:
+    """By keys."""
+    page.get_by_test_id("kf-marker-2").focus()
+    page.keyboard.press("ArrowRight")
+    later = number(page, "kf-marker-2", "time")
+    page.keyboard.press("Control+z")
+    assert number(page, "kf-marker-2", "time") < later
+    page.keyboard.press("Control+Shift+z")
+    assert number(page, "kf-marker-2", "time") == later
+
+
+def opened_again(page: Page, laboratory: Machine, made: list[dict[str, Any]]) -> None:
+    """What is saved is opened again; what somebody changed by hand is not."""
+    page.reload()
+    expect(page.get_by_test_id("kf-track")).to_be_visible(timeout=PATIENCE_MS)
+    assert keyframes(page) == made
+    with laboratory.api() as api:
+        path = "/robot-types/ur5/movements/kf-turn"
+        saved = api.get(path)
+        changed = {"source": saved["source"] + "robot.home()\n"}
+        assert api.http.put(path, json=changed).is_success
+    page.reload()
+    expect(page.get_by_test_id("kf-by-hand")).to_be_visible(timeout=PATIENCE_MS)
+    with laboratory.api() as api:
+        assert api.http.delete("/robot-types/ur5/movements/kf-turn").is_success
+
+
+def test_what_moves_the_robot_is_recorded_trimmed_and_becomes_keyframes(laboratory: Machine) -> None:
+    with sync_playwright() as playwright, chromium(playwright) as browser, pages(browser, laboratory) as (page,):
+        open_editor(page, laboratory, "ur5")
+        home = keyframes(page)[0]["position_rad"]
+        page.get_by_test_id("kf-record").click()
+        with laboratory.api() as api:
+            for position_rad in ({"shoulder_pan": home["shoulder_pan"] + 0.6}, home):
+                request = {"kind": "move_joints", "position_rad": position_rad, "speed": 0.7}
+                asked = {"request": request, "wait_ms": 10_000, "wait_for": "done"}
+                done = api.post(f"/devices/{api.device('ur5')['id']}/actions", asked)
+                assert done["status"] == "done", done
+        page.get_by_test_id("kf-record").click()
+        assert number(page, "kf-recorded", "samples") > 10
+        expect(page.get_by_test_id("kf-use")).to_be_enabled(timeout=PATIENCE_MS)
+        assert_good_page(page, "keyframes-record")
+        page.set_viewport_size({"width": 1440, "height": 900})
+        lasts = page.get_by_test_id("kf-to").evaluate("e => Number(e.max)")
+        page.get_by_test_id("kf-from").focus()
+        for _ in range(6):
+            page.keyboard.press("ArrowRight")
+        page.get_by_test_id("kf-use").click()
+        made = keyframes(page)
+        assert len(made) >= 2
+        assert made[0]["time_s"] == 0
+        assert made[-1]["time_s"] < lasts - 0.2, "its beginning was cut off"
+        assert max(one["position_rad"].get("shoulder_pan", -9) for one in made) > home["shoulder_pan"] + 0.5
+        page.get_by_test_id("kf-undo").click()
+        assert len(keyframes(page)) == 1
+
+
+@pytest.mark.parametrize(
+    ("name", "joint", "deg", "deed"),
+    [
+        ("nao", "HeadYaw", 30, "kf-posture"),
+        ("qbo", "head_pan", 25, "kf-drive"),
+        ("hanson", "Neck-Rotation", 20, "kf-say"),
+    ],
+)
+def test_the_same_editor_serves_every_robot(laboratory: Machine, name: str, joint: str, deg: float, deed: str) -> None:
+    with sync_playwright() as playwright, chromium(playwright) as browser, pages(browser, laboratory) as (page,):
+        open_editor(page, laboratory, name)
+        page.get_by_test_id("kf-add").click()
+        page.get_by_test_id("kf-lasts").fill("1.5")
+        page.get_by_test_id("kf-lasts").press("Enter")
+        set_joint(page, joint, deg)
+        field = page.get_by_test_id(deed)
+        if deed == "kf-drive":
+            field.check()
+        elif deed == "kf-say":
+            field.fill("Hello")
+        else:
+            field.select_option(index=1)
+        expect(page.get_by_test_id("kf-problems")).to_have_attribute("data-count", "0")
+        save(page, "kf-look")
+        assert len(keyframes(page)) == 2
+        if name != "qbo":
+            assert_good_page(page, f"keyframes-{name}")
+            page.set_viewport_size({"width": 1440, "height": 900})
+        if name == "hanson":
+            run(page)
+            turned = page.get_by_test_id(f"measured-{joint}")
+            wait_until(
+                lambda: abs(float(turned.get_attribute("data-value") or "nan") - deg) < 2, "the head to turn", 10
+            )
+        with laboratory.api() as api:
+            kind = api.device(name)["robot_type"]
+            source = page.get_by_test_id("kf-source").text_content()
+            assert api.post(f"/robot-types/{kind}/scripting/check", {"source": source})["marks"] == []
+            assert api.http.delete(f"/robot-types/{kind}/movements/kf-look").is_success

@@ -1,0 +1,297 @@
+"""Movements as a person writes, keeps and runs them, in a real Chromium with real agents."""
+
+import contextlib
+import subprocess
+import sys
+from collections.abc import Iterator
+from typing import Any
+
+import pytest
+from playwright.sync_api import Locator, Page, expect, sync_playwright
+
+from tests.support.brokers import ROOT, wait_until
+from tests.support.browser import PATIENCE_MS, chromium, pages
+from tests.support.machine import Api, Machine, Trace
+from tests.support.pages import assert_good_page
+
+SECOND = "second"
+SCRIPT = '''"""Turn the last wrist."""
+
+PARAMETERS = {
+    "angle_rad": {"type": "number", "minimum": -1.5, "maximum": 1.5, "default": 0.2, "unit": "rad"},
+    "wait_s": {"type": "number", "minimum": 0, "maximum": 30, "default": 0, "unit": "s"},
+}
+
+robot.move_joints({"wrist_3": parameters["angle_rad"]})
+wait(parameters["wait_s"])
+print("turned", parameters["angle_rad"])
+'''
+BROKEN = SCRIPT.replace("wait(parameters", "wait((parameters")
+LEFT_OUT = "wait(parameters"
+
+
+@pytest.fixture(scope="module")
+def api(machine: Machine) -> Iterator[Api]:
+    with machine.api() as api:
+        yield api
+
+
+@pytest.fixture
+def second(machine: Machine, api: Api) -> Iterator[Trace]:
+    """Another UR5 behind an agent of its own, for as long as a test lasts."""
+    home = machine.home / "agents" / SECOND
+    program = [sys.executable, "-m", "device_agent"]
+    told = ["--home", str(home), "--server", machine.url, "--name", SECOND, "--device", f"{SECOND}=ur5", "--no-wait"]
+    said = subprocess.run(
+        [*program, "enroll", *told], cwd=ROOT, capture_output=True, text=True, check=True
+    ).stdout.split()
+    agent = api.post("/agents/claim", {"code": said[said.index("code") + 1]})["agent"]
+    with (home / "log").open("w") as log:
+        trace = ["--trace", str(home / "trace")]
+        process = subprocess.Popen([*program, "run", "--home", str(home), *trace], cwd=ROOT, stdout=log, stderr=log)
+    try:
+        api.device(SECOND)
+        yield Trace(home / "trace" / f"{SECOND}.ndjson")
+    finally:
+        process.terminate()
+        process.wait(30)
+        api.http.delete(f"/agents/{agent}")
+
+
+@pytest.fixture
+def name(api: Api, request: pytest.FixtureRequest) -> Iterator[str]:
+    """Of a movement that is only for one test: numbers of versions are never used again."""
+    found = "".join(part[0] for part in request.node.name.split("_")[1:])
+    yield found
+    api.http.delete(f"/robot-types/ur5/movements/{found}")
+    device = api.device()["id"]
+    home: dict[str, Any] = {"kind": "run_movement", "name": "home"}
+    api.post(f"/devices/{device}/actions", {"request": home, "wait_ms": 20_000, "wait_for": "done"})
+
+
+@contextlib.contextmanager
+def tabs(machine: Machine, count: int = 1) -> Iterator[list[Page]]:
+    with sync_playwright() as playwright, chromium(playwright) as browser, pages(browser, machine, count) as opened:
+        yield opened
+
+
+def script(page: Page) -> Locator:
+    return page.get_by_test_id("code").get_by_role("textbox")
+
+
+def written(page: Page) -> str:
+    return "\n".join(script(page).locator(".cm-line").all_text_contents())
+
+
+def open_script(page: Page, machine: Machine, name: str) -> None:
+    page.goto(f"{machine.url}/#/movements/ur5/{name}")
+    expect(script(page)).to_be_visible(timeout=PATIENCE_MS)
+
+
+def write(page: Page, text: str) -> None:
+    """As by a paste over everything."""
+    script(page).click()
+    page.keyboard.press("Control+a")
+    page.keyboard.press(
+        "Delete"
+    )  # text put over several lines has Chromium try styles of its own, which the policy blocks
+    page.keyboard.insert_text(text)
+
+
+def save(page: Page, version: int) -> None:
+    page.get_by_test_id("save-movement").click()
+    expect(page.get_by_test_id("save-state")).to_have_attribute("data-version", str(version), timeout=PATIENCE_MS)
+    expect(page.get_by_test_id("save-state")).to_have_attribute("data-changed", "false")
+
+
+def wrist(trace: Trace) -> float:
+    return float(trace.now()["qpos"]["wrist_3"])
+
+
+def test_a_movement_is_written_mended_and_saved(machine: Machine, name: str) -> None:
+    with tabs(machine) as (page,):
+        page.get_by_role("link", name="Movements").click()
+        expect(page.get_by_test_id("shelf-ur5-wave")).to_be_visible(timeout=PATIENCE_MS)
+        page.get_by_test_id("movement-search").fill("square air")
+        expect(page.get_by_test_id("shelf-ur5-slow_square")).to_be_visible()
+        expect(page.get_by_test_id("shelf-ur5-wave")).to_have_count(0)
+        page.get_by_test_id("movement-search").fill("")
+        assert_good_page(page, "movements")
+
+        page.get_by_test_id("new-type").select_option("ur5")
+        page.get_by_test_id("new-name").fill("no spaces")
+        page.get_by_test_id("new-movement").click()
+        expect(page.get_by_test_id("new-name")).to_have_attribute("aria-invalid", "true")
+        page.get_by_test_id("new-name").fill(name)
+        page.get_by_test_id("new-movement").click()
+
+        # What is wrong is marked in its line; it is not saved, and the text stays.
+        write(page, BROKEN)
+        problem = page.get_by_test_id("problem")
+        expect(problem).to_have_count(1, timeout=PATIENCE_MS)
+        line = BROKEN[: BROKEN.index(LEFT_OUT[:4] + "(")].count("\n") + 1
+        assert int(problem.get_attribute("data-line") or 0) == line, problem.text_content()
+        expect(page.get_by_test_id("code").locator(".cm-lintRange-error").first).to_be_visible()
+        page.get_by_test_id("save-movement").click()
+        expect(page.get_by_test_id("save-refused")).to_contain_text(f"Line {line}", timeout=PATIENCE_MS)
+        assert written(page) == BROKEN
+        assert_good_page(page, "movement-wrong")
+
+        # What the jail gives is offered, and the names of this robot type.
+        write(page, "robot.mo")
+        offered = page.get_by_test_id("code").locator(".cm-completionLabel")
+        page.keyboard.press("Control+Space")
+        expect(offered.filter(has_text="move_joints")).to_be_visible(timeout=PATIENCE_MS)
+        page.wait_for_timeout(200)  # a key that comes with the list is not meant for it
+        page.keyboard.press("Enter")
+        assert written(page) == "robot.move_joints"
+        page.keyboard.insert_text("({'el")
+        page.keyboard.press("Control+Space")
+        expect(offered.filter(has_text="elbow")).to_be_visible(timeout=PATIENCE_MS)
+        page.keyboard.press("Escape")
+
+        # Tab leads on, as everywhere.
+        page.keyboard.press("Tab")
+        assert page.evaluate("() => document.activeElement.dataset.testid") == "save-movement"
+
+        write(page, SCRIPT)
+        expect(page.get_by_test_id("problem-count")).to_have_attribute("data-count", "0", timeout=PATIENCE_MS)
+        save(page, 1)
+
+
+def test_a_movement_runs_with_parameters_from_a_form_and_its_failure_is_marked(
+    machine: Machine, api: Api, name: str
+) -> None:
+    api.http.put(f"/robot-types/ur5/movements/{name}", json={"source": SCRIPT}).raise_for_status()
+    with tabs(machine) as (page,):
+        open_script(page, machine, name)
+
+        page.get_by_test_id("choose-ur5").check()
+        # Its parameters are a form, in degrees; what is out of range says so.
+        angle = page.get_by_test_id("parameter-angle_rad")
+        angle.fill("120")
+        page.get_by_test_id("run-many").click()
+        expect(angle).to_have_attribute("aria-invalid", "true")
+        angle.fill("40")
+        page.get_by_test_id("run-many").click()
+        row = page.get_by_test_id("run-ur5")
+        wait_until(lambda: row.get_attribute("data-status") in {"done", "failed"}, "the run to end", 30)
+        assert row.get_attribute("data-status") == "done", row.inner_text()
+        expect(row).to_contain_text("turned 0.69")
+        wait_until(lambda: abs(wrist(machine.trace()) - 0.698) < 0.01, "the wrist to be turned by 40°", 20)
+        assert_good_page(page, "movement")
+
+        # A run that fails is marked in its line too.
+        write(page, SCRIPT.replace('print("turned"', 'print(1 / 0, "turned"'))
+        page.get_by_test_id("run-many").click()
+        expect(row).to_have_attribute("data-status", "failed", timeout=PATIENCE_MS)
+        failed = SCRIPT[: SCRIPT.index("print(")].count("\n") + 1
+        marked = page.get_by_test_id("problem").filter(has_text="ZeroDivisionError")
+        expect(marked).to_have_attribute("data-line", str(failed), timeout=PATIENCE_MS)
+
+        # The last values are there again, on the robot's own page too.
+        page.goto(f"{machine.url}/#/")
+        page.get_by_test_id("device-row").filter(has_text="UR5").get_by_role("link").first.click()
+        page.get_by_test_id(f"parameters-{name}").click()
+        expect(page.get_by_test_id("parameter-angle_rad")).to_have_value("40")
+        page.get_by_test_id("parameter-angle_rad").fill("-30")
+        assert_good_page(page, "movement-parameters", part="parameter-form")
+        page.get_by_test_id("run-with").click()
+        wait_until(lambda: abs(wrist(machine.trace()) + 0.5236) < 0.01, "the wrist to be turned by -30°", 20)
+
+
+def test_nothing_that_was_written_is_lost_and_versions_come_back(machine: Machine, api: Api, name: str) -> None:
+    with tabs(machine, 2) as (mine, other):
+        open_script(mine, machine, name)
+        write(mine, SCRIPT)
+        save(mine, 1)
+        open_script(other, machine, name)
+        expect(other.get_by_test_id("save-state")).to_have_attribute("data-version", "1")
+
+        # What is not saved survives a reload.
+        write(mine, SCRIPT + "# mine\n")
+        expect(mine.get_by_test_id("save-state")).to_have_attribute("data-changed", "true")
+        mine.reload()
+        expect(mine.get_by_test_id("restored")).to_be_visible(timeout=PATIENCE_MS)
+        assert written(mine) == SCRIPT + "# mine\n"
+
+        # The other tab saves first: it is not saved over, and both are there to see.
+        write(other, SCRIPT + "# theirs\n")
+        save(other, 2)
+        mine.get_by_test_id("save-movement").click()
+        conflict = mine.get_by_test_id("conflict")
+        expect(conflict).to_be_visible(timeout=PATIENCE_MS)
+        expect(conflict.get_by_test_id("difference")).to_contain_text("# theirs")
+        expect(conflict.get_by_test_id("difference")).to_contain_text("# mine")
+        assert_good_page(mine, "movement-conflict")
+        mine.get_by_test_id("save-over").click()
+        expect(mine.get_by_test_id("save-state")).to_have_attribute("data-version", "3", timeout=PATIENCE_MS)
+
+        # An older version is looked at, and saved again as the newest.
+        mine.get_by_test_id("version-2").get_by_role("button").click()
+        expect(mine.get_by_test_id("restore-version")).to_be_visible(timeout=PATIENCE_MS)
+        assert_good_page(mine, "movement-version")
+        mine.get_by_test_id("restore-version").click()
+        expect(mine.get_by_test_id("save-state")).to_have_attribute("data-version", "4", timeout=PATIENCE_MS)
+        wait_until(lambda: written(mine) == SCRIPT + "# theirs\n", "the older text", 20)
+        assert api.get(f"/robot-types/ur5/movements/{name}")["source"] == SCRIPT + "# theirs\n"
+
+        # A draft is given up only when somebody says so, and comes back.
+        write(mine, "1")
+        mine.reload()
+        mine.get_by_test_id("discard-draft").click()
+        wait_until(lambda: written(mine) == SCRIPT + "# theirs\n", "the saved text", 20)
+        mine.get_by_role("button", name="Undo").click()
+        wait_until(lambda: written(mine) == "1", "what was given up", 20)
+
+        # Deleting asks in its own place.
+        mine.goto(f"{machine.url}/#/movements")
+        mine.get_by_test_id(f"remove-{name}").click()
+        mine.get_by_test_id("confirm-yes").click()
+        expect(mine.get_by_test_id(f"shelf-ur5-{name}")).to_have_count(0, timeout=PATIENCE_MS)
+
+
+def test_one_movement_runs_on_many_robots_and_all_are_stopped_at_once(
+    machine: Machine, api: Api, second: Trace, name: str
+) -> None:
+    api.http.put(f"/robot-types/ur5/movements/{name}", json={"source": SCRIPT}).raise_for_status()
+    with tabs(machine) as (page,):
+        open_script(page, machine, name)
+        page.get_by_role("button", name="Choose all").click()
+        expect(page.get_by_test_id("many-state")).to_be_visible(timeout=PATIENCE_MS)
+        page.get_by_test_id("parameter-angle_rad").fill("20")
+        page.get_by_test_id("run-many").click()
+        rows = [page.get_by_test_id(f"run-{robot}") for robot in ("ur5", SECOND)]
+        for row in rows:
+            expect(row).to_have_attribute("data-status", "done", timeout=PATIENCE_MS)
+        for trace in (machine.trace(), second):
+            wait_until(lambda trace=trace: abs(wrist(trace) - 0.349) < 0.01, "the wrist to be turned by 20°", 20)  # type: ignore[misc]
+
+        # One is cancelled, then both are stopped by the key, wherever the focus is.
+        page.get_by_test_id("parameter-wait_s").fill("30")
+        page.get_by_test_id("run-many").click()
+        for row in rows:
+            expect(row).to_have_attribute("data-status", "started", timeout=PATIENCE_MS)
+        assert_good_page(page, "movement-many")
+        page.get_by_role("button", name="Cancel on").last.click()
+        wait_until(lambda: "cancelled" in [row.get_attribute("data-status") for row in rows], "one to be cancelled", 20)
+        script(page).click()
+        page.keyboard.press("Escape")
+        expect(page.get_by_test_id("stop-banner")).to_have_count(2, timeout=PATIENCE_MS)
+        for banner in page.get_by_test_id("stop-banner").all():
+            expect(banner).to_have_attribute("data-state", "latched", timeout=PATIENCE_MS)
+
+        # A robot that may not run it says why; the other is not asked in vain.
+        page.get_by_test_id("reset-stop").first.click()
+        page.get_by_test_id("confirm-reset").click()
+        expect(page.get_by_test_id("stop-banner")).to_have_count(1, timeout=PATIENCE_MS)
+        page.get_by_test_id("parameter-wait_s").fill("0")
+        page.get_by_test_id("run-many").click()
+        wait_until(
+            lambda: min(str(row.get_attribute("data-status")) for row in rows) == "done",
+            "one to be done",
+            20,
+        )
+        page.get_by_test_id("reset-stop").click()
+        page.get_by_test_id("confirm-reset").click()
+        expect(page.get_by_test_id("stop-banner")).to_have_count(0, timeout=PATIENCE_MS)

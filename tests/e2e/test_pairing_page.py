@@ -1,0 +1,141 @@
+"""A person pairs a robot by the link that its agent prints in a terminal, and gives it a name and a room."""
+
+import codecs
+import contextlib
+import os
+import pty
+import re
+import signal
+import subprocess
+import sys
+import threading
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+from playwright.sync_api import Browser, Page, expect, sync_playwright
+
+from device_agent import claim_link
+from tests.support.brokers import ROOT, wait_until
+from tests.support.browser import FLAT, PATIENCE_MS, chromium, person
+from tests.support.machine import Machine
+from tests.support.pages import assert_good_page
+
+
+@pytest.fixture(scope="module")
+def browser() -> Iterator[Browser]:
+    with sync_playwright() as playwright, chromium(playwright, FLAT) as browser:
+        yield browser
+
+
+class Terminal:
+    """An agent that enrolls, in a terminal of its own, and all that it has printed."""
+
+    def __init__(self, machine: Machine, home: Path) -> None:
+        self.text = ""
+        ours, theirs = pty.openpty()
+        command = [
+            *(sys.executable, "-m", "device_agent", "enroll", "--server", machine.url, "--home", str(home)),
+            *("--name", "visitor", "--device", "visitor=ur5"),
+        ]
+        self.process = subprocess.Popen(
+            command, cwd=ROOT, stdin=theirs, stdout=theirs, stderr=theirs, env=os.environ | {"COLUMNS": "80"}
+        )
+        os.close(theirs)
+        self._ours = ours
+        self._reader = threading.Thread(target=self._read)
+        self._reader.start()
+
+    def _read(self) -> None:
+        with contextlib.suppress(OSError):  # its end
+            decoder = codecs.getincrementaldecoder("utf-8")()
+            while said := os.read(self._ours, 4096):
+                self.text += decoder.decode(said)
+
+    def link(self) -> str:
+        def found() -> re.Match[str] | None:
+            return re.search(r"(http\S+#pair=\S+)\s", self.text)
+
+        wait_until(lambda: found() is not None, "the link", 60)
+        match = found()
+        assert match
+        return match[1]
+
+    def close(self) -> None:
+        if self.process.poll() is None:
+            self.process.send_signal(signal.SIGINT)
+        self.process.wait(20)
+        self._reader.join(10)
+        os.close(self._ours)
+
+
+@pytest.fixture
+def terminal(machine: Machine, tmp_path: Path) -> Iterator[Terminal]:
+    terminal = Terminal(machine, tmp_path)
+    yield terminal
+    terminal.close()
+
+
+def field(page: Page) -> str:
+    return page.get_by_test_id("claim-code").input_value()
+
+
+def test_a_robot_is_paired_by_the_link_in_its_agents_terminal(
+    browser: Browser, machine: Machine, terminal: Terminal
+) -> None:
+    link = terminal.link()
+    # The same link stands there as a picture.
+    drawn = claim_link.picture(link)
+    wait_until(lambda: all(line in terminal.text for line in drawn), "the QR code", 20)
+    with machine.api() as api, person(browser, link) as page:
+        known = {device["id"] for device in api.get("/devices")["items"]}
+        # Nobody is signed in: the code leaves the address and is there again afterwards. Nothing is claimed by itself.
+        expect(page.get_by_text("Sign in, and you go on from there")).to_be_visible(timeout=PATIENCE_MS)
+        assert "pair=" not in page.url
+        page.goto(machine.sign_in_link())
+        expect(page.get_by_test_id("claim-code")).to_have_value(link.partition("=")[2], timeout=PATIENCE_MS)
+        assert {device["id"] for device in api.get("/devices")["items"]} == known
+        assert_good_page(page, "pairing")
+
+        # A wrong code pairs nothing, says so, and costs nothing that was typed.
+        right = field(page)
+        page.get_by_test_id("claim-code").fill("bcdf")
+        page.get_by_test_id("claim").click()
+        expect(page.get_by_role("alert")).to_contain_text("eight letters")
+        page.get_by_test_id("claim-code").fill("zzzz zzzz")
+        page.get_by_test_id("claim-space").select_option("new")
+        page.get_by_label("Name of the new space").fill("Guest room")
+        page.get_by_test_id("claim").press("Enter")
+        expect(page.get_by_role("alert")).to_contain_text("Nothing is paired", timeout=PATIENCE_MS)
+        assert field(page) == "zzzz zzzz"
+        assert page.get_by_test_id("claim-space").locator("option:checked").inner_text() == "Guest room"
+        assert_good_page(page, "pairing-wrong")
+
+        page.get_by_test_id("claim-code").fill(right)
+        page.get_by_test_id("claim").press("Enter")
+        expect(page.get_by_test_id("paired")).to_be_visible(timeout=PATIENCE_MS)
+        assert terminal.process.wait(30) == 0
+        assert "paired with demo" in terminal.text
+        row = page.get_by_test_id("paired-device")
+        expect(row).to_contain_text("Guest room")
+        expect(row).to_contain_text("Waiting for its first word")
+        spaces = [space["name"] for space in api.get("/spaces")["items"]]
+        assert spaces.count("Guest room") == 1, "the second try went into the space of the first"
+
+        # It is given a name, and its own again.
+        before = row.get_by_role("link").inner_text()
+        row.get_by_test_id("rename").press("Enter")
+        row.get_by_test_id("name").fill("Visitor")
+        assert_good_page(page, "paired")
+        row.get_by_test_id("save-name").press("Enter")
+        expect(row.get_by_role("link")).to_have_text("Visitor", timeout=PATIENCE_MS)
+        row.get_by_test_id("undo-name").press("Enter")
+        expect(row.get_by_role("link")).to_have_text(before, timeout=PATIENCE_MS)
+
+        # Used once, the code is worth nothing any more.
+        page.get_by_role("button", name="Pair another").click()
+        page.get_by_test_id("claim-code").fill(right)
+        page.get_by_test_id("claim").click()
+        expect(page.get_by_role("alert")).to_contain_text("was used already", timeout=PATIENCE_MS)
+        (paired,) = [device for device in api.get("/devices")["items"] if device["id"] not in known]
+        api.http.delete(f"/agents/{paired['agent']}").raise_for_status()

@@ -1,0 +1,217 @@
+"""A robot type from files in somebody's hands to the list: refused so that one can mend it, seen, saved, deleted."""
+
+import io
+import zipfile
+from collections.abc import Mapping
+from pathlib import Path
+
+from playwright.sync_api import FilePayload, Locator, Page, expect, sync_playwright
+
+from tests.support.brokers import wait_until
+from tests.support.browser import PATIENCE_MS, chromium, pages
+from tests.support.machine import Machine
+from tests.support.pages import assert_good_page
+
+MANIFEST = """type = "reacher"
+version = 1
+label = "Reacher"
+kind = "arm"
+description = "Two joints, one above the other."
+model = "reacher.xml"
+scene = "scene.xml"
+driver = "mujoco"
+period_ms = 20
+braking_rad_s2 = 12.0
+frames = ["tip"]
+capabilities = ["joints", "movements"]
+home_rad = { shoulder = 0.0, elbow = 0.5 }
+
+[[streams]]
+name = "joints"
+rate_hz = 20.0
+""" + "".join(
+    f"""
+[[joints]]
+name = "{name}"
+label = "{name.capitalize()}"
+lower_rad = -1.5
+upper_rad = 1.5
+max_velocity_rad_s = 1.5
+max_acceleration_rad_s2 = 6.0
+max_jerk_rad_s3 = 60.0
+max_effort_nm = 20.0
+"""
+    for name in ("shoulder", "elbow")
+)
+MODEL = """<mujoco model="reacher"><compiler angle="radian" autolimits="true"/>
+  <worldbody>
+    <body name="base">
+      <geom type="cylinder" size="0.06 0.05" pos="0 0 0.05" rgba="0.3 0.35 0.4 1"/>
+      <body name="upper" pos="0 0 0.12" gravcomp="1">
+        <joint name="shoulder" axis="0 1 0" range="-1.6 1.6" damping="1" armature="0.05"/>
+        <geom type="capsule" size="0.03" fromto="0 0 0 0 0 0.3" mass="0.5" rgba="0.16 0.5 0.75 1"/>
+        <body name="lower" pos="0 0 0.3" gravcomp="1">
+          <joint name="elbow" axis="0 1 0" range="-1.6 1.6" damping="1" armature="0.05"/>
+          <geom type="capsule" size="0.025" fromto="0 0 0 0 0 0.25" mass="0.3" rgba="0.9 0.5 0.1 1"/>
+          <site name="tip" pos="0 0 0.25"/>
+        </body>
+      </body>
+    </body>
+  </worldbody>
+  <actuator>
+    <position name="shoulder" joint="shoulder" kp="60" kv="4" ctrlrange="-1.5 1.5" forcerange="-20 20"/>
+    <position name="elbow" joint="elbow" kp="60" kv="4" ctrlrange="-1.5 1.5" forcerange="-20 20"/>
+  </actuator>
+</mujoco>
+"""
+SCENE = """<mujoco model="reacher_scene">
+  <include file="reacher.xml"/>
+  <worldbody>
+    <camera name="picture" pos="0.9 -0.9 0.6" xyaxes="0.7 0.7 0 -0.2 0.2 0.95"/>
+    <geom name="floor" type="plane" size="1 1 0.1"/>
+  </worldbody>
+</mujoco>
+"""
+BOW = '"""Bow, and come up again."""\nrobot.move_joints({"shoulder": 0.6}, speed=0.5)\nrobot.home()\n'
+GOOD = {"robot.toml": MANIFEST, "reacher.xml": MODEL, "scene.xml": SCENE, "movements/bow.py": BOW}
+WORSE = MODEL.replace("<worldbody>", '<asset><mesh name="hand" file="hand.stl"/></asset><worldbody>', 1).replace(
+    '<site name="tip"', '<geom type="mesh" mesh="hand"/><site name="tip"'
+)
+BROKEN = {
+    **GOOD,
+    "robot.toml": MANIFEST.replace("upper_rad = 1.5", "upper_rad = 2.5", 1),
+    "reacher.xml": WORSE,
+    "scene.xml": SCENE.replace("</worldbody>", "</wurldbody>"),
+}
+"""A limit wider than the joint's, a mesh that is not there, and torn XML in line 6."""
+
+
+def archive(files: Mapping[str, str]) -> FilePayload:
+    """A zip of a folder, with what file managers add."""
+    held = io.BytesIO()
+    with zipfile.ZipFile(held, "w") as made:
+        for name, text in files.items():
+            made.writestr(f"reacher/{name}", text)
+        made.writestr("__MACOSX/reacher/._robot.toml", "x")
+    return {"name": "reacher.zip", "mimeType": "application/zip", "buffer": held.getvalue()}
+
+
+def at_step(page: Page, step: str) -> None:
+    expect(page.locator(f"[data-testid=add-type][data-step={step}]")).to_be_visible(timeout=PATIENCE_MS)
+
+
+def replace(page: Page, folder: Path, name: str, text: str) -> None:
+    """One file in the place of one that was chosen."""
+    (folder / name).write_text(text)
+    page.locator(f"[data-file='{name}'] input").set_input_files(folder / name)
+
+
+def frames(view: Locator) -> int:
+    return int(view.get_attribute("data-frames") or 0)
+
+
+def finding(page: Page, kind: str, level: str = "error") -> Locator:
+    return page.locator(f"[data-testid={level}][data-kind={kind}]")
+
+
+def test_a_robot_type_is_mended_seen_saved_and_deleted(machine: Machine, tmp_path: Path) -> None:
+    with sync_playwright() as playwright, chromium(playwright) as browser, pages(browser, machine) as (page,):
+        page.get_by_role("link", name="Robot types").click()
+        expect(page.locator("[data-testid=type-row][data-type=ur5]")).to_be_visible()
+        expect(page.locator("[data-type=ur5]")).to_contain_text("1 device")
+        page.get_by_test_id("add-robot-type").click()
+        assert_good_page(page, "robot-type-add")
+        is_refused(page)
+        is_mended(page, tmp_path)
+        is_looked_at(page, machine)
+        is_saved(page, machine)
+        is_deleted(page, machine)
+
+        # A type that comes with the installation has its picture too.
+        page.locator("[data-type=ur5] a").click()
+        view = page.get_by_test_id("model-view")
+        wait_until(lambda: frames(view) > 0, "a picture", 30)
+        expect(page.get_by_test_id("delete-type")).to_have_count(0)
+
+
+def is_refused(page: Page) -> None:
+    """What is no archive says so; then all that is wrong is told at once, each with its file and what to do."""
+    torn: FilePayload = {"name": "torn.zip", "mimeType": "application/zip", "buffer": b"PK\x03\x04 and no more"}
+    page.get_by_test_id("type-files").set_input_files([torn])
+    expect(page.get_by_role("alert").filter(has_text="torn.zip cannot be unpacked")).to_be_visible()
+
+    page.get_by_test_id("type-files").set_input_files([archive(BROKEN)])
+    at_step(page, "wrong")
+    expect(finding(page, "torn")).to_contain_text("scene.xml, line 6")
+    expect(finding(page, "missing")).to_contain_text("reacher.xml, line 2")
+    expect(finding(page, "missing")).to_contain_text("Add hand.stl, or take it out of reacher.xml.")
+    expect(finding(page, "range").first).to_contain_text("joint shoulder go from -91.7° to 91.7°")
+    expect(page.get_by_test_id("error")).to_have_count(4)
+    assert "Traceback" not in page.inner_text("body")
+    assert_good_page(page, "robot-type-wrong")
+    rows = page.locator("[data-testid=chosen-files] li")
+    expect(rows).to_have_count(4)
+
+
+def is_mended(page: Page, folder: Path) -> None:
+    """The files have stayed, and are exchanged one by one."""
+    replace(page, folder, "scene.xml", SCENE)
+    replace(page, folder, "robot.toml", MANIFEST)
+    expect(page.get_by_test_id("error")).to_have_count(1, timeout=PATIENCE_MS)
+    expect(finding(page, "missing")).to_be_visible()
+    replace(page, folder, "reacher.xml", MODEL)
+    at_step(page, "good")
+
+
+def is_looked_at(page: Page, machine: Machine) -> None:
+    """Seen before it is saved: each joint moves, and nobody else has it."""
+    view = page.get_by_test_id("model-view")
+    wait_until(lambda: frames(view) > 0, "a picture", 30)
+    before, first = frames(view), view.locator("canvas").screenshot()
+    page.get_by_test_id("model-joint-elbow").focus()
+    page.keyboard.press("End")
+    wait_until(lambda: frames(view) > before, "another picture", 30)
+    expect(page.locator("output[for=model-joint-elbow]")).to_have_text("85.9°")
+    assert view.locator("canvas").screenshot() != first, "the elbow has moved"
+    expect(page.get_by_test_id("found")).to_contain_text("Movements: 1")
+    expect(page.get_by_test_id("found")).to_contain_text("picture")
+    with machine.api() as api:
+        assert "reacher" not in [each["type"] for each in api.get("/robot-types")["items"]]
+    assert_good_page(page, "robot-type-look")
+
+
+def is_saved(page: Page, machine: Machine) -> None:
+    """It has a page of its own, and is in the list."""
+    page.get_by_test_id("save-type").click()
+    expect(page.get_by_test_id("type-saved")).to_be_visible(timeout=PATIENCE_MS)
+    expect(page.locator("[data-testid=saved-movements] [data-accepted=true]")).to_have_text("bow accepted")
+    expect(page.get_by_test_id("command-enroll")).to_have_value(enrolment(machine))
+    assert_good_page(page, "robot-type-saved")
+
+    view = page.get_by_test_id("model-view")
+    page.get_by_test_id("open-type").click()
+    expect(page.get_by_test_id("type-movements")).to_contain_text("Bow, and come up again.")
+    wait_until(lambda: frames(view) > 0, "a picture", 30)
+    expect(page.get_by_test_id("joint-table").locator("tbody tr")).to_have_count(2)
+    assert_good_page(page, "robot-type")
+    page.get_by_role("link", name="Robot types", exact=True).click()
+    expect(page.locator("[data-type=reacher] [data-testid=type-state]")).to_have_attribute("data-state", "ready")
+    assert_good_page(page, "robot-types")
+
+
+def is_deleted(page: Page, machine: Machine) -> None:
+    """While something of it is in use it stays; then it goes."""
+    page.locator("[data-type=reacher] a").click()
+    page.get_by_test_id("delete-type").click()
+    page.get_by_test_id("confirm-yes").click()
+    expect(page.get_by_role("alert").filter(has_text="'reacher' is used by movement bow")).to_be_visible()
+    with machine.api() as api:
+        assert api.http.delete("/robot-types/reacher/movements/bow").is_success
+    page.get_by_test_id("confirm-yes").click()
+    expect(page.locator("[data-type=ur5]")).to_be_visible()
+    expect(page.locator("[data-type=reacher]")).to_have_count(0)
+
+
+def enrolment(machine: Machine) -> str:
+    words = "python -m device_agent enroll --home ~/reacher-agent"
+    return f"{words} --server {machine.url} --device reacher=reacher --no-wait"

@@ -1,0 +1,105 @@
+"""The laboratory as a person sees and uses it: its plan, its camera, its lamp, in a real Chromium."""
+
+import math
+
+from playwright.sync_api import Page, expect, sync_playwright
+
+from device_agent.protocol import room as rooms
+from tests.support.brokers import ROOT, wait_until
+from tests.support.browser import PATIENCE_MS, chromium, pages
+from tests.support.machine import Machine
+from tests.support.pages import assert_good_page
+
+ROBOTS = ("ur5", "nao", "qbo", "hanson")
+FIXED = ("ur5", "hanson")
+
+
+def place(page: Page, who: str) -> tuple[float, float]:
+    """Where the plan shows somebody [m]."""
+    mark = page.get_by_test_id(f"place-{who}")
+    expect(mark).to_be_visible(timeout=PATIENCE_MS)
+    x_m, y_m = (float(mark.get_attribute(f"data-{axis}") or "nan") for axis in "xy")
+    return x_m, y_m
+
+
+def picture(page: Page) -> str:
+    """The pixels that are on the canvas now."""
+    shown: str = page.get_by_test_id("camera-picture").evaluate("canvas => canvas.toDataURL()")
+    return shown
+
+
+def lux(page: Page) -> float:
+    return float(page.get_by_test_id("value-light_lux").get_attribute("data-value") or "nan")
+
+
+def open_device(page: Page, name: str) -> None:
+    page.get_by_test_id("device-row").filter(has_text=name).get_by_role("link").first.click()
+    expect(page.locator(".desk.room")).to_be_visible(timeout=PATIENCE_MS)
+
+
+def test_the_room_is_seen_and_used(laboratory: Machine) -> None:
+    room = rooms.load(ROOT / "robots" / "rooms" / "lab")
+    with sync_playwright() as playwright, chromium(playwright) as browser, pages(browser, laboratory, 2) as (ann, bob):
+        # The four robots stand on the plan where the room sees them, the fixed ones where they are screwed down.
+        ann.get_by_test_id("plan-link").click()
+        for name in ROBOTS:
+            x_m, y_m = place(ann, name)
+            assert room.plan.lower_m[0] < x_m < room.plan.upper_m[0], name
+            assert room.plan.lower_m[1] < y_m < room.plan.upper_m[1], name
+            robot = room.robot(name)
+            assert robot is not None
+            assert name not in FIXED or math.dist((x_m, y_m), robot.position_m[:2]) < 0.3, (name, x_m, y_m)
+        wait_until(lambda: bool(ann.get_by_test_id("plan").get_attribute("data-floor")), "the floor", 30)
+
+        assert_good_page(ann, "plan")
+
+        # A pin opens what hangs there.
+        ann.get_by_test_id("plan").get_by_role("link", name="Camera in the corner").click()
+        ann.get_by_test_id("camera-live").click()
+        canvas = ann.get_by_test_id("camera-picture")
+        wait_until(lambda: canvas.get_attribute("data-sequence") is not None, "a picture", 30)
+        first = picture(ann)
+        wait_until(lambda: picture(ann) != first, "another picture", 30)
+        ann.get_by_test_id("camera-live").click()
+        expect(ann.get_by_test_id("camera-live")).to_have_attribute("aria-pressed", "false")
+        ann.wait_for_timeout(300)  # one picture may be under way
+        last = canvas.get_attribute("data-sequence")
+        ann.wait_for_timeout(700)
+        assert canvas.get_attribute("data-sequence") == last, "pictures still come, though nobody watches"
+
+        # One page gathers light, the other turns the lamp on and off.
+        open_light(bob)
+        ann.goto(f"{laboratory.url}/#/")
+        open_device(ann, "Lamps on the ceiling")
+        ann.get_by_test_id("level-most").click()
+        expect(ann.get_by_test_id("applied-level")).to_have_attribute("data-value", "1", timeout=PATIENCE_MS)
+        bob.wait_for_timeout(1500)  # the meter's own lag
+        bright = lux(bob)
+        ann.get_by_test_id("level-least").click()
+        expect(ann.get_by_test_id("applied-level")).to_have_attribute("data-value", "0", timeout=PATIENCE_MS)
+        wait_until(lambda: lux(bob) < bright - 100, f"less light than {bright} lx", 30)
+        assert_good_page(bob, "light")
+        bob.get_by_test_id("gather").click()
+        expect(bob.get_by_test_id("gather-state")).to_have_attribute("data-running", "false", timeout=PATIENCE_MS)
+
+        # As it was, for who comes next; by the keyboard.
+        slider = ann.get_by_test_id("set-level")
+        slider.focus()
+        for _ in range(7):
+            ann.keyboard.press("PageUp")
+        wait_until(lambda: applied(ann) > 0.5, "the lamp to be on again", 30)
+
+
+def applied(page: Page) -> float:
+    return float(page.get_by_test_id("applied-level").get_attribute("data-value") or "nan")
+
+
+def open_light(page: Page) -> None:
+    """The light meter's page, measuring five times a second."""
+    page.get_by_test_id("search").fill("light meter")
+    expect(page.get_by_test_id("device-row")).to_have_count(1)
+    open_device(page, "Light")
+    page.get_by_test_id("gather-rate").fill("5")
+    page.get_by_test_id("gather").click()
+    expect(page.get_by_test_id("gather-state")).to_have_attribute("data-running", "true", timeout=PATIENCE_MS)
+    wait_until(lambda: lux(page) > 0, "light", 30)

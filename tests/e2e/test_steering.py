@@ -1,0 +1,276 @@
+"""Robots moved by hand, by a stick, keys, held pads, a gamepad: while they are held the simulation moves, no longer."""
+
+import contextlib
+from collections.abc import Callable, Iterator
+
+import pytest
+from playwright.sync_api import Browser, Error, Locator, Page, expect, sync_playwright
+
+from tests.support.brokers import wait_until
+from tests.support.browser import PATIENCE_MS, chromium, pages
+from tests.support.machine import Machine, Trace
+from tests.support.pages import assert_good_page
+
+TRIES = 8
+GAMEPAD = """() => {
+    const made = {
+        id: "Scripted pad", index: 0, connected: true, mapping: "standard", timestamp: 0,
+        axes: [0, 0, 0, 0],
+        buttons: Array.from({length: 17}, () => ({pressed: false, touched: false, value: 0})),
+    };
+    window.scriptedPad = made;
+    navigator.getGamepads = () => (made.connected ? [made] : []);
+}"""
+PRESS = (
+    "([index, down]) => { window.scriptedPad.buttons[index] = {pressed: down, touched: down, value: down ? 1 : 0}; }"
+)
+PUSH = "([axis, value]) => { window.scriptedPad.axes[axis] = value; }"
+SHOULDER, B = 5, 1
+
+
+@pytest.fixture(scope="module")
+def browser() -> Iterator[Browser]:
+    with sync_playwright() as playwright, chromium(playwright) as browser:
+        yield browser
+
+
+@contextlib.contextmanager
+def at(browser: Browser, machine: Machine, name: str) -> Iterator[Page]:
+    """Somebody on a robot's page."""
+    with pages(browser, machine) as (page,):
+        page.get_by_test_id("device-row").filter(has_text=name).get_by_role("link").first.click()
+        expect(page.get_by_test_id("control-state")).to_be_visible(timeout=PATIENCE_MS)
+        yield page
+
+
+def wheels(trace: Trace) -> tuple[float, float]:
+    """How fast the Qbo's wheels turn in the simulation, left and right [rad/s]."""
+    turning = trace.now()["qvel"]
+    return float(turning["left_wheel"]), float(turning["right_wheel"])
+
+
+def rolls(trace: Trace) -> bool:
+    return all(each > 0.5 for each in wheels(trace))
+
+
+def stands(trace: Trace) -> bool:
+    return all(abs(each) < 0.05 for each in wheels(trace))
+
+
+def mine(station: Page | Locator) -> bool:
+    return station.get_by_test_id("control-state").get_attribute("data-state") == "mine"
+
+
+def take(station: Page | Locator) -> None:
+    """Take control, again where a busy robot had to hold and has ended it, until the stream may begin."""
+    button, stream = station.get_by_test_id("take-control"), station.get_by_test_id("stream-state")
+
+    def may() -> bool:
+        if not mine(station):
+            with contextlib.suppress(Error):  # gone between the look and the click, or not to be pressed yet
+                button.click(timeout=1000)
+        return mine(station) and stream.get_attribute("data-state") != "blocked"
+
+    wait_until(may, "control", 60)
+
+
+def give_back(page: Page) -> None:
+    with contextlib.suppress(Error):  # a robot that had to hold has ended it already
+        page.get_by_test_id("release-control").click(timeout=1000)
+
+
+def holding(
+    station: Page | Locator,
+    press: Callable[[], None],
+    let_go: Callable[[], None],
+    moved: Callable[[], bool],
+    what: str,
+) -> None:
+    """Hold something until the simulation has moved, then let go.
+
+    On a machine so busy that setpoints come late, the robot holds and ends the control, as it must: take it again.
+    """
+    page = station if isinstance(station, Page) else station.page
+    for _ in range(TRIES):
+        take(station)
+        press()
+        for _ in range(40):
+            if moved():
+                let_go()
+                return
+            if not mine(station):
+                break
+            page.wait_for_timeout(50)
+        let_go()
+    pytest.fail(f"{what} never happened")
+
+
+def hold_key(station: Page | Locator, key: str, moved: Callable[[], bool], what: str) -> None:
+    keyboard = (station if isinstance(station, Page) else station.page).keyboard
+    holding(station, lambda: keyboard.down(key), lambda: keyboard.up(key), moved, what)
+
+
+def test_the_base_is_driven_by_stick_and_keys_while_they_are_held(browser: Browser, laboratory: Machine) -> None:
+    trace = laboratory.trace("qbo")
+    with at(browser, laboratory, "Qbo") as page:
+        page.get_by_test_id("tab-drive").click()
+        page.get_by_test_id("show-keys").click()
+        assert_good_page(page, "steer-drive", part="steer-card")
+        page.get_by_test_id("show-keys").click()
+        page.set_viewport_size({"width": 1440, "height": 900})
+
+        def stick() -> None:
+            box = page.get_by_test_id("stick").bounding_box()
+            assert box is not None
+            page.mouse.move(box["x"] + box["width"] / 2, box["y"] + box["height"] / 2)
+            page.mouse.down()
+            page.mouse.move(box["x"] + box["width"] / 2, box["y"] + 2, steps=4)
+
+        holding(page, stick, page.mouse.up, lambda: rolls(trace), "the stick driving")
+        wait_until(lambda: stands(trace), "rest after the stick was let go", 10)
+
+        page.get_by_test_id("stick").focus()
+        hold_key(page, "ArrowLeft", lambda: wheels(trace)[1] > 0.3 > -0.3 > wheels(trace)[0], "a turn by the arrow key")
+        wait_until(lambda: stands(trace), "rest after the key was let go", 10)
+
+        # Letters reach it from anywhere, but not from a text field; and while the window is left nothing is held.
+        page.get_by_test_id("tab-drive").focus()
+        hold_key(page, "w", lambda: rolls(trace), "driving by the letter key")
+        wait_until(lambda: stands(trace), "rest after the letter key was let go", 10)
+
+        def leave() -> None:
+            page.evaluate("() => dispatchEvent(new Event('blur'))")
+
+        holding(page, lambda: page.keyboard.down("w"), leave, lambda: rolls(trace), "driving once more")
+        wait_until(lambda: stands(trace), "rest after the window was left", 10)
+        page.keyboard.up("w")
+        page.get_by_test_id("tab-joints").click()
+        page.get_by_test_id("target-head_pan").focus()
+        take(page)
+        page.get_by_test_id("target-head_pan").focus()
+        page.keyboard.down("t")
+        page.keyboard.up("t")
+        assert mine(page), "a letter in a text field gave control away"
+        give_back(page)
+
+
+def test_a_frame_is_moved_while_a_pad_is_held(browser: Browser, laboratory: Machine) -> None:
+    with at(browser, laboratory, "UR5") as page:
+        page.get_by_test_id("tab-jog").click()
+        pose = page.get_by_test_id("live-pose")
+        wait_until(lambda: bool(pose.get_attribute("data-value")), "the pose", 30)
+
+        def height() -> float:
+            return float((pose.get_attribute("data-value") or "nan nan nan").split()[2])
+
+        assert_good_page(page, "steer-jog", part="steer-card")
+        page.set_viewport_size({"width": 1440, "height": 900})
+        pad = page.get_by_test_id("hold-z+")
+        below = height()
+
+        def press() -> None:
+            pad.scroll_into_view_if_needed()
+            pad.hover()
+            page.mouse.down()
+
+        holding(page, press, page.mouse.up, lambda: height() > below + 0.02, "the frame rising")
+        trace = laboratory.trace("ur5")
+        wait_until(lambda: max(map(abs, trace.now()["qvel"].values())) < 0.01, "rest after the pad was let go", 10)
+        hold_key(page, "f", lambda: height() < below + 0.01, "the frame sinking by its key")
+
+        # Joints by keys: the third is the elbow.
+        page.get_by_test_id("tab-joints").click()
+        elbow = float(trace.now()["qpos"]["elbow"])
+        page.keyboard.press("3")
+        page.get_by_role("heading", level=1).click()
+        hold_key(page, "ArrowDown", lambda: float(trace.now()["qpos"]["elbow"]) < elbow - 0.05, "the elbow by its key")
+        hold_key(page, "ArrowUp", lambda: float(trace.now()["qpos"]["elbow"]) > elbow - 0.02, "the elbow back")
+        page.keyboard.press("t")
+        expect(page.get_by_test_id("take-control")).to_be_visible(timeout=PATIENCE_MS)
+
+
+def test_a_gamepad_moves_nothing_without_its_dead_man_button(browser: Browser, laboratory: Machine) -> None:
+    trace = laboratory.trace("qbo")
+    with at(browser, laboratory, "Qbo") as page:
+        page.get_by_test_id("tab-drive").click()
+        page.evaluate(GAMEPAD)
+        expect(page.get_by_test_id("gamepad")).to_contain_text("Scripted pad", timeout=PATIENCE_MS)
+        take(page)
+        page.evaluate(PUSH, [1, -1.0])
+        page.wait_for_timeout(600)
+        assert stands(trace), "it was driven without the button"
+
+        def press(down: bool) -> Callable[[], None]:
+            return lambda: page.evaluate(PRESS, [SHOULDER, down])
+
+        holding(page, press(True), press(False), lambda: rolls(trace), "the gamepad driving")
+        wait_until(lambda: stands(trace), "rest after the button was let go", 10)
+
+        # Gone in the middle of it: the same as let go.
+        unplug = "() => { window.scriptedPad.connected = false; }"
+        holding(page, press(True), lambda: page.evaluate(unplug), lambda: rolls(trace), "the gamepad driving again")
+        wait_until(lambda: stands(trace), "rest after the gamepad was gone", 10)
+        expect(page.get_by_test_id("gamepad")).to_contain_text("disconnected", ignore_case=True)
+
+        page.evaluate("() => { window.scriptedPad.connected = true; }")
+        page.evaluate(PRESS, [B, True])
+        expect(page.get_by_test_id("stop-banner")).to_have_attribute("data-state", "latched", timeout=PATIENCE_MS)
+        page.evaluate(PRESS, [B, False])
+        reset(page)
+
+
+def test_two_robots_have_a_page_with_a_control_each_and_one_stop(browser: Browser, laboratory: Machine) -> None:
+    with pages(browser, laboratory) as (page,):
+        for name in ("UR5", "Qbo"):
+            page.get_by_test_id("device-row").filter(has_text=name).get_by_test_id("pick").check()
+        page.get_by_test_id("operate-together").click()
+        stations = page.get_by_test_id("station")
+        expect(stations).to_have_count(2, timeout=PATIENCE_MS)
+        arm = stations.filter(has=page.get_by_role("heading", name="UR5"))
+        qbo = stations.filter(has=page.get_by_role("heading", name="Qbo"))
+
+        # Control of one is not control of the other.
+        take(arm)
+        expect(qbo.get_by_test_id("control-state")).to_have_attribute("data-state", "free")
+        take(qbo)
+        assert_good_page(page, "together")
+        page.set_viewport_size({"width": 1440, "height": 900})
+
+        # Keys move the one that was chosen last, which is marked.
+        trace = laboratory.trace("qbo")
+        arm_trace = laboratory.trace("ur5")
+        qbo.get_by_test_id("tab-drive").click()
+        arm.get_by_test_id("tab-jog").click()
+        expect(arm).to_have_attribute("data-chosen", "true")
+        qbo.get_by_test_id("choose").click()
+        expect(qbo).to_have_attribute("data-chosen", "true")
+        expect(arm).to_have_attribute("data-chosen", "false")
+        wait_until(lambda: speed(arm_trace) < 0.01, "the arm to rest", 10)
+        hold_key(qbo, "w", lambda: rolls(trace), "driving the chosen one")
+        assert speed(arm_trace) < 0.05, "the key moved the other robot"
+
+        # One key for all of them, while one of them moves.
+        holding(qbo, lambda: page.keyboard.down("w"), lambda: None, lambda: rolls(trace), "driving again")
+        page.keyboard.press("Escape")
+        for station in (arm, qbo):
+            expect(station.get_by_test_id("stop-banner")).to_have_attribute(
+                "data-state", "latched", timeout=PATIENCE_MS
+            )
+        wait_until(lambda: stands(trace), "rest after Stop", 10)
+        page.keyboard.up("w")
+        for station in (arm, qbo):
+            reset(station)
+        page.get_by_test_id("stop-all").click()
+        for station in (arm, qbo):
+            reset(station)
+
+
+def speed(trace: Trace) -> float:
+    """Of the fastest joint of a simulation [rad/s]."""
+    return max(abs(float(each)) for each in trace.now()["qvel"].values())
+
+
+def reset(station: Locator | Page) -> None:
+    station.get_by_test_id("reset-stop").click()
+    station.get_by_test_id("confirm-reset").click()
+    expect(station.get_by_test_id("stop-banner")).to_be_hidden(timeout=PATIENCE_MS)
