@@ -90,8 +90,8 @@ web/dist/index.html: web/node_modules/.installed web/index.html web/package.json
 test: .venv/.dev console check tests/azurite/node_modules/.installed tests/oidc/node_modules/.installed .venv/.azure-worker coverage
 	@tests/system-packages
 	@$(NPM) test --silent
-	@$(BIN)/python -m pytest -m "not long" $(SIDE_BY_SIDE) --ignore tests/unit/agent $(ALONE:%=--ignore %)
-	@$(BIN)/python -m pytest -m "not long" $(ALONE)
+	@tests/twice -m "not long" $(SIDE_BY_SIDE) --ignore tests/unit/agent $(ALONE:%=--ignore %)
+	@tests/twice -m "not long" $(ALONE)
 
 test-long: .venv/.dev console check tests/azurite/node_modules/.installed tests/oidc/node_modules/.installed .venv/.azure-worker coverage
 	@tests/system-packages
