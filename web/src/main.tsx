@@ -7,7 +7,7 @@ import { FollowedCode, pairingCode } from "./core/pairing";
 import { Session, signInFailure, signInToken } from "./core/session";
 import "./style.css";
 import { texts } from "./texts";
-import { App } from "./ui/app";
+import { App, fetchEarly } from "./ui/app";
 import { invitationAddress, pairAddress, replaceWith } from "./ui/route";
 
 const api = new Api();
@@ -56,6 +56,7 @@ effect(() => {
 effect(() => {
   if (session.state.value.kind === "in" && pairing.code.value !== null) replaceWith(pairAddress);
 });
+fetchEarly();
 startClock();
 void session.start(takeToken(), takeFailure());
 addEventListener("hashchange", () => {

@@ -28,6 +28,8 @@ function deg(rad: number): string {
 
 export const texts = {
   product: "Telescope",
+  /** In the browser's tab. */
+  titled: (page: string): string => (page === "" ? "Telescope" : `${page} · Telescope`),
   loading: "Loading …",
   skipToContent: "Skip to the content",
 

@@ -7,26 +7,21 @@ import type { FollowedInvitation } from "../core/invitation";
 import type { FollowedCode } from "../core/pairing";
 import type { Session } from "../core/session";
 import { texts } from "../texts";
-import { AccountPage } from "./account-page";
-import { ActivityPage } from "./activity-page";
-import { DevicePage } from "./device-page";
-import { FleetPage } from "./fleet-page";
-import { InvitationPage } from "./invitation-page";
 import { later } from "./later";
 import { Navigation } from "./navigation";
+import { type At, type PageProps, ROWS } from "./pages";
 import { route } from "./route";
 import { SignIn } from "./sign-in";
-import { SpacePage } from "./space-page";
 
-const TogetherPage = later(() => import("./steer/together-page").then((page) => page.TogetherPage));
-const RobotTypesPage = later(() => import("./robot-types/list-page").then((page) => page.RobotTypesPage));
-const AddRobotTypePage = later(() => import("./robot-types/add-page").then((page) => page.AddRobotTypePage));
-const RobotTypePage = later(() => import("./robot-types/type-page").then((page) => page.RobotTypePage));
-const HealthPage = later(() => import("./health-page").then((part) => part.HealthPage));
-const TimesPage = later(() => import("./times-page").then((part) => part.TimesPage));
-const LibraryPage = later(() => import("./movements/library-page").then((found) => found.LibraryPage));
-const EditorPage = later(() => import("./movements/editor-page").then((found) => found.EditorPage));
-const PairingPage = later(async () => (await import("./pairing-page")).PairingPage);
+const LATER = new Map([...ROWS].map(([name, { load }]) => [name, later(load)]));
+
+/** Fetch what the address names and what must not be waited for, while it is still being asked who this is. */
+export function fetchEarly(): void {
+  for (const [name, { early }] of ROWS) {
+    // What fails here is tried again, and said, when it is opened.
+    if (early === true || name === route.value.page) LATER.get(name)?.fetch().catch(() => undefined);
+  }
+}
 
 interface AppProps {
   api: Api;
@@ -62,8 +57,6 @@ export function App({ api, session, followed, pairing }: AppProps) {
   }
 }
 
-const KeyframesPage = later(() => import("./keyframes/page").then((page) => page.KeyframesPage));
-
 interface SignedInProps extends AppProps {
   account: Account;
 }
@@ -83,7 +76,6 @@ function SignedIn({ api, session, followed, pairing, account }: SignedInProps) {
     };
   }, [api, session]);
   if (fleet === null) return null;
-  const at = route.value;
   return (
     <>
       <a class="skip" href="#content" onClick={focusContent}>
@@ -91,43 +83,24 @@ function SignedIn({ api, session, followed, pairing, account }: SignedInProps) {
       </a>
       <Navigation account={account} session={session} />
       <LinkBanner fleet={fleet} />
-      {at.page === "fleet" && <FleetPage api={api} fleet={fleet} />}
-      {at.page === "keyframes" && (
-        <KeyframesPage key={`${at.id}/${at.name}`} api={api} fleet={fleet} account={account} id={at.id} name={at.name} />
-      )}
-      {at.page === "account" && <AccountPage api={api} fleet={fleet} />}
-      {at.page === "activity" && <ActivityPage api={api} fleet={fleet} />}
-      {at.page === "invitation" && (
-        <InvitationPage api={api} fleet={fleet} account={account} followed={followed} />
-      )}
-      {at.page === "robot-types" && <RobotTypesPage api={api} fleet={fleet} />}
-      {at.page === "add-robot-type" && <AddRobotTypePage api={api} />}
-      {at.page === "robot-type" && <RobotTypePage key={at.id} api={api} fleet={fleet} id={at.id} />}
-      {at.page === "health" && (
-        <HealthPage key={at.device + at.space} api={api} fleet={fleet} account={account} device={at.device} space={at.space} />
-      )}
-      {at.page === "times" && (
-        <TimesPage key={at.device} api={api} fleet={fleet} account={account} device={at.device} />
-      )}
-      {at.page === "movements" && <LibraryPage api={api} fleet={fleet} />}
-      {at.page === "movement" && (
-        <EditorPage
-          key={`${at.robotType}/${at.name}`}
-          api={api}
-          fleet={fleet}
-          account={account}
-          robotType={at.robotType}
-          name={at.name}
-        />
-      )}
-      {at.page === "pair" && <PairingPage api={api} fleet={fleet} followed={pairing} />}
-      {at.page === "space" && <SpacePage key={at.id} api={api} fleet={fleet} account={account} id={at.id} />}
-      {at.page === "together" && (
-        <TogetherPage key={at.ids.join()} api={api} fleet={fleet} ids={at.ids} account={account} />
-      )}
-      {at.page === "device" && <DevicePage key={at.id} api={api} fleet={fleet} id={at.id} account={account} />}
+      <Opened api={api} fleet={fleet} account={account} followed={followed} pairing={pairing} />
     </>
   );
+}
+
+/** The page that the address names. */
+function Opened(props: Omit<PageProps, keyof At>) {
+  const { page, at } = route.value;
+  const title = ROWS.get(page)?.title ?? "";
+  const name = typeof title === "string" ? title : title(at, props.fleet);
+  useEffect(() => {
+    document.title = texts.titled(name);
+    return () => {
+      document.title = texts.product;
+    };
+  }, [name]);
+  const Page = LATER.get(page)?.Page;
+  return Page === undefined ? null : <Page key={`${page} ${Object.values(at).join()}`} {...props} {...at} />;
 }
 
 async function checkSession(api: Api, session: Session): Promise<void> {

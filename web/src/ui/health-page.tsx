@@ -30,7 +30,7 @@ interface HealthPageProps {
 export function HealthPage({ device, space, ...rest }: HealthPageProps) {
   if (device === "") return <HealthList api={rest.api} fleet={rest.fleet} space={space} />;
   return (
-    <DeviceFrame id={device} page="health" {...rest}>
+    <DeviceFrame {...rest} id={device} page="health">
       {(station) => <DeviceHealthView api={rest.api} device={station.device} />}
     </DeviceFrame>
   );

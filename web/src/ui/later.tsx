@@ -3,27 +3,36 @@ import type { ComponentType } from "preact";
 import { useEffect, useState } from "preact/hooks";
 import { texts } from "../texts";
 
-/** The page that `load` brings; it says so while that takes, and offers another try where it fails. */
-export function later<Props extends object>(load: () => Promise<ComponentType<Props>>): ComponentType<Props> {
+export interface Later<Props> {
+  /** The page; it says so while it is still being loaded, and offers another try where that fails. */
+  Page: ComponentType<Props>;
+  /** Load it before it is opened. */
+  fetch: () => Promise<void>;
+}
+
+export function later<Props extends object>(load: () => Promise<ComponentType<Props>>): Later<Props> {
   let known: ComponentType<Props> | null = null;
-  return function Later(props: Props) {
+  const fetch = async (): Promise<void> => {
+    known = await load();
+  };
+  function Page(props: Props) {
     const [, setCame] = useState(known !== null);
     const [failed, setFailed] = useState(false);
     const [tries, setTries] = useState(0);
     useEffect(() => {
-      if (known !== null) return;
+      if (known !== null) {
+        setCame(true); // It came between the drawing and now.
+        return;
+      }
       setFailed(false);
-      load().then(
-        (page) => {
-          known = page;
-          setCame(true);
-        },
+      fetch().then(
+        () => setCame(true),
         () => setFailed(true),
       );
     }, [tries]);
     if (known !== null) {
-      const Page = known;
-      return <Page {...props} />;
+      const Known = known;
+      return <Known {...props} />;
     }
     return (
       <main class="page" id="content">
@@ -37,5 +46,6 @@ export function later<Props extends object>(load: () => Promise<ComponentType<Pr
         )}
       </main>
     );
-  };
+  }
+  return { Page, fetch };
 }

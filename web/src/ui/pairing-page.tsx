@@ -13,10 +13,10 @@ import { deviceAddress, fleetAddress } from "./route";
 interface PairingPageProps {
   api: Api;
   fleet: Fleet;
-  followed: FollowedCode;
+  pairing: FollowedCode;
 }
 
-export function PairingPage({ api, fleet, followed }: PairingPageProps) {
+export function PairingPage({ api, fleet, pairing }: PairingPageProps) {
   const [paired, setPaired] = useState<readonly Device[] | null>(null);
   return (
     <main class="page pairing" id="content">
@@ -28,9 +28,9 @@ export function PairingPage({ api, fleet, followed }: PairingPageProps) {
         <PairForm
           api={api}
           fleet={fleet}
-          followed={followed}
+          pairing={pairing}
           onPaired={(devices) => {
-            followed.drop();
+            pairing.drop();
             setPaired(devices);
           }}
         />
@@ -48,8 +48,8 @@ interface PairFormProps extends PairingPageProps {
 }
 
 /** Whatever a link says, nothing is claimed without a click. What was typed stays until it has come to something. */
-function PairForm({ api, fleet, followed, onPaired }: PairFormProps) {
-  const linked = followed.code.value;
+function PairForm({ api, fleet, pairing, onPaired }: PairFormProps) {
+  const linked = pairing.code.value;
   const [typed, setTyped] = useState(linked ?? "");
   const [spaces, setSpaces] = useState<readonly Space[] | null>(null);
   const [space, setSpace] = useState("");
@@ -168,7 +168,7 @@ function PairForm({ api, fleet, followed, onPaired }: PairFormProps) {
               type="button"
               disabled={busy}
               onClick={() => {
-                followed.drop();
+                pairing.drop();
                 setTyped("");
               }}
             >

@@ -1,101 +1,89 @@
-/** Where the page is: in the address's fragment, which the server never sees. */
+/** Where the page is, in the address's fragment, which the server never sees; and the addresses of all pages. */
 import { signal, type ReadonlySignal } from "@preact/signals";
+import { type At, type PageName, PAGES, ROWS } from "./pages";
 
-export type Route =
-  | { page: "fleet" | "account" | "activity" | "invitation" | "movements" | "pair" }
-  | { page: "movement"; robotType: string; name: string }
-  | { page: "keyframes"; id: string; name: string }
-  | { page: "device" | "space"; id: string }
-  | { page: "together"; ids: readonly string[] }
-  | { page: "robot-types" | "add-robot-type" }
-  | { page: "robot-type"; id: string }
-  | { page: "health" | "times"; device: string; space: string };
-
-export const accountAddress = "#/account";
-export const activityAddress = "#/account/activity";
-export const invitationAddress = "#/invitation";
-export const robotTypesAddress = "#/robot-types";
-export const addRobotTypeAddress = "#/add-robot-type";
-export const movementsAddress = "#/movements";
-export const pairAddress = "#/pair";
-
-/** Of all devices, of one, or of one space's. */
-const KEPT = /^#\/(?:(device|space)s\/([A-Za-z0-9_-]+)\/)?(health|times)$/;
-
-const NAMED: Readonly<Record<string, Route>> = {
-  [accountAddress]: { page: "account" },
-  [activityAddress]: { page: "activity" },
-  [invitationAddress]: { page: "invitation" },
-  [robotTypesAddress]: { page: "robot-types" },
-  [addRobotTypeAddress]: { page: "add-robot-type" },
-  [movementsAddress]: { page: "movements" },
-  [pairAddress]: { page: "pair" },
-};
-
-function read(): Route {
-  const keyframes = /^#\/devices\/([A-Za-z0-9_-]+)\/keyframes(?:\/([A-Za-z0-9_-]+))?$/.exec(location.hash);
-  if (keyframes?.[1] !== undefined) return { page: "keyframes", id: keyframes[1], name: keyframes[2] ?? "" };
-  const found = /^#\/(device|space|robot-type)s\/([A-Za-z0-9_-]+)$/.exec(location.hash);
-  if (found?.[2] !== undefined) return { page: found[1] as "device" | "space" | "robot-type", id: found[2] };
-  const several = /^#\/operate\/([A-Za-z0-9_-]+(?:,[A-Za-z0-9_-]+)*)$/.exec(location.hash)?.[1];
-  if (several !== undefined) return { page: "together", ids: [...new Set(several.split(","))] };
-  const kept = KEPT.exec(location.hash);
-  if (kept !== null) {
-    const [, kind, id = "", page] = kept;
-    return { page: page === "times" ? "times" : "health", device: kind === "device" ? id : "", space: kind === "space" ? id : "" };
-  }
-  const movement = /^#\/movements\/([A-Za-z0-9_-]+)\/([A-Za-z0-9_-]+)$/.exec(location.hash);
-  if (movement?.[1] !== undefined && movement[2] !== undefined) {
-    return { page: "movement", robotType: movement[1], name: movement[2] };
-  }
-  return NAMED[location.hash] ?? { page: "fleet" };
+export interface Route {
+  page: PageName;
+  at: At;
 }
 
-const current = signal(read());
+const NOTHING: At = { device: "", id: "", ids: "", name: "", robotType: "", space: "" };
+
+const EXPRESSIONS: readonly (readonly [PageName, RegExp])[] = [...ROWS].map(([name, { pattern }]) => [
+  name,
+  new RegExp(
+    `^${pattern
+      .replaceAll(/\/:(\w+)\?/g, "(?:/(?<$1>[A-Za-z0-9_,-]+))?")
+      .replaceAll(/\/:(\w+)/g, "/(?<$1>[A-Za-z0-9_,-]+)")}$`,
+  ),
+]);
+
+/** The page of an address; the first one's where there is no such page. */
+export function read(hash: string): Route {
+  for (const [page, expression] of EXPRESSIONS) {
+    const found = expression.exec(hash);
+    if (found === null) continue;
+    const named = Object.entries(found.groups ?? {}).filter(([, value]) => (value as string | undefined) !== undefined);
+    return { page, at: { ...NOTHING, ...Object.fromEntries(named) } };
+  }
+  return { page: "fleet", at: NOTHING };
+}
+
+/** The address of a page, with what its pattern names. */
+function address(page: PageName, at: Partial<At> = {}): string {
+  return PAGES[page].pattern.replaceAll(/\/:(\w+)\??/g, (_, name: keyof At) => (at[name] ? `/${at[name]}` : ""));
+}
+
+const current = signal(read(location.hash));
 export const route: ReadonlySignal<Route> = current;
 
-export const fleetAddress = "#/";
-
-export const healthAddress = "#/health";
-export const timesAddress = "#/times";
+export const accountAddress = address("account");
+export const activityAddress = address("activity");
+export const addRobotTypeAddress = address("addRobotType");
+export const fleetAddress = address("fleet");
+export const healthAddress = address("health");
+export const invitationAddress = address("invitation");
+export const movementsAddress = address("movements");
+export const pairAddress = address("pair");
+export const robotTypesAddress = address("robotTypes");
 
 export function deviceAddress(id: string): string {
-  return `#/devices/${id}`;
+  return address("device", { id });
 }
 
 /** The keyframe editor on a device; without a name a new movement. */
 export function keyframesAddress(device: string, name = ""): string {
-  return `${deviceAddress(device)}/keyframes${name === "" ? "" : `/${name}`}`;
+  return address("keyframes", { id: device, name });
 }
 
 export function spaceAddress(id: string): string {
-  return `#/spaces/${id}`;
+  return address("space", { id });
 }
 
 /** Several devices on one page. */
 export function togetherAddress(ids: readonly string[]): string {
-  return `#/operate/${ids.join(",")}`;
+  return address("together", { ids: ids.join(",") });
 }
 
-export function robotTypeAddress(type: string): string {
-  return `#/robot-types/${type}`;
+export function robotTypeAddress(id: string): string {
+  return address("robotType", { id });
 }
 
 export function healthAddressOf(kind: "device" | "space", id: string): string {
-  return `#/${kind}s/${id}/health`;
+  return kind === "device" ? address("deviceHealth", { device: id }) : address("spaceHealth", { space: id });
 }
 
 export function timesAddressOf(device: string): string {
-  return `#/devices/${device}/times`;
+  return address("deviceTimes", { device });
 }
 
 export function movementAddress(robotType: string, name: string): string {
-  return `${movementsAddress}/${robotType}/${name}`;
+  return address("movement", { robotType, name });
 }
 
 /** Go to a page in the place of this one: the way back does not lead here again. */
-export function replaceWith(address: string): void {
-  location.replace(address);
+export function replaceWith(to: string): void {
+  location.replace(to);
 }
 
-addEventListener("hashchange", () => (current.value = read()));
+addEventListener("hashchange", () => (current.value = read(location.hash)));

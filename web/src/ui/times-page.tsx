@@ -35,7 +35,7 @@ export function TimesPage({ device, ...rest }: TimesPageProps) {
   const devices = rest.fleet.devices.value;
   if (device !== "") {
     return (
-      <DeviceFrame id={device} page="times" {...rest}>
+      <DeviceFrame {...rest} id={device} page="times">
         {(station) => <OfDevice api={rest.api} fleet={rest.fleet} station={station} />}
       </DeviceFrame>
     );

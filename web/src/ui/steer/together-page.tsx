@@ -1,5 +1,5 @@
 /** Several robots on one page, each with its own control; one key and one button stop them all. */
-import { useState } from "preact/hooks";
+import { useMemo, useState } from "preact/hooks";
 import type { Account, Api } from "../../core/api";
 import type { DeviceStore } from "../../core/device";
 import type { Fleet } from "../../core/fleet";
@@ -17,11 +17,13 @@ import "./together.css";
 interface TogetherPageProps {
   api: Api;
   fleet: Fleet;
-  ids: readonly string[];
+  /** Of the devices, with commas between. */
+  ids: string;
   account: Account;
 }
 
-export function TogetherPage({ api, fleet, ids, account }: TogetherPageProps) {
+export function TogetherPage({ api, fleet, ids: asked, account }: TogetherPageProps) {
+  const ids = useMemo(() => [...new Set(asked.split(","))], [asked]);
   const all = fleet.devices.value;
   const devices = ids.map((id) => all?.get(id)).filter((device) => device !== undefined);
   const stations = useStations(api, fleet, devices, account);
