@@ -28,9 +28,11 @@ from device_agent.runtime.journal import Journal
 from device_agent.runtime.outbox import Outbox, Publish
 from device_agent.runtime.pins import Pins
 from device_agent.runtime.room import Room
+from device_agent.runtime.round_trips import RoundTrips
 from device_agent.runtime.shelf import Shelf
 from device_agent.speech import Espeak
 from device_agent.transports.http.api import CloudApi
+from device_agent.transports.http.latencies import HttpLatencies
 from device_agent.transports.http.uploads import HttpUploads
 
 
@@ -209,19 +211,19 @@ def build(home: Home, *, trace: Path | None = None) -> Cell:
         own=[entry.name for entry in configuration.devices],
         named=(*configuration.sources, *_own_streams(configuration)),
     )
-    transport = links.make(
-        links.Wiring(
-            configuration=configuration,
-            pairing=pairing,
-            membership=membership,
-            open_api=lambda: api_of(home, configuration, clock),
-            next_session=journal.next_session,
-            quiet=lambda: agent.quiet,
-            certificate=OwnCertificate(home.folder),
-            now_ms=clock.now_ms,
-            listen=room.topics(),
-        )
+    wiring = links.Wiring(
+        configuration=configuration,
+        pairing=pairing,
+        membership=membership,
+        open_api=lambda: api_of(home, configuration, clock),
+        next_session=journal.next_session,
+        quiet=lambda: agent.quiet,
+        certificate=OwnCertificate(home.folder),
+        now_ms=clock.now_ms,
+        listen=room.topics(),
     )
+    latencies = HttpLatencies(pairing.agent, _carrier(configuration), wiring.open_api)
+    transport = RoundTrips(links.make(wiring), tell=latencies.tell, at_ms=lambda: round(clock.now_ms() or wall_ms()))
     outbox = _outbox(home, configuration, pairing, publish=transport.publish, quiet=lambda: agent.quiet)
     jail = WarmJail(trusted=configuration.trusted_scripts)
     uploads = HttpUploads(pairing.agent, lambda: api_of(home, configuration, clock))
@@ -249,6 +251,12 @@ def build(home: Home, *, trace: Path | None = None) -> Cell:
         )
     agent = Agent(devices, transport, outbox=outbox, room=room, address=(pairing.space, pairing.agent))
     return Cell(agent, journal, membership, jail)
+
+
+def _carrier(configuration: Configuration) -> str:
+    """What carries messages, as the cloud tells it apart."""
+    plain = configuration.transport == "http" and configuration.http.poll == "plain"
+    return "http-poll" if plain else configuration.transport
 
 
 def _own_streams(configuration: Configuration) -> Iterator[tuple[str, str]]:

@@ -146,7 +146,11 @@ class Device:
             outbox=outbox,
         )
         self._filmer = Filmer(
-            robot_type.cameras, driver if isinstance(driver, Filming) else None, name=name, film=self.voice.film
+            robot_type.cameras,
+            driver if isinstance(driver, Filming) else None,
+            name=name,
+            film=self.voice.film,
+            controlled=lambda: self._controller.lease(time.monotonic()) is not None,
         )
         self._room = room
         self._interlocks = Interlocks(
@@ -257,6 +261,7 @@ class Device:
 
     def link_changed(self, up: bool) -> None:
         """The link came or went."""
+        self._filmer.link_changed(up)
         if up:
             self._office.introduce()
         else:

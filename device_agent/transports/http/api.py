@@ -23,6 +23,7 @@ _TIMEOUT_S = 10.0
 _CONNECT_S = 3.0
 ANSWER_WITHIN_S = 4.0
 """What is asked and told all the time is answered within this, or never: the cloud gives a broker that is away 2 s."""
+_NO_CONTENT = 204
 _SERVER_ERROR = 500
 _TOO_MANY = 429
 
@@ -221,6 +222,8 @@ class CloudApi:
         # An answer that was held back (long poll) says little about the moment it was asked for.
         if server_ms.isdecimal() and "wait_ms" not in (request.get("params") or {}):
             self._clock.observe(server_ms=int(server_ms), sent_tick_ms=sent, received_tick_ms=received)
+        if answer.status_code == _NO_CONTENT:
+            return {}
         try:
             body = msgspec.json.decode(answer.content)  # unlike ``answer.json()`` it takes no NaN
         except (msgspec.DecodeError, UnicodeDecodeError, RecursionError):

@@ -16,7 +16,7 @@ from device_agent.links import SOFTWARE
 from device_agent.ports.clock import CloudClock
 from device_agent.protocol import codec, topics
 from device_agent.protocol.messages import Ack, AckStatus, MoveJoints, State
-from device_agent.runtime.home import Configuration, DeviceEntry, Home, Pairing
+from device_agent.runtime.home import Configuration, DeviceEntry, Home, HttpPolling, Pairing
 from device_agent.transports.http.api import CloudApi
 from tests.contract.transports.suite import Spoken
 from tests.support.brokers import wait_until
@@ -213,6 +213,22 @@ class AgentSuite:
         assert resident.move(FAR, epoch=again, wait_for="done")["reason"]["code"] == "stopped"
         assert ground.anna.post(f"/devices/{resident.id}/stop/reset").json() == {"confirmed": True}
         assert resident.move({"shoulder_pan": 0.0}, epoch=resident.take(), wait_for="done")["status"] == "done"
+
+    def test_the_cloud_learns_how_long_messages_take(self, ground: Ground, resident: Resident, spoken: Spoken) -> None:
+        found: list[dict[str, Any]] = []
+
+        def told() -> bool:
+            found[:] = ground.anna.get(f"/devices/{resident.id}/latency", params={"path": "device-cloud"}).json()[
+                "items"
+            ]
+            return bool(found)
+
+        wait_until(told, "samples of the agent's own", PATIENCE_S)
+        polling = spoken.configuration.get("http", HttpPolling())
+        plain = "-poll" if polling.poll == "plain" else ""
+        assert [each["transport"] for each in found] == [spoken.configuration.get("transport", "mqtt") + plain]
+        assert found[0]["count"] >= 1
+        assert found[0]["min_ms"] > 0
 
     def test_a_link_that_is_lost_in_motion_ends_it_and_nothing_resumes(
         self, ground: Ground, resident: Resident, spoken: Spoken

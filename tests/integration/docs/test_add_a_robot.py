@@ -63,7 +63,7 @@ def follow(page: str, home: Path, url: str, environment: Mapping[str, str]) -> s
 
 @pytest.mark.timeout(300)
 def test_the_page_can_be_followed_from_top_to_bottom(ground: Ground, tmp_path: Path) -> None:
-    said = follow(PAGE.read_text(encoding="utf-8"), tmp_path, ground.url, {"TELESCOPE_KEY": ground.anna.token})
+    said = follow(PAGE.read_text(encoding="utf-8"), tmp_path, ground.url, {"TELESCOPE_TOKEN": ground.anna.token})
     assert "type    lever: A lever" in said
     assert "driver  lever" in said
     assert "claim code" in said.lower()
