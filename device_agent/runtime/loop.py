@@ -1,4 +1,8 @@
-"""The control loop of one device: observe, decide, command, every ``period_ms``. The only writer of motor commands."""
+"""The control loop of one device: observe, decide, command, every ``period_ms``. The only writer of motor commands.
+
+While the device rests, a setpoint does not wait for the next period: its own begins when it comes. In motion periods
+keep their length, for each carries one period's way.
+"""
 
 import contextlib
 import logging
@@ -28,7 +32,8 @@ class ControlLoop:
         driver: Not yet connected; this loop alone calls ``observe`` and ``send``.
         controller: Decides.
         name: The device's name.
-        tell: Called with telemetry, 20 times a second at rest and 50 times in motion; must not block.
+        tell: Called with telemetry, 20 times a second at rest and 50 times in motion, and as soon as a new setpoint is
+            applied, though never more than 50 times a second; must not block.
         watch: Called before each decision with the monotonic clock [s]: the room's interlocks. Quick; an error holds.
     """
 
@@ -52,6 +57,8 @@ class ControlLoop:
         self._watch = watch
         self._sequence = 0
         self._next_telemetry_s = 0.0
+        self._told_s = 0.0
+        self._told_setpoint = 0
         self._stopping = threading.Event()
         self._thread = threading.Thread(target=self._run, name=f"{name}-loop", daemon=True)
         self.seen: Observation | None = None
@@ -79,9 +86,10 @@ class ControlLoop:
             self._thread.join(timeout=2)
 
     def _run(self) -> None:
-        next_s = time.monotonic()
+        next_s, early = time.monotonic(), False
         while not self._stopping.is_set():
             now_s = time.monotonic()
+            self._controller.asked.clear()  # what has come until here is decided upon below
             try:
                 self.seen = self._driver.observe()
                 self._watch(now_s)
@@ -98,9 +106,18 @@ class ControlLoop:
                 self._fail(f"internal error: {error}")
             # Late periods are dropped, never made up for: a burst of commands would be a jump.
             next_s = max(next_s + self._period_s, time.monotonic() - self._period_s)
-            pause_s = next_s - time.monotonic()
-            if pause_s > 0:
-                time.sleep(pause_s)
+            # Not twice running, so that a flood of setpoints makes no more than twice the periods.
+            early = self._wait(next_s, sooner=not early)
+            if early:
+                next_s = time.monotonic()
+
+    def _wait(self, next_s: float, *, sooner: bool) -> bool:
+        """Sleep until the next period, or with ``sooner`` until a setpoint for a device at rest; whether one came."""
+        pause_s = max(0.0, next_s - time.monotonic())
+        if sooner and not self._controller.moving:
+            return self._controller.asked.wait(pause_s)
+        time.sleep(pause_s)
+        return False
 
     def _fail(self, message: str) -> None:
         _log.error("%s: %s", self._name, message)
@@ -114,10 +131,13 @@ class ControlLoop:
                 return
 
     def _measure(self, now_s: float, seen: Observation, tick: Tick, applied: tuple[float, ...]) -> None:
-        if now_s < self._next_telemetry_s:
+        news = tick.setpoint_sequence != self._told_setpoint and now_s >= self._told_s + 1 / MOVING_RATE_HZ
+        if now_s < self._next_telemetry_s and not news:
             return
         busy = tick.mode in (Mode.STREAMING, Mode.ACTION) or self._controller.moving
-        self._next_telemetry_s = max(now_s, self._next_telemetry_s + 1 / (MOVING_RATE_HZ if busy else IDLE_RATE_HZ))
+        due_s = min(self._next_telemetry_s, now_s) + 1 / (MOVING_RATE_HZ if busy else IDLE_RATE_HZ)
+        self._next_telemetry_s, self._told_s = max(now_s, due_s), now_s
+        self._told_setpoint = tick.setpoint_sequence
         self._sequence += 1
         self._tell(
             JointTelemetry(

@@ -1,0 +1,98 @@
+"""A setpoint for a device at rest does not wait for the next period, and telemetry tells of it when it is applied."""
+
+import time
+from collections.abc import Iterator
+from dataclasses import replace
+
+import pytest
+
+from device_agent.ports.driver import Observation
+from device_agent.protocol.messages import JointTarget, JointTelemetry, Setpoint
+from device_agent.runtime.controller import Controller
+from device_agent.runtime.lease import LeaseGate
+from device_agent.runtime.loop import ControlLoop
+from tests.support.brokers import SILENCE_S, wait_until
+from tests.support.toys import ToyDriver, robot_type
+
+LONG_MS = 60_000
+"""No test waits for a period of this length."""
+
+
+class Desk:
+    """A toy arm whose control loop runs, and its operator."""
+
+    def __init__(self) -> None:
+        kind = robot_type(period_ms=LONG_MS)
+        self.driver = ToyDriver()
+        self.controller = Controller(kind, LeaseGate())
+        self.told: list[JointTelemetry] = []
+        self.loop = ControlLoop(
+            kind, self.driver, self.controller, name="arm", tell=self.told.append, watch=lambda _now_s: None
+        )
+        self._sequence = 0
+
+    def start(self) -> None:
+        self.loop.start()
+        wait_until(lambda: len(self.told) == 1, "the first period")
+        self.controller.grant(epoch=1, holder="ann", lease_s=1000, now_s=time.monotonic())
+
+    def ask(self, elbow_rad: float) -> None:
+        self._sequence += 1
+        target = JointTarget(position_rad={"elbow": elbow_rad})
+        setpoint = Setpoint(epoch=1, sequence=self._sequence, echo_tick_ms=5, sent_ms=0.0, target=target)
+        self.controller.offer(setpoint, now_s=time.monotonic(), tick_ms=10)
+
+
+@pytest.fixture
+def desk() -> Iterator[Desk]:
+    desk = Desk()
+    desk.start()
+    yield desk
+    desk.loop.stop()
+
+
+def test_a_device_at_rest_follows_a_setpoint_at_once(desk: Desk) -> None:
+    desk.ask(0.5)
+    wait_until(lambda: desk.driver.position[1] == pytest.approx(0.5), "the setpoint at the driver")
+    wait_until(lambda: desk.told[-1].setpoint_sequence == 1, "telemetry of it")
+
+
+def test_a_flood_of_setpoints_makes_one_more_period_and_not_one_each(desk: Desk) -> None:
+    desk.ask(0.5)
+    wait_until(lambda: desk.driver.position[1] == pytest.approx(0.5), "the setpoint at the driver")
+    desk.ask(0.7)
+    time.sleep(SILENCE_S)
+    assert desk.driver.position[1] == pytest.approx(0.5)
+
+
+def test_in_motion_periods_keep_their_length() -> None:
+    desk = Desk()
+    desk.controller.start_at((0.0, 0.0))
+    now_s = time.monotonic()
+    desk.controller.grant(epoch=1, holder="ann", lease_s=1000, now_s=now_s)
+    desk.ask(0.5)
+    assert desk.loop._wait(now_s + 30, sooner=True)
+    slow = robot_type()
+    desk.controller = Controller(slow, LeaseGate())
+    desk.loop._controller = desk.controller
+    desk.controller.start_at((0.0, 0.0))
+    desk.controller.grant(epoch=1, holder="ann", lease_s=1000, now_s=now_s)
+    desk.ask(0.5)
+    desk.controller.step(now_s)
+    assert desk.controller.moving
+    assert not desk.loop._wait(time.monotonic(), sooner=True)
+
+
+def test_telemetry_tells_of_a_new_setpoint_but_not_more_often_than_in_motion() -> None:
+    desk = Desk()
+    desk.controller.start_at((0.0, 0.0))
+    seen, tick = Observation((0.0, 0.0), (0.0, 0.0), (0.0, 0.0), ()), desk.controller.step(0.0)
+
+    def told(now_s: float, sequence: int) -> bool:
+        before = len(desk.told)
+        desk.loop._measure(now_s, seen, replace(tick, setpoint_sequence=sequence), (0.0, 0.0))
+        return len(desk.told) > before
+
+    assert [told(now_s, sequence) for now_s, sequence in ((0.0, 0), (0.03, 0), (0.03, 1), (0.04, 2), (0.051, 2))] == [
+        True, False, True, False, True
+    ]  # fmt: skip
