@@ -72,9 +72,11 @@ def make(home: Path) -> World:
     robot, foreign = _paired(cloud, anna), _paired(cloud, people["stranger"])
     device, space = robot.device, robot.space
     anna.put(f"/robot-types/ur5/movements/{MOVEMENT}", {"source": SOURCE, "description": "geheim"})
+    _made(anna.post("/spaces", {"name": "Speicher"}))  # one's only space cannot be handed over
     invitations = {
         "withdraw_device_invitation": _made(anna.post(f"/devices/{device}/invitations", {"role": "viewer"})),
         "withdraw_space_invitation": _made(anna.post(f"/spaces/{space}/invitations", {"role": "viewer"})),
+        "withdraw_space_transfer": _made(anna.post(f"/spaces/{space}/transfers", {})),
         "withdraw_agent_transfer": _made(anna.post(f"/agents/{robot.id}/transfers", {})),
     }
     for name, on in (("viewer", f"devices/{device}"), ("operator", f"devices/{device}")):

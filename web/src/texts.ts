@@ -413,6 +413,35 @@ export const texts = {
     done: "I have it",
   },
 
+  transfer: {
+    title: "Hand it over for good",
+    open: "Hand it over",
+    goes: {
+      agent: (names: readonly string[]): string =>
+        names.length === 1 ? `${names[0]} goes.` : `All that is behind the same agent goes: ${names.join(", ")}.`,
+      space: (names: readonly string[]): string =>
+        names.length === 0 ? "The space goes; nothing stands in it." : `The space goes with all that is in it: ${names.join(", ")}.`,
+    },
+    terms: [
+      "Nothing changes before the other one accepts, and until then you can take the offer back.",
+      "Once accepted it is theirs. You cannot undo that; only they can hand it back.",
+      "Then control ends, whatever runs is cancelled, and everybody whom you shared it with loses access.",
+      "Recordings, measurements and movements stay with you and do not go along.",
+    ],
+    to: "To whom",
+    toName: "One account",
+    toLink: "Whoever has the link",
+    valid: "The offer stands for",
+    todo: "Make the offer",
+    doing: "Making the offer …",
+    madeNote: (until: string): string => `Send it to the new owner. It can be accepted ${until}, once.`,
+    none: "It is not offered to anybody.",
+    offered: (name: string | null): string => (name === null ? "Offered to whoever has the link" : `Offered to ${name}`),
+    waits: (until: string): string => `not accepted yet · ${until}`,
+    withdrawSure: "Take the offer back? Its link is worth nothing then.",
+    failed: (why: string): string => `What is offered could not be read: ${why}`,
+  },
+
   invitation: {
     title: "You are invited",
     outside:
@@ -437,8 +466,15 @@ export const texts = {
     lasts: (s: number | null): string =>
       s === null ? "It lasts until the owner ends it." : `It lasts ${texts.lasting.about(s)} from when you accept.`,
     hands: (by: string, label: string): string => `${by} hands ${label} over to you`,
-    handsNote:
+    handsNote: [
       "It becomes yours, with everything in it: you decide then who else has access, and whoever has now loses it.",
+      "Whatever runs on it is cancelled. What was measured and recorded before stays with the former owner.",
+      "You can hand it back, but not undo this.",
+    ],
+    handsSure: (label: string): string => `Take ${label} over?`,
+    handsYes: "Yes, it shall be mine",
+    handsKeep: "Not yet",
+    declined: "If you do not want it nothing happens: it stays with its owner, and the offer ends by itself.",
     into: "Put it into",
     accept: "Accept",
     acceptTransfer: "Take it over",

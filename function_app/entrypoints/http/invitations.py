@@ -11,6 +11,7 @@ from function_app.domain.times import rfc3339
 from function_app.entrypoints.http.answers import answer, empty, read
 from function_app.entrypoints.http.caller import Caller
 from function_app.entrypoints.http.contract import sharing as contract
+from function_app.entrypoints.http.contract.auth import AccountRef
 from function_app.entrypoints.http.routing import Routes
 from function_app.services.invitations import Known, Offer
 from function_app.services.sharing import Shared
@@ -21,6 +22,7 @@ def router(functions: Functions, caller: Caller) -> Routes:
     routes, invitations = Routes("sharing"), _Invitations(functions, caller)
     _of_devices(routes, invitations)
     _of_spaces(routes, invitations)
+    _of_whole_spaces(routes, invitations)
     _of_agents(routes, invitations)
 
     @routes.add(
@@ -91,7 +93,7 @@ def _of_spaces(routes: Routes, invitations: "_Invitations") -> None:
         "GET", at, summary="Open invitations to a space", answers={200: contract.InvitationList}, problems=(403, 404)
     )
     async def list_space_invitations(request: Request, space: str) -> Response:
-        """Those that can still be redeemed, without their secrets; its transfer too. For its owner."""
+        """Those that can still be redeemed, without their secrets. For its owner."""
         return await invitations.list(request, "space", space)
 
     @routes.add(
@@ -111,9 +113,20 @@ def _of_spaces(routes: Routes, invitations: "_Invitations") -> None:
         """Nobody can redeem it any more. What was redeemed stays shared."""
         return await invitations.withdraw(request, "space", space, invitation)
 
+
+def _of_whole_spaces(routes: Routes, invitations: "_Invitations") -> None:
+    at = "/spaces/{space}/transfers"
+
+    @routes.add(
+        "GET", at, summary="Open transfers of a space", answers={200: contract.InvitationList}, problems=(403, 404)
+    )
+    async def list_space_transfers(request: Request, space: str) -> Response:
+        """Those that can still be accepted, without their secrets. For its owner."""
+        return await invitations.list(request, "space", space, transfers=True)
+
     @routes.add(
         "POST",
-        "/spaces/{space}/transfers",
+        at,
         summary="Offer a space to another account",
         body=contract.TransferRequest,
         answers={201: contract.InvitationMade},
@@ -122,6 +135,11 @@ def _of_spaces(routes: Routes, invitations: "_Invitations") -> None:
     async def transfer_space(request: Request, space: str) -> Response:
         """With every agent that is in it then. Nothing changes until it is accepted, at ``invitations/redeem``."""
         return await invitations.transfer(request, "space", space)
+
+    @routes.add("DELETE", at + "/{invitation}", summary="Take an offer back", answers={204: None}, problems=(404,))
+    async def withdraw_space_transfer(request: Request, space: str, invitation: str) -> Response:
+        """Nobody can accept it any more."""
+        return await invitations.withdraw(request, "space", space, invitation)
 
 
 def _of_agents(routes: Routes, invitations: "_Invitations") -> None:
@@ -132,7 +150,7 @@ def _of_agents(routes: Routes, invitations: "_Invitations") -> None:
     )
     async def list_agent_transfers(request: Request, agent: str) -> Response:
         """Those that can still be accepted, without their secrets. For its owner."""
-        return await invitations.list(request, "agent", agent)
+        return await invitations.list(request, "agent", agent, transfers=True)
 
     @routes.add(
         "POST",
@@ -173,10 +191,17 @@ class _Invitations:
         shared = await whole(who, name)
         return await self._make(who, shared, Offer(Role.OWNER, 1, asked.expires_in_s, account=await self._id(asked)))
 
-    async def list(self, request: Request, kind: Kind, name: str) -> Response:
+    async def list(self, request: Request, kind: Kind, name: str, *, transfers: bool = False) -> Response:
         found = await self._functions.invitations.open(await self._of(request, kind, name))
-        items = tuple(contract.InvitationOut(**_shown(known)) for known in found)
-        return answer(contract.InvitationList(items=items, cursor=None))
+        wanted = [known for known in found if (known.invitation.role is Role.OWNER) == transfers]
+        items = [
+            contract.InvitationOut(**_shown(known), account=await self._only(known.invitation.account))
+            for known in wanted
+        ]
+        return answer(contract.InvitationList(items=tuple(items), cursor=None))
+
+    async def _only(self, account: str) -> AccountRef | None:
+        return AccountRef(id=account, name=await self._functions.sign_in.named(account)) if account else None
 
     async def withdraw(self, request: Request, kind: Kind, name: str, invitation: str) -> Response:
         who = await self._caller.account(request)

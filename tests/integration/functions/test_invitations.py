@@ -175,6 +175,25 @@ def test_a_space_that_is_handed_over_takes_all_its_agents_along(cloud: Cloud, th
         assert [item["name"] for item in clara.get("/spaces").json()["items"]] == ["Home"]
 
 
+def test_offers_of_a_space_have_a_list_of_their_own_that_says_for_whom_they_are(three: Three) -> None:
+    anna, bert, robot = three
+    anna.post("/spaces", {"name": "Attic"})
+    offers, links = f"/spaces/{robot.space}/transfers", f"/spaces/{robot.space}/invitations"
+    share = invite(anna, links, role="viewer")
+    made, open_to_all = invite(anna, offers, account="bert"), invite(anna, offers)
+    listed = anna.get(offers).json()["items"]
+    assert [(item["id"], item["role"]) for item in listed] == [(made["id"], "owner"), (open_to_all["id"], "owner")]
+    assert [item["account"] and item["account"]["name"] for item in listed] == ["bert", None]
+    assert all("secret" not in item for item in listed)
+    assert [item["id"] for item in anna.get(links).json()["items"]] == [share["id"]]
+    problem(bert.get(offers), 404, "space-unknown")
+    problem(bert.delete(f"{offers}/{made['id']}"), 404, "space-unknown")
+    assert bert.post("/invitations/look", {"secret": open_to_all["secret"]}).json()["account"] is None
+    assert anna.delete(f"{offers}/{made['id']}").status_code == 204
+    assert [item["id"] for item in anna.get(offers).json()["items"]] == [open_to_all["id"]]
+    problem(redeem(bert, made), 404, "invitation-unknown")
+
+
 def test_a_transfer_that_was_overtaken_is_void(three: Three) -> None:
     anna, bert, robot = three
     made = invite(anna, f"/agents/{robot.id}/transfers")

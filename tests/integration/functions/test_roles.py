@@ -32,8 +32,8 @@ OPERATING = {
 OWNING = {
     "list_device_shares", "share_device", "unshare_device", "list_space_shares", "share_space", "unshare_space",
     "list_device_invitations", "invite_to_device", "withdraw_device_invitation",
-    "list_space_invitations", "invite_to_space", "withdraw_space_invitation", "transfer_space", "delete_upload",
-    "rename_device",
+    "list_space_invitations", "invite_to_space", "withdraw_space_invitation", "list_space_transfers", "transfer_space",
+    "withdraw_space_transfer", "delete_upload", "rename_device",
 }  # fmt: skip
 OWN = {"unpair_agent", "move_agent", "list_agent_transfers", "transfer_agent", "withdraw_agent_transfer"}
 """About agents, which do not exist for anybody but their owner."""

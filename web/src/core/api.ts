@@ -21,6 +21,7 @@ import type {
   Target,
 } from "./rights";
 import { RobotTypes } from "./robot-types";
+import { Transfers } from "./transfers";
 import { TimesApi } from "./times";
 
 export interface Account {
@@ -175,6 +176,7 @@ export class Api {
   readonly robotTypes: RobotTypes;
   /** How long things take. */
   readonly times: TimesApi;
+  readonly transfers: Transfers;
 
   constructor(base = "/api/v1") {
     this.#http = new Http(base);
@@ -182,6 +184,7 @@ export class Api {
     this.library = new Library(this.#http);
     this.robotTypes = new RobotTypes(this.#http);
     this.times = new TimesApi(this.#http);
+    this.transfers = new Transfers(this.#http);
   }
 
   async signIn(link: string): Promise<Account> {

@@ -35,6 +35,8 @@ export interface Invitation {
   /** How long the part lasts from when it is taken [s]; `null`: until it is ended. */
   share_s: number | null;
   expires_at: string;
+  /** Who alone may redeem it, in the owner's lists; `null`: whoever has the secret. */
+  account: Person | null;
 }
 
 /** The secret, and the link that carries it, are told this once. */

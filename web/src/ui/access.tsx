@@ -3,13 +3,16 @@ import type { Account, Api } from "../core/api";
 import { ApiError, sentence } from "../core/http";
 import type { Invitation, Person, Role, Share, SharedRole, Target } from "../core/rights";
 import { secondsLeft, Sharing } from "../core/sharing";
+import type { Whole } from "../core/transfers";
 import { texts } from "../texts";
+import { AskedForm } from "./asked-form";
 import { Confirm } from "./confirm";
 import { useFocusBack } from "./focus";
 import { InviteForm, MAY } from "./invite-form";
 import { AS_IT_IS, LastingField, seconds } from "./lasting";
 import { Card, Choice } from "./parts";
 import { spaceAddress } from "./route";
+import { Transfer } from "./transfer";
 import "./sharing.css";
 
 /** While a link is out somebody may use it at any moment. */
@@ -20,6 +23,9 @@ interface AccessProps {
   api: Api;
   account: Account;
   target: Target;
+  /** What is handed over where it is, and the names of all that goes with it. */
+  whole: Whole;
+  goes: readonly string[];
   owner: Person;
   role: Role;
   /** Of a device: the space through which others have access too. */
@@ -27,6 +33,8 @@ interface AccessProps {
   /** One's own part was given up. */
   onLeft: () => void;
 }
+
+type PartProps = Omit<AccessProps, "goes" | "role" | "whole">;
 
 const ID = "access";
 
@@ -38,15 +46,16 @@ export function goToAccess(): void {
 }
 
 /** Who has access to a device or a space, and for its owner all that changes it. */
-export function Access({ role, ...rest }: AccessProps) {
+export function Access({ role, whole, goes, ...rest }: AccessProps) {
   return (
     <div id={ID} class="access" data-testid="access">
       {role === "owner" ? <OwnersAccess {...rest} /> : <OwnPart role={role} {...rest} />}
+      {role === "owner" && <Transfer api={rest.api} of={whole} goes={goes} />}
     </div>
   );
 }
 
-function OwnPart({ api, account, target, owner, role, onLeft }: AccessProps & { role: SharedRole }) {
+function OwnPart({ api, account, target, owner, role, onLeft }: PartProps & { role: SharedRole }) {
   const leave = async (): Promise<void> => {
     try {
       await api.unshare(target, account.id);
@@ -71,7 +80,7 @@ function OwnPart({ api, account, target, owner, role, onLeft }: AccessProps & { 
   );
 }
 
-function OwnersAccess({ api, target, owner, space }: Omit<AccessProps, "role">) {
+function OwnersAccess({ api, target, owner, space }: PartProps) {
   const { kind, id } = target;
   const sharing = useMemo(() => new Sharing(api, { kind, id }), [api, kind, id]);
   const [inviting, setInviting] = useState(false);
@@ -256,13 +265,14 @@ function ChangeForm({ share, sharing, onDone }: ChangeFormProps) {
     }
   };
   return (
-    <form
-      class="panel fields"
-      aria-label={texts.access.changeOf(share.account.name)}
-      onSubmit={(event) => {
-        event.preventDefault();
-        void save();
-      }}
+    <AskedForm
+      label={texts.access.changeOf(share.account.name)}
+      todo={texts.access.save}
+      doing={texts.access.saving}
+      busy={busy}
+      wrong={wrong}
+      onSend={save}
+      onClose={() => onDone("")}
     >
       <div class="field">
         <span class="label">{texts.invite.role}</span>
@@ -275,18 +285,7 @@ function ChangeForm({ share, sharing, onDone }: ChangeFormProps) {
         choices={LASTS}
         onChange={setLasts}
       />
-      <div class="row">
-        <button type="submit" class="primary" disabled={busy}>
-          {busy ? texts.access.saving : texts.access.save}
-        </button>
-        <button type="button" disabled={busy} onClick={() => onDone("")}>
-          {texts.access.cancel}
-        </button>
-      </div>
-      <p class="field-error" aria-live="polite">
-        {wrong}
-      </p>
-    </form>
+    </AskedForm>
   );
 }
 
@@ -307,7 +306,7 @@ function OpenLinks({ sharing }: { sharing: Sharing }) {
 
 function OpenLink({ invitation, sharing }: { invitation: Invitation; sharing: Sharing }) {
   const { role, uses, share_s: shareS } = invitation;
-  const terms = role === "owner" ? [] : [texts.access.uses(uses), texts.access.lasts(shareS)];
+  const terms = [texts.access.uses(uses), texts.access.lasts(shareS)];
   return (
     <li>
       <span class="person">

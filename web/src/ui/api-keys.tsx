@@ -4,6 +4,7 @@ import { sentence } from "../core/http";
 import type { Fleet } from "../core/fleet";
 import type { ApiKey, ApiKeyMade, SharedRole } from "../core/rights";
 import { texts } from "../texts";
+import { AskedForm } from "./asked-form";
 import { Confirm } from "./confirm";
 import { useFocusBack } from "./focus";
 import { MAY } from "./invite-form";
@@ -176,13 +177,15 @@ function KeyForm({ api, names, onMade, onClose }: KeyFormProps) {
   };
 
   return (
-    <form
-      class="panel fields"
-      aria-label={texts.keys.new}
-      onSubmit={(event) => {
-        event.preventDefault();
-        void make();
-      }}
+    <AskedForm
+      label={texts.keys.new}
+      todo={texts.keys.make}
+      doing={texts.keys.making}
+      busy={busy}
+      wrong={wrong}
+      sendTestId="make-key"
+      onSend={make}
+      onClose={onClose}
     >
       <div class="field">
         <label for="key-name">{texts.keys.name}</label>
@@ -223,18 +226,7 @@ function KeyForm({ api, names, onMade, onClose }: KeyFormProps) {
         <Choice label={texts.keys.only} value={reach} options={REACH} onChange={setReach} />
       </div>
       {reach === "some" && <Which names={names} chosen={only} onChange={choose} />}
-      <div class="row">
-        <button type="submit" class="primary" data-testid="make-key" disabled={busy}>
-          {busy ? texts.keys.making : texts.keys.make}
-        </button>
-        <button type="button" disabled={busy} onClick={onClose}>
-          {texts.access.cancel}
-        </button>
-      </div>
-      <p class="field-error" aria-live="polite">
-        {wrong}
-      </p>
-    </form>
+    </AskedForm>
   );
 }
 

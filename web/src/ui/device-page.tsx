@@ -152,12 +152,15 @@ function Desk({ api, fleet, station, account, access }: DeskProps) {
 }
 
 function DeviceAccess({ api, fleet, device, account }: OperateProps) {
-  const { id, owner, role, space } = device.info.value;
+  const { agent, id, owner, role, space } = device.info.value;
+  const behindIt = [...(fleet.devices.value?.values() ?? [])].filter(({ info }) => info.value.agent === agent);
   return (
     <Access
       api={api}
       account={account}
       target={{ kind: "device", id }}
+      whole={{ kind: "agent", id: agent }}
+      goes={behindIt.map(({ info }) => info.value.label)}
       owner={owner}
       role={role}
       space={{ id: space, name: fleet.spaceName(space) }}

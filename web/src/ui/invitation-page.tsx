@@ -5,6 +5,7 @@ import type { Fleet } from "../core/fleet";
 import type { FollowedInvitation } from "../core/invitation";
 import type { Invitation } from "../core/rights";
 import { texts } from "../texts";
+import { Confirm } from "./confirm";
 import { Card } from "./parts";
 import { deviceAddress, fleetAddress, replaceWith, spaceAddress } from "./route";
 
@@ -116,9 +117,20 @@ function Offer({ api, fleet, account, followed, secret, away, onAccepted }: Offe
       <p class="quiet">{texts.invitation.as(account.name)}</p>
       <div role="alert">{wrong !== null && <p class="notice bad">{wrong.text}</p>}</div>
       <div class="row">
-        {offer !== null && wrong?.final !== true && (
+        {offer !== null && hands && wrong?.final !== true && (
+          <Confirm
+            label={texts.invitation.acceptTransfer}
+            question={texts.invitation.handsSure(offer.label)}
+            yes={texts.invitation.handsYes}
+            busy={texts.invitation.accepting}
+            keep={texts.invitation.handsKeep}
+            onYes={accept}
+            data-testid="accept"
+          />
+        )}
+        {offer !== null && !hands && wrong?.final !== true && (
           <button type="button" class="primary" data-testid="accept" disabled={busy} onClick={() => void accept()}>
-            {busy ? texts.invitation.accepting : hands ? texts.invitation.acceptTransfer : texts.invitation.accept}
+            {busy ? texts.invitation.accepting : texts.invitation.accept}
           </button>
         )}
         {offer === null && wrong !== null && !wrong.final && (
@@ -135,7 +147,15 @@ function Offer({ api, fleet, account, followed, secret, away, onAccepted }: Offe
 }
 
 function Terms({ offer: { role, kind, share_s: shareS } }: { offer: Invitation }) {
-  if (role === "owner") return <p>{texts.invitation.handsNote}</p>;
+  if (role === "owner") {
+    return (
+      <ul class="terms" data-testid="terms">
+        {[...texts.invitation.handsNote, texts.invitation.declined].map((line) => (
+          <li key={line}>{line}</li>
+        ))}
+      </ul>
+    );
+  }
   return (
     <ul class="terms" data-testid="terms">
       <li>{texts.invitation.may[role]}</li>

@@ -3,9 +3,10 @@ import { sentence } from "../core/http";
 import type { InvitationMade, SharedRole } from "../core/rights";
 import type { Sharing } from "../core/sharing";
 import { texts } from "../texts";
+import { AskedForm } from "./asked-form";
 import { FOR_GOOD, LastingField, ONE_DAY, seconds } from "./lasting";
+import { MadeLink } from "./made-link";
 import { Choice } from "./parts";
-import { Secret } from "./secret";
 
 const HOW = [
   ["link", texts.invite.byLink],
@@ -63,18 +64,24 @@ export function InviteForm({ sharing, onClose }: InviteFormProps) {
     }
   };
 
-  if (made !== null) return <MadeLink made={made} onDone={onClose} />;
-  const doing = how === "name" ? texts.invite.sharing : texts.invite.making;
-  const todo = how === "name" ? texts.invite.share : texts.invite.make;
+  if (made !== null) {
+    const note = texts.invite.madeNote(texts.role[made.role], made.uses, texts.until(made.expires_at));
+    return <MadeLink link={made.link} note={note} onDone={onClose} />;
+  }
   return (
-    <form
-      class="panel fields"
-      ref={form}
-      aria-label={texts.invite.title}
-      onSubmit={(event) => {
-        event.preventDefault();
-        void send();
-      }}
+    <AskedForm
+      label={texts.invite.title}
+      todo={how === "name" ? texts.invite.share : texts.invite.make}
+      doing={how === "name" ? texts.invite.sharing : texts.invite.making}
+      busy={busy}
+      close={texts.invite.close}
+      wrong={wrong}
+      done={done}
+      answerId="invite-answer"
+      form={form}
+      sendTestId="invite-send"
+      onSend={send}
+      onClose={onClose}
     >
       <Choice label={texts.invite.how} value={how} options={HOW} onChange={setHow} />
       <p class="quiet small">{how === "name" ? texts.invite.nameNote : texts.invite.linkNote}</p>
@@ -123,36 +130,6 @@ export function InviteForm({ sharing, onClose }: InviteFormProps) {
           </div>
         </>
       )}
-      <div class="row">
-        <button type="submit" class="primary" data-testid="invite-send" disabled={busy}>
-          {busy ? doing : todo}
-        </button>
-        <button type="button" onClick={onClose}>
-          {texts.invite.close}
-        </button>
-      </div>
-      <p id="invite-answer" class={wrong === "" ? "field-note" : "field-error"} aria-live="polite">
-        {wrong === "" ? done : wrong}
-      </p>
-    </form>
-  );
-}
-
-function MadeLink({ made, onDone }: { made: InvitationMade; onDone: () => void }) {
-  const box = useRef<HTMLDivElement>(null);
-  useEffect(() => box.current?.querySelector("input")?.focus(), []);
-  return (
-    <div class="panel made" ref={box} role="group" aria-label={texts.invite.link}>
-      <p>
-        <strong>{texts.invite.made}</strong>
-      </p>
-      <Secret id="invitation-link" label={texts.invite.link} value={made.link} />
-      <p class="quiet small">{texts.invite.madeNote(texts.role[made.role], made.uses, texts.until(made.expires_at))}</p>
-      <div class="row">
-        <button type="button" onClick={onDone}>
-          {texts.invite.done}
-        </button>
-      </div>
-    </div>
+    </AskedForm>
   );
 }

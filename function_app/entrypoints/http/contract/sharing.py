@@ -69,7 +69,10 @@ class TransferRequest(Request, frozen=True, kw_only=True):
 
 
 class InvitationOut(Answer, frozen=True, kw_only=True):
-    """An open invitation. ``role`` ``owner``: a transfer. ``share_s``: how long the part will last; null: no end."""
+    """An open invitation. ``role`` ``owner``: a transfer. ``share_s``: how long the part will last; null: no end.
+
+    ``account``: who alone may redeem it, in lists, which are the owner's; null: whoever has the secret.
+    """
 
     id: str
     kind: Literal["device", "space", "agent"]
@@ -80,6 +83,7 @@ class InvitationOut(Answer, frozen=True, kw_only=True):
     uses: int
     share_s: int | None
     expires_at: Moment
+    account: AccountRef | None = None
 
 
 class InvitationMade(InvitationOut, frozen=True, kw_only=True):
