@@ -75,6 +75,22 @@ export const texts = {
         "Robots and people are where they were last seen, with the way of their last half minute. What is grey is old.",
         "Numbers are things that hang in the room. Open one to see what it measures.",
       ],
+      device: [
+        "Live view: the robot as its joints were last measured. The blue ghost is where it was told to go. Nothing is guessed.",
+        "Steer: moves it by hand while you have control. A velocity counts while you hold it; letting go, or losing the connection, stops it.",
+        "What is asked of it (postures, speech, movements) runs by itself. Above stands how far it is, and what ends it.",
+        "Camera, last 20 seconds and joint frames: pictures and values as the robot sends them, several times a second.",
+        "Times: how long your last commands took on each part of their way. Events: what the robot has said about itself.",
+        "Values are grey or say their age once they are older than they should be (stale). Offline means that its agent is not connected: what you see is what it said last.",
+        "Stop is always there, and on Escape. It holds until somebody releases it on purpose; keep the machine's own button within reach.",
+      ],
+      roomDevice: [
+        "Each card is one thing that this device says it can do: a picture, a scan, a number with its history, a switch or a slider.",
+        "Values come from the device itself, when they change or at its own rate. Behind a number stand the limits that its room gives.",
+        "Under a slider stands what the device has really set, which may be less than what was asked.",
+        "What is older than three of its periods is grey and says its age (stale). Offline means that its agent is not connected.",
+        "Stop ends what runs on it, and is on Escape. It holds until somebody releases it on purpose.",
+      ],
       types: [
         "A device is one robot; its type is what all of its kind have in common.",
         "A type that is yours can be used by your own devices. A newer version takes the place of the one before once it has been checked.",
@@ -1415,6 +1431,8 @@ print("done")
 
   plan: {
     title: "Plan",
+    /** Of somebody on the plan, for whose name there is no room there. */
+    letter: (index: number): string => String.fromCharCode(65 + (index % 26)),
     empty: "No device of this room tells where it or anybody else is. A room device of the kind “perception” does.",
     waiting: "Waiting for the room to say what it sees …",
     label: (count: number): string => `Plan of the room with ${count === 1 ? "1 robot or person" : `${count} robots and people`}`,

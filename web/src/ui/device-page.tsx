@@ -13,6 +13,7 @@ import "./desk.css";
 import { Events } from "./events";
 import { Times } from "./evidence";
 import { Foldable } from "./fold";
+import { WhatDoISee } from "./help/what-do-i-see";
 import { HealthChip } from "./health-chip";
 import { Movements } from "./movements/card";
 import { Naming } from "./naming";
@@ -87,6 +88,7 @@ function Operate({ api, fleet, device, account }: OperateProps) {
       <main class="page operate" id="content">
         <Heading api={api} device={device} fleet={fleet} />
         <StopBanner device={device} stop={stop} />
+        <WhatDoISee page={robot ? "device" : "roomDevice"} />
         {robot && <RunStatus device={device} control={control} actions={station.actions} />}
         {robot ? (
           <Desk api={api} fleet={fleet} station={station} account={account} access={access} />

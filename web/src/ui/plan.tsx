@@ -10,6 +10,7 @@ import { apart, extent, readFloor, readPlaces, type Extent, type Floor, type Pla
 import { texts } from "../texts";
 import { canvasBox } from "./canvas";
 import { Age, Card } from "./parts";
+import { useNames } from "./plan-names";
 import { shown } from "./readings";
 import { deviceAddress } from "./route";
 import { colour, onColourChange } from "./theme";
@@ -175,9 +176,14 @@ export function Drawing({ extent: room, floor, places, hung, devices, trails, ol
       ([atX, atY]) => [Math.min(width - edge, Math.max(edge, atX)), Math.min(high * scale - edge, Math.max(edge, atY))] as const,
     );
     // In shares of the box: at another size they are in the right place at once, and then moved apart anew.
-    const share = (px: number, of: number): string => `${(100 * px) / of}%`;
-    return apart(within, PIN_PX + 1).map(([atX, atY]) => [share(atX, width), share(atY, high * scale)] as const);
+    return apart(within, PIN_PX + 1).map(([atX, atY]) => [atX / width, atY / (high * scale)] as const);
   }, [room, width, hung.map(({ device }) => device.id).join()]);
+  const px = (share: number, of: number): number => (share * of * width) / wide;
+  useNames(
+    box,
+    places.map(({ xM, yM }) => [px((xM - room.lowX) / wide, wide), px((room.highY - yM) / high, high)]),
+    pins.map(([left, top]) => [px(left, wide), px(top, high)]),
+  );
 
   return (
     <div
@@ -192,7 +198,7 @@ export function Drawing({ extent: room, floor, places, hung, devices, trails, ol
     >
       <canvas ref={canvas} aria-hidden="true" />
       {hung.map((one, index) => {
-        const [left, top] = pins[index] ?? ["50%", "50%"];
+        const [left, top] = (pins[index] ?? [0.5, 0.5]).map((share) => `${100 * share}%`);
         return (
           <a
             key={one.device.id}
@@ -215,7 +221,6 @@ export function Drawing({ extent: room, floor, places, hung, devices, trails, ol
           label={nameOf(place, devices)}
           left={x(place.xM)}
           top={y(place.yM)}
-          share={(place.xM - room.lowX) / wide}
           receivedAt={receivedAt ?? 0}
         />
       ))}
@@ -250,20 +255,21 @@ interface MarkProps {
   label: string;
   left: string;
   top: string;
-  /** Of the plan's width: at its edges a label keeps inside. */
-  share: number;
   receivedAt: number;
 }
 
 /** A disc with an arrow the way it goes. A robot's opens its page; a person has none. */
-function Mark({ place, device, label, left, top, share, receivedAt, index }: MarkProps) {
+function Mark({ place, device, label, left, top, receivedAt, index }: MarkProps) {
   const ageS = place.ageS + Math.max(0, clock.value - receivedAt) / 1000;
   const unseen = ageS > UNSEEN_S;
   const content = (
     <>
       {place.yawRad !== null && <span class="arrow" style={{ transform: `rotate(${-place.yawRad}rad)` }} aria-hidden="true" />}
-      <span class="disc" aria-hidden="true" />
-      <span class="who-label" style={{ translate: `${-100 * Math.min(1, Math.max(0, share))}% 0` }}>
+      <span class="who-leader" aria-hidden="true" />
+      <span class="disc" aria-hidden="true">
+        {texts.plan.letter(index)}
+      </span>
+      <span class="who-label">
         {label}
         {unseen && <span class="small"> · {texts.plan.unseen(ageS)}</span>}
       </span>
@@ -412,7 +418,9 @@ function Who({ places, devices, receivedAt, old }: WhoProps) {
             return (
               <tr key={place.name}>
                 <th scope="row">
-                  <span class={`swatch series-${(index % 8) + 1}`} aria-hidden="true" />
+                  <span class={`swatch series-${(index % 8) + 1}`} aria-hidden="true">
+                    {texts.plan.letter(index)}
+                  </span>
                   {device === null ? label : <a href={deviceAddress(device.id)}>{label}</a>}
                 </th>
                 <td>{texts.plan.place(metres(place.xM), metres(place.yM))}</td>
