@@ -1,4 +1,4 @@
-"""``python -m device_agent enroll|run|doctor|repin|devices|import-model``: the agent's command line."""
+"""``python -m device_agent enroll|run|doctor|repin|devices|import-model|swarm``: the agent's command line."""
 
 import argparse
 import gc
@@ -21,6 +21,7 @@ from device_agent.ports.transport import TransportError
 from device_agent.protocol.topics import ID_PATTERN, is_id
 from device_agent.runtime.home import Configuration, DeviceEntry, Home, HomeError, HttpPolling, Pairing
 from device_agent.runtime.journal import JournalError
+from device_agent.swarm.plan import SwarmError, add_options, plan_of
 from device_agent.transports.http import answers
 from device_agent.transports.http.api import Claim, CloudApi, CloudError
 
@@ -38,7 +39,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     logging.basicConfig(level=logging.INFO, format="%(asctime)s %(levelname)s %(message)s", stream=sys.stderr)
     try:
         code: int = options.command(options)
-    except (HomeError, JournalError, DriverError, TransportError, CloudError, OSError) as error:
+    except (HomeError, JournalError, DriverError, TransportError, CloudError, SwarmError, OSError) as error:
         print(f"telescope agent: {error}", file=sys.stderr)
         return _EXIT_FAILED
     except KeyboardInterrupt:
@@ -115,6 +116,10 @@ def _parser() -> argparse.ArgumentParser:
         help="leave it out; may be given several times",
     )
     take_over.set_defaults(command=_import_model)
+
+    swarm = commands.add_parser("swarm", help="many agents without physics in one process, to try a server with")
+    add_options(swarm)
+    swarm.set_defaults(command=_swarm)
 
     for command in (enroll, run):
         command.add_argument(
@@ -358,6 +363,16 @@ def _devices(options: argparse.Namespace) -> int:
     for name in sensors.names():
         print(f"sensor  {name}")
     return 0
+
+
+# ------------------------------------------------------------ swarm
+
+
+def _swarm(options: argparse.Namespace) -> int:
+    # Read here: only Unix has what it is made of.
+    from device_agent.swarm import run  # noqa: PLC0415
+
+    return run.run(plan_of(options))
 
 
 # ------------------------------------------------------------ import-model
