@@ -21,8 +21,6 @@ from device_agent.protocol import topics
 from tests.support.brokers import BROKERS, HOST, ROOT
 from tests.support.ground import Ground, start_ground
 
-SPREAD_S = 0.02
-"""From one connection to the next [s]."""
 LAST_S = 1.0
 """What is under way when the swarm ends is waited for."""
 
@@ -54,9 +52,9 @@ class Ear:
         return len(self._heard.read_bytes()) // 2
 
 
-def swarm(ground: Ground, home: Path, *, count: int, rate_hz: float, seconds: float) -> dict[str, Any]:
+def swarm(ground: Ground, home: Path, *, count: int, rate_hz: float, seconds: float, gap_s: float) -> dict[str, Any]:
     """What a swarm says of itself at its end."""
-    spread_s = max(count * SPREAD_S, 2.0)
+    spread_s = max(count * gap_s, 2.0)
     figures = home / "figures.json"
     subprocess.run(  # noqa: S603 (this project's own)
         [
@@ -72,11 +70,11 @@ def swarm(ground: Ground, home: Path, *, count: int, rate_hz: float, seconds: fl
     return found
 
 
-def run(ground: Ground, home: Path, *, count: int, rate_hz: float, seconds: float) -> dict[str, Any]:
+def run(ground: Ground, home: Path, *, count: int, rate_hz: float, seconds: float, gap_s: float) -> dict[str, Any]:
     """One run: what it says of itself, and what of it a subscriber has got."""
     ear = Ear(ground, home)
     load = os.getloadavg()[0]
-    found = swarm(ground, home, count=count, rate_hz=rate_hz, seconds=seconds)
+    found = swarm(ground, home, count=count, rate_hz=rate_hz, seconds=seconds, gap_s=gap_s)
     heard = ear.end()
     # Said at QoS 1 are all but measurements.
     sent = found["counts"]["out"] - found["counts"]["asked"]
@@ -98,14 +96,17 @@ def main() -> int:
     parser.add_argument("--counts", default="100,500,1000,2000")
     parser.add_argument("--rates", default="1,5,20")
     parser.add_argument("--seconds", type=float, default=15.0)
+    parser.add_argument("--gap", type=float, default=0.05, help="from one connection to the next [s]")
     options = parser.parse_args()
     known = json.loads(options.json.read_text()) if options.json.exists() else {"runs": []}
     with tempfile.TemporaryDirectory() as folder, start_ground(options.broker, Path(folder) / "ground") as ground:
         # The first agent makes the space one in which there is something to hear.
-        swarm(ground, Path(folder), count=1, rate_hz=1, seconds=2)
+        swarm(ground, Path(folder), count=1, rate_hz=1, seconds=2, gap_s=0.1)
         for count in map(int, options.counts.split(",")):
             for rate_hz in map(float, options.rates.split(",")):
-                found = run(ground, Path(folder), count=count, rate_hz=rate_hz, seconds=options.seconds)
+                found = run(
+                    ground, Path(folder), count=count, rate_hz=rate_hz, seconds=options.seconds, gap_s=options.gap
+                )
                 machine = {"cores": os.cpu_count(), "python": platform.python_version(), "system": platform.platform()}
                 made = {"broker": options.broker, "on": datetime.now(UTC).date().isoformat(), "machine": machine}
                 known["runs"].append({**made, **found})

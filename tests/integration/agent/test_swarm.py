@@ -15,8 +15,8 @@ from tests.support.ground import Ground, start_ground
 COUNT = 20
 
 
-def command(*options: str, token: str = "") -> "subprocess.Popen[str]":
-    environment = {**os.environ, "TELESCOPE_TOKEN": token, "TELESCOPE_SIGN_IN": ""}
+def command(*options: str, token: str = "", link: str = "") -> "subprocess.Popen[str]":
+    environment = {**os.environ, "TELESCOPE_TOKEN": token, "TELESCOPE_SIGN_IN": link}
     return subprocess.Popen(
         [sys.executable, "-m", "device_agent", "swarm", *options],
         cwd=ROOT,
@@ -57,7 +57,8 @@ def test_twenty_agents_are_claimed_come_on_line_obey_and_leave(kind: BrokerKind,
         plan = ["--cloud", ground.url, "--home", str(tmp_path / "home"), "--count", str(COUNT), "--joints", "2"]
         timing = ["--rate-hz", "2", "--seconds", "60", "--spread-s", "1", "--every-s", "1"]
         figures = tmp_path / "figures.json"
-        with command(*plan, *timing, "--json", str(figures), token=ground.anna.token) as swarm:
+        who = {"token": ground.anna.token} if kind == "amqtt" else {"link": ground.cloud.link("anna")}
+        with command(*plan, *timing, "--json", str(figures), **who) as swarm:
             wait_until(lambda: sum(each["online"] for each in devices(ground)) == COUNT, "all on line", 120)
             one = devices(ground)[0]
             assert one["robot_type"] == "swarm-arm"
