@@ -2,13 +2,15 @@
 
 ``python -m benchmarks.swarm --json FILE [--broker mosquitto] [--counts 100,500] [--rates 1,5] [--seconds 15]`` starts
 the functions' server, a broker and the swarm as processes of their own, and counts with ``mosquitto_sub`` how many of
-the swarm's measurements a subscriber gets. Each run is added to the file as it ends.
+the swarm's measurements a subscriber gets. Each run is added to the file as it ends. ``--credentials 800`` measures
+instead what each further agent costs mosquitto, whose dynamic security writes down all it knows at each change.
 """
 
 import argparse
 import json
 import os
 import platform
+import secrets
 import subprocess
 import sys
 import tempfile
@@ -17,10 +19,11 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
-from device_agent.protocol import topics
-from tests.support.brokers import BROKERS, HOST, ROOT
+from device_agent.protocol import grants, topics
+from tests.support.brokers import BROKERS, HOST, ROOT, start_broker
 from tests.support.ground import Ground, start_ground
 
+_STEP = 100
 LAST_S = 1.0
 """What is under way when the swarm ends is waited for."""
 
@@ -88,6 +91,32 @@ def run(ground: Ground, home: Path, *, count: int, rate_hz: float, seconds: floa
     }
 
 
+def credentials(folder: Path, most: int) -> list[dict[str, float]]:
+    """What it costs mosquitto to be told of one more agent, while it knows so many: processor time, not the clock's."""
+    found = []
+    with start_broker("mosquitto", folder) as broker:
+        known, before_s = 0, _processor_s(broker.process.pid)
+        while known < most:
+            for _ in range(_STEP):
+                known += 1
+                grant = grants.agent_grant("space", f"agent{known}", token_id=secrets.token_hex(8), lifetime_s=3600)
+                broker.issue(grant)
+            now_s = _processor_s(broker.process.pid)
+            found.append({"known": known, "processor_ms_each": round((now_s - before_s) / _STEP * 1000, 2)})
+            before_s = now_s
+    return found
+
+
+def _processor_s(process: int) -> float:
+    """Of a process and its children."""
+    total = 0
+    for stat in Path("/proc").glob("[0-9]*/stat"):
+        fields = stat.read_text(encoding="ascii", errors="replace").rpartition(")")[2].split()
+        if int(stat.parent.name) == process or int(fields[1]) == process:
+            total += int(fields[11]) + int(fields[12])
+    return total / os.sysconf("SC_CLK_TCK")
+
+
 def main() -> int:
     """Run all that was asked for."""
     parser = argparse.ArgumentParser(description=__doc__)
@@ -97,8 +126,16 @@ def main() -> int:
     parser.add_argument("--rates", default="1,5,20")
     parser.add_argument("--seconds", type=float, default=15.0)
     parser.add_argument("--gap", type=float, default=0.05, help="from one connection to the next [s]")
+    parser.add_argument("--credentials", type=int, default=0, metavar="AGENTS", help="only what so many cost mosquitto")
     options = parser.parse_args()
+    machine = {"cores": os.cpu_count(), "python": platform.python_version(), "system": platform.platform()}
     known = json.loads(options.json.read_text()) if options.json.exists() else {"runs": []}
+    if options.credentials:
+        with tempfile.TemporaryDirectory() as folder:
+            steps = credentials(Path(folder) / "broker", options.credentials)
+        known["credentials"] = {"on": datetime.now(UTC).date().isoformat(), "machine": machine, "steps": steps}
+        options.json.write_text(json.dumps(known, indent=1) + "\n")
+        return 0
     with tempfile.TemporaryDirectory() as folder, start_ground(options.broker, Path(folder) / "ground") as ground:
         # The first agent makes the space one in which there is something to hear.
         swarm(ground, Path(folder), count=1, rate_hz=1, seconds=2, gap_s=0.1)
@@ -107,7 +144,6 @@ def main() -> int:
                 found = run(
                     ground, Path(folder), count=count, rate_hz=rate_hz, seconds=options.seconds, gap_s=options.gap
                 )
-                machine = {"cores": os.cpu_count(), "python": platform.python_version(), "system": platform.platform()}
                 made = {"broker": options.broker, "on": datetime.now(UTC).date().isoformat(), "machine": machine}
                 known["runs"].append({**made, **found})
                 options.json.write_text(json.dumps(known, indent=1) + "\n")

@@ -1,0 +1,44 @@
+"""The sheet on paper is what its files say, and its arithmetic is right."""
+
+import pytest
+
+from benchmarks import sheet
+
+
+def test_the_page_is_what_the_files_say() -> None:
+    page = sheet.PAGE.read_text(encoding="utf-8")
+    assert page == "\n".join(sheet.lines()) + "\n", "run `python -m benchmarks.sheet`"
+
+
+def test_what_robots_ask_for_grows_with_them() -> None:
+    def value(of: float) -> dict[str, object]:
+        return {"value": of, "why": ""}
+
+    assumed = {
+        "state_every_s": value(10),
+        "commands_a_day": value(86_400),
+        "answers_a_command": value(1),
+        "retained_a_robot": value(3),
+        "credentials_good_s": value(100),
+        "credentials_renewed_at": value(0.5),
+        "stored_every_s": value(2),
+        "rows_a_store": value(7),
+        "write_units_a_row": value(2),
+        "subscribers": value(1),
+    }
+    found = sheet.demand(assumed, 10, 0.9, 100.0)
+    assert found["in_per_s"] == pytest.approx(10 * (0.9 + 0.1 + 2))
+    assert found["in_bytes_per_s"] == pytest.approx(3000)
+    assert found["stores_per_s"] == pytest.approx(5)
+    assert found["write_units_per_s"] == pytest.approx(70)
+    assert found["credentials_per_s"] == pytest.approx(0.2)
+
+
+def test_a_price_that_is_not_known_stays_a_formula() -> None:
+    assert sheet.cost({"A": {"value": None}}, "A", 12.0) == "12 x A"
+    assert sheet.cost({"A": {"value": 0.5}}, "A", 12.0) == "6 $"
+
+
+def test_the_slope_is_that_of_a_line() -> None:
+    steps = [{"known": known, "processor_ms_each": 1 + known / 10} for known in (100, 200, 400)]
+    assert sheet.slope_s(steps) == pytest.approx(1e-4)
