@@ -157,11 +157,11 @@ def _limits(facts: Known, size: float) -> Iterator[str]:
     a_namespace = units["throughput_units_of_a_namespace"]["value"]
     for cloud, limits in facts["limits"].items():
         for hz in assumed["measures_hz"]["value"]:
-            full = {limit["name"]: limit["value"] / demand(assumed, 1, hz, size)[limit["of"]] for limit in limits}
-            first = min(full, key=lambda name: full[name])
-            yield f"- First bottleneck, {cloud}, {hz} Hz: **{first}**, at {full[first]:,.0f} robots."
+            fills = {limit["name"]: limit["value"] / demand(assumed, 1, hz, size)[limit["of"]] for limit in limits}
+            first = min(fills, key=lambda name: fills[name])
+            yield f"- First bottleneck, {cloud}, {hz} Hz: **{first}**, at {fills[first]:,.0f} robots."
             if "throughput unit" in first:
-                yield f"  A namespace of {a_namespace} units is full at {full[first] * a_namespace:,.0f} robots."
+                yield f"  A namespace of {a_namespace} units is full at {fills[first] * a_namespace:,.0f} robots."
     for robots, hz in sizes:
         needed_units = _throughput_units(facts, robots, hz, size)
         spaces = math.ceil(needed_units / a_namespace)
@@ -182,7 +182,7 @@ def _limits(facts: Known, size: float) -> Iterator[str]:
 def _throughput_units(facts: Known, robots: int, hz: float, size: float) -> int:
     wanted = demand(facts["assumed"], robots, hz, size)
     of_units = [limit for limit in facts["limits"]["azure"] if "throughput unit" in limit["name"]]
-    return max(math.ceil(wanted[limit["of"]] / limit["value"]) for limit in of_units)
+    return max(math.ceil(wanted[str(limit["of"])] / float(limit["value"])) for limit in of_units)
 
 
 def _own_broker(swarm: Known, facts: Known) -> Iterator[str]:
