@@ -1,32 +1,20 @@
 """One conversation over each of three stores under each of three hosts: the same answers, word for word."""
 
-import asyncio
 import difflib
 from collections.abc import Callable
 from pathlib import Path
 
 import pytest
 
-from function_app import bootstrap
-from function_app.settings import read
 from tests.api.conversation import PUBLIC_URL, Conversation
 from tests.conftest import Emulators
 from tests.support.aws import use_credentials
 from tests.support.brokers import RunningBroker
 from tests.support.hosts import HOSTS, HostKind, start_host
+from tests.support.site import sign_in_links
 from tests.support.stores import STORES, StoreKind, empty_store, make_places
 
 Talk = Callable[[StoreKind, HostKind, Path], list[str]]
-
-
-def make_links(environment: dict[str, str], *names: str) -> list[str]:
-    async def made() -> list[str]:
-        functions = bootstrap.build(read(environment))
-        links = [await functions.sign_in.link(await functions.sign_in.account(name)) for name in names]
-        await functions.close()
-        return links
-
-    return asyncio.run(made())
 
 
 @pytest.fixture
@@ -43,7 +31,7 @@ def talk(broker: RunningBroker, emulators: Emulators, monkeypatch: pytest.Monkey
             **empty_store(store, emulators(store)),
         }
         make_places(home, environment)
-        links = make_links(environment, "anna", "anna", "bert")
+        links = sign_in_links(environment, "anna", "anna", "bert")
         with start_host(kind, environment) as host:
             return Conversation(host, links).hold()
 

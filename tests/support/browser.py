@@ -7,19 +7,21 @@ from playwright.sync_api import Browser, Page, Playwright, expect
 
 from tests.support.machine import Machine
 
-PATIENCE_MS = 30_000
-FLAT = ["--no-sandbox", "--disable-gpu", "--disable-3d-apis", "--disable-background-networking"]
-"""Without the twin, whose drawing costs more than much of what is asked of a page."""
-FLAGS = [
+PATIENCE_MS = 90_000
+"""How long a person waits for what has to appear [ms]: the machine may be slow, and busy."""
+expect.set_options(timeout=PATIENCE_MS)
+_COMMON = [
     "--no-sandbox",
     "--disable-gpu",
-    "--enable-unsafe-swiftshader",
     "--disable-quic",
     "--no-first-run",
     "--disable-background-networking",
     "--disable-component-update",
     "--disable-sync",
 ]
+FLAGS = [*_COMMON, "--enable-unsafe-swiftshader"]
+FLAT = [*_COMMON, "--disable-3d-apis"]
+"""Without the twin: drawn without a graphics card it costs more than much of what is asked of a page."""
 
 
 @contextlib.contextmanager

@@ -69,7 +69,7 @@ class Server:
     def revive(self) -> None:
         program = self._stack.enter_context(start_program(["-m", "function_app", "serve"], self._environment))
         self._program = program
-        wait_until(lambda: _listens(self.port) or program.process.poll() is not None, "the server", 60)
+        wait_until(lambda: _listens(self.port) or program.process.poll() is not None, "the server")
         assert program.process.poll() is None, program.said()
 
 
@@ -240,7 +240,7 @@ class Link:
 
     def up(self, times: int = 1) -> Self:
         """Wait for the link to come up for this time."""
-        wait_until(lambda: self.changes.count(True) >= times, f"link number {times}", 60)
+        wait_until(lambda: self.changes.count(True) >= times, f"link number {times}")
         return self
 
     def topic(self, kind: str, name: str = "") -> str:

@@ -19,6 +19,7 @@ from typing import Any, Self
 import httpx
 
 from tests.support.brokers import ROOT, wait_until
+from tests.support.site import sign_in_link
 
 START_WITHIN_S = 90.0
 _ROW_BYTES = 500
@@ -66,15 +67,7 @@ class Machine:
 
     def sign_in_link(self, account: str = "demo") -> str:
         """A new one-time link, as an administrator makes one."""
-        done = subprocess.run(
-            [sys.executable, "-m", "function_app", "sign-in-link", "--account", account],
-            cwd=ROOT,
-            env=os.environ | {"TELESCOPE_HOME": str(self.home), "TELESCOPE_PORT": str(self.port)},
-            capture_output=True,
-            text=True,
-            check=True,
-        )
-        return done.stdout.strip().splitlines()[-1]
+        return f"{self.url}/#sign-in={sign_in_link({'TELESCOPE_HOME': str(self.home)}, account)}"
 
     def api(self, account: str = "demo") -> "Api":
         """The HTTP API, signed in."""
@@ -133,7 +126,7 @@ class Api:
             found[:] = [each for each in self.get("/devices")["items"] if each["name"] == name and each["online"]]
             return bool(found)
 
-        wait_until(online, f"{name} to be online", 30)
+        wait_until(online, f"{name} to be online")
         return found[0]
 
     @staticmethod

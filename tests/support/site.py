@@ -1,15 +1,15 @@
 """People who use the functions over HTTP, wherever they run."""
 
+import asyncio
 import os
-import subprocess
-import sys
 from collections.abc import Mapping
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
 import httpx
 
-from tests.support.brokers import ROOT
+from function_app import bootstrap, settings
 from tests.support.cloud import API, Person
 from tests.support.hosts import Host
 from tests.support.polling import Site
@@ -32,17 +32,23 @@ class Visitor(Person):
 
 
 def sign_in_link(environment: Mapping[str, str], name: str) -> str:
-    """A one-time token, from the program that prints links."""
-    done = subprocess.run(
-        [sys.executable, "-m", "function_app", "sign-in-link", "--account", name],
-        cwd=ROOT,
-        env={**os.environ, **environment},
-        capture_output=True,
-        text=True,
-        check=False,
-    )
-    assert done.returncode == 0, done.stderr
-    return done.stdout.strip().partition("#sign-in=")[2]
+    """A one-time token for the store of these functions."""
+    (token,) = sign_in_links(environment, name)
+    return token
+
+
+def sign_in_links(environment: Mapping[str, str], *names: str) -> list[str]:
+    """One-time tokens, made as the program that prints links makes them, without starting it for each."""
+
+    async def made() -> list[str]:
+        functions = bootstrap.build(settings.read({**os.environ, **environment}))
+        try:
+            return [await functions.sign_in.link(await functions.sign_in.account(name)) for name in names]
+        finally:
+            await functions.close()
+
+    with ThreadPoolExecutor(1) as pool:  # where a browser is, this thread has a loop of its own
+        return pool.submit(asyncio.run, made()).result()
 
 
 def sign_in(host: Host, site: Site, home: Path, name: str, environment: Mapping[str, str] | None = None) -> Visitor:

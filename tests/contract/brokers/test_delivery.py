@@ -191,7 +191,7 @@ def test_small_messages_are_sent_at_once(broker: RunningBroker, space: str, tran
         listener.send(wire.subscribe_packet(topic))
         assert listener.read() == (wire.SUBACK, 0, b"\0\1\0")
         medians = []
-        for _ in range(5):
+        for _ in range(25):
             gaps = []
             for _ in range(9):
                 for _ in range(CONVERSATION):

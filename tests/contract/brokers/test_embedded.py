@@ -33,14 +33,11 @@ def test_a_revoked_agent_is_seen_to_be_offline(broker: RunningBroker, space: str
 
 def test_an_agent_whose_token_runs_out_is_seen_to_be_offline(broker: RunningBroker, space: str) -> None:
     topic = f"ts/v1/{space}/arm/conn"
-    credentials = broker.issue(broker.grant(space, publish=(topic,), lifetime_s=3))
-    with (
-        broker.client(f"{space}-page", subscribe=(topic,)) as page,
-        broker.connect(space, credentials, will=Message(topic, b"offline", 1, retain=True)) as agent,
-    ):
-        assert agent.connected.is_set()
-        page.subscribe(topic)
-        assert page.receive().payload == b"offline"
+    with broker.client(f"{space}-page", subscribe=(topic,)) as page:
+        _, agent = broker.short_lived(space, publish=(topic,), will=Message(topic, b"offline", 1, retain=True))
+        with agent:
+            page.subscribe(topic)
+            assert page.receive().payload == b"offline"
 
 
 def test_one_token_can_be_revoked_alone(broker: RunningBroker, space: str) -> None:

@@ -121,5 +121,5 @@ def test_nothing_is_left_lying_in_what_was_decrypted(
     talker = connect(broker, "tcp", trusting)
     for number in range(200):
         talker.publish(topics.conn(space, f"agent{number}"), b"x" * 50)
-    wait_until(lambda: len(heard) == 200, "all of them", 10)
+    wait_until(lambda: len(heard) == 200, "all of them")
     broker.run(link.close())

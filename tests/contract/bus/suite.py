@@ -1,6 +1,7 @@
 """What every ``CommandBus`` keeps. A test class inherits it and gives ``stage``: the bus, and what lies behind it."""
 
 import asyncio
+import threading
 import time
 from collections.abc import Awaitable, Callable
 from dataclasses import dataclass
@@ -114,12 +115,21 @@ class BusContract:
         await stage.bus.close()
 
 
-async def beats_meanwhile(work: Awaitable[None]) -> int:
-    """How often the event loop came round, every 10 ms at best, while ``work`` was done."""
+async def beats_until(work: Awaitable[None], enough: threading.Event) -> int:
+    """How often the event loop came round while ``work`` was done, which waits for ``enough``: that it did five times.
+
+    Where the work holds up the loop it waits in vain.
+    """
     beats = 0
     task = asyncio.ensure_future(work)
     while not task.done():
         await asyncio.sleep(0.01)
         beats += 1
+        if beats == BEATS:
+            enough.set()
     await task
     return beats
+
+
+BEATS = 5
+WAITS_IN_VAIN_S = 10.0

@@ -1,5 +1,6 @@
 """The command bus over AWS IoT Core: moto, which takes messages and keeps them, behind a wire that can be spoilt."""
 
+import threading
 import time
 from collections.abc import AsyncIterator, Iterator
 from itertools import count
@@ -10,7 +11,7 @@ import pytest
 from function_app.adapters.aws import command_bus as adapter
 from function_app.adapters.aws.command_bus import IotCommandBus
 from function_app.ports.command_bus import BusUnavailable
-from tests.contract.bus.suite import BusContract, Heard, Stage, beats_meanwhile
+from tests.contract.bus.suite import BEATS, WAITS_IN_VAIN_S, BusContract, Heard, Stage, beats_until
 from tests.support.aws import REGION, Refusal, Wire, start_moto, start_wire, use_credentials
 
 _spaces = count()
@@ -98,8 +99,9 @@ class TestIot(BusContract):
         self, stage: Stage, wire: Wire, monkeypatch: pytest.MonkeyPatch
     ) -> None:
         await stage.bus.publish(stage.topic, b"x")
-        wire.spoil(lambda: time.sleep(0.5))
-        assert await beats_meanwhile(stage.bus.publish(stage.topic, b"x")) >= 5
+        enough = threading.Event()
+        wire.spoil(lambda: enough.wait(WAITS_IN_VAIN_S))
+        assert await beats_until(stage.bus.publish(stage.topic, b"x"), enough) >= BEATS
         monkeypatch.setattr(adapter, "GIVE_UP_S", 0.2)
         wire.spoil(lambda: time.sleep(1.0))
         with pytest.raises(BusUnavailable, match="did not answer"):

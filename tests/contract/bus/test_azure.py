@@ -20,7 +20,7 @@ import pytest
 from function_app.adapters.azure import command_bus as adapter
 from function_app.adapters.azure.command_bus import EventGridCommandBus
 from function_app.ports.command_bus import BusUnavailable
-from tests.contract.bus.suite import BusContract, Heard, Stage, beats_meanwhile
+from tests.contract.bus.suite import BEATS, WAITS_IN_VAIN_S, BusContract, Heard, Stage, beats_until
 from tests.support.identity import HOST, Host, make_certificate, start_host
 
 _spaces = count()
@@ -212,8 +212,9 @@ class TestEventGrid(BusContract):
         self, stage: Stage, namespace: Namespace, monkeypatch: pytest.MonkeyPatch
     ) -> None:
         await stage.bus.publish(stage.topic, b"x")
-        namespace.faults.append(lambda: time.sleep(0.5))
-        assert await beats_meanwhile(stage.bus.publish(stage.topic, b"x")) >= 5
+        enough = threading.Event()
+        namespace.faults.append(lambda: enough.wait(WAITS_IN_VAIN_S))
+        assert await beats_until(stage.bus.publish(stage.topic, b"x"), enough) >= BEATS
         monkeypatch.setattr(adapter, "GIVE_UP_S", 0.2)
         namespace.faults.append(lambda: time.sleep(1.0))
         with pytest.raises(BusUnavailable, match="did not answer"):

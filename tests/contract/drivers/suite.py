@@ -10,7 +10,7 @@ from device_agent.ports.driver import Driver, DriverError, Observation
 from device_agent.protocol import codec
 from device_agent.protocol.robot_type import RobotType
 
-DEADLINE_S = 20.0
+DEADLINE_S = 60.0
 
 
 def until(condition: Callable[[], bool]) -> None:

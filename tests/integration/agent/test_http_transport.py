@@ -19,7 +19,7 @@ from device_agent.transports.http import transport as http
 from device_agent.transports.http.api import CloudApi, CloudError
 from device_agent.transports.http.out_tray import Message, OutTray
 from device_agent.transports.http.transport import HttpTransport
-from tests.support.brokers import wait_until
+from tests.support.brokers import PATIENCE_S, wait_until
 
 CONN = topics.conn("lab", "arm1")
 CMD = topics.device("lab", "arm1", "arm", topics.CMD)
@@ -202,14 +202,16 @@ def test_more_commands_than_can_be_named_all_come_in_order_and_once(server: Serv
 def test_a_busy_server_is_given_time_and_one_that_stays_busy_is_no_link(
     server: Server, agent: Agent, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(http, "LOST_AFTER_S", 1.0)
+    monkeypatch.setattr(http, "LOST_AFTER_S", 2 * PATIENCE_S)
     agent.start()
     server.on_poll = lambda: problem(503)
-    time.sleep(0.6)
+    polls = len(server.polls)
+    wait_until(lambda: len(server.polls) > polls + 2, "polls that are not")
     server.on_poll = lambda: None
     polls = len(server.polls)
     wait_until(lambda: len(server.polls) > polls + 1, "polls that are answered")
     assert agent.changes == [True]
+    monkeypatch.setattr(http, "LOST_AFTER_S", 1.0)
     server.on_poll = lambda: problem(503)
     wait_until(lambda: agent.changes == [True, False], "the loss")
     assert not agent.ack("x")

@@ -52,7 +52,7 @@ def test_after_a_killed_server_all_find_together_and_go_on(site: XmppSite, anna:
     robot.silent = False
     with start_prosody(site.prosody.home, f"{site.url}/api/v1/xmpp/verify", port=site.prosody.port) as again:
         site.prosody.process = again.process
-        wait_until(lambda: robot.changes[-1] is True, "the way back", 30)
+        wait_until(lambda: robot.changes[-1] is True, "the way back")
         assert waiting().status_code == 200
         wait_until(lambda: robot.heard(StopDevice), "the Stop")
         wait_until(lambda: anna.get(f"/devices/{robot.device}").json()["online"], "online again")

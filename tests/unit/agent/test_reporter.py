@@ -20,7 +20,7 @@ from tests.support.bench import Bench, eventually
 from tests.support.toys import ToyDriver, robot_type
 from tests.unit.agent.test_robot import play
 
-WITHIN_S = 15.0
+WITHIN_S = 60.0
 JOINTS, SONAR, HEALTH = (Stream(name=name, rate_hz=100.0) for name in ("joints", "sonar", "health"))
 Answer = Callable[[], Mapping[str, float | bool]]
 

@@ -25,7 +25,7 @@ from device_agent.protocol.abilities import Battery
 from device_agent.protocol.errors import ProtocolError
 from tests.unit.robots.folders import ROBOTS
 
-WITHIN_S = 20.0
+WITHIN_S = 60.0
 UR5 = robot_type.load(ROBOTS / "ur5")
 NAMES = [joint.name for joint in UR5.joints]
 MOST = np.array([joint.max_effort_nm for joint in UR5.joints])
