@@ -1,25 +1,17 @@
 """Each of the four robots operated from its page: what is asked for is done in the simulation, and seen to be done."""
 
 import math
-from collections.abc import Iterator
 from itertools import pairwise
 
 import pytest
-from playwright.sync_api import Browser, Page, expect, sync_playwright
+from playwright.sync_api import Browser, Page, expect
 
 from tests.support.brokers import wait_until
-from tests.support.browser import PATIENCE_MS, chromium, pages
+from tests.support.browser import PATIENCE_MS, pages
 from tests.support.machine import Machine
 from tests.support.pages import assert_good_page
 
-DONE_WITHIN_MS = 60_000
 STEPS = ("accepted", "started", "observed", "ended")
-
-
-@pytest.fixture(scope="module")
-def browser() -> Iterator[Browser]:
-    with sync_playwright() as playwright, chromium(playwright) as browser:
-        yield browser
 
 
 def open_robot(page: Page, machine: Machine, name: str) -> None:
@@ -32,7 +24,7 @@ def open_robot(page: Page, machine: Machine, name: str) -> None:
 
 def ask(page: Page, button: str) -> None:
     """Press a button once it may be pressed: what was before has ended."""
-    expect(page.get_by_test_id(button)).to_be_enabled(timeout=DONE_WITHIN_MS)
+    expect(page.get_by_test_id(button)).to_be_enabled(timeout=PATIENCE_MS)
     page.get_by_test_id(button).click()
 
 
@@ -40,7 +32,7 @@ def assert_done(page: Page, kind: str, *, seen: str = "motion", nth: int = 0) ->
     """The newest command is done, and its line tells of every step, one after the other."""
     row = page.get_by_test_id("evidence-row").nth(nth)
     expect(row).to_have_attribute("data-kind", kind, timeout=PATIENCE_MS)
-    expect(page.get_by_test_id("action-status")).to_have_attribute("data-status", "done", timeout=DONE_WITHIN_MS)
+    expect(page.get_by_test_id("action-status")).to_have_attribute("data-status", "done", timeout=PATIENCE_MS)
     expect(row).to_have_attribute("data-seen", seen, timeout=PATIENCE_MS)
     times = {step: float(row.get_attribute(f"data-{step}") or "nan") for step in STEPS}
     assert times["accepted"] > 0
@@ -65,7 +57,7 @@ def test_the_arm_moves_to_a_pose_and_back(browser: Browser, laboratory: Machine)
     with pages(browser, laboratory) as (page,):
         open_robot(page, laboratory, "ur5")
         height = page.get_by_test_id("pose-2")
-        wait_until(lambda: height.input_value() != "", "the pose to be filled in", 30)
+        wait_until(lambda: height.input_value() != "", "the pose to be filled in")
         before = {name: joint(laboratory, "ur5", name) for name in ("shoulder_lift", "elbow", "wrist_1")}
         height.fill(f"{float(height.input_value()) - 0.08:.3f}")
         ask(page, "pose-go")
@@ -89,7 +81,7 @@ def test_the_arm_moves_to_a_pose_and_back(browser: Browser, laboratory: Machine)
         height.fill("3")
         ask(page, "pose-go")
         status = page.get_by_test_id("action-status")
-        expect(status).to_have_attribute("data-status", "failed", timeout=DONE_WITHIN_MS)
+        expect(status).to_have_attribute("data-status", "failed", timeout=PATIENCE_MS)
         expect(status.locator(".field-error")).not_to_be_empty()
         assert height.input_value() == "3"
 
@@ -156,7 +148,7 @@ def test_the_robot_on_wheels_goes_to_a_place_on_the_plan(browser: Browser, labor
         for view in (0, 1):
             page.get_by_test_id("watch-from").select_option(index=view)
             page.get_by_test_id("camera-live").click()
-            wait_until(lambda: page.get_by_test_id("camera-picture").get_attribute("data-sequence"), "a picture", 30)
+            wait_until(lambda: page.get_by_test_id("camera-picture").get_attribute("data-sequence"), "a picture")
         assert_good_page(page, "wheels")
         assert_good_page(page, "place", part="plan")
         ask(page, "back")

@@ -2,18 +2,18 @@
 
 from itertools import pairwise
 
-from playwright.sync_api import sync_playwright
+from playwright.sync_api import Browser
 
 from benchmarks import console
-from tests.support.browser import chromium, pages
+from tests.support.browser import pages
 from tests.support.machine import Machine
 
 CLOCKS_AGREE_MS = 15.0
 """The simulation's record has a line each 10 ms, and the wall clocks of two programs are read in between."""
 
 
-def test_every_part_of_a_press_is_measured_and_in_order(machine: Machine) -> None:
-    with sync_playwright() as playwright, chromium(playwright) as browser, pages(browser, machine) as (page,):
+def test_every_part_of_a_press_is_measured_and_in_order(drawing_browser: Browser, machine: Machine) -> None:
+    with pages(drawing_browser, machine) as (page,):
         found = console.measure(page, machine, 2)
         if page.get_by_test_id("release-control").count():
             page.get_by_test_id("release-control").click()

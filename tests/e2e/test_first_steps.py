@@ -1,15 +1,15 @@
 """Somebody who is here for the first time: signs in, has nothing yet, and is told how to get going."""
 
-from playwright.sync_api import Page, expect, sync_playwright
+from playwright.sync_api import Browser, Page, expect
 
-from tests.support.browser import PATIENCE_MS, chromium
+from tests.support.browser import PATIENCE_MS
 from tests.support.machine import Machine
 from tests.support.pages import assert_good_page
 
 
-def test_a_newcomer_is_told_how_to_get_going(machine: Machine) -> None:
-    with sync_playwright() as playwright, chromium(playwright) as browser:
-        page = browser.new_context(viewport={"width": 1440, "height": 900}).new_page()
+def test_a_newcomer_is_told_how_to_get_going(browser: Browser, machine: Machine) -> None:
+    with browser.new_context(viewport={"width": 1440, "height": 900}) as context:
+        page = context.new_page()
         page.set_default_timeout(PATIENCE_MS)
         errors: list[str] = []
         page.on("pageerror", lambda error: errors.append(str(error)))

@@ -3,18 +3,12 @@
 from collections.abc import Iterator
 
 import pytest
-from playwright.sync_api import Browser, Page, expect, sync_playwright
+from playwright.sync_api import Browser, Page, expect
 
 from tests.support.brokers import wait_until
-from tests.support.browser import FLAT, PATIENCE_MS, chromium, person
+from tests.support.browser import PATIENCE_MS, person
 from tests.support.machine import Machine
 from tests.support.pages import assert_good_page
-
-
-@pytest.fixture(scope="module")
-def browser() -> Iterator[Browser]:
-    with sync_playwright() as playwright, chromium(playwright, FLAT) as browser:
-        yield browser
 
 
 @pytest.fixture
@@ -74,7 +68,7 @@ def move_the_elbow(page: Page, machine: Machine) -> None:
         page.wait_for_timeout(200)
         return abs(elbow(machine) - before) > 0.1
 
-    wait_until(moved, "the elbow moving", 45)
+    wait_until(moved, "the elbow moving")
 
 
 def test_control_goes_from_hand_to_hand_and_who_watches_is_seen(two: tuple[Page, Page], machine: Machine) -> None:

@@ -69,24 +69,24 @@ def test_who_is_handed_control_finds_the_arm_at_rest_and_the_former_holder_moves
     trace = machine.trace()
     epoch = ann.post(f"/devices/{device}/lease", {"lease_ms": 60_000})["epoch"]
     action = move(ann, device, epoch, FAR)
-    wait_until(lambda: commanded_speed(trace) > SLOW / 10, "motion", 20)
+    wait_until(lambda: commanded_speed(trace) > SLOW / 10, "motion")
     asked = bob.post(f"/devices/{device}/lease/requests", {"lease_ms": 60_000})
     assert asked["confirmed"] is True
     request = asked["request"]["id"]
-    wait_until(lambda: (state(ann, device)["lease"] or {}).get("request"), "the request in the device's state", 20)
+    wait_until(lambda: (state(ann, device)["lease"] or {}).get("request"), "the request in the device's state")
     assert state(ann, device)["lease"]["request"]["id"] == request
     assert commanded_speed(trace) > 0, "asking changes nothing about motion"
     given = ann.post(f"/devices/{device}/lease/requests/{request}/accept")
     assert (given["epoch"], given["confirmed"]) == (epoch + 1, True)
     last = ended(ann, action)
     assert (last["status"], last["reason"]["code"]) == ("failed", "lease_lost")
-    wait_until(lambda: commanded_speed(trace) == 0, "rest", 10)
-    wait_until(lambda: state(bob, device)["lease"]["epoch"] == epoch + 1, "the new holder in the state", 20)
+    wait_until(lambda: commanded_speed(trace) == 0, "rest")
+    wait_until(lambda: state(bob, device)["lease"]["epoch"] == epoch + 1, "the new holder in the state")
     request_body = {"request": {"kind": "move_joints", "position_rad": FAR}, "epoch": epoch}
     assert refused(ann, f"/devices/{device}/actions", request_body) == "lease-lost"
     taken = ann.post(f"/devices/{device}/lease", {"take_over": True, "reason": "to try it"})
     assert (taken["epoch"], taken["confirmed"]) == (epoch + 2, True)
-    wait_until(lambda: state(bob, device)["lease"]["reason"] == "to try it", "the reason in the state", 20)
+    wait_until(lambda: state(bob, device)["lease"]["reason"] == "to try it", "the reason in the state")
     ann.http.delete(f"/devices/{device}/lease", params={"epoch": epoch + 2})
 
 
@@ -97,14 +97,14 @@ def test_after_a_stop_of_everything_only_who_takes_control_anew_moves_it(
     trace = machine.trace()
     epoch = ann.post(f"/devices/{device}/lease", {"lease_ms": 60_000})["epoch"]
     action = move(ann, device, epoch, NEAR)
-    wait_until(lambda: commanded_speed(trace) > SLOW / 10, "motion", 20)
+    wait_until(lambda: commanded_speed(trace) > SLOW / 10, "motion")
     answer = bob.post("/stop", {"reason": "to try it"})
     assert [item["confirmed"] for item in answer["items"] if item["device"] == device] == [True]
     assert ended(ann, action)["reason"]["code"] == "stopped"
-    wait_until(lambda: commanded_speed(trace) == 0, "rest", 10)
-    wait_until(lambda: state(ann, device)["stop"], "the latch in the state", 20)
+    wait_until(lambda: commanded_speed(trace) == 0, "rest")
+    wait_until(lambda: state(ann, device)["stop"], "the latch in the state")
     # The device has ended Ann's lease, so control is anybody's; but it moves nothing while it is stopped.
-    wait_until(lambda: ann.get(f"/devices/{device}/lease")["lease"] is None, "the end of the lease", 20)
+    wait_until(lambda: ann.get(f"/devices/{device}/lease")["lease"] is None, "the end of the lease")
     other = bob.post(f"/devices/{device}/lease", {"lease_ms": 60_000})["epoch"]
     still = ended(bob, move(bob, device, other, NEAR))
     assert (still["status"], still["reason"]["code"]) == ("failed", "stopped")
@@ -115,10 +115,10 @@ def test_after_a_stop_of_everything_only_who_takes_control_anew_moves_it(
     assert commanded_speed(trace) == 0, "the reset resumes nothing"
     fresh = bob.post(f"/devices/{device}/lease", {"lease_ms": 60_000})["epoch"]
     again = move(bob, device, fresh, NEAR)
-    wait_until(lambda: commanded_speed(trace) > SLOW / 10, "motion", 20)
+    wait_until(lambda: commanded_speed(trace) > SLOW / 10, "motion")
     bob.post(f"/actions/{again}/cancel")
     ended(bob, again)
     bob.http.delete(f"/devices/{device}/lease", params={"epoch": fresh})
     told = {"stop-ordered", "stop-latched", "stop-reset-ordered", "stop-reset", "control-taken"}
     # The device's own come when its link is settled.
-    wait_until(lambda: told <= kinds(ann, device), "the events of cloud and device", 40)
+    wait_until(lambda: told <= kinds(ann, device), "the events of cloud and device")

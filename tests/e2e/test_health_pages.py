@@ -5,10 +5,10 @@ from collections import defaultdict
 from collections.abc import Iterator
 from pathlib import Path
 
-from playwright.sync_api import Page, expect, sync_playwright
+from playwright.sync_api import Browser, Page, expect
 
 from tests.support.brokers import wait_until
-from tests.support.browser import PATIENCE_MS, chromium, pages
+from tests.support.browser import PATIENCE_MS, pages
 from tests.support.machine import Api, Machine
 from tests.support.pages import assert_good_page
 
@@ -35,8 +35,10 @@ def go(page: Page, machine: Machine, address: str) -> None:
     assert page.url.startswith(machine.url)
 
 
-def test_a_fault_is_raised_seen_and_ended_and_a_trend_shows_what_was_measured(laboratory: Machine) -> None:
-    with laboratory.api() as api, sync_playwright() as playwright, chromium(playwright) as browser:
+def test_a_fault_is_raised_seen_and_ended_and_a_trend_shows_what_was_measured(
+    browser: Browser, laboratory: Machine
+) -> None:
+    with laboratory.api() as api:
         ids = {name: api.device(name)["id"] for name in ("thermometer", "co2")}
         # A meter that goes wild shows in its trend at once, and is found by the detectors while the rest is looked at.
         with (
@@ -92,7 +94,7 @@ def trend(page: Page, machine: Machine, device: str) -> None:
     go(page, machine, f"#/devices/{device}/health")
     page.get_by_text("10 min", exact=True).click()
     now = page.get_by_test_id("trend-now")
-    wait_until(lambda: float(now.get_attribute("data-value") or "0") > 2000, "a wild value", 30)
+    wait_until(lambda: float(now.get_attribute("data-value") or "0") > 2000, "a wild value")
     expect(now).to_contain_text("out of its limits")
     expect(page.get_by_test_id("trend-fault")).to_have_attribute("data-code", "co2.co2_ppm", timeout=2 * PATIENCE_MS)
     row = page.get_by_test_id("watched-row").first
@@ -100,7 +102,7 @@ def trend(page: Page, machine: Machine, device: str) -> None:
     expect(row).to_contain_text("Beyond a limit")
     expect(row).to_contain_text("Open door or window")  # as the room's manifest advises
     chart = page.get_by_test_id("series")
-    wait_until(lambda: int(chart.get_attribute("data-points") or "0") > 5, "points", 30)
+    wait_until(lambda: int(chart.get_attribute("data-points") or "0") > 5, "points")
     chart.focus()
     page.keyboard.press("ArrowLeft")
     before = chart.get_attribute("aria-valuetext")
@@ -113,15 +115,15 @@ def trend(page: Page, machine: Machine, device: str) -> None:
     expect(page.get_by_test_id("trend-table").get_by_role("row")).not_to_have_count(1)
 
 
-def test_times_are_measured_drawn_beside_the_papers_and_saved(laboratory: Machine) -> None:
-    with laboratory.api() as api, sync_playwright() as playwright, chromium(playwright) as browser:
+def test_times_are_measured_drawn_beside_the_papers_and_saved(browser: Browser, laboratory: Machine) -> None:
+    with laboratory.api() as api:
         device = api.device("light")["id"]
         with pages(browser, laboratory) as (ann,):
             go(ann, laboratory, f"#/devices/{device}/times")
             ann.get_by_test_id("measure").click()
             measured = ann.get_by_test_id("measured")
             chart = ann.get_by_test_id("times-samples")
-            wait_until(lambda: int(chart.get_attribute("data-samples") or "0") > 0, "samples while it measures", 30)
+            wait_until(lambda: int(chart.get_attribute("data-samples") or "0") > 0, "samples while it measures")
             expect(measured).to_have_attribute("data-busy", "false", timeout=2 * PATIENCE_MS)
             expect(measured).to_have_attribute("data-count", str(3 * MEASURED))
 
@@ -132,7 +134,7 @@ def test_times_are_measured_drawn_beside_the_papers_and_saved(laboratory: Machin
                 assert int(line.get_attribute("data-count") or "0") >= MEASURED
             # The cloud has measured the same requests on its own clock; nothing waits for it to note them.
             kinds = (("http", "operator-device"), ("mqtt", "command-started"))
-            wait_until(lambda: all(counted(api, device)[kind] >= MEASURED for kind in kinds), "all to be stored", 30)
+            wait_until(lambda: all(counted(api, device)[kind] >= MEASURED for kind in kinds), "all to be stored")
             counts = counted(api, device)
             ann.get_by_test_id("times-path").select_option("operator-device")
             assert chart.get_attribute("data-samples") == str(counts["http", "operator-device"])

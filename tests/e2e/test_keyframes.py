@@ -4,15 +4,12 @@ import ast
 from typing import Any
 
 import pytest
-from playwright.sync_api import Page, expect, sync_playwright
+from playwright.sync_api import Browser, Page, expect
 
 from tests.support.brokers import wait_until
-from tests.support.browser import PATIENCE_MS, chromium, pages
+from tests.support.browser import PATIENCE_MS, pages
 from tests.support.machine import Machine
 from tests.support.pages import assert_good_page
-
-pytestmark = pytest.mark.timeout(300)
-"""Drawing in three dimensions without a graphics card takes its time."""
 
 
 def open_editor(page: Page, laboratory: Machine, name: str) -> None:
@@ -22,7 +19,7 @@ def open_editor(page: Page, laboratory: Machine, name: str) -> None:
     page.goto(f"{laboratory.url}/#/devices/{device}")
     page.get_by_test_id("to-keyframes").click()
     expect(page.get_by_test_id("kf-track")).to_be_visible(timeout=PATIENCE_MS)
-    wait_until(lambda: number(page, "kf-view", "frames") > 0, "the twin to be drawn", 60)
+    wait_until(lambda: number(page, "kf-view", "frames") > 0, "the twin to be drawn")
 
 
 def number(page: Page, test_id: str, name: str) -> float:
@@ -55,12 +52,12 @@ def save(page: Page, name: str) -> None:
 def run(page: Page) -> None:
     page.get_by_test_id("kf-run").click()
     status = page.get_by_test_id("action-status")
-    wait_until(lambda: status.get_attribute("data-status") in {"done", "failed", "refused"}, "the run to end", 60)
+    wait_until(lambda: status.get_attribute("data-status") in {"done", "failed", "refused"}, "the run to end")
     assert status.get_attribute("data-status") == "done", status.text_content()
 
 
-def test_an_arm_s_movement_from_keyframes_to_the_robot(laboratory: Machine) -> None:
-    with sync_playwright() as playwright, chromium(playwright) as browser, pages(browser, laboratory) as (page,):
+def test_an_arm_s_movement_from_keyframes_to_the_robot(drawing_browser: Browser, laboratory: Machine) -> None:
+    with pages(drawing_browser, laboratory) as (page,):
         open_editor(page, laboratory, "ur5")
 
         # Two poses by number and by slider; the way between them is too fast, and one click mends it.
@@ -106,7 +103,7 @@ def test_an_arm_s_movement_from_keyframes_to_the_robot(laboratory: Machine) -> N
         page.get_by_test_id("kf-description").fill("Turns and looks around.")
         save(page, "kf-turn")
         page.get_by_test_id("kf-marker-2").focus()
-        wait_until(lambda: number(page, "kf-view", "frames") > 0, "the twin to be drawn", 60)
+        wait_until(lambda: number(page, "kf-view", "frames") > 0, "the twin to be drawn")
         assert_good_page(page, "keyframes")
         page.set_viewport_size({"width": 1440, "height": 900})
 
@@ -149,8 +146,10 @@ def opened_again(page: Page, laboratory: Machine, made: list[dict[str, Any]]) ->
         assert api.http.delete("/robot-types/ur5/movements/kf-turn").is_success
 
 
-def test_what_moves_the_robot_is_recorded_trimmed_and_becomes_keyframes(laboratory: Machine) -> None:
-    with sync_playwright() as playwright, chromium(playwright) as browser, pages(browser, laboratory) as (page,):
+def test_what_moves_the_robot_is_recorded_trimmed_and_becomes_keyframes(
+    drawing_browser: Browser, laboratory: Machine
+) -> None:
+    with pages(drawing_browser, laboratory) as (page,):
         open_editor(page, laboratory, "ur5")
         home = keyframes(page)[0]["position_rad"]
         page.get_by_test_id("kf-record").click()
@@ -187,8 +186,10 @@ def test_what_moves_the_robot_is_recorded_trimmed_and_becomes_keyframes(laborato
         ("hanson", "Neck-Rotation", 20, "kf-say"),
     ],
 )
-def test_the_same_editor_serves_every_robot(laboratory: Machine, name: str, joint: str, deg: float, deed: str) -> None:
-    with sync_playwright() as playwright, chromium(playwright) as browser, pages(browser, laboratory) as (page,):
+def test_the_same_editor_serves_every_robot(
+    drawing_browser: Browser, laboratory: Machine, *, name: str, joint: str, deg: float, deed: str
+) -> None:
+    with pages(drawing_browser, laboratory) as (page,):
         open_editor(page, laboratory, name)
         page.get_by_test_id("kf-add").click()
         page.get_by_test_id("kf-lasts").fill("1.5")

@@ -22,7 +22,7 @@ def clear_line(machine: Machine) -> str:
     """The one line with which it ended; anything like a traceback fails."""
     assert machine.process.wait(30) != 0
     # Its last words may still be on their way when it has gone.
-    wait_until(lambda: any(line.strip() and line != "telescope: starting\n" for line in machine.lines), "a word", 10)
+    wait_until(lambda: any(line.strip() and line != "telescope: starting\n" for line in machine.lines), "a word")
     text = "".join(machine.lines)
     assert "Traceback" not in text
     lines = [line for line in machine.lines if line.strip() and line != "telescope: starting\n"]
@@ -75,7 +75,7 @@ def test_the_lab_starts_with_everything_that_stands_in_it(laboratory: Machine) -
             api.device(name)
         devices = api.get("/devices", limit=100)["items"]
         assert sorted(each["name"] for each in devices) == sorted(room.names)
-        wait_until(lambda: _moves(api, api.device("ur5")["id"]), "the arm on its table to move", 60)
+        wait_until(lambda: _moves(api, api.device("ur5")["id"]), "the arm on its table to move")
         assert laboratory.trace("ur5").now()["qpos"]["wrist_3"] == pytest.approx(0.2, abs=0.02)
 
 
@@ -84,8 +84,8 @@ def test_every_part_that_is_killed_comes_back(tmp_path: Path) -> None:
         device = api.device()
         for words in ("infra.amqtt", "function_app serve", "function_app work", "-m device_agent"):
             machine.kill(words)
-            wait_until(functools.partial(_runs, machine, words), f"{words} to be started again", 30)
-        wait_until(lambda: _moves(api, device["id"]), "the robot to move again", 60)
+            wait_until(functools.partial(_runs, machine, words), f"{words} to be started again")
+        wait_until(lambda: _moves(api, device["id"]), "the robot to move again")
 
 
 def _runs(machine: Machine, words: str) -> bool:
@@ -114,7 +114,7 @@ def test_when_the_supervisor_is_killed_nothing_is_left_behind(tmp_path: Path) ->
             for words in ("infra.amqtt", "function_app serve", "function_app work", "-m device_agent")
         ]
         machine.process.send_signal(signal.SIGKILL)
-        wait_until(lambda: not any(Path(f"/proc/{pid}").exists() for pid in children), "the others to end", 30)
+        wait_until(lambda: not any(Path(f"/proc/{pid}").exists() for pid in children), "the others to end")
 
 
 @pytest.mark.parametrize("offset", [0, 1, 2])

@@ -1,16 +1,15 @@
 """Movements as a person writes, keeps and runs them, in a real Chromium with real agents."""
 
-import contextlib
 import subprocess
 import sys
 from collections.abc import Iterator
 from typing import Any
 
 import pytest
-from playwright.sync_api import Locator, Page, expect, sync_playwright
+from playwright.sync_api import Browser, Locator, Page, expect
 
 from tests.support.brokers import ROOT, wait_until
-from tests.support.browser import PATIENCE_MS, chromium, pages
+from tests.support.browser import PATIENCE_MS, pages
 from tests.support.machine import Api, Machine, Trace
 from tests.support.pages import assert_good_page
 
@@ -69,12 +68,6 @@ def name(api: Api, request: pytest.FixtureRequest) -> Iterator[str]:
     api.post(f"/devices/{device}/actions", {"request": home, "wait_ms": 20_000, "wait_for": "done"})
 
 
-@contextlib.contextmanager
-def tabs(machine: Machine, count: int = 1) -> Iterator[list[Page]]:
-    with sync_playwright() as playwright, chromium(playwright) as browser, pages(browser, machine, count) as opened:
-        yield opened
-
-
 def script(page: Page) -> Locator:
     return page.get_by_test_id("code").get_by_role("textbox")
 
@@ -108,8 +101,8 @@ def wrist(trace: Trace) -> float:
     return float(trace.now()["qpos"]["wrist_3"])
 
 
-def test_a_movement_is_written_mended_and_saved(machine: Machine, name: str) -> None:
-    with tabs(machine) as (page,):
+def test_a_movement_is_written_mended_and_saved(browser: Browser, machine: Machine, name: str) -> None:
+    with pages(browser, machine) as (page,):
         page.get_by_role("link", name="Movements").click()
         expect(page.get_by_test_id("shelf-ur5-wave")).to_be_visible(timeout=PATIENCE_MS)
         page.get_by_test_id("movement-search").fill("square air")
@@ -160,10 +153,10 @@ def test_a_movement_is_written_mended_and_saved(machine: Machine, name: str) -> 
 
 
 def test_a_movement_runs_with_parameters_from_a_form_and_its_failure_is_marked(
-    machine: Machine, api: Api, name: str
+    browser: Browser, machine: Machine, api: Api, name: str
 ) -> None:
     api.http.put(f"/robot-types/ur5/movements/{name}", json={"source": SCRIPT}).raise_for_status()
-    with tabs(machine) as (page,):
+    with pages(browser, machine) as (page,):
         open_script(page, machine, name)
 
         page.get_by_test_id("choose-ur5").check()
@@ -175,10 +168,10 @@ def test_a_movement_runs_with_parameters_from_a_form_and_its_failure_is_marked(
         angle.fill("40")
         page.get_by_test_id("run-many").click()
         row = page.get_by_test_id("run-ur5")
-        wait_until(lambda: row.get_attribute("data-status") in {"done", "failed"}, "the run to end", 30)
+        wait_until(lambda: row.get_attribute("data-status") in {"done", "failed"}, "the run to end")
         assert row.get_attribute("data-status") == "done", row.inner_text()
         expect(row).to_contain_text("turned 0.69")
-        wait_until(lambda: abs(wrist(machine.trace()) - 0.698) < 0.01, "the wrist to be turned by 40°", 20)
+        wait_until(lambda: abs(wrist(machine.trace()) - 0.698) < 0.01, "the wrist to be turned by 40°")
         assert_good_page(page, "movement")
 
         # A run that fails is marked in its line too.
@@ -197,11 +190,13 @@ def test_a_movement_runs_with_parameters_from_a_form_and_its_failure_is_marked(
         page.get_by_test_id("parameter-angle_rad").fill("-30")
         assert_good_page(page, "movement-parameters", part="parameter-form")
         page.get_by_test_id("run-with").click()
-        wait_until(lambda: abs(wrist(machine.trace()) + 0.5236) < 0.01, "the wrist to be turned by -30°", 20)
+        wait_until(lambda: abs(wrist(machine.trace()) + 0.5236) < 0.01, "the wrist to be turned by -30°")
 
 
-def test_nothing_that_was_written_is_lost_and_versions_come_back(machine: Machine, api: Api, name: str) -> None:
-    with tabs(machine, 2) as (mine, other):
+def test_nothing_that_was_written_is_lost_and_versions_come_back(
+    browser: Browser, machine: Machine, api: Api, name: str
+) -> None:
+    with pages(browser, machine, 2) as (mine, other):
         open_script(mine, machine, name)
         write(mine, SCRIPT)
         save(mine, 1)
@@ -233,16 +228,16 @@ def test_nothing_that_was_written_is_lost_and_versions_come_back(machine: Machin
         assert_good_page(mine, "movement-version")
         mine.get_by_test_id("restore-version").click()
         expect(mine.get_by_test_id("save-state")).to_have_attribute("data-version", "4", timeout=PATIENCE_MS)
-        wait_until(lambda: written(mine) == SCRIPT + "# theirs\n", "the older text", 20)
+        wait_until(lambda: written(mine) == SCRIPT + "# theirs\n", "the older text")
         assert api.get(f"/robot-types/ur5/movements/{name}")["source"] == SCRIPT + "# theirs\n"
 
         # A draft is given up only when somebody says so, and comes back.
         write(mine, "1")
         mine.reload()
         mine.get_by_test_id("discard-draft").click()
-        wait_until(lambda: written(mine) == SCRIPT + "# theirs\n", "the saved text", 20)
+        wait_until(lambda: written(mine) == SCRIPT + "# theirs\n", "the saved text")
         mine.get_by_role("button", name="Undo").click()
-        wait_until(lambda: written(mine) == "1", "what was given up", 20)
+        wait_until(lambda: written(mine) == "1", "what was given up")
 
         # Deleting asks in its own place.
         mine.goto(f"{machine.url}/#/movements")
@@ -252,10 +247,10 @@ def test_nothing_that_was_written_is_lost_and_versions_come_back(machine: Machin
 
 
 def test_one_movement_runs_on_many_robots_and_all_are_stopped_at_once(
-    machine: Machine, api: Api, second: Trace, name: str
+    browser: Browser, machine: Machine, api: Api, second: Trace, name: str
 ) -> None:
     api.http.put(f"/robot-types/ur5/movements/{name}", json={"source": SCRIPT}).raise_for_status()
-    with tabs(machine) as (page,):
+    with pages(browser, machine) as (page,):
         open_script(page, machine, name)
         page.get_by_role("button", name="Choose all").click()
         expect(page.get_by_test_id("many-state")).to_be_visible(timeout=PATIENCE_MS)
@@ -265,7 +260,7 @@ def test_one_movement_runs_on_many_robots_and_all_are_stopped_at_once(
         for row in rows:
             expect(row).to_have_attribute("data-status", "done", timeout=PATIENCE_MS)
         for trace in (machine.trace(), second):
-            wait_until(lambda trace=trace: abs(wrist(trace) - 0.349) < 0.01, "the wrist to be turned by 20°", 20)  # type: ignore[misc]
+            wait_until(lambda trace=trace: abs(wrist(trace) - 0.349) < 0.01, "the wrist to be turned by 20°")  # type: ignore[misc]
 
         # One is cancelled, then both are stopped by the key, wherever the focus is.
         page.get_by_test_id("parameter-wait_s").fill("30")
@@ -274,7 +269,7 @@ def test_one_movement_runs_on_many_robots_and_all_are_stopped_at_once(
             expect(row).to_have_attribute("data-status", "started", timeout=PATIENCE_MS)
         assert_good_page(page, "movement-many")
         page.get_by_role("button", name="Cancel on").last.click()
-        wait_until(lambda: "cancelled" in [row.get_attribute("data-status") for row in rows], "one to be cancelled", 20)
+        wait_until(lambda: "cancelled" in [row.get_attribute("data-status") for row in rows], "one to be cancelled")
         script(page).click()
         page.keyboard.press("Escape")
         expect(page.get_by_test_id("stop-banner")).to_have_count(2, timeout=PATIENCE_MS)

@@ -14,25 +14,13 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from playwright.sync_api import Browser, BrowserContext, Error, Page, Playwright, expect, sync_playwright
+from playwright.sync_api import Browser, BrowserContext, Error, Page, Playwright, expect
 
 from tests.support.brokers import wait_until
-from tests.support.browser import FLAGS, PATIENCE_MS, chromium
+from tests.support.browser import FLAGS, PATIENCE_MS
 from tests.support.machine import Machine, Trace
 
 STOP_WITHIN_MS = 350
-
-
-@pytest.fixture(scope="module")
-def playwright() -> Iterator[Playwright]:
-    with sync_playwright() as playwright:
-        yield playwright
-
-
-@pytest.fixture(scope="module")
-def browser(playwright: Playwright) -> Iterator[Browser]:
-    with chromium(playwright) as browser:
-        yield browser
 
 
 @contextlib.contextmanager
@@ -146,12 +134,12 @@ def test_the_elbow_slider_moves_the_simulation_and_nobody_elses_does(browser: Br
             return abs(math.degrees(elbow(trace)) - float(slider.input_value())) < 1.5
 
         drive(ann, 0.6, lambda: abs(elbow(trace) - before) > 0.2 and arrived(), "the elbow following the slider")
-        wait_until(lambda: abs(shown(ann) - math.degrees(elbow(trace))) < 0.5, "the page to show it", 30)
+        wait_until(lambda: abs(shown(ann) - math.degrees(elbow(trace))) < 0.5, "the page to show it")
         round_trip = ann.get_by_test_id("round-trip")
         assert float(round_trip.get_attribute("data-value") or "nan") > 0
 
         # The other browser sees it all and can move nothing.
-        wait_until(lambda: abs(shown(bob) - math.degrees(elbow(trace))) < 0.5, "the other page to show it", 30)
+        wait_until(lambda: abs(shown(bob) - math.degrees(elbow(trace))) < 0.5, "the other page to show it")
         expect(bob.get_by_test_id("slider-elbow")).to_be_disabled()
         if ann.get_by_test_id("control-state").get_attribute("data-state") != "mine":
             take(ann)  # the machine was so busy that the robot had to hold on its way
@@ -184,7 +172,7 @@ def test_stop_latches_until_it_is_reset(browser: Browser, machine: Machine) -> N
         drive(page, 0.25, lambda: commanded_speed(trace) > 0.1, "motion")
         page.keyboard.press("Escape")
         expect(page.get_by_test_id("stop-banner")).to_be_visible()
-        wait_until(lambda: commanded_speed(trace) == 0, "rest", 10)
+        wait_until(lambda: commanded_speed(trace) == 0, "rest")
         wait_until(lambda: page.get_by_test_id("slider-elbow").is_disabled(), "the sliders to be locked")
         rest = elbow(trace)
         page.wait_for_timeout(1000)
@@ -202,7 +190,7 @@ def end_in_mid_motion(page: Page, trace: Trace, end: Callable[[], None]) -> floa
     drive(page, share, lambda: commanded_speed(trace) > 0.2, "motion", let_go=False)
     end()
     ended_ms = time.time() * 1000
-    wait_until(lambda: commanded_speed(trace) == 0, "rest", 10)
+    wait_until(lambda: commanded_speed(trace) == 0, "rest")
     moving = [row["at_ms"] for row in speeds(trace) if row["speed"] > 1e-3]
     rest = elbow(trace)
     time.sleep(1)
@@ -243,7 +231,7 @@ def test_the_view_the_plot_and_the_pose_table_are_alive(browser: Browser, machin
     with operator(browser, machine) as page:
         view = page.get_by_test_id("view-3d")
         view.scroll_into_view_if_needed()
-        wait_until(lambda: int(view.get_attribute("data-frames") or 0) > 0, "the 3D view to be drawn", 60)
+        wait_until(lambda: int(view.get_attribute("data-frames") or 0) > 0, "the 3D view to be drawn")
         expect(page.get_by_test_id("plot").locator("canvas").first).to_be_visible()
         rows = page.get_by_test_id("poses").locator("tbody tr")
         assert rows.count() >= 6
@@ -254,13 +242,13 @@ def test_a_movement_runs_from_the_list(browser: Browser, machine: Machine) -> No
     with operator(browser, machine) as page:
         page.get_by_test_id("movement-home").click()
         status = page.get_by_test_id("action-status")
-        expect(status).to_have_attribute("data-status", "done", timeout=60_000)
+        expect(status).to_have_attribute("data-status", "done", timeout=PATIENCE_MS)
         page.get_by_test_id("movement-wave").click()
         expect(status).to_have_attribute("data-status", "started", timeout=PATIENCE_MS)
-        wait_until(lambda: commanded_speed(trace) > 0.1, "the simulation to wave", 30)
+        wait_until(lambda: commanded_speed(trace) > 0.1, "the simulation to wave")
         page.get_by_test_id("cancel-action").click()
         expect(status).to_have_attribute("data-status", "cancelled", timeout=PATIENCE_MS)
-        wait_until(lambda: commanded_speed(trace) == 0, "rest", 10)
+        wait_until(lambda: commanded_speed(trace) == 0, "rest")
 
 
 def test_a_robot_that_goes_offline_is_shown_as_such(browser: Browser, machine: Machine) -> None:

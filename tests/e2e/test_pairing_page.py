@@ -13,19 +13,13 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
-from playwright.sync_api import Browser, Page, expect, sync_playwright
+from playwright.sync_api import Browser, Page, expect
 
 from device_agent import claim_link
 from tests.support.brokers import ROOT, wait_until
-from tests.support.browser import FLAT, PATIENCE_MS, chromium, person
+from tests.support.browser import PATIENCE_MS, person
 from tests.support.machine import Machine
 from tests.support.pages import assert_good_page
-
-
-@pytest.fixture(scope="module")
-def browser() -> Iterator[Browser]:
-    with sync_playwright() as playwright, chromium(playwright, FLAT) as browser:
-        yield browser
 
 
 class Terminal:
@@ -56,7 +50,7 @@ class Terminal:
         def found() -> re.Match[str] | None:
             return re.search(r"(http\S+#pair=\S+)\s", self.text)
 
-        wait_until(lambda: found() is not None, "the link", 60)
+        wait_until(lambda: found() is not None, "the link")
         match = found()
         assert match
         return match[1]
@@ -86,7 +80,7 @@ def test_a_robot_is_paired_by_the_link_in_its_agents_terminal(
     link = terminal.link()
     # The same link stands there as a picture.
     drawn = claim_link.picture(link)
-    wait_until(lambda: all(line in terminal.text for line in drawn), "the QR code", 20)
+    wait_until(lambda: all(line in terminal.text for line in drawn), "the QR code")
     with machine.api() as api, person(browser, link) as page:
         known = {device["id"] for device in api.get("/devices")["items"]}
         # Nobody is signed in: the code leaves the address and is there again afterwards. Nothing is claimed by itself.

@@ -29,7 +29,7 @@ def test_curl_pairs_a_second_robot_and_runs_a_movement_on_it(machine: Machine, t
             start_new_session=True,
         )
     try:
-        wait_until(lambda: "claim code" in said.read_text(), "the claim code", 60)
+        wait_until(lambda: "claim code" in said.read_text(), "the claim code")
         code = re.search(r"claim code (\S+)", said.read_text())
         assert code
         script = "\n".join(block(name, machine, tmp_path) for name in ("curl", "mqtt"))

@@ -5,10 +5,10 @@ import zipfile
 from collections.abc import Mapping
 from pathlib import Path
 
-from playwright.sync_api import FilePayload, Locator, Page, expect, sync_playwright
+from playwright.sync_api import Browser, FilePayload, Locator, Page, expect
 
 from tests.support.brokers import wait_until
-from tests.support.browser import PATIENCE_MS, chromium, pages
+from tests.support.browser import PATIENCE_MS, pages
 from tests.support.machine import Machine
 from tests.support.pages import assert_good_page
 
@@ -114,8 +114,10 @@ def finding(page: Page, kind: str, level: str = "error") -> Locator:
     return page.locator(f"[data-testid={level}][data-kind={kind}]")
 
 
-def test_a_robot_type_is_mended_seen_saved_and_deleted(machine: Machine, tmp_path: Path) -> None:
-    with sync_playwright() as playwright, chromium(playwright) as browser, pages(browser, machine) as (page,):
+def test_a_robot_type_is_mended_seen_saved_and_deleted(
+    drawing_browser: Browser, machine: Machine, tmp_path: Path
+) -> None:
+    with pages(drawing_browser, machine) as (page,):
         page.get_by_role("link", name="Robot types").click()
         expect(page.locator("[data-testid=type-row][data-type=ur5]")).to_be_visible()
         expect(page.locator("[data-type=ur5]")).to_contain_text("1 device")
@@ -130,7 +132,7 @@ def test_a_robot_type_is_mended_seen_saved_and_deleted(machine: Machine, tmp_pat
         # A type that comes with the installation has its picture too.
         page.locator("[data-type=ur5] a").click()
         view = page.get_by_test_id("model-view")
-        wait_until(lambda: frames(view) > 0, "a picture", 30)
+        wait_until(lambda: frames(view) > 0, "a picture")
         expect(page.get_by_test_id("delete-type")).to_have_count(0)
 
 
@@ -166,11 +168,11 @@ def is_mended(page: Page, folder: Path) -> None:
 def is_looked_at(page: Page, machine: Machine) -> None:
     """Seen before it is saved: each joint moves, and nobody else has it."""
     view = page.get_by_test_id("model-view")
-    wait_until(lambda: frames(view) > 0, "a picture", 30)
+    wait_until(lambda: frames(view) > 0, "a picture")
     before, first = frames(view), view.locator("canvas").screenshot()
     page.get_by_test_id("model-joint-elbow").focus()
     page.keyboard.press("End")
-    wait_until(lambda: frames(view) > before, "another picture", 30)
+    wait_until(lambda: frames(view) > before, "another picture")
     expect(page.locator("output[for=model-joint-elbow]")).to_have_text("85.9°")
     assert view.locator("canvas").screenshot() != first, "the elbow has moved"
     expect(page.get_by_test_id("found")).to_contain_text("Movements: 1")
@@ -191,7 +193,7 @@ def is_saved(page: Page, machine: Machine) -> None:
     view = page.get_by_test_id("model-view")
     page.get_by_test_id("open-type").click()
     expect(page.get_by_test_id("type-movements")).to_contain_text("Bow, and come up again.")
-    wait_until(lambda: frames(view) > 0, "a picture", 30)
+    wait_until(lambda: frames(view) > 0, "a picture")
     expect(page.get_by_test_id("joint-table").locator("tbody tr")).to_have_count(2)
     assert_good_page(page, "robot-type")
     page.get_by_role("link", name="Robot types", exact=True).click()

@@ -79,7 +79,7 @@ def test_one_gathers_and_any_number_reads_it(api: Api) -> None:
                 seen[number] = seen.get(number, 0) + len(measured(client))
             return bool(api.get(f"/actions/{begun['id']}")["status"] == "done")
 
-        wait_until(ended, "the end of the gathering", 60)
+        wait_until(ended, "the end of the gathering")
     done = api.get(f"/actions/{begun['id']}")
     gathered = done["result"]["samples"]["range"]
     # How fast a busy machine is, is not the question; that it is faster than its own 5 Hz, and that all hear it, is.
@@ -94,7 +94,7 @@ def test_one_gathers_and_any_number_reads_it(api: Api) -> None:
             answer = reader.get(f"{base}/range", params={"resolution": "raw"})
             return len(answer.json()["at_ms"]) if answer.is_success else 0
 
-        wait_until(lambda: all(stored(reader) >= gathered for reader in readers), "all of it to be stored", 30)
+        wait_until(lambda: all(stored(reader) >= gathered for reader in readers), "all of it to be stored")
 
 
 def test_a_capture_is_in_the_blob_store_as_it_was_taken(api: Api) -> None:
@@ -114,7 +114,7 @@ def test_what_is_set_is_measured_by_others_and_stop_refuses_it(api: Api) -> None
     with watching(api, contact, topics.TELE) as watcher:
         done = act(api, door, kind="set_control", control="opening", value=0.5)
         assert done["result"]["applied"]["opening"] == pytest.approx(0.5)
-        wait_until(lambda: any(each.values["open"] for each in measured(watcher)), "the door to be open", 30)
+        wait_until(lambda: any(each.values["open"] for each in measured(watcher)), "the door to be open")
 
         beyond = act(api, door, kind="set_control", control="opening", value=1.5)
         assert (beyond["status"], beyond["reason"]["code"]) == ("failed", "out_of_range")
@@ -128,7 +128,7 @@ def test_what_is_set_is_measured_by_others_and_stop_refuses_it(api: Api) -> None
         assert (stopped["status"], stopped["reason"]["code"]) == ("failed", "stopped")
         assert api.http.post(f"/devices/{door['id']}/stop/reset").is_success
         assert act(api, door, kind="set_control", control="opening", value=0.0)["status"] == "done"
-        wait_until(lambda: any(not each.values["open"] for each in measured(watcher)), "the door to be shut", 30)
+        wait_until(lambda: any(not each.values["open"] for each in measured(watcher)), "the door to be shut")
 
 
 def test_pictures_come_to_who_may_see_them(api: Api) -> None:
@@ -140,7 +140,7 @@ def test_pictures_come_to_who_may_see_them(api: Api) -> None:
             pictures.extend(each.payload for each in watcher.heard())
             return len(pictures) >= 5
 
-        wait_until(enough, "pictures", 30)
+        wait_until(enough, "pictures")
     told = [frames.decode(each) for each in pictures]
     assert {(each.width, each.height) for each in told} == {(320, 240)}
     assert [each.sequence for each in told] == sorted({each.sequence for each in told})
@@ -165,7 +165,7 @@ def test_a_script_is_told_what_the_room_knows(api: Api) -> None:
     assert saved.is_success, saved.text
     done = act(api, api.device("hanson"), kind="run_movement", name="what_the_room_knows")
     if done["status"] != "done":
-        wait_until(lambda: api.get(f"/actions/{done['id']}")["status"] == "done", "the script to end", 60)
+        wait_until(lambda: api.get(f"/actions/{done['id']}")["status"] == "done", "the script to end")
     assert "True True True True" in json.dumps(api.get(f"/actions/{done['id']}")), done
 
 
@@ -207,7 +207,7 @@ def test_home_assistant_is_shown_the_room_and_moves_its_door(
     shown: dict[str, bytes] = {}
     try:
         client = Client("home", None, port=home_assistants_broker)
-        wait_until(lambda: bool(client.open().connected.is_set()), "the other broker", 30)
+        wait_until(lambda: bool(client.open().connected.is_set()), "the other broker")
         client.subscribe("homeassistant/#", "telescope/#")
 
         def there(topic: str) -> bool:
@@ -215,7 +215,7 @@ def test_home_assistant_is_shown_the_room_and_moves_its_door(
             return topic in shown
 
         slider = f"homeassistant/number/{door['id']}/set-opening/config"
-        wait_until(lambda: there(slider), "the door's slider", 30)
+        wait_until(lambda: there(slider), "the door's slider")
         content = json.loads(shown[slider])
         client.publish(content["command_topic"], b"0.5")
 
@@ -224,8 +224,8 @@ def test_home_assistant_is_shown_the_room_and_moves_its_door(
                 there(content["state_topic"]) and json.loads(shown[content["state_topic"]])["values"]["opening"] > 0.3
             )
 
-        wait_until(opens, "the door to open", 30)
-        wait_until(lambda: there(f"telescope/{api.device('camera')['id']}/cam/colour"), "a picture", 30)
+        wait_until(opens, "the door to open")
+        wait_until(lambda: there(f"telescope/{api.device('camera')['id']}/cam/colour"), "a picture")
         client.close()
     finally:
         bridge.terminate()

@@ -2,11 +2,11 @@
 
 import math
 
-from playwright.sync_api import Page, expect, sync_playwright
+from playwright.sync_api import Browser, Page, expect
 
 from device_agent.protocol import room as rooms
 from tests.support.brokers import ROOT, wait_until
-from tests.support.browser import PATIENCE_MS, chromium, pages
+from tests.support.browser import PATIENCE_MS, pages
 from tests.support.machine import Machine
 from tests.support.pages import assert_good_page
 
@@ -37,9 +37,9 @@ def open_device(page: Page, name: str) -> None:
     expect(page.locator(".desk.room")).to_be_visible(timeout=PATIENCE_MS)
 
 
-def test_the_room_is_seen_and_used(laboratory: Machine) -> None:
+def test_the_room_is_seen_and_used(browser: Browser, laboratory: Machine) -> None:
     room = rooms.load(ROOT / "robots" / "rooms" / "lab")
-    with sync_playwright() as playwright, chromium(playwright) as browser, pages(browser, laboratory, 2) as (ann, bob):
+    with pages(browser, laboratory, 2) as (ann, bob):
         # The four robots stand on the plan where the room sees them, the fixed ones where they are screwed down.
         ann.get_by_test_id("plan-link").click()
         for name in ROBOTS:
@@ -49,7 +49,7 @@ def test_the_room_is_seen_and_used(laboratory: Machine) -> None:
             robot = room.robot(name)
             assert robot is not None
             assert name not in FIXED or math.dist((x_m, y_m), robot.position_m[:2]) < 0.3, (name, x_m, y_m)
-        wait_until(lambda: bool(ann.get_by_test_id("plan").get_attribute("data-floor")), "the floor", 30)
+        wait_until(lambda: bool(ann.get_by_test_id("plan").get_attribute("data-floor")), "the floor")
 
         assert_good_page(ann, "plan")
 
@@ -57,9 +57,9 @@ def test_the_room_is_seen_and_used(laboratory: Machine) -> None:
         ann.get_by_test_id("plan").get_by_role("link", name="Camera in the corner").click()
         ann.get_by_test_id("camera-live").click()
         canvas = ann.get_by_test_id("camera-picture")
-        wait_until(lambda: canvas.get_attribute("data-sequence") is not None, "a picture", 30)
+        wait_until(lambda: canvas.get_attribute("data-sequence") is not None, "a picture")
         first = picture(ann)
-        wait_until(lambda: picture(ann) != first, "another picture", 30)
+        wait_until(lambda: picture(ann) != first, "another picture")
         ann.get_by_test_id("camera-live").click()
         expect(ann.get_by_test_id("camera-live")).to_have_attribute("aria-pressed", "false")
         ann.wait_for_timeout(300)  # one picture may be under way
@@ -77,7 +77,7 @@ def test_the_room_is_seen_and_used(laboratory: Machine) -> None:
         bright = lux(bob)
         ann.get_by_test_id("level-least").click()
         expect(ann.get_by_test_id("applied-level")).to_have_attribute("data-value", "0", timeout=PATIENCE_MS)
-        wait_until(lambda: lux(bob) < bright - 100, f"less light than {bright} lx", 30)
+        wait_until(lambda: lux(bob) < bright - 100, f"less light than {bright} lx")
         assert_good_page(bob, "light")
         bob.get_by_test_id("gather").click()
         expect(bob.get_by_test_id("gather-state")).to_have_attribute("data-running", "false", timeout=PATIENCE_MS)
@@ -87,7 +87,7 @@ def test_the_room_is_seen_and_used(laboratory: Machine) -> None:
         slider.focus()
         for _ in range(7):
             ann.keyboard.press("PageUp")
-        wait_until(lambda: applied(ann) > 0.5, "the lamp to be on again", 30)
+        wait_until(lambda: applied(ann) > 0.5, "the lamp to be on again")
 
 
 def applied(page: Page) -> float:
@@ -102,4 +102,4 @@ def open_light(page: Page) -> None:
     page.get_by_test_id("gather-rate").fill("5")
     page.get_by_test_id("gather").click()
     expect(page.get_by_test_id("gather-state")).to_have_attribute("data-running", "true", timeout=PATIENCE_MS)
-    wait_until(lambda: lux(page) > 0, "light", 30)
+    wait_until(lambda: lux(page) > 0, "light")

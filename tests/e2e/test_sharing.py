@@ -27,11 +27,11 @@ def test_a_guest_who_is_unshared_in_mid_motion_leaves_the_arm_at_rest(machine: M
             "speed": 0.05,
         }
         action = guest.post(f"/devices/{device}/actions", {"request": request, "wait_ms": 10_000})["id"]
-        wait_until(lambda: abs(target_rad(trace) - begin_rad) > 0.01, "motion", 20)
+        wait_until(lambda: abs(target_rad(trace) - begin_rad) > 0.01, "motion")
         account = guest.get("/accounts/me")["id"]
         answer = owner.http.delete(f"/devices/{device}/shares/{account}")
         assert answer.status_code == httpx.codes.NO_CONTENT
-        wait_until(lambda: at_rest(trace), "rest", 10)
+        wait_until(lambda: at_rest(trace), "rest")
         ended = owner.get(f"/actions/{action}", wait_ms=20_000, wait_for="done")
         # Whoever says it first: the cloud, or the device that has lost the lease.
         assert (ended["status"], ended["reason"]["code"]) in {("failed", "unshared"), ("failed", "lease_lost")}

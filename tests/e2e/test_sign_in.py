@@ -3,25 +3,16 @@
 from collections.abc import Iterator
 
 import pytest
-from playwright.sync_api import Browser, Page, expect, sync_playwright
+from playwright.sync_api import Browser, Page, expect
 
 from tests.support.brokers import wait_until
+from tests.support.browser import PATIENCE_MS
 from tests.support.hosts.host import environment_of, start_program
 from tests.support.hosts.uvicorn import _answers, _free_port
 from tests.support.open_id import CLIENT_ID, CLIENT_SECRET, new_key, start_provider
 from tests.support.site import sign_in_link
 
 PASSWORD = "correct horse battery"
-
-
-@pytest.fixture(scope="module")
-def browser() -> Iterator[Browser]:
-    with sync_playwright() as playwright:
-        browser = playwright.chromium.launch(
-            executable_path="/usr/bin/chromium", args=["--no-sandbox", "--disable-gpu"]
-        )
-        yield browser
-        browser.close()
 
 
 @pytest.fixture(scope="module")
@@ -44,19 +35,19 @@ def environment(tmp_path_factory: pytest.TempPathFactory) -> Iterator[dict[str, 
             "TELESCOPE_OIDC_ACCOUNTS": "anyone",
         }
         with start_program(["-m", "function_app", "serve"], environment_of(settings)) as server:
-            wait_until(lambda: _answers(port) or server.process.poll() is not None, "the server", 60)
+            wait_until(lambda: _answers(port) or server.process.poll() is not None, "the server")
             assert server.process.poll() is None, server.said()
             yield settings
 
 
 def page_of(browser: Browser) -> Page:
     page = browser.new_context().new_page()
-    page.set_default_timeout(30_000)
+    page.set_default_timeout(PATIENCE_MS)
     return page
 
 
 def signed_in(page: Page, name: str) -> None:
-    expect(page.get_by_test_id("signed-in")).to_have_text(name, timeout=30_000)
+    expect(page.get_by_test_id("signed-in")).to_have_text(name, timeout=PATIENCE_MS)
 
 
 def test_a_password_is_set_after_a_link_and_signs_in(browser: Browser, environment: dict[str, str]) -> None:
@@ -67,13 +58,13 @@ def test_a_password_is_set_after_a_link_and_signs_in(browser: Browser, environme
     page.get_by_test_id("signed-in").click()
     page.get_by_label("New password").fill(PASSWORD)
     page.get_by_role("button", name="Set password").click()
-    expect(page.get_by_text("The password is set.")).to_be_visible(timeout=30_000)
+    expect(page.get_by_text("The password is set.")).to_be_visible(timeout=PATIENCE_MS)
     page = page_of(browser)
     page.goto(url)
     page.get_by_test_id("sign-in-name").fill("ann")
     page.get_by_test_id("sign-in-password").fill("another one")
     page.get_by_test_id("sign-in").click()
-    expect(page.get_by_text("do not belong together")).to_be_visible(timeout=30_000)
+    expect(page.get_by_text("do not belong together")).to_be_visible(timeout=PATIENCE_MS)
     page.get_by_test_id("sign-in-password").fill(PASSWORD)
     page.get_by_test_id("sign-in").click()
     signed_in(page, "ann")
@@ -115,7 +106,7 @@ def test_who_was_invited_and_signs_in_at_another_site_comes_back_to_what_they_we
     page.locator("button[type=submit]").click()
     page.locator("button[type=submit]").click()
     signed_in(page, "Name of eve")
-    expect(page.get_by_test_id("shared-with-me")).to_contain_text("Home", timeout=30_000)
+    expect(page.get_by_test_id("shared-with-me")).to_contain_text("Home", timeout=PATIENCE_MS)
     page.reload()
     signed_in(page, "Name of eve")
     expect(page.get_by_test_id("shared-with-me")).to_have_count(0)  # it is answered, and asked no more
