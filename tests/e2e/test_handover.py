@@ -108,7 +108,7 @@ def test_after_a_stop_of_everything_only_who_takes_control_anew_moves_it(
     other = bob.post(f"/devices/{device}/lease", {"lease_ms": 60_000})["epoch"]
     still = ended(bob, move(bob, device, other, NEAR))
     assert (still["status"], still["reason"]["code"]) == ("failed", "stopped")
-    assert ann.post(f"/devices/{device}/stop/reset") == {"confirmed": True}
+    wait_until(lambda: ann.post(f"/devices/{device}/stop/reset")["confirmed"], "the reset")
     request_body = {"request": {"kind": "move_joints", "position_rad": NEAR}, "epoch": other}
     assert refused(bob, f"/devices/{device}/actions", request_body) == "lease-lost"
     time.sleep(0.5)

@@ -37,7 +37,7 @@ from tests.support.jail import warm_jail
 from tests.support.pins import pins_of
 from tests.support.toys import ToyDriver, robot_type
 
-WITHIN_S = 60.0
+WITHIN_S = 120.0
 OWNER = "accountaaaaaaaaa"
 
 

@@ -35,7 +35,7 @@ Transport = Literal["tcp", "websockets"]
 BROKERS: tuple[BrokerKind, ...] = ("amqtt", "mosquitto")
 TRANSPORTS: tuple[Transport, ...] = ("tcp", "websockets")
 HOST = "127.0.0.1"
-PATIENCE_S = 60.0
+PATIENCE_S = 120.0
 """How long a test waits for what has to happen [s]: the machine may be slow, and busy."""
 SILENCE_S = 0.4
 """How long a test waits for what must not happen [s], after something later on the same way has happened."""

@@ -13,6 +13,7 @@ from function_app.adapters.aws.command_bus import IotCommandBus
 from function_app.ports.command_bus import BusUnavailable
 from tests.contract.bus.suite import BEATS, WAITS_IN_VAIN_S, BusContract, Heard, Stage, beats_until
 from tests.support.aws import REGION, Refusal, Wire, start_moto, start_wire, use_credentials
+from tests.support.brokers import PATIENCE_S
 
 _spaces = count()
 ACCOUNT = "123456789012"
@@ -38,9 +39,10 @@ def wire(moto: str, monkeypatch: pytest.MonkeyPatch) -> Iterator[Wire]:
 
 class TestIot(BusContract):
     @pytest.fixture
-    async def stage(self, wire: Wire) -> AsyncIterator[Stage]:
+    async def stage(self, wire: Wire, monkeypatch: pytest.MonkeyPatch) -> AsyncIterator[Stage]:
         from moto.iotdata.models import iotdata_backends
 
+        monkeypatch.setattr(adapter, "GIVE_UP_S", PATIENCE_S)
         space = f"bus{next(_spaces)}"
         taken = iotdata_backends[ACCOUNT][REGION].published_payloads
 

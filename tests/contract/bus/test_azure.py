@@ -21,6 +21,7 @@ from function_app.adapters.azure import command_bus as adapter
 from function_app.adapters.azure.command_bus import EventGridCommandBus
 from function_app.ports.command_bus import BusUnavailable
 from tests.contract.bus.suite import BEATS, WAITS_IN_VAIN_S, BusContract, Heard, Stage, beats_until
+from tests.support.brokers import PATIENCE_S
 from tests.support.identity import HOST, Host, make_certificate, start_host
 
 _spaces = count()
@@ -136,8 +137,9 @@ def namespace(certificate: Path) -> Iterator[Namespace]:
 
 class TestEventGrid(BusContract):
     @pytest.fixture
-    async def stage(self, namespace: Namespace, host: Host) -> AsyncIterator[Stage]:
+    async def stage(self, namespace: Namespace, host: Host, monkeypatch: pytest.MonkeyPatch) -> AsyncIterator[Stage]:
         assert host
+        monkeypatch.setattr(adapter, "GIVE_UP_S", PATIENCE_S)
         space = f"bus{next(_spaces)}"
 
         def kept(topic: str) -> bytes | None:
