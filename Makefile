@@ -11,8 +11,10 @@ NPM = $(NODE) --prefix web
 SECONDS_EACH ?= 60
 # Most tests wait for processes of their own, so three run side by side on two cores; a file's tests stay together.
 SIDE_BY_SIDE = -n 3 --dist loadfile --no-loadscope-reorder
-# Those run one at a time that have a browser or a robot in motion before them, or an answer that must come in time.
-ALONE = tests/api tests/e2e tests/faults tests/leaks/test_secrets.py
+# Two browsers and two products fill two cores: a worker has the laboratory, the other one all that needs one arm or less.
+BROWSERS = -n 2 --dist loadscope tests/e2e
+# Those run one at a time that have a robot in motion before them, or an answer that must come in time.
+ALONE = tests/api tests/faults tests/leaks/test_secrets.py
 
 .PHONY: help up link env console test test-long coverage fuzz check audit-packages contract requirements clean
 .DELETE_ON_ERROR:
@@ -20,7 +22,7 @@ ALONE = tests/api tests/e2e tests/faults tests/leaks/test_secrets.py
 help:
 	@echo "make up            run Telescope on this machine"
 	@echo "make link          print another one-time sign-in link"
-	@echo "make test          check and test everything (about thirty-five minutes on two cores, most of it in real processes)"
+	@echo "make test          check and test everything (about half an hour on two cores: see CONTRIBUTING.md for where it goes)"
 	@echo "make test-long     the same with every suite at full size"
 	@echo "make coverage      every branch of the agent's runtime, by its unit tests alone"
 	@echo "make fuzz          each parser under a fuzzer, SECONDS_EACH=60"
@@ -90,7 +92,8 @@ web/dist/index.html: web/node_modules/.installed web/index.html web/package.json
 test: .venv/.dev console check tests/azurite/node_modules/.installed tests/oidc/node_modules/.installed .venv/.azure-worker coverage
 	@tests/system-packages
 	@$(NPM) test --silent
-	@tests/twice -m "not long" $(SIDE_BY_SIDE) --ignore tests/unit/agent $(ALONE:%=--ignore %)
+	@tests/twice -m "not long" $(SIDE_BY_SIDE) --ignore tests/unit/agent --ignore tests/e2e $(ALONE:%=--ignore %)
+	@tests/twice -m "not long" $(BROWSERS)
 	@tests/twice -m "not long" $(ALONE)
 
 test-long: .venv/.dev console check tests/azurite/node_modules/.installed tests/oidc/node_modules/.installed .venv/.azure-worker coverage

@@ -1,11 +1,37 @@
 import os
 from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
 
 import pytest
 from playwright.sync_api import Browser, Playwright, sync_playwright
 
 from tests.support.browser import FLAT, chromium
 from tests.support.machine import Machine, start_machine
+
+LABORATORY = {
+    "test_acts",
+    "test_health_pages",
+    "test_keyframes",
+    "test_room_devices",
+    "test_room_pages",
+    "test_steering",
+}
+OWN = {"test_make_up", "test_sign_in", "test_tls", "test_xmpp"}
+"""Files that need the laboratory, and those that start what they need; the others share one arm."""
+
+
+@pytest.hookimpl(optionalhook=True)
+def pytest_xdist_make_scheduler(config: pytest.Config, log: Any) -> object:
+    """Where several workers share the tests, those of one product stay together, so that it is started once."""
+    from xdist.scheduler import LoadScopeScheduling  # type: ignore[import-untyped]
+
+    class ByProduct(LoadScopeScheduling):  # type: ignore[misc]
+        def _split_scope(self, nodeid: str) -> str:
+            name = Path(nodeid.partition("::")[0]).stem
+            return "laboratory" if name in LABORATORY else name if name in OWN else "machine"
+
+    return ByProduct(config, log)
 
 
 @pytest.fixture(scope="session")

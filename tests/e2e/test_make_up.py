@@ -13,9 +13,8 @@ from typing import Any
 import httpx
 import pytest
 
-from device_agent.protocol import room as rooms
 from tests.support.brokers import BROKERS, ROOT, wait_until
-from tests.support.machine import Api, Machine, free_ports, ready_link, start_machine
+from tests.support.machine import Machine, free_ports, moves, ready_link, start_machine
 
 
 def clear_line(machine: Machine) -> str:
@@ -68,24 +67,13 @@ def test_it_gets_ready_ends_cleanly_and_keeps_its_data(tmp_path: Path, broker: s
         assert "mine" in [each["name"] for each in api.get("/robot-types/ur5/movements")["items"]]
 
 
-def test_the_lab_starts_with_everything_that_stands_in_it(laboratory: Machine) -> None:
-    room = rooms.load(ROOT / "robots" / "rooms" / "lab")
-    with laboratory.api() as api:
-        for name in room.names:
-            api.device(name)
-        devices = api.get("/devices", limit=100)["items"]
-        assert sorted(each["name"] for each in devices) == sorted(room.names)
-        wait_until(lambda: _moves(api, api.device("ur5")["id"]), "the arm on its table to move")
-        assert laboratory.trace("ur5").now()["qpos"]["wrist_3"] == pytest.approx(0.2, abs=0.02)
-
-
 def test_every_part_that_is_killed_comes_back(tmp_path: Path) -> None:
     with start_machine(tmp_path) as machine, machine.api() as api:
         device = api.device()
         for words in ("infra.amqtt", "function_app serve", "function_app work", "-m device_agent"):
             machine.kill(words)
             wait_until(functools.partial(_runs, machine, words), f"{words} to be started again")
-        wait_until(lambda: _moves(api, device["id"]), "the robot to move again")
+        wait_until(lambda: moves(api, device["id"]), "the robot to move again")
 
 
 def _runs(machine: Machine, words: str) -> bool:
@@ -94,17 +82,6 @@ def _runs(machine: Machine, words: str) -> bool:
     except AssertionError:
         return False
     return True
-
-
-def _moves(api: Api, device: str) -> bool:
-    move = {"kind": "move_joints", "position_rad": {"wrist_3": 0.2}}
-    try:
-        answer = api.http.post(
-            f"/devices/{device}/actions", json={"request": move, "wait_ms": 20_000, "wait_for": "done"}
-        )
-        return bool(answer.json().get("status") == "done")
-    except httpx.HTTPError:
-        return False
 
 
 def test_when_the_supervisor_is_killed_nothing_is_left_behind(tmp_path: Path) -> None:

@@ -16,11 +16,12 @@ import httpx
 import pytest
 
 from device_agent.protocol import codec, frames, topics
+from device_agent.protocol import room as rooms
 from device_agent.protocol.messages import Measurements
 from function_app.ports.broker_access import Credentials
 from infra.mosquitto.configuration import binary
 from tests.support.brokers import ROOT, Client, wait_until
-from tests.support.machine import Api, Machine
+from tests.support.machine import Api, Machine, moves
 
 RATE_HZ, FOR_S = 20.0, 3.0
 
@@ -57,6 +58,17 @@ def measured(client: Client) -> list[Measurements]:
 
 def refused(api: Api, device: dict[str, Any], **request: Any) -> httpx.Response:
     return api.http.post(f"/devices/{device['id']}/actions", json={"request": request})
+
+
+def test_the_lab_starts_with_everything_that_stands_in_it(laboratory: Machine) -> None:
+    room = rooms.load(ROOT / "robots" / "rooms" / "lab")
+    with laboratory.api() as api:
+        for name in room.names:
+            api.device(name)
+        devices = api.get("/devices", limit=100)["items"]
+        assert sorted(each["name"] for each in devices) == sorted(room.names)
+        wait_until(lambda: moves(api, api.device("ur5")["id"]), "the arm on its table to move")
+        assert laboratory.trace("ur5").now()["qpos"]["wrist_3"] == pytest.approx(0.2, abs=0.02)
 
 
 def test_one_shot_measures_now(api: Api) -> None:

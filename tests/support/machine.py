@@ -135,6 +135,18 @@ class Api:
         return answer.json() if answer.content else None
 
 
+def moves(api: Api, device: str) -> bool:
+    """Whether a little of the arm's wrist can be moved now."""
+    move = {"kind": "move_joints", "position_rad": {"wrist_3": 0.2}}
+    try:
+        answer = api.http.post(
+            f"/devices/{device}/actions", json={"request": move, "wait_ms": 20_000, "wait_for": "done"}
+        )
+        return bool(answer.json().get("status") == "done")
+    except httpx.HTTPError:
+        return False
+
+
 class Trace:
     """The simulation's own record, line by line: what really moved."""
 

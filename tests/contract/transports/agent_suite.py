@@ -222,7 +222,7 @@ class AgentSuite:
             ]
             return bool(found)
 
-        wait_until(told, "samples of the agent's own", PATIENCE_S)
+        wait_until(told, "samples of the agent's own")
         polling = spoken.configuration.get("http", HttpPolling())
         plain = "-poll" if polling.poll == "plain" else ""
         assert [each["transport"] for each in found] == [spoken.configuration.get("transport", "mqtt") + plain]

@@ -11,7 +11,7 @@ from device_agent.protocol import signing
 from device_agent.protocol.messages import GrantLease
 from function_app.adapters.key_ring import Ring
 from function_app.adapters.local.keys import FileKeys
-from tests.contract.transports.agent_suite import PATIENCE_S, Resident
+from tests.contract.transports.agent_suite import Resident
 from tests.contract.transports.suite import Spoken
 from tests.support.brokers import wait_until
 from tests.support.ground import Ground, start_ground
@@ -64,7 +64,7 @@ def test_a_live_agent_goes_on_and_the_old_key_ends(ground: Ground, resident: Res
     news = ground.cloud.run(ground.cloud.functions.keys.rotate(learn_ms=LEARN_MS, overlap_ms=OVERLAP_MS))
     new = news.pins[-1].id
     work(ground, resident)
-    wait_until(lambda: pins.serial == 2, "the agent to learn of the new key, while it works", PATIENCE_S)
+    wait_until(lambda: pins.serial == 2, "the agent to learn of the new key, while it works")
     assert new in pins
     pairing = resident.home.pairing()
     assert pairing is not None
@@ -96,7 +96,5 @@ def send(ground: Ground, resident: Resident, key: Any) -> dict[str, int]:
     order = ground.order(resident.agent, lease, epoch=epoch, key=key)
     before = refusals(resident)
     ground.deliver(resident.agent, order)
-    wait_until(
-        lambda: refusals(resident) != before or resident.device._controller.epochs[0] == epoch, "an answer", PATIENCE_S
-    )
+    wait_until(lambda: refusals(resident) != before or resident.device._controller.epochs[0] == epoch, "an answer")
     return {code: count - before.get(code, 0) for code, count in refusals(resident).items()}

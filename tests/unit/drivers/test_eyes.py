@@ -6,16 +6,18 @@ import pytest
 import simplejpeg
 
 from device_agent.drivers import mujoco as simulation
+from device_agent.mjcf import studio
 from device_agent.ports.driver import DriverError, Filming
 from device_agent.protocol import robot_type
 from device_agent.protocol.messages import Stream
-from tests.support.brokers import ROOT
+from tests.support.brokers import PATIENCE_S, ROOT
 
 QBO = ROOT / "robots" / "qbo"
 TYPE = robot_type.load(QBO)
 
 
-def test_the_eyes_see_the_world_that_the_robot_stands_in() -> None:
+def test_the_eyes_see_the_world_that_the_robot_stands_in(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(studio, "WITHIN_S", PATIENCE_S)
     driver = simulation.create(TYPE, QBO, {}, "qbo")
     assert isinstance(driver, Filming)
     assert driver.frame("eyes") is None
