@@ -7,7 +7,7 @@ import pytest
 from playwright.sync_api import Browser, Page, expect
 
 from tests.support.brokers import wait_until
-from tests.support.browser import PATIENCE_MS, pages
+from tests.support.browser import PATIENCE_MS, pages, person
 from tests.support.machine import Machine
 from tests.support.pages import assert_good_page
 
@@ -219,3 +219,25 @@ def test_the_same_editor_serves_every_robot(
             source = page.get_by_test_id("kf-source").text_content()
             assert api.post(f"/robot-types/{kind}/scripting/check", {"source": source})["marks"] == []
             assert api.http.delete(f"/robot-types/{kind}/movements/kf-look").is_success
+
+
+def test_keyframes_are_made_for_a_robot_type_without_a_robot(
+    browser: Browser, laboratory: Machine
+) -> None:
+    with person(browser, laboratory.sign_in_link()) as ann:
+        expect(ann.get_by_test_id("signed-in")).to_be_visible(timeout=PATIENCE_MS)
+        ann.goto(f"{laboratory.url}/#/movements")
+        ann.get_by_test_id("new-type").select_option("nao")
+        ann.get_by_test_id("new-keyframes").click()
+        ann.get_by_test_id("kf-name").fill("at_ease")
+        expect(ann.get_by_text("No robot is chosen here")).to_be_visible()
+        for part in ("kf-run", "kf-record", "stop"):
+            assert ann.get_by_test_id(part).count() == 0, f"{part}: there is no robot"
+        ann.get_by_test_id("kf-save").click()
+        expect(ann.get_by_test_id("kf-said")).to_have_attribute("data-version", "1", timeout=PATIENCE_MS)
+        assert_good_page(ann, "keyframes-type")
+        # From the movement's own page it is opened as keyframes again; nobody's robot has moved.
+        ann.goto(f"{laboratory.url}/#/movements/nao/at_ease")
+        ann.get_by_test_id("as-keyframes").click()
+        expect(ann.get_by_test_id("kf-name")).to_have_value("at_ease", timeout=PATIENCE_MS)
+        expect(ann.get_by_test_id("kf-save")).to_be_disabled()

@@ -1026,6 +1026,7 @@ export const texts = {
     robotType: "Robot type",
     name: "Name",
     nameExample: "bow_twice",
+    beginKeyframes: "New with keyframes",
     begin: "Begin",
     badName: "A name has letters without accents, digits, _ and -, and no spaces; at most 64.",
     taken: "There is a movement of this name for this robot type already.",
@@ -1268,6 +1269,9 @@ print("done")
 
   keyframes: {
     title: "Keyframes",
+    editAs: "Edit as keyframes",
+    noRobot: "The drawing of the robot type. No robot moves.",
+    runsOnDevice: "No robot is chosen here: save it, and run it from the movement's own page or from a robot's.",
     open: "New movement from keyframes",
     edit: (name: string): string => `Open the keyframes of ${name}`,
     editShort: "Keyframes",

@@ -11,6 +11,7 @@ describe("the table of pages", () => {
       fleet: route.fleetAddress,
       device: route.deviceAddress("a-b"),
       keyframes: route.keyframesAddress("a-b", "wave"),
+      typeKeyframes: route.typeKeyframesAddress("ur5"),
       together: route.togetherAddress(["a-b", "c_d"]),
       space: route.spaceAddress("lab"),
       pair: route.pairAddress,

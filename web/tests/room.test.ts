@@ -167,6 +167,12 @@ describe("a room", () => {
     expect(extent([], [[2, 2]])).toEqual({ lowX: 1.5, lowY: 1.5, highX: 2.5, highY: 2.5 });
   });
 
+  it("moves pins apart into the plan, never out of it", () => {
+    for (const [x, y] of apart(Array.from({ length: 12 }, () => [12, 290] as const), 25, [360, 302])) {
+      expect(x >= 11.5 && y >= 11.5 && x <= 348.5 && y <= 290.5).toBe(true);
+    }
+  });
+
   it("keeps pins of things in one place apart", () => {
     const pins = apart(Array.from({ length: 12 }, () => [100, 100] as const), 25);
     expect(pins[0]).toEqual([100, 100]);

@@ -5,6 +5,7 @@ from typing import Any
 import msgspec
 
 from device_agent.protocol.messages import State
+from device_agent.protocol.robot_type import RobotType
 from function_app.domain.accounts import Identity
 from function_app.domain.actions import Action
 from function_app.domain.lease import Asked, Lease
@@ -103,12 +104,33 @@ def robot_type(found: KnownType) -> robot_types.RobotTypeOut:
         joints=manifest.joints,
         frames=manifest.frames,
         capabilities=manifest.capabilities,
+        home_rad=manifest.home_rad,
+        mirrors=manifest.mirrors,
+        narrowing=manifest.narrowing,
+        postures=tuple(manifest.postures),
+        expressions=tuple(manifest.expressions),
+        behaviours=tuple(manifest.behaviours),
+        actions=_actions(manifest),
         streams=manifest.streams,
         built_in=found.built_in,
         state="ready" if found.usable or upload is None else _upload_state(upload),
         files=found.files,
         upload=None if upload is None else _upload(upload),
     )
+
+
+def _actions(manifest: RobotType) -> tuple[str, ...]:
+    """As far as the manifest tells: what a driver adds, and what a room's floor allows, only the robot knows."""
+    has = {
+        "move_joints": bool(manifest.joints),
+        "say": "speech" in manifest.capabilities,
+        "express": bool(manifest.expressions),
+        "take_posture": bool(manifest.postures),
+        "run_behaviour": bool(manifest.behaviours),
+        "drive": manifest.base is not None,
+        "go_to": manifest.base is not None,
+    }
+    return tuple(kind for kind, there in has.items() if there)
 
 
 def twin(found: Model) -> robot_types.RobotTypeTwin:

@@ -160,6 +160,14 @@ def advance(cloud: Cloud, ms: int) -> None:
 
 @pytest.mark.usefixtures("checker")
 class TestLife:
+    def test_it_says_what_keyframes_are_checked_by(self, anna: Person) -> None:
+        nao = anna.get("/robot-types/nao").json()
+        assert set(nao["home_rad"]) == {joint["name"] for joint in nao["joints"]}
+        assert {"take_posture", "run_behaviour", "drive"} <= set(nao["actions"])
+        assert all(len(nao[key]) > 0 for key in ("mirrors", "narrowing", "postures", "behaviours"))
+        ur5 = anna.get("/robot-types/ur5").json()
+        assert (ur5["actions"], ur5["mirrors"], ur5["postures"]) == (["move_joints"], [], [])
+
     def test_one_is_added_seen_and_used_like_a_built_in_one(self, cloud: Cloud, anna: Person) -> None:
         added = add(anna)
         assert added.status_code == 201, added.text
@@ -170,6 +178,7 @@ class TestLife:
         assert shown["upload"]["errors"] == []
         assert [joint["name"] for joint in shown["joints"]] == ["shoulder"]
         assert shown["streams"] == [{"name": "joints", "rate_hz": 20.0}]
+        assert (shown["home_rad"].keys(), shown["actions"]) == ({"shoulder"}, ["move_joints"])
         assert shown["files"] == {name: len(text) for name, text in {**FILES, "robot.toml": manifest()}.items()}
         source = 'PARAMETERS = {"speed": {"type": "number", "default": 0.5}}\nrobot.home()\n'
         assert anna.put("/robot-types/lever/movements/up", {"source": source}).status_code == 201

@@ -1,7 +1,8 @@
 /** Robot types over the HTTP API: those that one may see, and one that is looked at before it is saved. */
 import type { Http } from "./http";
 import { readTwin, type KnownTwin } from "./messages";
-import type { Joint } from "./protocol";
+import type { Robot } from "./keyframes";
+import type { Joint, Mirror, Narrowing } from "./protocol";
 
 export type TypeState = "checking" | "ready" | "refused";
 
@@ -23,6 +24,14 @@ export interface RobotType {
   joints: Joint[];
   frames: string[];
   capabilities: string[];
+  home_rad: Record<string, number>;
+  mirrors: Mirror[];
+  narrowing: Narrowing[];
+  postures: string[];
+  expressions: string[];
+  behaviours: string[];
+  /** What its robots may be asked for; each says itself what it really takes. */
+  actions: string[];
   streams: { name: string; rate_hz: number }[];
   built_in: boolean;
   state: TypeState;
@@ -64,6 +73,12 @@ interface TwinAnswer {
   bodies: unknown;
   actuators: string[];
   cameras: string[];
+}
+
+/** What the keyframe editor needs to know of any robot of a type. */
+export function robotOf({ joints, narrowing, mirrors, postures, expressions, behaviours, capabilities, actions }: RobotType): Robot {
+  const counted = mirrors.map(({ joint, of, factor = 1 }) => ({ joint, of, factor }));
+  return { joints, narrowing, mirrors: counted, postures, expressions, behaviours, capabilities, actions };
 }
 
 /** How long a large upload may take on a slow line [ms]. */

@@ -98,15 +98,28 @@ export function extent(floors: readonly Floor[], points: readonly (readonly [num
   return { lowX: found.lowX - missing, lowY: found.lowY - missing, highX: found.highX + missing, highY: found.highY + missing };
 }
 
-/** Pins that would cover one another, moved apart until none does [px]. Each stays as near to its place as it can. */
-export function apart(points: readonly (readonly [number, number])[], gap: number): [number, number][] {
+/** Pins that would cover one another, moved apart until none does [px]. Each stays as near to its place, and as far inside, as it can. */
+export function apart(
+  points: readonly (readonly [number, number])[],
+  gap: number,
+  [wide, high]: readonly [number, number] = [Infinity, Infinity],
+): [number, number][] {
+  const inside = ([x, y]: [number, number]): boolean =>
+    x >= gap / 2 - 1 && y >= gap / 2 - 1 && x <= wide - gap / 2 + 1 && y <= high - gap / 2 + 1;
   const placed: [number, number][] = [];
-  for (const [x, y] of points) placed.push(free(x, y, placed, gap));
+  for (const [x, y] of points) placed.push(free(x, y, placed, gap, inside));
   return placed;
 }
 
-function free(x: number, y: number, placed: readonly [number, number][], gap: number): [number, number] {
+function free(
+  x: number,
+  y: number,
+  placed: readonly [number, number][],
+  gap: number,
+  inside: (at: [number, number]) => boolean,
+): [number, number] {
   const clear = ([atX, atY]: [number, number]): boolean =>
+    inside([atX, atY]) &&
     placed.every(([otherX, otherY]) => Math.hypot(atX - otherX, atY - otherY) >= gap - 0.5);
   for (let ring = 0; ring < 12; ring += 1) {
     const steps = ring === 0 ? 1 : ring * 6;

@@ -96,6 +96,12 @@ export const PAGES = {
     part: "movements",
     load: async (): Loaded => (await import("./movements/editor-page")).EditorPage,
   },
+  typeKeyframes: {
+    pattern: "#/robot-types/:robotType/keyframes/:name?",
+    title: texts.keyframes.title,
+    part: "movements",
+    load: async (): Loaded => (await import("./keyframes/type-page")).TypeKeyframesPage,
+  },
   robotTypes: {
     pattern: "#/robot-types",
     title: texts.robotTypes.title,

@@ -176,7 +176,7 @@ export function Drawing({ extent: room, floor, places, hung, devices, trails, ol
       ([atX, atY]) => [Math.min(width - edge, Math.max(edge, atX)), Math.min(high * scale - edge, Math.max(edge, atY))] as const,
     );
     // In shares of the box: at another size they are in the right place at once, and then moved apart anew.
-    return apart(within, PIN_PX + 1).map(([atX, atY]) => [atX / width, atY / (high * scale)] as const);
+    return apart(within, PIN_PX + 1, [width, high * scale]).map(([atX, atY]) => [atX / width, atY / (high * scale)] as const);
   }, [room, width, hung.map(({ device }) => device.id).join()]);
   const px = (share: number, of: number): number => (share * of * width) / wide;
   useNames(

@@ -56,6 +56,11 @@ export function keyframesAddress(device: string, name = ""): string {
   return address("keyframes", { id: device, name });
 }
 
+/** The same for all robots of a type, without a device. */
+export function typeKeyframesAddress(robotType: string, name = ""): string {
+  return address("typeKeyframes", { robotType, name });
+}
+
 export function spaceAddress(id: string): string {
   return address("space", { id });
 }

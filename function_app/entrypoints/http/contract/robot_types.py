@@ -5,6 +5,7 @@ from typing import Annotated, Literal
 from msgspec import Meta, field
 
 from device_agent.protocol.messages import Body, Joint, Stream
+from device_agent.protocol.reports import Mirror, Narrowing
 from function_app.entrypoints.http.contract.base import Answer, Moment, Request, WaitMs
 from function_app.services.model_files import MAX_FILES, MAX_MANIFEST
 
@@ -27,7 +28,7 @@ class RobotTypeOut(Answer, frozen=True, kw_only=True):
     """What every robot of one type has in common, in the version in use: the newest one that was found good.
 
     ``state`` is ``ready`` as soon as there is one; until then everything is of the newest upload. ``files``: name →
-    bytes.
+    bytes. ``actions``: the kinds of action that such a robot may be asked for; each says itself which it takes.
     """
 
     type: str
@@ -39,6 +40,13 @@ class RobotTypeOut(Answer, frozen=True, kw_only=True):
     joints: tuple[Joint, ...]
     frames: tuple[str, ...]
     capabilities: tuple[str, ...]
+    home_rad: dict[str, float]
+    mirrors: tuple[Mirror, ...]
+    narrowing: tuple[Narrowing, ...]
+    postures: tuple[str, ...]
+    expressions: tuple[str, ...]
+    behaviours: tuple[str, ...]
+    actions: tuple[str, ...]
     streams: tuple[Stream, ...]
     built_in: bool
     state: State

@@ -13,7 +13,8 @@ import { whyNotAct } from "../usable";
 
 interface SaveProps {
   api: Api;
-  station: Station;
+  /** `null`: there is no robot that it could run on. */
+  station: Station | null;
   editor: Editor;
   robotType: string;
   /** As the cloud knows it; empty: not yet. */
@@ -28,13 +29,12 @@ export function Save({ api, station, editor, robotType, name, version, onSaved }
   const [busy, setBusy] = useState(false);
   const [said, setSaid] = useState("");
   const [newer, setNewer] = useState<number | null>(null);
-  const [speed, setSpeed] = useState(1);
   const movement = editor.movement.value;
   const errors = editor.problems.value.filter(({ severity }) => severity === "error").length;
   const source = writeScript(movement);
+  const tooLong = source.length > LONGEST_SCRIPT;
   const named = /^[A-Za-z0-9_-]{1,64}$/.test(wanted);
   const changed = editor.changed.value || wanted !== name;
-  const why = whyNotAct(station.device, station.control);
 
   /** Gives whether the cloud has it now. */
   const save = async (basedOn = wanted === name ? version : 0): Promise<boolean> => {
@@ -54,10 +54,6 @@ export function Save({ api, station, editor, robotType, name, version, onSaved }
     } finally {
       setBusy(false);
     }
-  };
-  const run = async (): Promise<void> => {
-    if (changed && !(await save())) return;
-    await station.actions.start({ kind: "run_movement", name: wanted, parameters: { speed } }, station.control.epoch);
   };
 
   return (
@@ -93,32 +89,15 @@ export function Save({ api, station, editor, robotType, name, version, onSaved }
         {texts.keyframes.nameNote}
       </p>
       <div class="row">
-        <button type="button" data-testid="kf-save" disabled={busy || !named || !changed || source.length > LONGEST_SCRIPT} onClick={() => void save()}>
+        <button type="button" data-testid="kf-save" disabled={busy || !named || !changed || tooLong} onClick={() => void save()}>
           {busy ? texts.keyframes.saving : texts.keyframes.save}
         </button>
-        <button
-          type="button"
-          class="primary"
-          data-testid="kf-run"
-          disabled={busy || !named || errors > 0 || why !== "" || source.length > LONGEST_SCRIPT}
-          onClick={() => void run()}
-        >
-          {changed ? texts.keyframes.saveAndRun : texts.keyframes.run}
-        </button>
-        <label class="kf-speed">
-          {texts.keyframes.speed}
-          <select value={String(speed)} data-testid="kf-speed" onChange={(event) => setSpeed(Number(event.currentTarget.value))}>
-            {[0.25, 0.5, 0.75, 1, 1.5, 2].map((one) => (
-              <option key={one} value={String(one)}>
-                {texts.keyframes.percent(one)}
-              </option>
-            ))}
-          </select>
-        </label>
+        {station !== null && (
+          <Run station={station} name={wanted} changed={changed} blocked={busy || !named || tooLong} errors={errors} save={save} />
+        )}
       </div>
-      {errors > 0 && <p class="quiet small">{texts.keyframes.mendFirst}</p>}
-      {errors === 0 && why !== "" && <p class="quiet small">{why}</p>}
-      {source.length > LONGEST_SCRIPT && <p class="field-error">{texts.keyframes.tooLong}</p>}
+      {station === null && <p class="quiet small">{texts.keyframes.runsOnDevice}</p>}
+      {tooLong && <p class="field-error">{texts.keyframes.tooLong}</p>}
       <p role="status" data-testid="kf-said" data-version={version}>
         {said}
       </p>
@@ -130,7 +109,7 @@ export function Save({ api, station, editor, robotType, name, version, onSaved }
           </button>
         </p>
       )}
-      <RunStatus device={station.device} control={station.control} actions={station.actions} />
+      {station !== null && <RunStatus device={station.device} control={station.control} actions={station.actions} />}
       <details>
         <summary>{texts.keyframes.seeScript}</summary>
         <pre class="output kf-source" tabIndex={0} data-testid="kf-source">
@@ -138,5 +117,49 @@ export function Save({ api, station, editor, robotType, name, version, onSaved }
         </pre>
       </details>
     </Card>
+  );
+}
+
+interface RunProps {
+  station: Station;
+  name: string;
+  /** It is not saved as it stands: that is done first. */
+  changed: boolean;
+  blocked: boolean;
+  errors: number;
+  save: () => Promise<boolean>;
+}
+
+function Run({ station, name, changed, blocked, errors, save }: RunProps) {
+  const [speed, setSpeed] = useState(1);
+  const why = whyNotAct(station.device, station.control);
+  const run = async (): Promise<void> => {
+    if (changed && !(await save())) return;
+    await station.actions.start({ kind: "run_movement", name, parameters: { speed } }, station.control.epoch);
+  };
+  return (
+    <>
+      <button
+        type="button"
+        class="primary"
+        data-testid="kf-run"
+        disabled={blocked || errors > 0 || why !== ""}
+        onClick={() => void run()}
+      >
+        {changed ? texts.keyframes.saveAndRun : texts.keyframes.run}
+      </button>
+      <label class="kf-speed">
+        {texts.keyframes.speed}
+        <select value={String(speed)} data-testid="kf-speed" onChange={(event) => setSpeed(Number(event.currentTarget.value))}>
+          {[0.25, 0.5, 0.75, 1, 1.5, 2].map((one) => (
+            <option key={one} value={String(one)}>
+              {texts.keyframes.percent(one)}
+            </option>
+          ))}
+        </select>
+      </label>
+      {errors > 0 && <p class="quiet small">{texts.keyframes.mendFirst}</p>}
+      {errors === 0 && why !== "" && <p class="quiet small">{why}</p>}
+    </>
   );
 }

@@ -3,6 +3,7 @@ import { useSignalEffect } from "@preact/signals";
 import { useEffect } from "preact/hooks";
 import type { DeviceStore } from "../../core/device";
 import type { Editor } from "../../core/keyframe-editor";
+import type { KnownTwin } from "../../core/messages";
 import type { Positions } from "../../core/keyframes";
 import { texts } from "../../texts";
 import { Card } from "../parts";
@@ -17,8 +18,15 @@ export function measuredPose(device: DeviceStore): Positions | null {
   return Object.fromEntries(joints.map(({ name }, index) => [name, message.position_rad[index] ?? 0]));
 }
 
-export function Twin({ device, editor }: { device: DeviceStore; editor: Editor }) {
-  const { canvas, box, scene, said } = useScene(device.twin.value);
+interface TwinProps {
+  twin: KnownTwin | null;
+  /** Whose measured pose is the shadow; `null`: a robot type without a robot. */
+  device: DeviceStore | null;
+  editor: Editor;
+}
+
+export function Twin({ twin, device, editor }: TwinProps) {
+  const { canvas, box, scene, said } = useScene(twin);
   usePreviewClock(editor);
   const playing = editor.playing.value;
   const count = editor.movement.value.keyframes.length;
@@ -35,22 +43,28 @@ export function Twin({ device, editor }: { device: DeviceStore; editor: Editor }
       {scene !== null && <Follow scene={scene} device={device} editor={editor} />}
       <div ref={box} class="canvas-box" data-testid="kf-view" data-frames="0">
         {/* Keyed: a canvas whose context is gone cannot be drawn on again. */}
-        <canvas key={device.twin.value} ref={canvas} aria-label={texts.keyframes.twinLabel} role="img" />
-        {device.twin.value === null && <p class="over quiet">{texts.view.waiting}</p>}
+        <canvas key={twin} ref={canvas} aria-label={texts.keyframes.twinLabel} role="img" />
+        {twin === null && <p class="over quiet">{texts.view.waiting}</p>}
         {said !== "" && <p class="over notice">{said}</p>}
         <p class={`tag ${playing ? "kf-preview" : ""}`}>
           {playing ? texts.keyframes.previewing : texts.keyframes.numberOf(editor.chosen.value + 1, count)}
         </p>
       </div>
       <p class="quiet small kf-legend">
-        <span class="kf-swatch" aria-hidden="true" /> {device.live.value ? texts.keyframes.ghost : texts.keyframes.noGhost}
+        {device === null ? (
+          texts.keyframes.noRobot
+        ) : (
+          <>
+            <span class="kf-swatch" aria-hidden="true" /> {device.live.value ? texts.keyframes.ghost : texts.keyframes.noGhost}
+          </>
+        )}
       </p>
     </Card>
   );
 }
 
-function Follow({ scene, device, editor }: { scene: LiveScene; device: DeviceStore; editor: Editor }) {
-  useSignalEffect(() => scene.show(editor.pose.value, measuredPose(device)));
+function Follow({ scene, device, editor }: { scene: LiveScene; device: DeviceStore | null; editor: Editor }) {
+  useSignalEffect(() => scene.show(editor.pose.value, device === null ? null : measuredPose(device)));
   return null;
 }
 

@@ -5,6 +5,7 @@ import type { Account, Api } from "../../core/api";
 import { now } from "../../core/clock";
 import type { Fleet } from "../../core/fleet";
 import { sentence } from "../../core/http";
+import { readScript } from "../../core/keyframe-script";
 import { keptDraft } from "../../core/kept";
 import type { Checked, Scripting } from "../../core/library";
 import { Manuscript } from "../../core/manuscript";
@@ -12,7 +13,7 @@ import { failureMark, placed, type Place } from "../../core/marks";
 import type { Station } from "../../core/station";
 import { texts } from "../../texts";
 import { Age, Card } from "../parts";
-import { movementsAddress } from "../route";
+import { movementsAddress, typeKeyframesAddress } from "../route";
 import { useStations } from "../stations";
 import { CodeEditor } from "./code-editor";
 import { ManyBar, RunPanel, robotsOf } from "./many";
@@ -45,7 +46,10 @@ export function EditorPage({ api, fleet, account, robotType, name }: EditorPageP
         <div class="heading">
           <a href={movementsAddress}>← {texts.library.title}</a>
           <h1>{name}</h1>
-          <p class="quiet">{robotType.replaceAll("_", " ")}</p>
+          <p class="quiet">
+            {robotType.replaceAll("_", " ")}
+            {loading.kind === "there" && <AsKeyframes script={script} />}
+          </p>
         </div>
         {loading.kind === "loading" && (
           <p class="quiet" role="status">
@@ -72,6 +76,20 @@ export function EditorPage({ api, fleet, account, robotType, name }: EditorPageP
           />
         )}
       </main>
+    </>
+  );
+}
+
+/** Offered as long as its script is exactly what the keyframe editor would write. */
+function AsKeyframes({ script }: { script: Manuscript }) {
+  const saved = script.base.value?.source;
+  if (saved === undefined || script.changed.value || readScript(saved).kind !== "keyframes") return null;
+  return (
+    <>
+      {" · "}
+      <a href={typeKeyframesAddress(script.robotType, script.name)} data-testid="as-keyframes">
+        {texts.keyframes.editAs}
+      </a>
     </>
   );
 }

@@ -7,7 +7,7 @@ import type { Movement, RobotTypeEntry } from "../../core/library";
 import { texts } from "../../texts";
 import { Confirm } from "../confirm";
 import { Card } from "../parts";
-import { movementAddress } from "../route";
+import { movementAddress, typeKeyframesAddress } from "../route";
 import "./movements.css";
 
 interface Shelf {
@@ -196,6 +196,9 @@ function NewMovement({ shelves }: { shelves: readonly Shelf[] }) {
         <button type="submit" class="primary" data-testid="new-movement">
           {texts.library.begin}
         </button>
+        <a class="elsewhere" data-testid="new-keyframes" href={typeKeyframesAddress(type)}>
+          {texts.library.beginKeyframes}
+        </a>
       </div>
       <p id={`${id}-wrong`} class="field-error" role="alert">
         {wrong}

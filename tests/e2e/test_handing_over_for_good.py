@@ -1,0 +1,96 @@
+"""A room changes its owner: offered, taken back, offered anew, and taken over by somebody in a browser of their own."""
+
+from playwright.sync_api import Page, expect, sync_playwright
+
+from tests.support.browser import FLAT, PATIENCE_MS, chromium, person
+from tests.support.machine import Api, Machine
+from tests.support.pages import assert_good_page
+
+TO = "Berta"
+ROOM = "Annex"
+
+
+def offer(page: Page, to: str) -> str:
+    """Fill in the form that is open, and give the link."""
+    page.get_by_label("Name of their account").fill(to)
+    page.get_by_test_id("transfer-send").click()
+    expect(page.get_by_test_id("invitation-link")).to_be_visible(timeout=PATIENCE_MS)
+    return page.get_by_test_id("invitation-link").input_value()
+
+
+def rooms(machine: Machine, account: str) -> set[str]:
+    with Api(machine, account) as api:
+        return {space["name"] for space in api.get("/spaces")["items"] if space["role"] == "owner"}
+
+
+def test_a_room_is_offered_taken_back_offered_anew_and_taken_over(machine: Machine) -> None:
+    with Api(machine) as api:
+        room = api.post("/spaces", {"name": ROOM})["id"]
+    theirs = machine.sign_in_link(TO)
+    with (
+        sync_playwright() as playwright,
+        chromium(playwright, FLAT) as browser,
+        person(browser, machine.sign_in_link()) as ann,
+        person(browser, theirs) as berta,
+    ):
+        expect(ann.get_by_test_id("signed-in")).to_be_visible(timeout=PATIENCE_MS)
+        expect(berta.get_by_test_id("signed-in")).to_be_visible(timeout=PATIENCE_MS)
+        ann.goto(f"{machine.url}/#/spaces/{room}")
+        ann.get_by_test_id("transfer").click()
+        expect(ann.get_by_test_id("transfer-terms")).to_contain_text("You cannot undo that")
+        ann.get_by_label("Name of their account").fill("nobody of that name")
+        ann.get_by_test_id("transfer-send").click()
+        expect(ann.locator("#transfer-answer")).not_to_be_empty(timeout=PATIENCE_MS)
+        expect(ann.get_by_label("Name of their account")).to_have_value("nobody of that name")  # nothing is lost
+        assert_good_page(ann, "transfer", part="transfers")
+        first = offer(ann, TO)
+        ann.get_by_role("button", name="I have it").click()
+        expect(ann.get_by_test_id("transfer")).to_be_focused()
+        expect(ann.get_by_test_id("offers")).to_contain_text(f"Offered to {TO}")
+        assert_good_page(ann, "transfer-open", part="transfers")
+        # Taken back, its link is worth nothing.
+        ann.get_by_role("button", name=f"Take back: Offered to {TO}").click()
+        ann.get_by_test_id("confirm-yes").click()
+        expect(ann.get_by_test_id("offers")).to_have_count(0, timeout=PATIENCE_MS)
+        berta.goto(first)
+        expect(berta.get_by_role("alert")).not_to_be_empty(timeout=PATIENCE_MS)
+        expect(berta.get_by_test_id("accept")).to_have_count(0)
+        # Offered anew: nothing changes before it is accepted, and then it is hers.
+        ann.get_by_test_id("transfer").click()
+        berta.goto(offer(ann, TO))
+        expect(berta.get_by_test_id("terms")).to_contain_text("not undo this", timeout=PATIENCE_MS)
+        expect(berta.get_by_role("heading", level=1)).to_contain_text(f"hands {ROOM} over to you")
+        assert_good_page(berta, "transfer-offered")
+        assert ROOM in rooms(machine, "demo")
+        berta.get_by_test_id("accept").click()
+        berta.get_by_test_id("confirm-yes").click()
+        expect(berta.get_by_role("heading", level=1)).to_have_text(f"{ROOM} is yours.", timeout=PATIENCE_MS)
+        assert ROOM in rooms(machine, TO)
+        assert ROOM not in rooms(machine, "demo")
+
+
+def test_the_bar_above_every_page_fits_a_phone_and_says_in_the_tab_which_page_it_is(machine: Machine) -> None:
+    with (
+        sync_playwright() as playwright,
+        chromium(playwright, FLAT) as browser,
+        person(browser, machine.sign_in_link()) as ann,
+    ):
+        ann.set_viewport_size({"width": 390, "height": 844})
+        parts = ann.get_by_role("navigation", name="Parts of the console").get_by_role("link")
+        expect(parts).to_have_text(["Devices", "Movements", "Robot types", "Health", "Times"], timeout=PATIENCE_MS)
+        for part in parts.all():
+            box = part.bounding_box()
+            assert box is not None
+            assert box["x"] >= 0
+            assert box["x"] + box["width"] <= 390, "a link is cut off"
+        expect(ann).to_have_title("Devices · Telescope")
+        parts.nth(3).click()
+        expect(ann.get_by_role("heading", level=1)).to_have_text("Health", timeout=PATIENCE_MS)
+        expect(parts.nth(3)).to_have_attribute("aria-current", "page")
+        expect(ann).to_have_title("Health · Telescope")
+        ann.goto(f"{machine.url}/#/")
+        ann.get_by_test_id("device-row").filter(has_text="UR5").get_by_role("link").first.click()
+        expect(ann).to_have_title("Universal Robots UR5 · Telescope", timeout=PATIENCE_MS)
+        ann.get_by_test_id("what-do-i-see").locator("summary").click()
+        expect(ann.get_by_test_id("what-do-i-see")).to_contain_text("stale")
+        assert_good_page(ann, "device-explained", part="what-do-i-see")
