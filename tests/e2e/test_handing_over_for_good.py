@@ -1,8 +1,8 @@
 """A room changes its owner: offered, taken back, offered anew, and taken over by somebody in a browser of their own."""
 
-from playwright.sync_api import Page, expect, sync_playwright
+from playwright.sync_api import Browser, Page, expect
 
-from tests.support.browser import FLAT, PATIENCE_MS, chromium, person
+from tests.support.browser import PATIENCE_MS, person
 from tests.support.machine import Api, Machine
 from tests.support.pages import assert_good_page
 
@@ -23,13 +23,11 @@ def rooms(machine: Machine, account: str) -> set[str]:
         return {space["name"] for space in api.get("/spaces")["items"] if space["role"] == "owner"}
 
 
-def test_a_room_is_offered_taken_back_offered_anew_and_taken_over(machine: Machine) -> None:
+def test_a_room_is_offered_taken_back_offered_anew_and_taken_over(browser: Browser, machine: Machine) -> None:
     with Api(machine) as api:
         room = api.post("/spaces", {"name": ROOM})["id"]
     theirs = machine.sign_in_link(TO)
     with (
-        sync_playwright() as playwright,
-        chromium(playwright, FLAT) as browser,
         person(browser, machine.sign_in_link()) as ann,
         person(browser, theirs) as berta,
     ):
@@ -69,10 +67,10 @@ def test_a_room_is_offered_taken_back_offered_anew_and_taken_over(machine: Machi
         assert ROOM not in rooms(machine, "demo")
 
 
-def test_the_bar_above_every_page_fits_a_phone_and_says_in_the_tab_which_page_it_is(machine: Machine) -> None:
+def test_the_bar_above_every_page_fits_a_phone_and_says_in_the_tab_which_page_it_is(
+    browser: Browser, machine: Machine
+) -> None:
     with (
-        sync_playwright() as playwright,
-        chromium(playwright, FLAT) as browser,
         person(browser, machine.sign_in_link()) as ann,
     ):
         ann.set_viewport_size({"width": 390, "height": 844})

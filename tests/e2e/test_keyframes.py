@@ -221,9 +221,7 @@ def test_the_same_editor_serves_every_robot(
             assert api.http.delete(f"/robot-types/{kind}/movements/kf-look").is_success
 
 
-def test_keyframes_are_made_for_a_robot_type_without_a_robot(
-    browser: Browser, laboratory: Machine
-) -> None:
+def test_keyframes_are_made_for_a_robot_type_without_a_robot(browser: Browser, laboratory: Machine) -> None:
     with person(browser, laboratory.sign_in_link()) as ann:
         expect(ann.get_by_test_id("signed-in")).to_be_visible(timeout=PATIENCE_MS)
         ann.goto(f"{laboratory.url}/#/movements")
