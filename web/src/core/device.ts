@@ -124,6 +124,12 @@ export class DeviceStore {
   /** Whether what is shown of the device is what it is now. */
   readonly live = computed(() => this.reach.value === "online");
 
+  /** What it does, by its newest telemetry; `undefined` before the first. Changes seldom, where telemetry does not. */
+  readonly mode = computed(() => this.#telemetry.value?.message.mode);
+
+  /** What makes its motion other than asked for, as it names it; empty where nothing does. */
+  readonly limited = computed(() => this.#telemetry.value?.message.limited.join(", ") ?? "");
+
   /** Latched, by the newest word of the device. */
   readonly stopped = computed(() => {
     const latest = this.#telemetry.value?.message;

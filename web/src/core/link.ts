@@ -60,6 +60,8 @@ export class MqttLink implements Link {
   readonly #status = signal<LinkStatus>({ state: "connecting", why: "" });
   readonly #receivers = new Map<string, Set<Receiver>>();
   readonly #wildcards = new Set<string>();
+  /** Topic → the filters that cover it: looked for once, not at each message. Empty after each change of filters. */
+  readonly #covering = new Map<string, readonly string[]>();
   #current: Connection | null = null;
   #opening = false;
   #again = false;
@@ -83,12 +85,14 @@ export class MqttLink implements Link {
     receivers.add(receiver);
     this.#receivers.set(filter, receivers);
     if (isWildcard(filter)) this.#wildcards.add(filter);
+    this.#covering.clear();
     if (receivers.size === 1) this.#subscribeSoon(filter);
     return () => {
       receivers.delete(receiver);
       if (receivers.size > 0 || this.#receivers.get(filter) !== receivers) return;
       this.#receivers.delete(filter);
       this.#wildcards.delete(filter);
+      this.#covering.clear();
       this.#fresh.delete(filter);
       const client = this.#current?.client;
       if (client?.connected) client.unsubscribe(filter, () => undefined);
@@ -246,10 +250,12 @@ export class MqttLink implements Link {
   }
 
   #deliver(topic: string, payload: Uint8Array, retained: boolean): void {
-    this.#receivers.get(topic)?.forEach((receiver) => receiver(topic, payload, retained));
-    for (const filter of this.#wildcards) {
-      if (matches(filter, topic)) this.#receivers.get(filter)?.forEach((receiver) => receiver(topic, payload, retained));
+    let filters = this.#covering.get(topic);
+    if (filters === undefined) {
+      filters = [topic, ...[...this.#wildcards].filter((filter) => matches(filter, topic))];
+      this.#covering.set(topic, filters);
     }
+    for (const filter of filters) this.#receivers.get(filter)?.forEach((receiver) => receiver(topic, payload, retained));
   }
 
   /** Subscriptions of one turn go out together, in as few packets as the limit allows. */

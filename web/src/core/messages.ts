@@ -43,71 +43,83 @@ const MAX_BYTES = 128 * 1024;
 const MAX_JOINTS = 128;
 const MAX_BODIES = 512;
 
-/** Checks one value; `at` is where it stands, for the error's text. */
-export type Check<T> = (value: unknown, at: string) => T;
+/**
+ * Checks one value; `at` is where it stands and `key` its place there, for the error's text. They are put together only
+ * for what is wrong: of ten robots two hundred messages come a second, each with a hundred numbers.
+ */
+export type Check<T> = (value: unknown, at: string, key?: string | number) => T;
 
-function fail(at: string, wanted: string): never {
-  throw new MessageError(`${at} is not ${wanted}`);
+function place(at: string, key?: string | number): string {
+  if (key === undefined) return at;
+  return typeof key === "number" ? `${at}[${key}]` : `${at}.${key}`;
 }
 
-const number: Check<number> = (value, at) =>
-  typeof value === "number" && Number.isFinite(value) ? value : fail(at, "a finite number");
+function fail(at: string, wanted: string, key?: string | number): never {
+  throw new MessageError(`${place(at, key)} is not ${wanted}`);
+}
 
-const count: Check<number> = (value, at) =>
-  Number.isSafeInteger(value) && (value as number) >= 0 ? (value as number) : fail(at, "a whole number from 0");
+const number: Check<number> = (value, at, key) =>
+  typeof value === "number" && Number.isFinite(value) ? value : fail(at, "a finite number", key);
 
-const text: Check<string> = (value, at) => (typeof value === "string" ? value : fail(at, "text"));
+const count: Check<number> = (value, at, key) =>
+  Number.isSafeInteger(value) && (value as number) >= 0 ? (value as number) : fail(at, "a whole number from 0", key);
 
-const flag: Check<boolean> = (value, at) => (typeof value === "boolean" ? value : fail(at, "true or false"));
+const text: Check<string> = (value, at, key) => (typeof value === "string" ? value : fail(at, "text", key));
 
-const anything: Check<Record<string, unknown>> = (value, at) =>
+const flag: Check<boolean> = (value, at, key) => (typeof value === "boolean" ? value : fail(at, "true or false", key));
+
+const anything: Check<Record<string, unknown>> = (value, at, key) =>
   typeof value === "object" && value !== null && !Array.isArray(value)
     ? (value as Record<string, unknown>)
-    : fail(at, "an object");
+    : fail(at, "an object", key);
 
 function oneOf<const T extends string>(...names: T[]): Check<T> {
-  return (value, at) => {
+  return (value, at, key) => {
     const found = names.find((name) => name === value);
-    return found ?? fail(at, `one of ${names.join(", ")}`);
+    return found ?? fail(at, `one of ${names.join(", ")}`, key);
   };
 }
 
 function list<T>(item: Check<T>, longest: number): Check<T[]> {
-  return (value, at) => {
-    if (!Array.isArray(value) || value.length > longest) fail(at, `a list of at most ${longest}`);
-    return value.map((entry, index) => item(entry, `${at}[${index}]`));
+  return (value, at, key) => {
+    if (!Array.isArray(value) || value.length > longest) fail(at, `a list of at most ${longest}`, key);
+    const here = place(at, key);
+    return value.map((entry, index) => item(entry, here, index));
   };
 }
 
 /** Numbers by name, of which none is taken for a part of what every object has. */
-const byName: Check<Record<string, number>> = (value, at) => {
-  const entries = Object.entries(anything(value, at));
-  if (entries.length > MAX_JOINTS) fail(at, `at most ${MAX_JOINTS} numbers`);
-  return Object.fromEntries(entries.map(([name, entry]) => [name, number(entry, `${at}.${name}`)]));
+const byName: Check<Record<string, number>> = (value, at, key) => {
+  const entries = Object.entries(anything(value, at, key));
+  if (entries.length > MAX_JOINTS) fail(at, `at most ${MAX_JOINTS} numbers`, key);
+  const here = place(at, key);
+  return Object.fromEntries(entries.map(([name, entry]) => [name, number(entry, here, name)]));
 };
 
 function numbers<T extends number[]>(length: T["length"]): Check<T> {
-  return (value, at) => {
-    if (!Array.isArray(value) || value.length !== length) fail(at, `${length} numbers`);
-    return value.map((entry, index) => number(entry, `${at}[${index}]`)) as T;
+  return (value, at, key) => {
+    if (!Array.isArray(value) || value.length !== length) fail(at, `${length} numbers`, key);
+    const here = place(at, key);
+    return value.map((entry, index) => number(entry, here, index)) as T;
   };
 }
 
 function optional<T>(check: Check<T>, otherwise: T): Check<T> {
-  return (value, at) => (value === undefined ? otherwise : check(value, at));
+  return (value, at, key) => (value === undefined ? otherwise : check(value, at, key));
 }
 
 function nullable<T>(check: Check<T>): Check<T | null> {
-  return (value, at) => (value === undefined || value === null ? null : check(value, at));
+  return (value, at, key) => (value === undefined || value === null ? null : check(value, at, key));
 }
 
 type Fields<T> = { [K in keyof T]-?: Check<T[K]> };
 
 function object<T extends object>(fields: Fields<T>): Check<T> {
   const entries = Object.entries<Check<unknown>>(fields as Record<string, Check<unknown>>);
-  return (value, at) => {
-    const given = anything(value, at);
-    return Object.fromEntries(entries.map(([name, check]) => [name, check(given[name], `${at}.${name}`)])) as T;
+  return (value, at, key) => {
+    const given = anything(value, at, key);
+    const here = place(at, key);
+    return Object.fromEntries(entries.map(([name, check]) => [name, check(given[name], here, name)])) as T;
   };
 }
 
@@ -273,11 +285,12 @@ const jointTelemetry = object<Required<JointTelemetry>>({
 });
 
 /** Numbers and states by name. */
-const values: Check<Record<string, number | boolean>> = (value, at) => {
-  const entries = Object.entries(anything(value, at));
-  if (entries.length > MAX_JOINTS) fail(at, `at most ${MAX_JOINTS} values`);
+const values: Check<Record<string, number | boolean>> = (value, at, key) => {
+  const entries = Object.entries(anything(value, at, key));
+  if (entries.length > MAX_JOINTS) fail(at, `at most ${MAX_JOINTS} values`, key);
+  const here = place(at, key);
   return Object.fromEntries(
-    entries.map(([name, entry]) => [name, typeof entry === "boolean" ? entry : number(entry, `${at}.${name}`)]),
+    entries.map(([name, entry]) => [name, typeof entry === "boolean" ? entry : number(entry, here, name)]),
   );
 };
 

@@ -23,6 +23,8 @@ import {
   WebGLRenderer,
 } from "three";
 import { OrbitControls } from "three/examples/jsm/controls/OrbitControls.js";
+import { radians } from "../core/angles";
+import { canBeSeen } from "../core/seen";
 import { add, forward, placed, rotate, standing } from "../core/kinematics";
 import type { KnownTwin } from "../core/messages";
 import type { Geometry } from "../core/protocol";
@@ -53,39 +55,30 @@ type Robot = Object3D[];
 
 /** Builds the view inside `canvas`. `onFrame` is told of every drawn frame. Throws `NoWebglError`. */
 export function createScene(canvas: HTMLCanvasElement, twin: KnownTwin, onFrame: () => void): LiveScene {
-  let renderer: WebGLRenderer;
-  try {
-    renderer = new WebGLRenderer({ canvas, antialias: true, alpha: true });
-  } catch {
-    throw new NoWebglError();
-  }
-  renderer.outputColorSpace = SRGBColorSpace;
+  const renderer = createRenderer(canvas);
   const scene = new Scene();
-  const solid = build(scene, twin, solidMaterial);
-  const ghostRoot = new Group();
-  scene.add(ghostRoot);
-  const ghostMaterial = new MeshBasicMaterial({
-    color: GHOST_COLOUR,
-    transparent: true,
-    opacity: GHOST_OPACITY,
-    depthWrite: false,
-  });
-  const ghost = build(ghostRoot, twin, () => ghostMaterial, moving(twin));
-  ghostRoot.visible = false;
-
+  const robots = bothRobots(scene, twin);
+  const home = frame(twin);
+  light(scene, home.radius);
+  let grid = floor(scene, home);
   const camera = new PerspectiveCamera(38, 1, 0.01, 100);
   camera.up.set(0, 0, 1);
   const controls = new OrbitControls(camera, canvas);
   controls.enableDamping = false;
-  const home = frame(twin);
-  light(scene, home.radius);
-  let grid = floor(scene, home);
 
+  let wanted: Shown = { measured: {}, target: null };
+  let drawn: Shown | null = null;
+  let inSight = true;
   const turn = new Turn(() => {
+    robots.pose(wanted);
     renderer.render(scene, camera);
+    drawn = wanted;
     onFrame();
   });
-  const drawSoon = (): void => turn.ask();
+  // What is scrolled away waits, but for the first picture: nobody is to scroll to an empty one.
+  const drawSoon = (): void => {
+    if (inSight || drawn === null) turn.ask();
+  };
   const resetView = (): void => {
     controls.target.copy(home.centre);
     camera.position.copy(home.centre).add(new Vector3(1.15, -1.5, 0.75).normalize().multiplyScalar(home.radius * 3.2));
@@ -99,22 +92,24 @@ export function createScene(canvas: HTMLCanvasElement, twin: KnownTwin, onFrame:
     renderer.setSize(width, height, false);
     camera.aspect = width / height;
     camera.updateProjectionMatrix();
+    // The new size has emptied it.
+    drawn = null;
     drawSoon();
   };
-  const observer = new ResizeObserver(resize);
-  observer.observe(canvas);
+  const forget = watchCanvas(canvas, resize, (seen) => {
+    inSight = seen;
+    drawSoon();
+  });
   controls.addEventListener("change", drawSoon);
   resize();
   resetView();
 
   return {
     show(measured, target) {
-      pose(solid, twin, measured);
-      const differs =
-        target !== null && Object.entries(target).some(([name, at]) => Math.abs(at - (measured[name] ?? at)) > GHOST_FROM);
-      ghostRoot.visible = differs;
-      if (differs) pose(ghost, twin, target);
-      drawSoon();
+      wanted = { measured, target: target !== null && differs(measured, target) ? target : null };
+      const pxPerM = canvas.height / (2 * Math.tan(radians(camera.fov) / 2)) / nearest(camera, controls.target, home.reach);
+      const seen = (next: Targets | null, last: Targets | null): boolean => canBeSeen(last, next, home.reach, pxPerM);
+      if (drawn === null || seen(measured, drawn.measured) || seen(wanted.target, drawn.target)) drawSoon();
     },
     recolour() {
       scene.remove(grid);
@@ -125,7 +120,7 @@ export function createScene(canvas: HTMLCanvasElement, twin: KnownTwin, onFrame:
     resetView,
     dispose() {
       turn.dispose();
-      observer.disconnect();
+      forget();
       controls.dispose();
       scene.traverse((object) => {
         if (!(object instanceof Mesh)) return;
@@ -136,6 +131,64 @@ export function createScene(canvas: HTMLCanvasElement, twin: KnownTwin, onFrame:
       grid.dispose();
       renderer.dispose();
     },
+  };
+}
+
+function createRenderer(canvas: HTMLCanvasElement): WebGLRenderer {
+  try {
+    const made = new WebGLRenderer({ canvas, antialias: true, alpha: true });
+    made.outputColorSpace = SRGBColorSpace;
+    return made;
+  } catch {
+    throw new NoWebglError();
+  }
+}
+
+interface Shown {
+  measured: Targets;
+  target: Targets | null;
+}
+
+/** The robot as it is, and the ghost of where it is to be. */
+function bothRobots(scene: Scene, twin: KnownTwin): { pose: (shown: Shown) => void } {
+  const solid = build(scene, twin, solidMaterial);
+  const ghostRoot = new Group();
+  scene.add(ghostRoot);
+  const material = new MeshBasicMaterial({
+    color: GHOST_COLOUR,
+    transparent: true,
+    opacity: GHOST_OPACITY,
+    depthWrite: false,
+  });
+  const ghost = build(ghostRoot, twin, () => material, moving(twin));
+  ghostRoot.visible = false;
+  return {
+    pose({ measured, target }) {
+      pose(solid, twin, measured);
+      ghostRoot.visible = target !== null;
+      if (target !== null) pose(ghost, twin, target);
+    },
+  };
+}
+
+function differs(measured: Targets, target: Targets): boolean {
+  return Object.entries(target).some(([name, at]) => Math.abs(at - (measured[name] ?? at)) > GHOST_FROM);
+}
+
+/** How far the nearest part of the robot can be from the eye [m]. */
+function nearest(camera: PerspectiveCamera, centre: Vector3, reach: number): number {
+  return Math.max(0.1, camera.position.distanceTo(centre) - reach);
+}
+
+/** Tells of another size, and of coming into sight and going. Returns what ends it. */
+function watchCanvas(canvas: HTMLCanvasElement, resized: () => void, sight: (seen: boolean) => void): () => void {
+  const sizes = new ResizeObserver(resized);
+  sizes.observe(canvas);
+  const places = new IntersectionObserver((entries) => sight(entries.at(-1)?.isIntersecting ?? true));
+  places.observe(canvas);
+  return () => {
+    sizes.disconnect();
+    places.disconnect();
   };
 }
 
@@ -216,6 +269,8 @@ interface Frame {
   centre: Vector3;
   radius: number;
   floor: number;
+  /** The furthest that a part can be from a joint that carries it [m]. */
+  reach: number;
 }
 
 /** Where to look, so that the whole robot is in sight, also when it reaches out. */
@@ -234,6 +289,8 @@ function frame(twin: KnownTwin): Frame {
   return {
     centre: base.clone().add(new Vector3(0, 0, reach * 0.32 + below * 0.6)),
     radius: reach * 0.95,
+    // Stretched out it is longer than it stands at home.
+    reach: 2 * reach,
     floor: planes[0]?.position_m[2] ?? 0,
   };
 }

@@ -1,6 +1,6 @@
 /**
- * Views that cost time to draw take turns, however many there are on the page: one a frame, and all of them together
- * only a part of the page's time. Sliders and setpoints go first.
+ * Views that cost time to draw take turns, however many there are on the page: as many in a frame as nobody feels, one
+ * at least, and all of them together only a part of the page's time. Sliders and setpoints go first.
  */
 import { now } from "../core/clock";
 
@@ -45,7 +45,8 @@ function next(): void {
   asked = true;
   requestAnimationFrame(() => {
     const startedAt = now();
-    Turn.next();
+    do Turn.next();
+    while (waiting.size > 0 && now() - startedAt < FREE_MS / 2);
     // Without a graphics card a frame can cost the page more than its share; then the next one waits.
     setTimeout(() => {
       const tookMs = now() - startedAt;

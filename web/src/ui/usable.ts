@@ -15,7 +15,7 @@ export function whyNot(device: DeviceStore): string {
 export function whyNotAct(device: DeviceStore, control: Control): string {
   const no = whyNot(device);
   if (no !== "") return no;
-  const mode = device.live.value ? device.telemetry.value?.message.mode : undefined;
+  const mode = device.live.value ? device.mode.value : undefined;
   // First of all: an action that nobody had control for brings a lease of its own, and that says nothing here.
   if (mode === "action") return texts.acts.busy;
   const holder = device.holder.value;

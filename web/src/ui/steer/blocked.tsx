@@ -7,7 +7,7 @@ import { texts } from "../../texts";
 /** Why nothing here can move the robot now; `null` when it can. */
 export function whyBlocked(device: DeviceStore, control: Control): string | null {
   if (control.streamer.value === null) return texts.joints.takeFirst;
-  const mode = device.telemetry.value?.message.mode;
+  const mode = device.mode.value;
   if (device.stopped.value) return texts.joints.stopped;
   if (!device.live.value) return texts.joints.waiting;
   if (mode === "action") return texts.joints.busy;
@@ -23,7 +23,7 @@ interface StreamNoteProps {
 
 export function StreamNote({ device, streamer, blocked }: StreamNoteProps) {
   const [state, text] = streamText(device, streamer, blocked);
-  const limited = state === "streaming" && limitsOf(device).length > 0;
+  const limited = state === "streaming" && device.limited.value !== "";
   return (
     <span class={`quiet stream-${limited ? "limited" : state}`} data-testid="stream-state" data-state={state} role="status">
       {text}
@@ -36,15 +36,9 @@ function streamText(device: DeviceStore, streamer: SetpointStreamer | null, bloc
   const state = streamer.state.value;
   if (state === "waiting") return [state, texts.joints.waiting];
   if (state === "streaming") {
-    const limited = limitsOf(device);
-    if (limited.length > 0) return [state, texts.joints.limited(limited.join(", "))];
+    if (device.limited.value !== "") return [state, texts.joints.limited(device.limited.value)];
     return [state, streamer.way.value === "joints" ? texts.joints.streaming : texts.steer.holding];
   }
   const ended = streamer.ended.value;
   return [state, ended === null ? "" : texts.joints.ended[ended]];
-}
-
-/** What makes the motion other than asked for, as the robot names it. */
-function limitsOf(device: DeviceStore): readonly string[] {
-  return device.telemetry.value?.message.limited ?? [];
 }

@@ -1,11 +1,14 @@
-import { effect, useSignalEffect } from "@preact/signals";
+import { effect, type ReadonlySignal, useComputed, useSignalEffect } from "@preact/signals";
 import { useEffect, useMemo, useRef, useState } from "preact/hooks";
 import { clamp, radians } from "../../core/angles";
+import type { DeviceStore } from "../../core/device";
 import { Held } from "../../core/held";
 import { JOINT_KEYS, jointOfKey } from "../../core/keymap";
+import type { KnownTelemetry } from "../../core/messages";
 import type { Joint } from "../../core/protocol";
 import type { SetpointStreamer } from "../../core/streamer";
 import { texts } from "../../texts";
+import { useDrawn } from "../drawn";
 import { useHeldPad } from "./gamepad";
 import { JointRow } from "./joint-row";
 import { useHeldKeys, useKey } from "./keys";
@@ -15,6 +18,8 @@ import type { PanelProps } from "./panel";
 const RATE_RAD_S = radians(20);
 const LEAD_RAD = radians(4);
 const STEP_MS = 40;
+/** What differs by less is shown the same [rad]. */
+const SHOWN_RAD = 1e-5;
 
 export function JointsPanel({ device, streamer, active, pad }: PanelProps) {
   const description = device.description.value;
@@ -22,6 +27,7 @@ export function JointsPanel({ device, streamer, active, pad }: PanelProps) {
   const [chosen, setChosen] = useState(0);
   const rows = useRef<HTMLDivElement>(null);
   useTurning({ device, streamer, active, pad }, chosen);
+  const telemetry = useDrawn(device.telemetry);
 
   const choose = (index: number): void => {
     const next = clamp(index, 0, joints.length - 1);
@@ -58,6 +64,7 @@ export function JointsPanel({ device, streamer, active, pad }: PanelProps) {
             joint={joint}
             index={index}
             device={device}
+            telemetry={telemetry}
             streamer={streamer}
             chosen={active && streamer !== null && index === chosen}
           />
@@ -71,22 +78,35 @@ export function JointsPanel({ device, streamer, active, pad }: PanelProps) {
 interface LiveJointProps extends Pick<PanelProps, "device" | "streamer"> {
   joint: Joint;
   index: number;
+  telemetry: DeviceStore["telemetry"];
   chosen: boolean;
 }
 
 /** Reads what changes many times a second by itself, so that the panel need not. */
-function LiveJoint({ joint, index, device, streamer, chosen }: LiveJointProps) {
-  const telemetry = device.telemetry.value?.message;
+function LiveJoint({ joint, index, device, telemetry, streamer, chosen }: LiveJointProps) {
+  const measured = useShown(telemetry, (message) => message.position_rad[index]);
+  const commanded = useShown(telemetry, (message) => message.commanded_rad[index]);
   return (
     <JointRow
       joint={joint}
-      targetRad={streamer?.targets.value[joint.name] ?? telemetry?.commanded_rad[index]}
-      measuredRad={telemetry?.position_rad[index]}
+      targetRad={streamer?.targets.value[joint.name] ?? commanded.value}
+      measuredRad={measured.value}
       old={!device.live.value}
       chosen={chosen}
       onSet={streamer === null ? null : (positionRad) => streamer.setTarget(joint.name, positionRad)}
     />
   );
+}
+
+/** One position of the newest telemetry: the same number for as long as the row would look the same. */
+function useShown(
+  telemetry: DeviceStore["telemetry"],
+  of: (message: KnownTelemetry) => number | undefined,
+): ReadonlySignal<number | undefined> {
+  return useComputed(() => {
+    const at = telemetry.value === null ? undefined : of(telemetry.value.message);
+    return at === undefined ? undefined : Math.round(at / SHOWN_RAD) * SHOWN_RAD;
+  });
 }
 
 /** Turns the chosen joint while a key, or the stick of a gamepad, is held: its target runs ahead by a little. */
