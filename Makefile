@@ -102,7 +102,7 @@ test-long: .venv/.dev console check tests/azurite/node_modules/.installed tests/
 	@$(BIN)/python -m pytest
 
 coverage: .venv/.dev
-	@$(BIN)/python -m pytest -q tests/unit/agent -m "not long" $(SIDE_BY_SIDE) --cov=device_agent/runtime --cov-branch \
+	@tests/twice -q tests/unit/agent -m "not long" $(SIDE_BY_SIDE) --cov=device_agent/runtime --cov-branch \
 		--cov-report=term-missing:skip-covered --cov-fail-under=100
 
 fuzz: .venv/.dev
