@@ -1,11 +1,12 @@
 """Two people, a browser each, one arm: control goes from hand to hand, and who watches is seen."""
 
+import contextlib
 import json
 from collections.abc import Iterator
 from typing import Any
 
 import pytest
-from playwright.sync_api import Browser, Page, Route, expect
+from playwright.sync_api import Browser, Error, Page, Route, expect
 
 from tests.support.brokers import wait_until
 from tests.support.browser import PATIENCE_MS, person
@@ -43,10 +44,16 @@ def expect_state(page: Page, state: str) -> None:
 
 def take(page: Page) -> None:
     """Where the robot has ended control by itself, on a machine so busy that it had to hold, take it again."""
-    if page.get_by_test_id("control-state").get_attribute("data-state") != "mine":
-        page.get_by_test_id("take-control").click()
+    slider, button = page.get_by_test_id("slider-elbow"), page.get_by_test_id("take-control")
+
+    def in_hand() -> bool:
+        if page.get_by_test_id("control-state").get_attribute("data-state") != "mine" and button.is_visible():
+            with contextlib.suppress(Error):  # gone between the look and the click
+                button.click(timeout=1000)
+        return slider.is_enabled()
+
+    wait_until(in_hand, "control")
     expect_state(page, "mine")
-    expect(page.get_by_test_id("slider-elbow")).to_be_enabled(timeout=PATIENCE_MS)
 
 
 def ask(asker: Page, holder: Page) -> None:
