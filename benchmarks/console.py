@@ -5,27 +5,26 @@ machine's own clock: the press, the setpoint that leaves the page, the command t
 motion of the simulated joint, the telemetry that tells of it to the page, and the twin that is drawn from it. The
 clock of the page is compared with the machine's at each press.
 
-``python -m benchmarks.console --fleet [--minutes 10]`` shows ten simulated arms on one page, each measured 20 times a
-second, and looks for a minute how far apart the page's frames are, and to the end how much memory its scripts keep.
+``python -m benchmarks.console --fleet [--minutes 10]`` shows ten simulated arms on one page (``console_fleet.py``),
+``--devices 200`` the list of so many devices (``console_list.py``).
 """
 
 import argparse
-import contextlib
 import os
 import platform
 import statistics
-import subprocess
 import sys
 import tempfile
-import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
 
-from playwright.sync_api import Browser, CDPSession, Page, expect, sync_playwright
+from playwright.sync_api import Page, expect, sync_playwright
 
-from tests.support.brokers import ROOT, wait_until
+from benchmarks.console_fleet import show_fleet
+from benchmarks.console_list import show_list
+from tests.support.brokers import wait_until
 from tests.support.browser import PATIENCE_MS, chromium, pages
 from tests.support.machine import Machine, Trace, start_machine
 
@@ -34,13 +33,8 @@ PARTS: Final = ("input", "published", "commanded", "moved", "told", "drawn")
 """In their order: pressed and handled by the page, sent to the broker, at the simulation, moving, heard, drawn."""
 MOST_MS: Final = 60.0
 """From the press to simulated motion, median."""
-LONGEST_FRAME_MS: Final = 100.0
 MOVES_RAD_S: Final = 0.002
 """A simulated joint that is faster than this moves: a tenth of a degree per second."""
-ROBOTS: Final = 10
-WARM_UP_S: Final = 20.0
-GROWS_MB: Final = 5.0
-"""More memory than this at the end than after the first minute is a leak."""
 
 # Looks on from outside: what the page sends, hears and draws stays as it is.
 WATCH: Final = """() => {
@@ -83,17 +77,6 @@ WATCH: Final = """() => {
         marks.ahead = ahead;
     };
 }"""
-FRAMES: Final = """(forMs) => new Promise((resolve) => {
-    const gaps = [];
-    let last = performance.now();
-    const end = last + forMs;
-    const look = (now) => {
-        gaps.push(now - last);
-        last = now;
-        if (now < end) requestAnimationFrame(look); else resolve(gaps);
-    };
-    requestAnimationFrame(look);
-})"""
 
 
 @dataclass(frozen=True)
@@ -196,97 +179,13 @@ def show(found: Sequence[Press]) -> bool:
     return good
 
 
-# ------------------------------------------------------------ ten at once
-
-
-@contextlib.contextmanager
-def arms(machine: Machine, folder: Path, count: int) -> Iterator[list[str]]:
-    """Agents with so many simulated arms between them, paired with the demo account; the arms' ids."""
-    started: list[subprocess.Popen[bytes]] = []
-    names = [f"arm{index}" for index in range(count)]
-    with machine.api() as api:
-        for number, own in enumerate((names[: count // 2], names[count // 2 :])):
-            home = folder / f"agent{number}"
-            wanted = [part for name in own for part in ("--device", f"{name}=ur5")]
-            said = _agent("enroll", home, "--server", machine.url, "--name", f"Arms {number}", *wanted, "--no-wait")
-            words = said.split()
-            api.post("/agents/claim", {"code": words[words.index("code") + 1]})
-            started.append(
-                subprocess.Popen(  # noqa: S603 (our own program)
-                    [sys.executable, "-m", "device_agent", "run", "--home", str(home)],
-                    cwd=ROOT,
-                    stdout=subprocess.DEVNULL,
-                    stderr=subprocess.DEVNULL,
-                )
-            )
-        try:
-            yield [api.device(name)["id"] for name in names]
-        finally:
-            for process in started:
-                process.terminate()
-            for process in started:
-                process.wait(30)
-
-
-def _agent(command: str, home: Path, *arguments: str) -> str:
-    done = subprocess.run(  # noqa: S603 (our own program)
-        [sys.executable, "-m", "device_agent", command, "--home", str(home), *arguments],
-        cwd=ROOT,
-        capture_output=True,
-        text=True,
-        check=True,
-    )
-    return done.stdout + done.stderr
-
-
-def heap_mb(session: CDPSession) -> float:
-    """What the page's scripts keep, after everything else was collected [MB]."""
-    session.send("HeapProfiler.collectGarbage")
-    used: float = session.send("Runtime.getHeapUsage")["usedSize"]
-    return used / 1e6
-
-
-def frames(page: Page, for_s: float) -> list[float]:
-    """The gaps between the page's frames [ms]."""
-    gaps: list[float] = page.evaluate(FRAMES, for_s * 1000)
-    return gaps
-
-
-def open_together(page: Page, machine: Machine, ids: Sequence[str]) -> None:
-    """All on one page, each of them heard and drawn."""
-    page.goto(f"{machine.url}/#/operate/{','.join(ids)}")
-    expect(page.get_by_test_id("station")).to_have_count(len(ids), timeout=PATIENCE_MS)
-    drawn = "() => document.querySelectorAll('[data-testid=view-3d]:not([data-frames=\"0\"])').length"
-    wait_until(lambda: page.evaluate(drawn) == len(ids), "every twin to be drawn", 120)
-
-
-def show_fleet(browser: Browser, machine: Machine, folder: Path, minutes: float) -> bool:
-    """Look at ten arms; whether frames come in time and memory stays."""
-    with arms(machine, folder, ROBOTS) as ids, pages(browser, machine) as (page,):
-        open_together(page, machine, ids)
-        session = page.context.new_cdp_session(page)
-        time.sleep(WARM_UP_S)
-        gaps = sorted(frames(page, 60))
-        kept = [heap_mb(session)]
-        print(f"{platform.python_version()}, {os.cpu_count()} cores, {len(ids)} arms, {len(gaps)} frames in a minute")
-        marks = [gaps[round((len(gaps) - 1) * share)] for share in (0.5, 0.95, 0.99, 1.0)]
-        print("ms between frames: p50 {:.0f}, p95 {:.0f}, p99 {:.0f}, max {:.0f}".format(*marks), flush=True)
-        for _ in range(round(minutes) - 1):
-            time.sleep(60)
-            kept.append(heap_mb(session))
-        print("MB that scripts keep, minute by minute: " + ", ".join(f"{each:.1f}" for each in kept))
-        quick, steady = gaps[-1] <= LONGEST_FRAME_MS, kept[-1] - kept[0] <= GROWS_MB
-        print(f"longest frame {gaps[-1]:.0f} ms, {'within' if quick else 'MORE THAN'} {LONGEST_FRAME_MS:.0f} ms")
-        print(f"memory {'steady' if steady else 'GROWS'}: {kept[-1] - kept[0]:+.1f} MB")
-        return quick and steady
-
-
 def main() -> int:
     """Command line."""
     parser = argparse.ArgumentParser(description="How quick the console is.")
     parser.add_argument("--samples", type=int, default=40)
     parser.add_argument("--fleet", action="store_true", help="ten arms on one page")
     parser.add_argument("--minutes", type=float, default=10.0, help="with --fleet: how long memory is looked at")
+    parser.add_argument("--devices", type=int, default=0, help="the list of so many devices")
     chosen = parser.parse_args()
     with tempfile.TemporaryDirectory(prefix="ts-bench-console-") as name:
         folder = Path(name)
@@ -297,6 +196,8 @@ def main() -> int:
         ):
             if chosen.fleet:
                 return 0 if show_fleet(browser, machine, folder, chosen.minutes) else 1
+            if chosen.devices:
+                return 0 if show_list(browser, machine, chosen.devices) else 1
             with pages(browser, machine) as (page,):
                 found = measure(page, machine, chosen.samples)
             return 0 if show(found) else 1

@@ -17,7 +17,7 @@ LABORATORY = {
     "test_room_pages",
     "test_steering",
 }
-OWN = {"test_make_up", "test_sign_in", "test_tls", "test_xmpp"}
+OWN = {"test_fleet", "test_make_up", "test_sign_in", "test_tls", "test_xmpp"}
 """Files that need the laboratory, and those that start what they need; the others share one arm."""
 
 

@@ -1,0 +1,63 @@
+"""Ten robots on one page: what is shown of each came from it, and the page keeps no more for showing it longer."""
+
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+from playwright.sync_api import Browser, Page, expect
+
+from benchmarks.console_fleet import ROBOTS, arms, kept, open_together, sweeping
+from benchmarks.console_list import crowd
+from tests.support.brokers import wait_until
+from tests.support.browser import PATIENCE_MS, pages
+from tests.support.machine import Machine, start_machine
+
+SHOWN_MS = 8_000
+KEEPS = 1.5
+"""So many times the memory at most after that: the last twenty seconds of telemetry are still filling."""
+PANS = (
+    """() => [...document.querySelectorAll("[data-testid=measured-shoulder_pan]")].map((each) => each.dataset.value)"""
+)
+
+
+@pytest.fixture
+def own_machine(tmp_path: Path) -> Iterator[Machine]:
+    """The product, to which robots are added."""
+    with start_machine(tmp_path / "machine") as machine:
+        yield machine
+
+
+def pans(page: Page) -> list[str]:
+    found: list[str] = page.evaluate(PANS)
+    return found
+
+
+def shows_nothing_of_who_says_nothing(page: Page, machine: Machine, silent: str, arm: str) -> None:
+    page.goto(f"{machine.url}/#/operate/{silent},{arm}")
+    station = page.locator(f"[data-testid=station][data-device={silent}]")
+    expect(station).to_be_visible(timeout=PATIENCE_MS)
+    wait_until(lambda: len(pans(page)) == 1 and pans(page)[0] != "", "the other's joints")
+    expect(station.get_by_test_id("view-3d")).to_have_attribute("data-frames", "0")
+    expect(station.locator(".joint")).to_have_count(0)
+
+
+def test_ten_robots_are_shown_as_they_say_and_memory_stays(
+    own_machine: Machine, drawing_browser: Browser, tmp_path: Path
+) -> None:
+    with (
+        arms(own_machine, tmp_path, ROBOTS) as ids,
+        crowd(own_machine, 1) as (silent,),
+        pages(drawing_browser, own_machine) as (page,),
+    ):
+        open_together(page, own_machine, ids)
+        wait_until(lambda: len(pans(page)) == ROBOTS and "" not in pans(page), "the joints of each")
+        session = page.context.new_cdp_session(page)
+        before, at = kept(session), pans(page)
+        with sweeping(own_machine, ids):
+            wait_until(lambda: all(now != was for now, was in zip(pans(page), at, strict=True)), "each to move")
+            page.wait_for_timeout(SHOWN_MS)
+        after = kept(session)
+        assert after.heap_mb < KEEPS * before.heap_mb, f"{before}, then {after}"
+        assert after.nodes < KEEPS * before.nodes, f"{before}, then {after}"
+        assert after.listeners < KEEPS * before.listeners, f"{before}, then {after}"
+        shows_nothing_of_who_says_nothing(page, own_machine, silent.device, ids[0])
