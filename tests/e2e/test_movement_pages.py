@@ -65,7 +65,8 @@ def name(api: Api, request: pytest.FixtureRequest) -> Iterator[str]:
     api.http.delete(f"/robot-types/ur5/movements/{found}")
     device = api.device()["id"]
     home: dict[str, Any] = {"kind": "run_movement", "name": "home"}
-    api.post(f"/devices/{device}/actions", {"request": home, "wait_ms": 20_000, "wait_for": "done"})
+    # In its turn: what the test has begun may still be under way.
+    api.post(f"/devices/{device}/actions", {"request": home, "policy": "queue", "wait_ms": 20_000, "wait_for": "done"})
 
 
 def script(page: Page) -> Locator:

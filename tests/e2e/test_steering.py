@@ -201,12 +201,18 @@ def test_a_gamepad_moves_nothing_without_its_dead_man_button(browser: Browser, l
         wait_until(lambda: stands(trace), "rest after the button was let go")
 
         # Gone in the middle of it: the same as let go.
-        unplug = "() => { window.scriptedPad.connected = false; }"
-        holding(page, press(True), lambda: page.evaluate(unplug), lambda: rolls(trace), "the gamepad driving again")
+        def plug(there: bool) -> Callable[[], None]:
+            return lambda: page.evaluate("(there) => { window.scriptedPad.connected = there; }", there)
+
+        def plug_and_press() -> None:  # both: it may have been gone in vain already
+            plug(True)()
+            press(True)()
+
+        holding(page, plug_and_press, plug(False), lambda: rolls(trace), "the gamepad driving again")
         wait_until(lambda: stands(trace), "rest after the gamepad was gone")
         expect(page.get_by_test_id("gamepad")).to_contain_text("disconnected", ignore_case=True)
 
-        page.evaluate("() => { window.scriptedPad.connected = true; }")
+        plug(True)()
         page.evaluate(PRESS, [B, True])
         expect(page.get_by_test_id("stop-banner")).to_have_attribute("data-state", "latched", timeout=PATIENCE_MS)
         page.evaluate(PRESS, [B, False])
