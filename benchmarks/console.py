@@ -195,7 +195,7 @@ def main() -> int:
             chromium(playwright) as browser,
         ):
             if chosen.fleet:
-                return 0 if show_fleet(browser, machine, folder, chosen.minutes) else 1
+                return 0 if show_fleet(browser, machine, chosen.minutes) else 1
             if chosen.devices:
                 return 0 if show_list(browser, machine, chosen.devices) else 1
             with pages(browser, machine) as (page,):

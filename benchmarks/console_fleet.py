@@ -1,26 +1,22 @@
-"""Ten simulated arms on one page, all of them moving: how far apart its frames are, and what its memory does.
+"""Ten arms on one page, all of them moving: how far apart its frames are, and what its memory does.
 
 What opening the page costs (its code, ten scenes, the shaders' compilation) is printed by itself and is not in the
 minute, which begins ``WARM_UP_S`` after every twin was drawn.
 """
 
-import contextlib
 import os
 import statistics
-import subprocess
-import sys
-import threading
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any, Final
 
 from playwright.sync_api import Browser, CDPSession, Page, expect
 
-from tests.support.brokers import ROOT, wait_until
+from benchmarks.puppets import puppets
+from tests.support.brokers import wait_until
 from tests.support.browser import PATIENCE_MS, pages
-from tests.support.machine import Api, Machine
+from tests.support.machine import Machine
 
 ROBOTS: Final = 10
 WARM_UP_S: Final = 20.0
@@ -29,8 +25,6 @@ GROWS_MB_MIN: Final = 0.2
 """Memory that grows faster than this after the first minute is a leak."""
 MORE: Final = 1.1
 """So many times the nodes and listeners of the first minute, at the end."""
-SWEEP_S: Final = 9.0
-_SIDE_RAD: Final = 0.9
 
 # Of each frame when it was, and of the long ones what they were spent on, as the browser has it.
 WATCH_FRAMES: Final = """() => {
@@ -63,78 +57,6 @@ TAKE_FRAMES: Final = """() => {
 DRAWN: Final = (
     "() => [...document.querySelectorAll('[data-testid=view-3d]')].map((each) => Number(each.dataset.frames))"
 )
-
-
-@contextlib.contextmanager
-def arms(machine: Machine, folder: Path, count: int) -> Iterator[list[str]]:
-    """Two agents with so many simulated arms between them, paired with the demo account; the arms' ids."""
-    names = [f"arm{index}" for index in range(count)]
-    with contextlib.ExitStack() as stack, machine.api() as api:
-        for number, own in enumerate((names[: count // 2], names[count // 2 :])):
-            home = folder / f"agent{number}"
-            wanted = [part for name in own for part in ("--device", f"{name}=ur5")]
-            words = _enroll(home, "--server", machine.url, "--name", f"Arms {number}", *wanted, "--no-wait").split()
-            api.post("/agents/claim", {"code": words[words.index("code") + 1]})
-            stack.enter_context(_running(home))
-        wait_until(
-            lambda: _online(api) >= set(names),
-            "every arm to be online",
-        )
-        yield [api.device(name)["id"] for name in names]
-
-
-def _online(api: Api) -> set[str]:
-    return {each["name"] for each in api.get("/devices")["items"] if each["online"]}
-
-
-def _enroll(home: Path, *arguments: str) -> str:
-    done = subprocess.run(  # noqa: S603 (our own program)
-        [sys.executable, "-m", "device_agent", "enroll", "--home", str(home), *arguments],
-        cwd=ROOT,
-        capture_output=True,
-        text=True,
-        check=True,
-    )
-    return done.stdout + done.stderr
-
-
-@contextlib.contextmanager
-def _running(home: Path) -> Iterator[None]:
-    process = subprocess.Popen(  # noqa: S603 (our own program)
-        [sys.executable, "-m", "device_agent", "run", "--home", str(home)],
-        cwd=ROOT,
-        stdout=subprocess.DEVNULL,
-        stderr=subprocess.DEVNULL,
-    )
-    try:
-        yield
-    finally:
-        process.terminate()
-        process.wait(30)
-
-
-@contextlib.contextmanager
-def sweeping(machine: Machine, ids: Sequence[str]) -> Iterator[None]:
-    """All arms go slowly from side to side: what stands still costs a page nothing."""
-    over = threading.Event()
-
-    def sweep() -> None:
-        side_rad = _SIDE_RAD
-        with machine.api() as api:
-            while not over.is_set():
-                position_rad = {"shoulder_pan": side_rad, "elbow": 1.5 + side_rad / 3}
-                request = {"kind": "move_joints", "position_rad": position_rad, "speed": 0.08}
-                api.http.post("/actions", json={"devices": list(ids), "request": request})
-                side_rad = -side_rad
-                over.wait(SWEEP_S)
-
-    thread = threading.Thread(target=sweep)
-    thread.start()
-    try:
-        yield
-    finally:
-        over.set()
-        thread.join()
 
 
 @dataclass(frozen=True)
@@ -178,9 +100,9 @@ def open_together(page: Page, machine: Machine, ids: Sequence[str]) -> None:
     )
 
 
-def show_fleet(browser: Browser, machine: Machine, folder: Path, minutes: float) -> bool:
+def show_fleet(browser: Browser, machine: Machine, minutes: float) -> bool:
     """Look at ten arms; whether frames come in time and memory stays."""
-    with arms(machine, folder, ROBOTS) as ids, sweeping(machine, ids), pages(browser, machine) as (page,):
+    with puppets(machine, ROBOTS) as ids, pages(browser, machine) as (page,):
         session = page.context.new_cdp_session(page)
         page.evaluate(WATCH_FRAMES)
         began_s = time.monotonic()

@@ -4,17 +4,16 @@ The devices are agents as the protocol has them, paired over HTTP and heard thro
 them: what is measured is the page.
 """
 
-import contextlib
 import os
 import statistics
 import time
-from collections.abc import Callable, Iterator, Sequence
-from typing import TYPE_CHECKING, Any, Final, cast
+from collections.abc import Callable, Sequence
+from typing import Final
 
-import httpx
 from playwright.sync_api import Browser, CDPSession, Page
 
 from benchmarks.console_fleet import TAKE_FRAMES, WATCH_FRAMES
+from benchmarks.crowd import crowd
 from device_agent.ports.clock import tick_ms, wall_ms
 from device_agent.protocol import codec, topics
 from device_agent.protocol.messages import Mode, State
@@ -23,10 +22,6 @@ from tests.support.browser import pages
 from tests.support.machine import Machine
 from tests.support.robot import Robot
 
-if TYPE_CHECKING:
-    from tests.support.cloud import Cloud, Person
-
-AGENT_HAS: Final = 20
 OWN: Final = 1
 """The product's own arm is in the list too."""
 DRAWN_WITHIN_MS: Final = 1000.0
@@ -58,50 +53,6 @@ _SEARCH: Final = """(words) => new Promise((resolve) => {
     requestAnimationFrame(() => requestAnimationFrame(() => setTimeout(() => resolve(performance.now() - began))));
 })"""
 _ONLINE: Final = "() => document.querySelectorAll('[data-testid=device-row] [data-status=online]').length"
-
-
-class _Clock:
-    def now_ms(self) -> int:
-        return wall_ms()
-
-
-class _Functions:
-    """The product, asked over HTTP by agents."""
-
-    def __init__(self, machine: Machine) -> None:
-        self._http = httpx.Client(base_url=machine.url, timeout=30)
-        self.clock = _Clock()
-
-    def ask(self, method: str, path: str, **options: Any) -> httpx.Response:
-        return self._http.request(method, path, **options)
-
-    def close(self) -> None:
-        self._http.close()
-
-
-class _Owner:
-    """Who the agents are paired with."""
-
-    def __init__(self, http: httpx.Client) -> None:
-        self._http = http
-
-    def post(self, path: str, body: Any) -> httpx.Response:
-        return self._http.post(path, json=body)
-
-
-@contextlib.contextmanager
-def crowd(machine: Machine, count: int, each: int = AGENT_HAS) -> Iterator[list[Robot]]:
-    """Agents with so many devices between them, paired with the demo account and connected."""
-    with contextlib.ExitStack() as stack, machine.api() as api:
-        functions = _Functions(machine)
-        stack.callback(functions.close)
-        robots: list[Robot] = []
-        for first in range(0, count, each):
-            names = tuple(f"device_{number}" for number in range(first, min(first + each, count)))
-            robot = stack.enter_context(Robot(cast("Cloud", functions), names))
-            robot.pair(cast("Person", _Owner(api.http)))
-            robots.append(robot.connect())
-        yield robots
 
 
 def speak(robot: Robot, name: str, mode: Mode) -> None:

@@ -6,8 +6,9 @@ from pathlib import Path
 import pytest
 from playwright.sync_api import Browser, Page, expect
 
-from benchmarks.console_fleet import ROBOTS, arms, kept, open_together, sweeping
-from benchmarks.console_list import crowd
+from benchmarks.console_fleet import ROBOTS, kept, open_together
+from benchmarks.crowd import crowd
+from benchmarks.puppets import puppets
 from tests.support.brokers import wait_until
 from tests.support.browser import PATIENCE_MS, pages
 from tests.support.machine import Machine, start_machine
@@ -41,21 +42,18 @@ def shows_nothing_of_who_says_nothing(page: Page, machine: Machine, silent: str,
     expect(station.locator(".joint")).to_have_count(0)
 
 
-def test_ten_robots_are_shown_as_they_say_and_memory_stays(
-    own_machine: Machine, drawing_browser: Browser, tmp_path: Path
-) -> None:
+def test_ten_robots_are_shown_as_they_say_and_memory_stays(own_machine: Machine, drawing_browser: Browser) -> None:
     with (
-        arms(own_machine, tmp_path, ROBOTS) as ids,
         crowd(own_machine, 1) as (silent,),
+        puppets(own_machine, ROBOTS) as ids,
         pages(drawing_browser, own_machine) as (page,),
     ):
         open_together(page, own_machine, ids)
         wait_until(lambda: len(pans(page)) == ROBOTS and "" not in pans(page), "the joints of each")
         session = page.context.new_cdp_session(page)
         before, at = kept(session), pans(page)
-        with sweeping(own_machine, ids):
-            wait_until(lambda: all(now != was for now, was in zip(pans(page), at, strict=True)), "each to move")
-            page.wait_for_timeout(SHOWN_MS)
+        wait_until(lambda: all(now != was for now, was in zip(pans(page), at, strict=True)), "each to move")
+        page.wait_for_timeout(SHOWN_MS)
         after = kept(session)
         assert after.heap_mb < KEEPS * before.heap_mb, f"{before}, then {after}"
         assert after.nodes < KEEPS * before.nodes, f"{before}, then {after}"

@@ -1,0 +1,60 @@
+"""Agents as the protocol has them, paired over HTTP and heard through the broker, with nothing behind them."""
+
+import contextlib
+from collections.abc import Iterator
+from typing import TYPE_CHECKING, Any, Final, cast
+
+import httpx
+
+from device_agent.ports.clock import wall_ms
+from tests.support.machine import Machine
+from tests.support.robot import Robot
+
+if TYPE_CHECKING:
+    from tests.support.cloud import Cloud, Person
+
+AGENT_HAS: Final = 20
+
+
+class _Clock:
+    def now_ms(self) -> int:
+        return wall_ms()
+
+
+class _Functions:
+    """The product, asked over HTTP by agents."""
+
+    def __init__(self, machine: Machine) -> None:
+        self._http = httpx.Client(base_url=machine.url, timeout=30)
+        self.clock = _Clock()
+
+    def ask(self, method: str, path: str, **options: Any) -> httpx.Response:
+        return self._http.request(method, path, **options)
+
+    def close(self) -> None:
+        self._http.close()
+
+
+class _Owner:
+    """Who the agents are paired with."""
+
+    def __init__(self, http: httpx.Client) -> None:
+        self._http = http
+
+    def post(self, path: str, body: Any) -> httpx.Response:
+        return self._http.post(path, json=body)
+
+
+@contextlib.contextmanager
+def crowd(machine: Machine, count: int, each: int = AGENT_HAS) -> Iterator[list[Robot]]:
+    """Agents with so many devices between them, paired with the demo account and connected."""
+    with contextlib.ExitStack() as stack, machine.api() as api:
+        functions = _Functions(machine)
+        stack.callback(functions.close)
+        robots: list[Robot] = []
+        for first in range(0, count, each):
+            names = tuple(f"device_{number}" for number in range(first, min(first + each, count)))
+            robot = stack.enter_context(Robot(cast("Cloud", functions), names))
+            robot.pair(cast("Person", _Owner(api.http)))
+            robots.append(robot.connect())
+        yield robots
