@@ -1,0 +1,51 @@
+"""``python -m benchmarks [SUITE …] [--quick]``: measures, writes ``results/*.json`` and ``docs/benchmarks.md``.
+
+Prints what is claimed and what was seen; the exit code is 1 where a claim does not hold.
+"""
+
+import argparse
+import importlib
+import sys
+import time
+from typing import Any
+
+from benchmarks import page, suites
+from benchmarks.report import Report, save
+
+
+def main() -> int:
+    """Run the suites that are asked for, one after the other."""
+    parser = argparse.ArgumentParser(prog="python -m benchmarks", description=__doc__.splitlines()[0])
+    parser.add_argument("suites", nargs="*", metavar="SUITE", help=f"of {', '.join(suites.NAMES)}; all by default")
+    parser.add_argument("--quick", action="store_true", help="fewer samples: all suites in under ten minutes")
+    chosen = parser.parse_args()
+    unknown = sorted(set(chosen.suites) - set(suites.NAMES))
+    if unknown:
+        parser.error(f"no suite {', '.join(unknown)}; there are {', '.join(suites.NAMES)}")
+    reports = [run(name, quick=chosen.quick) for name in chosen.suites or suites.NAMES]
+    page.PAGE.write_text(page.text(page.reports()), encoding="utf-8")
+    for report in reports:
+        page.draw(report)
+    claims = [claim for report in reports for claim in report.claims]
+    print()
+    for claim in claims:
+        print("reached    " if claim.holds else "NOT REACHED", claim.line())
+    return 0 if all(claim.holds for claim in claims) else 1
+
+
+def run(name: str, *, quick: bool) -> Report:
+    """One suite; its report is saved."""
+    began_s = time.monotonic()
+    suite: Any = importlib.import_module(f"benchmarks.suites.{name}")
+
+    def say(line: str) -> None:
+        print(f"{name:10} {time.monotonic() - began_s:6.0f} s  {line}", flush=True)
+
+    report: Report = suite.run(quick=quick, say=say)
+    save(report)
+    say(f"done, {sum(claim.holds for claim in report.claims)} of {len(report.claims)} claims hold")
+    return report
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,257 @@
+"""What suites measure at: the product as ``make up`` starts it, bare peers beside it, and clients with any rights."""
+
+import contextlib
+import http.client
+import json
+import queue
+import socket
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any, Final, Self
+
+import paho.mqtt.client as paho
+from paho.mqtt.enums import CallbackAPIVersion
+
+from benchmarks.echoes import HOST, send_at_once
+from device_agent.protocol import codec, robot_type
+from device_agent.protocol.grants import Grant
+from device_agent.protocol.messages import JointTarget, JointTelemetry, Setpoint
+from function_app import settings
+from tests.support.brokers import ROOT, BrokerKind
+from tests.support.cloud import Cloud
+from tests.support.machine import Api, Machine, start_machine
+
+PATIENCE_S: Final = 10.0
+LEASE_MS: Final = 60_000
+PERIOD_S: Final = 0.025
+"""Between two setpoints, as the console sends them."""
+PAYLOAD: Final = json.dumps({"text": "x" * 139}).encode()
+"""150 bytes of JSON, as in the facts that these figures are to be compared with."""
+
+
+class Stand:
+    """One started product. ``start`` gives one.
+
+    Attributes:
+        machine: It.
+        api: Its API, asked with ``token``, an API key of who owns all.
+        kind: Its broker.
+    """
+
+    def __init__(self, machine: Machine, kind: BrokerKind, cloud: Cloud) -> None:
+        self.machine = machine
+        self.kind = kind
+        self.api = Api(machine)
+        self.token: str = self.api.post("/api-keys", {"name": "bench", "role": "operator", "days": 1})["token"]
+        self.api.http.headers["Authorization"] = f"Bearer {self.token}"
+        self.api.http.cookies.clear()
+        self._cloud = cloud
+        self._number = 0
+
+    @property
+    def mqtt_port(self) -> int:
+        """Where its broker takes TCP."""
+        return self.machine.port + 1
+
+    def rights(self, *, publish: tuple[str, ...] = (), subscribe: tuple[str, ...] = ()) -> tuple[str, str, str]:
+        """Client id, user name and password of a new client with exactly these rights."""
+        self._number += 1
+        name = f"bench-{self._number}"
+        grant = Grant(
+            principal=f"account:{name}",
+            client_id=name,
+            publish=publish,
+            subscribe=subscribe,
+            token_id=f"{name}{time.time_ns():x}",
+            expires_at=int(time.time() + 7200),
+        )
+        issued = self._cloud.run(self._cloud.functions.access.issue(grant))
+        return name, issued.username, issued.password
+
+    def line(self, *, publish: tuple[str, ...] = (), subscribe: tuple[str, ...] = (), qos: int = 0) -> "Line":
+        """A connected client that has subscribed."""
+        return Line(self.mqtt_port, *self.rights(publish=publish, subscribe=subscribe), subscribe=subscribe, qos=qos)
+
+
+class Line:
+    """A warm paho client, as an app would have one. ``with`` closes it.
+
+    Attributes:
+        heard: Payloads in the order in which they came.
+    """
+
+    def __init__(
+        self, port: int, client_id: str, user: str, password: str, *, subscribe: tuple[str, ...], qos: int
+    ) -> None:
+        self.heard: queue.SimpleQueue[bytes] = queue.SimpleQueue()
+        self.hear: Callable[[bytes], None] = self.heard.put_nowait
+        self._filters = [(each, qos) for each in subscribe]
+        self._ready = threading.Event()
+        self.client = paho.Client(CallbackAPIVersion.VERSION2, client_id, protocol=paho.MQTTv311)
+        self.client.username_pw_set(user, password)
+        self.client.on_socket_open = send_at_once
+        self.client.on_message = lambda _c, _u, message: self.hear(bytes(message.payload))
+        self.client.on_connect = self._connected
+        self.client.on_subscribe = lambda *_: self._ready.set()
+        self.client.connect(HOST, port, keepalive=60)
+        self.client.loop_start()
+        if not self._ready.wait(PATIENCE_S):
+            raise TimeoutError("the broker does not let the bench's client in")
+
+    def _connected(self, *_: Any) -> None:
+        if self._filters:
+            self.client.subscribe(self._filters)
+        else:
+            self._ready.set()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.client.disconnect()
+        self.client.loop_stop()
+
+
+class Hand:
+    """An operator who holds one robot's joints where they are, setpoint by setpoint. ``with`` gives control up.
+
+    Args:
+        stand: The product.
+        name: The device's name at its agent.
+    """
+
+    def __init__(self, stand: Stand, name: str = "ur5") -> None:
+        self._stand = stand
+        self.device = stand.api.device(name)
+        self._path = f"/devices/{self.device['id']}/lease"
+        self._seen = threading.Condition()
+        self._newest: JointTelemetry | None = None
+        self._sequence = 0
+        self._next_s = 0.0
+        self._ending = threading.Event()
+        topic = self.device["topic"]
+        self.line = stand.line(publish=(f"{topic}/ctl/+",), subscribe=(f"{topic}/tele/joints",))
+        self.line.hear = self._hear
+        granted = stand.api.post(self._path, {"lease_ms": LEASE_MS, "wait_ms": 5000})
+        self.epoch: int = granted["epoch"]
+        self._topic = f"{topic}/ctl/{self.epoch}"
+        self._renewing = threading.Thread(target=self._renew, daemon=True)
+        self._renewing.start()
+        with self._seen:
+            self._seen.wait_for(lambda: self._newest is not None, PATIENCE_S)
+        joints = [each.name for each in robot_type.load(ROOT / "robots" / self.device["robot_type"]).joints]
+        self.target_rad: dict[str, float] = dict(zip(joints, self._latest().commanded_rad, strict=True))
+
+    def exchange(self) -> float:
+        """A setpoint, until telemetry says that the driver has applied it [ms]; as many a second as a page sends.
+
+        Raises:
+            TimeoutError: It does not.
+        """
+        time.sleep(max(0.0, self._next_s - time.monotonic()))
+        self._next_s = time.monotonic() + PERIOD_S
+        began = time.perf_counter()
+        with self._seen:
+            self._sequence += 1
+            setpoint = Setpoint(
+                epoch=self.epoch,
+                sequence=self._sequence,
+                echo_tick_ms=self._latest().tick_ms,
+                sent_ms=time.monotonic() * 1000,
+                target=JointTarget(position_rad=self.target_rad),
+            )
+            self.line.client.publish(self._topic, codec.encode(setpoint))
+            if not self._seen.wait_for(self._applied, PATIENCE_S):
+                raise TimeoutError(f"setpoint {self._sequence} is not seen again in telemetry")
+        return (time.perf_counter() - began) * 1000
+
+    def _latest(self) -> JointTelemetry:
+        if self._newest is None:
+            raise TimeoutError("the robot tells nothing")
+        return self._newest
+
+    def _applied(self) -> bool:
+        newest = self._newest
+        return newest is not None and newest.epoch == self.epoch and newest.setpoint_sequence >= self._sequence
+
+    def _hear(self, payload: bytes) -> None:
+        newest = codec.decode(payload, JointTelemetry)
+        with self._seen:
+            self._newest = newest
+            self._seen.notify()
+
+    def _renew(self) -> None:
+        while not self._ending.wait(LEASE_MS / 4000):
+            self._stand.api.post(self._path, {"lease_ms": LEASE_MS, "epoch": self.epoch})
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._ending.set()
+        self._renewing.join(PATIENCE_S)
+        self._stand.api.http.delete(self._path, params={"epoch": self.epoch})
+        self.line.__exit__()
+
+
+class Caller:
+    """One warm HTTP connection of the standard library: the client that costs least. ``with`` closes it."""
+
+    def __init__(self, port: int, headers: dict[str, str] | None = None) -> None:
+        self._line = http.client.HTTPConnection(HOST, port, timeout=PATIENCE_S)
+        self._headers = {"Content-Type": "application/json", **(headers or {})}
+        self._line.connect()
+        self._line.sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+
+    def ask(self, method: str, path: str, body: bytes | None = None) -> Any:
+        """The answer's JSON. Raises: RuntimeError: It is a refusal."""
+        self._line.request(method, path, body, self._headers)
+        answer = self._line.getresponse()
+        read = answer.read()
+        if answer.status >= http.client.BAD_REQUEST:
+            raise RuntimeError(f"{method} {path}: {answer.status} {read[:300]!r}")
+        return json.loads(read) if read else None
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._line.close()
+
+
+@contextlib.contextmanager
+def start(home: Path, kind: BrokerKind, **more: str) -> Iterator[Stand]:
+    """The product with one simulated UR5, and this broker; ``more`` are settings."""
+    with start_machine(home, port=0, TELESCOPE_BROKER=kind, **more) as machine:
+        if machine.process.poll() is not None:
+            raise RuntimeError("".join(machine.lines))
+        given = {"TELESCOPE_HOME": str(home), "TELESCOPE_PORT": str(machine.port), "TELESCOPE_BROKER": kind, **more}
+        with Cloud(settings.read(given)) as cloud:
+            yield Stand(machine, kind, cloud)
+
+
+@contextlib.contextmanager
+def peer(module: str, *arguments: str) -> Iterator[None]:
+    """A program beside the product that says ``ready`` when it is, to the end of the ``with``."""
+    with subprocess.Popen(
+        [sys.executable, "-m", module, *arguments], cwd=ROOT, stdout=subprocess.PIPE, text=True
+    ) as process:
+        try:
+            assert process.stdout is not None
+            if process.stdout.readline().strip() != "ready":
+                raise RuntimeError(f"{module} {arguments[0]} did not start")
+            yield
+        finally:
+            process.terminate()
+
+
+def free_port() -> int:
+    """A port that nobody listens on."""
+    with socket.socket() as found:
+        found.bind((HOST, 0))
+        port: int = found.getsockname()[1]
+        return port

@@ -1,0 +1,5 @@
+"""The suites, each a module with ``run(quick, say) -> Report``. Their order is the page's."""
+
+from typing import Final
+
+NAMES: Final = ("limit",)

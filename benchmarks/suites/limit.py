@@ -1,0 +1,134 @@
+"""Our path against what it must contain: bare TCP, a bare MQTT round trip on the same broker, bare HTTP."""
+
+import contextlib
+import json
+import socket
+import tempfile
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Final
+
+from benchmarks.echoes import HOST
+from benchmarks.measure import Exchange, in_turns, median, table
+from benchmarks.report import Claim, Report
+from benchmarks.stand import PATIENCE_S, PAYLOAD, Caller, Hand, Stand, free_port, peer, start
+from tests.support.brokers import BROKERS
+
+SETPOINT_MOST: Final = 1.5
+ACTION_MOST: Final = 2.5
+_ABOUT: Final = """A simulated UR5, its agent, the broker, the functions and who measures are processes of their own.
+*Setpoint* runs from the operator's publish to the telemetry which says that the driver has applied it; the arm rests.
+*Action* runs from `POST actions` to its answer that the robot has started: identity, role, the row's write, signature,
+publish, the agent's checks and journal, ack. The bare ones echo 150 bytes of JSON in another process."""
+_TOPICS: Final = ("bench/limit/there", "bench/limit/back")
+
+
+def run(*, quick: bool, say: Callable[[str], None]) -> Report:
+    """Both brokers, one after the other; on each, all paths take turns."""
+    report = Report(
+        suite="limit",
+        title="Against the limit",
+        quick=quick,
+        about=[_ABOUT],
+    )
+    rounds, each = (6, 25) if quick else (20, 50)
+    for kind in BROKERS:
+        say(f"{kind}: starting")
+        with tempfile.TemporaryDirectory() as folder, start(Path(folder), kind) as stand, paths(stand) as found:
+            taken = in_turns(found, rounds=rounds, each=each)
+        _judge(report, kind, taken)
+        for claim in report.claims[-2:]:
+            say(claim.line())
+    return report
+
+
+def _judge(report: Report, kind: str, taken: dict[str, list[float]]) -> None:
+    report.tables.append(table(f"Over {kind}", taken, against="MQTT, QoS 0"))
+    mqtt, echo = median(taken["MQTT, QoS 0"]), median(taken["HTTP"])
+    report.claims += [
+        Claim(
+            text=f"setpoint → applied → seen again, to a bare round trip over {kind}",
+            seen=median(taken["setpoint"]) / mqtt,
+            bound=SETPOINT_MOST,
+            unit="×",
+        ),
+        Claim(
+            text=f"`POST actions` until started, to bare HTTP and a bare round trip over {kind}",
+            seen=median(taken["action"]) / (median(taken["MQTT, QoS 1"]) + echo),
+            bound=ACTION_MOST,
+            unit="×",
+        ),
+    ]
+
+
+@contextlib.contextmanager
+def paths(stand: Stand) -> Iterator[dict[str, Exchange]]:
+    """All exchanges, warm."""
+    with contextlib.ExitStack() as stack:
+        tcp, web = free_port(), free_port()
+        stack.enter_context(peer("benchmarks.echoes", "tcp", str(tcp)))
+        stack.enter_context(peer("benchmarks.echoes", "http", str(web)))
+        found: dict[str, Exchange] = {"TCP": _tcp(stack, tcp), "HTTP": _http(stack, web)}
+        for qos in (0, 1):
+            found[f"MQTT, QoS {qos}"] = mqtt(stack, stand, qos)
+        hand = stack.enter_context(Hand(stand))
+        found["setpoint"] = hand.exchange
+        found["action"] = action(stack, stand, hand)
+        yield found
+
+
+def _tcp(stack: contextlib.ExitStack, port: int) -> Exchange:
+    line = stack.enter_context(socket.create_connection((HOST, port), PATIENCE_S))
+    line.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+
+    def exchange() -> None:
+        line.sendall(PAYLOAD)
+        left = len(PAYLOAD)
+        while left:
+            left -= len(line.recv(left))
+
+    return exchange
+
+
+def _http(stack: contextlib.ExitStack, port: int) -> Exchange:
+    caller = stack.enter_context(Caller(port))
+
+    def exchange() -> None:
+        caller.ask("POST", "/echo", PAYLOAD)
+
+    return exchange
+
+
+def mqtt(stack: contextlib.ExitStack, stand: Stand, qos: int) -> Exchange:
+    """To another process and back, with clients as bare as ours are."""
+    there, back = (f"{topic}/{qos}" for topic in _TOPICS)
+    rights = stand.rights(publish=(back,), subscribe=(there,))
+    stack.enter_context(peer("benchmarks.echoes", "mqtt", str(stand.mqtt_port), *rights, there, back, str(qos)))
+    line = stack.enter_context(stand.line(publish=(there,), subscribe=(back,), qos=qos))
+
+    def exchange() -> None:
+        line.client.publish(there, PAYLOAD, qos)
+        line.heard.get(timeout=PATIENCE_S)
+
+    return exchange
+
+
+def action(stack: contextlib.ExitStack, stand: Stand, hand: Hand) -> Exchange:
+    """A move to where the arm is: it starts, and ends by itself. The next one waits until it has, off the clock."""
+    caller = stack.enter_context(Caller(stand.machine.port, {"Authorization": f"Bearer {stand.token}"}))
+    path = f"/api/v1/devices/{hand.device['id']}/actions"
+    request = {"kind": "move_joints", "position_rad": hand.target_rad}
+    asked = {"request": request, "epoch": hand.epoch, "wait_for": "started", "wait_ms": 10_000}
+    body = json.dumps(asked).encode()
+
+    def exchange() -> float:
+        began = time.perf_counter()
+        started = caller.ask("POST", path, body)
+        took_ms = (time.perf_counter() - began) * 1000
+        if started["status"] not in ("started", "done", "succeeded"):
+            raise RuntimeError(f"not started: {started}")
+        caller.ask("GET", f"/api/v1/actions/{started['id']}?wait_ms=10000")
+        return took_ms
+
+    return exchange
