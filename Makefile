@@ -16,7 +16,7 @@ BROWSERS = -n 2 --dist loadscope tests/e2e
 # Those run one at a time that have a robot in motion before them, or an answer that must come in time.
 ALONE = tests/api tests/faults tests/leaks/test_secrets.py
 
-.PHONY: help up link env console test test-long coverage fuzz check audit-packages contract requirements clean
+.PHONY: help up link env console test test-long bench bench-quick coverage fuzz check audit-packages contract requirements clean
 .DELETE_ON_ERROR:
 
 help:
@@ -24,6 +24,8 @@ help:
 	@echo "make link          print another one-time sign-in link"
 	@echo "make test          check and test everything (about half an hour on two cores: see CONTRIBUTING.md for where it goes)"
 	@echo "make test-long     the same with every suite at full size"
+	@echo "make bench         what users feel, measured: benchmarks/results, docs/benchmarks.md"
+	@echo "make bench-quick   the same with fewer samples, in some minutes"
 	@echo "make coverage      every branch of the agent's runtime, by its unit tests alone"
 	@echo "make fuzz          each parser under a fuzzer, SECONDS_EACH=60"
 	@echo "make check         linters, types, import contracts, generated files, unsafe code, committed secrets"
@@ -53,6 +55,11 @@ env: .venv/.local
 	@echo "telescope: installing Python packages for development" >&2
 	@$(BIN)/python -m pip install --quiet --disable-pip-version-check --no-deps -r requirements/dev.txt
 	@touch $@ .venv/.local
+
+.venv/.bench: requirements/bench.txt | .venv/.dev
+	@echo "telescope: installing Python packages for benchmarks" >&2
+	@$(BIN)/python -m pip install --quiet --disable-pip-version-check --no-deps -r requirements/bench.txt
+	@touch $@
 
 .venv/.node: requirements/node.txt | .venv/.python
 	@{ $(NODE_READY); } 2>/dev/null || { echo "telescope: installing Node.js" >&2; \
@@ -104,6 +111,10 @@ test-long: .venv/.dev console check tests/azurite/node_modules/.installed tests/
 coverage: .venv/.dev
 	@tests/twice -q tests/unit/agent -m "not long" $(SIDE_BY_SIDE) --cov=device_agent/runtime --cov-branch \
 		--cov-report=term-missing:skip-covered --cov-fail-under=100
+
+bench bench-quick: .venv/.dev .venv/.bench console
+	@tests/system-packages
+	@$(BIN)/python -m benchmarks $(if $(findstring quick,$@),--quick)
 
 fuzz: .venv/.dev
 	@$(BIN)/python -m tests.fuzz $(SECONDS_EACH)

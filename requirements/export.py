@@ -12,6 +12,7 @@ EXPORTS = {
     "requirements/agent.txt": ("agent", "sim", "xmpp"),
     "requirements/local.txt": ("local",),
     "requirements/node.txt": ("node",),
+    "requirements/bench.txt": ("bench",),
     "requirements/dev.txt": ("dev",),
     "requirements/azure-worker.txt": ("azure-worker",),
 }
