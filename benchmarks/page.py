@@ -7,13 +7,10 @@ import argparse
 import sys
 from collections.abc import Iterator
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final
+from typing import Any, Final
 
 from benchmarks import suites
 from benchmarks.report import Chart, Report, Table, load, shown
-
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
 
 ROOT: Final = Path(__file__).parent.parent
 PAGE: Final = ROOT / "docs" / "benchmarks.md"
@@ -100,7 +97,7 @@ def draw(report: Report) -> None:
         plt.close(figure)
 
 
-def _plot(axes: "Axes", chart: Chart) -> None:
+def _plot(axes: Any, chart: Chart) -> None:
     if chart.kind == "bar":
         width = 0.8 / len(chart.series)
         for place, (name, values) in enumerate(chart.series.items()):
@@ -110,7 +107,7 @@ def _plot(axes: "Axes", chart: Chart) -> None:
         return
     for name, values in chart.series.items():
         if chart.kind == "cdf":
-            ordered: list[Any] = sorted(value for value in values if value is not None)
+            ordered = sorted(value for value in values if value is not None)
             axes.plot(ordered, [(index + 1) / len(ordered) for index in range(len(ordered))], label=name)
         else:
             axes.plot(chart.x, values, marker="o", markersize=3, label=name)

@@ -4,7 +4,7 @@ import pytest
 
 from benchmarks import page, suites
 from benchmarks.measure import in_turns, table
-from benchmarks.report import Claim, Report, load, percentile, save, shown
+from benchmarks.report import Claim, Report, Table, load, percentile, save, shown
 
 
 def report(*claims: Claim) -> Report:
@@ -15,7 +15,7 @@ def report(*claims: Claim) -> Report:
         about=["What was done."],
         quick=True,
         claims=list(claims),
-        tables=[page.Table(title="T", columns=["path", "n", "p50 ms", "x"], rows=rows)],
+        tables=[Table(title="T", columns=["path", "n", "p50 ms", "x"], rows=rows)],
     )
 
 
