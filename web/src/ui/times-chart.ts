@@ -48,7 +48,9 @@ export function createTimesChart(box: HTMLElement, { along, log }: Options): Tim
   };
   const build = (lines: readonly Drawn[]): uPlot => {
     const axis = { stroke: colour("--quiet"), grid: { stroke: colour("--line"), width: 1 }, ticks: { stroke: colour("--line"), width: 1 } };
-    const inMs = (ticks: (number | null)[]): string[] => ticks.map((tick) => (tick === null ? "" : `${tick} ${texts.times.milliseconds}`));
+    // The end of a logarithmic axis is no round number.
+    const inMs = (ticks: (number | null)[]): string[] =>
+      ticks.map((tick) => (tick === null ? "" : `${Number(tick.toPrecision(3))} ${texts.times.milliseconds}`));
     const times = { ...(log ? { distr: LOG, log: 10 as const } : {}), range: (_: uPlot, low: number | null, high: number | null) => reach(low, high) };
     const stepped = uPlot.paths.stepped?.({ align: 1 });
     return new uPlot(
