@@ -47,3 +47,25 @@ export function AskedForm({ label, todo, doing, busy, wrong, done = "", onSend, 
     </form>
   );
 }
+
+/** Who it is for, by the name of their account. What is `wrong` stands in the form's answer, `answerId`. */
+export function AccountNameField(props: { id: string; answerId: string; value: string; wrong: boolean; onInput: (name: string) => void }) {
+  return (
+    <div class="field">
+      <label for={props.id}>{texts.invite.name}</label>
+      <input
+        id={props.id}
+        type="text"
+        autocomplete="off"
+        autocapitalize="none"
+        spellcheck={false}
+        required
+        maxLength={200}
+        value={props.value}
+        aria-invalid={props.wrong}
+        aria-describedby={props.answerId}
+        onInput={(event) => props.onInput(event.currentTarget.value)}
+      />
+    </div>
+  );
+}

@@ -3,7 +3,7 @@ import { sentence } from "../core/http";
 import type { InvitationMade, SharedRole } from "../core/rights";
 import type { Sharing } from "../core/sharing";
 import { texts } from "../texts";
-import { AskedForm } from "./asked-form";
+import { AccountNameField, AskedForm } from "./asked-form";
 import { FOR_GOOD, LastingField, ONE_DAY, seconds } from "./lasting";
 import { MadeLink } from "./made-link";
 import { Choice } from "./parts";
@@ -86,22 +86,7 @@ export function InviteForm({ sharing, onClose }: InviteFormProps) {
       <Choice label={texts.invite.how} value={how} options={HOW} onChange={setHow} />
       <p class="quiet small">{how === "name" ? texts.invite.nameNote : texts.invite.linkNote}</p>
       {how === "name" && (
-        <div class="field">
-          <label for="invite-name">{texts.invite.name}</label>
-          <input
-            id="invite-name"
-            type="text"
-            autocomplete="off"
-            autocapitalize="none"
-            spellcheck={false}
-            required
-            maxLength={200}
-            value={name}
-            aria-invalid={wrong !== ""}
-            aria-describedby="invite-answer"
-            onInput={(event) => setName(event.currentTarget.value)}
-          />
-        </div>
+        <AccountNameField id="invite-name" answerId="invite-answer" value={name} wrong={wrong !== ""} onInput={setName} />
       )}
       <div class="field">
         <span class="label">{texts.invite.role}</span>

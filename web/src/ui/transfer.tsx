@@ -5,7 +5,7 @@ import { sentence } from "../core/http";
 import type { Invitation, InvitationMade } from "../core/rights";
 import type { Whole } from "../core/transfers";
 import { texts } from "../texts";
-import { AskedForm } from "./asked-form";
+import { AccountNameField, AskedForm } from "./asked-form";
 import { Confirm } from "./confirm";
 import { useFocusBack } from "./focus";
 import { LastingField, ONE_DAY, seconds } from "./lasting";
@@ -140,22 +140,7 @@ function OfferForm({ api, of, goes, onMade, onClose }: OfferFormProps) {
       </ul>
       <Choice label={texts.transfer.to} value={to} options={TO} onChange={setTo} />
       {to === "name" && (
-        <div class="field">
-          <label for="transfer-name">{texts.invite.name}</label>
-          <input
-            id="transfer-name"
-            type="text"
-            autocomplete="off"
-            autocapitalize="none"
-            spellcheck={false}
-            required
-            maxLength={200}
-            value={name}
-            aria-invalid={wrong !== ""}
-            aria-describedby="transfer-answer"
-            onInput={(event) => setName(event.currentTarget.value)}
-          />
-        </div>
+        <AccountNameField id="transfer-name" answerId="transfer-answer" value={name} wrong={wrong !== ""} onInput={setName} />
       )}
       <LastingField id="transfer-valid" label={texts.transfer.valid} value={valid} choices={VALID} onChange={setValid} />
     </AskedForm>
