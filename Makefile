@@ -22,7 +22,7 @@ ALONE = tests/api tests/faults tests/leaks/test_secrets.py
 help:
 	@echo "make up            run Telescope on this machine"
 	@echo "make link          print another one-time sign-in link"
-	@echo "make test          check and test everything (about half an hour on two cores: see CONTRIBUTING.md for where it goes)"
+	@echo "make test          check and test everything (about twenty-five minutes on two cores: see CONTRIBUTING.md for where it goes)"
 	@echo "make test-long     the same with every suite at full size"
 	@echo "make bench         what users feel, measured: benchmarks/results, docs/benchmarks.md"
 	@echo "make bench-quick   the same with fewer samples, in some minutes"
