@@ -123,8 +123,9 @@ class Filming(Protocol):
     def frame(self, camera: str) -> Frame | None:
         """A picture taken now; ``None`` where it has none at this moment.
 
-        Called at the camera's rate while somebody controls the robot, else once a second at most, from one thread that is
-        neither the control loop nor that of ``report``, and may run beside both; also before ``connect`` has succeeded. A picture is at most 128 KB: small, and JPEG.
+        Called at the camera's rate while somebody controls the robot, else once a second at most, from one thread that
+        is neither the control loop nor that of ``report``, and may run beside both; also before ``connect`` has
+        succeeded. A picture is at most 128 KB: small, and JPEG.
 
         Raises:
             DriverError: No such camera, or it failed; it is asked again when the next picture is due.
