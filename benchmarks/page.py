@@ -118,19 +118,24 @@ def reports() -> list[Report]:
     return [found for name in suites.NAMES if (found := load(name)) is not None]
 
 
+def write() -> None:
+    """The page and its pictures."""
+    found = reports()
+    PAGE.write_text(text(found), encoding="utf-8")
+    for report in found:
+        draw(report)
+
+
 def main() -> int:
     """Write or compare."""
     parser = argparse.ArgumentParser(prog="python -m benchmarks.page", description=__doc__)
     parser.add_argument("--check", action="store_true", help="fail when the page is not what the results say")
-    found = reports()
     if parser.parse_args().check:
-        if PAGE.read_text(encoding="utf-8") == text(found):
+        if PAGE.read_text(encoding="utf-8") == text(reports()):
             return 0
         sys.stderr.write("docs/benchmarks.md is not what benchmarks/results say; run `python -m benchmarks.page`\n")
         return 1
-    PAGE.write_text(text(found), encoding="utf-8")
-    for report in found:
-        draw(report)
+    write()
     return 0
 
 

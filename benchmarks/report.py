@@ -11,6 +11,8 @@ from typing import Final
 import msgspec
 
 RESULTS: Final = Path(__file__).parent / "results"
+QUICK: Final = RESULTS / "quick"
+"""Where short runs leave what they found; not kept with the sources."""
 Cell = str | float | int | None
 
 
@@ -98,7 +100,7 @@ class Report(msgspec.Struct, kw_only=True):
 
 def save(report: Report, folder: Path = RESULTS) -> Path:
     """Write it down, in place of what was found before."""
-    folder.mkdir(exist_ok=True)
+    folder.mkdir(parents=True, exist_ok=True)
     path = folder / f"{report.suite}.json"
     text = json.dumps(msgspec.to_builtins(report), indent=1, ensure_ascii=False)
     path.write_text(text + "\n", encoding="utf-8")
