@@ -113,10 +113,9 @@ def create_app(functions: Functions) -> FastAPI:
         uploads.router(functions, caller),
         health.router(functions),
     )
-    for routes in resources:
-        app.include_router(routes.router, prefix=PREFIX)
-    app.include_router(transfers.router(functions.transfers), prefix=PREFIX)
     app.state.routes = [route for routes in resources for route in routes.router.routes]
+    # Side by side and not as routers within the router, each of which would be looked through twice.
+    app.router.routes += [*app.state.routes, *transfers.router(functions.transfers).routes]
     _document(app, [kind for routes in resources for kind in routes.kinds])
     app.add_exception_handler(Problem, _on_problem)
     app.add_exception_handler(StoreError, _on_store)
@@ -205,10 +204,9 @@ async def _on_http(request: Request, error: Exception) -> Response:
 
 def _methods(request: Request) -> list[str]:
     """What may be asked at this address: the framework names the methods of the first route alone."""
-    path = request.url.path.removeprefix(PREFIX)
     known: list[Any] = request.app.state.routes
     # The first one that fits decides: ``agents/enroll`` is no agent.
-    place = next((route.path for route in known if route.path_regex.match(path)), None)
+    place = next((route.path for route in known if route.path_regex.match(request.url.path)), None)
     return sorted({method for route in known if route.path == place for method in route.methods})
 
 

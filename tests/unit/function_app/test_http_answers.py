@@ -10,6 +10,7 @@ import pytest
 from hypothesis import HealthCheck, given
 from hypothesis import settings as quickly
 from hypothesis import strategies as st
+from starlette.routing import Match
 
 from function_app.domain.problems import Problem
 from function_app.entrypoints.http.answers import MAX_BODY
@@ -297,3 +298,19 @@ class TestConsole:
 
         cloud.run(connect())
         assert [message["type"] for message in sent] == ["websocket.close"]
+
+
+class TestRoutes:
+    def test_one_that_is_passed_over_at_once_would_not_have_fitted(self, cloud: Cloud) -> None:
+        routes = cloud.app.state.routes
+        paths = {route.path_format.replace("{", "x").replace("}", "") for route in routes}
+        paths |= {f"{path}/more" for path in paths} | {f"{API}/robot-types/ur5/files/meshes/a/b.obj", f"{API}/devicesx"}
+        for path in paths:
+            scope = {"type": "http", "method": "GET", "path": path}
+            quickly_found = [route.path for route in routes if route.matches(dict(scope))[0] != Match.NONE]
+            assert quickly_found == [route.path for route in routes if route.path_regex.match(path)], path
+
+    def test_behind_a_prefix_of_the_host_they_are_found_too(self, cloud: Cloud) -> None:
+        scope = {"type": "http", "method": "GET", "path": f"/stage{API}/devices/{DEVICE}", "root_path": "/stage"}
+        found = [route.path for route in cloud.app.state.routes if route.matches(dict(scope))[0] == Match.FULL]
+        assert found == [f"{API}/devices/{{device}}"]
