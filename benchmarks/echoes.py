@@ -5,6 +5,7 @@
 """
 
 import asyncio
+import json
 import socket
 import sys
 from typing import Any
@@ -44,6 +45,10 @@ async def _http(port: int) -> None:
     @app.get("/echo")
     async def again() -> dict[str, str]:
         return {"status": "ok"}
+
+    @app.get("/sized/{length}")
+    async def sized(length: int) -> Response:
+        return Response(json.dumps("x" * (length - 2)), media_type="application/json")
 
     server = uvicorn.Server(
         uvicorn.Config(app, host=HOST, port=port, log_level="error", access_log=False, timeout_keep_alive=600)

@@ -235,7 +235,7 @@ def start(home: Path, kind: BrokerKind, **more: str) -> Iterator[Stand]:
 
 
 @contextlib.contextmanager
-def peer(module: str, *arguments: str) -> Iterator[None]:
+def peer(module: str, *arguments: str) -> Iterator["subprocess.Popen[str]"]:
     """A program beside the product that says ``ready`` when it is, to the end of the ``with``."""
     with subprocess.Popen(
         [sys.executable, "-m", module, *arguments], cwd=ROOT, stdout=subprocess.PIPE, text=True
@@ -244,7 +244,7 @@ def peer(module: str, *arguments: str) -> Iterator[None]:
             assert process.stdout is not None
             if process.stdout.readline().strip() != "ready":
                 raise RuntimeError(f"{module} {arguments[0]} did not start")
-            yield
+            yield process
         finally:
             process.terminate()
 

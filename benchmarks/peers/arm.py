@@ -1,0 +1,64 @@
+"""The least robot that is fair: the product's own driver of its simulated UR5, told and asked without any check."""
+
+from typing import Final
+
+from device_agent.drivers import mujoco
+from device_agent.ports.clock import tick_ms, wall_ms
+from device_agent.protocol import codec, robot_type
+from device_agent.protocol.messages import JointTarget, JointTelemetry, Mode, Setpoint
+from tests.support.brokers import ROOT
+
+FOLDER: Final = ROOT / "robots" / "ur5"
+KIND: Final = robot_type.load(FOLDER)
+NAMES: Final = tuple(joint.name for joint in KIND.joints)
+HOME_RAD: Final = tuple(KIND.home_rad[name] for name in NAMES)
+
+
+class Arm:
+    """What a setpoint asks is applied at once, and told at once. No lease, no limits, no watchdog, no stop."""
+
+    def __init__(self) -> None:
+        self._driver = mujoco.create(KIND, FOLDER, {}, "ur5")
+        self._driver.connect()
+
+    def apply(self, setpoint: Setpoint) -> JointTelemetry:
+        """What the arm does with it. Raises: TypeError: It is no target for joints."""
+        if not isinstance(setpoint.target, JointTarget):
+            raise TypeError("this arm takes joint targets")
+        wanted = setpoint.target.position_rad
+        seen = self._driver.observe()
+        applied = self._driver.send([wanted[name] for name in NAMES])
+        return JointTelemetry(
+            tick_ms=tick_ms(),
+            at_ms=wall_ms(),
+            sequence=setpoint.sequence,
+            mode=Mode.IDLE,
+            position_rad=_told(seen.position_rad),
+            velocity_rad_s=_told(seen.velocity_rad_s),
+            effort_nm=_told(seen.effort_nm),
+            commanded_rad=_told(applied),
+            frames=seen.frames,
+            epoch=setpoint.epoch,
+            setpoint_sequence=setpoint.sequence,
+            setpoint_sent_ms=setpoint.sent_ms,
+        )
+
+    def obey(self, payload: bytes) -> bytes:
+        """The same with both as they are on our own wire."""
+        return codec.encode(self.apply(codec.decode(payload, Setpoint)))
+
+
+def _told(values: tuple[float, ...]) -> tuple[float, ...]:
+    """With the digits that our own agent tells: longer text would be more to carry."""
+    return tuple(round(value, 6) for value in values)
+
+
+def setpoint(sequence: int, sent_ms: float) -> Setpoint:
+    """Hold where you are."""
+    return Setpoint(
+        epoch=1,
+        sequence=sequence,
+        echo_tick_ms=tick_ms(),
+        sent_ms=sent_ms,
+        target=JointTarget(position_rad=dict(zip(NAMES, HOME_RAD, strict=True))),
+    )

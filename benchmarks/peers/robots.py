@@ -1,0 +1,139 @@
+"""A robot behind each peer's wire: ``python -m benchmarks.peers.robots rosbridge|zenoh|grpc|foxglove PORT``.
+
+``… bridge PORT`` is what stands between the ends of the first. Each prints ``ready`` once it is.
+"""
+
+import asyncio
+import json
+import sys
+import threading
+from collections.abc import AsyncIterator, Callable, Mapping
+from typing import Any, Final
+
+from benchmarks.echoes import HOST
+from benchmarks.peers import bridge
+from benchmarks.peers.arm import NAMES, Arm
+from device_agent.protocol.messages import JointTarget, JointTelemetry, Setpoint
+
+CONTROL: Final = "arm/control"
+JOINTS: Final = "arm/joints"
+ROS_TYPE: Final = "sensor_msgs/JointState"
+METHOD: Final = ("bench.Arm", "Drive")
+
+
+def rosbridge(port: int) -> None:
+    """A robot's program with ``roslibpy``; both messages are ``JointState``."""
+    import roslibpy
+
+    arm, ros = Arm(), roslibpy.Ros(host=HOST, port=port)
+    ros.run()
+    joints = roslibpy.Topic(ros, "/" + JOINTS, ROS_TYPE)
+    control = roslibpy.Topic(ros, "/" + CONTROL, ROS_TYPE)
+    joints.advertise()
+    control.subscribe(lambda asked: joints.publish(to_ros(arm.apply(from_ros(asked)))))
+    _ready()
+
+
+def from_ros(asked: Mapping[str, Any]) -> Setpoint:
+    """A ``JointState`` that asks."""
+    wanted = JointTarget(position_rad=dict(zip(asked["name"], asked["position"], strict=True)))
+    return Setpoint(epoch=1, sequence=asked["header"]["seq"], echo_tick_ms=0, sent_ms=0.0, target=wanted)
+
+
+def to_ros(told: JointTelemetry) -> dict[str, Any]:
+    """A ``JointState`` that tells."""
+    seconds, rest_ms = divmod(told.at_ms, 1000)
+    return {
+        "header": {"seq": told.setpoint_sequence, "stamp": {"secs": seconds, "nsecs": rest_ms * 1_000_000}},
+        "name": NAMES,
+        "position": told.position_rad,
+        "velocity": told.velocity_rad_s,
+        "effort": told.effort_nm,
+    }
+
+
+def zenoh(port: int) -> None:
+    """A peer that listens: no router between the ends."""
+    import zenoh as library
+
+    with library.open(zenoh_peer(listen=port)) as session:
+        arm, joints = Arm(), session.declare_publisher(JOINTS, express=True)
+        session.declare_subscriber(CONTROL, lambda asked: joints.put(arm.obey(asked.payload.to_bytes())))
+        _ready()
+
+
+def zenoh_peer(*, listen: int = 0, connect: int = 0) -> Any:
+    """A configuration that speaks TCP on loopback alone, and looks for nobody."""
+    import zenoh as library
+
+    chosen = library.Config()
+    for part, port in (("listen/endpoints", listen), ("connect/endpoints", connect)):
+        chosen.insert_json5(part, json.dumps([f"tcp/{HOST}:{port}"] if port else []))
+    chosen.insert_json5("mode", '"peer"')
+    chosen.insert_json5("scouting/multicast/enabled", "false")
+    return chosen
+
+
+def grpc(port: int) -> None:
+    """A bidirectional stream, bytes each way, which spares it protobuf's work."""
+
+    async def serve() -> None:
+        import grpc as library
+
+        arm = Arm()
+
+        async def drive(asked: AsyncIterator[bytes], _context: Any) -> AsyncIterator[bytes]:
+            async for payload in asked:
+                yield arm.obey(payload)
+
+        server = library.aio.server()
+        service, method = METHOD
+        handler = library.stream_stream_rpc_method_handler(drive)
+        server.add_generic_rpc_handlers((library.method_handlers_generic_handler(service, {method: handler}),))
+        server.add_insecure_port(f"{HOST}:{port}")
+        await server.start()
+        print("ready", flush=True)
+        await server.wait_for_termination()
+
+    asyncio.run(serve())
+
+
+def foxglove(port: int) -> None:
+    """The SDK's server, to which clients publish; it tells on a channel of its own."""
+    import foxglove as library
+    from foxglove.websocket import Capability
+
+    arm, joints = Arm(), library.Channel(f"/{JOINTS}", message_encoding="json")
+
+    class Listener(library.ServerListener):  # type: ignore[misc]
+        def on_message_data(self, client: Any, client_channel_id: int, data: bytes) -> None:
+            del client, client_channel_id
+            joints.log(arm.obey(data))
+
+    library.start_server(
+        name="arm",
+        host=HOST,
+        port=port,
+        capabilities=[Capability.ClientPublish],
+        server_listener=Listener(),
+        supported_encodings=["json"],
+    )
+    _ready()
+
+
+def _ready() -> None:
+    print("ready", flush=True)
+    threading.Event().wait()
+
+
+KINDS: Final[Mapping[str, Callable[[int], None]]] = {
+    "rosbridge": rosbridge,
+    "zenoh": zenoh,
+    "grpc": grpc,
+    "foxglove": foxglove,
+    "bridge": bridge.main,
+}
+
+
+if __name__ == "__main__":
+    KINDS[sys.argv[1]](int(sys.argv[2]))

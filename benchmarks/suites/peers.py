@@ -1,0 +1,80 @@
+"""The peers' wires at our work: a setpoint, until telemetry says that the driver has applied it."""
+
+import contextlib
+import tempfile
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Final
+
+from benchmarks.measure import Exchange, in_turns, median, table
+from benchmarks.peers import operators, safety
+from benchmarks.report import Chart, Claim, Report, percentile
+from benchmarks.stand import Hand, start
+from tests.support.brokers import BROKERS
+
+OURS: Final = "Telescope, mosquitto"
+ROSBRIDGE: Final = "rosbridge-style, roslibpy"
+PEERS: Final = {
+    ROSBRIDGE: operators.rosbridge,
+    "zenoh, peer to peer": operators.zenoh,
+    "gRPC, one stream": operators.grpc,
+    "Foxglove WebSocket": operators.foxglove,
+}
+_ABOUT: Final = """A setpoint for six joints, until telemetry says that the driver has applied it, 40 a second as the
+console sends them. Robot, operator and what stands between them are processes of their own, over loopback. The robot is
+the same simulated UR5 with the same driver everywhere. With Telescope it is the product as `make up` starts it: lease,
+loop age, limits, own body, recorded. At the peers it is the least that is fair: a program of the peer's own library
+that applies what comes and tells it at once."""
+_HOW: Final = """rosbridge-style: `roslibpy` at both ends, between them a server of the rosbridge protocol without ROS
+behind it, which costs less than a real one. zenoh: two peers over TCP, without a router, `express`. gRPC: a
+bidirectional stream of bytes, asyncio at the robot, without protobuf's work. Foxglove: its SDK's server at the robot,
+to which the operator publishes. zenoh, gRPC and Foxglove connect both ends directly: nobody between them could hold
+rights, and the robot has to be reachable. Telescope and rosbridge pass a third process."""
+
+
+def run(*, quick: bool, say: Callable[[str], None]) -> Report:
+    """All at once, in turns."""
+    rounds, each = (6, 25) if quick else (14, 50)
+    say("starting everything")
+    with paths() as found:
+        say("taking turns")
+        taken = in_turns(found, rounds=rounds, each=each)
+    report = Report(suite="peers", title="Peers at the same work", quick=quick, about=[_ABOUT, _HOW])
+    report.tables += [table("Setpoint → applied → seen again", taken, against=OURS), safety.table()]
+    report.charts.append(_chart(taken))
+    report.claims.append(
+        Claim(
+            text="setpoint → applied → seen again over mosquitto, to the rosbridge-style peer",
+            seen=median(taken[OURS]) / median(taken[ROSBRIDGE]),
+            bound=1.0,
+            unit="×",
+        )
+    )
+    say(report.claims[0].line())
+    return report
+
+
+def _chart(taken: dict[str, list[float]]) -> Chart:
+    shares = {"median": 0.5, "p95": 0.95, "p99": 0.99}
+    return Chart(
+        title="Setpoint → applied → seen again",
+        kind="bar",
+        x_label="",
+        y_label="ms",
+        x=[name.replace(", ", ",\n") for name in taken],
+        series={label: [percentile(each, share) for each in taken.values()] for label, share in shares.items()},
+    )
+
+
+@contextlib.contextmanager
+def paths() -> Iterator[dict[str, Exchange]]:
+    """Two products and four peers, all connected."""
+    with contextlib.ExitStack() as stack:
+        found: dict[str, Exchange] = {}
+        for kind in reversed(BROKERS):
+            home = Path(stack.enter_context(tempfile.TemporaryDirectory()))
+            stand = stack.enter_context(start(home, kind))
+            found[f"Telescope, {kind}"] = stack.enter_context(Hand(stand)).exchange
+        for name, open_peer in PEERS.items():
+            found[name] = stack.enter_context(open_peer())
+        yield found
