@@ -2,4 +2,4 @@
 
 from typing import Final
 
-NAMES: Final = ("limit",)
+NAMES: Final = ("limit", "soak")

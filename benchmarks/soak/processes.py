@@ -1,0 +1,142 @@
+"""What each process of the product holds: memory, descriptors, threads, from ``/proc``; written down as it is seen."""
+
+import contextlib
+import threading
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Final, Self
+
+import msgspec
+
+_PARTS: Final = (
+    ("function_app serve", "functions"),
+    ("function_app work", "worker"),
+    ("infra.amqtt", "broker"),
+    ("infra.mosquitto", "broker"),
+    ("device_agent run", "agent"),
+)
+CHILDREN: Final = "agent's children"
+STARTER: Final = "starter"
+PARTS: Final = ("functions", "worker", "broker", "agent", CHILDREN, STARTER)
+_KB: Final = 1024
+
+
+class Sample(msgspec.Struct, frozen=True, kw_only=True):
+    """One part of the product at one moment.
+
+    Attributes:
+        at_s: Since the load began.
+        processes: It consists of so many; the other figures are their sums.
+        rss_mb: Pages in memory, those shared with others counted whole.
+        private_mb: Pages that nobody else has.
+    """
+
+    at_s: float
+    part: str
+    processes: int
+    rss_mb: float
+    pss_mb: float
+    private_mb: float
+    descriptors: int
+    threads: int
+
+
+class Watch:
+    """Samples a product's processes until the end of the ``with``.
+
+    Args:
+        root: Process id of the program that starts the others.
+        every_s: From one look to the next.
+        file: Where each sample goes at once, a line of comma-separated values; a run that is killed has left them.
+    """
+
+    def __init__(self, root: int, *, every_s: float, file: Path) -> None:
+        self._root = root
+        self._every_s = every_s
+        self._file = file
+        self._began_s = time.monotonic()
+        self._ending = threading.Event()
+        self._thread = threading.Thread(target=self._run)
+        self.samples: list[Sample] = []
+
+    def _run(self) -> None:
+        self._file.parent.mkdir(parents=True, exist_ok=True)
+        with self._file.open("w", encoding="utf-8") as out:
+            print(",".join(Sample.__struct_fields__), file=out, flush=True)
+            while not self._ending.wait(self._every_s):
+                for sample in look(self._root, time.monotonic() - self._began_s):
+                    self.samples.append(sample)
+                    print(",".join(map(str, msgspec.structs.astuple(sample))), file=out)
+                out.flush()
+
+    def __enter__(self) -> Self:
+        self._thread.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._ending.set()
+        self._thread.join()
+
+
+def look(root: int, at_s: float) -> Iterator[Sample]:
+    """All parts at this moment."""
+    members: dict[str, list[int]] = {}
+    for process, part in _family(root).items():
+        members.setdefault(part, []).append(process)
+    for part, processes in members.items():
+        held = [found for each in processes if (found := _held(each)) is not None]
+        if held:
+            rss, pss, private, descriptors, threads = map(sum, zip(*held, strict=True))
+            yield Sample(
+                at_s=round(at_s, 1),
+                part=part,
+                processes=len(held),
+                rss_mb=round(rss / _KB, 3),
+                pss_mb=round(pss / _KB, 3),
+                private_mb=round(private / _KB, 3),
+                descriptors=descriptors,
+                threads=threads,
+            )
+
+
+def _family(root: int) -> dict[int, str]:
+    """Process ids of the product and the part that each is of."""
+    parents: dict[int, int] = {}
+    for folder in Path("/proc").glob("[0-9]*"):
+        with contextlib.suppress(OSError):
+            parents[int(folder.name)] = int((folder / "stat").read_text().rpartition(")")[2].split()[1])
+    found = {root: STARTER}
+    waiting = [root]
+    while waiting:
+        parent = waiting.pop()
+        for process in [each for each, above in parents.items() if above == parent]:
+            found[process] = _part(process, found[parent])
+            waiting.append(process)
+    return found
+
+
+def _part(process: int, above: str) -> str:
+    """By its command line; what is below the agent or the broker is counted with it."""
+    try:
+        command = Path(f"/proc/{process}/cmdline").read_bytes().replace(b"\0", b" ").decode(errors="replace")
+    except OSError:
+        command = ""
+    if above in ("agent", CHILDREN):
+        return CHILDREN
+    if above != STARTER:
+        return above
+    return next((part for words, part in _PARTS if words in command), STARTER)
+
+
+def _held(process: int) -> tuple[int, int, int, int, int] | None:
+    """Resident, proportional and private memory [kB], descriptors and threads; None once it has ended."""
+    folder = Path(f"/proc/{process}")
+    try:
+        rolled = dict(line.split(":", 1) for line in (folder / "smaps_rollup").read_text().splitlines()[1:])
+        kb = {name: int(value.split()[0]) for name, value in rolled.items()}
+        descriptors = len(list((folder / "fd").iterdir()))
+        threads = len(list((folder / "task").iterdir()))
+    except (OSError, ValueError):
+        return None
+    return kb["Rss"], kb["Pss"], kb["Private_Clean"] + kb["Private_Dirty"], descriptors, threads

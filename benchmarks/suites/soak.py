@@ -1,0 +1,172 @@
+"""An hour of the laboratory under load: memory, descriptors, and whatever goes wrong."""
+
+import os
+import tempfile
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Final
+
+from benchmarks.report import QUICK, Chart, Claim, Report, Table, load
+from benchmarks.soak.figures import Held, after_warm_up, drawn_together
+from benchmarks.soak.load import Load
+from benchmarks.soak.processes import PARTS, Sample, Watch
+from benchmarks.stand import start
+
+MINUTES: Final = "SOAK_MINUTES"
+"""The environment variable for another length of the whole run [min]."""
+SERIES: Final = QUICK / "soak.csv"
+"""All samples, as they come: what a run that was killed has left."""
+_SLOPE_MOST: Final = 1.0
+_QUICK_S: Final = 48.0
+_ABOUT: Final = """The laboratory as `make up` starts it over amqtt: four robots and a room in one agent. Somebody
+streams setpoints to the arm under leases that they take, renew and give back, each time with new credentials;
+movements, which are scripts, run on all robots; one robot is stopped in the middle of every third, and released; two
+people listen to all that is measured and come back with new credentials; somebody signs in, looks round and signs out.
+`SOAK_MINUTES=10 python -m benchmarks soak` takes another length; `benchmarks/results/quick/soak.csv` has each sample as
+soon as it is taken."""
+_NOTE: Final = """Slopes by Theil and Sen over medians of a minute after a sixth of the run for warming up, with Sen's
+95 % interval; a plus sign is growth. Private pages are those of no other process; resident ones count shared libraries
+too. Of descriptors and threads first and last are the medians of the first and the last tenth after warm-up. The
+agent's children are its planner and the jails of scripts: how many there are follows what runs."""
+
+
+def run(*, quick: bool, say: Callable[[str], None]) -> Report:
+    """The load for an hour, or not quite a minute; then the figures."""
+    for_s = _QUICK_S if quick else 60 * float(os.environ.get(MINUTES, "60"))
+    say(f"starting the laboratory, then {for_s / 60:.1f} min of load")
+    with (
+        tempfile.TemporaryDirectory() as folder,
+        start(Path(folder), "amqtt", TELESCOPE_ROOM="lab", TELESCOPE_TRACE="") as stand,
+        Watch(stand.machine.process.pid, every_s=1.0 if quick else 5.0, file=SERIES) as watch,
+        Load(stand, hold_s=4.0 if quick else 20.0) as people,
+    ):
+        began_s = time.monotonic()
+        told_s = began_s
+        while (now_s := time.monotonic()) < began_s + for_s:
+            time.sleep(min(1.0, began_s + for_s - now_s))
+            if now_s > told_s + 60:
+                told_s = now_s
+                say(progress(watch.samples, people))
+    held = after_warm_up(watch.samples, for_s / 6, end_share=1 / 3 if quick else 0.1)
+    report = Report(suite="soak", title="Soak", about=[_ABOUT], quick=quick)
+    report.tables = [_memory(held, for_s), _descriptors(held), _work(people)]
+    report.charts = charts(watch.samples, for_s / 6)
+    report.claims = _quick_claims(held, people) if quick else claims(held, people, for_s)
+    return report
+
+
+def progress(samples: list[Sample], people: Load) -> str:
+    """One line: what each part holds now, and what has been done."""
+    newest = {each.part: each for each in samples[-2 * len(PARTS) :]}
+    held = ", ".join(f"{part} {each.rss_mb:.0f} MB {each.descriptors} fd" for part, each in newest.items())
+    errors = f"; ERRORS {dict(people.errors)}" if people.errors else ""
+    return f"{held}; {people.done['HTTP requests']} requests, {people.done['actions']} actions{errors}"
+
+
+def claims(held: list[Held], people: Load, for_s: float) -> list[Claim]:
+    """Of a whole run."""
+    worst = max(held, key=lambda each: each.private.percent_per_h)
+    length = f"{for_s / 60:.0f} min of load"
+    return [
+        Claim(
+            text=f"memory of the process that grows fastest ({worst.part}) after warm-up, over {length}",
+            seen=worst.private.percent_per_h,
+            bound=_SLOPE_MOST,
+            unit="%/h",
+        ),
+        Claim(
+            text=f"descriptors that any process has more of after {length}",
+            seen=max(each.more_descriptors for each in held),
+            bound=0,
+            unit="more",
+        ),
+        Claim(
+            text=f"errors in {length}: {people.done['HTTP requests']:,} requests, {people.done['actions']:,} actions",
+            seen=sum(people.errors.values()),
+            bound=0,
+            unit="errors",
+        ),
+    ]
+
+
+def _quick_claims(held: list[Held], people: Load) -> list[Claim]:
+    """What the last whole run has found, and what not quite a minute can tell."""
+    whole = load("soak")
+    found = []
+    if whole is not None:
+        found = [
+            Claim(text=f"{each.text} (whole run of {whole.made})", seen=each.seen, bound=each.bound, unit=each.unit)
+            for each in whole.claims
+        ]
+    return [
+        *found,
+        Claim(
+            text="descriptors that any process has more of, within a minute of load",
+            seen=max(each.more_descriptors for each in held),
+            bound=0,
+            unit="more",
+        ),
+        Claim(text="errors in a minute of load", seen=sum(people.errors.values()), bound=0, unit="errors"),
+    ]
+
+
+def _memory(held: list[Held], for_s: float) -> Table:
+    columns = ["part", "private MB", "private %/h", "95 %", "resident MB", "resident %/h", "95 %"]
+    rows: list[list[str | float | int | None]] = [
+        [
+            each.part, each.private_mb, f"{each.private.percent_per_h:+.2f}",
+            f"{each.private.low:+.2f} to {each.private.high:+.2f}", each.rss_mb, f"{each.rss.percent_per_h:+.2f}",
+            f"{each.rss.low:+.2f} to {each.rss.high:+.2f}",
+        ]
+        for each in held
+    ]  # fmt: skip
+    return Table(title=f"Memory over {for_s / 60:.0f} min", columns=columns, rows=rows, note=_NOTE)
+
+
+def _descriptors(held: list[Held]) -> Table:
+    columns = ["part", "descriptors: first", "last", "most", "threads: first", "last"]
+    rows: list[list[str | float | int | None]] = [
+        [
+            each.part,
+            *map(int, (each.first_descriptors, each.last_descriptors, each.most_descriptors)),
+            *map(int, (each.first_threads, each.last_threads)),
+        ]
+        for each in held
+    ]
+    return Table(title="Descriptors and threads", columns=columns, rows=rows)
+
+
+def _work(people: Load) -> Table:
+    rows: list[list[str | float | int | None]] = [[what, count] for what, count in sorted(people.done.items())]
+    rows += [[f"error: {what}", count] for what, count in sorted(people.errors.items())]
+    return Table(title="What was done meanwhile", columns=["", "times"], rows=rows)
+
+
+def charts(samples: list[Sample], warm_up_s: float) -> list[Chart]:
+    """Memory over time: as it is, and in per cent of what it was after warm-up."""
+    series: dict[str, list[float | None]] = {}
+    change: dict[str, list[float | None]] = {}
+    x: list[str | float] = []
+    for part in PARTS:
+        mine = [each for each in samples if each.part == part]
+        if not mine:
+            continue
+        at_s, private_mb = drawn_together([each.at_s for each in mine], [each.private_mb for each in mine])
+        x = x or [round(each / 60, 2) for each in at_s]
+        then = next((value for at, value in zip(at_s, private_mb, strict=True) if at >= warm_up_s), private_mb[-1])
+        # A part that came later or went sooner than the first has fewer places.
+        wanted = [*private_mb[: len(x)], *[None] * (len(x) - len(private_mb))]
+        series[part] = list(wanted)
+        change[part] = [None if value is None else round((value / then - 1) * 100, 3) for value in wanted]
+    time_axis = "minutes of load"
+    return [
+        Chart(
+            title="Private memory", kind="line", x_label=time_axis, y_label="MB (logarithmic)", x=x, series=series,
+            log=True,
+        ),
+        Chart(
+            title="Private memory, against the end of warm-up", kind="line", x_label=time_axis, y_label="%", x=x,
+            series={part: values for part, values in change.items() if part not in ("agent's children", "starter")},
+        ),
+    ]  # fmt: skip
