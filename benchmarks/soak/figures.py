@@ -30,9 +30,9 @@ class Held(msgspec.Struct, frozen=True, kw_only=True):
 
     part: str
     rss: Slope
-    private: Slope
+    own: Slope
     rss_mb: float
-    private_mb: float
+    own_mb: float
     first_descriptors: float
     last_descriptors: float
     most_descriptors: int
@@ -86,15 +86,15 @@ def after_warm_up(samples: Iterable[Sample], warm_up_s: float, *, end_share: flo
         def ends(values: list[int], few: int = few) -> tuple[float, float]:
             return statistics.median(values[:few]), statistics.median(values[-few:])
 
-        rss, private = [each.rss_mb for each in mine], [each.private_mb for each in mine]
+        rss, own = [each.rss_mb for each in mine], [each.own_mb for each in mine]
         descriptors, threads = [each.descriptors for each in mine], [each.threads for each in mine]
         found.append(
             Held(
                 part=part,
                 rss=theil_sen(*drawn_together(at_s, rss)),
-                private=theil_sen(*drawn_together(at_s, private)),
+                own=theil_sen(*drawn_together(at_s, own)),
                 rss_mb=percentile(rss, 0.5),
-                private_mb=percentile(private, 0.5),
+                own_mb=percentile(own, 0.5),
                 first_descriptors=ends(descriptors)[0],
                 last_descriptors=ends(descriptors)[1],
                 most_descriptors=max(descriptors),

@@ -29,7 +29,8 @@ class Sample(msgspec.Struct, frozen=True, kw_only=True):
         at_s: Since the load began.
         processes: It consists of so many; the other figures are their sums.
         rss_mb: Pages in memory, those shared with others counted whole.
-        private_mb: Pages that nobody else has.
+        own_mb: Anonymous pages, which are heaps and stacks: what a leak makes more of. Others that use the same
+            libraries, or a fork, do not change it.
     """
 
     at_s: float
@@ -37,7 +38,7 @@ class Sample(msgspec.Struct, frozen=True, kw_only=True):
     processes: int
     rss_mb: float
     pss_mb: float
-    private_mb: float
+    own_mb: float
     descriptors: int
     threads: int
 
@@ -87,14 +88,14 @@ def look(root: int, at_s: float) -> Iterator[Sample]:
     for part, processes in members.items():
         held = [found for each in processes if (found := _held(each)) is not None]
         if held:
-            rss, pss, private, descriptors, threads = map(sum, zip(*held, strict=True))
+            rss, pss, own, descriptors, threads = map(sum, zip(*held, strict=True))
             yield Sample(
                 at_s=round(at_s, 1),
                 part=part,
                 processes=len(held),
                 rss_mb=round(rss / _KB, 3),
                 pss_mb=round(pss / _KB, 3),
-                private_mb=round(private / _KB, 3),
+                own_mb=round(own / _KB, 3),
                 descriptors=descriptors,
                 threads=threads,
             )
@@ -130,7 +131,7 @@ def _part(process: int, above: str) -> str:
 
 
 def _held(process: int) -> tuple[int, int, int, int, int] | None:
-    """Resident, proportional and private memory [kB], descriptors and threads; None once it has ended."""
+    """Resident, proportional and anonymous memory [kB], descriptors and threads; None once it has ended."""
     folder = Path(f"/proc/{process}")
     try:
         rolled = dict(line.split(":", 1) for line in (folder / "smaps_rollup").read_text().splitlines()[1:])
@@ -139,4 +140,4 @@ def _held(process: int) -> tuple[int, int, int, int, int] | None:
         threads = len(list((folder / "task").iterdir()))
     except (OSError, ValueError):
         return None
-    return kb["Rss"], kb["Pss"], kb["Private_Clean"] + kb["Private_Dirty"], descriptors, threads
+    return kb["Rss"], kb["Pss"], kb["Anonymous"], descriptors, threads

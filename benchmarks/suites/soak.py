@@ -26,9 +26,10 @@ people listen to all that is measured and come back with new credentials; somebo
 `SOAK_MINUTES=10 python -m benchmarks soak` takes another length; `benchmarks/results/quick/soak.csv` has each sample as
 soon as it is taken."""
 _NOTE: Final = """Slopes by Theil and Sen over medians of a minute after a sixth of the run for warming up, with Sen's
-95 % interval; a plus sign is growth. Private pages are those of no other process; resident ones count shared libraries
-too. Of descriptors and threads first and last are the medians of the first and the last tenth after warm-up. The
-agent's children are its planner and the jails of scripts: how many there are follows what runs."""
+95 % interval; a plus sign is growth. A process's own pages are the anonymous ones, its heaps and stacks; resident ones
+count libraries too, which others may share. Of descriptors and threads first and last are the medians of the first and
+the last tenth after warm-up. The agent's children are its planner and the jails of scripts: how many there are follows
+what runs."""
 
 
 def run(*, quick: bool, say: Callable[[str], None]) -> Report:
@@ -66,12 +67,12 @@ def progress(samples: list[Sample], people: Load) -> str:
 
 def claims(held: list[Held], people: Load, for_s: float) -> list[Claim]:
     """Of a whole run."""
-    worst = max(held, key=lambda each: each.private.percent_per_h)
+    worst = max(held, key=lambda each: each.own.percent_per_h)
     length = f"{for_s / 60:.0f} min of load"
     return [
         Claim(
-            text=f"memory of the process that grows fastest ({worst.part}) after warm-up, over {length}",
-            seen=worst.private.percent_per_h,
+            text=f"own memory of the process that grows fastest ({worst.part}) after warm-up, over {length}",
+            seen=worst.own.percent_per_h,
             bound=_SLOPE_MOST,
             unit="%/h",
         ),
@@ -112,11 +113,11 @@ def _quick_claims(held: list[Held], people: Load) -> list[Claim]:
 
 
 def _memory(held: list[Held], for_s: float) -> Table:
-    columns = ["part", "private MB", "private %/h", "95 %", "resident MB", "resident %/h", "95 %"]
+    columns = ["part", "own MB", "own %/h", "95 %", "resident MB", "resident %/h", "95 %"]
     rows: list[list[str | float | int | None]] = [
         [
-            each.part, each.private_mb, f"{each.private.percent_per_h:+.2f}",
-            f"{each.private.low:+.2f} to {each.private.high:+.2f}", each.rss_mb, f"{each.rss.percent_per_h:+.2f}",
+            each.part, each.own_mb, f"{each.own.percent_per_h:+.2f}",
+            f"{each.own.low:+.2f} to {each.own.high:+.2f}", each.rss_mb, f"{each.rss.percent_per_h:+.2f}",
             f"{each.rss.low:+.2f} to {each.rss.high:+.2f}",
         ]
         for each in held
@@ -152,21 +153,21 @@ def charts(samples: list[Sample], warm_up_s: float) -> list[Chart]:
         mine = [each for each in samples if each.part == part]
         if not mine:
             continue
-        at_s, private_mb = drawn_together([each.at_s for each in mine], [each.private_mb for each in mine])
+        at_s, own_mb = drawn_together([each.at_s for each in mine], [each.own_mb for each in mine])
         x = x or [round(each / 60, 2) for each in at_s]
-        then = next((value for at, value in zip(at_s, private_mb, strict=True) if at >= warm_up_s), private_mb[-1])
+        then = next((value for at, value in zip(at_s, own_mb, strict=True) if at >= warm_up_s), own_mb[-1])
         # A part that came later or went sooner than the first has fewer places.
-        wanted = [*private_mb[: len(x)], *[None] * (len(x) - len(private_mb))]
+        wanted = [*own_mb[: len(x)], *[None] * (len(x) - len(own_mb))]
         series[part] = list(wanted)
         change[part] = [None if value is None else round((value / then - 1) * 100, 3) for value in wanted]
     time_axis = "minutes of load"
     return [
         Chart(
-            title="Private memory", kind="line", x_label=time_axis, y_label="MB (logarithmic)", x=x, series=series,
+            title="Own memory", kind="line", x_label=time_axis, y_label="MB (logarithmic)", x=x, series=series,
             log=True,
         ),
         Chart(
-            title="Private memory, against the end of warm-up", kind="line", x_label=time_axis, y_label="%", x=x,
+            title="Own memory, against the end of warm-up", kind="line", x_label=time_axis, y_label="%", x=x,
             series={part: values for part, values in change.items() if part not in ("agent's children", "starter")},
         ),
     ]  # fmt: skip

@@ -13,7 +13,7 @@ from benchmarks.soak.processes import STARTER, Sample, Watch, look
 
 def sample(at_s: float, *, mb: float = 100.0, descriptors: int = 20, part: str = "agent") -> Sample:
     return Sample(
-        at_s=at_s, part=part, processes=1, rss_mb=mb + 50, pss_mb=mb, private_mb=mb, descriptors=descriptors, threads=3
+        at_s=at_s, part=part, processes=1, rss_mb=mb + 50, pss_mb=mb, own_mb=mb, descriptors=descriptors, threads=3
     )
 
 
@@ -48,7 +48,7 @@ def test_warming_up_does_not_count_and_a_leak_does() -> None:
     still = [sample(float(at), part="broker", mb=10 if at < 600 else 30) for at in range(0, 3600, 5)]
     found = {each.part: each for each in after_warm_up([*leaking, *still], 600)}
     assert found["agent"].more_descriptors > 30
-    assert (found["broker"].more_descriptors, found["broker"].private.percent_per_h) == (0, 0)
+    assert (found["broker"].more_descriptors, found["broker"].own.percent_per_h) == (0, 0)
 
 
 def test_a_process_and_those_below_it_are_looked_at() -> None:
@@ -58,8 +58,8 @@ def test_a_process_and_those_below_it_are_looked_at() -> None:
         while not (found := list(look(process.pid, 1.0))) or found[0].processes < 2:
             assert time.monotonic() < deadline_s
         assert [each.part for each in found] == [STARTER]
-        assert found[0].private_mb > 1
-        assert found[0].rss_mb >= found[0].pss_mb >= found[0].private_mb
+        assert found[0].own_mb > 1
+        assert found[0].rss_mb >= found[0].pss_mb >= found[0].own_mb
         assert found[0].descriptors > 3
 
 
