@@ -14,7 +14,9 @@ Exchange = Callable[[], float | None]
 SHARES: Final = {"p50": 0.5, "p95": 0.95, "p99": 0.99, "most": 1.0}
 
 
-def in_turns(paths: Mapping[str, Exchange], *, rounds: int, each: int, warm_up: int = 20) -> dict[str, list[float]]:
+def in_turns(
+    paths: Mapping[str, Exchange], *, rounds: int, each: int, warm_up: int = 20, pause_s: float = 0.0
+) -> dict[str, list[float]]:
     """Time several paths so that what else the machine does falls on all of them alike.
 
     Args:
@@ -22,6 +24,8 @@ def in_turns(paths: Mapping[str, Exchange], *, rounds: int, each: int, warm_up: 
         rounds: How often all paths have their turn, in a new order each time.
         each: Round trips in a turn.
         warm_up: Round trips of each path that are not counted.
+        pause_s: Before each round trip, outside of its time. What comes after a pause finds sleeping processors and
+            cold caches, so what is paced by nature is to be compared with what is paced alike.
 
     Returns:
         Name → how long each round trip took [ms], ``rounds`` × ``each`` of them.
@@ -37,6 +41,7 @@ def in_turns(paths: Mapping[str, Exchange], *, rounds: int, each: int, warm_up: 
             for name in order:
                 exchange, taken = paths[name], found[name]
                 for _ in range(each):
+                    time.sleep(pause_s)
                     began = time.perf_counter()
                     own = exchange()
                     taken.append((time.perf_counter() - began) * 1000 if own is None else own)

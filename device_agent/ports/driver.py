@@ -44,8 +44,9 @@ class Observation:
 class Driver(Protocol):
     """Makes one kind of robot do what the agent asks.
 
-    One thread calls it, the device's control loop, once per ``period_ms``: ``observe`` then ``send``. Neither blocks
-    longer than a fraction of the period. The constructor touches neither disk, network nor hardware.
+    One thread calls it, the device's control loop, once per ``period_ms``: ``observe`` then ``send`` (see also
+    ``Prompt``). Neither blocks longer than a fraction of the period. The constructor touches neither disk, network nor
+    hardware.
     """
 
     @property
@@ -81,6 +82,19 @@ class Driver(Protocol):
 
     def close(self) -> None:
         """Let go. May be called twice, and without ``connect``."""
+
+
+@runtime_checkable
+class Prompt(Driver, Protocol):
+    """A driver whose ``observe``, ``send`` and ``drive`` only look into memory, as of a simulation beside it.
+
+    They return within microseconds, and different threads may call them, one at a time: while the device rests, a
+    setpoint is then carried out by the thread that brings it. Another driver waits for its control loop.
+    """
+
+    @property
+    def prompt(self) -> bool:
+        """Whether that is so."""
 
 
 @runtime_checkable

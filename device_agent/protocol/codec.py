@@ -27,9 +27,9 @@ def encode(message: Any, *, limit: int = MAX_BYTES) -> bytes:
     Raises:
         ProtocolError: It holds a NaN or an infinity, or is longer than ``limit`` bytes.
     """
-    if not _finite(message):
-        raise ProtocolError(f"{type(message).__name__} holds a number that is not finite")
     payload = _encoder.encode(message)
+    if b"null" in payload and not _finite(message):  # which is what it has made of such a number
+        raise ProtocolError(f"{type(message).__name__} holds a number that is not finite")
     if len(payload) > limit:
         raise ProtocolError(f"{type(message).__name__} is {len(payload)} bytes, {limit} is the most")
     return payload

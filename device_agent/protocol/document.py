@@ -32,7 +32,12 @@ _CHANNELS = (
         "state", f"{_DEVICE}/state", "State", 1, True, "Current condition: on change and every 30 s, at most 1 Hz."
     ),
     _Channel(
-        "joints", f"{_DEVICE}/tele/joints", "JointTelemetry", 0, False, "All joints, 20 Hz at rest, 50 Hz in motion."
+        "joints",
+        f"{_DEVICE}/tele/joints",
+        "JointTelemetry",
+        0,
+        False,
+        "All joints: 20 Hz at rest, 50 Hz in motion, with each setpoint while they come.",
     ),
     _Channel(
         "measurements",

@@ -34,7 +34,6 @@ class Controller:
 
     Attributes:
         changed: Set whenever epochs or the latch have changed and must be written down; whoever does clears it.
-        asked: Set with each setpoint that is taken; the control loop clears it.
     """
 
     def __init__(
@@ -51,7 +50,6 @@ class Controller:
         self._envelope, self._helm, self._stream = self._pilot.envelope, self._pilot.helm, self._pilot.stream
         self._motion, self._slack, self._authority = self._helm.motion, self._pilot.slack, self._pilot.authority
         self.changed = self._authority.changed
-        self.asked = threading.Event()
         self._lock = threading.Lock()
 
     # ------------------------------------------------------------ what other threads ask
@@ -107,7 +105,6 @@ class Controller:
             if self._authority.tenure is not None:
                 raise Refused("busy", "an action runs; cancel it first")
             self._stream.take(setpoint, now_s=now_s, tick_ms=tick_ms)
-        self.asked.set()
 
     def begin_action(self, *, epoch: int, on_lost: Callable[[Refused], None]) -> Tenure:
         """An action now has the device, until ``end_action`` or until its lease ends.

@@ -258,6 +258,7 @@ class Device:
         if epoch != str(setpoint.epoch):
             raise Refused("no_lease", "the epoch in the topic and in the message differ")
         self._controller.offer(setpoint, now_s=time.monotonic(), tick_ms=tick_ms())
+        self._loop.hurry()
 
     def link_changed(self, up: bool) -> None:
         """The link came or went."""

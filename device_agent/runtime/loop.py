@@ -11,7 +11,7 @@ import time
 from collections.abc import Callable
 
 from device_agent.ports.clock import tick_ms, wall_ms
-from device_agent.ports.driver import Driver, DriverError, MobileDriver, Observation
+from device_agent.ports.driver import Driver, DriverError, MobileDriver, Observation, Prompt
 from device_agent.protocol.messages import JointTelemetry, Mode
 from device_agent.protocol.robot_type import RobotType
 from device_agent.runtime.controller import Controller
@@ -19,21 +19,24 @@ from device_agent.runtime.pilot import Tick
 
 IDLE_RATE_HZ = 20.0
 MOVING_RATE_HZ = 50.0
+_STREAMING_GAP_S = 0.03
+"""Telemetry goes with the setpoints while they come: a word between two of them, which a console sends 25 ms apart,
+would only stand in the way of the next one's."""
 _RECONNECT_EVERY_S = 1.0
 _REST_WITHIN_S = 1.0
 _log = logging.getLogger(__name__)
 
 
 class ControlLoop:
-    """One thread that never waits for disk or network.
+    """One thread that never waits for disk or network; setpoints for a device at rest may bring their own (``hurry``).
 
     Args:
         robot_type: The control period.
         driver: Not yet connected; this loop alone calls ``observe`` and ``send``.
         controller: Decides.
         name: The device's name.
-        tell: Called with telemetry, 20 times a second at rest and 50 times in motion, and as soon as a new setpoint is
-            applied, though never more than 50 times a second; must not block.
+        tell: Called with telemetry, 20 times a second at rest and 50 times in motion, and while setpoints come with
+            each of them as soon as it is applied, at most 50 times a second; must not block.
         watch: Called before each decision with the monotonic clock [s]: the room's interlocks. Quick; an error holds.
     """
 
@@ -57,8 +60,14 @@ class ControlLoop:
         self._watch = watch
         self._sequence = 0
         self._next_telemetry_s = 0.0
-        self._told_s = 0.0
+        self._spent_s = 0.0
         self._told_setpoint = 0
+        self._next_s = 0.0
+        self._early = False
+        self._trouble = ""
+        self._prompt = isinstance(driver, Prompt) and driver.prompt
+        self._asked = threading.Event()
+        self._turn = threading.Lock()  # of whoever runs a period
         self._stopping = threading.Event()
         self._thread = threading.Thread(target=self._run, name=f"{name}-loop", daemon=True)
         self.seen: Observation | None = None
@@ -82,62 +91,81 @@ class ControlLoop:
         while self._controller.moving and self._thread.is_alive() and time.monotonic() < deadline_s:
             time.sleep(self._period_s)
         self._stopping.set()
+        if self._turn.acquire(timeout=2):  # whoever is in a period ends it; then the driver may be closed
+            self._turn.release()
         if self._thread.is_alive():
             self._thread.join(timeout=2)
 
-    def _run(self) -> None:
-        next_s, early = time.monotonic(), False
-        while not self._stopping.is_set():
-            now_s = time.monotonic()
-            self._controller.asked.clear()  # what has come until here is decided upon below
+    def hurry(self) -> None:
+        """A setpoint was taken: while the device rests its period begins now, here if the driver is ``Prompt``."""
+        if self._prompt and not self._early and not self._controller.moving and self._turn.acquire(blocking=False):
             try:
-                self.seen = self._driver.observe()
-                self._watch(now_s)
-                tick = self._controller.step(now_s, self.seen.position_rad)
-                applied = self._driver.send(tick.position_rad)
-                self._controller.applied(applied)
-                if self._base is not None:
-                    self._controller.driven(tick.twist, self._base.drive(tick.twist))
-                self._measure(now_s, self.seen, tick, applied)
-            except DriverError as error:
-                self._fail(str(error))
-            except Exception as error:  # noqa: BLE001 (whatever it is: hold until the driver answers)
-                _log.exception("%s: control loop", self._name)
-                self._fail(f"internal error: {error}")
-            # Late periods are dropped, never made up for: a burst of commands would be a jump.
-            next_s = max(next_s + self._period_s, time.monotonic() - self._period_s)
-            # Not twice running, so that a flood of setpoints makes no more than twice the periods.
-            early = self._wait(next_s, sooner=not early)
-            if early:
-                next_s = time.monotonic()
+                if self._thread.is_alive() and not self._stopping.is_set() and not self._trouble:
+                    self._period(early=True)
+                    return
+            finally:
+                self._turn.release()
+        self._asked.set()
 
-    def _wait(self, next_s: float, *, sooner: bool) -> bool:
-        """Sleep until the next period, or with ``sooner`` until a setpoint for a device at rest; whether one came."""
-        pause_s = max(0.0, next_s - time.monotonic())
-        if sooner and not self._controller.moving:
-            return self._controller.asked.wait(pause_s)
-        time.sleep(pause_s)
-        return False
+    def _run(self) -> None:
+        self._next_s = time.monotonic()
+        while not self._stopping.is_set():
+            early = self._wait()
+            with self._turn:
+                if self._trouble:
+                    self._fail()
+                elif early or time.monotonic() >= self._next_s:  # else a setpoint has just had a period of its own
+                    self._period(early=early)
 
-    def _fail(self, message: str) -> None:
-        _log.error("%s: %s", self._name, message)
-        self._controller.fail(message)
+    def _wait(self) -> bool:
+        """Sleep until the next period, or until a setpoint for a device at rest; whether one came.
+
+        Not twice running, so that a flood of setpoints makes no more than twice the periods.
+        """
+        pause_s = max(0.0, self._next_s - time.monotonic())
+        if self._early or self._controller.moving or self._trouble:
+            time.sleep(pause_s)
+            return False
+        return self._asked.wait(pause_s)
+
+    def _period(self, *, early: bool) -> None:
+        """Observe, decide, command, tell; ``_trouble`` is what went wrong. Its caller has the turn."""
+        now_s = time.monotonic()
+        self._asked.clear()  # what has come until here is decided upon below
+        try:
+            self.seen = self._driver.observe()
+            self._watch(now_s)
+            tick = self._controller.step(now_s, self.seen.position_rad)
+            applied = self._driver.send(tick.position_rad)
+            self._controller.applied(applied)
+            if self._base is not None:
+                self._controller.driven(tick.twist, self._base.drive(tick.twist))
+            self._measure(now_s, self.seen, tick, applied)
+        except DriverError as error:
+            self._trouble = str(error)
+        except Exception as error:  # noqa: BLE001 (whatever it is: hold until the driver answers)
+            _log.exception("%s: control loop", self._name)
+            self._trouble = f"internal error: {error}"
+        self._early = early
+        # Late periods are dropped, never made up for: a burst of commands would be a jump.
+        begun_s = now_s if early else max(self._next_s, time.monotonic() - 2 * self._period_s)
+        self._next_s = begun_s + self._period_s
+
+    def _fail(self) -> None:
+        _log.error("%s: %s", self._name, self._trouble)
+        self._controller.fail(self._trouble)
         self._controller.step(time.monotonic())
         while not self._stopping.wait(_RECONNECT_EVERY_S):
             with contextlib.suppress(DriverError):
                 self._driver.connect()
                 self.seen = self._driver.observe()
                 self._controller.recover(self.seen.position_rad)
+                self._trouble = ""
                 return
 
     def _measure(self, now_s: float, seen: Observation, tick: Tick, applied: tuple[float, ...]) -> None:
-        news = tick.setpoint_sequence != self._told_setpoint and now_s >= self._told_s + 1 / MOVING_RATE_HZ
-        if now_s < self._next_telemetry_s and not news:
+        if not self._due(now_s, tick):
             return
-        busy = tick.mode in (Mode.STREAMING, Mode.ACTION) or self._controller.moving
-        due_s = min(self._next_telemetry_s, now_s) + 1 / (MOVING_RATE_HZ if busy else IDLE_RATE_HZ)
-        self._next_telemetry_s, self._told_s = max(now_s, due_s), now_s
-        self._told_setpoint = tick.setpoint_sequence
         self._sequence += 1
         self._tell(
             JointTelemetry(
@@ -157,6 +185,22 @@ class ControlLoop:
                 limited=tick.limited,
             )
         )
+
+    def _due(self, now_s: float, tick: Tick) -> bool:
+        """Whether telemetry is to be told: a regular word, or news of a setpoint. Two may be close, many may not."""
+        gap_s = 1 / MOVING_RATE_HZ
+        news = tick.setpoint_sequence != self._told_setpoint and now_s >= self._spent_s - gap_s
+        if now_s < self._next_telemetry_s and not news:
+            return False
+        if tick.mode is Mode.STREAMING:
+            self._next_telemetry_s = now_s + _STREAMING_GAP_S
+        else:
+            busy = tick.mode is Mode.ACTION or self._controller.moving
+            due_s = min(self._next_telemetry_s, now_s) + (gap_s if busy else 1 / IDLE_RATE_HZ)
+            self._next_telemetry_s = max(now_s, due_s)
+        self._spent_s = max(self._spent_s, now_s) + gap_s
+        self._told_setpoint = tick.setpoint_sequence
+        return True
 
 
 def _rounded(values: tuple[float, ...]) -> tuple[float, ...]:

@@ -93,6 +93,9 @@ class SensorLoop:
         if self._thread.is_alive():
             self._thread.join(timeout=2)
 
+    def hurry(self) -> None:
+        """See ``ControlLoop.hurry``: nothing here follows setpoints."""
+
     def _run(self) -> None:
         while not self._stopping.is_set():
             now_s = time.monotonic()

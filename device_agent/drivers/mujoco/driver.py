@@ -72,7 +72,10 @@ class MujocoDriver:
         self._actuators: Ints = np.zeros(0, dtype=np.intp)
         self._lower: Floats = np.zeros(0)
         self._upper: Floats = np.zeros(0)
-        self._frames: list[tuple[bool, int]] = []  # (is a site, index)
+        self._frame_bodies: Ints = np.zeros(0, dtype=np.intp)
+        self._frame_sites: tuple[Ints, Ints] = (self._frame_bodies, self._frame_bodies)  # which frames, which sites
+        self._frame_turns: Floats = np.zeros((0, 4, 4))  # turns each frame by its site's own orientation
+        self._base_matrix: Floats = np.empty(9)
         self._ramp_s = RAMP_PERIODS * robot_type.period_ms / 1000
         battery = None if robot_type.simulation is None else robot_type.simulation.battery
         self._health = Health(robot_type.joints, battery, seed=device)
@@ -85,6 +88,11 @@ class MujocoDriver:
     @property
     def simulated(self) -> bool:
         """Always: no metal moves."""
+        return True
+
+    @property
+    def prompt(self) -> bool:
+        """Always: the physics have a thread of their own."""
         return True
 
     def connect(self) -> None:
@@ -242,28 +250,22 @@ class MujocoDriver:
         return snapshot
 
     def _poses(self, snapshot: Snapshot) -> tuple[Pose, ...]:
-        """Frames in the base: p = Rᵀ (x - b), R = Bᵀ X."""
-        base_matrix = np.empty(9)
-        mujoco.mju_quat2Mat(base_matrix, snapshot.body_quaternion[self._base])
-        inverse = base_matrix.reshape(3, 3).T
-        origin = snapshot.body_position_m[self._base]
-        quaternion, matrix = np.empty(4), np.empty(9)
-        poses: list[Pose] = []
-        for is_site, index in self._frames:
-            if is_site:
-                position = inverse @ (snapshot.site_position_m[index] - origin)
-                matrix = inverse @ snapshot.site_matrix[index].reshape(3, 3)
-            else:
-                position = inverse @ (snapshot.body_position_m[index] - origin)
-                world = np.empty(9)
-                mujoco.mju_quat2Mat(world, snapshot.body_quaternion[index])
-                matrix = inverse @ world.reshape(3, 3)
-            mujoco.mju_mat2Quat(quaternion, matrix.ravel())
-            x, y, z = position.tolist()
-            w, i, j, k = quaternion.tolist()
-            # A rotation has two quaternions; give the one with w >= 0.
-            poses.append((x, y, z, w, i, j, k) if w >= 0 else (x, y, z, -w, -i, -j, -k))
-        return tuple(poses)
+        """Frames in the base, all at once: p = Bᵀ (x - b), q = b* ⊗ body ⊗ site."""
+        if not len(self._frame_bodies):
+            return ()
+        w, x, y, z = snapshot.body_quaternion[self._base].tolist()
+        from_base = np.array([[w, -x, -y, -z], [x, w, -z, y], [y, z, w, -x], [z, -y, x, w]])  # b ⊗; transposed b* ⊗
+        mujoco.mju_quat2Mat(self._base_matrix, snapshot.body_quaternion[self._base])
+        places = snapshot.body_position_m[self._frame_bodies]
+        at_sites, sites = self._frame_sites
+        places[at_sites] = snapshot.site_position_m[sites]
+        poses = np.empty((len(places), 7))
+        np.matmul(places - snapshot.body_position_m[self._base], self._base_matrix.reshape(3, 3), out=poses[:, :3])
+        turns = snapshot.body_quaternion[self._frame_bodies] @ from_base
+        poses[:, 3:] = np.einsum("kij,kj->ki", self._frame_turns, turns)
+        # A rotation has two quaternions; give the one with w >= 0.
+        poses[:, 3:] *= np.where(poses[:, 3:4] < 0, -1.0, 1.0)
+        return tuple([(x, y, z, w, i, j, k) for x, y, z, w, i, j, k in poses.tolist()])
 
     # ------------------------------------------------------------ names
 
@@ -285,7 +287,7 @@ class MujocoDriver:
         self._lower = np.where(limited, ranges[:, 0], -np.inf)
         self._upper = np.where(limited, ranges[:, 1], np.inf)
         self._base = int(model.body_rootid[model.jnt_bodyid[joints[0]]]) if joints else 0
-        self._frames = [self._frame(model, name) for name in self._type.frames]
+        self._resolve_frames(model)
         if self._infliction is None:
             self._infliction = Infliction(model, dict(zip(names, self._actuators.tolist(), strict=True)))
             self._world.add(self._infliction)
@@ -293,11 +295,20 @@ class MujocoDriver:
             self._stiffness = Stiffness(model, dict(zip(names, self._actuators.tolist(), strict=True)))
             self._world.add(self._stiffness)
 
-    def _frame(self, model: Any, name: str) -> tuple[bool, int]:
-        site = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_SITE, self._prefix + name)
-        if site >= 0:
-            return True, site
-        return False, self._find(model, mujoco.mjtObj.mjOBJ_BODY, "site or body", model.nbody, name)
+    def _resolve_frames(self, model: Any) -> None:
+        names = self._type.frames
+        sites = [mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_SITE, self._prefix + name) for name in names]
+        bodies = [
+            int(model.site_bodyid[site])
+            if site >= 0
+            else self._find(model, mujoco.mjtObj.mjOBJ_BODY, "site or body", model.nbody, name)
+            for name, site in zip(names, sites, strict=True)
+        ]
+        self._frame_bodies = np.array(bodies, dtype=np.intp)
+        at = [index for index, site in enumerate(sites) if site >= 0]
+        self._frame_sites = np.array(at, dtype=np.intp), np.array([sites[index] for index in at], dtype=np.intp)
+        own = [model.site_quat[site] if site >= 0 else (1.0, 0.0, 0.0, 0.0) for site in sites]
+        self._frame_turns = np.array([_turned_by(*quaternion) for quaternion in own]).reshape(-1, 4, 4)
 
     def _find(self, model: Any, kind: Any, word: str, count: int, name: str) -> int:
         index = int(mujoco.mj_name2id(model, kind, self._prefix + name))
@@ -305,6 +316,11 @@ class MujocoDriver:
             known = ", ".join(filter(None, (mujoco.mj_id2name(model, kind, other) for other in range(count))))
             raise DriverError(f"the model of '{self._type.type}' has no {word} '{self._prefix}{name}'; it has: {known}")
         return index
+
+
+def _turned_by(w: float, x: float, y: float, z: float) -> list[list[float]]:
+    """The matrix of q → q ⊗ (w, x, y, z)."""
+    return [[w, -x, -y, -z], [x, w, z, -y], [y, -z, w, x], [z, y, -x, w]]
 
 
 def _is_position_servo(model: Any, actuator: int, joint: int) -> bool:

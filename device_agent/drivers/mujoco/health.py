@@ -162,6 +162,9 @@ class Health:
             velocity_rad_s: Of the joints, shape (n,).
         """
         strained = np.abs(effort_nm) >= _AT_LIMIT * self._most_nm
+        if not strained.any():
+            self._still_s[:] = 0.0
+            return []
         stalled = strained & (np.abs(velocity_rad_s) < _STILL_RAD_S) & (np.abs(behind_rad) > _BEHIND_RAD)
         self._still_s = np.where(stalled, self._still_s + elapsed_s, 0.0)
         return [self._names[index] for index in np.flatnonzero(self._still_s > STALLED_S - 1e-6)]

@@ -26,7 +26,6 @@ class Snapshot:
         body_position_m: Of each body in the world, shape (nbody, 3) [m].
         body_quaternion: Of each body in the world, shape (nbody, 4).
         site_position_m: Of each site in the world, shape (nsite, 3) [m].
-        site_matrix: Rotation of each site in the world, row-major, shape (nsite, 9).
         mocap_position_m: Of what is moved by hand rather than by physics, shape (nmocap, 3) [m].
         mocap_quaternion: The same's orientation, shape (nmocap, 4).
         lag_ms: Simulated time lost so far because the machine could not keep up [ms].
@@ -42,7 +41,6 @@ class Snapshot:
     body_position_m: Floats
     body_quaternion: Floats
     site_position_m: Floats
-    site_matrix: Floats
     mocap_position_m: Floats
     mocap_quaternion: Floats
     lag_ms: float
@@ -75,14 +73,13 @@ def take(data: Any, *, passive_gravity: Floats, addresses: Mapping[str, int], la
             data.xpos,
             data.xquat,
             data.site_xpos,
-            data.site_xmat,
             data.mocap_pos,
             data.mocap_quat,
         )
     ]
     for array in arrays:
         array.setflags(write=False)
-    qpos, qvel, effort, ctrl, xpos, xquat, site_xpos, site_xmat, mocap_pos, mocap_quat = arrays
+    qpos, qvel, effort, ctrl, xpos, xquat, site_xpos, mocap_pos, mocap_quat = arrays
     return Snapshot(
         time_s=float(data.time),
         taken_s=time.monotonic(),
@@ -93,7 +90,6 @@ def take(data: Any, *, passive_gravity: Floats, addresses: Mapping[str, int], la
         body_position_m=xpos,
         body_quaternion=xquat,
         site_position_m=site_xpos,
-        site_matrix=site_xmat,
         mocap_position_m=mocap_pos,
         mocap_quaternion=mocap_quat,
         lag_ms=lag_s * 1000,

@@ -7,7 +7,7 @@ from dataclasses import replace
 import pytest
 
 from device_agent.ports.driver import Observation
-from device_agent.protocol.messages import JointTarget, JointTelemetry, Setpoint
+from device_agent.protocol.messages import JointTarget, JointTelemetry, Mode, Setpoint
 from device_agent.runtime.controller import Controller
 from device_agent.runtime.lease import LeaseGate
 from device_agent.runtime.loop import ControlLoop
@@ -93,6 +93,20 @@ def test_telemetry_tells_of_a_new_setpoint_but_not_more_often_than_in_motion() -
         desk.loop._measure(now_s, seen, replace(tick, setpoint_sequence=sequence), (0.0, 0.0))
         return len(desk.told) > before
 
-    assert [told(now_s, sequence) for now_s, sequence in ((0.0, 0), (0.03, 0), (0.03, 1), (0.04, 2), (0.051, 2))] == [
-        True, False, True, False, True
-    ]  # fmt: skip
+    asked = ((0.0, 0), (0.03, 0), (0.03, 1), (0.04, 2), (0.045, 3), (0.0501, 3))
+    assert [told(now_s, sequence) for now_s, sequence in asked] == [True, False, True, True, False, True]
+
+
+def test_while_setpoints_come_telemetry_goes_with_them_and_else_33_times_a_second() -> None:
+    desk = Desk()
+    desk.controller.start_at((0.0, 0.0))
+    seen = Observation((0.0, 0.0), (0.0, 0.0), (0.0, 0.0), ())
+    tick = replace(desk.controller.step(0.0), mode=Mode.STREAMING)
+    for period in range(1001):
+        now_s = period / 1000
+        desk.loop._measure(now_s, seen, replace(tick, setpoint_sequence=period // 25), (0.0, 0.0))
+    assert [each.setpoint_sequence for each in desk.told] == list(range(41))
+    desk.told.clear()
+    for period in range(1001, 2002):
+        desk.loop._measure(period / 1000, seen, replace(tick, setpoint_sequence=40), (0.0, 0.0))
+    assert 32 <= len(desk.told) <= 34
