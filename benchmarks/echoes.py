@@ -1,7 +1,7 @@
 """The least that an exchange must contain, each in a process of its own: it answers what comes with what came.
 
-``python -m benchmarks.echoes tcp|http PORT`` or ``… mqtt PORT CLIENT USER PASSWORD TOPIC ANSWER QOS``; it prints
-``ready`` once it is.
+``python -m benchmarks.echoes tcp|http PORT`` or ``… mqtt PORT CLIENT USER PASSWORD TOPIC ANSWER QOS BYTES``; it prints
+``ready`` once it is. Over MQTT the answer is made as long as ``BYTES`` if it is shorter.
 """
 
 import asyncio
@@ -61,14 +61,14 @@ async def _http(port: int) -> None:
 
 
 def _mqtt(port: int, *words: str) -> None:
-    client_id, user, password, topic, answer, level = words
-    qos = int(level)
+    client_id, user, password, topic, answer, level, least = words
+    qos, size = int(level), int(least)
     client = paho.Client(CallbackAPIVersion.VERSION2, client_id, protocol=paho.MQTTv311)
     client.username_pw_set(user, password)
     client.on_socket_open = send_at_once
 
     def back(_client: paho.Client, _userdata: Any, message: paho.MQTTMessage) -> None:
-        client.publish(answer, message.payload, qos)
+        client.publish(answer, message.payload.ljust(size), qos)
 
     def subscribe(*_: Any) -> None:
         client.subscribe(topic, qos)

@@ -13,13 +13,14 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any, Final, Self
 
+import msgspec
 import paho.mqtt.client as paho
 from paho.mqtt.enums import CallbackAPIVersion
 
 from benchmarks.echoes import HOST, send_at_once
 from device_agent.protocol import codec, robot_type
 from device_agent.protocol.grants import Grant
-from device_agent.protocol.messages import JointTarget, JointTelemetry, Setpoint
+from device_agent.protocol.messages import JointTarget, Setpoint
 from function_app import settings
 from tests.support.brokers import ROOT, BrokerKind
 from tests.support.cloud import Cloud
@@ -116,20 +117,34 @@ class Line:
         self.client.loop_stop()
 
 
+class _Seen(msgspec.Struct):
+    """What a hand needs to know of telemetry."""
+
+    tick_ms: int
+    commanded_rad: tuple[float, ...]
+    epoch: int
+    setpoint_sequence: int
+
+
 class Hand:
     """An operator who holds one robot's joints where they are, setpoint by setpoint. ``with`` gives control up.
 
     Args:
         stand: The product.
         name: The device's name at its agent.
+
+    Attributes:
+        sent: The newest setpoint, as it went out.
+        heard: The newest telemetry, as it came.
     """
 
     def __init__(self, stand: Stand, name: str = "ur5") -> None:
         self._stand = stand
+        self.sent = self.heard = b""
         self.device = stand.api.device(name)
         self._path = f"/devices/{self.device['id']}/lease"
         self._seen = threading.Condition()
-        self._newest: JointTelemetry | None = None
+        self._newest: _Seen | None = None
         self._sequence = 0
         self._next_s = 0.0
         self._ending = threading.Event()
@@ -154,7 +169,6 @@ class Hand:
         """
         time.sleep(max(0.0, self._next_s - time.monotonic()))
         self._next_s = time.monotonic() + PERIOD_S
-        began = time.perf_counter()
         with self._seen:
             self._sequence += 1
             setpoint = Setpoint(
@@ -164,12 +178,14 @@ class Hand:
                 sent_ms=time.monotonic() * 1000,
                 target=JointTarget(position_rad=self.target_rad),
             )
-            self.line.client.publish(self._topic, codec.encode(setpoint))
+            self.sent = codec.encode(setpoint)
+            began = time.perf_counter()
+            self.line.client.publish(self._topic, self.sent)
             if not self._seen.wait_for(self._applied, PATIENCE_S):
                 raise TimeoutError(f"setpoint {self._sequence} is not seen again in telemetry")
         return (time.perf_counter() - began) * 1000
 
-    def _latest(self) -> JointTelemetry:
+    def _latest(self) -> _Seen:
         if self._newest is None:
             raise TimeoutError("the robot tells nothing")
         return self._newest
@@ -179,9 +195,9 @@ class Hand:
         return newest is not None and newest.epoch == self.epoch and newest.setpoint_sequence >= self._sequence
 
     def _hear(self, payload: bytes) -> None:
-        newest = codec.decode(payload, JointTelemetry)
+        newest = codec.decode(payload, _Seen)
         with self._seen:
-            self._newest = newest
+            self._newest, self.heard = newest, payload
             self._seen.notify()
 
     def _renew(self) -> None:

@@ -4,6 +4,7 @@ Seven levels at most and no leading slash, so that every broker of DESIGN §4 ta
 """
 
 import re
+from functools import lru_cache
 from typing import NamedTuple
 
 from device_agent.protocol.errors import ProtocolError
@@ -71,8 +72,9 @@ def device(space: str, agent: str, name: str, kind: str, stream: str = "") -> st
     return f"{base}/{stream}" if stream else base
 
 
+@lru_cache(maxsize=1024)
 def parse(topic: str) -> Topic:
-    """Read a topic that arrived.
+    """Read a topic that arrived. The same few arrive again and again.
 
     Raises:
         ProtocolError: The text is not a topic of this contract.

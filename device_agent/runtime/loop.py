@@ -8,7 +8,10 @@ import contextlib
 import logging
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import numpy as np
 
 from device_agent.ports.clock import tick_ms, wall_ms
 from device_agent.ports.driver import Driver, DriverError, MobileDriver, Observation, Prompt
@@ -62,6 +65,7 @@ class ControlLoop:
         self._next_telemetry_s = 0.0
         self._spent_s = 0.0
         self._told_setpoint = 0
+        self._shown: tuple[Observation, Observation] | None = None
         self._next_s = 0.0
         self._early = False
         self._trouble = ""
@@ -133,14 +137,15 @@ class ControlLoop:
         now_s = time.monotonic()
         self._asked.clear()  # what has come until here is decided upon below
         try:
-            self.seen = self._driver.observe()
+            # What rests is where the period before has seen it.
+            seen = self.seen = self.seen if early and self.seen is not None else self._driver.observe()
             self._watch(now_s)
-            tick = self._controller.step(now_s, self.seen.position_rad)
+            tick = self._controller.step(now_s, seen.position_rad)
             applied = self._driver.send(tick.position_rad)
             self._controller.applied(applied)
             if self._base is not None:
                 self._controller.driven(tick.twist, self._base.drive(tick.twist))
-            self._measure(now_s, self.seen, tick, applied)
+            self._measure(now_s, seen, tick, applied)
         except DriverError as error:
             self._trouble = str(error)
         except Exception as error:  # noqa: BLE001 (whatever it is: hold until the driver answers)
@@ -165,7 +170,10 @@ class ControlLoop:
 
     def _measure(self, now_s: float, seen: Observation, tick: Tick, applied: tuple[float, ...]) -> None:
         if not self._due(now_s, tick):
+            if tick.mode is Mode.STREAMING:
+                self._show(seen)  # so that the next setpoint finds it done
             return
+        shown = self._show(seen)
         self._sequence += 1
         self._tell(
             JointTelemetry(
@@ -173,11 +181,11 @@ class ControlLoop:
                 at_ms=wall_ms(),
                 sequence=self._sequence,
                 mode=tick.mode,
-                position_rad=_rounded(seen.position_rad),
-                velocity_rad_s=_rounded(seen.velocity_rad_s),
-                effort_nm=_rounded(seen.effort_nm),
+                position_rad=shown.position_rad,
+                velocity_rad_s=shown.velocity_rad_s,
+                effort_nm=shown.effort_nm,
                 commanded_rad=_rounded(applied),
-                frames=seen.frames,
+                frames=shown.frames,
                 epoch=tick.epoch,
                 setpoint_sequence=tick.setpoint_sequence,
                 setpoint_sent_ms=tick.setpoint_sent_ms,
@@ -185,6 +193,18 @@ class ControlLoop:
                 limited=tick.limited,
             )
         )
+
+    def _show(self, seen: Observation) -> Observation:
+        """An observation as telemetry shows it."""
+        if self._shown is None or self._shown[0] is not seen:
+            shown = Observation(
+                position_rad=_rounded(seen.position_rad),
+                velocity_rad_s=_rounded(seen.velocity_rad_s),
+                effort_nm=_rounded(seen.effort_nm),
+                frames=tuple([(x, y, z, w, i, j, k) for x, y, z, w, i, j, k in _rounded(seen.frames)]),
+            )
+            self._shown = seen, shown
+        return self._shown[1]
 
     def _due(self, now_s: float, tick: Tick) -> bool:
         """Whether telemetry is to be told: a regular word, or news of a setpoint. Two may be close, many may not."""
@@ -203,6 +223,6 @@ class ControlLoop:
         return True
 
 
-def _rounded(values: tuple[float, ...]) -> tuple[float, ...]:
-    """Six decimals: a microradian, far below any encoder, at half the bytes."""
-    return tuple(round(value, 6) for value in values)
+def _rounded(values: Sequence[Any]) -> tuple[Any, ...]:
+    """Six decimals: a microradian or a micrometre, far below any encoder, at half the bytes."""
+    return tuple(np.round(np.array(values, dtype=np.float64), 6).tolist())

@@ -81,6 +81,9 @@ class Pace:
         if self._geometry is None or self._periods % _EVERY:
             return self._cap_rad_s
         fastest = max(map(abs, velocity_rad_s), default=0.0)
+        if not fastest:  # going on as it goes, it stays: all of that way is clear
+            self._cap_rad_s = math.inf
+            return self._cap_rad_s
         blind_s = self.age_s + self._watchdog_s + braking_s + _LAG_S
         ahead_s = _AHEAD * blind_s
         end = [position + velocity * ahead_s for position, velocity in zip(position_rad, velocity_rad_s, strict=True)]

@@ -30,6 +30,8 @@ log = logging.getLogger(__name__)
 _LOOKED_S = 0.1
 """What lies further back than this nobody has seen: a motor may have moved meanwhile."""
 
+_NOTED_EVERY_S = 0.02
+"""How a robot is changes slowly; a joint is stuck after half a second."""
 RAMP_PERIODS = 1.5
 """Control periods over which a target is approached. Targets arrive up to half a period late on a busy machine; a ramp
 of one and a half then never runs dry between two of them, so the motion has no steps (cost: half a period of delay)."""
@@ -74,8 +76,10 @@ class MujocoDriver:
         self._upper: Floats = np.zeros(0)
         self._frame_bodies: Ints = np.zeros(0, dtype=np.intp)
         self._frame_sites: tuple[Ints, Ints] = (self._frame_bodies, self._frame_bodies)  # which frames, which sites
-        self._frame_turns: Floats = np.zeros((0, 4, 4))  # turns each frame by its site's own orientation
-        self._base_matrix: Floats = np.empty(9)
+        self._frame_turns: Floats | None = None  # turns each frame by its site's own orientation, if any has one
+        self._turned_as = b""  # the base's orientation when what follows was worked out
+        self._base_matrix: Floats = np.eye(3)
+        self._from_base: Floats = np.eye(4)
         self._ramp_s = RAMP_PERIODS * robot_type.period_ms / 1000
         battery = None if robot_type.simulation is None else robot_type.simulation.battery
         self._health = Health(robot_type.joints, battery, seed=device)
@@ -136,7 +140,8 @@ class MujocoDriver:
             DriverError: Not connected, the simulation has stopped, or a joint is stuck; the text says why.
         """
         snapshot = self._live()
-        self._note(snapshot)
+        if not 0 <= snapshot.time_s - self._noted_s < _NOTED_EVERY_S:
+            self._note(snapshot)
         return Observation(
             position_rad=tuple(snapshot.qpos[self._qpos].tolist()),
             velocity_rad_s=tuple(snapshot.qvel[self._dof].tolist()),
@@ -194,7 +199,7 @@ class MujocoDriver:
             self._world.close()
 
     def _note(self, snapshot: Snapshot) -> None:
-        """What each measurement says about how the robot is.
+        """What a measurement says about how the robot is.
 
         Raises:
             DriverError: A joint is stuck.
@@ -253,19 +258,22 @@ class MujocoDriver:
         """Frames in the base, all at once: p = Bᵀ (x - b), q = b* ⊗ body ⊗ site."""
         if not len(self._frame_bodies):
             return ()
-        w, x, y, z = snapshot.body_quaternion[self._base].tolist()
-        from_base = np.array([[w, -x, -y, -z], [x, w, -z, y], [y, z, w, -x], [z, -y, x, w]])  # b ⊗; transposed b* ⊗
-        mujoco.mju_quat2Mat(self._base_matrix, snapshot.body_quaternion[self._base])
+        origin, quaternion = snapshot.body_position_m[self._base], snapshot.body_quaternion[self._base]
+        now = quaternion.tobytes()
+        if now != self._turned_as:
+            self._turned_as, self._base_matrix, self._from_base = now, *_bases(*quaternion.tolist())
         places = snapshot.body_position_m[self._frame_bodies]
         at_sites, sites = self._frame_sites
         places[at_sites] = snapshot.site_position_m[sites]
-        poses = np.empty((len(places), 7))
-        np.matmul(places - snapshot.body_position_m[self._base], self._base_matrix.reshape(3, 3), out=poses[:, :3])
-        turns = snapshot.body_quaternion[self._frame_bodies] @ from_base
-        poses[:, 3:] = np.einsum("kij,kj->ki", self._frame_turns, turns)
+        places -= origin
+        turns = snapshot.body_quaternion[self._frame_bodies] @ self._from_base
+        if self._frame_turns is not None:
+            turns = np.einsum("kij,kj->ki", self._frame_turns, turns)
+        pairs = zip((places @ self._base_matrix).tolist(), turns.tolist(), strict=True)
         # A rotation has two quaternions; give the one with w >= 0.
-        poses[:, 3:] *= np.where(poses[:, 3:4] < 0, -1.0, 1.0)
-        return tuple([(x, y, z, w, i, j, k) for x, y, z, w, i, j, k in poses.tolist()])
+        return tuple(
+            [(x, y, z, w, i, j, k) if w >= 0 else (x, y, z, -w, -i, -j, -k) for (x, y, z), (w, i, j, k) in pairs]
+        )
 
     # ------------------------------------------------------------ names
 
@@ -308,7 +316,8 @@ class MujocoDriver:
         at = [index for index, site in enumerate(sites) if site >= 0]
         self._frame_sites = np.array(at, dtype=np.intp), np.array([sites[index] for index in at], dtype=np.intp)
         own = [model.site_quat[site] if site >= 0 else (1.0, 0.0, 0.0, 0.0) for site in sites]
-        self._frame_turns = np.array([_turned_by(*quaternion) for quaternion in own]).reshape(-1, 4, 4)
+        turns = np.array([_turned_by(*quaternion) for quaternion in own]).reshape(-1, 4, 4)
+        self._frame_turns = None if np.array_equal(turns, np.broadcast_to(np.eye(4), turns.shape)) else turns
 
     def _find(self, model: Any, kind: Any, word: str, count: int, name: str) -> int:
         index = int(mujoco.mj_name2id(model, kind, self._prefix + name))
@@ -316,6 +325,13 @@ class MujocoDriver:
             known = ", ".join(filter(None, (mujoco.mj_id2name(model, kind, other) for other in range(count))))
             raise DriverError(f"the model of '{self._type.type}' has no {word} '{self._prefix}{name}'; it has: {known}")
         return index
+
+
+def _bases(w: float, x: float, y: float, z: float) -> tuple[Floats, Floats]:
+    """Of a base that is turned so: the matrices of v → v B, which is Bᵀ v, and of q → q b, which is b* ⊗ q."""
+    matrix = np.empty(9)
+    mujoco.mju_quat2Mat(matrix, np.array([w, x, y, z]))
+    return matrix.reshape(3, 3), np.array([[w, -x, -y, -z], [x, w, -z, y], [y, z, w, -x], [z, -y, x, w]])
 
 
 def _turned_by(w: float, x: float, y: float, z: float) -> list[list[float]]:
