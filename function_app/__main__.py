@@ -3,6 +3,7 @@
 import argparse
 import asyncio
 import logging
+import os
 import sys
 from collections.abc import Callable, Coroutine, Sequence
 from typing import Any
@@ -22,6 +23,8 @@ from function_app.ports.tables import StoreError
 from function_app.services.api_keys import Wanted
 
 _EXIT_FAILED = 1
+_WORKER_NICE = 5
+"""What is stored may wait a moment; for an answer, and for a robot beside it on this machine, somebody waits."""
 _MINUTE_MS = 60_000
 _HOUR_MS = 60 * _MINUTE_MS
 _LEAST_LEARN_MINUTES = 65
@@ -100,6 +103,8 @@ async def _check(functions: Functions) -> None:
 
 
 async def _work(functions: Functions, _: argparse.Namespace) -> None:
+    if hasattr(os, "nice"):
+        os.nice(_WORKER_NICE)
     await work(functions)
 
 

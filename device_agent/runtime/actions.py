@@ -32,9 +32,11 @@ class Executor:
         trust: Judges scripts.
         jail: Where they run.
         report: Journals and publishes an ack.
+        settle: Sees to it that what was journalled is on the disk; raises where it cannot be.
     """
 
-    def __init__(self, body: Body, *, trust: Trust, jail: Jail, report: Report) -> None:
+    def __init__(self, body: Body, *, trust: Trust, jail: Jail, report: Report, settle: Callable[[], None]) -> None:
+        self._settle = settle
         self._body = body
         self._trust = trust
         self._jail = jail
@@ -52,7 +54,7 @@ class Executor:
         with self._lock:
             if self._run is not None:
                 raise Refused("busy", f"action {self._run.command.id} runs on this device")
-            run = _Run(command, self._body, self._report)
+            run = _Run(command, self._body, self._report, self._settle)
             if isinstance(order, RunMovement):
                 cell = self._cell(order)
                 run.begin(_Playing(order, run, cell))
@@ -62,6 +64,7 @@ class Executor:
             else:
                 run.begin(tasks.Deed(order, run.robot))
             self._run = run
+        run.announce()
         threading.Thread(target=self._follow, args=(run,), name=f"action-{command.id}", daemon=True).start()
 
     def cancel(self, action: str, who: str) -> None:
@@ -150,9 +153,11 @@ class _Run:
         command: What is to be done.
         body: The device.
         report: Journals and publishes an ack.
+        settle: See ``Executor``.
     """
 
-    def __init__(self, command: Command, body: Body, report: Report) -> None:
+    def __init__(self, command: Command, body: Body, report: Report, settle: Callable[[], None]) -> None:
+        self._settle = settle
         self.command = command
         self.over = threading.Event()
         self.robot = ScriptRobot(body)
@@ -174,11 +179,22 @@ class _Run:
         self._activity = activity
         self.robot.begin(self.command.epoch, self._lost)
 
+    def announce(self) -> None:
+        """Tell that it has begun, before a thread of its own has come up: somebody waits to hear it."""
+        self._attempt(lambda: self._report(self.command.id, AckStatus.STARTED))
+
     def play(self) -> None:
         """Do it; returns when it is over, however it ended."""
+        if self._ending is None:
+            self._attempt(self._do)
+
+    def _do(self) -> None:
+        self._settle()  # before anything moves: what has moved once must not be run again
+        self._result = self._activity.run()
+
+    def _attempt(self, step: Callable[[], None]) -> None:
         try:
-            self._report(self.command.id, AckStatus.STARTED)
-            self._result = self._activity.run()
+            step()
         except Refused as refused:
             self.end(AckStatus.FAILED, refused)
         except ScriptFailed as failed:

@@ -162,7 +162,7 @@ class Device:
         )
         self._loop = self._loop_of(driver, robot_type)
         trust = Trust(device=name, robot_type=robot_type.type, owner=owner, keys=keys, journal=journal)
-        self._executor = Executor(body, trust=trust, jail=jail, report=self.voice.report)
+        self._executor = Executor(body, trust=trust, jail=jail, report=self.voice.report, settle=journal.settle)
         self._office = Office(
             address=(space, agent, name),
             controller=self._controller,

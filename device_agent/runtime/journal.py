@@ -1,10 +1,14 @@
 """What an agent must not forget: commands it has seen, epochs, Stop latches, movements that ran, its session number.
 
-SQLite, committed to disk before anything that follows from it happens. One file per agent, one connection per thread.
+SQLite, one file per agent. Epochs, latches, movements and the ends of commands are on the disk when their call returns.
+That a command has come, and what it has come to, is only written, which outlives the agent but not the machine's power:
+whoever is about to move something because of it calls ``settle`` before.
 """
 
+import contextlib
 import sqlite3
 import threading
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -79,7 +83,7 @@ class Journal:
                 self._database = None
 
     def begin(self, device: str, ack: Ack) -> Ack | None:
-        """Remember a command before anything is done about it.
+        """Remember a command before anything is done about it; see ``settle``.
 
         Args:
             device: Name of the device.
@@ -88,7 +92,7 @@ class Journal:
         Returns:
             ``None`` for a new command; for one seen before, the last answer given to it, and nothing may be done again.
         """
-        with self._lock:
+        with self._lock, self._soon():
             rows = self._execute(
                 "INSERT INTO commands VALUES (?, ?, ?, ?, 0, ?) ON CONFLICT (id) DO NOTHING RETURNING id",
                 (ack.id, device, codec.encode(ack), ack.status.terminal, ack.at_ms),
@@ -98,17 +102,24 @@ class Journal:
             return codec.decode(self._execute("SELECT last_ack FROM commands WHERE id = ?", (ack.id,))[0][0], Ack)
 
     def record(self, ack: Ack) -> None:
-        """Remember the newest answer to a command begun before."""
-        with self._lock:
+        """Remember the newest answer to a command begun before; on the disk when this returns if it is the last."""
+        with self._lock, self._soon(not ack.status.terminal):
             self._execute(
                 "UPDATE commands SET last_ack = ?, terminal = ?, delivered = 0, at_ms = ? "
                 "WHERE id = ? AND terminal = 0",
                 (codec.encode(ack), ack.status.terminal, ack.at_ms, ack.id),
             )
 
+    def settle(self) -> None:
+        """All that was written is on the disk when this returns: with the next start, none of it is done again."""
+        with self._lock:
+            self._execute(
+                "INSERT INTO counters VALUES ('settled', 1) ON CONFLICT (name) DO UPDATE SET value = value + 1"
+            )
+
     def delivered(self, ack: Ack) -> None:
         """Note that the cloud has this answer, unless a newer one has been recorded since."""
-        with self._lock:
+        with self._lock, self._soon():
             if self._database is not None:
                 self._execute(
                     "UPDATE commands SET delivered = 1 WHERE id = ? AND last_ack = ?", (ack.id, codec.encode(ack))
@@ -196,6 +207,18 @@ class Journal:
                 "RETURNING value"
             )
         return int(rows[0][0])
+
+    @contextlib.contextmanager
+    def _soon(self, soon: bool = True) -> Iterator[None]:
+        """What is written here does not wait for the disk, if ``soon``; other programs see it at once all the same."""
+        if not soon or self._database is None:
+            yield
+            return
+        self._execute("PRAGMA synchronous=NORMAL")
+        try:
+            yield
+        finally:
+            self._execute("PRAGMA synchronous=FULL")
 
     def _execute(self, sql: str, values: tuple[object, ...] = ()) -> list[Any]:
         if self._database is None:

@@ -95,6 +95,7 @@ class ControlLoop:
         while self._controller.moving and self._thread.is_alive() and time.monotonic() < deadline_s:
             time.sleep(self._period_s)
         self._stopping.set()
+        self._asked.set()
         if self._turn.acquire(timeout=2):  # whoever is in a period ends it; then the driver may be closed
             self._turn.release()
         if self._thread.is_alive():
@@ -116,6 +117,8 @@ class ControlLoop:
         while not self._stopping.is_set():
             early = self._wait()
             with self._turn:
+                if self._stopping.is_set():
+                    return
                 if self._trouble:
                     self._fail()
                 elif early or time.monotonic() >= self._next_s:  # else a setpoint has just had a period of its own

@@ -126,6 +126,7 @@ class Voice:
         self._believed_from_s = float("-inf")
         self._answer_again = False
         self._sequences: dict[str, int] = {}
+        self._held: dict[str, Ack] = {}
         self._lock = threading.Lock()
         self._shown: tuple[object, ...] = ()
         self._shown_at_s = float("-inf")
@@ -150,8 +151,19 @@ class Voice:
         self._journal.record(ack)
         self.send_ack(ack)
 
+    def report_with_next(self, command: str, status: AckStatus) -> None:
+        """Journal the next ack of a command; it is published with the one after it, which follows at once."""
+        ack = self.ack(command, status)
+        self._journal.record(ack)
+        with self._lock:
+            self._held[command] = ack
+
     def send_ack(self, ack: Ack) -> None:
         """Publish an ack that the journal has."""
+        with self._lock:
+            held = self._held.pop(ack.id, None)
+        if held is not None:
+            self.send_ack(held)
         self._publish(self._topic(topics.ACK), codec.encode(ack), qos=1, delivered=partial(self._confirmed, ack))
 
     def _confirmed(self, ack: Ack) -> None:

@@ -59,6 +59,7 @@ class ToyDriver:
     def __init__(self) -> None:
         self.position: tuple[float, ...] = (0.0, 0.0)
         self.broken = False
+        self.refuses = False
 
     def connect(self) -> None:
         if self.broken:
@@ -73,6 +74,8 @@ class ToyDriver:
         return Observation(self.position, (0.0, 0.0), (0.0, 0.0), ())
 
     def send(self, position_rad: Sequence[float]) -> tuple[float, ...]:
+        if self.refuses:
+            raise DriverError("no")
         self.position = tuple(position_rad)
         return self.position
 

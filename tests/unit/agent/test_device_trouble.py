@@ -67,6 +67,25 @@ def test_a_command_that_could_not_be_written_down_is_not_obeyed(bench: Bench, mo
     monkeypatch.undo()
 
 
+@pytest.mark.parametrize("step", ['"started"', "settled"])
+def test_nothing_moves_where_what_has_come_could_not_be_written(
+    bench: Bench, monkeypatch: pytest.MonkeyPatch, step: str
+) -> None:
+    """Neither where its start cannot be journalled, nor where the disk does not take what was."""
+    execute = Journal._execute
+
+    def full(journal: Journal, sql: str, values: tuple[object, ...] = ()) -> list[Any]:
+        if step in sql or any(isinstance(value, bytes) and step.encode() in value for value in values):
+            raise JournalError("is the disk full?")
+        return execute(journal, sql, values)
+
+    monkeypatch.setattr(Journal, "_execute", full)
+    assert code(bench, bench.command(MOVE, epoch=1)) == "internal"
+    assert bench.driver.position == (0.0, 0.0)
+    monkeypatch.undo()
+    assert bench.end(bench.command(MOVE, epoch=1)).status is AckStatus.DONE
+
+
 def test_what_else_goes_wrong_does_not_end_the_office(bench: Bench, monkeypatch: pytest.MonkeyPatch) -> None:
     met = threading.Event()
 

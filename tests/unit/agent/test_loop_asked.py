@@ -1,7 +1,8 @@
 """A setpoint for a device at rest does not wait for the next period, and telemetry tells of it when it is applied."""
 
+import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 
 import pytest
@@ -21,9 +22,9 @@ LONG_MS = 60_000
 class Desk:
     """A toy arm whose control loop runs, and its operator."""
 
-    def __init__(self) -> None:
-        kind = robot_type(period_ms=LONG_MS)
-        self.driver = ToyDriver()
+    def __init__(self, driver: ToyDriver | None = None, *, period_ms: int = LONG_MS) -> None:
+        kind = robot_type(period_ms=period_ms)
+        self.driver = driver or ToyDriver()
         self.controller = Controller(kind, LeaseGate())
         self.told: list[JointTelemetry] = []
         self.loop = ControlLoop(
@@ -41,6 +42,7 @@ class Desk:
         target = JointTarget(position_rad={"elbow": elbow_rad})
         setpoint = Setpoint(epoch=1, sequence=self._sequence, echo_tick_ms=5, sent_ms=0.0, target=target)
         self.controller.offer(setpoint, now_s=time.monotonic(), tick_ms=10)
+        self.loop.hurry()
 
 
 @pytest.fixture
@@ -65,22 +67,96 @@ def test_a_flood_of_setpoints_makes_one_more_period_and_not_one_each(desk: Desk)
     assert desk.driver.position[1] == pytest.approx(0.5)
 
 
-def test_in_motion_periods_keep_their_length() -> None:
+class PromptDriver(ToyDriver):
+    """Its loop's thread is not needed: ``threads`` are those that have commanded it."""
+
+    prompt = True
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.threads: list[str] = []
+
+    def send(self, position_rad: Sequence[float]) -> tuple[float, ...]:
+        self.threads.append(threading.current_thread().name)
+        return super().send(position_rad)
+
+
+def test_a_prompt_driver_is_commanded_by_the_thread_that_brings_the_setpoint() -> None:
+    desk = Desk(PromptDriver())
+    desk.start()
+    try:
+        desk.ask(0.5)
+        assert desk.driver.position[1] == pytest.approx(0.5)
+        assert desk.told[-1].setpoint_sequence == 1
+        desk.ask(0.7)  # the second waits for its period, which here takes a minute
+        assert desk.driver.position[1] == pytest.approx(0.5)
+        assert isinstance(desk.driver, PromptDriver)
+        assert desk.driver.threads[1:] == [threading.current_thread().name]
+    finally:
+        desk.loop.stop()
+    desk.loop._early = False
+    desk.ask(0.9)
+    assert len(desk.driver.threads) == 2, "who has stopped commands nothing more"
+
+
+def test_the_period_after_a_setpoints_own_comes_a_whole_period_later() -> None:
+    driver = PromptDriver()
+    desk = Desk(driver, period_ms=300)
+    desk.start()
+    try:
+        before = len(driver.threads)
+        wait_until(lambda: len(driver.threads) > before, "a period")
+        desk.loop._early = False
+        desk.ask(0.5)
+        asked_s, commanded = time.monotonic(), len(driver.threads)
+        wait_until(lambda: len(driver.threads) > commanded, "the next period")
+        assert time.monotonic() - asked_s >= 0.29
+    finally:
+        desk.loop.stop()
+
+
+def test_a_period_that_does_not_end_keeps_nobody_from_stopping() -> None:
     desk = Desk()
+    desk.start()
+    with desk.loop._turn:
+        desk.loop.stop()
+    assert desk.loop._stopping.is_set()
+
+
+def test_what_goes_wrong_in_a_setpoints_own_period_is_a_fault_until_the_driver_answers() -> None:
+    desk = Desk(PromptDriver(), period_ms=8)
+    desk.start()
+    try:
+        with desk.loop._turn:  # its loop's thread waits meanwhile
+            desk.driver.broken = True
+            desk.controller.step(time.monotonic())
+        wait_until(lambda: desk.controller.fault is not None, "the fault")
+        desk.driver.broken = False
+        wait_until(lambda: desk.controller.fault is None, "the driver's return")
+    finally:
+        desk.loop.stop()
+    desk = Desk(PromptDriver())
+    desk.start()
+    try:
+        desk.driver.refuses = True
+        desk.ask(0.5)
+        wait_until(lambda: desk.controller.fault == "no", "the fault")
+    finally:
+        desk.loop.stop()
+
+
+def test_in_motion_periods_keep_their_length() -> None:
+    desk = Desk(PromptDriver(), period_ms=8)
     desk.controller.start_at((0.0, 0.0))
     now_s = time.monotonic()
     desk.controller.grant(epoch=1, holder="ann", lease_s=1000, now_s=now_s)
     desk.ask(0.5)
-    assert desk.loop._wait(now_s + 30, sooner=True)
-    slow = robot_type()
-    desk.controller = Controller(slow, LeaseGate())
-    desk.loop._controller = desk.controller
-    desk.controller.start_at((0.0, 0.0))
-    desk.controller.grant(epoch=1, holder="ann", lease_s=1000, now_s=now_s)
-    desk.ask(0.5)
+    assert desk.loop._wait()
     desk.controller.step(now_s)
     assert desk.controller.moving
-    assert not desk.loop._wait(time.monotonic(), sooner=True)
+    desk.ask(0.6)
+    assert not desk.loop._wait()
+    assert desk.driver.position[1] == 0.0, "no period has been run"
 
 
 def test_telemetry_tells_of_a_new_setpoint_but_not_more_often_than_in_motion() -> None:
