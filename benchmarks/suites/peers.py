@@ -18,7 +18,7 @@ PEERS: Final = {
     ROSBRIDGE: operators.rosbridge,
     "zenoh, peer to peer": operators.zenoh,
     "gRPC, one stream": operators.grpc,
-    "Foxglove WebSocket": operators.foxglove,
+    "Foxglove, WebSocket": operators.foxglove,
 }
 _ABOUT: Final = """A setpoint for six joints, until telemetry says that the driver has applied it, 40 a second as the
 console sends them. Robot, operator and what stands between them are processes of their own, over loopback. The robot is
