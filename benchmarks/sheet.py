@@ -1,7 +1,7 @@
 """Cost and limits on paper: ``python -m benchmarks.sheet`` writes docs/scale.md from the files in benchmarks/scale.
 
-``swarm.json`` is what ``benchmarks.swarm`` has measured, ``limits.json`` what is assumed, and limits and prices with
-their source. A price that is not known stands in the sheet by its name. ``--check`` only looks whether the page is new.
+``swarm.json`` is what the last whole run of the suite ``scale`` has measured, ``limits.json`` what is assumed, and
+limits and prices with their source. A price that is not known stands in the sheet by its name. ``--check`` only looks whether the page is new.
 """
 # ruff: noqa: E501 (lines of the page stand here as they will there)
 
@@ -61,11 +61,21 @@ def cost(prices: Known, name: str, millions: float) -> str:
 
 def main() -> int:
     """Write the page, or look whether it is what would be written."""
-    page = "\n".join(lines()) + "\n"
     if "--check" in sys.argv:
-        return 0 if PAGE.read_text(encoding="utf-8") == page else 1
-    PAGE.write_text(page, encoding="utf-8")
+        return 0 if PAGE.read_text(encoding="utf-8") == "\n".join(lines()) + "\n" else 1
+    write()
     return 0
+
+
+def write() -> None:
+    """The page."""
+    PAGE.write_text("\n".join(lines()) + "\n", encoding="utf-8")
+
+
+def keep(swarm: Known) -> None:
+    """What was measured, in place of what was measured before; the page follows."""
+    (SCALE / "swarm.json").write_text(json.dumps(swarm, indent=1) + "\n", encoding="utf-8")
+    write()
 
 
 def lines() -> Iterator[str]:
@@ -90,9 +100,9 @@ def lines() -> Iterator[str]:
 def _measured(swarm: Known, size: float) -> Iterator[str]:
     yield "## Measured: one process of the swarm"
     yield ""
-    yield f"A message is {size:,.0f} bytes on average, topic and payload, for an arm of 6 joints. Other programs ran beside: `load` is the mean number of"
-    yield "processes that wanted one of the two cores before and after. Lag and what was missed are the swarm's own, so they say how far that machine let"
-    yield "it go, and not how far it goes. `lost` is what a subscriber at QoS 0 did not get."
+    yield f"A message is {size:,.0f} bytes on average, topic and payload, for an arm of 6 joints. The product and a subscriber run on the same two cores;"
+    yield "`load` is the mean number of processes that wanted one of them before and after. Lag and what was missed are the swarm's own. `lost` is what a"
+    yield "subscriber at QoS 0 did not get."
     yield ""
     yield "| broker | agents | Hz | connected | sent/s | missed | lost | loop's lag p50, p99 ms | confirmed p50, p99 ms | µs of processor a message | kB an agent | load |"
     yield "| --- | ---: | ---: | ---: | ---: | ---: | ---: | ---: | ---: | ---: | ---: | ---: |"

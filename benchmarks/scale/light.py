@@ -1,0 +1,46 @@
+"""A driver without physics: the arm is where it was told to be. What is left is what the agent itself costs."""
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Final
+
+from device_agent.ports.driver import Observation
+from device_agent.protocol.messages import Pose, Twin
+from device_agent.protocol.robot_type import RobotType
+
+_SOMEWHERE: Final[Pose] = (0.123456, 0.234567, 0.345678, 0.707107, 0.0, 0.707107, 0.0)
+
+
+class LightArm:
+    """A ``Driver`` of joints alone."""
+
+    simulated = True
+
+    def __init__(self, kind: RobotType) -> None:
+        self._position_rad = tuple(kind.home_rad[joint.name] for joint in kind.joints)
+        self._still = (0.0,) * len(kind.joints)
+        self._frames = (_SOMEWHERE,) * len(kind.frames)
+
+    def connect(self) -> None:
+        """As the port says."""
+
+    def twin(self) -> Twin | None:
+        """As the port says: there is nothing to draw."""
+        return None
+
+    def observe(self) -> Observation:
+        """As the port says."""
+        return Observation(self._position_rad, self._still, self._still, self._frames)
+
+    def send(self, position_rad: Sequence[float]) -> tuple[float, ...]:
+        """As the port says."""
+        self._position_rad = tuple(position_rad)
+        return self._position_rad
+
+    def close(self) -> None:
+        """As the port says."""
+
+
+def create(robot_type: RobotType, _folder: Path, _options: Mapping[str, object], _device: str) -> LightArm:
+    """As ``drivers.load`` wants it."""
+    return LightArm(robot_type)

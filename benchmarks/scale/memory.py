@@ -1,0 +1,80 @@
+"""What one more connection costs a broker, and the functions."""
+
+import contextlib
+import socket
+import tempfile
+from collections.abc import Callable
+from pathlib import Path
+from typing import Final
+
+from benchmarks.echoes import HOST
+from benchmarks.report import Cell, Table
+from benchmarks.scale import wire
+from benchmarks.scale.askers import Request
+from benchmarks.scale.functions import Site
+from benchmarks.scale.processes import resident_mb
+from benchmarks.stand import PATIENCE_S
+from tests.support.brokers import BROKERS, BrokerKind, start_broker
+
+COLUMNS: Final = ["", "connections", "MB", "kB a connection"]
+_ANSWER: Final = 65_536
+
+
+def measure(site: Site, *, quick: bool, say: Callable[[str], None]) -> Table:
+    """Connections that do nothing, more and more of them."""
+    steps = (100,) if quick else (100, 200, 400)
+    rows: list[list[Cell]] = []
+    for kind in BROKERS:
+        rows += broker(kind, steps)
+    rows += functions(site, steps)
+    say("; ".join(f"{row[0]}: {row[3]:.0f} kB a connection" for row in rows if row[1] == steps[-1]))
+    note = """Memory of the program and its children (proportional set size). A broker's clients have each
+credentials of their own, and one subscription; at mosquitto their rights are in its memory too. The functions'
+have each asked once."""
+    return Table(title="Memory by connections", columns=COLUMNS, rows=rows, note=note)
+
+
+def broker(kind: BrokerKind, steps: tuple[int, ...]) -> list[list[Cell]]:
+    """A broker's, as the product starts it."""
+    with contextlib.ExitStack() as stack:
+        folder = Path(stack.enter_context(tempfile.TemporaryDirectory()))
+        running = stack.enter_context(start_broker(kind, folder))
+        lines: list[socket.socket] = []
+
+        def grow(count: int) -> None:
+            while len(lines) < count:
+                name = f"idle-{len(lines)}"
+                topic = f"ts/v1/lab/{name}/arm/cmd"
+                issued = running.issue(running.grant(name, subscribe=(topic,)))
+                line = wire.connect(running.tcp_port, name, issued.username, issued.password)
+                lines.append(stack.enter_context(line))
+                wire.subscribe(line, topic)
+
+        grow(1)  # the functions' own connection, by which rights are given, is there from the first on
+        return _rows(kind, running.process.pid, steps, grow)
+
+
+def functions(site: Site, steps: tuple[int, ...]) -> list[list[Cell]]:
+    """One process of the functions."""
+    with contextlib.ExitStack() as stack:
+        lines: list[socket.socket] = []
+        asked = Request("GET", "/api/v1/nothing").encode()
+
+        def grow(count: int) -> None:
+            while len(lines) < count:
+                line = stack.enter_context(socket.create_connection((HOST, site.ports[0]), PATIENCE_S))
+                line.sendall(asked)
+                line.recv(_ANSWER)
+                lines.append(line)
+
+        return _rows("functions", site.pids[0], steps, grow)
+
+
+def _rows(what: str, pid: int, steps: tuple[int, ...], grow: Callable[[int], None]) -> list[list[Cell]]:
+    before = resident_mb(pid)
+    rows: list[list[Cell]] = [[what, 0, before, None]]
+    for count in steps:
+        grow(count)
+        now = resident_mb(pid)
+        rows.append([what, count, now, (now - before) / count * 1000])
+    return rows

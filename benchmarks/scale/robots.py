@@ -1,0 +1,159 @@
+"""How many robots one agent serves: processor, memory, and how late its control loops come."""
+
+import contextlib
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Final, Literal
+
+import msgspec
+
+from benchmarks.report import Cell, Table
+from benchmarks.scale.agent import DIVIDER, LIGHT, Seen
+from benchmarks.scale.processes import processor_s, resident_mb
+from benchmarks.stand import Stand
+from tests.support.brokers import ROOT
+from tests.support.machine import Api
+
+Kind = Literal["light", "simulated"]
+PERIOD_MS: Final = 8.0
+"""The UR5's."""
+WHOLE: Final[tuple[tuple[Kind, float, tuple[int, ...]], ...]] = (
+    ("light", 50.0, (1, 4, 16, 32)),
+    ("light", 20.0, (16, 32)),
+    ("simulated", 50.0, (1, 4, 8, 16)),
+    ("simulated", 20.0, (8,)),
+)
+QUICK: Final[tuple[tuple[Kind, float, tuple[int, ...]], ...]] = (
+    ("light", 50.0, (8,)),
+    ("simulated", 50.0, (4,)),
+)
+_SETTLE_S: Final = 2.0
+COLUMNS: Final = [
+    "robots", "", "telemetry Hz", "agent, % of a core", "late p50 ms", "late p99 ms", "most ms", "in time", "agent MB",
+    "MB a robot",
+]  # fmt: skip
+
+
+class Crew(msgspec.Struct):
+    """One agent's robots."""
+
+    kind: Kind
+    rate_hz: float
+    count: int
+    seen: Seen
+    percent: float
+    mb: float
+
+    @property
+    def in_time(self) -> bool:
+        """99 of 100 decisions come less than a period late."""
+        return self.seen.late_p99_ms < PERIOD_MS
+
+    def row(self, alone_mb: float | None) -> list[Cell]:
+        """As the page shows it; ``alone_mb`` is what one robot's agent takes."""
+        each = None if alone_mb is None or self.count == 1 else (self.mb - alone_mb) / (self.count - 1)
+        return [
+            self.count, self.kind, self.rate_hz, self.percent,
+            self.seen.late_p50_ms, self.seen.late_p99_ms, self.seen.late_most_ms,
+            "yes" if self.in_time else "no", self.mb, each,
+        ]  # fmt: skip
+
+
+def measure(stand: Stand, *, quick: bool, say: Callable[[str], None]) -> list[Crew]:
+    """More and more robots, until they are late."""
+    found: list[Crew] = []
+    for kind, rate_hz, counts in QUICK if quick else WHOLE:
+        for count in counts:
+            found.append(crew(stand, kind, rate_hz, count, 3.0 if quick else 5.0))
+            say(
+                f"{count} {kind} robots at {rate_hz:g} Hz: {found[-1].percent:.0f} % of a core, "
+                f"late p99 {found[-1].seen.late_p99_ms:.1f} ms"
+            )
+            if not found[-1].in_time:
+                break
+    return found
+
+
+def crew(stand: Stand, kind: Kind, rate_hz: float, count: int, seconds: float) -> Crew:
+    """One agent with so many, watched for some seconds."""
+    with tempfile.TemporaryDirectory() as folder:
+        pair(stand, Path(folder), kind, count)
+        with running(Path(folder), rate_hz) as process:
+            pid = process.pid
+            watch(process, _SETTLE_S)
+            before_s, began_s = processor_s(pid), time.monotonic()
+            seen = watch(process, seconds)
+            took_s = time.monotonic() - began_s
+            return Crew(kind, rate_hz, count, seen, 100 * (processor_s(pid) - before_s) / took_s, resident_mb(pid))
+
+
+def pair(stand: Stand, home: Path, kind: Kind, count: int) -> None:
+    """Enrolled, and claimed by the demo account: a key of the API may not."""
+    driver = f":{LIGHT}" if kind == "light" else ""
+    devices = [word for number in range(count) for word in ("--device", f"arm_{number}=ur5{driver}")]
+    server = ("--server", stand.machine.url, "--name", "Crew", "--no-wait", "--no-qr")
+    made = subprocess.run(
+        [*program(20.0), "enroll", "--home", str(home), *server, *devices],
+        cwd=ROOT, capture_output=True, text=True, check=True, stdin=subprocess.DEVNULL,
+    )  # fmt: skip
+    words = made.stdout.split()
+    with Api(stand.machine) as owner:
+        owner.post("/agents/claim", {"code": words[words.index("code") + 1]})
+
+
+def program(rate_hz: float) -> list[str]:
+    """The agent, watched."""
+    return [sys.executable, "-m", "benchmarks.scale.agent", str(rate_hz), DIVIDER]
+
+
+@contextlib.contextmanager
+def running(home: Path, rate_hz: float) -> Iterator["subprocess.Popen[str]"]:
+    """The agent, once its robots run."""
+    with (
+        (home / "log").open("w") as log,
+        subprocess.Popen(
+            [*program(rate_hz), "run", "--home", str(home)],
+            cwd=ROOT,
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            stderr=log,
+            text=True,
+        ) as process,
+    ):
+        try:
+            said(process, "running")
+            yield process
+        finally:
+            process.terminate()
+
+
+def watch(process: "subprocess.Popen[str]", seconds: float) -> Seen:
+    """What its loops do from now on."""
+    assert process.stdin is not None
+    process.stdin.write(f"{seconds}\n")
+    process.stdin.flush()
+    return msgspec.json.decode(said(process, "seen").partition(" ")[2], type=Seen)
+
+
+def said(process: "subprocess.Popen[str]", beginning: str) -> str:
+    """The next line that begins so. Raises: RuntimeError: It ended."""
+    assert process.stdout is not None
+    for line in process.stdout:
+        if line.startswith(beginning):
+            return line
+    raise RuntimeError(f"the agent ended with {process.wait()}")
+
+
+def table(found: list[Crew]) -> Table:
+    """What was found."""
+    alone = {(each.kind, each.rate_hz): each.mb for each in found if each.count == 1}
+    note = """An agent of the product with so many UR5, none of them moving: *light* ones are where they were
+told to be, so that what is left is what the agent itself costs; *simulated* ones have a world and its physics
+each. Late is how much more than its 8 ms a control period took; in time: less than a period, for 99 of 100. The
+functions and mosquitto run beside it and take in what is told."""
+    rows = [each.row(alone.get((each.kind, each.rate_hz))) for each in found]
+    return Table(title="Robots of one agent", columns=COLUMNS, rows=rows, note=note)

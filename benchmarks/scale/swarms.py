@@ -1,0 +1,200 @@
+"""A swarm through the product: connections, messages, what is lost, actions through the store, and memory."""
+
+import contextlib
+import json
+import os
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any, Final
+
+import msgspec
+
+from benchmarks.report import Cell, Table
+from benchmarks.scale.askers import Request
+from benchmarks.scale.brokers import answer, program
+from benchmarks.scale.ear import Ear, Heard
+from benchmarks.scale.functions import Load, Site
+from benchmarks.scale.processes import processor_s, resident_mb
+from benchmarks.stand import PATIENCE_S, Stand
+from device_agent.protocol import topics
+from device_agent.swarm.arm import DEVICE
+from tests.support.brokers import ROOT
+from tests.support.machine import Api
+
+QUICK: Final = ((100, 5.0),)
+WHOLE: Final = ((100, 5.0), (300, 5.0), (1000, 2.0))
+"""Agents, and the measurements of each a second."""
+GAP_S: Final = 0.02
+EVERY_S: Final = 1.0
+ARMS: Final = 60
+"""Of those that take actions: more than there are clients, so that each has ended one before the next comes."""
+COLUMNS: Final = [
+    "agents", "Hz", "made known in s", "connected", "connects/s", "messages/s", "lost", "p50 ms", "p99 ms", "most ms",
+    "broker, µs of a core a message", "swarm, µs", "broker MB", "functions MB", "swarm kB an agent",
+]  # fmt: skip
+
+
+class Swarmed(msgspec.Struct):
+    """One run. ``figures`` is what the swarm says of itself."""
+
+    known_s: float
+    connects_per_s: float
+    figures: dict[str, Any]
+    heard: Heard
+    broker_s: float
+    broker_mb: float
+    functions_mb: float
+    load_before: float
+    load_after: float
+
+    @property
+    def measured(self) -> int:
+        """Measurements that it sent: all that is not told at QoS 1."""
+        counts: dict[str, int] = self.figures["counts"]
+        return counts["out"] - counts["asked"]
+
+    @property
+    def lost(self) -> int:
+        """Measurements that the subscriber did not get."""
+        return self.measured - self.heard.count
+
+    def row(self) -> list[Cell]:
+        """As the page shows it."""
+        told, heard = self.figures, self.heard
+        return [
+            told["agents"], told["rate_hz"], self.known_s, told["most_connected"], self.connects_per_s,
+            told["out_per_s"], self.lost, heard.p50_ms, heard.p99_ms, heard.most_ms,
+            self.broker_s / told["counts"]["out"] * 1e6, told["cpu_share"] / max(told["out_per_s"], 1e-9) * 1e6,
+            self.broker_mb, self.functions_mb, told["memory_bytes_per_agent"] / 1000,
+        ]  # fmt: skip
+
+    def kept(self) -> dict[str, Any]:
+        """As the sheet on paper reads it."""
+        return {
+            "broker": "mosquitto",
+            "on": datetime.now(UTC).date().isoformat(),
+            **self.figures,
+            "measured": self.measured,
+            "subscriber_heard": self.heard.count,
+            "lost_share": round(self.lost / max(self.measured, 1), 6),
+            "load_before": self.load_before,
+            "load_after": self.load_after,
+        }
+
+
+class Swarm:
+    """A swarm that lives for some seconds, with a subscriber beside it.
+
+    Args:
+        stand: The product.
+        home: Where its keys are: the next one of the same home is known already.
+    """
+
+    def __init__(self, stand: Stand, home: Path) -> None:
+        self._stand = stand
+        self._home = home
+
+    @contextlib.contextmanager
+    def living(self, count: int, rate_hz: float, seconds: float) -> Iterator["subprocess.Popen[str]"]:
+        """It, while it connects and lives."""
+        with subprocess.Popen(
+            [
+                sys.executable, "-m", "device_agent", "swarm", "--cloud", self._stand.machine.url,
+                "--home", str(self._home / "keys"), "--count", str(count), "--rate-hz", str(rate_hz),
+                "--spread-s", str(count * GAP_S), "--seconds", str(count * GAP_S + seconds), "--every-s", str(EVERY_S),
+                "--json", str(self._home / "figures.json"),
+            ],
+            cwd=ROOT,
+            env={**os.environ, "TELESCOPE_SIGN_IN": self._stand.machine.sign_in_link()},
+            stdout=subprocess.PIPE,
+            text=True,
+        ) as process:  # fmt: skip
+            try:
+                yield process
+            finally:
+                process.terminate()
+
+    def run(self, count: int, rate_hz: float, seconds: float) -> Swarmed:
+        """From the first key to the last word."""
+        everything = topics.device(topics.ANY, topics.ANY, DEVICE, topics.TELE, topics.ANY)
+        ear = Ear(self._stand.mqtt_port, *self._stand.rights(subscribe=(everything,)), everything, wall=True)
+        broker = self._stand.machine.pid("infra.mosquitto")
+        load, began_s = os.getloadavg()[0], time.monotonic()
+        with program("ear", ear) as listener, self.living(count, rate_hz, seconds) as process:
+            progress = _Progress(process, count)
+            known_s = progress.first_s - began_s
+            before_s = processor_s(broker)
+            progress.wait()
+            megabytes = resident_mb(broker), resident_mb(self._stand.machine.pid("function_app serve"))
+            process.wait(PATIENCE_S + count * GAP_S + seconds)
+            heard = msgspec.json.decode(answer(listener, "now"), type=Heard)
+        return Swarmed(
+            known_s=known_s,
+            connects_per_s=count / (progress.all_s - progress.first_s) if progress.all_s else 0.0,
+            figures=json.loads((self._home / "figures.json").read_text()),
+            heard=heard,
+            broker_s=processor_s(broker) - before_s,
+            broker_mb=megabytes[0],
+            functions_mb=megabytes[1],
+            load_before=round(load, 1),
+            load_after=round(os.getloadavg()[0], 1),
+        )
+
+
+class _Progress:
+    """When the first agents connected, and the last: the swarm says a line a second."""
+
+    def __init__(self, process: "subprocess.Popen[str]", count: int) -> None:
+        self._process = process
+        self._all = f"{count} of {count} connected"
+        self.all_s = 0.0
+        line = self._line()
+        while line and "connected" not in line:
+            line = self._line()
+        self.first_s = time.monotonic() - EVERY_S
+        self._look(line)
+
+    def wait(self) -> None:
+        """Until all are connected, or it has ended."""
+        while not self.all_s and (line := self._line()):
+            self._look(line)
+
+    def _look(self, line: str) -> None:
+        if self._all in line:
+            self.all_s = time.monotonic()
+
+    def _line(self) -> str:
+        assert self._process.stdout is not None
+        return self._process.stdout.readline()
+
+
+def actions(site: Site, stand: Stand, home: Path, *, seconds: float, processes: tuple[int, ...]) -> list[Load]:
+    """As many as are taken, by so many processes, for the arms of a swarm, which are where they are asked to be."""
+    found = []
+    longest_s = len(processes) * (seconds + 1) + PATIENCE_S
+    with contextlib.ExitStack() as stack, Swarm(stand, home).living(ARMS, 1.0, longest_s) as process:
+        _Progress(process, ARMS).wait()
+        with Api(stand.machine) as owner:
+            devices = [each["id"] for each in owner.get("/devices")["items"] if each["name"] == DEVICE]
+        body = json.dumps({"request": {"kind": "move_joints", "position_rad": {"joint_1": 0.0}}})
+        asked = [Request("POST", f"/api/v1/devices/{device}/actions", stand.token, body) for device in devices[:ARMS]]
+        for count in processes:
+            site.grow(count)
+            ask = site.ask("POST actions", count, asked, stack)
+            ask(0.5)
+            found.append(ask(seconds))
+    return found
+
+
+def table(runs: list[Swarmed]) -> Table:
+    """What was found."""
+    note = """`python -m device_agent swarm`: agents that are real ones on the wire, in one process, without
+physics, at the product over mosquitto; one subscriber to all that they measure. *Made known*: keys, enrolment
+and claim of those that were not known yet, over HTTP. Connects: credentials and the connection; mosquitto
+writes all the rights that it knows to its file at each new one. p50 to most: from an agent's measurement to the
+subscriber, in whole milliseconds."""
+    return Table(title="A swarm", columns=COLUMNS, rows=[run.row() for run in runs], note=note)

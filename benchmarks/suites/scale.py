@@ -1,0 +1,45 @@
+"""How far one machine goes: brokers, the API, actions, robots of one agent, memory, a swarm, rights."""
+
+import tempfile
+from collections.abc import Callable
+from pathlib import Path
+from typing import Final
+
+from benchmarks import sheet
+from benchmarks.report import Report
+from benchmarks.scale import brokers, credentials, functions, memory, robots, swarms
+
+_ABOUT: Final = """What one small machine carries, and what each more of something costs it. Every program of these
+figures, also those that ask, runs on the same cores."""
+
+
+def run(*, quick: bool, say: Callable[[str], None]) -> Report:
+    """Part by part; all but the first at one product."""
+    report = Report(suite="scale", title="Scale", quick=quick, about=[_ABOUT])
+    carried = brokers.measure(quick=quick, say=say)
+    report.tables.append(brokers.table(carried))
+    report.claims += brokers.claims(carried)
+    say("starting the product")
+    with tempfile.TemporaryDirectory() as folder, functions.started() as (stand, site):
+        one, more = functions.measure(site, quick=quick, say=say)
+        report.claims += functions.claims(one)
+        report.tables.append(functions.table(one, more))
+        report.tables.append(memory.measure(site, quick=quick, say=say))
+        crews = robots.measure(stand, quick=quick, say=say)
+        report.tables.append(robots.table(crews))
+        swarm = swarms.Swarm(stand, Path(folder))
+        runs = []
+        for count, rate_hz in swarms.QUICK if quick else swarms.WHOLE:
+            runs.append(swarm.run(count, rate_hz, 5.0 if quick else 12.0))
+            say(f"swarm of {count}: {runs[-1].figures['out_per_s']:.0f} messages/s, lost {runs[-1].lost}")
+        report.tables.append(swarms.table(runs))
+        started = swarms.actions(
+            site, stand, Path(folder), seconds=3.0 if quick else 8.0, processes=functions.PROCESSES[:2]
+        )
+        report.tables.insert(2, functions.actions_table(started))
+        say(f"actions: {started[0].answered.per_s:.0f}/s by one process, {started[1].answered.per_s:.0f}/s by two")
+    steps = credentials.measure(credentials.QUICK if quick else credentials.WHOLE)
+    report.tables.append(credentials.table(steps))
+    if not quick:
+        sheet.keep({"runs": [run.kept() for run in runs], "credentials": {"steps": steps}})
+    return report
