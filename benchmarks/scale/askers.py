@@ -36,7 +36,7 @@ class Request(msgspec.Struct):
 
 
 class Askers(msgspec.Struct):
-    """So many connections, spread over the ports; each begins elsewhere in the requests, and asks them in turn."""
+    """So many connections, spread over the ports. Each has its part of the requests, or all where there are fewer."""
 
     ports: list[int]
     connections: int
@@ -59,9 +59,9 @@ class Answered(msgspec.Struct):
 class Line(asyncio.Protocol):
     """One connection, one request at a time."""
 
-    def __init__(self, requests: list[bytes], first: int) -> None:
+    def __init__(self, requests: list[bytes]) -> None:
         self._requests = requests
-        self._next = first
+        self._next = 0
         self._came = bytearray()
         self._began_s = self._ends_s = 0.0
         self._transport: asyncio.Transport
@@ -147,9 +147,9 @@ async def run() -> None:
     asked = msgspec.json.decode(sys.stdin.readline(), type=Askers)
     requests, lines = [each.encode() for each in asked.requests], []
     for number in range(asked.connections):
-        first = number * len(requests) // asked.connections
+        own = requests[number :: asked.connections] or requests
         port = asked.ports[number % len(asked.ports)]
-        _, line = await loop.create_connection(lambda first=first: Line(requests, first), HOST, port)  # type: ignore[misc]
+        _, line = await loop.create_connection(lambda own=own: Line(own), HOST, port)  # type: ignore[misc]
         lines.append(line)
     print("ready", flush=True)
     while seconds := await asyncio.to_thread(sys.stdin.readline):

@@ -66,7 +66,7 @@ def measure(*, quick: bool, say: Callable[[str], None]) -> list[Run]:
     for kind, rate_hz in RATES_HZ.items():
         with tempfile.TemporaryDirectory() as folder, start_broker(kind, Path(folder)) as broker, crowd(broker) as ask:
             ask(rate_hz, 1.0)
-            found.append(ask(rate_hz, 8.0 if quick else 20.0))
+            found.append(ask(rate_hz, 8.0 if quick else 15.0))
             say(f"{kind}: {found[-1].told.sent} messages, lost {found[-1].lost}, p99 {found[-1].heard.p99_ms:.2f} ms")
             for higher_hz in () if quick else HIGHER[kind]:
                 found.append(ask(higher_hz, 5.0))

@@ -6,12 +6,13 @@ import sys
 import tempfile
 import time
 from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Final, Literal
 
 import msgspec
 
-from benchmarks.report import Cell, Table
+from benchmarks.report import Cell, Chart, Table
 from benchmarks.scale.agent import DIVIDER, LIGHT, Seen
 from benchmarks.scale.processes import processor_s, resident_mb
 from benchmarks.stand import Stand
@@ -21,28 +22,34 @@ from tests.support.machine import Api
 Kind = Literal["light", "simulated"]
 PERIOD_MS: Final = 8.0
 """The UR5's."""
-WHOLE: Final[tuple[tuple[Kind, float, tuple[int, ...]], ...]] = (
-    ("light", 50.0, (1, 4, 16, 32)),
-    ("light", 20.0, (16, 32)),
-    ("simulated", 50.0, (1, 4, 8, 16)),
-    ("simulated", 20.0, (8,)),
+WHOLE: Final[tuple[tuple[Kind, float, int, tuple[int, ...]], ...]] = (
+    ("light", 50.0, 1, (1, 8, 32, 64)),
+    ("light", 20.0, 1, (64,)),
+    ("light", 50.0, 2, (32,)),
+    ("simulated", 50.0, 1, (1, 8, 16, 24)),
+    ("simulated", 20.0, 1, (24,)),
+    ("simulated", 50.0, 2, (12,)),
 )
-QUICK: Final[tuple[tuple[Kind, float, tuple[int, ...]], ...]] = (
-    ("light", 50.0, (8,)),
-    ("simulated", 50.0, (4,)),
+"""What they are, telemetry's rate [Hz], how many agents, and how many robots each of them has."""
+QUICK: Final[tuple[tuple[Kind, float, int, tuple[int, ...]], ...]] = (
+    ("light", 50.0, 1, (8,)),
+    ("simulated", 50.0, 1, (4,)),
 )
+CHARTED_HZ: Final = 50.0
 _SETTLE_S: Final = 2.0
+_WATCH_S: Final = 3.0
 COLUMNS: Final = [
-    "robots", "", "telemetry Hz", "agent, % of a core", "late p50 ms", "late p99 ms", "most ms", "in time", "agent MB",
-    "MB a robot",
+    "agents × robots", "", "telemetry Hz", "agents, % of a core", "late p50 ms", "late p99 ms", "most ms", "in time",
+    "an agent's MB", "MB a robot",
 ]  # fmt: skip
 
 
 class Crew(msgspec.Struct):
-    """One agent's robots."""
+    """Robots of one agent, or of some agents beside each other; what is late is that of the latest of them."""
 
     kind: Kind
     rate_hz: float
+    agents: int
     count: int
     seen: Seen
     percent: float
@@ -57,8 +64,8 @@ class Crew(msgspec.Struct):
         """As the page shows it; ``alone_mb`` is what one robot's agent takes."""
         each = None if alone_mb is None or self.count == 1 else (self.mb - alone_mb) / (self.count - 1)
         return [
-            self.count, self.kind, self.rate_hz, self.percent,
-            self.seen.late_p50_ms, self.seen.late_p99_ms, self.seen.late_most_ms,
+            f"{self.agents} × {self.count}", self.kind, self.rate_hz, self.percent,
+            max(0.0, self.seen.late_p50_ms), self.seen.late_p99_ms, self.seen.late_most_ms,
             "yes" if self.in_time else "no", self.mb, each,
         ]  # fmt: skip
 
@@ -66,11 +73,11 @@ class Crew(msgspec.Struct):
 def measure(stand: Stand, *, quick: bool, say: Callable[[str], None]) -> list[Crew]:
     """More and more robots, until they are late."""
     found: list[Crew] = []
-    for kind, rate_hz, counts in QUICK if quick else WHOLE:
+    for kind, rate_hz, agents, counts in QUICK if quick else WHOLE:
         for count in counts:
-            found.append(crew(stand, kind, rate_hz, count, 3.0 if quick else 5.0))
+            found.append(crew(stand, kind, rate_hz, agents, count))
             say(
-                f"{count} {kind} robots at {rate_hz:g} Hz: {found[-1].percent:.0f} % of a core, "
+                f"{agents} × {count} {kind} robots at {rate_hz:g} Hz: {found[-1].percent:.0f} % of a core, "
                 f"late p99 {found[-1].seen.late_p99_ms:.1f} ms"
             )
             if not found[-1].in_time:
@@ -78,17 +85,23 @@ def measure(stand: Stand, *, quick: bool, say: Callable[[str], None]) -> list[Cr
     return found
 
 
-def crew(stand: Stand, kind: Kind, rate_hz: float, count: int, seconds: float) -> Crew:
-    """One agent with so many, watched for some seconds."""
-    with tempfile.TemporaryDirectory() as folder:
-        pair(stand, Path(folder), kind, count)
-        with running(Path(folder), rate_hz) as process:
-            pid = process.pid
-            watch(process, _SETTLE_S)
-            before_s, began_s = processor_s(pid), time.monotonic()
-            seen = watch(process, seconds)
-            took_s = time.monotonic() - began_s
-            return Crew(kind, rate_hz, count, seen, 100 * (processor_s(pid) - before_s) / took_s, resident_mb(pid))
+def crew(stand: Stand, kind: Kind, rate_hz: float, agents: int, count: int) -> Crew:
+    """Agents with so many each, watched for some seconds."""
+    with contextlib.ExitStack() as stack:
+        homes = [Path(stack.enter_context(tempfile.TemporaryDirectory())) for _ in range(agents)]
+        for home in homes:
+            pair(stand, home, kind, count)
+        processes = [stack.enter_context(running(home, rate_hz)) for home in homes]
+        pool = stack.enter_context(ThreadPoolExecutor(agents))
+
+        def together(seconds: float) -> list[Seen]:
+            return list(pool.map(lambda process: watch(process, seconds), processes))
+
+        together(_SETTLE_S)
+        before_s, began_s = sum(processor_s(each.pid) for each in processes), time.monotonic()
+        seen = max(together(_WATCH_S), key=lambda each: each.late_p99_ms)
+        percent = 100 * (sum(processor_s(each.pid) for each in processes) - before_s) / (time.monotonic() - began_s)
+        return Crew(kind, rate_hz, agents, count, seen, percent, resident_mb(processes[0].pid))
 
 
 def pair(stand: Stand, home: Path, kind: Kind, count: int) -> None:
@@ -148,12 +161,32 @@ def said(process: "subprocess.Popen[str]", beginning: str) -> str:
     raise RuntimeError(f"the agent ended with {process.wait()}")
 
 
+def chart(found: list[Crew]) -> Chart | None:
+    """How late they come, where there is more than one number of them."""
+    one = [each for each in found if each.agents == 1 and each.rate_hz == CHARTED_HZ]
+    counts = sorted({each.count for each in one})
+    kinds = {each.kind for each in one}
+    if len(counts) <= len(kinds):
+        return None
+    late = {(each.kind, each.count): each.seen.late_p99_ms for each in one}
+    return Chart(
+        title=f"Control periods of one agent, telemetry at {CHARTED_HZ:g} Hz",
+        kind="bar",
+        x_label="robots",
+        y_label="late, p99 ms",
+        x=[str(count) for count in counts],
+        series={kind: [late.get((kind, count)) for count in counts] for kind in sorted(kinds)},
+        marks={"a period": PERIOD_MS},
+        log=True,
+    )
+
+
 def table(found: list[Crew]) -> Table:
     """What was found."""
-    alone = {(each.kind, each.rate_hz): each.mb for each in found if each.count == 1}
+    alone = {each.kind: each.mb for each in found if each.count == 1}
     note = """An agent of the product with so many UR5, none of them moving: *light* ones are where they were
 told to be, so that what is left is what the agent itself costs; *simulated* ones have a world and its physics
 each. Late is how much more than its 8 ms a control period took; in time: less than a period, for 99 of 100. The
 functions and mosquitto run beside it and take in what is told."""
-    rows = [each.row(alone.get((each.kind, each.rate_hz))) for each in found]
+    rows = [each.row(alone.get(each.kind)) for each in found]
     return Table(title="Robots of one agent", columns=COLUMNS, rows=rows, note=note)

@@ -24,17 +24,19 @@ def run(*, quick: bool, say: Callable[[str], None]) -> Report:
         one, more = functions.measure(site, quick=quick, say=say)
         report.claims += functions.claims(one)
         report.tables.append(functions.table(one, more))
+        report.charts.append(functions.chart(one, more))
         report.tables.append(memory.measure(site, quick=quick, say=say))
         crews = robots.measure(stand, quick=quick, say=say)
         report.tables.append(robots.table(crews))
+        report.charts += [drawn] if (drawn := robots.chart(crews)) else []
         swarm = swarms.Swarm(stand, Path(folder))
         runs = []
-        for count, rate_hz in swarms.QUICK if quick else swarms.WHOLE:
-            runs.append(swarm.run(count, rate_hz, 5.0 if quick else 12.0))
+        for count, rate_hz, gap_s in swarms.QUICK if quick else swarms.WHOLE:
+            runs.append(swarm.run(count, rate_hz, gap_s, 5.0 if quick else 8.0))
             say(f"swarm of {count}: {runs[-1].figures['out_per_s']:.0f} messages/s, lost {runs[-1].lost}")
         report.tables.append(swarms.table(runs))
         started = swarms.actions(
-            site, stand, Path(folder), seconds=3.0 if quick else 8.0, processes=functions.PROCESSES[:2]
+            site, stand, Path(folder), seconds=3.0 if quick else 6.0, processes=functions.PROCESSES[:2]
         )
         report.tables.insert(2, functions.actions_table(started))
         say(f"actions: {started[0].answered.per_s:.0f}/s by one process, {started[1].answered.per_s:.0f}/s by two")

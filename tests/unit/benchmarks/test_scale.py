@@ -22,7 +22,7 @@ def test_packets_are_taken_when_they_are_whole_and_no_sooner() -> None:
     long = b"x" * 300
     stream = wire.packet(0x30, b"ab") + wire.packet(0x31, long)
     assert wire.packet(0x30, long)[1:3] == bytes([300 % 128 | 128, 300 // 128])
-    buffer, found = bytearray(), []
+    buffer, found = bytearray(), list[tuple[int, bytes]]()
     for byte in stream:
         buffer.append(byte)
         found += wire.packets(buffer)
@@ -31,11 +31,11 @@ def test_packets_are_taken_when_they_are_whole_and_no_sooner() -> None:
 
 
 def test_a_message_is_what_a_robot_tells_and_says_when() -> None:
-    told = codec.decode(telemetry(), JointTelemetry)
-    assert (len(told.position_rad), len(told.frames)) == (6, 7)
     body = telemetry().replace(SENT + b"-1.0", SENT + b"1234.567")
+    told = codec.decode(body, JointTelemetry)
+    assert (len(told.position_rad), len(told.frames)) == (6, 7)
     assert said_ms(body, SENT) == 1234.567
-    assert said_ms(body, MEASURED) == told.at_ms == codec.decode(body, JointTelemetry).at_ms
+    assert said_ms(body, MEASURED) == told.at_ms
 
 
 @pytest.mark.parametrize(
@@ -73,7 +73,7 @@ class Transport(asyncio.Transport):
 
 def test_a_client_asks_on_when_an_answer_is_whole_and_counts_refusals_apart() -> None:
     async def ask() -> Line:
-        line, transport = Line([b"first", b"second"], 1), Transport()
+        line, transport = Line([b"second", b"first"]), Transport()
         line.connection_made(transport)
         line.begin(1e12)
         line.data_received(b"HTTP/1.1 200 OK\r\nContent-Len")
@@ -124,7 +124,7 @@ def test_lateness_is_what_a_period_took_more_than_it_should() -> None:
 
 
 def test_memory_of_a_robot_is_what_more_of_them_take() -> None:
-    crew = Crew("light", 50.0, 5, Seen(5, 100, 0.1, 7.9, 20.0), 10.0, 140.0)
+    crew = Crew("light", 50.0, 1, 5, Seen(5, 100, 0.1, 7.9, 20.0), 10.0, 140.0)
     assert crew.in_time
     assert crew.row(100.0)[-1] == 10.0
     assert crew.row(None)[-1] is None
