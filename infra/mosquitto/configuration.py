@@ -42,6 +42,9 @@ _HEADER_BYTES = 600
 """Fixed header, packet id and the longest topic in a PUBLISH [bytes]."""
 _MAX_INFLIGHT = 100
 _MAX_QUEUED = 10_000
+_LEAVING = True
+"""Whoever may hear something may stop to: it takes nothing from anybody. The broker writes every right of everybody to
+its file at each new client, twice, so that what need not be said costs each agent of a site."""
 _SECRET = 0o600
 """Mode of a file that nobody else may read."""
 
@@ -101,7 +104,7 @@ def write(
             str(home / PASSWORD_FILE),
         )
     else:
-        _renew_service_rights(security)
+        _renew(security)
     text = configuration(
         home, host=host, tcp_port=tcp_port, websocket_port=websocket_port, plugin_path=plugin_path, tls=tls
     )
@@ -165,7 +168,7 @@ def first_security(password: str) -> dict[str, Any]:
             "publishClientSend": False,
             "publishClientReceive": False,
             "subscribe": False,
-            "unsubscribe": False,
+            "unsubscribe": _LEAVING,
         },
         "clients": [
             {
@@ -182,10 +185,12 @@ def first_security(password: str) -> dict[str, Any]:
     }
 
 
-def _renew_service_rights(security: Path) -> None:
-    """What the functions may do is for this version to say, not for the one that wrote the file; the rest is kept."""
+def _renew(security: Path) -> None:
+    """What the functions, and everybody, may do is this version's to say, not that of the file; the rest is kept."""
     known = json.loads(security.read_bytes())
-    changed = False
+    everybody = known.get("defaultACLAccess", {})
+    changed = everybody.get("unsubscribe") != _LEAVING
+    known["defaultACLAccess"] = {**everybody, "unsubscribe": _LEAVING}
     for role in known.get("roles", ()):
         if role["rolename"] == SERVICE and _by_topic(role.get("acls", ())) != _by_topic(_service_acls()):
             role["acls"] = _service_acls()
@@ -203,5 +208,5 @@ def _service_acls() -> list[dict[str, Any]]:
     mine = "$CONTROL/dynamic-security/#"
     acls = [("publishClientSend", topic) for topic in (*grants.SERVICE_PUBLISH, mine) if topic != control.TOPIC]
     for pattern in (*grants.SERVICE_SUBSCRIBE, mine):
-        acls += [(kind, pattern) for kind in ("subscribePattern", "unsubscribePattern", "publishClientReceive")]
+        acls += [(kind, pattern) for kind in ("subscribePattern", "publishClientReceive")]
     return [{"acltype": kind, "topic": topic, "priority": 0, "allow": True} for kind, topic in acls]

@@ -341,7 +341,7 @@ def _exactly_one(client_id: str | None, principal: str | None) -> None:
 def _acls(grant: Grant) -> list[dict[str, Any]]:
     acls = [("publishClientSend", pattern) for pattern in grant.publish]
     for pattern in grant.subscribe:
-        acls += [(kind, pattern) for kind in ("subscribePattern", "unsubscribePattern", "publishClientReceive")]
+        acls += [(kind, pattern) for kind in ("subscribePattern", "publishClientReceive")]
     return [{"acltype": kind, "topic": topic, "priority": 0, "allow": True} for kind, topic in acls]
 
 

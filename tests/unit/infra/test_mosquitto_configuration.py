@@ -12,12 +12,15 @@ def write(home: Path, tcp_port: int = 1) -> None:
 
 
 def test_whatever_was_not_granted_is_denied() -> None:
-    """Each of these alone would keep a message from a stranger: all are off, so that one mistake is not enough."""
+    """Each of these alone would keep a message from a stranger: all are off, so that one mistake is not enough.
+
+    Who leaves what they heard takes nothing from anybody.
+    """
     assert set(configuration.first_security("x")["defaultACLAccess"].items()) == {
         ("publishClientSend", False),
         ("publishClientReceive", False),
         ("subscribe", False),
-        ("unsubscribe", False),
+        ("unsubscribe", True),
     }
 
 
@@ -48,9 +51,12 @@ def test_a_newer_version_gives_the_functions_their_rights_and_leaves_what_was_gr
     }
     old["roles"][0]["acls"] = old["roles"][0]["acls"][:2]
     old["roles"].append(granted)
+    old["defaultACLAccess"]["unsubscribe"] = False
     path.write_text(json.dumps(old))
     write(tmp_path)
-    assert json.loads(path.read_text())["roles"] == [*new["roles"], granted]
+    renewed = json.loads(path.read_text())
+    assert renewed["roles"] == [*new["roles"], granted]
+    assert renewed["defaultACLAccess"] == new["defaultACLAccess"]
 
 
 def test_the_password_is_in_its_own_file_only(tmp_path: Path) -> None:
