@@ -11,11 +11,15 @@ from benchmarks.scale import brokers, credentials, functions, memory, robots, sw
 
 _ABOUT: Final = """What one small machine carries, and what each more of something costs it. Every program of these
 figures, also those that ask, runs on the same cores."""
+_BEFORE: Final = """**Before and after.** To find a request's route took longer than to read a device: each router of a
+resource was looked through twice, pattern by pattern. Now routes stand side by side, and are passed over by how they
+begin and how deep they are. In the application alone, without its server, a device took 177 µs and takes 134, the list
+240 and 190, `health`, whose route is the last one, 250 and 113; a bare route takes 42 (2026-11-22, best of three)."""
 
 
 def run(*, quick: bool, say: Callable[[str], None]) -> Report:
     """Part by part; all but the first at one product."""
-    report = Report(suite="scale", title="Scale", quick=quick, about=[_ABOUT])
+    report = Report(suite="scale", title="Scale", quick=quick, about=[_ABOUT, _BEFORE])
     carried = brokers.measure(quick=quick, say=say)
     report.tables.append(brokers.table(carried))
     report.claims += brokers.claims(carried)

@@ -13,7 +13,7 @@ from benchmarks.scale.ear import MEASURED, Heard, said_ms
 from benchmarks.scale.fleet import SENT, Told, telemetry
 from benchmarks.scale.functions import Load
 from benchmarks.scale.processes import family, processor_s, resident_mb
-from benchmarks.scale.robots import Crew
+from benchmarks.scale.robots import Crew, ceilings
 from device_agent.protocol import codec
 from device_agent.protocol.messages import JointTelemetry
 
@@ -128,6 +128,17 @@ def test_memory_of_a_robot_is_what_more_of_them_take() -> None:
     assert crew.in_time
     assert crew.row(100.0)[-1] == 10.0
     assert crew.row(None)[-1] is None
+
+
+def test_the_most_that_were_in_time_are_named() -> None:
+    def crew(agents: int, count: int, late_ms: float) -> Crew:
+        return Crew("light", 50.0, agents, count, Seen(count, 100, 0.1, late_ms, 20.0), 10.0, 140.0)
+
+    found = ceilings([crew(1, 8, 1.0), crew(1, 16, 7.9), crew(1, 32, 8.1), crew(2, 16, 9.0)])
+    assert found == [
+        "In time at 50 Hz were 16 light ones of one agent",
+        "In time at 50 Hz were 0 light ones of each of 2",
+    ]
 
 
 def test_a_process_costs_something() -> None:
