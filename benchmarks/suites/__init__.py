@@ -2,4 +2,4 @@
 
 from typing import Final
 
-NAMES: Final = ("limit", "peers", "soak")
+NAMES: Final = ("limit", "peers", "scale", "soak")
