@@ -44,13 +44,14 @@ class Askers(msgspec.Struct):
 
 
 class Answered(msgspec.Struct):
-    """What came back; ``refused`` counts all but 2xx by status."""
+    """What came back; ``refused`` counts all but 2xx by status, ``refusal`` is the last of them."""
 
     count: int
     per_s: float
     p50_ms: float
     p99_ms: float
     refused: dict[str, int]
+    refusal: str
     answer_bytes: int
     processor_s: float
     took_s: float
@@ -72,6 +73,7 @@ class Line(asyncio.Protocol):
         """Ask until then; counts begin anew."""
         self.taken: list[float] = []
         self.refused: dict[str, int] = {}
+        self.refusal = ""
         self.bytes = 0
         self._ends_s = ends_s
         self.done = asyncio.get_running_loop().create_future()
@@ -103,6 +105,7 @@ class Line(asyncio.Protocol):
         else:
             status = self._came[_STATUS].decode()
             self.refused[status] = self.refused.get(status, 0) + 1
+            self.refusal = self._came[head + 4 :].decode(errors="replace")
         self.bytes = len(self._came) - head - 4
         self._came.clear()
         if now_s < self._ends_s:
@@ -135,6 +138,7 @@ async def ask(lines: list[Line], seconds: float) -> Answered:
         p50_ms=percentile(taken or [0.0], 0.5) * 1000,
         p99_ms=percentile(taken or [0.0], 0.99) * 1000,
         refused=refused,
+        refusal=next((line.refusal for line in lines if line.refusal), ""),
         answer_bytes=max(line.bytes for line in lines),
         processor_s=time.process_time() - spent_s,
         took_s=took_s,

@@ -182,14 +182,15 @@ def chart(found: list[Crew]) -> Chart | None:
 
 
 def ceilings(found: list[Crew]) -> list[str]:
-    """Of each kind and rate, the most that were in time."""
-    most: dict[tuple[int, Kind, float], int] = {}
+    """Where more than one number of them was tried, the most that were in time."""
+    tried: dict[tuple[int, Kind, float], list[Crew]] = {}
     for each in found:
-        known = most.setdefault((each.agents, each.kind, each.rate_hz), 0)
-        most[each.agents, each.kind, each.rate_hz] = max(known, each.count if each.in_time else 0)
+        tried.setdefault((each.agents, each.kind, each.rate_hz), []).append(each)
     return [
-        f"In time at {rate_hz:g} Hz were {count} {kind} ones of {'one agent' if agents == 1 else f'each of {agents}'}"
-        for (agents, kind, rate_hz), count in most.items()
+        f"Of one agent's, {max((each.count for each in crews if each.in_time), default=0)} {kind} ones were in time at "
+        f"{rate_hz:g} Hz."
+        for (agents, kind, rate_hz), crews in tried.items()
+        if agents == 1 and len(crews) > 1
     ]
 
 
@@ -200,6 +201,6 @@ def table(found: list[Crew]) -> Table:
 told to be, so that what is left is what the agent itself costs; *simulated* ones have a world and its physics
 each. Late is how much more than its 8 ms a control period took; in time: less than a period, for 99 of 100. The
 functions and mosquitto run beside it and take in what is told."""
-    note += " " + "; ".join(ceilings(found)) + "."
+    note = " ".join([note, *ceilings(found)])
     rows = [each.row(alone.get(each.kind)) for each in found]
     return Table(title="Robots of one agent", columns=COLUMNS, rows=rows, note=note)

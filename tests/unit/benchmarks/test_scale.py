@@ -82,12 +82,12 @@ def test_a_client_asks_on_when_an_answer_is_whole_and_counts_refusals_apart() ->
         line.data_received(b"cde")
         assert transport.written == [b"second", b"first"]
         line._ends_s = 0
-        line.data_received(b"HTTP/1.1 409 Conflict\r\ncontent-length: 0\r\n\r\n")
+        line.data_received(b"HTTP/1.1 409 Conflict\r\ncontent-length: 4\r\n\r\nbusy")
         assert line.done.done()
         return line
 
     line = asyncio.run(ask())
-    assert (len(line.taken), line.refused) == (1, {"409": 1})
+    assert (len(line.taken), line.refused, line.refusal) == (1, {"409": 1}, "busy")
 
 
 def test_a_request_is_one_that_a_server_reads() -> None:
@@ -100,7 +100,15 @@ def test_a_request_is_one_that_a_server_reads() -> None:
 
 def load(what: str, per_s: float) -> Load:
     answered = Answered(
-        count=10, per_s=per_s, p50_ms=1.0, p99_ms=2.0, refused={}, answer_bytes=1, processor_s=0.1, took_s=1.0
+        count=10,
+        per_s=per_s,
+        p50_ms=1.0,
+        p99_ms=2.0,
+        refused={},
+        refusal="",
+        answer_bytes=1,
+        processor_s=0.1,
+        took_s=1.0,
     )
     return Load(1, what, answered, 0.5)
 
@@ -135,10 +143,7 @@ def test_the_most_that_were_in_time_are_named() -> None:
         return Crew("light", 50.0, agents, count, Seen(count, 100, 0.1, late_ms, 20.0), 10.0, 140.0)
 
     found = ceilings([crew(1, 8, 1.0), crew(1, 16, 7.9), crew(1, 32, 8.1), crew(2, 16, 9.0)])
-    assert found == [
-        "In time at 50 Hz were 16 light ones of one agent",
-        "In time at 50 Hz were 0 light ones of each of 2",
-    ]
+    assert found == ["Of one agent's, 16 light ones were in time at 50 Hz."]
 
 
 def test_a_process_costs_something() -> None:
