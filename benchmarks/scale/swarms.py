@@ -181,8 +181,7 @@ def actions(site: Site, stand: Stand, home: Path, *, seconds: float, processes: 
     longest_s = len(processes) * (seconds + 1) + PATIENCE_S
     with contextlib.ExitStack() as stack, Swarm(stand, home).living(ARMS, ARMS_HZ, longest_s, 0.02) as process:
         _Progress(process, ARMS).wait()
-        with Api(stand.machine) as owner:
-            devices = [each["id"] for each in owner.get("/devices")["items"] if each["name"] == DEVICE]
+        devices = _there(stand)
         request = {"kind": "move_joints", "position_rad": {"joint_1": 0.0}}
         body = json.dumps({"request": request, "wait_for": "done", "wait_ms": 10_000})
         asked = [Request("POST", f"/api/v1/devices/{device}/actions", stand.token, body) for device in devices[:ARMS]]
@@ -192,6 +191,19 @@ def actions(site: Site, stand: Stand, home: Path, *, seconds: float, processes: 
             ask(0.5)
             found.append(ask(seconds))
     return found
+
+
+def _there(stand: Stand) -> list[str]:
+    """Ids of the arms that are online: others of an earlier swarm are known too."""
+    found: list[str] = []
+    query: dict[str, Any] = {"limit": 1000}
+    with Api(stand.machine) as owner:
+        while True:
+            page = owner.get("/devices", **query)
+            found += [each["id"] for each in page["items"] if each["name"] == DEVICE and each["online"]]
+            if page["cursor"] is None:
+                return found
+            query["cursor"] = page["cursor"]
 
 
 def table(runs: list[Swarmed]) -> Table:
