@@ -15,6 +15,9 @@ from benchmarks.report import Chart, Report, Table, load, shown
 ROOT: Final = Path(__file__).parent.parent
 PAGE: Final = ROOT / "docs" / "benchmarks.md"
 PICTURES: Final = ROOT / "docs" / "pictures" / "benchmarks"
+_INSIDE: Final = 5
+"""So many names at most fit into a chart; more stand beside it."""
+_DASHES: Final = ("--", ":", "-.")
 _HEAD: Final = """# Benchmarks
 
 Made by `make bench` from `benchmarks/results/*.json`; do not edit. What is compared took turns in one run on one
@@ -83,21 +86,28 @@ def draw(report: Report) -> None:
 
     PICTURES.mkdir(parents=True, exist_ok=True)
     for number, chart in enumerate(report.charts):
-        figure, axes = plt.subplots(figsize=(7.2, 3.6), layout="constrained")
+        names = len(chart.series) + len(chart.marks)
+        beside = names > _INSIDE
+        figure, axes = plt.subplots(figsize=(9.6 if beside else 7.2, 3.6), layout="constrained")
         _plot(axes, chart)
         axes.set(title=chart.title, xlabel=chart.x_label, ylabel=chart.y_label)
         if chart.log:
             axes.set_yscale("log")
-        for name, value in chart.marks.items():
-            axes.axhline(value, linestyle="--", linewidth=1, color="grey", label=name)
+        for place, (name, value) in enumerate(chart.marks.items()):
+            axes.axhline(value, linestyle=_DASHES[place % len(_DASHES)], linewidth=1, color="dimgrey", label=name)
         axes.grid(alpha=0.3)
-        if len(chart.series) + len(chart.marks) > 1:
+        if beside:
+            figure.legend(loc="outside right upper", fontsize="small")
+        elif names > 1:
             axes.legend(fontsize="small")
         figure.savefig(PICTURES / _file(report, number), dpi=110, metadata={"Software": None})
         plt.close(figure)
 
 
 def _plot(axes: Any, chart: Chart) -> None:
+    if chart.kind == "waterfall":
+        _waterfall(axes, chart)
+        return
     if chart.kind == "bar":
         width = 0.8 / len(chart.series)
         for place, (name, values) in enumerate(chart.series.items()):
@@ -111,6 +121,19 @@ def _plot(axes: Any, chart: Chart) -> None:
             axes.plot(ordered, [(index + 1) / len(ordered) for index in range(len(ordered))], label=name)
         else:
             axes.plot(chart.x, values, marker="o", markersize=3, label=name)
+
+
+def _waterfall(axes: Any, chart: Chart) -> None:
+    height = 0.8 / len(chart.series)
+    for place, (name, values) in enumerate(chart.series.items()):
+        widths = [value or 0.0 for value in values]
+        left = [sum(widths[:index]) for index in range(len(widths))]
+        at = [index + (place - (len(chart.series) - 1) / 2) * height for index in range(len(widths))]
+        drawn = axes.barh(at, widths, height, left=left, label=name)
+        axes.bar_label(drawn, labels=[f"{width:.2f}" for width in widths], padding=3, fontsize=7)
+    axes.set_yticks(range(len(chart.x)), [str(each) for each in chart.x], fontsize=8)
+    axes.margins(x=0.08)
+    axes.invert_yaxis()
 
 
 def reports() -> list[Report]:

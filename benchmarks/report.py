@@ -29,7 +29,8 @@ class Chart(msgspec.Struct, frozen=True, kw_only=True):
     """Lines, or bars beside each other, over the same places.
 
     Attributes:
-        kind: ``line``, ``bar``, or ``cdf``: shares of the samples of each series, which are not paired with ``x``.
+        kind: ``line``, ``bar``, ``cdf``: shares of the samples of each series, which are not paired with ``x``, or
+            ``waterfall``: parts that follow each other, each beginning where the one above it ends.
         x: Places, numbers or names.
         series: Name → values.
         marks: Name → a value to compare with, drawn as a dashed line.

@@ -1,0 +1,192 @@
+"""Where the time goes: a command and a setpoint by parts, each part timed at its hop by one clock."""
+
+import json
+import random
+import tempfile
+import time
+from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path
+from typing import Final
+
+from benchmarks.marks import Mark
+from benchmarks.report import Cell, Chart, Report, Table, percentile
+from benchmarks.stand import Caller, Hand
+from benchmarks.watched import Watched, start
+from tests.support.brokers import BROKERS
+
+ROBOT: Final = "ur5"
+JOINT: Final = "wrist_3"
+SWINGS_RAD: Final = 0.02
+_WARM_UP: Final = 5
+_WITHIN_S: Final = 10.0
+ASKED: Final = "asked"
+ANSWERED: Final = "answered"
+Steps = tuple[tuple[str, str], ...]
+"""What a mark ends: its name, and what was done until then since the mark before."""
+ACTION: Final[Steps] = (
+    ("http-in", "HTTP in"),
+    ("identified", "identity"),
+    ("writing", "role, robot, lease, plan"),
+    ("written", "row's write"),
+    ("publishing", "still allowed, signature"),
+    ("heard:cmd", "publish, broker, to the agent"),
+    ("checked", "agent: signature, journal, checks"),
+    ("ack-said:started", "agent: begins, journal"),
+    ("ack-heard:started", "ack: broker, to the functions"),
+    ("http-out", "answer's row, HTTP out"),
+    (ANSWERED, "to the caller"),
+)
+MOTION: Final[Steps] = (
+    ("http-in", "HTTP in"),
+    ("publishing", "functions: identity, role, row, signature"),
+    ("heard:cmd", "publish, broker, to the agent"),
+    ("checked", "agent: signature, journal, checks"),
+    ("driver", "control loop, driver"),
+    ("moves:ur5", "simulation, to the first motion"),
+)
+SETPOINT: Final[Steps] = (
+    ("heard:ctl", "publish, broker, to the agent"),
+    ("taken", "agent: decode, checks"),
+    ("decided", "control loop: waits, decides"),
+    ("driver", "driver applies"),
+    ("telemetry", "telemetry: measured, encoded"),
+    (ANSWERED, "broker, to the operator, decoded"),
+)
+_ABOUT: Final = """Each program tells when it has come how far, by the clock that all processes of this machine share;
+a part is the time from one such moment to the next, so the parts of one exchange add up to the whole. The product has
+no tracing in it: the bench wraps public functions of its modules, which costs some ten microseconds a mark. A simulated
+UR5 that the operator holds; an action moves its wrist by a degree. On loopback."""
+
+
+def run(*, quick: bool, say: Callable[[str], None]) -> Report:
+    """Both brokers."""
+    report = Report(suite="path", title="The path by parts", quick=quick, about=[_ABOUT])
+    count = 40 if quick else 200
+    found: dict[str, dict[str, Parts]] = {}
+    for kind in BROKERS:
+        say(f"{kind}: starting")
+        with tempfile.TemporaryDirectory() as folder, start(Path(folder), kind, {ROBOT: JOINT}) as stand:
+            found[kind] = take(stand, count)
+        say(", ".join(f"{path} {percentile(whole(each), 0.5):.3g} ms" for path, each in found[kind].items()))
+    show(report, found)
+    return report
+
+
+Parts = list[dict[str, float]]
+"""Of each exchange: part → how long it took [ms]."""
+
+
+def take(stand: Watched, count: int) -> dict[str, Parts]:
+    """So many actions and setpoints, in turns; what was too slow to be told in its order is left out."""
+    found: dict[str, Parts] = {"action": [], "first motion": [], "setpoint": []}
+    with Hand(stand, ROBOT) as hand, stand.caller() as caller:
+        home_rad = hand.target_rad[JOINT]
+        for index in range(count + _WARM_UP):
+            to_rad = home_rad + (0.0 if index % 2 else SWINGS_RAD)
+            marks = list(_act(stand, caller, hand, to_rad))
+            taken: dict[str, dict[str, float] | None] = {}
+            taken["action"], taken["first motion"] = parts(marks, ACTION), parts(marks, MOTION)
+            hand.target_rad[JOINT] = to_rad
+            hand.exchange()  # which takes the arm over from the action
+            time.sleep(0.1 + 0.003 * (index % 7))  # at any phase of the control loop
+            taken["setpoint"] = parts(_set(stand, hand), SETPOINT)
+            for name, one in taken.items():
+                if one is not None and index >= _WARM_UP:
+                    found[name].append(one)
+    for name, each in found.items():
+        if len(each) < count / 2:
+            raise RuntimeError(f"{name}: only {len(each)} of {count} were told whole; has a traced function moved?")
+    return found
+
+
+def _act(stand: Watched, caller: Caller, hand: Hand, to_rad: float) -> Iterator[Mark]:
+    """An action to its end."""
+    request = {"kind": "move_joints", "position_rad": {JOINT: to_rad}}
+    asked = {"request": request, "epoch": hand.epoch, "wait_for": "started", "wait_ms": 10_000}
+    body = json.dumps(asked).encode()
+    stand.marks.drain()
+    stand.marks.until(f"rests:{ROBOT}", since_ns=time.monotonic_ns(), within_s=_WITHIN_S)
+    time.sleep(random.uniform(0.0, 0.01))  # at any phase of the control loop
+    began_ns = time.monotonic_ns()
+    yield Mark(ASKED, began_ns)
+    started = caller.ask("POST", f"/api/v1/devices/{hand.device['id']}/actions", body)
+    yield Mark(ANSWERED, time.monotonic_ns())
+    yield from stand.marks.until(f"moves:{ROBOT}", since_ns=began_ns, within_s=_WITHIN_S)
+    caller.ask("GET", f"/api/v1/actions/{started['id']}?wait_ms=10000")
+
+
+def _set(stand: Watched, hand: Hand) -> list[Mark]:
+    """One setpoint, until it is seen again."""
+    stand.marks.drain()
+    began_ns = time.monotonic_ns()
+    took_ms = hand.exchange()
+    answered = Mark(ANSWERED, time.monotonic_ns())
+    # Where the last was a moment ago, `exchange` has waited first.
+    asked = Mark(ASKED, max(began_ns, answered.at_ns - round(took_ms * 1e6)))
+    return [asked, *stand.marks.drain(), answered]
+
+
+def parts(marks: Sequence[Mark], steps: Steps) -> dict[str, float] | None:
+    """How long each part took [ms]; ``None`` where one of the marks is missing.
+
+    Each step's mark is the first of its name after the mark of the step before.
+    """
+    marks = sorted(marks, key=lambda mark: mark.at_ns)
+    at_ns = next(mark.at_ns for mark in marks if mark.name == ASKED)
+    found: dict[str, float] = {}
+    for name, what in steps:
+        following = next((mark.at_ns for mark in marks if mark.name == name and mark.at_ns >= at_ns), None)
+        if following is None:
+            return None
+        found[what] = (following - at_ns) / 1e6
+        at_ns = following
+    return found
+
+
+def whole(found: Parts) -> list[float]:
+    """The sum of each exchange's parts [ms]."""
+    return [sum(each.values()) for each in found]
+
+
+_TITLES: Final = {
+    "action": "`POST actions` until started",
+    "first motion": "`POST actions` until the simulated joint moves",
+    "setpoint": "A setpoint until it is seen in telemetry",
+}
+
+
+def show(report: Report, found: dict[str, dict[str, Parts]]) -> None:
+    """For each path a table of its parts over each broker, and a chart of both."""
+    for path, title in _TITLES.items():
+        for kind in found:
+            report.tables.append(_table(f"{title}, over {kind}", found[kind][path]))
+        names = list(next(iter(found.values()))[path][0])
+        report.charts.append(
+            Chart(
+                title=title.replace("`", ""),
+                kind="waterfall",
+                x_label="ms, medians of the parts",
+                y_label="",
+                x=[*names],
+                series={kind: [_middle(each[path], name) for name in names] for kind, each in found.items()},
+            )
+        )
+
+
+def _table(title: str, found: Parts) -> Table:
+    total = percentile(whole(found), 0.5)
+    rows: list[list[Cell]] = []
+    for part in found[0]:
+        middle = _middle(found, part)
+        rows.append([part, middle, percentile([each[part] for each in found], 0.95), round(100 * middle / total, 1)])
+    summed = sum(_middle(found, part) for part in found[0])
+    rows += [
+        ["sum of the medians", summed, None, round(100 * summed / total, 1)],
+        ["the whole", total, percentile(whole(found), 0.95), 100.0],
+    ]
+    columns = ["part", "p50 ms", "p95 ms", "% of the whole"]
+    return Table(title=f"{title}, n = {len(found)}", columns=columns, rows=rows)
+
+
+def _middle(found: Parts, part: str) -> float:
+    return percentile([each[part] for each in found], 0.5)
