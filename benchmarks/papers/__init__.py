@@ -1,0 +1,1 @@
+"""What the two papers printed, measured again with Telescope in their place."""

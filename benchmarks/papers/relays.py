@@ -1,0 +1,76 @@
+"""The servers of other ways, each a process of its own, that prints ``ready`` once it is.
+
+``python -m benchmarks.papers.relays web PORT``: the newest message is put and asked for over HTTP, as a robot that
+polls does it; it also lets everybody in at an XMPP server that asks it. ``… socket PORT``: each JSON message over
+WebSocket is read, and sent to all others.
+"""
+
+import asyncio
+import json
+import sys
+from typing import Any
+
+from benchmarks.echoes import HOST
+
+LIFETIME_S = 3600
+
+
+async def _web(port: int) -> None:
+    """FastAPI by uvicorn, as our functions are served."""
+    import uvicorn
+    from fastapi import FastAPI, Request
+
+    app = FastAPI()
+    newest: dict[str, Any] = {}
+
+    @app.put("/messages/{name}")
+    async def put(name: str, request: Request) -> dict[str, bool]:
+        newest[name] = await request.json()
+        return {"stored": True}
+
+    @app.get("/messages/{name}")
+    async def get(name: str) -> Any:
+        return newest.get(name)
+
+    @app.post("/verify")
+    async def verify(request: Request) -> dict[str, Any]:
+        user = (await request.json())["user"]
+        return {"user": user, "name": user, "kind": user, "lifetime_s": LIFETIME_S, "contacts": []}
+
+    server = uvicorn.Server(
+        uvicorn.Config(app, host=HOST, port=port, log_level="error", access_log=False, timeout_keep_alive=600)
+    )
+    serving = asyncio.create_task(server.serve())
+    while not server.started:  # noqa: ASYNC110 (it offers nothing to wait for)
+        await asyncio.sleep(0.01)
+    print("ready", flush=True)
+    await serving
+
+
+async def _socket(port: int) -> None:
+    from websockets.asyncio.server import ServerConnection, serve
+
+    there: set[ServerConnection] = set()
+
+    async def relay(connection: ServerConnection) -> None:
+        there.add(connection)
+        try:
+            async for text in connection:
+                message = json.dumps(json.loads(text))
+                for other in there - {connection}:
+                    await other.send(message)
+        finally:
+            there.discard(connection)
+
+    async with serve(relay, HOST, port, compression=None) as server:
+        print("ready", flush=True)
+        await server.serve_forever()
+
+
+def main(kind: str, port: str) -> None:
+    """Until it is ended."""
+    asyncio.run(_web(int(port)) if kind == "web" else _socket(int(port)))
+
+
+if __name__ == "__main__":
+    main(*sys.argv[1:])

@@ -1,0 +1,242 @@
+"""Table 2 of the UR5 paper: how long one message takes, over HTTP and XMPP as printed, and over what there is today."""
+
+import contextlib
+import statistics
+import tempfile
+from collections.abc import Callable, Iterator, Mapping
+from concurrent.futures import Future, ThreadPoolExecutor
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Final
+
+from benchmarks.measure import SHARES, Exchange, in_turns, median
+from benchmarks.papers import messengers, polled
+from benchmarks.report import Cell, Chart, Claim, Report, Table, percentile
+from benchmarks.stand import free_port, peer
+from tests.support.brokers import HOST, TRANSPORTS, RunningBroker, start_broker
+from tests.support.delay import start_delay
+from tests.support.ground import Ground, start_ground
+from tests.support.xmpp import start_prosody
+
+HTTP: Final = (
+    2762, 3244, 2711, 2859, 3235, 2817, 2935, 2962, 2857, 2999,
+    3298, 2931, 3286, 3115, 2776, 2783, 3214, 3032, 3142, 2934,
+)  # fmt: skip
+XMPP: Final = (
+    800, 855, 890, 815, 854, 761, 800, 894, 809, 802, 879, 821, 820, 782, 795, 894, 842, 808, 759, 805,
+)  # fmt: skip
+"""Both as printed [ms]."""
+SAMPLES: Final = len(HTTP)
+SHOWN_RTT_MS: Final = 30
+"""Whose samples are shown one by one."""
+LOSS: Final = 0.02
+OURS: Final = "MQTT, mosquitto"
+EMBEDDED: Final = "MQTT, amqtt"
+IN_STEP: Final = "HTTP, polled every 3 s in step"
+ANY_PHASE: Final = "HTTP, polled every 3 s"
+HELD: Final = "HTTP, our long poll"
+ROUNDS: Final = 5
+"""Turns of each way."""
+
+
+@dataclass(frozen=True)
+class Servers:
+    """All that runs. Ports of ``web`` (polled) and ``relay`` (WebSocket) are peers'."""
+
+    ground: Ground
+    amqtt: RunningBroker
+    prosody: int
+    web: int
+    relay: int
+
+    @property
+    def mosquitto(self) -> RunningBroker:
+        """Ground's."""
+        return self.ground.broker.now
+
+    @property
+    def ports(self) -> tuple[int, ...]:
+        """Of all of them."""
+        brokers = (each.port(kind) for each in (self.mosquitto, self.amqtt) for kind in TRANSPORTS)
+        return (self.ground.endpoints["server"].port, self.prosody, self.web, self.relay, *brokers)
+
+
+@dataclass(frozen=True)
+class Condition:
+    """A network, and how many samples of each way are worth their time there."""
+
+    rtt_ms: int
+    loss: float
+    each: int
+
+    @property
+    def name(self) -> str:
+        """For people."""
+        return f"{self.rtt_ms} ms" + (f", {self.loss:.0%} loss" if self.loss else "")
+
+
+def conditions(*, quick: bool) -> list[Condition]:
+    """The networks: four round trips, and loss wherever there is a network to lose."""
+    counts = {0: 40, 15: 16, 30: 8, 100: 3} if quick else {0: 200, 15: 40, 30: 30, 100: 12}
+    found = [Condition(rtt_ms, 0.0, each) for rtt_ms, each in counts.items()]
+    lossy = {15: 16} if quick else {15: 40, 30: 30, 100: 12}
+    return found + [Condition(rtt_ms, LOSS, each) for rtt_ms, each in lossy.items()]
+
+
+def measure(report: Report, *, quick: bool, say: Callable[[str], None]) -> None:
+    """Adds tables, charts, and a claim for each round trip."""
+    say("Table 2: starting")
+    found: dict[Condition, dict[str, list[float]]] = {}
+    with tempfile.TemporaryDirectory() as folder, servers(Path(folder)) as there:
+        for condition in conditions(quick=quick):
+            found[condition] = at(there, condition, quick=quick)
+            say(
+                f"Table 2: {condition.name}: "
+                + ", ".join(f"{name} {median(each):.4g}" for name, each in found[condition].items())
+            )
+    show(report, found)
+
+
+@contextlib.contextmanager
+def servers(folder: Path) -> Iterator[Servers]:
+    """Start them all."""
+    unlimited = {"TELESCOPE_RATE_ADDRESS": "0", "TELESCOPE_RATE_KEY": "0", "TELESCOPE_RATE_AGENT": "0"}
+    web, relay = free_port(), free_port()
+    with contextlib.ExitStack() as stack:
+        stack.enter_context(peer("benchmarks.papers.relays", "web", str(web)))
+        stack.enter_context(peer("benchmarks.papers.relays", "socket", str(relay)))
+        prosody = stack.enter_context(start_prosody(folder / "prosody", f"http://{HOST}:{web}/verify"))
+        amqtt = stack.enter_context(start_broker("amqtt", folder / "amqtt"))
+        ground = stack.enter_context(start_ground("mosquitto", folder / "ground", unlimited))
+        yield Servers(ground, amqtt, prosody.port, web, relay)
+
+
+def at(there: Servers, condition: Condition, *, quick: bool) -> dict[str, list[float]]:
+    """All ways in turns over one network; who polls waits meanwhile. A quick run leaves MQTT over WebSocket out."""
+    with contextlib.ExitStack() as stack:
+        ports: Mapping[int, int] = {port: port for port in there.ports}
+        if condition.rtt_ms or condition.loss:
+            way = stack.enter_context(start_delay(*there.ports, rtt_ms=condition.rtt_ms))
+            ports = way.ports
+        ways = _ways(stack, ports, there, quick=quick)
+        slow: dict[str, Exchange] = {HELD: polled.held(stack, ports, there.ground)}
+        if condition.loss:
+            way.set(rtt_ms=condition.rtt_ms, loss=condition.loss)
+        waiting = _poll(stack, ports[there.web])
+        found = in_turns(ways, rounds=ROUNDS, each=condition.each, warm_up=3)
+        found |= in_turns(slow, rounds=ROUNDS, each=max(4, condition.each // 5), warm_up=1)
+        return found | {name: each.result() for name, each in waiting.items()}
+
+
+def _ways(stack: contextlib.ExitStack, ports: Mapping[int, int], there: Servers, *, quick: bool) -> dict[str, Exchange]:
+    brokers = {OURS: there.mosquitto, EMBEDDED: there.amqtt}
+    found = {name: messengers.mqtt(stack, ports, broker) for name, broker in brokers.items()}
+    if not quick:
+        for name, broker in brokers.items():
+            found[f"{name}, over WebSocket"] = messengers.mqtt(stack, ports, broker, "websockets")
+    return found | {
+        "WebSocket, JSON relay": messengers.web_socket(stack, ports, there.relay),
+        "XMPP, Prosody": messengers.xmpp(stack, ports, there.prosody),
+    }
+
+
+def _poll(stack: contextlib.ExitStack, port: int) -> dict[str, Future[list[float]]]:
+    pool = stack.enter_context(ThreadPoolExecutor(2))
+    return {
+        IN_STEP: pool.submit(polled.pairs, port, SAMPLES, in_step=True, seed=1),
+        ANY_PHASE: pool.submit(polled.pairs, port, SAMPLES, in_step=False, seed=2),
+    }
+
+
+def show(report: Report, found: Mapping[Condition, Mapping[str, list[float]]]) -> None:
+    """What was found, beside what was printed."""
+    shown = next(taken for each, taken in found.items() if each.rtt_ms == SHOWN_RTT_MS and not each.loss)
+    report.tables.append(_one_by_one(shown))
+    report.tables += [_long(condition, taken) for condition, taken in found.items()]
+    report.charts.append(_chart(found))
+    report.claims += [claim(condition, taken) for condition, taken in found.items() if not condition.loss]
+
+
+def claim(condition: Condition, taken: Mapping[str, list[float]]) -> Claim:
+    """Ours to the fastest of all that is not MQTT."""
+    others = {name: median(each) for name, each in taken.items() if not name.startswith("MQTT")}
+    best = min(others, key=lambda name: others[name])
+    return Claim(
+        text=f"Table 2 at {condition.rtt_ms} ms of round trip: our MQTT (mosquitto), to the fastest other way ({best})",
+        seen=median(taken[OURS]) / others[best],
+        bound=1.0,
+        unit="×",
+    )
+
+
+def _one_by_one(taken: Mapping[str, list[float]]) -> Table:
+    rows: list[list[Cell]] = [
+        [
+            index + 1,
+            HTTP[index],
+            XMPP[index],
+            *(round(each[index], 1) if index < len(each) else None for each in taken.values()),
+        ]
+        for index in range(SAMPLES)
+    ]
+    means = [statistics.fmean(each[:SAMPLES]) for each in (HTTP, XMPP, *taken.values())]
+    rows.append(["average", *means])
+    return Table(
+        title=f"Table 2: 20 messages one by one [ms], printed and over {SHOWN_RTT_MS} ms of round trip",
+        columns=["sample", "printed: HTTP", "printed: XMPP", *taken],
+        rows=rows,
+        note="One way: from the sender through a server to the receiver, who each have this round trip to the server. "
+        "The paper's server stood in Singapore; how far away that was it does not say. "
+        + " ".join((polled.__doc__ or "").split("\n\n")[1].split()),
+    )
+
+
+def _long(condition: Condition, taken: Mapping[str, list[float]]) -> Table:
+    best = min(median(each) for name, each in taken.items() if not name.startswith("MQTT"))
+    rows: list[list[Cell]] = [
+        [name, len(each), *(percentile(each, share) for share in SHARES.values()), median(each) / best]
+        for name, each in taken.items()
+    ]
+    return Table(
+        title=f"The same at length, {condition.name}{'' if condition.rtt_ms else ' (loopback)'}",
+        columns=["way", "n", *(f"{share} ms" for share in SHARES), "× the fastest that is not MQTT"],
+        rows=rows,
+        note=_why(condition, taken),
+    )
+
+
+def _why(condition: Condition, taken: Mapping[str, list[float]]) -> str:
+    """What the order of the ways comes from."""
+    if condition.loss:
+        return "A stall holds up what follows it on the same connection. What polls hardly notices: it waits anyway."
+    slower = [name for name in (OURS, EMBEDDED) if median(taken[name]) > claim_best(taken)]
+    told = (
+        f"A setpoint of {len(messengers.SETPOINT)} bytes, one way. What is pushed over a connection that stands takes "
+        "half of each round trip and what its programs need. Our long poll brings a whole action (identity, role, "
+        "rows, signature), not a bare message."
+    )
+    if slower:
+        told += (
+            f" Slower than the fastest other way: {', '.join(slower)}. A WebSocket relay hands a text to whoever else "
+            "is connected; a broker looks at topics and rights for each message, and amqtt does so in Python."
+        )
+    return told
+
+
+def claim_best(taken: Mapping[str, list[float]]) -> float:
+    """The median of the fastest way that is not MQTT [ms]."""
+    return min(median(each) for name, each in taken.items() if not name.startswith("MQTT"))
+
+
+def _chart(found: Mapping[Condition, Mapping[str, list[float]]]) -> Chart:
+    names = next(iter(found.values()))
+    return Chart(
+        title="One message, median (Table 2)",
+        kind="bar",
+        x_label="round trip to the server",
+        y_label="ms",
+        x=[condition.name for condition in found],
+        series={name: [median(taken[name]) for taken in found.values()] for name in names},
+        marks={"printed: HTTP": statistics.fmean(HTTP), "printed: XMPP": statistics.fmean(XMPP)},
+        log=True,
+    )
