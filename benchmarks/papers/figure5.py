@@ -76,7 +76,7 @@ Begin = Callable[[], End]
 def measure(report: Report, *, quick: bool, say: Callable[[str], None]) -> None:
     """Adds a table, a chart, and claims."""
     found: Found = {}
-    distances, count = ((RTT_MS,), 8) if quick else ((0, RTT_MS), 16)
+    distances, count = ((RTT_MS,), 6) if quick else ((0, RTT_MS), 16)
     for robot in ROBOTS:
         alone = {robot.name: robot.watched}
         with tempfile.TemporaryDirectory() as folder, start(Path(folder), "mosquitto", alone) as stand:

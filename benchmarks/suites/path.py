@@ -61,7 +61,7 @@ UR5 that the operator holds; an action moves its wrist by a degree. On loopback.
 def run(*, quick: bool, say: Callable[[str], None]) -> Report:
     """Both brokers."""
     report = Report(suite="path", title="The path by parts", quick=quick, about=[_ABOUT])
-    count = 40 if quick else 200
+    count = 28 if quick else 200
     found: dict[str, dict[str, Parts]] = {}
     for kind in BROKERS:
         say(f"{kind}: starting")
