@@ -77,7 +77,7 @@ def functions(arguments: Sequence[str]) -> int:
 
 
 class _Door:
-    """The application, with who comes to start an action told, and when the answer has gone."""
+    """The application, with who comes to start an action told, and when the answer is ready."""
 
     def __init__(self, app: Any, tell: Tell) -> None:
         self._app = app
@@ -89,9 +89,10 @@ class _Door:
             return
 
         async def sent(message: Any) -> None:
-            await send(message)
+            # Before it goes: the caller may have the answer while `send` has still to return.
             if message["type"] == "http.response.body" and not message.get("more_body"):
                 self._tell("http-out")
+            await send(message)
 
         self._tell("http-in")
         await self._app(scope, receive, sent)

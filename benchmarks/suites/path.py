@@ -33,8 +33,8 @@ ACTION: Final[Steps] = (
     ("checked", "agent: signature, journal, checks"),
     ("ack-said:started", "agent: begins, journal"),
     ("ack-heard:started", "ack: broker, to the functions"),
-    ("http-out", "answer's row, HTTP out"),
-    (ANSWERED, "to the caller"),
+    ("http-out", "answer's row"),
+    (ANSWERED, "HTTP out, to the caller"),
 )
 MOTION: Final[Steps] = (
     ("http-in", "HTTP in"),
