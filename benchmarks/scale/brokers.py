@@ -130,7 +130,8 @@ def table(runs: list[Run]) -> Table:
     note = f"""{ROBOTS} connections in one program, one subscriber at QoS 0 in another, the broker as the
 product starts it: three programs on two cores. A message is what the simulated UR5 tells, {size:,} bytes with
 its topic. p50 to most are from a message's sending to its being read by the subscriber. The last row of a
-broker is the first that it no longer carries (lost, or p99 over {LATE_MS:g} ms), or the highest that was tried."""
+broker is the first that it no longer carries (lost, or p99 over {LATE_MS:g} ms), or the highest that was tried;
+where messages were sent late, it is the robots' program that was full."""
     return Table(title="Brokers", columns=COLUMNS, rows=[run.row() for run in runs], note=note)
 
 
