@@ -66,7 +66,7 @@ class Journal:
         try:
             self._database = sqlite3.connect(self._path, check_same_thread=False, isolation_level=None)
             self._database.execute("PRAGMA journal_mode=WAL")
-            self._database.execute("PRAGMA synchronous=FULL")
+            self._database.execute("PRAGMA synchronous=NORMAL")
             self._database.executescript(_SCHEMA)
             self._database.execute("DELETE FROM commands WHERE terminal = 1 AND at_ms < ?", (now_ms - _KEEP_MS,))
         except sqlite3.Error as error:
@@ -92,7 +92,7 @@ class Journal:
         Returns:
             ``None`` for a new command; for one seen before, the last answer given to it, and nothing may be done again.
         """
-        with self._lock, self._soon():
+        with self._lock:
             rows = self._execute(
                 "INSERT INTO commands VALUES (?, ?, ?, ?, 0, ?) ON CONFLICT (id) DO NOTHING RETURNING id",
                 (ack.id, device, codec.encode(ack), ack.status.terminal, ack.at_ms),
@@ -103,7 +103,7 @@ class Journal:
 
     def record(self, ack: Ack) -> None:
         """Remember the newest answer to a command begun before; on the disk when this returns if it is the last."""
-        with self._lock, self._soon(not ack.status.terminal):
+        with self._lock, self._on_disk() if ack.status.terminal else contextlib.nullcontext():
             self._execute(
                 "UPDATE commands SET last_ack = ?, terminal = ?, delivered = 0, at_ms = ? "
                 "WHERE id = ? AND terminal = 0",
@@ -112,14 +112,14 @@ class Journal:
 
     def settle(self) -> None:
         """All that was written is on the disk when this returns: with the next start, none of it is done again."""
-        with self._lock:
+        with self._lock, self._on_disk():
             self._execute(
                 "INSERT INTO counters VALUES ('settled', 1) ON CONFLICT (name) DO UPDATE SET value = value + 1"
             )
 
     def delivered(self, ack: Ack) -> None:
         """Note that the cloud has this answer, unless a newer one has been recorded since."""
-        with self._lock, self._soon():
+        with self._lock:
             if self._database is not None:
                 self._execute(
                     "UPDATE commands SET delivered = 1 WHERE id = ? AND last_ack = ?", (ack.id, codec.encode(ack))
@@ -165,7 +165,7 @@ class Journal:
 
     def save_epoch(self, device: str, *, epoch: int, burned: int) -> None:
         """Remember a device's epochs; neither ever falls."""
-        with self._lock:
+        with self._lock, self._on_disk():
             self._execute(
                 "INSERT INTO devices (device, epoch, burned) VALUES (?, ?, ?) ON CONFLICT (device) DO UPDATE SET "
                 "epoch = max(epoch, excluded.epoch), burned = max(burned, excluded.burned)",
@@ -174,7 +174,7 @@ class Journal:
 
     def save_latch(self, device: str, latch: StopLatch | None) -> None:
         """Remember a device's Stop latch."""
-        with self._lock:
+        with self._lock, self._on_disk():
             self._execute(
                 "INSERT INTO devices (device, latch) VALUES (?, ?) "
                 "ON CONFLICT (device) DO UPDATE SET latch = excluded.latch",
@@ -192,7 +192,7 @@ class Journal:
 
     def save_movement(self, device: str, author: str, robot_type: str, name: str, version: int) -> None:
         """Remember a version that runs; what is remembered never falls."""
-        with self._lock:
+        with self._lock, self._on_disk():
             self._execute(
                 "INSERT INTO movements VALUES (?, ?, ?, ?, ?) ON CONFLICT (device, author, robot_type, name) "
                 "DO UPDATE SET version = max(version, excluded.version)",
@@ -201,7 +201,7 @@ class Journal:
 
     def next_session(self) -> int:
         """The next session number of this agent's link, rising for ever."""
-        with self._lock:
+        with self._lock, self._on_disk():
             rows = self._execute(
                 "INSERT INTO counters VALUES ('session', 1) ON CONFLICT (name) DO UPDATE SET value = value + 1 "
                 "RETURNING value"
@@ -209,16 +209,14 @@ class Journal:
         return int(rows[0][0])
 
     @contextlib.contextmanager
-    def _soon(self, soon: bool = True) -> Iterator[None]:
-        """What is written here does not wait for the disk, if ``soon``; other programs see it at once all the same."""
-        if not soon or self._database is None:
-            yield
-            return
-        self._execute("PRAGMA synchronous=NORMAL")
+    def _on_disk(self) -> Iterator[None]:
+        """What is written here, and all before it, is on the disk at the end."""
+        self._execute("PRAGMA synchronous=FULL")
         try:
             yield
         finally:
-            self._execute("PRAGMA synchronous=FULL")
+            with contextlib.suppress(JournalError):  # what went wrong is being told already
+                self._execute("PRAGMA synchronous=NORMAL")
 
     def _execute(self, sql: str, values: tuple[object, ...] = ()) -> list[Any]:
         if self._database is None:

@@ -251,7 +251,7 @@ class Office:
             case CancelAction(action=action):
                 self._executor.cancel(action, command.who)
             case order:  # an action
-                # Journalled as accepted before it begins: after a crash here it is ended, never run again.
+                # Journalled before it begins: after a crash here it is ended, never run again.
                 self._voice.report_with_next(command.id, AckStatus.ACCEPTED)
                 self._executor.start(command, order)
                 self._keep()

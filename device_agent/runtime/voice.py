@@ -152,9 +152,8 @@ class Voice:
         self.send_ack(ack)
 
     def report_with_next(self, command: str, status: AckStatus) -> None:
-        """Journal the next ack of a command; it is published with the one after it, which follows at once."""
+        """The next ack of a command is published with the one after it, which follows at once and is journalled."""
         ack = self.ack(command, status)
-        self._journal.record(ack)
         with self._lock:
             self._held[command] = ack
 
