@@ -252,13 +252,13 @@ def claims(far: Found) -> Iterator[Claim]:
     """Of each robot's action, and of the slowest robot's stored movement."""
     for robot in ROBOTS:
         yield Claim(
-            text=f"{robot.label}: operator's action → first simulated motion, both {RTT_MS} ms from the cloud",
+            text=f"{robot.label}: action → first simulated motion, operator and robot {RTT_MS} ms from the cloud, median",
             seen=_median(far[robot.label, ACTION, RTT_MS]),
             bound=MOST_MS,
             unit="ms",
         )
     yield Claim(
-        text=f"a stored movement → first simulated motion, the same for the slowest robot (printed: {_PRINTED})",
+        text=f"a stored movement → first simulated motion, the same, of the slowest robot (printed: {_PRINTED})",
         seen=max(_median(far[robot.label, SCRIPT, RTT_MS]) for robot in ROBOTS),
         bound=MOST_MS,
         unit="ms",

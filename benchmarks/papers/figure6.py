@@ -141,7 +141,7 @@ def judge(report: Report, taken: dict[str, list[float]]) -> None:
             unit="ms",
         ),
         Claim(
-            text=f"the same, the worst of {len(found):,} (printed: 103)",
+            text=f"the same exchange of a room client, the worst of {len(found):,} (printed: 103)",
             seen=max(found),
             bound=WORST_MOST_MS,
             unit="ms",
