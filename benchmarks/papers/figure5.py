@@ -252,7 +252,7 @@ def claims(far: Found) -> Iterator[Claim]:
     """Of each robot's action, and of the slowest robot's stored movement."""
     for robot in ROBOTS:
         yield Claim(
-            text=f"{robot.label}: action → first simulated motion, operator and robot {RTT_MS} ms from the cloud, median",
+            text=f"{robot.label}: action → first simulated motion, median, both sides {RTT_MS} ms from the cloud",
             seen=_median(far[robot.label, ACTION, RTT_MS]),
             bound=MOST_MS,
             unit="ms",
