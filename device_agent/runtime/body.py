@@ -36,6 +36,7 @@ class Body:
         name: As the room's positions name it.
         ground: What stands in its room, while somebody sees that; without it, it goes nowhere by itself.
         speaker: Who says what it is to say.
+        hurry: Called when something is asked of the controller: see ``ControlLoop.hurry``.
     """
 
     robot_type: RobotType
@@ -49,6 +50,7 @@ class Body:
     name: str = ""
     ground: Callable[[], Ground | None] | None = None
     speaker: Speaker = field(default_factory=Speaker)
+    hurry: Callable[[], None] = lambda: None
 
     def seen(self) -> Observation:
         """The newest measurement.

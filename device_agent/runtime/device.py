@@ -124,6 +124,7 @@ class Device:
             instrument=instrument,
             name=name,
             ground=ground,
+            hurry=self._hurry,
             speaker=Speaker(
                 name,
                 speech=speech,
@@ -258,6 +259,10 @@ class Device:
         if epoch != str(setpoint.epoch):
             raise Refused("no_lease", "the epoch in the topic and in the message differ")
         self._controller.offer(setpoint, now_s=time.monotonic(), tick_ms=tick_ms())
+        self._hurry()
+
+    def _hurry(self) -> None:
+        """What was asked does not wait for the next period."""
         self._loop.hurry()
 
     def link_changed(self, up: bool) -> None:

@@ -1,7 +1,7 @@
 """The control loop of one device: observe, decide, command, every ``period_ms``. The only writer of motor commands.
 
-While the device rests, a setpoint does not wait for the next period: its own begins when it comes. In motion periods
-keep their length, for each carries one period's way.
+While the device rests, a setpoint or a move does not wait for the next period: its own begins when it comes. In motion
+periods keep their length, for each carries one period's way.
 """
 
 import contextlib
@@ -102,7 +102,7 @@ class ControlLoop:
             self._thread.join(timeout=2)
 
     def hurry(self) -> None:
-        """A setpoint was taken: while the device rests its period begins now, here if the driver is ``Prompt``."""
+        """Something is asked of a device: while it rests its period begins now, here if the driver is ``Prompt``."""
         if self._prompt and not self._early and not self._controller.moving and self._turn.acquire(blocking=False):
             try:
                 if self._thread.is_alive() and not self._stopping.is_set() and not self._trouble:

@@ -165,7 +165,8 @@ class ScriptRobot:
         self.follow(controller.drive(self.tenure, REST, duration_s=EVERY_S))
 
     def follow(self, course: Course) -> None:
-        """Wait for its end."""
+        """Have it begin, and wait for its end."""
+        self._body.hurry()
         course.finished.wait()
         self.limited += tuple(one for one in course.limited if one not in self.limited)
         if course.outcome is not Outcome.REACHED:
