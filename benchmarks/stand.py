@@ -61,21 +61,25 @@ class Stand:
     def rights(self, *, publish: tuple[str, ...] = (), subscribe: tuple[str, ...] = ()) -> tuple[str, str, str]:
         """Client id, user name and password of a new client with exactly these rights."""
         self._number += 1
-        name = f"bench-{self._number}"
-        grant = Grant(
-            principal=f"account:{name}",
-            client_id=name,
-            publish=publish,
-            subscribe=subscribe,
-            token_id=f"{name}{time.time_ns():x}",
-            expires_at=int(time.time() + 7200),
-        )
-        issued = self._cloud.run(self._cloud.functions.access.issue(grant))
-        return name, issued.username, issued.password
+        return rights(self._cloud, f"bench-{self._number}", publish, subscribe)
 
     def line(self, *, publish: tuple[str, ...] = (), subscribe: tuple[str, ...] = (), qos: int = 0) -> "Line":
         """A connected client that has subscribed."""
         return Line(self.mqtt_port, *self.rights(publish=publish, subscribe=subscribe), subscribe=subscribe, qos=qos)
+
+
+def rights(cloud: Cloud, name: str, publish: tuple[str, ...], subscribe: tuple[str, ...]) -> tuple[str, str, str]:
+    """Client id, user name and password of a client with exactly these rights, for two hours."""
+    grant = Grant(
+        principal=f"account:{name}",
+        client_id=name,
+        publish=publish,
+        subscribe=subscribe,
+        token_id=f"{name}{time.time_ns():x}",
+        expires_at=int(time.time() + 7200),
+    )
+    issued = cloud.run(cloud.functions.access.issue(grant))
+    return name, issued.username, issued.password
 
 
 class Line:

@@ -289,7 +289,7 @@ class Bench:
                 for process in stack.below(stack.agent):
                     with contextlib.suppress(ProcessLookupError):
                         os.kill(process, signal.SIGKILL)
-                return _nothing
+                return mends_itself
             case _:
                 return self._cut_link(how)
 
@@ -303,7 +303,7 @@ class Bench:
             case "stalls":
                 link.freeze()
                 return link.thaw
-        return _nothing
+        return mends_itself
 
     @property
     def _children(self) -> dict[str, Child]:
@@ -318,5 +318,5 @@ class Bench:
         self.stack.await_health()
 
 
-def _nothing() -> None:
+def mends_itself() -> None:
     """It mends itself."""

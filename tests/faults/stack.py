@@ -81,7 +81,13 @@ class Console:
 
 
 class Stack:
-    """Started processes. ``start`` gives one."""
+    """Started processes. ``start`` gives one.
+
+    Attributes:
+        AGENT: The program that is the agent.
+    """
+
+    AGENT = "tests.faults.agent"
 
     def __init__(self, kind: BrokerKind, arms: int, *, watchdog_s: float) -> None:
         self.names = [f"arm{number}" for number in range(arms)]
@@ -92,6 +98,8 @@ class Stack:
         self._environment = os.environ | {
             "TELESCOPE_HOME": str(self.home), "TELESCOPE_PORT": str(self.port), "TELESCOPE_BROKER": kind
         }  # fmt: skip
+        self._agent_home = ["--home", str(self.home / "agent")]
+        self.trace = self.home / "trace"
         self._logs = self.home / "logs"
         self._logs.mkdir()
         self._closing = contextlib.ExitStack()
@@ -124,20 +132,22 @@ class Stack:
 
     def _begin_agent(self) -> None:
         devices = [part for name in self.names for part in ("--device", f"{name}=ur5")]
-        home = ["--home", str(self.home / "agent")]
+        home = self._agent_home
         said = self._program(
             "device_agent", "enroll", *home, "--server", f"http://{HOST}:{self.port}", "--name", "bench", *devices,
             "--no-wait",
         ).split()  # fmt: skip
         self.agent_id = self.post("/agents/claim", code=said[said.index("code") + 1])["agent"]
-        self.trace = self.home / "trace"
-        proxied = [str(self.agent_mqtt.port), str(self._watchdog_s)]
-        self.agent = self._child("agent", "tests.faults.agent", *proxied, *home, "--trace", str(self.trace))
+        self.agent = self._child("agent", self.AGENT, *self.agent_arguments(self.agent_mqtt.port))
         self.agent.await_line("running", PATIENCE_S)
         with contextlib.suppress(PermissionError):  # what moves metal goes before what only talks, where one may say so
             os.setpriority(os.PRIO_PGRP, self.pid(self.agent), _AGENT_NICE)
         wait_until(lambda: all(each["online"] for each in self.devices()), "the arms to be online", PATIENCE_S)
         (self.space,) = {each["topic"].split("/")[2] for each in self.devices()}
+
+    def agent_arguments(self, mqtt_port: int) -> list[str]:
+        """Of the agent's program, that is to find the broker there."""
+        return [str(mqtt_port), str(self._watchdog_s), *self._agent_home, "--trace", str(self.trace)]
 
     # ------------------------------------------------------------ for the bench
 

@@ -9,6 +9,7 @@ import contextlib
 import selectors
 import socket
 import threading
+import time
 from collections.abc import Callable, Iterator
 
 HOST = "127.0.0.1"
@@ -24,10 +25,13 @@ class Proxy:
     Attributes:
         port: Where clients connect.
         accepted: Number of connections so far.
+        arrivals: What came since ``acknowledge_late``: when [s], whether from the server, and what.
     """
 
     def __init__(self, behind: int, heard: Callable[[bytes], None] | None = None) -> None:
         self.accepted = 0
+        self.arrivals: list[tuple[float, bool, bytes]] = []
+        self._late = False
         self._heard = heard
         self._frozen = False
         self._behind = behind
@@ -87,6 +91,13 @@ class Proxy:
         """Let connections through again."""
         self._refuses = False
 
+    def acknowledge_late(self) -> None:
+        """As a kernel may: after 40 ms, or with the next answer. Who does not set TCP_NODELAY then waits for it."""
+        with self._lock:
+            self._late = True
+            for each in self._peers:
+                _acknowledge_late(each)
+
     def end(self) -> None:
         if self._frozen:
             self.thaw()
@@ -108,37 +119,53 @@ class Proxy:
         if self._frozen:
             return
         if ready is self._listener:
-            client, _ = self._listener.accept()
-            self.accepted += 1
-            if self._refuses:
-                client.close()
-                return
-            try:
-                server = socket.create_connection((HOST, self._behind))
-            except OSError:
-                client.close()
-                return
-            self._servers.add(server)
-            for one, other in ((client, server), (server, client)):
-                one.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
-                self._peers[one] = other
-                self._selector.register(one, selectors.EVENT_READ)
+            self._accept()
         elif isinstance(ready, socket.socket) and ready in self._peers:
-            other = self._peers[ready]
-            content = b""
+            self._pass_on(ready, self._peers[ready])
+
+    def _accept(self) -> None:
+        client, _ = self._listener.accept()
+        self.accepted += 1
+        if self._refuses:
+            client.close()
+            return
+        try:
+            server = socket.create_connection((HOST, self._behind))
+        except OSError:
+            client.close()
+            return
+        self._servers.add(server)
+        for one, other in ((client, server), (server, client)):
+            one.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+            if self._late:
+                _acknowledge_late(one)
+            self._peers[one] = other
+            self._selector.register(one, selectors.EVENT_READ)
+
+    def _pass_on(self, ready: socket.socket, other: socket.socket) -> None:
+        content = b""
+        with contextlib.suppress(OSError):
+            content = ready.recv(65_536)
+        if content:
+            if self._late:
+                self.arrivals.append((time.perf_counter(), ready in self._servers, content))
+                _acknowledge_late(ready)
+            if self._heard is not None and ready in self._servers:
+                self._heard(content)
             with contextlib.suppress(OSError):
-                content = ready.recv(65_536)
-            if content:
-                if self._heard is not None and ready in self._servers:
-                    self._heard(content)
-                with contextlib.suppress(OSError):
-                    other.sendall(content)
-                return
-            for each in (ready, other):
-                self._selector.unregister(each)
-                del self._peers[each]
-                self._servers.discard(each)
-                each.close()
+                other.sendall(content)
+            return
+        for each in (ready, other):
+            self._selector.unregister(each)
+            del self._peers[each]
+            self._servers.discard(each)
+            each.close()
+
+
+def _acknowledge_late(one: socket.socket) -> None:
+    """To be said again after each read: the kernel forgets it."""
+    with contextlib.suppress(OSError):  # it has just ended
+        one.setsockopt(socket.IPPROTO_TCP, socket.TCP_QUICKACK, 0)
 
 
 @contextlib.contextmanager

@@ -1,0 +1,81 @@
+"""``device_agent run`` that tells what it decides, period by period, and whose wall clock can be set wrong.
+
+``python -m benchmarks.faults.agent MQTT_PORT WATCHDOG_S …``, where ``$TELESCOPE_HOME/noted.socket`` listens: each
+period is a datagram (see ``noted.Period``), and so is each action that begins. SIGUSR1 and SIGUSR2 put its wall clock
+an hour ahead and back. Nothing of this is in the product.
+"""
+
+import contextlib
+import os
+import signal
+import socket
+import sys
+import threading
+import time
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from device_agent.protocol.messages import Command
+from device_agent.runtime.actions import Executor
+from device_agent.runtime.controller import Controller
+from device_agent.runtime.pilot import Tick
+from tests.faults import agent
+
+JUMP_S = 3600.0
+
+
+def main(*arguments: str) -> int:
+    """The agent, until it is ended."""
+    _tell(str(Path(os.environ["TELESCOPE_HOME"]) / "noted.socket"))
+    _set_clock_by_signals()
+    return agent.main(*arguments)
+
+
+def _tell(path: str) -> None:
+    line = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM)
+    line.setblocking(False)
+    step, start = Controller.step, Executor.start
+    before: dict[str, list[float]] = {}
+
+    def say(text: str) -> None:
+        with contextlib.suppress(OSError):  # nobody listens, or too slowly: the loop must not wait
+            line.sendto(text.encode(), path)
+
+    def stepped(controller: Controller, now_s: float, *seen: Sequence[float] | None) -> Tick:
+        tick = step(controller, now_s, *seen)
+        name = threading.current_thread().name.removesuffix("-loop")
+        moved = max(
+            map(abs, (new - old for new, old in zip(tick.position_rad, before.get(name, []), strict=False))),
+            default=0.0,
+        )
+        before[name] = tick.position_rad
+        say(
+            f"period {name} {time.monotonic() * 1000:.3f} {tick.mode} {moved:.9f} {tick.epoch} {tick.setpoint_sequence}"
+        )
+        return tick
+
+    def started(executor: Executor, command: Command, order: Any) -> None:
+        say(f"begun {command.device} {command.id}")
+        start(executor, command, order)
+
+    Controller.step = stepped  # type: ignore[method-assign,assignment]
+    Executor.start = started  # type: ignore[method-assign,assignment]
+
+
+def _set_clock_by_signals() -> None:
+    ahead_s = 0.0
+    seconds, nanoseconds = time.time, time.time_ns
+
+    def jump(number: int, _frame: object) -> None:
+        nonlocal ahead_s
+        ahead_s += JUMP_S if number == signal.SIGUSR1 else -JUMP_S
+
+    time.time = lambda: seconds() + ahead_s
+    time.time_ns = lambda: nanoseconds() + round(ahead_s * 1e9)
+    signal.signal(signal.SIGUSR1, jump)
+    signal.signal(signal.SIGUSR2, jump)
+
+
+if __name__ == "__main__":
+    sys.exit(main(*sys.argv[1:]))

@@ -1,0 +1,81 @@
+"""What the bench's agent tells: each period of each control loop, and each action as it begins."""
+
+import contextlib
+import socket
+import threading
+from collections import Counter
+from pathlib import Path
+from typing import NamedTuple
+
+from tests.faults.judge import Row
+
+_NEWEST = 4000
+"""Half a minute of periods."""
+
+
+class Period(NamedTuple):
+    """One decision of a control loop.
+
+    Attributes:
+        at_ms: On the machine's monotonic clock, as everything of the bench.
+        moved_rad: How far the fastest joint was commanded to move in this period.
+    """
+
+    at_ms: float
+    mode: str
+    moved_rad: float
+    epoch: int
+    sequence: int
+
+
+class Noted:
+    """Listens until it is closed.
+
+    Attributes:
+        begun: Action → how often it has begun; once is right.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self.begun: Counter[str] = Counter()
+        self._periods: dict[str, list[Period]] = {}
+        self._lock = threading.Lock()
+        self._line = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM)
+        self._line.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 1 << 20)
+        self._line.bind(str(path))
+        self._thread = threading.Thread(target=self._listen, daemon=True)
+        self._thread.start()
+
+    def _listen(self) -> None:
+        with contextlib.suppress(OSError):
+            while words := self._line.recv(400).decode().split():
+                with self._lock:
+                    self._take(words)
+
+    def _take(self, words: list[str]) -> None:
+        if words[0] == "begun":
+            self.begun[words[2]] += 1
+            return
+        _, name, at_ms, mode, moved, epoch, sequence = words
+        kept = self._periods.setdefault(name, [])
+        kept.append(Period(float(at_ms), mode, float(moved), int(epoch), int(sequence)))
+        if len(kept) > 2 * _NEWEST:
+            del kept[:_NEWEST]
+
+    def since(self, name: str, at_ms: float) -> list[Period]:
+        """Periods of one device from then on."""
+        with self._lock:
+            return [each for each in self._periods.get(name, ()) if each.at_ms >= at_ms]
+
+    def rows(self, name: str, since_ms: float) -> list[Row]:
+        """The same for a judge, who otherwise reads the simulation's record: one joint that has gone so far."""
+        gone_rad, rows = 0.0, []
+        for each in self.since(name, since_ms):
+            gone_rad += each.moved_rad
+            rows.append(Row(each.at_ms, (gone_rad,)))
+        return rows
+
+    def close(self) -> None:
+        """Listen no longer."""
+        self._line.shutdown(socket.SHUT_RDWR)
+        self._thread.join()
+        self._line.close()

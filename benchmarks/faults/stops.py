@@ -1,0 +1,114 @@
+"""Stop: from the operator's message to the first period that brakes, and to the first that commands no motion."""
+
+import contextlib
+import random
+import time
+from collections.abc import Callable
+from typing import Final, Self
+
+import msgspec
+
+from benchmarks.faults.ground import STREAMED, Ground
+from benchmarks.faults.hand import FULL, SLOW_RAD_S, Hand
+from benchmarks.faults.noted import Period
+from device_agent.protocol import codec
+from device_agent.protocol.messages import Stop
+from tests.faults.stack import now_ms
+
+SPEEDS: Final = {"at rest": 0.0, f"{SLOW_RAD_S} rad/s": SLOW_RAD_S, "full speed": FULL}
+MESSAGE: Final = "MQTT message"
+CALL: Final = "POST stop"
+_STILL_RAD: Final = 1e-9
+_RESTS_WITHIN_S: Final = 2.0
+_FULL_S: Final = 0.35
+"""What the arm takes to its full speed, and well before it turns."""
+_PERIODS_S: Final = 0.008
+
+
+class Stopped(msgspec.Struct, frozen=True, kw_only=True):
+    """One Stop. Times from just before it was sent [ms]."""
+
+    broker: str
+    way: str
+    speed: str
+    at_rad_s: float
+    braking_ms: float
+    zero_ms: float
+
+
+class Stops:
+    """Makes them, over a link without proxies. ``with`` closes what it has opened."""
+
+    def __init__(self, ground: Ground, *, seed: int) -> None:
+        self._ground = ground
+        self._chance = random.Random(seed)
+        self._stack = contextlib.ExitStack()
+        self._line = self._stack.enter_context(ground.issued({"purpose": "watch"}))
+        self._number = 0
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._stack.close()
+
+    def make(self, way: str, speed: str) -> Stopped:
+        """One of them, in motion as it is asked for, and its reset."""
+        send = self._send if way == MESSAGE else self._call
+        with Hand(self._ground, SPEEDS[speed]) as hand:
+            hand.await_motion()
+            time.sleep((_FULL_S if speed == "full speed" else 0.1) + self._chance.uniform(0, 3 * _PERIODS_S))
+            sent_ms = now_ms()
+            send()
+            periods = self._until_rest(sent_ms)
+        before = [each for each in self._ground.noted.since(STREAMED, sent_ms - 30) if each.at_ms <= sent_ms]
+        answer = self._ground.owner.post(f"{self._ground.device(STREAMED)}/stop/reset")
+        answer.raise_for_status()
+        return judged(before, periods, sent_ms=sent_ms, broker=self._ground.kind, way=way, speed=speed)
+
+    def _until_rest(self, sent_ms: float) -> list[Period]:
+        deadline_s = time.monotonic() + _RESTS_WITHIN_S
+        while time.monotonic() < deadline_s:
+            periods = self._ground.noted.since(STREAMED, sent_ms)
+            last = periods[-2:]
+            if len(last) > 1 and all(each.mode == "stopped" and each.moved_rad <= _STILL_RAD for each in last):
+                return periods
+            time.sleep(0.02)
+        raise TimeoutError("a Stop did not stop the arm")
+
+    def _send(self) -> None:
+        self._number += 1
+        stop = Stop(id=f"bench{self._number}", by="bench")
+        self._line.client.publish(f"{self._ground.topic(STREAMED)}/stop", codec.encode(stop), 1)
+
+    def _call(self) -> None:
+        self._ground.post(f"{self._ground.device(STREAMED)}/stop", reason="bench")
+
+
+def judged(
+    before: list[Period], periods: list[Period], *, sent_ms: float, broker: str, way: str, speed: str
+) -> Stopped:
+    """From the last periods before it was sent, and those after until rest."""
+    braking = next(each for each in periods if each.mode == "stopped")
+    moving = [each for each in periods if each.at_ms >= braking.at_ms and each.moved_rad > _STILL_RAD]
+    after_ms = moving[-1].at_ms if moving else 0.0
+    zero = next(each for each in periods if each.at_ms >= max(after_ms + 1e-6, braking.at_ms))
+    return Stopped(
+        broker=broker,
+        way=way,
+        speed=speed,
+        at_rad_s=round(max((each.moved_rad for each in before), default=0.0) / _PERIODS_S, 3),
+        braking_ms=round(braking.at_ms - sent_ms, 3),
+        zero_ms=round(zero.at_ms - sent_ms, 3),
+    )
+
+
+def series(stops: Stops, each: int, say: Callable[[str], None]) -> list[Stopped]:
+    """So many of each speed and way, in turns."""
+    found: list[Stopped] = []
+    for number in range(each):
+        for speed in SPEEDS:
+            found += [stops.make(way, speed) for way in (MESSAGE, CALL)]
+        if number % 10 == 9:  # noqa: PLR2004 (now and then)
+            say(f"{len(found)} Stops")
+    return found

@@ -1,0 +1,189 @@
+"""What is broken while arms move: how long until they rest, how long until all works again, and what is lost."""
+
+import math
+from collections.abc import Callable, Iterable
+from typing import Final
+
+from benchmarks.faults.ground import start
+from benchmarks.faults.orders import Orders, doubled, lost
+from benchmarks.faults.rounds import Found, Rounds
+from benchmarks.faults.stops import CALL, MESSAGE, SPEEDS, Stopped, Stops, series
+from benchmarks.report import Cell, Chart, Claim, Report, Table, percentile
+from device_agent.protocol import robot_type
+from tests.support.brokers import BROKERS, ROOT
+
+_STOP_MOST_MS: Final = 10.0
+_WATCHDOG_MOST_MS: Final = 350.0
+_RECOVERY_MOST_S: Final = 10.0
+_ROUNDS: Final = 2
+_STOPS: Final = 20
+_QUICK_STOPS: Final = 5
+_RECORD: Final = "all orders, by the record"
+_FULL_RAD_S: Final = 1.1
+"""What streaming allows an arm; see the record."""
+_RAMP_S: Final = 0.01
+"""In which braking reaches its full deceleration (`runtime/motion.py`)."""
+_WORDS: Final = dict(zip(SPEEDS, ("at rest", "at 0.1 rad/s", "at full speed of 1.1 rad/s"), strict=True))
+_ABOUT: Final = """Two simulated UR5 behind one agent; operators, agent, functions, worker and broker are processes
+of their own, the agent's link and each operator's go through proxies that do the damage. One arm is streamed to and
+fro at up to 1.1 rad/s, the other is given one order after the other over HTTP, each with the same idempotency key
+until it is answered. Something breaks, is mended, and then control is taken again."""
+_FAULTS_NOTE: Final = """*Stop*: from the last setpoint that reached the agent to the first line of the simulation's
+record (every 10 ms) from which on the arm is commanded to stand still; where its link is cut or the broker killed,
+of which the agent is told, from the cut; where functions are killed, from the end of the lease; with a full disk,
+which ends the record, by the periods of the control loop. Where the fault stops nobody (delay, loss, clock, disk,
+messages out of order), the operator dies while it lasts, or stops streaming. With the agent ends its simulation.
+*Recovery*: from mending (a start, where something was killed; the cut itself, where a link is only cut or
+forgotten) until a new lease moves the arm **and** a new order is done on the other; the bench itself looks for 0.6
+s first whether anything moves that must not. *Lost*: accepted orders without an end. *Doubled*: orders that began
+twice in the agent, or that the record shows done again, and setpoints applied after newer ones. A full disk is a
+limit of 0 bytes on what the agent's files may grow."""
+_STOP_NOTE: Final = """From just before the operator's publish, or call, to a period of the control loop ({period:g}
+ms), on one clock; the link has no proxy. *Braking*: the first period that is decided under the Stop. *Zero*: the
+first that commands no motion. Between them lies the braking ramp, which the arm's limits make: at most {braking:g}
+rad/s², reached within {ramp:g} ms; from 1.1 rad/s that is {least:.0f} ms at least, so at speed no Stop can be
+within 10 ms."""
+
+
+def run(*, quick: bool, say: Callable[[str], None]) -> Report:
+    """Both brokers; a quick run breaks half of the things over the one, the others over the other."""
+    found: list[Found] = []
+    stops: list[Stopped] = []
+    orders: dict[tuple[str, str], tuple[int, int, int]] = {}
+    for number, kind in enumerate(BROKERS):
+        say(f"{kind}: starting")
+        with start(kind) as ground:
+            with Orders(ground) as given:
+                rounds = Rounds(ground, given, seed=number)
+                chosen = rounds.names[number::2] if quick else rounds.names * _ROUNDS
+                for fault in chosen:
+                    found.append(rounds.round(fault))
+                    say(_told(found[-1]))
+            given.settle()
+            again = rounds.wrist_went_back()
+            rounds.close()
+            for fault in {each.fault for each in given.given}:
+                mine = [each for each in given.given if each.fault == fault]
+                accepted = sum(bool(each.action) for each in mine)
+                orders[kind, fault] = accepted, len(lost(mine)), len(doubled(mine, ground.noted.begun))
+            orders[kind, _RECORD] = 0, 0, again
+            ground.restart_agent_without_proxies()
+            with Stops(ground, seed=number) as made:
+                stops += series(made, _QUICK_STOPS if quick else _STOPS, say)
+    report = Report(suite="faults", title="Faults", about=[_ABOUT], quick=quick)
+    report.tables = [faults_table(found, orders), stops_table(stops)]
+    report.charts = [_chart(stops)]
+    report.claims = claims(found, stops, orders)
+    return report
+
+
+def _told(found: Found) -> str:
+    stop = "" if found.stop_ms is None else f"rest after {found.stop_ms:.0f} ms, "
+    return f"{found.broker}: {found.fault}: {stop}recovered in {found.recovery_s:.1f} s"
+
+
+Counted = dict[tuple[str, str], tuple[int, int, int]]
+"""Broker and fault → orders that were accepted, lost, doubled."""
+
+
+def faults_table(found: list[Found], orders: Counted) -> Table:
+    """A row for each fault and broker."""
+    columns = ["fault", "broker", "rounds", "stop ms: most", "recovery s: most", "orders", "lost", "doubled"]
+    rows: list[list[Cell]] = []
+    for fault in dict.fromkeys(each.fault for each in found):
+        for kind in BROKERS:
+            mine = [each for each in found if (each.fault, each.broker) == (fault, kind)]
+            if not mine:
+                continue
+            stop = max((each.stop_ms for each in mine if each.stop_ms is not None), default=None)
+            accepted, gone, twice = orders.get((kind, fault), (0, 0, 0))
+            recovery = max(each.recovery_s for each in mine)
+            twice += sum(each.undone for each in mine)
+            rows.append([fault, kind, len(mine), stop, recovery, accepted, gone, twice])
+    records = [(kind, orders[kind, _RECORD]) for kind in BROKERS if (kind, _RECORD) in orders]
+    rows += [[_RECORD, kind, None, None, None, None, None, again] for kind, (_, _, again) in records]
+    return Table(title="What breaks", columns=columns, rows=rows, note=_FAULTS_NOTE)
+
+
+def _select(stops: Iterable[Stopped], **wanted: str) -> list[Stopped]:
+    return [each for each in stops if all(getattr(each, name) == value for name, value in wanted.items())]
+
+
+def stops_table(stops: list[Stopped]) -> Table:
+    """A row for each speed, way and broker."""
+    columns = [
+        "arm", "way", "broker", "n", "at rad/s", "braking ms: p50", "p99", "most", "zero ms: p50", "p99", "most"
+    ]  # fmt: skip
+    rows: list[list[Cell]] = []
+    for speed in SPEEDS:
+        for way in (MESSAGE, CALL):
+            for kind in BROKERS:
+                mine = _select(stops, speed=speed, way=way, broker=kind)
+                if not mine:
+                    continue
+                row: list[Cell] = [speed, way, kind, len(mine), percentile([each.at_rad_s for each in mine], 0.5)]
+                for taken in ([each.braking_ms for each in mine], [each.zero_ms for each in mine]):
+                    row += [percentile(taken, share) for share in (0.5, 0.99, 1.0)]
+                rows.append(row)
+    return Table(title="Stop", columns=columns, rows=rows, note=_note())
+
+
+def _note() -> str:
+    """With the arm's own limits: a trapezoid of deceleration takes its plateau's time and one ramp."""
+    arm = robot_type.load(ROOT / "robots" / "ur5")
+    least_s = _FULL_RAD_S / arm.braking_rad_s2 + _RAMP_S
+    return _STOP_NOTE.format(
+        period=arm.period_ms, braking=arm.braking_rad_s2, ramp=_RAMP_S * 1000, least=least_s * 1000
+    )
+
+
+def _chart(stops: list[Stopped]) -> Chart:
+    series: dict[str, list[float | None]] = {"braking begins, all": [each.braking_ms for each in stops]}
+    for speed in SPEEDS:
+        series[f"zero, {speed}"] = [each.zero_ms for each in _select(stops, speed=speed)]
+    return Chart(
+        title="From Stop to braking, and to zero commanded velocity", kind="cdf", x_label="ms",
+        y_label="share of Stops", x=[], series=series,
+    )  # fmt: skip
+
+
+def claims(found: list[Found], stops: list[Stopped], orders: Counted) -> list[Claim]:
+    """What is promised."""
+    made: list[Claim] = []
+    for way in (MESSAGE, CALL):
+        mine = _select(stops, way=way)
+        braking = percentile([each.braking_ms for each in mine], 0.99)
+        text = f"Stop by {way} → braking begins, p99 of {len(mine)}"
+        made.append(Claim(text=text, seen=braking, bound=_STOP_MOST_MS, unit="ms"))
+    for speed in SPEEDS:
+        zero = [each.zero_ms for each in _select(stops, way=MESSAGE, speed=speed)]
+        text = f"Stop by {MESSAGE} → zero commanded velocity, arm {_WORDS[speed]}, p99 of {len(zero)}"
+        made.append(Claim(text=text, seen=percentile(zero, 0.99), bound=_STOP_MOST_MS, unit="ms"))
+    rest = [math.inf if each.moved_again else each.stop_ms for each in found if each.stop_ms is not None]
+    slowest = max(found, key=lambda each: each.recovery_s)
+    accepted = sum(each[0] for each in orders.values())
+    undone = sum(each.undone for each in found)
+    return [
+        *made,
+        Claim(
+            text=f"last fresh setpoint → zero commanded velocity, and rest until a new lease, most of {len(rest)}",
+            seen=max(rest),
+            bound=_WATCHDOG_MOST_MS,
+            unit="ms",
+        ),
+        Claim(
+            text=f"recovery after each fault, slowest: {slowest.fault} over {slowest.broker}",
+            seen=slowest.recovery_s,
+            bound=_RECOVERY_MOST_S,
+            unit="s",
+        ),
+        Claim(
+            text=f"lost, of {accepted} orders", seen=sum(each[1] for each in orders.values()), bound=0, unit="orders"
+        ),
+        Claim(
+            text="doubled: orders done twice, setpoints applied after newer ones",
+            seen=sum(each[2] for each in orders.values()) + undone,
+            bound=0,
+            unit="times",
+        ),
+    ]

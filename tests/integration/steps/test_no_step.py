@@ -1,0 +1,268 @@
+"""No connection holds a small message back for the 40 ms of a delayed acknowledgement (TCP_NODELAY missing).
+
+Before each end stands a proxy that acknowledges as late as a kernel may. Two small messages go one after the other:
+with Nagle's algorithm the second cannot come before the first is acknowledged, so no pair is ever quick. A busy machine
+can slow any pair down, but not all of them. What a browser sends is Chromium's business, which always sets TCP_NODELAY.
+"""
+
+import contextlib
+import http.client
+import os
+import socket
+import threading
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from device_agent.protocol import topics
+from tests.support.brokers import BROKERS, HOST, TRANSPORTS, BrokerKind, Client, Transport, wait_until
+from tests.support.ground import Ground, Link, start_ground
+from tests.support.hosts.host import environment_of, start_program
+from tests.support.proxy import Proxy, start_proxy
+from tests.support.xmpp import DOMAIN, ProsodyEnd, free_port
+
+PAIRS = 40
+APART_S = 0.003
+"""So that who sends does not put both into one packet."""
+QUICK_MS = 30.0
+"""A delayed acknowledgement takes 36 ms at least: 40, and kernels count in steps of 4."""
+QUICK_SHARE = 0.25
+BAND_MS = 10.0
+SPIKE_SHARE = 0.2
+
+Send = Callable[[bytes], object]
+
+
+@pytest.fixture(scope="module")
+def grounds(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Callable[[Any], Ground]]:
+    running: dict[str, Ground] = {}
+    with contextlib.ExitStack() as stack:
+
+        def start(kind: Any) -> Ground:
+            if kind not in running:
+                running[kind] = stack.enter_context(start_ground(kind, tmp_path_factory.mktemp(kind)))
+            return running[kind]
+
+        yield start
+
+
+@pytest.fixture(params=BROKERS)
+def ground(request: pytest.FixtureRequest, grounds: Callable[[Any], Ground]) -> Ground:
+    return grounds(request.param)
+
+
+@pytest.fixture(scope="module")
+def xmpp_ground(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Ground]:
+    folder, port = tmp_path_factory.mktemp("xmpp"), free_port()
+    settings = {"TELESCOPE_XMPP_DOMAIN": DOMAIN, "TELESCOPE_XMPP_HOST": HOST, "TELESCOPE_XMPP_PORT": str(port)}
+    with start_ground("mosquitto", folder, settings) as ground:
+        end = ProsodyEnd(folder / "prosody", f"{ground.url}/api/v1/xmpp/verify", port, ground.stack)
+        ground.endpoints["xmpp"] = end
+        environment = environment_of({**ground.environment, "TELESCOPE_PORT": str(ground.endpoints["server"].port)})
+        ground.stack.enter_context(start_program(["-m", "function_app", "xmpp"], environment))
+        yield ground
+
+
+def gaps_ms(proxy: Proxy, send: Send, *, from_server: bool) -> list[float]:
+    """From the arrival of the first message of each pair to that of the second."""
+    proxy.acknowledge_late()
+    found = []
+    for number in range(PAIRS):
+        marks = [b"first-%d." % number, b"second-%d." % number]
+        send(b'{"mark": "%s"}' % marks[0])
+        time.sleep(APART_S)
+        send(b'{"mark": "%s"}' % marks[1])
+        first_s, second_s = (arrival_s(proxy, mark, from_server=from_server) for mark in marks)
+        found.append((second_s - first_s) * 1000)
+    return found
+
+
+def arrival_s(proxy: Proxy, mark: bytes, *, from_server: bool) -> float:
+    found: list[float] = []
+
+    def came() -> bool:
+        found[:] = [at_s for at_s, back, content in proxy.arrivals if back is from_server and mark in content]
+        return bool(found)
+
+    wait_until(came, f"{mark!r} to arrive")
+    return found[0]
+
+
+def stepped(gaps: list[float]) -> bool:
+    """Whether hardly any pair is quick, or a fifth and more of them are heaped up where such a step is."""
+
+    def share(low_ms: float, high_ms: float) -> float:
+        return sum(low_ms <= each < high_ms for each in gaps) / len(gaps)
+
+    heap, before, behind = (share(begin, begin + BAND_MS) for begin in (36.0, 36.0 - BAND_MS, 36.0 + BAND_MS))
+    return share(0, QUICK_MS) < QUICK_SHARE or heap - max(before, behind) > SPIKE_SHARE
+
+
+# ------------------------------------------------------------ the measure
+
+
+@pytest.mark.parametrize("at_once", [False, True], ids=["Nagle", "TCP_NODELAY"])
+def test_the_measure_tells_a_step_from_none(at_once: bool) -> None:
+    with socket.create_server((HOST, 0)) as listener, start_proxy(listener.getsockname()[1]) as proxy:
+        threading.Thread(target=swallow, args=(listener,), daemon=True).start()
+        with socket.create_connection((HOST, proxy.port)) as opened:
+            opened.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, at_once)
+            gaps = gaps_ms(proxy, opened.sendall, from_server=False)
+    assert stepped(gaps) is not at_once, gaps
+
+
+def swallow(listener: socket.socket) -> None:
+    accepted, _ = listener.accept()
+    with accepted:
+        while accepted.recv(4096):
+            pass
+
+
+def test_a_heap_among_quick_pairs_is_a_step_and_a_slow_machine_is_none() -> None:
+    assert stepped([1.0] * 30 + [41.0] * 10)
+    assert not stepped([float(each) for each in range(1, 80, 2)])
+
+
+@contextlib.contextmanager
+def client(ground: Ground, name: str, *, publish: str = "#", subscribe: str = "#", **options: Any) -> Iterator[Client]:
+    """A connected client with these rights, behind the port in ``options`` if there is one."""
+    broker, functions = ground.broker.now, ground.cloud.functions
+    login = ground.cloud.run(functions.access.issue(broker.grant(name, publish=(publish,), subscribe=(subscribe,))))
+    port = options.pop("port", 0) or broker.port(options.get("transport", "tcp"))
+    with Client(name, login, port=port, **options).open() as found:
+        assert found.connected.is_set(), found.answer
+        yield found
+
+
+# ------------------------------------------------------------ MQTT
+
+
+def test_what_an_agent_publishes(ground: Ground) -> None:
+    with Link(ground, {}, through="broker").start() as link:
+        link.up()
+        assert link.proxy is not None
+        topic = link.topic(topics.TELE, "joints")
+        gaps = gaps_ms(link.proxy, lambda mark: link.transport.publish(topic, mark, qos=0), from_server=False)
+    assert not stepped(gaps), gaps
+
+
+def test_what_the_broker_tells_an_agent(ground: Ground) -> None:
+    with Link(ground, {}, through="broker").start() as link, client(ground, "operator") as operator:
+        link.up()
+        assert link.proxy is not None
+        topic = f"{link.topic(topics.CTL)}/1"
+        wait_until(lambda: operator.publish(topic, b"{}", qos=0) and link.received, "the way to be open")
+        gaps = gaps_ms(link.proxy, lambda mark: operator.publish(topic, mark, qos=0), from_server=True)
+    assert not stepped(gaps), gaps
+
+
+@pytest.mark.parametrize("transport", TRANSPORTS)
+def test_what_the_broker_tells_an_operator(ground: Ground, transport: Transport) -> None:
+    topic = "ts/v1/lab/robot/arm/tele/joints"
+    with (
+        start_proxy(ground.broker.now.port(transport)) as proxy,
+        client(ground, "page", subscribe=topic, port=proxy.port, transport=transport) as page,
+        client(ground, "robot", publish=topic) as robot,
+    ):
+        page.subscribe(topic, qos=0)
+        gaps = gaps_ms(proxy, lambda mark: robot.publish(topic, mark, qos=0), from_server=True)
+    assert not stepped(gaps), gaps
+
+
+@pytest.mark.parametrize("transport", TRANSPORTS)
+def test_what_an_operator_sends_comes_through_the_broker(ground: Ground, transport: Transport) -> None:
+    """The client is a test's own, as a program of an operator may be; what the broker does with it is ours."""
+    topic = "ts/v1/lab/robot/arm/ctl/1"
+    with (
+        start_proxy(ground.broker.now.tcp_port) as proxy,
+        client(ground, "robot", subscribe=topic, port=proxy.port) as robot,
+        client(ground, "page", publish=topic, transport=transport) as page,
+    ):
+        robot.subscribe(topic, qos=0)
+        gaps = gaps_ms(proxy, lambda mark: page.publish(topic, mark, qos=0), from_server=True)
+    assert not stepped(gaps), gaps
+
+
+def test_the_functions_send_to_the_broker_at_once(ground: Ground) -> None:
+    """Their messages are acknowledged one by one, which hides a step; so their sockets are asked."""
+    ground.keep("ts/v1/lab/robot/arm/state", b"{}")
+    asked = at_once(ground.broker.port)
+    assert asked
+    assert all(asked), asked
+
+
+def at_once(port: int) -> list[bool]:
+    """Of this process's connections to a port, whether each sets TCP_NODELAY."""
+    found = []
+    for entry in Path("/proc/self/fd").iterdir():
+        with contextlib.suppress(OSError):  # no socket, not connected, or closed meanwhile
+            if not str(entry.readlink()).startswith("socket:"):
+                continue
+            with socket.socket(fileno=os.dup(int(entry.name))) as opened:
+                if opened.family == socket.AF_INET and opened.getpeername()[1] == port:
+                    found.append(opened.getsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY) != 0)
+    return found
+
+
+# ------------------------------------------------------------ HTTP
+
+
+def test_what_the_functions_answer_over_http(grounds: Callable[[BrokerKind], Ground]) -> None:
+    """Head and body of an answer are two writes."""
+    with start_proxy(grounds("amqtt").endpoints["server"].port) as proxy:
+        proxy.acknowledge_late()
+        asked = http.client.HTTPConnection(HOST, proxy.port, timeout=60)
+        gaps = []
+        for _ in range(PAIRS):
+            proxy.arrivals.clear()
+            asked.request("GET", "/api/v1/health")
+            assert asked.getresponse().read()
+            came_s = [at_s for at_s, back, _ in proxy.arrivals if back]
+            gaps.append((came_s[-1] - came_s[0]) * 1000)
+        asked.close()
+    assert not stepped(gaps), gaps
+
+
+def test_what_an_agent_tells_over_http(grounds: Callable[[BrokerKind], Ground]) -> None:
+    """Head and body of a request are two writes."""
+    with Link(grounds("amqtt"), {"transport": "http"}, through="server").start() as link:
+        link.up()
+        assert link.proxy is not None
+        link.proxy.acknowledge_late()
+        gaps = []
+        for number in range(PAIRS):
+            mark = b"body-%d." % number
+            link.transport.publish(link.topic(topics.EVENT), b'{"mark": "%s"}' % mark, qos=1)
+            body_s = arrival_s(link.proxy, mark, from_server=False)
+            heads_s = [at_s for at_s, back, content in link.proxy.arrivals if not back and content.startswith(b"POST ")]
+            gaps.append((body_s - max(at_s for at_s in heads_s if at_s <= body_s)) * 1000)
+    assert not stepped(gaps), gaps
+
+
+# ------------------------------------------------------------ XMPP
+
+
+def test_what_an_agent_says_over_xmpp(xmpp_ground: Ground) -> None:
+    with Link(xmpp_ground, {"transport": "xmpp"}, through="xmpp").start() as link:
+        link.up()
+        assert link.proxy is not None
+        topic = link.topic(topics.TELE, "joints")
+        gaps = gaps_ms(link.proxy, lambda mark: link.transport.publish(topic, mark, qos=0), from_server=False)
+    assert not stepped(gaps), gaps
+
+
+def test_what_the_xmpp_server_tells_an_agent(xmpp_ground: Ground) -> None:
+    """By way of the broker and of the program that speaks for the cloud."""
+    with (
+        Link(xmpp_ground, {"transport": "xmpp"}, through="xmpp").start() as link,
+        client(xmpp_ground, "op") as operator,
+    ):
+        link.up()
+        assert link.proxy is not None
+        topic = f"{link.topic(topics.CTL)}/1"
+        wait_until(lambda: operator.publish(topic, b"{}", qos=0) and link.received, "the way to be open")
+        gaps = gaps_ms(link.proxy, lambda mark: operator.publish(topic, mark, qos=0), from_server=True)
+    assert not stepped(gaps), gaps
