@@ -8,12 +8,12 @@ from typing import Any
 import httpx
 
 from benchmarks.faults.noted import Noted
-from benchmarks.faults.weather import Weather
 from benchmarks.stand import Line, rights
 from function_app import settings
 from tests.faults.stack import Stack
 from tests.support.brokers import BrokerKind
 from tests.support.cloud import Cloud
+from tests.support.delay import start_delay
 from tests.support.proxy import Proxy
 from tests.support.site import sign_in_link
 
@@ -23,11 +23,11 @@ _WATCHDOG_S = 0.3
 
 
 class Ground(Stack):
-    """As ``Stack``; the agent's link goes through weather as well.
+    """As ``Stack``; the agent's link goes through a network as well (`tests.support.delay`).
 
     Attributes:
         noted: What the agent tells of its periods.
-        weather: Between the agent's link and the broker.
+        network: Between the agent's link and the broker.
         owner: HTTP of somebody who has signed in, for what an API key may not do.
     """
 
@@ -50,9 +50,8 @@ class Ground(Stack):
         self.cloud = self._closing.enter_context(Cloud(settings.read(self._environment)))
 
     def _proxy(self, behind: int, heard: Callable[[bytes], None]) -> Proxy:
-        self.weather = Weather(behind)
-        self._closing.callback(self.weather.end)
-        return super()._proxy(self.weather.port, heard)
+        self.network = self._closing.enter_context(start_delay(behind, rtt_ms=0))
+        return super()._proxy(self.network.ports[behind], heard)
 
     def device(self, name: str) -> str:
         """The path of a device's routes."""

@@ -37,7 +37,7 @@ _SHUFFLED: Final = "all sent twice, out of order"
 _AGENT_KILLED: Final = "agent killed"
 _DISK_FULL: Final = "agent's disk full"
 _TRIES: Final = 8
-_DELAY_S: Final = 0.05
+_RTT_MS: Final = 100.0
 _LOSS: Final = 0.02
 _RECOVERS_S: Final = 60.0
 _LOOK_MS: Final = 400.0
@@ -73,8 +73,8 @@ class Rounds(Bench):
         self.arms = [self.arm]
         self._mended_ms = 0.0
         self._faults: dict[str, tuple[Callable[[], object], Callable[[], object]]] = {
-            "100 ms of round trip": (lambda: self._weather(delay_s=_DELAY_S), self._weather),
-            "2 % lost, sent again after 200 ms": (lambda: self._weather(loss=_LOSS), self._weather),
+            "100 ms of round trip": (lambda: self._network(rtt_ms=_RTT_MS), self._network),
+            "2 % lost, sent again after 200 ms": (lambda: self._network(loss=_LOSS), self._network),
             "agent's clock an hour ahead": (lambda: self._clock(signal.SIGUSR1), lambda: self._clock(signal.SIGUSR2)),
             "agent's clock an hour back": (lambda: self._clock(signal.SIGUSR2), lambda: self._clock(signal.SIGUSR1)),
             _DISK_FULL: (lambda: self._disk(full=True), lambda: self._disk(full=False)),
@@ -211,8 +211,8 @@ class Rounds(Bench):
 
     # ------------------------------------------------------------ what does the damage
 
-    def _weather(self, *, delay_s: float = 0.0, loss: float = 0.0) -> None:
-        self.ground.weather.delay_s, self.ground.weather.loss = delay_s, loss
+    def _network(self, *, rtt_ms: float = 0.0, loss: float = 0.0) -> None:
+        self.ground.network.set(rtt_ms=rtt_ms, loss=loss)
 
     def _clock(self, number: int) -> None:
         """Only the agent's own process knows the signal."""

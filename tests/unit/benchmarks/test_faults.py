@@ -1,17 +1,11 @@
-"""What the fault bench makes of records: orders lost and doubled, the way from Stop to rest; and its weather."""
+"""What the fault bench makes of records: orders lost and doubled, the way from Stop to rest."""
 
 import socket
-import threading
-import time
-from collections.abc import Iterator
-
-import pytest
 
 from benchmarks.faults.noted import Noted, Period
 from benchmarks.faults.orders import STEP_RAD, Order, doubled, lost, went_back
 from benchmarks.faults.rounds import Found
 from benchmarks.faults.stops import CALL, MESSAGE, SPEEDS, Stopped, judged
-from benchmarks.faults.weather import STALL_S, Weather
 from benchmarks.suites.faults import claims, faults_table, stops_table
 from tests.support.brokers import wait_until
 
@@ -93,34 +87,3 @@ def test_the_agent_is_heard(tmp_path) -> None:
     assert noted.since("arm0", 11.0) == [Period(18.5, "stopped", 0.002, 3, 7)]
     assert [row.target_rad for row in noted.rows("arm0", 0.0)] == [(0.001,), (0.003,)]
     noted.close()
-
-
-@pytest.fixture
-def echo() -> Iterator[int]:
-    with socket.create_server(("127.0.0.1", 0)) as listener:
-
-        def answer() -> None:
-            accepted, _ = listener.accept()
-            with accepted:
-                while content := accepted.recv(4096):
-                    accepted.sendall(content)
-
-        threading.Thread(target=answer, daemon=True).start()
-        yield listener.getsockname()[1]
-
-
-def test_weather_delays_and_loses_and_keeps_the_order(echo: int) -> None:
-    weather = Weather(echo)
-    weather.delay_s = 0.05
-    with socket.create_connection(("127.0.0.1", weather.port)) as line:
-        began_s = time.monotonic()
-        line.sendall(b"1")
-        assert line.recv(1) == b"1"
-        assert time.monotonic() - began_s >= 0.1
-        weather.delay_s, weather.loss = 0.0, 1.0
-        began_s = time.monotonic()
-        for each in b"abc":
-            line.sendall(bytes([each]))
-        assert b"".join(line.recv(1) for _ in range(3)) == b"abc"
-        assert time.monotonic() - began_s >= 2 * STALL_S
-    weather.end()
