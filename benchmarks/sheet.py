@@ -238,7 +238,7 @@ def _money(facts: Known, size: float) -> Iterator[str]:
     yield ""
     yield "The price of the first billion messages is taken for all of them: those after are cheaper, so this is the most. Left out: that a state kept by the broker"
     yield "counts twice, pages that watch, the functions' time and calls, storage, traffic. AWS takes pings every 30 s for nothing; an"
-    yield "agent pings every 5 s, and what that costs is not in the source."
+    yield "agent pings every 4 s, and what that costs is not in the source."
     yield ""
     answers = assumed["answers_a_command"]["value"]
     yield "### A million commands"

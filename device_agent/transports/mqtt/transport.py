@@ -21,7 +21,7 @@ from device_agent.protocol import codec, topics
 from device_agent.protocol.messages import Presence
 from device_agent.transports.back_off import BackOff
 
-KEEP_ALIVE_S = 5
+KEEP_ALIVE_S = 4
 """A dead peer is noticed after two of these at most; at rest it costs one ping."""
 NOTICED_WITHIN_S = 2.0 * KEEP_ALIVE_S
 _CONNECT_TIMEOUT_S = 5.0
