@@ -258,7 +258,13 @@ one agent, which wants more than one of the cores; in whole runs. Over mosquitto
 
 
 def claims(far: Found) -> Iterator[Claim]:
-    """Of each robot's action, and of the slowest robot's stored movement."""
+    """Of each robot's action, and of the slowest robot's setpoint and stored movement."""
+    yield Claim(
+        text=f"a setpoint → first simulated motion, median, both sides {RTT_MS} ms from the cloud, slowest robot",
+        seen=max(_median(far[robot.label, SETPOINT, RTT_MS]) for robot in ROBOTS),
+        bound=MOST_MS,
+        unit="ms",
+    )
     for robot in ROBOTS:
         yield Claim(
             text=f"{robot.label}: action → first simulated motion, median, both sides {RTT_MS} ms from the cloud",

@@ -240,6 +240,7 @@ class Device:
             elif topic.kind == topics.STOP:
                 stop = codec.decode(payload, Stop)
                 self._controller.stop(StopLatch(by=stop.by, reason=stop.reason, at_ms=wall_ms()))
+                self._hurry()
                 _log.warning("%s: stopped by %s", self.name, stop.by)
             elif topic.kind == topics.CMD:
                 self._office.put(payload)

@@ -130,7 +130,7 @@ class ControlLoop:
         Not twice running, so that a flood of setpoints makes no more than twice the periods.
         """
         pause_s = max(0.0, self._next_s - time.monotonic())
-        if self._early or self._controller.moving or self._trouble:
+        if self._early or self._controller.moving:
             time.sleep(pause_s)
             return False
         return self._asked.wait(pause_s)
@@ -154,6 +154,8 @@ class ControlLoop:
         except Exception as error:  # noqa: BLE001 (whatever it is: hold until the driver answers)
             _log.exception("%s: control loop", self._name)
             self._trouble = f"internal error: {error}"
+        if self._trouble:
+            self._asked.set()  # for the loop's own thread, which sees to it
         self._early = early
         # Late periods are dropped, never made up for: a burst of commands would be a jump.
         begun_s = now_s if early else max(self._next_s, time.monotonic() - 2 * self._period_s)

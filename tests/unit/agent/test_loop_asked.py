@@ -4,14 +4,17 @@ import threading
 import time
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
+from pathlib import Path
 
 import pytest
 
 from device_agent.ports.driver import Observation
-from device_agent.protocol.messages import JointTarget, JointTelemetry, Mode, Setpoint
+from device_agent.protocol import codec, topics
+from device_agent.protocol.messages import JointTarget, JointTelemetry, Mode, Setpoint, Stop
 from device_agent.runtime.controller import Controller
 from device_agent.runtime.lease import LeaseGate
 from device_agent.runtime.loop import ControlLoop
+from tests.support.bench import Bench
 from tests.support.brokers import SILENCE_S, wait_until
 from tests.support.toys import ToyDriver, robot_type
 
@@ -143,6 +146,22 @@ def test_what_goes_wrong_in_a_setpoints_own_period_is_a_fault_until_the_driver_a
         wait_until(lambda: desk.controller.fault == "no", "the fault")
     finally:
         desk.loop.stop()
+
+
+@pytest.mark.parametrize("driver", [ToyDriver, PromptDriver])
+def test_a_stop_of_a_device_at_rest_waits_for_no_period(tmp_path: Path, driver: type[ToyDriver]) -> None:
+    bench = Bench(tmp_path, driver=driver(), kind=robot_type(period_ms=LONG_MS))
+    bench.device.start()
+    try:
+        loop = bench.device._loop
+        assert isinstance(loop, ControlLoop)
+        wait_until(lambda: loop._next_s > time.monotonic() + LONG_MS / 2000, "the first period")
+        bench.device.receive(
+            topics.Topic("s", "a", "arm", topics.STOP), codec.encode(Stop(id="s", by="ann", reason=""))
+        )
+        wait_until(lambda: bench.device._controller.mode is Mode.STOPPED, "the period that obeys")
+    finally:
+        bench.stop()
 
 
 def test_in_motion_periods_keep_their_length() -> None:

@@ -58,6 +58,6 @@ def test_fig_5_claims_every_robot_far_away_and_no_laboratory() -> None:
             found[robot.label, what, 0] = [figure5.Sample(1.0, 2.0)]
         found[f"{robot.label}, {figure5.LABORATORY}", figure5.ACTION, figure5.RTT_MS] = [figure5.Sample(500.0, 500.0)]
     figure5.show(report, found)
-    assert [claim.seen for claim in report.claims] == [24.0] * 4 + [60.0]
-    assert [claim.holds for claim in report.claims] == [True] * 4 + [False]
+    assert [claim.seen for claim in report.claims] == [24.0] * 5 + [60.0]
+    assert [claim.holds for claim in report.claims] == [True] * 5 + [False]
     assert report.charts[0].series[figure5.SCRIPT] == [24.0, 60.0, 24.0, 24.0]
