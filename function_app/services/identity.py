@@ -104,18 +104,25 @@ class Identify:
     async def _find(self, token: str, audience: Audience) -> _Known:
         now_ms = self._clock.now_ms()
         known = self._known.get((audience, token))
-        if known is None:
+        if known is None or not self._fresh(known, now_ms):
+            # In full, and not for sign-outs alone: its key may have leaked, and counts no more.
             known = await self._verify(token, audience)
-            self._known[audience, token] = known
-            if len(self._known) > KNOWN_TOKENS:
-                self._known.popitem(last=False)
+            self._remember((audience, token), known)
         if now_ms >= known.expires_ms:
             self._known.pop((audience, token), None)
             raise unauthorized("The access token has expired. Sign in again.")
-        if now_ms - known.checked_ms >= RECHECK_MS or now_ms < known.checked_ms:
-            # In full, and not for sign-outs alone: its key may have leaked, and counts no more.
-            known = self._known[audience, token] = await self._verify(token, audience)
         return known
+
+    def _remember(self, name: tuple[str, str], known: _Known) -> None:
+        """Keep what was checked just now, and nothing that would have to be checked again in any case."""
+        self._known[name] = known
+        self._known.move_to_end(name)
+        while len(self._known) > KNOWN_TOKENS or not self._fresh(next(iter(self._known.values())), known.checked_ms):
+            self._known.popitem(last=False)
+
+    @staticmethod
+    def _fresh(known: _Known, now_ms: int) -> bool:
+        return 0 <= now_ms - known.checked_ms < RECHECK_MS
 
     async def sign_out(self, who: Identity) -> None:
         """End the session: its tokens are refused from now on, by other instances within ``RECHECK_MS``."""
