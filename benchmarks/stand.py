@@ -118,7 +118,8 @@ class Line:
 
     def __exit__(self, *_: object) -> None:
         self.client.disconnect()
-        self.client.loop_stop()
+        with contextlib.suppress(AttributeError):  # paho's thread may end by itself, and be gone, just then
+            self.client.loop_stop()
 
 
 class _Seen(msgspec.Struct):

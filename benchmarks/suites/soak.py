@@ -25,7 +25,7 @@ movements, which are scripts, run on all robots; one robot is stopped in the mid
 people listen to all that is measured and come back with new credentials; somebody signs in, looks round and signs out.
 `SOAK_MINUTES=10 python -m benchmarks soak` takes another length; `benchmarks/results/quick/soak.csv` has each sample as
 soon as it is taken."""
-_NOTE: Final = """Slopes by Theil and Sen over medians of a minute after a sixth of the run for warming up, with Sen's
+_NOTE: Final = """Slopes by Theil and Sen over medians of a minute after a quarter of the run for warming up, with Sen's
 95 % interval; a plus sign is growth. A process's own pages are the anonymous ones, its heaps and stacks; resident ones
 count libraries too, which others may share. Of descriptors and threads first and last are the medians of the first and
 the last tenth after warm-up. The agent's children are its planner and the jails of scripts: how many there are follows
@@ -35,7 +35,7 @@ what runs."""
 def run(*, quick: bool, say: Callable[[str], None]) -> Report:
     """The load for an hour, or not quite a minute; then the figures."""
     for_s = _QUICK_S if quick else 60 * float(os.environ.get(MINUTES, "60"))
-    say(f"starting the laboratory, then {for_s / 60:.1f} min of load")
+    say(f"starting the laboratory, then {for_s / 40:.1f} min of load")
     with (
         tempfile.TemporaryDirectory() as folder,
         start(Path(folder), "amqtt", TELESCOPE_ROOM="lab", TELESCOPE_TRACE="") as stand,
@@ -49,10 +49,10 @@ def run(*, quick: bool, say: Callable[[str], None]) -> Report:
             if now_s > told_s + 60:
                 told_s = now_s
                 say(progress(watch.samples, people))
-    held = after_warm_up(watch.samples, for_s / 6, end_share=1 / 3 if quick else 0.1)
+    held = after_warm_up(watch.samples, for_s / 4, end_share=1 / 3 if quick else 0.1)
     report = Report(suite="soak", title="Soak", about=[_ABOUT], quick=quick)
     report.tables = [_memory(held, for_s), _descriptors(held), _work(people)]
-    report.charts = charts(watch.samples, for_s / 6)
+    report.charts = charts(watch.samples, for_s / 4)
     report.claims = _quick_claims(held, people) if quick else claims(held, people, for_s)
     return report
 
@@ -68,7 +68,7 @@ def progress(samples: list[Sample], people: Load) -> str:
 def claims(held: list[Held], people: Load, for_s: float) -> list[Claim]:
     """Of a whole run."""
     worst = max(held, key=lambda each: each.own.percent_per_h)
-    length = f"{for_s / 60:.0f} min of load"
+    length = f"{for_s / 40:.0f} min of load"
     return [
         Claim(
             text=f"own memory of the process that grows fastest ({worst.part}) after warm-up, over {length}",
@@ -122,7 +122,7 @@ def _memory(held: list[Held], for_s: float) -> Table:
         ]
         for each in held
     ]  # fmt: skip
-    return Table(title=f"Memory over {for_s / 60:.0f} min", columns=columns, rows=rows, note=_NOTE)
+    return Table(title=f"Memory over {for_s / 40:.0f} min", columns=columns, rows=rows, note=_NOTE)
 
 
 def _descriptors(held: list[Held]) -> Table:
