@@ -103,14 +103,18 @@ class ControlLoop:
 
     def hurry(self) -> None:
         """Something is asked of a device: while it rests its period begins now, here if the driver is ``Prompt``."""
-        if self._prompt and not self._early and not self._controller.moving and self._turn.acquire(blocking=False):
+        if self._prompt and self._turn.acquire(blocking=False):
             try:
-                if self._thread.is_alive() and not self._stopping.is_set() and not self._trouble:
+                if self._free() and self._thread.is_alive() and not self._stopping.is_set():
                     self._period(early=True)
                     return
             finally:
                 self._turn.release()
         self._asked.set()
+
+    def _free(self) -> bool:
+        """Whether a period may begin early. Not twice running: in motion each carries a period's way."""
+        return not (self._early or self._trouble or self._controller.moving)
 
     def _run(self) -> None:
         self._next_s = time.monotonic()
@@ -121,14 +125,13 @@ class ControlLoop:
                     return
                 if self._trouble:
                     self._fail()
-                elif early or time.monotonic() >= self._next_s:  # else a setpoint has just had a period of its own
-                    self._period(early=early)
+                elif time.monotonic() >= self._next_s:
+                    self._period(early=False)
+                elif early and self._free():  # else somebody has just had a period of their own
+                    self._period(early=True)
 
     def _wait(self) -> bool:
-        """Sleep until the next period, or until a setpoint for a device at rest; whether one came.
-
-        Not twice running, so that a flood of setpoints makes no more than twice the periods.
-        """
+        """Sleep until the next period, or until something is asked of a device at rest; whether it was."""
         pause_s = max(0.0, self._next_s - time.monotonic())
         if self._early or self._controller.moving:
             time.sleep(pause_s)

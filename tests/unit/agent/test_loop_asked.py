@@ -5,6 +5,7 @@ import time
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -124,6 +125,42 @@ def test_a_period_that_does_not_end_keeps_nobody_from_stopping() -> None:
     with desk.loop._turn:
         desk.loop.stop()
     assert desk.loop._stopping.is_set()
+
+
+def test_of_two_that_hurry_at_once_one_begins_a_period() -> None:
+    """The other finds out when it has the turn, not before; so does the loop's own thread."""
+    driver = PromptDriver()
+    desk = Desk(driver)
+    desk.start()
+    real = desk.loop._turn
+
+    class Turn:
+        """Whoever takes it finds that somebody else was quicker."""
+
+        def acquire(self, **how: Any) -> bool:
+            taken = real.acquire(**how)
+            desk.loop._early = True
+            return taken
+
+        def release(self) -> None:
+            real.release()
+
+        def __enter__(self) -> None:
+            self.acquire()
+
+        def __exit__(self, *_: object) -> None:
+            self.release()
+
+    try:
+        wait_until(lambda: desk.loop._next_s > time.monotonic() + LONG_MS / 2000, "the first period")
+        desk.loop._turn = Turn()  # type: ignore[assignment]
+        commanded = len(driver.threads)
+        desk.ask(0.5)
+        time.sleep(SILENCE_S)
+        assert len(driver.threads) == commanded
+    finally:
+        desk.loop._turn = real
+        desk.loop.stop()
 
 
 def test_what_goes_wrong_in_a_setpoints_own_period_is_a_fault_until_the_driver_answers() -> None:
