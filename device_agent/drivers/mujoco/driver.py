@@ -140,8 +140,7 @@ class MujocoDriver:
             DriverError: Not connected, the simulation has stopped, or a joint is stuck; the text says why.
         """
         snapshot = self._live()
-        if not 0 <= snapshot.time_s - self._noted_s < _NOTED_EVERY_S:
-            self._note(snapshot)
+        self._note(snapshot)
         return Observation(
             position_rad=tuple(snapshot.qpos[self._qpos].tolist()),
             velocity_rad_s=tuple(snapshot.qvel[self._dof].tolist()),
@@ -204,6 +203,8 @@ class MujocoDriver:
         Raises:
             DriverError: A joint is stuck.
         """
+        if 0 <= snapshot.time_s - self._noted_s < _NOTED_EVERY_S:
+            return
         effort, velocity = snapshot.effort[self._dof], snapshot.qvel[self._dof]
         elapsed_s = min(max(0.0, snapshot.time_s - self._noted_s), _LOOKED_S)
         self._noted_s = snapshot.time_s

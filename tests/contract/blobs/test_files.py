@@ -14,6 +14,7 @@ from fastapi import FastAPI, Response
 from function_app.adapters.local.blobs import FileBlobs
 from function_app.domain.problems import Problem
 from function_app.entrypoints.http import transfers
+from function_app.entrypoints.http.routing import PREFIX
 from function_app.ports.blobs import Blobs
 from function_app.ports.tables import StoreError
 from tests.contract.blobs.suite import NAMES, Again, BlobsSuite, Direct
@@ -56,7 +57,7 @@ async def direct(tmp_path: Path) -> AsyncIterator[Direct]:
         return f"{head}/{'.'.join(parts)}"
 
     listener = socket.create_server(("127.0.0.1", 0))
-    blobs._url = f"http://127.0.0.1:{listener.getsockname()[1]}/blobs"
+    blobs._url = f"http://127.0.0.1:{listener.getsockname()[1]}{PREFIX}/blobs"
     server = uvicorn.Server(uvicorn.Config(app, log_level="warning", lifespan="off"))
     serving = asyncio.create_task(server.serve(sockets=[listener]))
     async with httpx.AsyncClient() as client:
