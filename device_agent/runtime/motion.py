@@ -118,8 +118,8 @@ class Motion:
     ) -> None:
         """Head for ``target_rad``, shape (n,) [rad], already inside the joints' ranges.
 
-        What still brakes harder than it may speed up goes on braking: with ordinary jerk it would take so long to
-        leave that deceleration that it ran backwards. What is on a way comes to rest on it first.
+        What still brakes harder than with ordinary jerk it could leave off goes on braking: it would run backwards.
+        What is on a way comes to rest on it first.
 
         Args:
             target_rad: Where to come to rest.
@@ -134,10 +134,7 @@ class Motion:
         if self._ride is not None:
             self.brake()
             return
-        if any(
-            abs(now) > limit + _SAME_RAD_S2
-            for now, limit in zip(self._input.current_acceleration, self._acceleration_limits, strict=True)
-        ):
+        if self.braking and self._would_turn():
             return
         self.braking = False
         self._input.control_interface = ControlInterface.Position
@@ -151,6 +148,20 @@ class Motion:
         self._input.target_position = self._heading()
         self._input.target_velocity = self._zeros
         self._input.target_acceleration = self._zeros
+
+    def _would_turn(self) -> bool:
+        """Whether a joint, with ordinary jerk, would run backwards before it has left its deceleration."""
+        return any(
+            abs(now) > limit + _SAME_RAD_S2
+            or (now * velocity <= 0 and now * now > 2 * jerk * abs(velocity) + _SAME_RAD_S2)
+            for now, limit, jerk, velocity in zip(
+                self._input.current_acceleration,
+                self._acceleration_limits,
+                self._jerk_limits,
+                self.velocity_rad_s,
+                strict=True,
+            )
+        )
 
     def ride(self, way: Way, *, share: float) -> None:
         """Go along a way that begins where the device rests.
@@ -244,8 +255,11 @@ class Motion:
         ahead = [self._plan.at_time(self._plan.duration * (index + 1) / knots)[0] for index in range(knots)]
         return [list(self.position_rad), list(self._output.new_position), *(list(knot) for knot in ahead)]
 
-    def update(self) -> list[float]:
-        """Advance one period, as proposed if it was.
+    def update(self, passed_s: float | None = None) -> list[float]:
+        """Advance one period, as proposed if it was; or by what has passed of one, of which nothing was proposed.
+
+        Args:
+            passed_s: Since the last period began, where this one comes early [s].
 
         Returns:
             The position to command now, shape (n,) [rad].
@@ -254,11 +268,15 @@ class Motion:
             MotionError: The generator found no trajectory; position and velocity are as they were.
         """
         if self._ride is not None:
-            return self._update_ride(self._ride)
+            return self._update_ride(self._ride, passed_s)
         if not self._zeros:
             return self.position_rad
         if not self._proposed:
-            plan(self._generator.update, self._input, self._output)
+            self._generator.delta_time = passed_s or self._period_s
+            try:
+                plan(self._generator.update, self._input, self._output)
+            finally:
+                self._generator.delta_time = self._period_s
         self._proposed = False
         self._output.pass_to_input(self._input)
         before = self.position_rad
@@ -269,8 +287,8 @@ class Motion:
         self._hold_together(before)
         return self.position_rad
 
-    def _update_ride(self, ride: Ride) -> list[float]:
-        ride.update()
+    def _update_ride(self, ride: Ride, passed_s: float | None) -> list[float]:
+        ride.update(passed_s)
         before = self.position_rad
         self.position_rad, self.velocity_rad_s = ride.position_rad.tolist(), ride.velocity_rad_s.tolist()
         self._hold_together(before)
