@@ -63,12 +63,13 @@ class BaseMotion:
         """Come to rest as fast as the robot type allows, and stay there."""
         self._aim(REST, self._braking, _BRAKING_RAMP_S)
 
-    def update(self) -> Twist:
-        """Advance one period.
+    def update(self, passed_s: float | None = None) -> Twist:
+        """Advance one period, or by what has passed of one [s].
 
         Raises:
             MotionError: The generator found no way; the twist is as it was.
         """
+        self._generator.delta_time = passed_s or self._period_s
         plan(self._generator.update, self._input, self._output)
         self._output.pass_to_input(self._input)
         self.twist = Twist(*self._output.new_velocity)

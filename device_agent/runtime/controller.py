@@ -268,6 +268,11 @@ class Controller:
         return self._authority.latch
 
     @property
+    def stops(self) -> bool:
+        """Whether a Stop is latched that no period has obeyed yet."""
+        return self._authority.latch is not None and self._pilot.mode not in {Mode.STOPPED, Mode.FAULT}
+
+    @property
     def fault(self) -> str | None:
         """What is wrong with the driver."""
         return self._authority.fault
@@ -317,15 +322,16 @@ class Controller:
 
     # ------------------------------------------------------------ the control loop
 
-    def step(self, now_s: float, measured_rad: Sequence[float] | None = None) -> Tick:
+    def step(self, now_s: float, measured_rad: Sequence[float] | None = None, *, passed_s: float | None = None) -> Tick:
         """Decide this period's command.
 
         Args:
             now_s: Monotonic clock [s].
             measured_rad: Where the joints are, shape (n,); limp ones are commanded there, others are to arrive there.
+            passed_s: Since the last period began, where a Stop makes this one come early [s].
         """
         with self._lock:
-            return self._pilot.step(now_s, measured_rad)
+            return self._pilot.step(now_s, measured_rad, passed_s=passed_s)
 
     def _fence(self, epoch: int) -> None:
         if self._authority.fence(epoch):

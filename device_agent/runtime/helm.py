@@ -128,15 +128,15 @@ class Helm:
             return None
         return self._envelope.blocked(self.motion.propose())
 
-    def update(self) -> None:
-        """Advance one period.
+    def update(self, passed_s: float | None = None) -> None:
+        """Advance one period, or by what has passed of one [s].
 
         Raises:
             MotionError: No way to go on.
         """
-        self.motion.update()
+        self.motion.update(passed_s)
         if self.base is not None:
-            self.base.update()
+            self.base.update(passed_s)
 
     def settle(self, limited: tuple[str, ...], *, measured_rad: Sequence[float] | None, soft: Collection[int]) -> None:
         """See whether the course has come to its end.

@@ -1,7 +1,7 @@
 """The control loop of one device: observe, decide, command, every ``period_ms``. The only writer of motor commands.
 
 While the device rests, a setpoint or a move does not wait for the next period: its own begins when it comes. In motion
-periods keep their length, for each carries one period's way.
+periods keep their length, for each carries one period's way; but for a Stop's, which brakes for as long as has passed.
 """
 
 import contextlib
@@ -27,6 +27,8 @@ _STREAMING_GAP_S = 0.03
 would only stand in the way of the next one's."""
 _RECONNECT_EVERY_S = 1.0
 _REST_WITHIN_S = 1.0
+_LEAST_S = 1e-4
+"""What has passed at least since a period when a Stop begins the next: of nothing ``ruckig`` plans nothing."""
 _log = logging.getLogger(__name__)
 
 
@@ -102,8 +104,12 @@ class ControlLoop:
             self._thread.join(timeout=2)
 
     def hurry(self) -> None:
-        """Something is asked of a device: while it rests its period begins now, here if the driver is ``Prompt``."""
-        if self._prompt and self._turn.acquire(blocking=False):
+        """Something is asked of a device: while it rests its period begins now, here if the driver is ``Prompt``.
+
+        So does a Stop's while it moves, where the driver is ``Prompt``; else a Stop waits for the period that comes.
+        """
+        # A period that runs may have decided before the Stop was there.
+        if self._prompt and self._turn.acquire(timeout=self._period_s if self._controller.stops else 0):
             try:
                 if self._free() and self._thread.is_alive() and not self._stopping.is_set():
                     self._period(early=True)
@@ -114,7 +120,7 @@ class ControlLoop:
 
     def _free(self) -> bool:
         """Whether a period may begin early. Not twice running: in motion each carries a period's way."""
-        return not (self._early or self._trouble or self._controller.moving)
+        return not (self._early or self._trouble) and (self._controller.stops or not self._controller.moving)
 
     def _run(self) -> None:
         self._next_s = time.monotonic()
@@ -146,7 +152,8 @@ class ControlLoop:
             # What rests is where the period before has seen it.
             seen = self.seen = self.seen if early and self.seen is not None else self._driver.observe()
             self._watch(now_s)
-            tick = self._controller.step(now_s, seen.position_rad)
+            passed_s = self._passed_s(now_s) if early and self._controller.moving else None
+            tick = self._controller.step(now_s, seen.position_rad, passed_s=passed_s)
             applied = self._driver.send(tick.position_rad)
             self._controller.applied(applied)
             if self._base is not None:
@@ -163,6 +170,10 @@ class ControlLoop:
         # Late periods are dropped, never made up for: a burst of commands would be a jump.
         begun_s = now_s if early else max(self._next_s, time.monotonic() - 2 * self._period_s)
         self._next_s = begun_s + self._period_s
+
+    def _passed_s(self, now_s: float) -> float:
+        """Of the period that would end next [s]."""
+        return min(max(now_s - (self._next_s - self._period_s), _LEAST_S), self._period_s)
 
     def _fail(self) -> None:
         _log.error("%s: %s", self._name, self._trouble)

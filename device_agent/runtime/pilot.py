@@ -86,12 +86,13 @@ class Pilot:
         self._driver_limits: tuple[str, ...] = ()
         self._base_limits: tuple[str, ...] = ()
 
-    def step(self, now_s: float, measured_rad: Sequence[float] | None = None) -> Tick:
+    def step(self, now_s: float, measured_rad: Sequence[float] | None = None, *, passed_s: float | None = None) -> Tick:
         """Decide this period's command.
 
         Args:
             now_s: Monotonic clock [s].
             measured_rad: Where the joints are, shape (n,); limp ones are commanded there, others are to arrive there.
+            passed_s: Since the last period began, where a Stop makes this one come early [s].
         """
         if measured_rad is not None:
             self._motion.loosen(self.slack.feel(measured_rad))
@@ -103,7 +104,7 @@ class Pilot:
             obstacle = self.helm.look(late_s)
             if obstacle is not None:
                 self._block(obstacle)
-            self.helm.update()
+            self.helm.update(passed_s)
         except MotionError as error:
             self.authority.end(Refused("fault", str(error)))
             self.mode = Mode.HOLDING

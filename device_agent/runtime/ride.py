@@ -72,16 +72,16 @@ class Ride:
 
     def propose(self) -> list[list[float]]:
         """Where it is, where it would be a period on, then places as far as it could need to come to rest."""
-        self._next = time_s, share, _ = self._step()
+        self._next = time_s, share, _ = self._step(self._period_s)
         fastest = float(np.max(np.abs(self.way.at(time_s)[1]), initial=0.0)) * share
         ahead_s = share * _SLACK * (fastest / float(np.min(self._hard)) + self._period_s)
         knots = max(1, math.ceil(ahead_s / _KNOT_S))
         places = [time_s, *(time_s + ahead_s * (index + 1) / knots for index in range(knots))]
         return [self.position_rad.tolist(), *(self.way.at(place)[0].tolist() for place in places)]
 
-    def update(self) -> None:
-        """Advance one period, as proposed if it was."""
-        self._time_s, self._share, self._change = self._next or self._step()
+    def update(self, passed_s: float | None = None) -> None:
+        """Advance one period, as proposed if it was; or by what has passed of one [s]."""
+        self._time_s, self._share, self._change = self._next or self._step(passed_s or self._period_s)
         self._next = None
         position, velocity, _ = self.way.at(self._time_s)
         self.position_rad, self.velocity_rad_s = position, velocity * max(self._share, 0.0)
@@ -92,19 +92,19 @@ class Ride:
         self._share, self._next = max(0.0, self._share + least * lost_s), None
         self.velocity_rad_s = self.way.at(self._time_s)[1] * self._share
 
-    def _step(self) -> tuple[float, float, float]:
-        """Time on the way, share and its change a period on."""
+    def _step(self, passed_s: float) -> tuple[float, float, float]:
+        """Time on the way, share and its change so much later."""
         now = max(self._share, 0.0)
         if self._braking:
-            change = max(self._changes(self._hard)[0], -now / self._period_s)
+            change = max(self._changes(self._hard)[0], -now / passed_s)
         else:
             least, most = self._changes(self._easy)
             speed = np.maximum(np.abs(self.way.at(self._time_s)[1]), _NOTHING)
-            ramp = self._period_s * float(np.min(self._jerk / speed))
+            ramp = passed_s * float(np.min(self._jerk / speed))
             wanted = min(max((self._aim - now) / _EASE_S, self._change - ramp), self._change + ramp)
             change = min(max(wanted, least), most)
-        share = min(max(now + change * self._period_s, 0.0), max(now, self._aim))
-        return self._time_s + (now + share) / 2 * self._period_s, share, change
+        share = min(max(now + change * passed_s, 0.0), max(now, self._aim))
+        return self._time_s + (now + share) / 2 * passed_s, share, change
 
     def _changes(self, limit: Floats) -> tuple[float, float]:
         """How fast the share may fall and rise so that no joint exceeds an acceleration [1/s]."""

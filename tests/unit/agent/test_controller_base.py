@@ -152,3 +152,18 @@ def test_an_action_may_end_while_it_drives() -> None:
     rig.controller.end_action(tenure)
     assert twists(rig, 0.3)[-1] == pytest.approx(REST, abs=1e-6)
     assert drive.outcome is Outcome.INTERRUPTED
+
+
+def test_two_parts_of_a_period_brake_a_base_as_much_as_a_whole_one() -> None:
+    ends = []
+    for parts in ((None,), (PERIOD_S / 4, 3 * PERIOD_S / 4)):
+        motion = BaseMotion(BASE, PERIOD_S)
+        for _ in range(100):
+            motion.follow(Twist(0.3, 0.0, 0.0))
+            motion.update()
+        motion.brake()
+        for part in parts:
+            motion.update(part)
+        ends.append(tuple(motion.twist))
+    assert ends[0] == pytest.approx(ends[1])
+    assert 0 < ends[0][0] < 0.3

@@ -83,11 +83,11 @@ class Chance:
         self.tenure: Tenure | None = None
         self.may_move_until_s = -1.0
         self.position = [0.0, 0.0]
-        self.velocity = [0.0, 0.0]
+        self.velocity, self.passed_s = [0.0, 0.0], PERIOD_S
         self.twist = REST
         self.unmoved_since_s = 0.0
         self.rest_from_s = 0.0
-        self.unasked = 0
+        self.unasked_s = 0.0
         self.burned = 0
         self.slowed_for, self.share = 0, 1.0
         self.restrictions: dict[str, float] = {}
@@ -203,6 +203,8 @@ class Chance:
     def stop(self) -> None:
         self.controller.stop(StopLatch(by="bob", reason="", at_ms=1))
         self.taken_away()
+        if self.random.random() < 0.7:
+            self.tick(self.random.uniform(0.02, 1.0) * PERIOD_S)
 
     def reset(self) -> None:
         self.epoch += 1
@@ -249,20 +251,21 @@ class Chance:
 
     # ------------------------------------------------------------ what must hold
 
-    def tick(self) -> None:
-        self.now_s += PERIOD_S
-        tick = self.controller.step(self.now_s)
+    def tick(self, passed_s: float = PERIOD_S) -> None:
+        self.now_s += passed_s
+        tick = self.controller.step(self.now_s, passed_s=None if passed_s == PERIOD_S else passed_s)
+        between_s, self.passed_s = (self.passed_s + passed_s) / 2, passed_s
         faster = False
         self.slowed_for = self.slowed_for + 1 if self.speed() == self.share else 0
         self.share = self.speed()
         for index, (was, now) in enumerate(zip(self.position, tick.position_rad, strict=True)):
-            velocity = (now - was) / PERIOD_S
+            velocity = (now - was) / passed_s
             gain = abs(velocity) - abs(self.velocity[index])
             turned = velocity * self.velocity[index] < 0
             assert -RANGE - 1e-9 <= now <= RANGE + 1e-9
             assert abs(velocity) <= MAX_SPEED + 1e-6
             limit = MAX_ACCELERATION if gain > 0 and not turned else BRAKING
-            assert abs(velocity - self.velocity[index]) / PERIOD_S <= limit + 1e-3
+            assert abs(velocity - self.velocity[index]) / between_s <= limit + 1e-3
             faster |= gain > 1e-6
             if gain > 1e-6 and self.slowed_for > JERK_PERIODS:
                 assert abs(velocity) <= self.speed() * MAX_SPEED + 1e-6, "faster than the room allows"
@@ -270,12 +273,12 @@ class Chance:
         self.position = tick.position_rad
         if self.shape is not None:
             assert self.shape.clearance(self.position).room_m >= -CLIPPED
-        faster |= self.base(tick.twist)
+        faster |= self.base(tick.twist, passed_s)
         allowed = self.tenure is not None or self.now_s <= self.may_move_until_s + 1e-9
         # What speeds up when the hold begins does so for four milliseconds more: the brakes have a ramp.
         asked = allowed and tick.mode in {Mode.STREAMING, Mode.ACTION}
-        self.unasked = 0 if asked else self.unasked + 1
-        assert self.unasked <= 2 or not faster, "it moves by itself"
+        self.unasked_s = 0.0 if asked else self.unasked_s + passed_s
+        assert self.unasked_s <= 2 * PERIOD_S + 1e-9 or not faster, "it moves by itself"
         moving = max(map(abs, self.velocity)) > 1e-6 or any(abs(part) > 1e-6 for part in tick.twist)
         if asked:
             self.unmoved_since_s = self.now_s
@@ -287,13 +290,13 @@ class Chance:
         if self.tenure is None and self.now_s > self.may_move_until_s + PERIOD_S and tick.mode is Mode.STREAMING:
             pytest.fail("setpoints that stopped coming are followed no more after 300 ms")
 
-    def base(self, twist: Twist) -> bool:
+    def base(self, twist: Twist, passed_s: float) -> bool:
         """What holds for the base; whether any part of its twist grows."""
         faster = False
         for was, now, limit, easy, hard in zip(self.twist, twist, LIMITS, EASY, HARD, strict=True):
             gain = abs(now) - abs(was)
             assert abs(now) <= limit + 1e-6
-            assert abs(now - was) / PERIOD_S <= (easy if gain > 0 and now * was >= 0 else hard) + 1e-3
+            assert abs(now - was) / passed_s <= (easy if gain > 0 and now * was >= 0 else hard) + 1e-3
             faster |= gain > 1e-6
             if gain > 1e-6 and self.slowed_for > JERK_PERIODS:
                 assert abs(now) <= self.speed() * limit + 1e-6, "faster than the room allows"

@@ -11,7 +11,7 @@ import pytest
 
 from device_agent.ports.driver import Observation
 from device_agent.protocol import codec, topics
-from device_agent.protocol.messages import JointTarget, JointTelemetry, Mode, Setpoint, Stop
+from device_agent.protocol.messages import JointTarget, JointTelemetry, Mode, Setpoint, Stop, StopLatch
 from device_agent.runtime.controller import Controller
 from device_agent.runtime.lease import LeaseGate
 from device_agent.runtime.loop import ControlLoop
@@ -213,6 +213,56 @@ def test_in_motion_periods_keep_their_length() -> None:
     desk.ask(0.6)
     assert not desk.loop._wait()
     assert desk.driver.position[1] == 0.0, "no period has been run"
+
+
+def moving(period_ms: int, periods: int = 20) -> Desk:
+    """A desk whose arm moves and whose loop's thread is held back, as between two periods."""
+    desk = Desk(PromptDriver(), period_ms=period_ms)
+    desk.controller.start_at((0.0, 0.0))
+    desk.loop._thread = threading.current_thread()
+    now_s = time.monotonic()
+    desk.controller.grant(epoch=1, holder="ann", lease_s=1000, now_s=now_s)
+    desk.loop._early = True
+    desk.ask(2.5)
+    for _ in range(periods):
+        desk.loop._period(early=False)
+    assert desk.controller.mode is Mode.STREAMING
+    assert desk.controller.moving
+    return desk
+
+
+def test_a_stop_in_motion_brakes_at_once_and_by_no_more_than_has_passed() -> None:
+    desk = moving(period_ms=4)
+    assert isinstance(desk.driver, PromptDriver)
+    before_rad, speed_rad_s = desk.driver.position[1], desk.controller._motion.velocity_rad_s[1]
+    commanded = len(desk.driver.threads)
+    desk.loop._next_s = time.monotonic() + 0.004 - 0.001  # a quarter of the period has passed, or more
+    desk.controller.stop(StopLatch(by="bob", reason="", at_ms=1))
+    desk.loop.hurry()
+    assert desk.controller.mode is Mode.STOPPED
+    assert len(desk.driver.threads) == commanded + 1
+    assert 0 < desk.driver.position[1] - before_rad <= speed_rad_s * 0.004 + 1e-9
+    assert desk.controller.moving, "it brakes, it does not jump"
+    assert desk.loop._next_s > time.monotonic() - 1
+    desk.loop.hurry()
+    assert len(desk.driver.threads) == commanded + 1, "only once: then periods keep their length again"
+
+
+def test_what_has_passed_is_never_more_than_a_period_and_never_nothing() -> None:
+    desk = moving(period_ms=4)
+    desk.loop._next_s = 10.0
+    assert [desk.loop._passed_s(now_s) for now_s in (9.0, 9.996, 9.998, 10.0, 11.0)] == pytest.approx(
+        [0.0001, 0.0001, 0.002, 0.004, 0.004]
+    )
+
+
+def test_a_stop_waits_for_the_end_of_a_period_that_may_not_know_of_it() -> None:
+    desk = moving(period_ms=100, periods=3)
+    desk.controller.stop(StopLatch(by="bob", reason="", at_ms=1))
+    desk.loop._turn.acquire()
+    threading.Timer(0.05, desk.loop._turn.release).start()
+    desk.loop.hurry()
+    assert desk.controller.mode is Mode.STOPPED
 
 
 def test_telemetry_tells_of_a_new_setpoint_but_not_more_often_than_in_motion() -> None:
