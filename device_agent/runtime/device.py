@@ -173,6 +173,7 @@ class Device:
             journal=journal,
             cloud_clock=cloud_clock,
             keys=keys,
+            hurry=self._hurry,
             ailing=tuple if instrument is None else instrument.vigil.faults,
         )
 

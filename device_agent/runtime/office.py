@@ -59,6 +59,7 @@ class Office:
         journal: Open.
         cloud_clock: For ``ttl_ms``.
         keys: The cloud's keys, as far as they are pinned.
+        hurry: Called when a Stop has come: it waits for no control period.
         ailing: What is wrong with the device though its driver raises no error.
     """
 
@@ -73,6 +74,7 @@ class Office:
         journal: Journal,
         cloud_clock: CloudClock,
         keys: Pins,
+        hurry: Callable[[], None],
         ailing: Callable[[], tuple[Fault, ...]] = tuple,
     ) -> None:
         self._address = address
@@ -84,6 +86,7 @@ class Office:
         self._journal = journal
         self._cloud_clock = cloud_clock
         self._keys = keys
+        self._hurry = hurry
         self._ailing = ailing
         self._handover = Handover()
         self._twin: Twin | None = None
@@ -239,6 +242,7 @@ class Office:
                 self._controller.release(epoch=command.epoch)
             case StopDevice(reason=reason):
                 self._controller.stop(StopLatch(by=command.who, reason=reason, at_ms=wall_ms()))
+                self._hurry()
             case ResetStop():
                 latched = self._controller.latch is not None
                 self._controller.reset_stop(epoch=command.epoch)

@@ -131,15 +131,18 @@ class StopDevices:
     ) -> bool:
         """Tell it in both ways; the tables are written beside that, not before."""
         plain = asyncio.create_task(self._repeat(device, Stop(id=new_id(), by=who.name, reason=reason)))
-        writing = asyncio.create_task(self._write(who, device, reason, gate))
+        writing: asyncio.Task[None] | None = None
         try:
+            await asyncio.sleep(0)  # it goes before anything is signed or written
+            writing = asyncio.create_task(self._write(who, device, reason, gate))
             order = StopDevice(reason=reason)
             return await self._commands.confirmed(device, order, who=who.name, epoch=0, wait_ms=CONFIRM_MS)
         finally:
             plain.cancel()
             with contextlib.suppress(asyncio.CancelledError, BusUnavailable):
                 await plain
-            await writing
+            if writing is not None:
+                await writing
 
     async def _repeat(self, device: Device, stop: Stop) -> None:
         payload = codec.encode(stop)

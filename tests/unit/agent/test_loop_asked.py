@@ -2,7 +2,7 @@
 
 import threading
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -11,7 +11,7 @@ import pytest
 
 from device_agent.ports.driver import Observation
 from device_agent.protocol import codec, topics
-from device_agent.protocol.messages import JointTarget, JointTelemetry, Mode, Setpoint, Stop, StopLatch
+from device_agent.protocol.messages import JointTarget, JointTelemetry, Mode, Setpoint, Stop, StopDevice, StopLatch
 from device_agent.runtime.controller import Controller
 from device_agent.runtime.lease import LeaseGate
 from device_agent.runtime.loop import ControlLoop
@@ -185,17 +185,26 @@ def test_what_goes_wrong_in_a_setpoints_own_period_is_a_fault_until_the_driver_a
         desk.loop.stop()
 
 
+def plainly(bench: Bench) -> None:
+    bench.receive(topics.STOP, codec.encode(Stop(id="s", by="ann", reason="")))
+
+
+def signed(bench: Bench) -> None:
+    bench.command(StopDevice(reason=""))
+
+
+@pytest.mark.parametrize("stop", [plainly, signed])
 @pytest.mark.parametrize("driver", [ToyDriver, PromptDriver])
-def test_a_stop_of_a_device_at_rest_waits_for_no_period(tmp_path: Path, driver: type[ToyDriver]) -> None:
+def test_a_stop_of_a_device_at_rest_waits_for_no_period(
+    tmp_path: Path, driver: type[ToyDriver], stop: Callable[[Bench], object]
+) -> None:
     bench = Bench(tmp_path, driver=driver(), kind=robot_type(period_ms=LONG_MS))
     bench.device.start()
     try:
         loop = bench.device._loop
         assert isinstance(loop, ControlLoop)
         wait_until(lambda: loop._next_s > time.monotonic() + LONG_MS / 2000, "the first period")
-        bench.device.receive(
-            topics.Topic("s", "a", "arm", topics.STOP), codec.encode(Stop(id="s", by="ann", reason=""))
-        )
+        stop(bench)
         wait_until(lambda: bench.device._controller.mode is Mode.STOPPED, "the period that obeys")
     finally:
         bench.stop()
