@@ -19,6 +19,8 @@ SERIES: Final = QUICK / "soak.csv"
 """All samples, as they come: what a run that was killed has left."""
 _SLOPE_MOST: Final = 1.0
 _QUICK_S: Final = 48.0
+_WARM_UP: Final = 0.25
+"""Of the run: what fills once, caches and pools, has been filled then."""
 _ABOUT: Final = """The laboratory as `make up` starts it over amqtt: four robots and a room in one agent. Somebody
 streams setpoints to the arm under leases that they take, renew and give back, each time with new credentials;
 movements, which are scripts, run on all robots; one robot is stopped in the middle of every third, and released; two
@@ -35,7 +37,7 @@ what runs."""
 def run(*, quick: bool, say: Callable[[str], None]) -> Report:
     """The load for an hour, or not quite a minute; then the figures."""
     for_s = _QUICK_S if quick else 60 * float(os.environ.get(MINUTES, "60"))
-    say(f"starting the laboratory, then {for_s / 40:.1f} min of load")
+    say(f"starting the laboratory, then {for_s / 60:.1f} min of load")
     with (
         tempfile.TemporaryDirectory() as folder,
         start(Path(folder), "amqtt", TELESCOPE_ROOM="lab", TELESCOPE_TRACE="") as stand,
@@ -49,10 +51,10 @@ def run(*, quick: bool, say: Callable[[str], None]) -> Report:
             if now_s > told_s + 60:
                 told_s = now_s
                 say(progress(watch.samples, people))
-    held = after_warm_up(watch.samples, for_s / 4, end_share=1 / 3 if quick else 0.1)
+    held = after_warm_up(watch.samples, for_s * _WARM_UP, end_share=1 / 3 if quick else 0.1)
     report = Report(suite="soak", title="Soak", about=[_ABOUT], quick=quick)
     report.tables = [_memory(held, for_s), _descriptors(held), _work(people)]
-    report.charts = charts(watch.samples, for_s / 4)
+    report.charts = charts(watch.samples, for_s * _WARM_UP)
     report.claims = _quick_claims(held, people) if quick else claims(held, people, for_s)
     return report
 
@@ -68,7 +70,7 @@ def progress(samples: list[Sample], people: Load) -> str:
 def claims(held: list[Held], people: Load, for_s: float) -> list[Claim]:
     """Of a whole run."""
     worst = max(held, key=lambda each: each.own.percent_per_h)
-    length = f"{for_s / 40:.0f} min of load"
+    length = f"{for_s / 60:.0f} min of load"
     return [
         Claim(
             text=f"own memory of the process that grows fastest ({worst.part}) after warm-up, over {length}",
@@ -122,7 +124,7 @@ def _memory(held: list[Held], for_s: float) -> Table:
         ]
         for each in held
     ]  # fmt: skip
-    return Table(title=f"Memory over {for_s / 40:.0f} min", columns=columns, rows=rows, note=_NOTE)
+    return Table(title=f"Memory over {for_s / 60:.0f} min", columns=columns, rows=rows, note=_NOTE)
 
 
 def _descriptors(held: list[Held]) -> Table:
