@@ -65,12 +65,12 @@ def run_agent(report: Path, for_s: float, arguments: Sequence[str]) -> int:
     last: dict[str, float] = {}
     step = Controller.step
 
-    def timed(controller: Controller, now_s: float, *seen: Sequence[float] | None) -> Tick:
+    def timed(controller: Controller, *given: Any, **named: Any) -> Tick:
         name, at_s = threading.current_thread().name, time.monotonic()
         if name in last:
             gaps.setdefault(name, []).append(at_s - last[name])
         last[name] = at_s
-        return step(controller, now_s, *seen)
+        return step(controller, *given, **named)
 
     Controller.step = timed  # type: ignore[method-assign,assignment]
     loop.IDLE_RATE_HZ = TELEMETRY_HZ

@@ -204,8 +204,8 @@ def _tell_control(tell: Tell) -> None:
     decided: set[int] = set()
 
     def stepped(step: Any) -> Any:
-        def run(self: Controller, *given: Any) -> Any:
-            tick = step(self, *given)
+        def run(self: Controller, *given: Any, **named: Any) -> Any:
+            tick = step(self, *given, **named)
             if (seen := (tick.epoch, tick.setpoint_sequence)) != newest.get(id(self)):
                 newest[id(self)] = seen
                 decided.add(threading.get_ident())

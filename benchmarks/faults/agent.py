@@ -12,7 +12,6 @@ import socket
 import sys
 import threading
 import time
-from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -37,14 +36,18 @@ def _tell(path: str) -> None:
     line.setblocking(False)
     step, start = Controller.step, Executor.start
     before: dict[str, list[float]] = {}
+    names: dict[int, str] = {}
 
     def say(text: str) -> None:
         with contextlib.suppress(OSError):  # nobody listens, or too slowly: the loop must not wait
             line.sendto(text.encode(), path)
 
-    def stepped(controller: Controller, now_s: float, *seen: Sequence[float] | None) -> Tick:
-        tick = step(controller, now_s, *seen)
-        name = threading.current_thread().name.removesuffix("-loop")
+    def stepped(controller: Controller, *given: Any, **named: Any) -> Tick:
+        tick = step(controller, *given, **named)
+        thread = threading.current_thread().name
+        if thread.endswith("-loop"):  # who brings something may begin a period as well
+            names[id(controller)] = thread.removesuffix("-loop")
+        name = names.get(id(controller), "")
         moved = max(
             map(abs, (new - old for new, old in zip(tick.position_rad, before.get(name, []), strict=False))),
             default=0.0,

@@ -45,9 +45,9 @@ class Watcher:
         step, begin = Controller.step, loop.ControlLoop.__init__
         watcher = self
 
-        def watched(controller: Controller, now_s: float, *seen: Any) -> Any:
+        def watched(controller: Controller, *given: Any, **named: Any) -> Any:
             watcher.note(id(controller))
-            return step(controller, now_s, *seen)
+            return step(controller, *given, **named)
 
         def made(made_loop: Any, kind: Any, driver: Any, controller: Any, **more: Any) -> None:
             watcher.periods_s[id(controller)] = kind.period_ms / 1000
