@@ -119,8 +119,8 @@ class ControlLoop:
         self._asked.set()
 
     def _free(self) -> bool:
-        """Whether a period may begin early. Not twice running: in motion each carries a period's way."""
-        return not (self._early or self._trouble) and (self._controller.stops or not self._controller.moving)
+        """Whether a period may begin early: a Stop's always, others at rest and not twice running."""
+        return not self._trouble and (self._controller.stops or not (self._early or self._controller.moving))
 
     def _run(self) -> None:
         self._next_s = time.monotonic()

@@ -257,6 +257,14 @@ def test_a_stop_in_motion_brakes_at_once_and_by_no_more_than_has_passed() -> Non
     assert len(desk.driver.threads) == commanded + 1, "only once: then periods keep their length again"
 
 
+def test_a_stop_waits_for_no_period_after_a_setpoints_own_either() -> None:
+    desk = moving(period_ms=4)
+    desk.loop._early = True
+    desk.controller.stop(StopLatch(by="bob", reason="", at_ms=1))
+    desk.loop.hurry()
+    assert desk.controller.mode is Mode.STOPPED
+
+
 def test_what_has_passed_is_never_more_than_a_period_and_never_nothing() -> None:
     desk = moving(period_ms=4)
     desk.loop._next_s = 10.0
