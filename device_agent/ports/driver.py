@@ -88,8 +88,8 @@ class Driver(Protocol):
 class Prompt(Driver, Protocol):
     """A driver whose ``observe``, ``send`` and ``drive`` only look into memory, as of a simulation beside it.
 
-    They return within microseconds, and different threads may call them, one at a time: while the device rests, a
-    setpoint is then carried out by the thread that brings it. Another driver waits for its control loop.
+    They return within microseconds, and different threads may call them, one at a time: a Stop is then carried out by
+    the thread that brings it, and while the device rests a setpoint too. Another driver waits for its control loop.
     """
 
     @property
