@@ -64,8 +64,8 @@ class Executor:
             else:
                 run.begin(tasks.Deed(order, run.robot))
             self._run = run
-        run.announce()
         threading.Thread(target=self._follow, args=(run,), name=f"action-{command.id}", daemon=True).start()
+        run.announce()
 
     def cancel(self, action: str, who: str) -> None:
         """End the named action; the device holds.
@@ -160,6 +160,7 @@ class _Run:
         self._settle = settle
         self.command = command
         self.over = threading.Event()
+        self._announced = threading.Event()
         self.robot = ScriptRobot(body)
         self._body = body
         self._report = report
@@ -180,16 +181,18 @@ class _Run:
         self.robot.begin(self.command.epoch, self._lost)
 
     def announce(self) -> None:
-        """Tell that it has begun, before a thread of its own has come up: somebody waits to hear it."""
+        """Tell that it has begun, while its own thread comes up and sees to the disk: somebody waits to hear it."""
         self._attempt(lambda: self._report(self.command.id, AckStatus.STARTED))
+        self._announced.set()
 
     def play(self) -> None:
         """Do it; returns when it is over, however it ended."""
+        self._attempt(self._settle)  # before anything moves: what has moved once must not be run again
+        self._announced.wait()
         if self._ending is None:
             self._attempt(self._do)
 
     def _do(self) -> None:
-        self._settle()  # before anything moves: what has moved once must not be run again
         self._result = self._activity.run()
 
     def _attempt(self, step: Callable[[], None]) -> None:

@@ -1,5 +1,7 @@
 """A device in trouble with its own code or its driver: it holds, says so, and leaves nothing without an end."""
 
+import errno
+import os
 import threading
 from pathlib import Path
 from typing import Any
@@ -8,7 +10,7 @@ import pytest
 
 from device_agent.ports.driver import DriverError, Observation
 from device_agent.protocol import topics
-from device_agent.protocol.messages import AckStatus, Event, GrantLease, Mode, MoveJoints, Twin
+from device_agent.protocol.messages import Ack, AckStatus, Event, GrantLease, Mode, MoveJoints, Twin
 from device_agent.runtime import office
 from device_agent.runtime.journal import Journal, JournalError
 from device_agent.runtime.office import Office
@@ -67,19 +69,24 @@ def test_a_command_that_could_not_be_written_down_is_not_obeyed(bench: Bench, mo
     monkeypatch.undo()
 
 
-@pytest.mark.parametrize("step", ['"started"', "settled"])
+@pytest.mark.parametrize("what", ["its start cannot be journalled", "the disk does not take it"])
 def test_nothing_moves_where_what_has_come_could_not_be_written(
-    bench: Bench, monkeypatch: pytest.MonkeyPatch, step: str
+    bench: Bench, monkeypatch: pytest.MonkeyPatch, what: str
 ) -> None:
-    """Neither where its start cannot be journalled, nor where the disk does not take what was."""
-    execute = Journal._execute
+    record = Journal.record
 
-    def full(journal: Journal, sql: str, values: tuple[object, ...] = ()) -> list[Any]:
-        if step in sql or any(isinstance(value, bytes) and step.encode() in value for value in values):
+    def full(journal: Journal, ack: Ack) -> None:
+        if ack.status is AckStatus.STARTED:
             raise JournalError("is the disk full?")
-        return execute(journal, sql, values)
+        record(journal, ack)
 
-    monkeypatch.setattr(Journal, "_execute", full)
+    def fails(_: int) -> None:
+        raise OSError(errno.EIO, "I/O error")
+
+    if what.startswith("its start"):
+        monkeypatch.setattr(Journal, "record", full)
+    else:
+        monkeypatch.setattr(os, "fsync", fails)
     assert code(bench, bench.command(MOVE, epoch=1)) == "internal"
     assert bench.driver.position == (0.0, 0.0)
     monkeypatch.undo()

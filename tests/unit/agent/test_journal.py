@@ -1,3 +1,5 @@
+import errno
+import os
 import sqlite3
 from pathlib import Path
 
@@ -137,3 +139,26 @@ def test_a_confirmation_that_comes_after_the_end_is_passed_over(journal: Journal
     journal.close()
     journal.delivered(ack("c1"))
     journal.close()
+
+
+def test_what_is_settled_is_on_the_disk_while_others_write(
+    journal: Journal, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    synced: list[int] = []
+    monkeypatch.setattr(os, "fsync", lambda descriptor: synced.append(os.fstat(descriptor).st_ino))
+    journal.begin("arm", ack("1", AckStatus.RECEIVED))
+    with journal._lock:
+        journal.settle()
+    assert synced == [next(tmp_path.glob("*-wal")).stat().st_ino]
+
+
+def test_what_is_not_on_the_disk_is_not_settled(journal: Journal, monkeypatch: pytest.MonkeyPatch) -> None:
+    def fails(_: int) -> None:
+        raise OSError(errno.EIO, "I/O error")
+
+    monkeypatch.setattr(os, "fsync", fails)
+    with pytest.raises(JournalError, match="look at the disk"):
+        journal.settle()
+    journal.close()
+    with pytest.raises(JournalError, match="not on the disk"):
+        journal.settle()
