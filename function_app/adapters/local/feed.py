@@ -18,6 +18,8 @@ MAX_WAITING = 10_000
 HOLD_ACK_S = 0.03
 """A call that waits for an ack writes it down itself: after this time it has, and the ingest finds nothing to change
 instead of competing for the same rows in the middle of the call."""
+READ_EVERY_S = 0.02
+"""What is stored may wait a moment; a command or a robot's answer on the same machine may not."""
 TRIES = 6
 FIRST_PAUSE_S = 0.1
 
@@ -54,6 +56,7 @@ class MqttFeed:
             subscriptions=FILTERS,
             receive=self._arrived,
             manual_ack=True,
+            every_s=READ_EVERY_S,
         )
 
     async def run(self, handler: Handler) -> None:
@@ -109,6 +112,7 @@ class MqttLate:
             subscriptions=(topics.device(ANY, ANY, ANY, topics.LATE, ANY),),
             receive=self._arrived,
             manual_ack=True,
+            every_s=READ_EVERY_S,
         )
 
     async def run(self, handler: BatchHandler) -> None:
@@ -159,6 +163,7 @@ class MqttTelemetry:
             subscriptions=(topics.device(ANY, ANY, ANY, topics.TELE, ANY),),
             receive=self._arrived,
             qos=0,
+            every_s=READ_EVERY_S,
         )
 
     async def run(self, handler: BatchHandler) -> None:

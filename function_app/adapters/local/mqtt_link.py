@@ -68,6 +68,7 @@ class MqttLink:
         receive: Callable[[mqtt.MQTTMessage], None] | None = None,
         manual_ack: bool = False,
         qos: int = 1,
+        every_s: float = 0.0,
     ) -> None:
         self._host = broker.host
         self._port = broker.port
@@ -76,6 +77,7 @@ class MqttLink:
         self._receive = receive
         self._manual_ack = manual_ack
         self._qos = qos
+        self._every_s = every_s
         self._tls = broker.tls
         self._version = 0
         self._client: mqtt.Client | None = None
@@ -228,7 +230,7 @@ class MqttLink:
             client = self._make(credentials, answered)
             try:
                 await asyncio.to_thread(client.connect, self._host, self._port, KEEP_ALIVE_S)
-                mqtt_socket.listen(client)
+                mqtt_socket.listen(client, every_s=self._every_s)
                 async with asyncio.timeout(CONNECT_TIMEOUT_S):
                     reason = await answered
                 if not reason.is_failure:

@@ -9,6 +9,9 @@ import paho.mqtt.client as mqtt
 
 from function_app.ports.command_bus import BusUnavailable
 
+_IDLE_TURNS = 2
+"""Turns of the event loop with nothing to read; before the first it may have looked without this reader."""
+
 
 def prepare(client: mqtt.Client) -> None:
     """To be called before the client connects, inside the loop that it is to live in."""
@@ -26,8 +29,12 @@ def prepare(client: mqtt.Client) -> None:
     client.on_socket_close = closing
 
 
-def listen(client: mqtt.Client) -> None:
+def listen(client: mqtt.Client, *, every_s: float = 0.0) -> None:
     """Read what comes, once it has connected.
+
+    Args:
+        client: It.
+        every_s: Read at most so often, all that has come meanwhile [s]; 0: each message when it comes.
 
     Raises:
         BusUnavailable: It is connected no longer.
@@ -35,7 +42,66 @@ def listen(client: mqtt.Client) -> None:
     sock = client.socket()
     if sock is None:
         raise BusUnavailable("the broker closed the connection")
-    asyncio.get_running_loop().add_reader(sock, _read, client)
+    if every_s:
+        _Unhurried(client, sock, every_s).sleep()
+    else:
+        asyncio.get_running_loop().add_reader(sock, _read, client)
+
+
+class _Unhurried:
+    """Reads in rounds. To wake for each message would take the processor from those that somebody waits for.
+
+    Args:
+        client: Connected.
+        sock: Its socket now.
+        every_s: Between two rounds [s].
+    """
+
+    def __init__(self, client: mqtt.Client, sock: Any, every_s: float) -> None:
+        self._client = client
+        self._sock = sock
+        self._every_s = every_s
+        self._loop = asyncio.get_running_loop()
+        self._some = False
+        self._idle_turns = 0
+
+    def sleep(self) -> None:
+        """Wait until something comes, however long."""
+        self._loop.add_reader(self._sock, self._wake)
+
+    def _wake(self) -> None:
+        self._loop.remove_reader(self._sock)
+        self._loop.call_later(self._every_s, self._begin)
+
+    def _begin(self) -> None:
+        if self._current:
+            self._some, self._idle_turns = False, 0
+            self._loop.add_reader(self._sock, self._read)
+            self._loop.call_soon(self._go_on)
+
+    @property
+    def _current(self) -> bool:
+        """Whether the client has not been dropped meanwhile."""
+        now: Any = self._client.socket()
+        return now is self._sock and now.fileno() >= 0
+
+    def _read(self) -> None:
+        self._some, self._idle_turns = True, 0
+        _read(self._client)
+
+    def _go_on(self) -> None:
+        """Once a turn of the loop, until there is nothing more to read."""
+        if not self._current:
+            return
+        self._idle_turns += 1
+        if self._idle_turns <= _IDLE_TURNS:
+            self._loop.call_soon(self._go_on)
+            return
+        self._loop.remove_reader(self._sock)
+        if self._some:
+            self._loop.call_later(self._every_s, self._begin)
+        else:
+            self.sleep()
 
 
 def flush(client: mqtt.Client) -> None:
