@@ -134,18 +134,18 @@ def apply_report(action: Action, report: Report) -> Action:
     if report.sequence <= action.sequence and report.status.rank <= action.status.rank:
         same = times is action.times and heard is action.heard
         return action if same else replace(action, times=times, heard=heard)
-    changed = replace(action, times=times, heard=heard, sequence=max(action.sequence, report.sequence))
-    if report.status.rank >= action.status.rank:
-        changed = replace(changed, status=report.status)
-    if report.sequence > action.sequence or report.status.terminal:
-        changed = replace(
-            changed,
-            progress=action.progress if report.progress is None else report.progress,
-            output=report.output or action.output,
-            result=report.result or action.result,
-            reason=report.reason or action.reason,
-        )
-    return changed
+    newest = report.sequence > action.sequence or report.status.terminal
+    return replace(
+        action,
+        times=times,
+        heard=heard,
+        sequence=max(action.sequence, report.sequence),
+        status=report.status if report.status.rank >= action.status.rank else action.status,
+        progress=report.progress if newest and report.progress is not None else action.progress,
+        output=(newest and report.output) or action.output,
+        result=(newest and report.result) or action.result,
+        reason=(newest and report.reason) or action.reason,
+    )
 
 
 def _heard(action: Action, report: Report) -> dict[str, int]:
