@@ -43,8 +43,6 @@ MAX_FILTERS = 8
 """Filters in one SUBSCRIBE (facts: AWS IoT Core takes eight)."""
 
 _log = logging.getLogger(__name__)
-_VERSIONS = (MQTTProtocolVersion.MQTTv5, MQTTProtocolVersion.MQTTv311)
-_UNSUPPORTED = "Unsupported protocol version"
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -79,7 +77,6 @@ class MqttLink:
         self._qos = qos
         self._every_s = every_s
         self._tls = broker.tls
-        self._version = 0
         self._client: mqtt.Client | None = None
         self._keeper: asyncio.Task[None] | None = None
         self._ready = asyncio.Event()
@@ -224,50 +221,38 @@ class MqttLink:
             pause_s = min(2 * pause_s, LAST_RETRY_S)
 
     async def _connect(self, credentials: ServiceCredentials) -> mqtt.Client:
-        """A connected and subscribed client; speaks MQTT 5, or 3.1.1 where the broker does not."""
-        while True:
-            answered: asyncio.Future[ReasonCode] = asyncio.get_running_loop().create_future()
-            client = self._make(credentials, answered)
-            try:
-                await asyncio.to_thread(client.connect, self._host, self._port, KEEP_ALIVE_S)
-                mqtt_socket.listen(client, every_s=self._every_s)
-                async with asyncio.timeout(CONNECT_TIMEOUT_S):
-                    reason = await answered
-                if not reason.is_failure:
-                    self._client = client
-                    self.generation += 1
-                    await self._subscribe(client, self._subscriptions)
-                    self._turn_at, self._unproven = self._clocks(), False
-                    self._ready.set()
-                    self._tried.set()
-                    return client
-            except TimeoutError as error:
-                mqtt_socket.drop(client)
-                if not self._next_version():
-                    raise BusUnavailable(f"no answer from the broker at {self._host}:{self._port}") from error
-                continue
-            except BaseException:
-                mqtt_socket.drop(client)
-                raise
+        """A connected and subscribed client."""
+        answered: asyncio.Future[None] = asyncio.get_running_loop().create_future()
+        client = self._make(credentials, answered)
+        try:
+            await asyncio.to_thread(client.connect, self._host, self._port, KEEP_ALIVE_S)
+            mqtt_socket.listen(client, every_s=self._every_s)
+            async with asyncio.timeout(CONNECT_TIMEOUT_S):
+                await answered
+            self._client = client
+            self.generation += 1
+            await self._subscribe(client, self._subscriptions)
+        except TimeoutError as error:
             mqtt_socket.drop(client)
-            if reason.getName() != _UNSUPPORTED or not self._next_version():
-                raise BusUnavailable(f"the broker at {self._host}:{self._port} refused us: {reason.getName()}")
-
-    def _next_version(self) -> bool:
-        """Step down to an older MQTT; ``False`` when there is none left (the next try begins at the newest again)."""
-        self._version = (self._version + 1) % len(_VERSIONS)
-        return self._version != 0
+            raise BusUnavailable(f"no answer from the broker at {self._host}:{self._port}") from error
+        except BaseException:
+            mqtt_socket.drop(client)
+            raise
+        self._turn_at, self._unproven = self._clocks(), False
+        self._ready.set()
+        self._tried.set()
+        return client
 
     def _make(  # noqa: C901 (one short callback after another)
-        self, credentials: ServiceCredentials, answered: asyncio.Future[ReasonCode]
+        self, credentials: ServiceCredentials, answered: asyncio.Future[None]
     ) -> mqtt.Client:
-        version = _VERSIONS[self._version]
+        # All brokers speak 3.1.1. Nothing here needs the properties of 5, which paho takes long to read.
         client = mqtt.Client(
             CallbackAPIVersion.VERSION2,
             client_id=credentials.client_id,
-            protocol=version,
+            protocol=MQTTProtocolVersion.MQTTv311,
             manual_ack=self._manual_ack,
-            clean_session=None if version is MQTTProtocolVersion.MQTTv5 else True,
+            clean_session=True,
         )
         client.username_pw_set(credentials.username, credentials.password)
         if self._tls is not None:
@@ -277,8 +262,13 @@ class MqttLink:
         mqtt_socket.prepare(client)
 
         def connected(_client: mqtt.Client, _data: Any, _flags: Any, reason: ReasonCode, _properties: Any) -> None:
-            if not answered.done():
-                answered.set_result(reason)
+            if answered.done():
+                return
+            if reason.is_failure:
+                refusal = f"the broker at {self._host}:{self._port} refused us: {reason.getName()}"
+                answered.set_exception(BusUnavailable(refusal))
+            else:
+                answered.set_result(None)
 
         def disconnected(_client: mqtt.Client, _data: Any, _flags: Any, reason: ReasonCode, _properties: Any) -> None:
             if not answered.done():
