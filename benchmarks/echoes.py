@@ -31,9 +31,20 @@ async def _tcp(port: int) -> None:
         await server.serve_forever()
 
 
-async def _http(port: int) -> None:
-    """FastAPI by uvicorn, as the functions are served."""
+async def serve(app: Any, port: int) -> None:
+    """An application under uvicorn, as the functions are served; prints ``ready``."""
     import uvicorn
+
+    config = uvicorn.Config(app, host=HOST, port=port, log_level="error", access_log=False, timeout_keep_alive=600)
+    server = uvicorn.Server(config)
+    serving = asyncio.create_task(server.serve())
+    while not server.started:  # noqa: ASYNC110 (it offers nothing to wait for)
+        await asyncio.sleep(0.01)
+    print("ready", flush=True)
+    await serving
+
+
+async def _http(port: int) -> None:
     from fastapi import FastAPI, Request, Response
 
     app = FastAPI()
@@ -50,14 +61,7 @@ async def _http(port: int) -> None:
     async def sized(length: int) -> Response:
         return Response(json.dumps("x" * (length - 2)), media_type="application/json")
 
-    server = uvicorn.Server(
-        uvicorn.Config(app, host=HOST, port=port, log_level="error", access_log=False, timeout_keep_alive=600)
-    )
-    serving = asyncio.create_task(server.serve())
-    while not server.started:  # noqa: ASYNC110 (it offers nothing to wait for)
-        await asyncio.sleep(0.01)
-    print("ready", flush=True)
-    await serving
+    await serve(app, port)
 
 
 def _mqtt(port: int, *words: str) -> None:

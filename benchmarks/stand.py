@@ -190,6 +190,23 @@ class Hand:
                 raise TimeoutError(f"setpoint {self._sequence} is not seen again in telemetry")
         return (time.perf_counter() - began) * 1000
 
+    def act(self, caller: "Caller") -> float:
+        """An action to where the arm is, until it has started [ms]; it ends by itself, which is waited for after that.
+
+        Raises:
+            RuntimeError: It did not start.
+        """
+        request = {"kind": "move_joints", "position_rad": self.target_rad}
+        asked = {"request": request, "epoch": self.epoch, "wait_for": "started", "wait_ms": 10_000}
+        body = json.dumps(asked).encode()
+        began = time.perf_counter()
+        started = caller.ask("POST", f"/api/v1/devices/{self.device['id']}/actions", body)
+        took_ms = (time.perf_counter() - began) * 1000
+        if started["status"] not in ("started", "done"):
+            raise RuntimeError(f"not started: {started}")
+        caller.ask("GET", f"/api/v1/actions/{started['id']}?wait_ms=10000")
+        return took_ms
+
     def _latest(self) -> _Seen:
         if self._newest is None:
             raise TimeoutError("the robot tells nothing")

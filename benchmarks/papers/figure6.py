@@ -1,12 +1,11 @@
 """Fig. 6 of Telescope v2: a room client tells the cloud who it is and what it has, and gets its answer."""
 
 import contextlib
-import json
 import statistics
 import tempfile
-import time
 import uuid
 from collections.abc import Callable, Iterator
+from functools import partial
 from pathlib import Path
 from typing import Final
 
@@ -71,7 +70,7 @@ def paths(stand: Stand) -> Iterator[dict[str, Exchange]]:
             ANNOUNCED: _announce(stand, f"http://{HOST}:{web}"),
             _READ: read,
             _TOLD: tell,
-            _STARTED: _start(caller, hand),
+            _STARTED: partial(hand.act, caller),
         }
 
 
@@ -86,23 +85,6 @@ def _announce(stand: Stand, server: str) -> Exchange:
     with stand.machine.api() as person:
         person.post("/agents/claim", {"code": claim.code})
     return announce
-
-
-def _start(caller: Caller, hand: Hand) -> Exchange:
-    path = f"/api/v1/devices/{hand.device['id']}/actions"
-    request = {"kind": "move_joints", "position_rad": hand.target_rad}
-    body = json.dumps({"request": request, "epoch": hand.epoch, "wait_for": "started", "wait_ms": 10_000}).encode()
-
-    def exchange() -> float:
-        began = time.perf_counter()
-        started = caller.ask("POST", path, body)
-        took_ms = (time.perf_counter() - began) * 1000
-        if started["status"] not in ("started", "done"):
-            raise RuntimeError(f"not started: {started}")
-        caller.ask("GET", f"/api/v1/actions/{started['id']}?wait_ms=10000")
-        return took_ms
-
-    return exchange
 
 
 def judge(report: Report, taken: dict[str, list[float]]) -> None:

@@ -10,14 +10,12 @@ import json
 import sys
 from typing import Any
 
-from benchmarks.echoes import HOST
+from benchmarks.echoes import HOST, serve
 
 LIFETIME_S = 3600
 
 
 async def _web(port: int) -> None:
-    """FastAPI by uvicorn, as our functions are served."""
-    import uvicorn
     from fastapi import FastAPI, Request
 
     app = FastAPI()
@@ -37,18 +35,12 @@ async def _web(port: int) -> None:
         user = (await request.json())["user"]
         return {"user": user, "name": user, "kind": user, "lifetime_s": LIFETIME_S, "contacts": []}
 
-    server = uvicorn.Server(
-        uvicorn.Config(app, host=HOST, port=port, log_level="error", access_log=False, timeout_keep_alive=600)
-    )
-    serving = asyncio.create_task(server.serve())
-    while not server.started:  # noqa: ASYNC110 (it offers nothing to wait for)
-        await asyncio.sleep(0.01)
-    print("ready", flush=True)
-    await serving
+    await serve(app, port)
 
 
 async def _socket(port: int) -> None:
-    from websockets.asyncio.server import ServerConnection, serve
+    from websockets.asyncio.server import ServerConnection
+    from websockets.asyncio.server import serve as listen
 
     there: set[ServerConnection] = set()
 
@@ -62,7 +54,7 @@ async def _socket(port: int) -> None:
         finally:
             there.discard(connection)
 
-    async with serve(relay, HOST, port, compression=None) as server:
+    async with listen(relay, HOST, port, compression=None) as server:
         print("ready", flush=True)
         await server.serve_forever()
 

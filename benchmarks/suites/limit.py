@@ -1,11 +1,10 @@
 """Our path against what it must contain: bare TCP, a bare MQTT round trip on the same broker, bare HTTP."""
 
 import contextlib
-import json
 import socket
 import tempfile
-import time
 from collections.abc import Callable, Iterator
+from functools import partial
 from pathlib import Path
 from typing import Final
 
@@ -100,7 +99,8 @@ def paths(stand: Stand) -> Iterator[dict[str, Exchange]]:
         found["MQTT, QoS 0"] = mqtt(stack, stand, 0, hand.sent, len(hand.heard))
         found["MQTT, QoS 1"] = mqtt(stack, stand, 1)
         found["setpoint"] = hand.exchange
-        found["action"] = action(stack, stand, hand)
+        caller = stack.enter_context(Caller(stand.machine.port, {"Authorization": f"Bearer {stand.token}"}))
+        found["action"] = partial(hand.act, caller)
         yield found
 
 
@@ -140,25 +140,5 @@ def mqtt(
     def exchange() -> None:
         line.client.publish(there, payload, qos)
         line.heard.get(timeout=PATIENCE_S)
-
-    return exchange
-
-
-def action(stack: contextlib.ExitStack, stand: Stand, hand: Hand) -> Exchange:
-    """A move to where the arm is: it starts, and ends by itself. The next one waits until it has, off the clock."""
-    caller = stack.enter_context(Caller(stand.machine.port, {"Authorization": f"Bearer {stand.token}"}))
-    path = f"/api/v1/devices/{hand.device['id']}/actions"
-    request = {"kind": "move_joints", "position_rad": hand.target_rad}
-    asked = {"request": request, "epoch": hand.epoch, "wait_for": "started", "wait_ms": 10_000}
-    body = json.dumps(asked).encode()
-
-    def exchange() -> float:
-        began = time.perf_counter()
-        started = caller.ask("POST", path, body)
-        took_ms = (time.perf_counter() - began) * 1000
-        if started["status"] not in ("started", "done", "succeeded"):
-            raise RuntimeError(f"not started: {started}")
-        caller.ask("GET", f"/api/v1/actions/{started['id']}?wait_ms=10000")
-        return took_ms
 
     return exchange

@@ -19,11 +19,6 @@ _spaces = count()
 ACCOUNT = "123456789012"
 
 
-@pytest.fixture
-def anyio_backend() -> str:
-    return "asyncio"
-
-
 @pytest.fixture(scope="module")
 def moto() -> Iterator[str]:
     with start_moto() as endpoint:

@@ -2,7 +2,7 @@
 
 import asyncio
 import queue
-from collections.abc import AsyncIterator, Iterator
+from collections.abc import AsyncIterator
 from itertools import count
 
 import pytest
@@ -11,21 +11,9 @@ from function_app.adapters.local.command_bus import MqttCommandBus
 from function_app.adapters.local.mqtt_link import Broker
 from function_app.ports.broker_access import ServiceCredentials
 from tests.contract.bus.suite import BusContract, Heard, Stage
-from tests.support.brokers import BROKERS, HOST, SILENCE_S, BrokerKind, RunningBroker, start_broker
+from tests.support.brokers import HOST, SILENCE_S, RunningBroker
 
 _spaces = count()
-
-
-@pytest.fixture
-def anyio_backend() -> str:
-    return "asyncio"
-
-
-@pytest.fixture(params=BROKERS, scope="module")
-def broker(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Iterator[RunningBroker]:
-    kind: BrokerKind = request.param
-    with start_broker(kind, tmp_path_factory.mktemp(kind)) as broker:
-        yield broker
 
 
 class TestMqtt(BusContract):

@@ -10,23 +10,11 @@ import pytest
 
 from function_app.adapters.local import mqtt_socket
 from function_app.adapters.local.mqtt_link import Broker, MqttLink
-from tests.support.brokers import BROKERS, HOST, PATIENCE_S, BrokerKind, RunningBroker, start_broker
+from tests.support.brokers import HOST, PATIENCE_S, RunningBroker, start_broker
 
 EVERY_S = 0.2
 TOPIC = "ts/v1/rounds/bench/arm/tele/joints"
 COUNT = 300
-
-
-@pytest.fixture
-def anyio_backend() -> str:
-    return "asyncio"
-
-
-@pytest.fixture(params=BROKERS, scope="module")
-def broker(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Iterator[RunningBroker]:
-    kind: BrokerKind = request.param
-    with start_broker(kind, tmp_path_factory.mktemp(kind)) as broker:
-        yield broker
 
 
 @pytest.fixture
