@@ -11,7 +11,7 @@ import json
 import socket
 import threading
 import time
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import Any, Protocol, Self
 
@@ -310,3 +310,17 @@ def _free_port() -> int:
 def _listens(port: int) -> bool:
     with socket.socket() as caller:
         return caller.connect_ex((HOST, port)) == 0
+
+
+@contextlib.contextmanager
+def shared_grounds(folder: Callable[[str], Path]) -> Iterator[Callable[[BrokerKind], Ground]]:
+    """One server and one broker of a kind for all tests of a module, started when the first one needs them."""
+    running: dict[str, Ground] = {}
+    with contextlib.ExitStack() as stack:
+
+        def start(kind: BrokerKind) -> Ground:
+            if kind not in running:
+                running[kind] = stack.enter_context(start_ground(kind, folder(kind)))
+            return running[kind]
+
+        yield start

@@ -27,6 +27,8 @@ from function_app.ports.broker_access import Credentials
 from function_app.settings import Settings
 from tests.support.brokers import HOST, PATIENCE_S, ROOT, Client, Message, RunningBroker, wait_until
 from tests.support.cloud import Cloud, Person
+from tests.support.ground import Ground, start_ground
+from tests.support.hosts.host import environment_of, start_program
 from tests.support.robot import Robot
 
 if TYPE_CHECKING:
@@ -326,3 +328,16 @@ class XmppClient:
 
     def _run(self, work: Any) -> Any:
         return asyncio.run_coroutine_threadsafe(work, self._loop).result(PATIENCE_S)
+
+
+@contextlib.contextmanager
+def start_xmpp_ground(folder: Path) -> Iterator[Ground]:
+    """A ground with Prosody, and a program beside it that speaks for the cloud."""
+    port = free_port()
+    settings = {"TELESCOPE_XMPP_DOMAIN": DOMAIN, "TELESCOPE_XMPP_HOST": HOST, "TELESCOPE_XMPP_PORT": str(port)}
+    with start_ground("mosquitto", folder, settings) as ground:
+        end = ProsodyEnd(folder / "prosody", f"{ground.url}/api/v1/xmpp/verify", port, ground.stack)
+        ground.endpoints["xmpp"] = end
+        environment = environment_of({**ground.environment, "TELESCOPE_PORT": str(ground.endpoints["server"].port)})
+        ground.stack.enter_context(start_program(["-m", "function_app", "xmpp"], environment))
+        yield ground

@@ -4,22 +4,12 @@ from typing import Any
 import pytest
 
 from tests.contract.transports.suite import Spoken
-from tests.support.ground import Ground, Link, start_ground
+from tests.support.ground import Ground, Link, shared_grounds
 
 
 @pytest.fixture(scope="module")
 def grounds(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Callable[[Any], Ground]]:
-    """One server and one broker of a kind for all tests of a module, started when the first one needs them."""
-    import contextlib
-
-    running: dict[str, Ground] = {}
-    with contextlib.ExitStack() as stack:
-
-        def start(kind: Any) -> Ground:
-            if kind not in running:
-                running[kind] = stack.enter_context(start_ground(kind, tmp_path_factory.mktemp(kind)))
-            return running[kind]
-
+    with shared_grounds(tmp_path_factory.mktemp) as start:
         yield start
 
 

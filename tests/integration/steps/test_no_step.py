@@ -19,10 +19,9 @@ import pytest
 
 from device_agent.protocol import topics
 from tests.support.brokers import BROKERS, HOST, TRANSPORTS, BrokerKind, Client, Transport, wait_until
-from tests.support.ground import Ground, Link, start_ground
-from tests.support.hosts.host import environment_of, start_program
+from tests.support.ground import Ground, Link, shared_grounds
 from tests.support.proxy import Proxy, start_proxy
-from tests.support.xmpp import DOMAIN, ProsodyEnd, free_port
+from tests.support.xmpp import start_xmpp_ground
 
 PAIRS = 40
 APART_S = 0.003
@@ -38,14 +37,7 @@ Send = Callable[[bytes], object]
 
 @pytest.fixture(scope="module")
 def grounds(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Callable[[Any], Ground]]:
-    running: dict[str, Ground] = {}
-    with contextlib.ExitStack() as stack:
-
-        def start(kind: Any) -> Ground:
-            if kind not in running:
-                running[kind] = stack.enter_context(start_ground(kind, tmp_path_factory.mktemp(kind)))
-            return running[kind]
-
+    with shared_grounds(tmp_path_factory.mktemp) as start:
         yield start
 
 
@@ -56,13 +48,7 @@ def ground(request: pytest.FixtureRequest, grounds: Callable[[Any], Ground]) -> 
 
 @pytest.fixture(scope="module")
 def xmpp_ground(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Ground]:
-    folder, port = tmp_path_factory.mktemp("xmpp"), free_port()
-    settings = {"TELESCOPE_XMPP_DOMAIN": DOMAIN, "TELESCOPE_XMPP_HOST": HOST, "TELESCOPE_XMPP_PORT": str(port)}
-    with start_ground("mosquitto", folder, settings) as ground:
-        end = ProsodyEnd(folder / "prosody", f"{ground.url}/api/v1/xmpp/verify", port, ground.stack)
-        ground.endpoints["xmpp"] = end
-        environment = environment_of({**ground.environment, "TELESCOPE_PORT": str(ground.endpoints["server"].port)})
-        ground.stack.enter_context(start_program(["-m", "function_app", "xmpp"], environment))
+    with start_xmpp_ground(tmp_path_factory.mktemp("xmpp")) as ground:
         yield ground
 
 
