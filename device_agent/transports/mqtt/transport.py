@@ -2,12 +2,12 @@
 
 import contextlib
 import logging
-import socket
 import ssl
 import threading
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import paho.mqtt.client as mqtt
@@ -20,11 +20,14 @@ from device_agent.ports.transport import LinkChanged, Receive
 from device_agent.protocol import codec, topics
 from device_agent.protocol.messages import Presence
 from device_agent.transports.back_off import BackOff
+from device_agent.transports.mqtt.connection import Connection
 
 KEEP_ALIVE_S = 4
 """A dead peer is noticed after two of these at most; at rest it costs one ping."""
 NOTICED_WITHIN_S = 2.0 * KEEP_ALIVE_S
 _CONNECT_TIMEOUT_S = 5.0
+_LOOK_EVERY_S = 0.25
+_FAREWELL_S = 0.5
 _REFRESH_AT = 0.8
 """Credentials are renewed after this share of their life, at a quiet moment; at the last moment in any case."""
 _REFRESH_LATEST = 0.97
@@ -80,13 +83,10 @@ class MqttTransport:
         self._listen = listen
         self._quiet = quiet
         self._version = MQTTProtocolVersion.MQTTv5
-        self._client: mqtt.Client | None = None
+        self._connection: Connection | None = None
         self._up = False
         self._stopping = threading.Event()
         self._thread: threading.Thread | None = None
-        self._delivery_lock = threading.Lock()
-        self._delivered: dict[int, Callable[[], None]] = {}
-        self._early: set[int] = set()
         self._pictures: dict[str, mqtt.MQTTMessageInfo] = {}
         self._session = 0
         self._orders: int | None = None
@@ -109,25 +109,24 @@ class MqttTransport:
         delivered: Callable[[], None] | None = None,
     ) -> bool:
         """See ``Transport.publish``."""
-        client = self._client
-        if client is None or not self._up:
+        connection = self._connection
+        if connection is None or not self._up:
             return False
         picture = f"/{topics.CAM}/" in topic
         if picture and (before := self._pictures.get(topic)) is not None and not before.is_published():
             return False  # on a slow link pictures would wait in a queue, and all that is live behind them
-        # No lock of ours is held here: paho holds its own while it calls ``_on_publish``, which takes ours.
-        sent = client.publish(topic, payload, qos=qos, retain=retain)
-        if sent.rc != mqtt.MQTT_ERR_SUCCESS:
+        sent = connection.publish(topic, payload, qos=qos, retain=retain, delivered=delivered if qos else None)
+        if sent is None:
             return False
         if picture:
             self._pictures[topic] = sent
-        if qos and self._confirmed(sent.mid, delivered or _nothing) and delivered is not None:
-            delivered()
         return True
 
     def stop(self) -> None:
         """See ``Transport.stop``."""
         self._stopping.set()
+        if (connection := self._connection) is not None:
+            connection.wake()
         if self._thread is not None and self._thread is not threading.current_thread():
             self._thread.join(timeout=3)
 
@@ -153,14 +152,13 @@ class MqttTransport:
         access = self._access()
         self._session = self._next_session()
         self._pictures = {}
-        client = self._client = self._new_client(access)
         self._gone.clear()
-        client.connect(access.host, access.port, keepalive=KEEP_ALIVE_S)
-        began_s = time.monotonic()
-        # A thread of paho's own does all writing: two threads that write one socket can tear a packet.
-        client.loop_start()
+        connection = self._connection = Connection(self._new_client(access), self._receive)
         try:
-            while not self._gone.wait(0.25) and not self._stopping.is_set():
+            connection.open(access.host, access.port, keep_alive_s=KEEP_ALIVE_S)
+            began_s = time.monotonic()
+            while not self._gone.is_set() and not self._stopping.is_set():
+                connection.turn(_LOOK_EVERY_S)
                 age_s = time.monotonic() - began_s
                 if not self._up and age_s > _CONNECT_TIMEOUT_S:
                     self._fall_back()
@@ -171,17 +169,18 @@ class MqttTransport:
         finally:
             was_up, self._up = self._up, False
             if self._stopping.is_set() and was_up:
-                with contextlib.suppress(ValueError, RuntimeError):
-                    farewell = client.publish(self._presence_topic, self._presence(online=False), qos=1, retain=True)
-                    farewell.wait_for_publish(0.5)
-            client.disconnect()
-            client.loop_stop()
-            self._client = None
-            with self._delivery_lock:
-                self._delivered.clear()
-                self._early.clear()
+                with contextlib.suppress(ValueError, RuntimeError, OSError):
+                    self._say_farewell(connection)
+            connection.close()
+            self._connection = None
             if was_up:
                 self._link_changed(False)
+
+    def _say_farewell(self, connection: Connection) -> None:
+        farewell = connection.publish(self._presence_topic, self._presence(online=False), qos=1, retain=True)
+        until_s = time.monotonic() + _FAREWELL_S
+        while farewell is not None and not farewell.is_published() and time.monotonic() < until_s:
+            connection.turn(_FAREWELL_S / 10)
 
     def _new_client(self, access: BrokerAccess) -> mqtt.Client:
         options: dict[str, Any] = {} if self._version is MQTTProtocolVersion.MQTTv5 else {"clean_session": True}
@@ -190,6 +189,7 @@ class MqttTransport:
             access.client_id,
             protocol=self._version,
             reconnect_on_failure=False,
+            manual_ack=True,
             **options,
         )
         client.username_pw_set(access.username, access.password)
@@ -199,16 +199,13 @@ class MqttTransport:
         client.max_queued_messages_set(_MOST_QUEUED)
         client.max_inflight_messages_set(100)
         client.connect_timeout = _CONNECT_TIMEOUT_S
-        client.on_socket_open = _no_delay
         client.on_connect = self._on_connect
         client.on_disconnect = self._on_disconnect
         client.on_subscribe = self._on_subscribe
-        client.on_publish = self._on_publish
-        client.on_message = self._on_message
         client.user_data_set(access)
         return client
 
-    # ------------------------------------------------------------ paho's callbacks, on our thread
+    # ------------------------------------------------------------ paho's callbacks, in a turn of the connection
 
     def _on_connect(
         self,
@@ -242,37 +239,15 @@ class MqttTransport:
         client.publish(self._presence_topic, self._presence(online=True), qos=1, retain=True)
         for first in range(0, len(self._listen), _MOST_FILTERS):
             client.subscribe([(topic, 0) for topic in self._listen[first : first + _MOST_FILTERS]])
-        self._link_changed(True)
+        if (connection := self._connection) is not None:
+            connection.later(partial(self._link_changed, True))
 
     def _on_disconnect(
         self, _client: mqtt.Client, _access: object, _flags: object, _code: ReasonCode, _properties: Properties | None
     ) -> None:
         self._gone.set()
-
-    def _on_publish(
-        self, _client: mqtt.Client, _access: object, mid: int, code: ReasonCode, _properties: Properties | None
-    ) -> None:
-        if code.is_failure:
-            return
-        with self._delivery_lock:
-            delivered = self._delivered.pop(mid, None)
-            if delivered is None:
-                self._early.add(mid)
-        if delivered is not None:
-            delivered()
-
-    def _confirmed(self, mid: int, delivered: Callable[[], None]) -> bool:
-        """Whether a message was confirmed before its sender knew its id; else ``delivered`` waits for it."""
-        with self._delivery_lock:
-            if mid in self._early:
-                self._early.discard(mid)
-                return True
-            self._delivered[mid] = delivered
-        return False
-
-    def _on_message(self, _client: mqtt.Client, _access: object, message: mqtt.MQTTMessage) -> None:
-        if not message.retain:  # an order that a broker kept is not an order of now
-            self._receive(message.topic, bytes(message.payload))
+        if (connection := self._connection) is not None:
+            connection.wake()
 
     def _fall_back(self) -> None:
         if self._version is MQTTProtocolVersion.MQTTv5:
@@ -281,13 +256,3 @@ class MqttTransport:
 
     def _presence(self, *, online: bool) -> bytes:
         return codec.encode(Presence(online=online, session=self._session, at_ms=wall_ms(), software=self._software))
-
-
-def _nothing() -> None:
-    """Nobody waits to hear of this message."""
-
-
-def _no_delay(_client: mqtt.Client, _userdata: object, sock: Any) -> None:
-    """Without this a small message can wait 40 ms for the peer's delayed acknowledgement."""
-    with contextlib.suppress(OSError, AttributeError):
-        sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)

@@ -1,17 +1,43 @@
 """MQTT, over each broker."""
 
+import time
+
 import pytest
 
+from device_agent.protocol import topics
 from device_agent.transports.mqtt.transport import NOTICED_WITHIN_S
 from tests.contract.transports.agent_suite import AgentSuite
 from tests.contract.transports.suite import Spoken, TransportSuite
+from tests.support.brokers import SILENCE_S, wait_until
+from tests.support.ground import Link
 
 
-class TestAmqtt(TransportSuite):
+class _OverMqtt(TransportSuite):
+    def test_what_counts_as_confirmed_is_the_brokers_word_after_very_many_messages_too(self, fragile: Link) -> None:
+        """Numbers of messages come again after 65,535 of them, which a robot tells within minutes."""
+        fragile.start().up()
+        assert fragile.proxy is not None
+        told = fragile.topic(topics.TELE, "joints")
+        assert fragile.transport.publish(told, b"{}", qos=0)
+        wait_until(lambda: fragile.heard(topics.TELE), "a measurement at the broker")
+        client = fragile.transport._connection._client  # type: ignore[attr-defined]
+        client._last_mid -= 1
+        fragile.proxy.freeze()
+        confirmed: list[float] = []
+        assert fragile.transport.publish(
+            fragile.topic(topics.EVENT), b"{}", qos=1, delivered=lambda: confirmed.append(time.monotonic())
+        )
+        time.sleep(SILENCE_S)
+        assert not confirmed
+        fragile.proxy.thaw()
+        wait_until(lambda: len(confirmed) == 1, "the broker's word")
+
+
+class TestAmqtt(_OverMqtt):
     spoken = Spoken(endpoint="broker", notices_s=NOTICED_WITHIN_S)
 
 
-class TestMosquitto(TransportSuite):
+class TestMosquitto(_OverMqtt):
     spoken = Spoken(endpoint="broker", notices_s=NOTICED_WITHIN_S, broker="mosquitto")
 
 
