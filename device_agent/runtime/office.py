@@ -256,7 +256,7 @@ class Office:
                 self._executor.cancel(action, command.who)
             case order:  # an action
                 # Journalled before it begins: after a crash here it is ended, never run again.
-                self._voice.report_with_next(command.id, AckStatus.ACCEPTED)
+                self._voice.pass_by(command.id, AckStatus.ACCEPTED)
                 self._executor.start(command, order)
                 self._keep()
                 return

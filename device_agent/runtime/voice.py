@@ -126,7 +126,6 @@ class Voice:
         self._believed_from_s = float("-inf")
         self._answer_again = False
         self._sequences: dict[str, int] = {}
-        self._held: dict[str, Ack] = {}
         self._lock = threading.Lock()
         self._shown: tuple[object, ...] = ()
         self._shown_at_s = float("-inf")
@@ -151,18 +150,12 @@ class Voice:
         self._journal.record(ack)
         self.send_ack(ack)
 
-    def report_with_next(self, command: str, status: AckStatus) -> None:
-        """The next ack of a command is published with the one after it, which follows at once and is journalled."""
-        ack = self.ack(command, status)
-        with self._lock:
-            self._held[command] = ack
+    def pass_by(self, command: str, status: AckStatus) -> None:
+        """Publish the next ack of a command without journalling it: the one after it follows at once, and is."""
+        self.send_ack(self.ack(command, status))
 
     def send_ack(self, ack: Ack) -> None:
         """Publish an ack that the journal has."""
-        with self._lock:
-            held = self._held.pop(ack.id, None)
-        if held is not None:
-            self.send_ack(held)
         self._publish(self._topic(topics.ACK), codec.encode(ack), qos=1, delivered=partial(self._confirmed, ack))
 
     def _confirmed(self, ack: Ack) -> None:
