@@ -195,7 +195,7 @@ for name in ("geteuid", "getuid", "fork", "pidfd_open", "getresuid", "setresuid"
 for name in ("SIGKILL", "SIGSTOP", "SIGHUP", "pidfd_send_signal"):
     if hasattr(signal, name):
         delattr(signal, name)
-for name in ("AF_UNIX", "SOCK_SEQPACKET", "send_fds", "recv_fds"):
+for name in ("SOCK_SEQPACKET", "send_fds", "recv_fds", *(("AF_UNIX",) if PLATFORM == "win32" else ())):
     delattr(socket, name)
 sys.platform = PLATFORM
 from device_agent.__main__ import main
