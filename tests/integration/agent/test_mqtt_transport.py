@@ -131,8 +131,8 @@ def test_it_renews_its_credentials_before_they_end_but_not_while_something_moves
 def test_small_messages_never_wait_for_nagle(broker: RunningBroker) -> None:
     link = Link(broker)
     link.up()
-    client: Any = link.transport._connection._client
-    assert client.socket().getsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY) != 0
+    connection: Any = link.transport._connection
+    assert connection._client.socket().getsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY) != 0
     link.transport.stop()
 
 
