@@ -29,6 +29,8 @@ CREATE TABLE IF NOT EXISTS movements (
     PRIMARY KEY (device, author, robot_type, name)) WITHOUT ROWID;
 CREATE TABLE IF NOT EXISTS counters (name TEXT PRIMARY KEY, value INTEGER NOT NULL);
 """
+_CACHE_KB = 256
+"""Rows are found one by one, by their key: more would only fill up over days, in the memory of a small computer."""
 _KEEP_MS = 7 * 24 * 3600 * 1000
 """Commands are remembered a week: longer than any ``ttl_ms`` (a day at most), so that none can run twice."""
 
@@ -68,6 +70,7 @@ class Journal:
             self._database = sqlite3.connect(self._path, check_same_thread=False, isolation_level=None)
             self._database.execute("PRAGMA journal_mode=WAL")
             self._database.execute("PRAGMA synchronous=NORMAL")
+            self._database.execute(f"PRAGMA cache_size=-{_CACHE_KB}")
             self._database.executescript(_SCHEMA)
             self._database.execute("DELETE FROM commands WHERE terminal = 1 AND at_ms < ?", (now_ms - _KEEP_MS,))
         except sqlite3.Error as error:
