@@ -81,6 +81,11 @@ class Connection:
             self.wake()
         return sent
 
+    @property
+    def waiting(self) -> bool:
+        """Whether somebody waits to hear that a message was confirmed."""
+        return bool(self._delivered or self._todo)
+
     def later(self, call: Callable[[], None]) -> None:
         """Have the reader do something, after what has come before it."""
         self._todo.append(call)

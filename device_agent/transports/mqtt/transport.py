@@ -7,7 +7,6 @@ import threading
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import partial
 from typing import Any
 
 import paho.mqtt.client as mqtt
@@ -28,9 +27,15 @@ NOTICED_WITHIN_S = 2.0 * KEEP_ALIVE_S
 _CONNECT_TIMEOUT_S = 5.0
 _LOOK_EVERY_S = 0.25
 _FAREWELL_S = 0.5
+_UNNOTICED_S = 0.25
+"""A connection that makes room for the next one, with new credentials, is no loss of the link if that is up so soon:
+meanwhile no Stop arrives, and setpoints that stop coming are noticed after about as long."""
+_ASK_AGAIN_S = 5.0
 _REFRESH_AT = 0.8
 """Credentials are renewed after this share of their life, at a quiet moment; at the last moment in any case."""
 _REFRESH_LATEST = 0.97
+_REFRESH_LAST_CALL = 0.99
+"""From here on a connection ends even where the cloud has given no credentials for the next one."""
 _MOST_QUEUED = 2000
 _MOST_FILTERS = 8
 """In one SUBSCRIBE: AWS IoT Core takes no more."""
@@ -91,6 +96,8 @@ class MqttTransport:
         self._session = 0
         self._orders: int | None = None
         self._gone = threading.Event()
+        self._break: threading.Timer | None = None
+        self._break_lock = threading.Lock()
 
     def start(self, receive: Receive, link_changed: LinkChanged) -> None:
         """See ``Transport.start``."""
@@ -134,22 +141,29 @@ class MqttTransport:
 
     def _run(self) -> None:
         back_off = BackOff()
+        following: BrokerAccess | None = None
         while not self._stopping.is_set():
             back_off.attempt()
-            version = self._version
+            version, access, following = self._version, following, None
             try:
-                self._connect_once()
+                following = self._connect_once(access or self._access())
             except (OSError, ValueError) as error:
                 _log.warning("no link: %s", error)
             except Exception:  # noqa: BLE001 (whatever it was: a robot that has lost its link must keep trying)
                 _log.exception("no link")
+            if following is not None:
+                continue
+            self._break_lasts()
             if self._version is not version:
                 continue  # the broker is there, it only speaks an older MQTT
             if self._stopping.wait(back_off.wait_s()):
-                return
+                break
+        self._break_lasts()
 
-    def _connect_once(self) -> None:
-        access = self._access()
+    def _connect_once(self, access: BrokerAccess) -> BrokerAccess | None:
+        """One connection, to its end; what the next one is to be made with at once, where that is why it has ended."""
+        following: BrokerAccess | None = None
+        renewal = _Renewal(self._access)
         self._session = self._next_session()
         self._pictures = {}
         self._gone.clear()
@@ -165,16 +179,53 @@ class MqttTransport:
                     raise OSError(f"{access.host}:{access.port} does not answer as an MQTT broker")
                 share = age_s / access.lifetime_s
                 if self._up and (share > _REFRESH_LATEST or (share > _REFRESH_AT and self._quiet())):
-                    return
+                    renewal.begin()
+                if renewal.found is not None or share > _REFRESH_LAST_CALL:
+                    following = renewal.found
+                    break
         finally:
             was_up, self._up = self._up, False
+            if following is not None and not self._drained(connection):
+                following = None
             if self._stopping.is_set() and was_up:
                 with contextlib.suppress(ValueError, RuntimeError, OSError):
                     self._say_farewell(connection)
             connection.close()
             self._connection = None
-            if was_up:
+            if following is not None:
+                self._begin_break()
+            elif was_up:
                 self._link_changed(False)
+        return following
+
+    def _drained(self, connection: Connection) -> bool:
+        """Whether the broker has confirmed, within a moment, all that was told: so nothing is lost without a loss."""
+        until_s = time.monotonic() + _UNNOTICED_S
+        with contextlib.suppress(OSError, ValueError):
+            while connection.waiting and time.monotonic() < until_s:
+                connection.turn(_UNNOTICED_S / 10)
+        return not connection.waiting
+
+    def _begin_break(self) -> None:
+        with self._break_lock:
+            self._break = threading.Timer(_UNNOTICED_S, self._break_lasts)
+            self._break.daemon = True
+            self._break.start()
+
+    def _break_lasts(self) -> None:
+        """The next connection is not up yet: the link is lost after all."""
+        with self._break_lock:
+            if self._break is not None:
+                self._break.cancel()
+                self._break = None
+                self._link_changed(False)
+
+    def _came_up(self) -> None:
+        with self._break_lock:
+            if self._break is not None:
+                self._break.cancel()
+                self._break = None
+            self._link_changed(True)
 
     def _say_farewell(self, connection: Connection) -> None:
         farewell = connection.publish(self._presence_topic, self._presence(online=False), qos=1, retain=True)
@@ -240,7 +291,7 @@ class MqttTransport:
         for first in range(0, len(self._listen), _MOST_FILTERS):
             client.subscribe([(topic, 0) for topic in self._listen[first : first + _MOST_FILTERS]])
         if (connection := self._connection) is not None:
-            connection.later(partial(self._link_changed, True))
+            connection.later(self._came_up)
 
     def _on_disconnect(
         self, _client: mqtt.Client, _access: object, _flags: object, _code: ReasonCode, _properties: Properties | None
@@ -256,3 +307,27 @@ class MqttTransport:
 
     def _presence(self, *, online: bool) -> bytes:
         return codec.encode(Presence(online=online, session=self._session, at_ms=wall_ms(), software=self._software))
+
+
+class _Renewal:
+    """Asks for the next credentials while the present connection goes on, again and again until it gets some."""
+
+    def __init__(self, access: Callable[[], BrokerAccess]) -> None:
+        self._access = access
+        self._thread: threading.Thread | None = None
+        self._next_s = float("-inf")
+        self.found: BrokerAccess | None = None
+
+    def begin(self) -> None:
+        """Ask, unless that is being done, or was done in vain a moment ago."""
+        asking = self._thread is not None and self._thread.is_alive()
+        if self.found is None and not asking and time.monotonic() >= self._next_s:
+            self._next_s = time.monotonic() + _ASK_AGAIN_S
+            self._thread = threading.Thread(target=self._ask, name="mqtt-renewal", daemon=True)
+            self._thread.start()
+
+    def _ask(self) -> None:
+        try:
+            self.found = self._access()
+        except (OSError, ValueError) as error:
+            _log.warning("no new credentials yet: %s", error)

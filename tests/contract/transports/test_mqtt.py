@@ -6,9 +6,9 @@ import pytest
 
 from device_agent.protocol import topics
 from device_agent.transports.mqtt.transport import NOTICED_WITHIN_S
-from tests.contract.transports.agent_suite import AgentSuite
+from tests.contract.transports.agent_suite import FAR, AgentSuite, Resident
 from tests.contract.transports.suite import Spoken, TransportSuite
-from tests.support.brokers import SILENCE_S, wait_until
+from tests.support.brokers import PATIENCE_S, SILENCE_S, wait_until
 from tests.support.ground import Link
 
 
@@ -41,10 +41,26 @@ class TestMosquitto(_OverMqtt):
     spoken = Spoken(endpoint="broker", notices_s=NOTICED_WITHIN_S, broker="mosquitto")
 
 
+class _AgentOverMqtt(AgentSuite):
+    def test_credentials_are_renewed_under_a_robot_that_moves(
+        self, resident: Resident, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        transport = "device_agent.transports.mqtt.transport"
+        monkeypatch.setattr(f"{transport}._UNNOTICED_S", PATIENCE_S)  # however slow this machine is
+        action = resident.move(FAR, speed=0.5, epoch=resident.take())
+        with monkeypatch.context() as patch:
+            patch.setattr(f"{transport}._REFRESH_AT", 0.0)
+            patch.setattr(f"{transport}._REFRESH_LATEST", 0.0)
+            wait_until(lambda: resident.links.count(True) > 1, "another connection")
+        assert resident.end_of(action["id"])["status"] == "done"
+        assert resident.lost_s == []
+        assert False not in resident.links
+
+
 @pytest.mark.long
-class TestAgentOnAmqtt(AgentSuite):
+class TestAgentOnAmqtt(_AgentOverMqtt):
     spoken = TestAmqtt.spoken
 
 
-class TestAgentOnMosquitto(AgentSuite):
+class TestAgentOnMosquitto(_AgentOverMqtt):
     spoken = TestMosquitto.spoken

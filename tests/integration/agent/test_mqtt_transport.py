@@ -43,6 +43,8 @@ class Link:
         self.changes: list[bool] = []
         self.sessions = 0
         self.asked = 0
+        self.refused = 0
+        self.cloud_away = False
         self.broker = broker
         self.port = port or broker.tcp_port
         self.lifetime_s = lifetime_s
@@ -53,6 +55,9 @@ class Link:
         self.transport.start(lambda topic, payload: self.received.append((topic, payload)), self.changes.append)
 
     def access(self) -> BrokerAccess:
+        if self.cloud_away:
+            self.refused += 1
+            raise OSError("the cloud is away")
         self.asked += 1
         grant = grants.agent_grant("lab", "arm1", token_id=os.urandom(8).hex(), lifetime_s=self.lifetime_s)
         credentials = self.broker.issue(grant)
@@ -125,7 +130,64 @@ def test_it_renews_its_credentials_before_they_end_but_not_while_something_moves
     still_for.append(asked)
     link.up(2)
     assert link.asked == asked + 1
+    assert link.changes == [True, True], "so short a break is no loss of the link"
     link.transport.stop()
+    assert link.changes == [True, True, False]
+
+
+@pytest.fixture
+def renewing(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Credentials are renewed as soon as it is quiet."""
+    monkeypatch.setattr("device_agent.transports.mqtt.transport._REFRESH_AT", 0.0)
+
+
+@pytest.mark.usefixtures("renewing")
+def test_a_renewal_that_takes_longer_is_a_loss_until_it_has_come_to_its_end(broker: RunningBroker) -> None:
+    with start_proxy(broker.tcp_port) as proxy:
+        still: list[bool] = []
+        link = Link(broker, port=proxy.port, quiet=lambda: bool(still))
+        link.up()
+        proxy.refuse()
+        still.append(True)
+        wait_until(lambda: link.changes == [True, False], "the loss")
+        still.clear()
+        proxy.admit()
+        link.up(2)
+        assert link.changes == [True, False, True]
+
+
+@pytest.mark.usefixtures("renewing")
+def test_where_something_is_not_confirmed_a_renewal_is_a_loss(broker: RunningBroker) -> None:
+    with start_proxy(broker.tcp_port) as proxy:
+        still: list[bool] = []
+        link = Link(broker, port=proxy.port, quiet=lambda: bool(still))
+        link.up()
+        proxy.freeze()
+        confirmed: list[bool] = []
+        assert link.transport.publish(ACK, b"{}", qos=1, delivered=lambda: confirmed.append(True))
+        still.append(True)
+        wait_until(lambda: link.changes == [True, False], "the loss")
+        assert not confirmed
+        still.clear()
+        proxy.thaw()
+        link.up(2)
+
+
+@pytest.mark.usefixtures("renewing")
+def test_without_new_credentials_the_old_ones_serve_on(broker: RunningBroker, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("device_agent.transports.mqtt.transport._ASK_AGAIN_S", 0.1)
+    still: list[bool] = []
+    link = Link(broker, quiet=lambda: bool(still))
+    link.up()
+    link.cloud_away = True
+    still.append(True)
+    wait_until(lambda: link.refused >= 3, "tries")
+    assert link.changes == [True]
+    assert link.transport.publish(ACK, b"{}", qos=0)
+    link.cloud_away = False
+    link.up(2)
+    still.clear()
+    assert False not in link.changes
 
 
 def test_small_messages_never_wait_for_nagle(broker: RunningBroker) -> None:
