@@ -8,6 +8,7 @@ import selectors
 import socket
 import ssl
 import threading
+import time
 from collections import deque
 from collections.abc import Callable
 from functools import partial
@@ -81,10 +82,12 @@ class Connection:
             self.wake()
         return sent
 
-    @property
-    def waiting(self) -> bool:
-        """Whether somebody waits to hear that a message was confirmed."""
-        return bool(self._delivered or self._todo)
+    def settle(self, within_s: float) -> None:
+        """Give the broker a moment to confirm what was told."""
+        until_s = time.monotonic() + within_s
+        with contextlib.suppress(OSError, ValueError):
+            while (self._delivered or self._todo) and time.monotonic() < until_s:
+                self.turn(within_s / 10)
 
     def later(self, call: Callable[[], None]) -> None:
         """Have the reader do something, after what has come before it."""
@@ -123,9 +126,10 @@ class Connection:
         while self._todo:
             self._todo.popleft()()
 
-    def close(self) -> None:
-        """Say farewell, and let go."""
+    def close(self) -> bool:
+        """Say farewell, and let go; whether everything was confirmed that somebody waited to hear of."""
         with self._lock:
+            confirmed = not self._delivered
             self._delivered.clear()
             self._client.disconnect()
             if (left := self._client.socket()) is not None:
@@ -133,6 +137,7 @@ class Connection:
             self._selector.close()
             self._alarm.close()
             self._bell.close()
+        return confirmed
 
     def _on_message(self, _client: mqtt.Client, _userdata: object, message: mqtt.MQTTMessage) -> None:
         self._todo.append(partial(self._take, message))

@@ -185,26 +185,18 @@ class MqttTransport:
                     break
         finally:
             was_up, self._up = self._up, False
-            if following is not None and not self._drained(connection):
-                following = None
+            if following is not None:
+                connection.settle(_UNNOTICED_S)
             if self._stopping.is_set() and was_up:
                 with contextlib.suppress(ValueError, RuntimeError, OSError):
                     self._say_farewell(connection)
-            connection.close()
+            confirmed = connection.close()
             self._connection = None
-            if following is not None:
+            if following is not None and confirmed:
                 self._begin_break()
             elif was_up:
                 self._link_changed(False)
         return following
-
-    def _drained(self, connection: Connection) -> bool:
-        """Whether the broker has confirmed, within a moment, all that was told: so nothing is lost without a loss."""
-        until_s = time.monotonic() + _UNNOTICED_S
-        with contextlib.suppress(OSError, ValueError):
-            while connection.waiting and time.monotonic() < until_s:
-                connection.turn(_UNNOTICED_S / 10)
-        return not connection.waiting
 
     def _begin_break(self) -> None:
         with self._break_lock:
