@@ -37,7 +37,7 @@ _TRIED: Final = Table(
         ["the disk has the command before motion, not before the answer", None, None, 8.8, 3.2],
         ["tried, not kept: uvloop and httptools (bare HTTP 1.46 → 1.14 ms)", None, None, 7.7, 3.5],
         ["as two rows above, on a quiet machine, as all that follows", 1.36, 1.7, 7.0, 3.3],
-        ["what is only stored is read in rounds; who says something writes it; the disk meanwhile", None, 1.6, None, 3.2],
+        ["what is only stored is read in rounds; who speaks writes; the disk meanwhile", None, 1.6, None, 3.2],
         ["that it was accepted is told at once", 1.16, 1.7, 6.1, 3.1],
     ],
     note="""Each row was measured when it was made, with what is above it, beside other work of the machine: medians,
