@@ -24,7 +24,7 @@ from typing import Any
 import msgspec
 
 from device_agent.jail.warm import WarmJail
-from device_agent.ports.jail import Limits
+from device_agent.ports.jail import Inmate, Limits
 from device_agent.protocol.messages import RunMovement
 from device_agent.runtime import calls
 from device_agent.runtime.lease import Refused
@@ -182,15 +182,24 @@ class Surroundings:
         shutil.rmtree(self.home, ignore_errors=True)
 
 
-def strays(session: int) -> int:
-    """What is alive of a script: of its session, or a child of a warm parent of this process."""
+def strays(jail: WarmJail, session: int) -> int:
+    """What is alive of a script: of its session, or a child of a warm parent of this process but for the ready ones."""
     count = 0
-    parents = warm_parents()
-    for stat in Path("/proc").glob("[0-9]*/stat"):
-        with contextlib.suppress(OSError):
-            state, parent, _, its_session, *_ = stat.read_text(encoding="utf-8").rsplit(")", 1)[1].split()
-            count += state not in "ZX" and (int(its_session) == session or int(parent) in parents)
+    with jail._lock:  # so that meanwhile none is made ready
+        parents = warm_parents()
+        waiting = {process_of(parent.ready[1]) for parent in (jail._own, jail._walled) if parent.ready}
+        for stat in Path("/proc").glob("[0-9]*/stat"):
+            with contextlib.suppress(OSError):
+                state, parent, _, its_session, *_ = stat.read_text(encoding="utf-8").rsplit(")", 1)[1].split()
+                child = int(parent) in parents and int(stat.parent.name) not in waiting
+                count += state not in "ZX" and (int(its_session) == session or child)
     return count
+
+
+def process_of(inmate: Inmate) -> int:
+    """Its process id in this world; behind bubblewrap it has another."""
+    known = Path(f"/proc/self/fdinfo/{inmate._descriptor}").read_text(encoding="ascii")  # type: ignore[attr-defined]
+    return next(int(line.split()[1]) for line in known.splitlines() if line.startswith("Pid:"))
 
 
 def warm_parents() -> list[int]:
@@ -244,7 +253,7 @@ def attack(jail: WarmJail, around: Surroundings, name: str, source: str, *, stra
     breaches = [line for line in printed[0].splitlines() if line.startswith("BREACH")]
     breaches += around.breaches()
     inmate = script._inmate
-    if inmate is not None and strays(inmate.pid):  # type: ignore[attr-defined]
+    if inmate is not None and strays(jail, inmate.pid):  # type: ignore[attr-defined]
         breaches.append("something of it is still alive")
     return Result(
         tried=printed[0].startswith("TRIED\n"),

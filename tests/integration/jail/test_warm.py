@@ -73,7 +73,7 @@ def test_the_warm_parent_holds_nothing_of_the_agents(monkeypatch: pytest.MonkeyP
     with open("/proc/self/cmdline", "rb") as inherited:  # noqa: PTH123 (a descriptor that could be inherited)
         os.set_inheritable(inherited.fileno(), True)
         jail = WarmJail()
-        jail.start()
+        assert jail.refusal(stranger=False) is None
     parent = parent_of(jail)
     environment = Path(f"/proc/{parent}/environ").read_bytes()
     assert b"TELESCOPE" not in environment
@@ -96,6 +96,8 @@ def test_a_parent_that_no_longer_answers_is_given_up_and_replaced(
     jail: WarmJail, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(warm, "_ANSWER_S", 0.1)
+    monkeypatch.setattr(warm, "_PREPARE_AFTER_S", 2 * WITHIN_S)
+    jail.open(Limits(), stranger=False).close()  # the one that is ready
     control = jail._own._control
     assert control is not None
     control.settimeout(0.1)
@@ -106,6 +108,46 @@ def test_a_parent_that_no_longer_answers_is_given_up_and_replaced(
     assert dead(stuck)
     monkeypatch.setattr(warm, "_ANSWER_S", 20.0)
     assert "7" in play(jail.open(Limits(), stranger=False), "print(3 + 4)")
+
+
+def ready(jail: WarmJail) -> warm._Inmate:
+    eventually(lambda: jail._own.ready is not None)
+    assert jail._own.ready is not None
+    return jail._own.ready[1]
+
+
+def test_a_process_is_ready_for_each_script(jail: WarmJail) -> None:
+    seen = set()
+    for number in range(3):
+        waiting = ready(jail)
+        inmate = jail.open(Limits(), stranger=False)
+        assert inmate is waiting
+        seen.add(waiting.pid)
+        assert str(number) in play(inmate, f"print({number})")
+    assert len(seen) == 3, "none runs a second script"
+
+
+def test_one_that_is_ready_for_other_limits_is_not_taken(jail: WarmJail) -> None:
+    waiting = ready(jail)
+    with contextlib.closing(jail.open(Limits(cpu_s=7), stranger=False)) as inmate:
+        assert isinstance(inmate, warm._Inmate)
+        assert inmate.pid != waiting.pid
+        assert b"ready" in inmate.link.recv(100)
+        assert f"Max cpu time              {7} " in Path(f"/proc/{inmate.pid}/limits").read_text(encoding="ascii")
+    assert dead(waiting.pid)
+
+
+def test_one_that_died_while_it_was_ready_is_replaced(jail: WarmJail) -> None:
+    waiting = ready(jail)
+    os.kill(waiting.pid, signal.SIGKILL)
+    assert waiting.wait(WITHIN_S)
+    assert "7" in play(jail.open(Limits(), stranger=False), "print(3 + 4)")
+
+
+def test_the_one_that_is_ready_ends_with_the_jail(jail: WarmJail) -> None:
+    waiting = ready(jail)
+    jail.close()
+    assert dead(waiting.pid)
 
 
 def test_all_of_it_dies_with_an_agent_that_is_killed() -> None:
