@@ -29,11 +29,15 @@ class Connection:
     Args:
         client: Not yet connected, with ``manual_ack``: a message is acknowledged after ``receive`` has returned.
         receive: Called with topic and payload of each message that no broker had kept.
+
+    Attributes:
+        silent_s: How long it has listened in vain [s]; where nothing else is said, a ping is answered each keep-alive.
     """
 
     def __init__(self, client: mqtt.Client, receive: Receive) -> None:
         self._client = client
         self._receive = receive
+        self.silent_s = 0.0
         self._lock = threading.RLock()
         self._delivered: dict[int, Callable[[], None]] = {}
         self._todo: deque[Callable[[], None]] = deque()
@@ -113,12 +117,15 @@ class Connection:
             self._events = events
         # With TLS a message may have been decrypted with the one before it: then the socket has nothing more to tell.
         decrypted = isinstance(sock, ssl.SSLSocket) and sock.pending() > 0
-        ready = [key.fileobj for key, _ in self._selector.select(0 if decrypted else within_s)]
+        began_s = time.monotonic()
+        ready = {key.fileobj: for_ for key, for_ in self._selector.select(0 if decrypted else within_s)}
+        heard = decrypted or bool(ready.get(sock, 0) & selectors.EVENT_READ)
+        self.silent_s = 0.0 if heard else self.silent_s + time.monotonic() - began_s
         if self._alarm in ready:
             with contextlib.suppress(BlockingIOError):
                 self._alarm.recv(4096)
         with self._lock:
-            if decrypted or sock in ready:
+            if heard:
                 self._client.loop_read()
             if self._client.want_write():
                 self._client.loop_write()

@@ -22,8 +22,9 @@ from device_agent.transports.back_off import BackOff
 from device_agent.transports.mqtt.connection import Connection
 
 KEEP_ALIVE_S = 4
-"""A dead peer is noticed after two of these at most; at rest it costs one ping."""
-NOTICED_WITHIN_S = 2.0 * KEEP_ALIVE_S
+"""At rest it costs one ping."""
+NOTICED_WITHIN_S = 1.5 * KEEP_ALIVE_S
+"""A broker that is silent for so long is gone: as long as brokers wait for a client (MQTT 5, 3.1.2.10)."""
 _CONNECT_TIMEOUT_S = 5.0
 _LOOK_EVERY_S = 0.25
 _FAREWELL_S = 0.5
@@ -173,6 +174,8 @@ class MqttTransport:
             began_s = time.monotonic()
             while not self._gone.is_set() and not self._stopping.is_set():
                 connection.turn(_LOOK_EVERY_S)
+                if self._up and connection.silent_s > NOTICED_WITHIN_S:
+                    raise OSError(f"{access.host}:{access.port} has been silent for {NOTICED_WITHIN_S:g} s")
                 age_s = time.monotonic() - began_s
                 if not self._up and age_s > _CONNECT_TIMEOUT_S:
                     self._fall_back()

@@ -190,6 +190,32 @@ def test_without_new_credentials_the_old_ones_serve_on(broker: RunningBroker, mo
     assert False not in link.changes
 
 
+def test_who_was_too_busy_to_listen_does_not_take_the_broker_for_silent(
+    broker: RunningBroker, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("device_agent.transports.mqtt.transport.KEEP_ALIVE_S", 2)
+    monkeypatch.setattr("device_agent.transports.mqtt.transport.NOTICED_WITHIN_S", 3.0)
+    link = Link(broker)
+    link.received = Tedious()
+    link.up()
+    with broker.service() as cloud:
+        cloud.publish(topics.device("lab", "arm1", "arm", topics.CMD), b"{}")
+        wait_until(lambda: link.received, "the order")
+        until_s = time.monotonic() + 6
+        while time.monotonic() < until_s:
+            assert link.transport.publish(ACK, b"{}", qos=0), "what it says keeps the connection alive"
+            time.sleep(0.1)
+    assert link.changes == [True]
+
+
+class Tedious(list[tuple[str, bytes]]):
+    """Takes four seconds for a message."""
+
+    def append(self, message: tuple[str, bytes]) -> None:
+        super().append(message)
+        time.sleep(4)
+
+
 def test_small_messages_never_wait_for_nagle(broker: RunningBroker) -> None:
     link = Link(broker)
     link.up()
