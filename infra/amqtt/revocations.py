@@ -1,5 +1,6 @@
 """What was taken back, remembered over restarts until no token from before can still be running."""
 
+import contextlib
 import json
 import os
 import time
@@ -31,8 +32,8 @@ class _Entry(msgspec.Struct, frozen=True):
 class Revocations:
     """Refused tokens, by token id, client id or principal.
 
-    The file has one JSON object a line and is only ever appended to, and rewritten at ``open`` without what has run
-    out. A line that a crash has cut short is passed over.
+    The file has one JSON object a line and is appended to; at ``open``, and when there are many, it is written anew
+    without what has run out. A line that a crash has cut short is passed over.
     """
 
     def __init__(self, path: Path, *, keep_s: float) -> None:
@@ -54,12 +55,7 @@ class Revocations:
             for entry in self._entries():
                 if entry.before_s >= oldest:
                     self._keep(entry)
-            tidy = self._path.with_name(f"{self._path.name}.new")
-            tidy.touch(mode=0o600)
-            with tidy.open("w") as file:
-                file.writelines(f"{self._line(_Entry(*key, before))}\n" for key, before in self._before.items())
-            tidy.replace(self._path)
-            self._file = self._path.open("a")
+            self._write_anew()
         except OSError as error:
             raise RevocationsError(f"cannot keep revocations in {self._path}: {error.strerror}") from error
 
@@ -78,13 +74,15 @@ class Revocations:
         by_time = field != "token_id" and revoke.before_s is not None
         entry = _Entry(field, value, revoke.before_s if by_time and revoke.before_s is not None else time.time())
         self._keep(entry)
-        if len(self._before) >= self._tidy_at:
-            self._forget()
-            self._tidy_at = max(_TIDY_AT, 2 * len(self._before))
         if self._file is not None:
             self._file.write(f"{self._line(entry)}\n")
             self._file.flush()
             os.fsync(self._file.fileno())
+        if len(self._before) >= self._tidy_at:
+            self._forget()
+            self._tidy_at = max(_TIDY_AT, 2 * len(self._before))
+            with contextlib.suppress(OSError):  # the file that there is has all of it, and more
+                self._write_anew()
 
     def covers(self, grant: Grant, issued_at: float) -> bool:
         """Whether a grant whose token was made at ``issued_at`` [s since 1970] has been taken back."""
@@ -103,6 +101,20 @@ class Revocations:
         """Let go of what no running token can be covered by any more."""
         oldest = time.time() - self._keep_s
         self._before = {key: before for key, before in self._before.items() if before >= oldest}
+
+    def _write_anew(self) -> None:
+        """Have a file of what is remembered, and of nothing else, in the place of the one before."""
+        tidy = self._path.with_name(f"{self._path.name}.new")
+        tidy.touch(mode=0o600)
+        with contextlib.ExitStack() as on_error:
+            file = on_error.enter_context(tidy.open("w"))
+            file.writelines(f"{self._line(_Entry(*key, before))}\n" for key, before in self._before.items())
+            file.flush()
+            os.fsync(file.fileno())
+            tidy.replace(self._path)
+            on_error.pop_all()
+        self.close()
+        self._file = file
 
     def _keep(self, entry: _Entry) -> None:
         key = (entry.field, entry.value)

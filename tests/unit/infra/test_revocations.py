@@ -67,10 +67,30 @@ def test_what_has_run_out_is_forgotten(tmp_path: Path, monkeypatch: pytest.Monke
     for name in ("x", "y"):
         revocations.add(Revoke(client_id=name))
     assert not revocations.covers(GRANT, 0.0)
+    assert len(path.read_text().splitlines()) == 2, "neither is the file to grow for ever"
+    revocations.add(Revoke(client_id="z"))
     revocations.close()
     again = opened(path, keep_s=50)
+    assert all(again.covers(msgspec.structs.replace(GRANT, client_id=name), 0.0) for name in ("x", "y", "z"))
     again.close()
-    assert len(path.read_text().splitlines()) == 2
+    assert len(path.read_text().splitlines()) == 3
+
+
+def test_where_the_file_cannot_be_written_anew_the_one_before_goes_on(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(module, "_TIDY_AT", 3)
+    path = tmp_path / "r"
+    revocations = opened(path)
+    (tmp_path / "r.new").mkdir()
+    for name in ("x", "y", "z", "c"):
+        revocations.add(Revoke(client_id=name))
+    revocations.close()
+    assert len(path.read_text().splitlines()) == 4
+    (tmp_path / "r.new").rmdir()
+    again = opened(path)
+    assert again.covers(GRANT, 0.0)
+    again.close()
 
 
 @pytest.mark.parametrize("revoke", [Revoke(), Revoke(client_id=""), Revoke(client_id="a", token_id="b")])
