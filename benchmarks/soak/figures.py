@@ -9,7 +9,7 @@ import msgspec
 import numpy as np
 
 from benchmarks.report import percentile
-from benchmarks.soak.processes import PARTS, Sample
+from benchmarks.soak.processes import CHILDREN, PARTS, TOGETHER, Sample
 
 _Z_95: Final = 1.96
 _POINTS: Final = 60
@@ -74,9 +74,11 @@ def drawn_together(at_s: Sequence[float], values: Sequence[float]) -> tuple[list
 
 
 def after_warm_up(samples: Iterable[Sample], warm_up_s: float, *, end_share: float = 0.1) -> list[Held]:
-    """What each part held. ``end_share``: of the samples, are its first and its last ones."""
+    """What each part held, and at last all of them together. ``end_share``: of its samples, first and last."""
+    samples = list(samples)
+    samples += together(samples)
     found = []
-    for part in PARTS:
+    for part in (*PARTS, TOGETHER):
         mine = [each for each in samples if each.part == part and each.at_s >= warm_up_s]
         if len(mine) < _LEAST_POINTS:
             continue
@@ -103,3 +105,24 @@ def after_warm_up(samples: Iterable[Sample], warm_up_s: float, *, end_share: flo
             )
         )
     return found
+
+
+def together(samples: Iterable[Sample]) -> list[Sample]:
+    """The sums of each look at the processes; of the agent's children there are as many as run something."""
+    looks: dict[float, list[Sample]] = {}
+    for each in samples:
+        if each.part != CHILDREN:
+            looks.setdefault(each.at_s, []).append(each)
+    return [
+        Sample(
+            at_s=at_s,
+            part=TOGETHER,
+            processes=sum(each.processes for each in found),
+            rss_mb=sum(each.rss_mb for each in found),
+            pss_mb=sum(each.pss_mb for each in found),
+            own_mb=sum(each.own_mb for each in found),
+            descriptors=sum(each.descriptors for each in found),
+            threads=sum(each.threads for each in found),
+        )
+        for at_s, found in looks.items()
+    ]

@@ -19,6 +19,7 @@ _PARTS: Final = (
 CHILDREN: Final = "agent's children"
 STARTER: Final = "starter"
 PARTS: Final = ("functions", "worker", "broker", "agent", CHILDREN, STARTER)
+TOGETHER: Final = "all, without the children"
 _KB: Final = 1024
 
 

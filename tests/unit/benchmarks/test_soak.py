@@ -8,7 +8,7 @@ import time
 import pytest
 
 from benchmarks.soak.figures import after_warm_up, drawn_together, theil_sen
-from benchmarks.soak.processes import STARTER, Sample, Watch, look
+from benchmarks.soak.processes import CHILDREN, STARTER, TOGETHER, Sample, Watch, look
 
 
 def sample(at_s: float, *, mb: float = 100.0, descriptors: int = 20, part: str = "agent") -> Sample:
@@ -49,6 +49,15 @@ def test_warming_up_does_not_count_and_a_leak_does() -> None:
     found = {each.part: each for each in after_warm_up([*leaking, *still], 600)}
     assert found["agent"].more_descriptors > 30
     assert (found["broker"].more_descriptors, found["broker"].own.percent_per_h) == (0, 0)
+
+
+def test_all_parts_are_also_looked_at_together_but_for_those_that_come_and_go() -> None:
+    series = {"agent": 100.0, "broker": 20.0, CHILDREN: 50.0}
+    samples = [sample(float(at), part=part, mb=mb) for at in range(0, 600, 5) for part, mb in series.items()]
+    samples += [sample(float(at), part="worker", mb=30 + at / 60) for at in range(0, 600, 5)]
+    found = {each.part: each for each in after_warm_up(samples, 0)}
+    assert found[TOGETHER].own_mb == pytest.approx(155, abs=1)
+    assert found[TOGETHER].own.percent_per_h == pytest.approx(60 / 155 * 100, rel=0.02)
 
 
 def test_a_process_and_those_below_it_are_looked_at() -> None:
