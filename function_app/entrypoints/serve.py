@@ -4,6 +4,7 @@ import socket
 
 import uvicorn
 
+import function_app
 from function_app.bootstrap import Functions
 from function_app.entrypoints.http import create_app
 
@@ -34,6 +35,7 @@ def serve(functions: Functions) -> None:
         ssl_certfile=None if tls is None else tls.certificate,
         ssl_keyfile=None if tls is None else tls.key,
     )
+    function_app.run_for_long()
     uvicorn.Server(config).run(sockets=[listener])
 
 

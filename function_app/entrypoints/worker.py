@@ -5,6 +5,7 @@ import logging
 import signal
 from collections.abc import Sequence
 
+import function_app
 from function_app.bootstrap import Functions
 from function_app.entrypoints.ingest import ingest, ingest_telemetry
 from function_app.ports.model_compiler import CompilerMissingError
@@ -32,6 +33,7 @@ async def work(functions: Functions) -> None:
     async def handle_telemetry(messages: Sequence[tuple[str, bytes]]) -> None:
         await ingest_telemetry(functions, messages)
 
+    function_app.run_for_long()
     tasks = [
         asyncio.create_task(functions.feed.run(handle)),
         asyncio.create_task(functions.telemetry.run(handle_telemetry)),
