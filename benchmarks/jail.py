@@ -2,7 +2,8 @@
 
 ``python -m benchmarks.jail [RUNS]`` prints percentiles over 300 runs of each kind [ms].
 
-- *start*: from asking for a process to the script's first line (its first message has arrived);
+- *start*: from asking for a process to the script's first line (its first message has arrived). As a rule one is asked
+  for at once after the other, when none is ready yet; where it says so, when one is;
 - *stop*: from the kill to the dead process, its memory taken back.
 """
 
@@ -16,6 +17,7 @@ from device_agent.ports.jail import Inmate, Limits
 
 _STUBBORN = "import signal\nfor n in (signal.SIGTERM, signal.SIGINT, signal.SIGHUP): signal.signal(n, signal.SIG_IGN)\n"
 _GREEDY = "kept = []\ntry:\n    while True: kept.append(bytearray(b'x' * 2**20))\nexcept MemoryError: pass\n"
+_UNTIL_READY_S = 0.7
 SCRIPTS = {
     "a script that waits": "print(1)\nwait(600)",
     "one that imports NumPy": "import numpy\nprint(numpy.zeros(3))\nwait(600)",
@@ -35,10 +37,13 @@ def first_line(inmate: Inmate, source: str) -> None:
             raise RuntimeError("the script did not print")
 
 
-def measure(jail: WarmJail, source: str, runs: int, *, stranger: bool) -> tuple[list[float], list[float]]:
+def measure(
+    jail: WarmJail, source: str, runs: int, *, stranger: bool, pause_s: float = 0.0
+) -> tuple[list[float], list[float]]:
     """Start and stop of each run [ms]."""
     starts, stops = [], []
     for _ in range(runs):
+        time.sleep(pause_s)
         begun_s = time.perf_counter()
         with contextlib.closing(jail.open(Limits(), stranger=stranger)) as inmate:
             first_line(inmate, source)
@@ -67,11 +72,14 @@ def main(runs: int = 300) -> None:
     for stranger in (False, True):
         with contextlib.closing(jail.open(Limits(), stranger=stranger)):
             pass  # the first starts the warm parent
+        where = "bubblewrap: " if stranger else ""
         for name, source in SCRIPTS.items():
             starts, stops = measure(jail, source, runs, stranger=stranger)
-            where = "bubblewrap: " if stranger else ""
             print(f"{where + name:50} start {percentiles(starts)}")
             print(f"{'':50} stop  {percentiles(stops)}")
+        waits = SCRIPTS["a script that waits"]
+        starts, _ = measure(jail, waits, max(1, runs // 6), stranger=stranger, pause_s=_UNTIL_READY_S)
+        print(f"{where + 'a script that waits, where one is ready':50} start {percentiles(starts)}")
     jail.close()
 
 
