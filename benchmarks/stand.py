@@ -92,8 +92,7 @@ class Line:
     def __init__(
         self, port: int, client_id: str, user: str, password: str, *, subscribe: tuple[str, ...], qos: int
     ) -> None:
-        self.heard: queue.SimpleQueue[bytes] = queue.SimpleQueue()
-        self.hear: Callable[[bytes], None] = self.heard.put_nowait
+        self.forget()
         self._filters = [(each, qos) for each in subscribe]
         self._ready = threading.Event()
         self.client = paho.Client(CallbackAPIVersion.VERSION2, client_id, protocol=paho.MQTTv311)
@@ -106,6 +105,11 @@ class Line:
         self.client.loop_start()
         if not self._ready.wait(PATIENCE_S):
             raise TimeoutError("the broker does not let the bench's client in")
+
+    def forget(self) -> None:
+        """Let go of what has been heard: a client is in a cycle with its callbacks, and may stay for long."""
+        self.heard: queue.SimpleQueue[bytes] = queue.SimpleQueue()
+        self.hear: Callable[[bytes], None] = self.heard.put_nowait
 
     def _connected(self, *_: Any) -> None:
         if self._filters:

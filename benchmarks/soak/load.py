@@ -205,6 +205,7 @@ class Load:
         with self._connected(http, {"purpose": "watch"}) as line:
             self._ending.wait(self._hold_s)
             heard = line.heard.qsize()
+            line.forget()
             self.count("messages heard", heard)
             if not heard:
                 raise RuntimeError("nothing is heard")
