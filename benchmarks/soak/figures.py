@@ -15,6 +15,7 @@ _Z_95: Final = 1.96
 _POINTS: Final = 60
 """Samples are drawn together to so many medians at most: neighbours in time are not independent of each other."""
 _LEAST_POINTS: Final = 4
+_LEAST: Final = 0.1
 
 
 class Slope(msgspec.Struct, frozen=True):
@@ -26,7 +27,10 @@ class Slope(msgspec.Struct, frozen=True):
 
 
 class Held(msgspec.Struct, frozen=True, kw_only=True):
-    """One part over the time after warm-up; ``first`` and ``last`` are medians of its first and last tenths."""
+    """One part over the time after warm-up; ``first`` and ``last`` are the lowest tenths of its first and last ones.
+
+    Low, since a script that runs has descriptors of its own: a leak raises what is there while least runs.
+    """
 
     part: str
     rss: Slope
@@ -86,7 +90,7 @@ def after_warm_up(samples: Iterable[Sample], warm_up_s: float, *, end_share: flo
         few = max(1, round(len(mine) * end_share))
 
         def ends(values: list[int], few: int = few) -> tuple[float, float]:
-            return statistics.median(values[:few]), statistics.median(values[-few:])
+            return percentile(values[:few], _LEAST), percentile(values[-few:], _LEAST)
 
         rss, own = [each.rss_mb for each in mine], [each.own_mb for each in mine]
         descriptors, threads = [each.descriptors for each in mine], [each.threads for each in mine]
