@@ -38,6 +38,7 @@ class Connection:
         self._client = client
         self._receive = receive
         self.silent_s = 0.0
+        self._settling = False
         self._lock = threading.RLock()
         self._delivered: dict[int, Callable[[], None]] = {}
         self._todo: deque[Callable[[], None]] = deque()
@@ -66,7 +67,7 @@ class Connection:
     def publish(
         self, topic: str, payload: bytes, *, qos: int, retain: bool = False, delivered: Callable[[], None] | None = None
     ) -> mqtt.MQTTMessageInfo | None:
-        """Send a message, as far as the socket takes it now; ``None`` where there is no connection.
+        """Send a message, as far as the socket takes it now; ``None`` where there is no connection, or not for long.
 
         Args:
             topic: Where to.
@@ -76,6 +77,8 @@ class Connection:
             delivered: Called by the reader once the broker has confirmed it, with QoS 1.
         """
         with self._lock:
+            if self._settling:
+                return None
             sent = self._client.publish(topic, payload, qos=qos, retain=retain)
             if sent.rc != mqtt.MQTT_ERR_SUCCESS:
                 return None
@@ -87,7 +90,9 @@ class Connection:
         return sent
 
     def settle(self, within_s: float) -> None:
-        """Give the broker a moment to confirm what was told."""
+        """Give the broker a moment to confirm what was told; nothing more is."""
+        with self._lock:
+            self._settling = True
         until_s = time.monotonic() + within_s
         with contextlib.suppress(OSError, ValueError):
             while (self._delivered or self._todo) and time.monotonic() < until_s:

@@ -52,7 +52,8 @@ class _AgentOverMqtt(AgentSuite):
             patch.setattr(f"{transport}._REFRESH_AT", 0.0)
             patch.setattr(f"{transport}._REFRESH_LATEST", 0.0)
             wait_until(lambda: resident.links.count(True) > 1, "another connection")
-        assert resident.end_of(action["id"])["status"] == "done"
+        end = resident.end_of(action["id"])
+        assert end["status"] == "done", (end, resident.links)
         assert resident.lost_s == []
         assert False not in resident.links
 

@@ -173,6 +173,16 @@ def test_where_something_is_not_confirmed_a_renewal_is_a_loss(broker: RunningBro
         link.up(2)
 
 
+def test_nothing_more_is_told_by_a_connection_that_waits_for_what_was(broker: RunningBroker) -> None:
+    link = Link(broker)
+    link.up()
+    connection: Any = link.transport._connection
+    assert link.transport.publish(ACK, b"{}", qos=1)
+    connection.settle(0.0)
+    assert not link.transport.publish(ACK, b"{}", qos=1, delivered=lambda: None)
+    assert not connection._delivered
+
+
 @pytest.mark.usefixtures("renewing")
 def test_without_new_credentials_the_old_ones_serve_on(broker: RunningBroker, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("device_agent.transports.mqtt.transport._ASK_AGAIN_S", 0.1)
