@@ -15,9 +15,11 @@ CLOCKS_AGREE_MS = 15.0
 def test_every_part_of_a_press_is_measured_and_in_order(drawing_browser: Browser, machine: Machine) -> None:
     with pages(drawing_browser, machine) as (page,):
         found = console.measure(page, machine, 2)
+        for _ in range(5):  # a busy machine may draw none of six in time
+            found = found or console.presses(page, machine, 2)
         if page.get_by_test_id("release-control").count():
             page.get_by_test_id("release-control").click()
-    assert found, "of six presses a busy machine may draw only some in time"
+    assert found, "not one press was drawn in time"
     for press in found:
         assert tuple(press.at_ms) == console.PARTS
         times = list(press.at_ms.values())
