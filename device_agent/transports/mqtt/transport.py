@@ -326,3 +326,5 @@ class _Renewal:
             self.found = self._access()
         except (OSError, ValueError) as error:
             _log.warning("no new credentials yet: %s", error)
+        except Exception:  # noqa: BLE001 (as above: the present ones still serve, and it is asked again)
+            _log.exception("no new credentials yet")
