@@ -14,7 +14,7 @@ SIDE_BY_SIDE = -n 3 --dist loadfile --no-loadscope-reorder
 # Two browsers and two products fill two cores: a worker has the laboratory, the other one all that needs one arm or less.
 BROWSERS = -n 2 --dist loadscope tests/e2e
 # Those run one at a time that have a robot in motion before them, or an answer that must come in time.
-ALONE = tests/api tests/faults tests/leaks/test_secrets.py
+ALONE = tests/api tests/faults tests/security/tenants/test_secrets.py
 
 .PHONY: help up link env console test test-long bench bench-quick coverage fuzz check audit-packages contract requirements clean
 .DELETE_ON_ERROR:
@@ -30,14 +30,14 @@ help:
 	@echo "make fuzz          each parser under a fuzzer, SECONDS_EACH=60"
 	@echo "make check         linters, types, import contracts, generated files, unsafe code, committed secrets"
 	@echo "make audit-packages  ask osv.dev what is known against the pinned packages (needs a network)"
-	@echo "make contract      regenerate docs/asyncapi.json, protocol/script_api.json and web/src/core/protocol.ts"
+	@echo "make contract      regenerate docs/asyncapi.json, protocol/script_api.json and web/src/shared/mqtt/protocol.generated.ts"
 	@echo "make requirements  regenerate requirements.txt and requirements/*.txt"
 
 up: env console
 	@exec $(BIN)/python -m infra.local
 
 link: env
-	@$(BIN)/python -m infra.local.link
+	@$(BIN)/python -m infra.local.sign_in_link
 
 env: .venv/.local
 
@@ -71,14 +71,14 @@ web/node_modules/.installed: web/package-lock.json | .venv/.node
 	@$(NPM) ci --loglevel error --no-fund --no-audit >/dev/null
 	@touch $@
 
-tests/azurite/node_modules/.installed: tests/azurite/package-lock.json | .venv/.node
+tests/harness/azurite/node_modules/.installed: tests/harness/azurite/package-lock.json | .venv/.node
 	@echo "telescope: installing Azurite" >&2
-	@$(NODE) --prefix tests/azurite ci --loglevel error --no-fund --no-audit >/dev/null
+	@$(NODE) --prefix tests/harness/azurite ci --loglevel error --no-fund --no-audit >/dev/null
 	@touch $@
 
-tests/oidc/node_modules/.installed: tests/oidc/package-lock.json | .venv/.node
+tests/harness/identity_provider/node_modules/.installed: tests/harness/identity_provider/package-lock.json | .venv/.node
 	@echo "telescope: installing an OpenID Connect provider" >&2
-	@$(NODE) --prefix tests/oidc ci --loglevel error --no-fund --no-audit >/dev/null
+	@$(NODE) --prefix tests/harness/identity_provider ci --loglevel error --no-fund --no-audit >/dev/null
 	@touch $@
 
 # The Functions worker runs on every Python that Telescope does, though it asks for 3.13.
@@ -96,20 +96,20 @@ web/dist/index.html: web/node_modules/.installed web/index.html web/package.json
 	@touch $@
 
 # The agent's unit tests run once: where their coverage is counted.
-test: .venv/.dev console check tests/azurite/node_modules/.installed tests/oidc/node_modules/.installed .venv/.azure-worker coverage
+test: .venv/.dev console check tests/harness/azurite/node_modules/.installed tests/harness/identity_provider/node_modules/.installed .venv/.azure-worker coverage
 	@tests/system-packages
 	@$(NPM) test --silent
-	@tests/twice -m "not long" $(SIDE_BY_SIDE) --ignore tests/unit/agent --ignore tests/e2e $(ALONE:%=--ignore %)
+	@tests/twice -m "not long" $(SIDE_BY_SIDE) --ignore tests/unit/device_agent --ignore tests/e2e $(ALONE:%=--ignore %)
 	@tests/twice -m "not long" $(BROWSERS)
 	@tests/twice -m "not long" $(ALONE)
 
-test-long: .venv/.dev console check tests/azurite/node_modules/.installed tests/oidc/node_modules/.installed .venv/.azure-worker coverage
+test-long: .venv/.dev console check tests/harness/azurite/node_modules/.installed tests/harness/identity_provider/node_modules/.installed .venv/.azure-worker coverage
 	@tests/system-packages
 	@$(NPM) test --silent
 	@$(BIN)/python -m pytest
 
 coverage: .venv/.dev
-	@tests/twice -q tests/unit/agent -m "not long" $(SIDE_BY_SIDE) --cov=device_agent/runtime --cov-branch \
+	@tests/twice -q tests/unit/device_agent -m "not long" $(SIDE_BY_SIDE) --cov=device_agent/runtime --cov-branch \
 		--cov-report=term-missing:skip-covered --cov-fail-under=100
 
 bench bench-quick: .venv/.dev .venv/.bench console
@@ -117,7 +117,7 @@ bench bench-quick: .venv/.dev .venv/.bench console
 	@$(BIN)/python -m benchmarks $(if $(findstring quick,$@),--quick)
 
 fuzz: .venv/.dev
-	@$(BIN)/python -m tests.fuzz $(SECONDS_EACH)
+	@$(BIN)/python -m tests.security.fuzz $(SECONDS_EACH)
 
 check: .venv/.dev web/node_modules/.installed
 	@$(BIN)/ruff check .
@@ -127,14 +127,14 @@ check: .venv/.dev web/node_modules/.installed
 	@$(BIN)/bandit --quiet --recursive --configfile pyproject.toml function_app device_agent infra
 	@git ls-files -z | grep -zvE '\.(png|npz)$$' | xargs -0 -n 300 -P 2 $(BIN)/detect-secrets-hook --baseline .secrets.baseline
 	@$(BIN)/python requirements/export.py --check
-	@$(BIN)/python -m device_agent.protocol.document | cmp - docs/asyncapi.json || { echo "docs/asyncapi.json is stale; run \`make contract\`" >&2; exit 1; }
-	@$(BIN)/python -m device_agent.jail.document | cmp - device_agent/protocol/script_api.json || { echo "script_api.json is stale; run \`make contract\`" >&2; exit 1; }
+	@$(BIN)/python -m device_agent.protocol.documents.asyncapi | cmp - docs/asyncapi.json || { echo "docs/asyncapi.json is stale; run \`make contract\`" >&2; exit 1; }
+	@$(BIN)/python -m device_agent.sandbox.api_document | cmp - device_agent/protocol/documents/script_api.json || { echo "script_api.json is stale; run \`make contract\`" >&2; exit 1; }
 	@$(NPM) run --silent check
 
 contract: .venv/.dev web/node_modules/.installed
-	@$(BIN)/python -m device_agent.protocol.document > docs/asyncapi.json
-	@$(BIN)/python -m device_agent.jail.document > device_agent/protocol/script_api.json.new
-	@mv device_agent/protocol/script_api.json.new device_agent/protocol/script_api.json
+	@$(BIN)/python -m device_agent.protocol.documents.asyncapi > docs/asyncapi.json
+	@$(BIN)/python -m device_agent.sandbox.api_document > device_agent/protocol/documents/script_api.json.new
+	@mv device_agent/protocol/documents/script_api.json.new device_agent/protocol/documents/script_api.json
 	@$(NPM) run --silent contract
 
 # Apart from `check`, which needs no network. It says so where it could not ask, and is not green then.

@@ -24,9 +24,9 @@ from playwright.sync_api import Page, expect, sync_playwright
 
 from benchmarks.console_fleet import show_fleet
 from benchmarks.console_list import show_list
-from tests.support.brokers import wait_until
-from tests.support.browser import PATIENCE_MS, chromium, pages
-from tests.support.machine import Machine, Trace, start_machine
+from tests.harness.browser.browser import PATIENCE_MS, chromium, pages
+from tests.harness.browser.product import Machine, Trace, start_machine
+from tests.harness.network.brokers import wait_until
 
 JOINT: Final = "elbow"
 PARTS: Final = ("input", "published", "commanded", "moved", "told", "drawn")

@@ -14,9 +14,9 @@ from typing import Any, Final
 from playwright.sync_api import Browser, CDPSession, Page, expect
 
 from benchmarks.puppets import puppets
-from tests.support.brokers import wait_until
-from tests.support.browser import PATIENCE_MS, pages
-from tests.support.machine import Machine
+from tests.harness.browser.browser import PATIENCE_MS, pages
+from tests.harness.browser.product import Machine
+from tests.harness.network.brokers import wait_until
 
 ROBOTS: Final = 10
 WARM_UP_S: Final = 20.0

@@ -15,12 +15,11 @@ from playwright.sync_api import Browser, CDPSession, Page
 from benchmarks.console_fleet import TAKE_FRAMES, WATCH_FRAMES
 from benchmarks.crowd import crowd
 from device_agent.ports.clock import tick_ms, wall_ms
-from device_agent.protocol import codec, topics
-from device_agent.protocol.messages import Mode, State
-from tests.support.brokers import wait_until
-from tests.support.browser import pages
-from tests.support.machine import Machine
-from tests.support.robot import Robot
+from device_agent.protocol import Mode, State, codec, topics
+from tests.fakes.agent import Robot
+from tests.harness.browser.browser import pages
+from tests.harness.browser.product import Machine
+from tests.harness.network.brokers import wait_until
 
 OWN: Final = 1
 """The product's own arm is in the list too."""

@@ -7,11 +7,11 @@ from typing import TYPE_CHECKING, Any, Final, cast
 import httpx
 
 from device_agent.ports.clock import wall_ms
-from tests.support.machine import Machine
-from tests.support.robot import Robot
+from tests.fakes.agent import Robot
+from tests.harness.browser.product import Machine
 
 if TYPE_CHECKING:
-    from tests.support.cloud import Cloud, Person
+    from tests.harness.cloud.cloud import Cloud, Person
 
 AGENT_HAS: Final = 20
 

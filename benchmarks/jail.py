@@ -12,8 +12,8 @@ import json
 import sys
 import time
 
-from device_agent.jail.warm import WarmJail
-from device_agent.ports.jail import Inmate, Limits
+from device_agent.ports.sandbox import Inmate, Limits
+from device_agent.sandbox.host import WarmJail
 
 _STUBBORN = "import signal\nfor n in (signal.SIGTERM, signal.SIGINT, signal.SIGHUP): signal.signal(n, signal.SIG_IGN)\n"
 _GREEDY = "kept = []\ntry:\n    while True: kept.append(bytearray(b'x' * 2**20))\nexcept MemoryError: pass\n"

@@ -25,11 +25,11 @@ from pathlib import Path
 from typing import Any
 
 from device_agent import __main__ as agent
-from device_agent.catalogue import ROOMS
-from device_agent.drivers.mujoco import worlds
-from device_agent.runtime import loop
-from device_agent.runtime.controller import Controller
-from device_agent.runtime.pilot import Tick
+from device_agent.config.catalogue import ROOMS
+from device_agent.runtime.control import control_loop
+from device_agent.runtime.control.command_arbiter import Tick
+from device_agent.runtime.control.controller import Controller
+from device_agent.simulation import world_registry
 from infra.local import __main__ as local
 from infra.local import settings
 
@@ -73,14 +73,14 @@ def run_agent(report: Path, for_s: float, arguments: Sequence[str]) -> int:
         return step(controller, *given, **named)
 
     Controller.step = timed  # type: ignore[method-assign,assignment]
-    loop.IDLE_RATE_HZ = TELEMETRY_HZ
+    control_loop.IDLE_RATE_HZ = TELEMETRY_HZ
     threading.Thread(target=_watch, args=(report, for_s, gaps), name="bench", daemon=True).start()
     return agent.main(arguments)
 
 
 def _watch(report: Path, for_s: float, gaps: dict[str, list[float]]) -> None:
     time.sleep(WARM_UP_S)
-    world = worlds.of(ROOMS.folder(ROOM))
+    world = world_registry.of(ROOMS.folder(ROOM))
     gaps.clear()
     before, busy, began_s = _threads(), _busy_s(), time.monotonic()
     first, process_s = world.snapshot(), time.process_time()

@@ -15,12 +15,12 @@ from pathlib import Path
 import mujoco
 
 from benchmarks.lab import _at
-from device_agent.geometry.model import MujocoGeometry
-from device_agent.protocol import robot_type
-from device_agent.protocol.robot_type import RobotType
-from device_agent.runtime.controller import Controller
-from device_agent.runtime.lease import LeaseGate
-from device_agent.runtime.routes import Routes
+from device_agent.geometry.mujoco_geometry import MujocoGeometry
+from device_agent.protocol.manifests import robot_type
+from device_agent.protocol.manifests.robot_type import RobotType
+from device_agent.runtime.authority.lease_gate import LeaseGate
+from device_agent.runtime.control.controller import Controller
+from device_agent.runtime.planning.motion_planner import Routes
 
 ROBOTS = Path(__file__).resolve().parents[1] / "robots"
 NAMES = ("ur5", "nao", "qbo", "hanson")

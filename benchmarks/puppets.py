@@ -16,12 +16,11 @@ import msgspec
 
 from benchmarks.crowd import crowd
 from device_agent.ports.clock import tick_ms, wall_ms
-from device_agent.protocol import codec, topics
-from device_agent.protocol.messages import Description, JointTelemetry, Mode, State, Twin
+from device_agent.protocol import Description, JointTelemetry, Mode, State, Twin, codec, topics
 from function_app.ports.broker_access import Credentials
-from tests.support.brokers import Client, wait_until
-from tests.support.machine import Machine
-from tests.support.robot import Robot
+from tests.fakes.agent import Robot
+from tests.harness.browser.product import Machine
+from tests.harness.network.brokers import Client, wait_until
 
 RATE_HZ: Final = 20.0
 SWING_S: Final = 9.0

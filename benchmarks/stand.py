@@ -18,13 +18,13 @@ import paho.mqtt.client as paho
 from paho.mqtt.enums import CallbackAPIVersion
 
 from benchmarks.echoes import HOST, send_at_once
-from device_agent.protocol import codec, robot_type
-from device_agent.protocol.grants import Grant
-from device_agent.protocol.messages import JointTarget, Setpoint
+from device_agent.protocol import JointTarget, Setpoint, codec
+from device_agent.protocol.manifests import robot_type
+from device_agent.protocol.security.grants import Grant
 from function_app import settings
-from tests.support.brokers import ROOT, BrokerKind
-from tests.support.cloud import Cloud
-from tests.support.machine import Api, Machine, start_machine
+from tests.harness.browser.product import Api, Machine, start_machine
+from tests.harness.cloud.cloud import Cloud
+from tests.harness.network.brokers import ROOT, BrokerKind
 
 PATIENCE_S: Final = 10.0
 LEASE_MS: Final = 60_000

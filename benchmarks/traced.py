@@ -57,22 +57,23 @@ def functions(arguments: Sequence[str]) -> int:
     """As ``python -m function_app``."""
     from function_app import __main__ as program
     from function_app.adapters.local.tables import SqliteTables
-    from function_app.entrypoints import serve
-    from function_app.entrypoints.http.caller import Caller
-    from function_app.services import action_acks, store
-    from function_app.services.commands import Commands
+    from function_app.entrypoints.hosts import uvicorn
+    from function_app.entrypoints.http.framework.authentication import Caller
+    from function_app.services.actions import acks
+    from function_app.services.messaging.command_sender import Commands
+    from function_app.services.storage import records
 
     tell = Teller().tell
 
     def to_control(name: str) -> Tell:
-        return lambda _self, table, *_: tell(name) if table == store.CONTROL else None
+        return lambda _self, table, *_: tell(name) if table == records.CONTROL else None
 
-    _wrap(serve, "create_app", lambda create: lambda *given: _Door(create(*given), tell))
+    _wrap(uvicorn, "create_app", lambda create: lambda *given: _Door(create(*given), tell))
     _wrap(Caller, "account", _told_after(lambda *_: tell("identified")))
     _wrap(SqliteTables, "batch", _told_first(to_control("writing")))
     _wrap(SqliteTables, "batch", _told_after(to_control("written")))
     _wrap(Commands, "publish", _told_first(lambda *_: tell("publishing")))
-    _wrap(action_acks, "report", _told_first(lambda ack, *_: tell(f"ack-heard:{ack.status.value}")))
+    _wrap(acks, "report", _told_first(lambda ack, *_: tell(f"ack-heard:{ack.status.value}")))
     return program.main(arguments)
 
 
@@ -154,7 +155,7 @@ def _pairs(variable: str, between: str) -> dict[str, str]:
 
 def _reroute(ways: Mapping[str, str]) -> None:
     """Reach the cloud and its broker by other ports."""
-    from device_agent.transports.http.api import CloudApi
+    from device_agent.transports.http.client import CloudApi
 
     def init(begin: Any) -> Any:
         def run(self: CloudApi, server: str, *given: Any, **named: Any) -> None:
@@ -197,8 +198,8 @@ def _tell_messages(tell: Tell) -> None:
 def _tell_control(tell: Tell) -> None:
     """What the device does with it."""
     from device_agent.drivers.mujoco.driver import MujocoDriver
-    from device_agent.runtime.actions import Executor
-    from device_agent.runtime.controller import Controller
+    from device_agent.runtime.actions.executor import Executor
+    from device_agent.runtime.control.controller import Controller
 
     newest: dict[int, tuple[Any, ...]] = {}
     decided: set[int] = set()
@@ -269,7 +270,7 @@ class Motion:
 
 def _tell_motion(tell: Tell, joints: Mapping[str, str]) -> None:
     """What the simulation's own record sees of some joints, which looks every 4 ms."""
-    from device_agent.drivers.mujoco.trace import Trace
+    from device_agent.simulation.trace import Trace
 
     watched: dict[int, tuple[Motion, list[int]]] = {}
 

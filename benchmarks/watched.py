@@ -8,10 +8,10 @@ from benchmarks import traced
 from benchmarks.marks import Marks
 from benchmarks.stand import Caller, Stand
 from function_app import settings
-from tests.support.brokers import BrokerKind
-from tests.support.cloud import Cloud
-from tests.support.delay import Way, start_delay
-from tests.support.machine import Machine, free_ports, start_program
+from tests.harness.browser.product import Machine, free_ports, start_program
+from tests.harness.cloud.cloud import Cloud
+from tests.harness.network.brokers import BrokerKind
+from tests.harness.network.delay import Way, start_delay
 
 
 class Watched(Stand):

@@ -13,17 +13,20 @@ from pathlib import Path
 
 import msgspec
 
-from device_agent import bootstrap, catalogue, claim_link, doctor, drivers, links, sensors, service
+from device_agent import bootstrap, drivers, sensors
+from device_agent.cli import claim_prompt, doctor, systemd
+from device_agent.config import catalogue
+from device_agent.config.agent_config import Configuration, DeviceEntry, Home, HomeError, HttpPolling, Pairing
+from device_agent.load_generator.options import SwarmError, add_options, plan_of
 from device_agent.ports.clock import CloudClock
 from device_agent.ports.driver import DriverError
 from device_agent.ports.geometry import GeometryError
 from device_agent.ports.transport import TransportError
 from device_agent.protocol.topics import ID_PATTERN, is_id
-from device_agent.runtime.home import Configuration, DeviceEntry, Home, HomeError, HttpPolling, Pairing
-from device_agent.runtime.journal import JournalError
-from device_agent.swarm.plan import SwarmError, add_options, plan_of
-from device_agent.transports.http import answers
-from device_agent.transports.http.api import Claim, CloudApi, CloudError
+from device_agent.runtime.storage.journal import JournalError
+from device_agent.transports import factory
+from device_agent.transports.http import responses
+from device_agent.transports.http.client import Claim, CloudApi, CloudError
 
 _POLL_S = 20.0
 _OUTDATED_POLL_S = 0.5
@@ -74,7 +77,7 @@ def _parser() -> argparse.ArgumentParser:
     )
     enroll.add_argument(
         "--transport",
-        choices=links.names(),
+        choices=factory.names(),
         help="how the cloud is reached: by a broker (mqtt, the default), by requests alone (http), or by XMPP (xmpp)",
     )
     enroll.add_argument(
@@ -163,7 +166,7 @@ def _configuration(options: argparse.Namespace, home: Home) -> Configuration:
         server=server,
         ca=home.pin_authority(options.ca) if options.ca else (before.ca if before else ""),
         name=options.name or (before.name if before else home.folder.resolve().name),
-        transport=options.transport or (before.transport if before else links.names()[0]),
+        transport=options.transport or (before.transport if before else factory.names()[0]),
         http=polling,
         devices=_entries(options) or (before.devices if before else ()),
     )
@@ -200,12 +203,12 @@ def _entry(text: str) -> DeviceEntry:
 def _announce(api: CloudApi, configuration: Configuration, *, qr: bool) -> Claim:
     claim = api.enroll(
         name=configuration.name,
-        software=links.SOFTWARE,
+        software=factory.SOFTWARE,
         transport=configuration.transport,
         devices=catalogue.enrolled_devices(configuration),
     )
     if claim.code is not None:
-        claim_link.show(claim, configuration.server, qr=qr)
+        claim_prompt.show(claim, configuration.server, qr=qr)
     return claim
 
 
@@ -213,11 +216,11 @@ def _await_claim(home: Home, api: CloudApi, configuration: Configuration, claim:
     """Wait until somebody redeems the code; a code that runs out is replaced."""
     expires_s = time.monotonic() + (claim.expires_in_s or 0)
     while True:
-        service.alive()
+        systemd.alive()
         found = api.enrollment(wait_s=_POLL_S if claim.code is not None else 0.0)
         if found.get("state") == "claimed":
-            claimed = answers.read(found, answers.Claimed)
-            pairing = links.pairing_of(claimed)
+            claimed = responses.read(found, responses.Claimed)
+            pairing = factory.pairing_of(claimed)
             home.save_pairing(pairing)
             print(f"paired with {pairing.account}", flush=True)
             return pairing
@@ -247,7 +250,7 @@ def _pair(home: Home, *, qr: bool) -> None:
     A robot may start before its network does: where the cloud is not reached it is asked again.
     """
     configuration = home.configuration()
-    service.ready("waiting to be claimed")
+    systemd.ready("waiting to be claimed")
     before = signal.signal(signal.SIGTERM, _leave)
     try:
         while True:
@@ -277,9 +280,9 @@ def _run_until_told(home: Home, trace: Path | None) -> bool:
         cell.start()
         _let_control_loops_go_first()
         print("running", flush=True)
-        service.ready("running")
+        systemd.ready("running")
         while not ending.wait(_OUTDATED_POLL_S):
-            service.alive()
+            systemd.alive()
             if cell.outdated:
                 return True
     finally:
@@ -330,7 +333,7 @@ def _repin(options: argparse.Namespace) -> int:
         found = bootstrap.api_of(home, home.configuration(), CloudClock()).enrollment()
         if found.get("state") != "claimed":
             raise HomeError("the agent was un-paired; `python -m device_agent run` shows a new claim code")
-        after = links.pairing_of(answers.read(found, answers.Claimed))
+        after = factory.pairing_of(responses.read(found, responses.Claimed))
         if after.serial < before.serial:
             raise HomeError(
                 f"the server's newest key is number {after.serial}, older than number {before.serial}, which is "
@@ -370,7 +373,7 @@ def _devices(options: argparse.Namespace) -> int:
 
 def _swarm(options: argparse.Namespace) -> int:
     # Read here: only Unix has what it is made of.
-    from device_agent.swarm import run  # noqa: PLC0415
+    from device_agent.load_generator import run  # noqa: PLC0415
 
     return run.run(plan_of(options))
 
@@ -380,7 +383,7 @@ def _swarm(options: argparse.Namespace) -> int:
 
 def _import_model(options: argparse.Namespace) -> int:
     # Read here: whoever only runs real robots may have no MuJoCo.
-    from device_agent.mjcf.adopt import AdoptError, adopt  # noqa: PLC0415
+    from device_agent.simulation.mjcf.import_model import AdoptError, adopt  # noqa: PLC0415
 
     try:
         folder = adopt(options.model, options.name, options.into, without=options.without)

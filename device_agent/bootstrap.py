@@ -6,40 +6,41 @@ from pathlib import Path
 
 import msgspec
 
-from device_agent import drivers, geometry, links, sensors
-from device_agent.catalogue import ROBOTS, ROOMS, TYPES, enrolled_devices, room_device_of, type_of
-from device_agent.jail.warm import WarmJail
+from device_agent import drivers, geometry, sensors
+from device_agent.config.agent_config import Configuration, DeviceEntry, Home, HomeError, Pairing
+from device_agent.config.catalogue import ROBOTS, ROOMS, TYPES, enrolled_devices, room_device_of, type_of
+from device_agent.config.client_certificate import OwnCertificate
 from device_agent.ports.clock import CloudClock, tick_ms, wall_ms
 from device_agent.ports.driver import Driver, DriverError
+from device_agent.ports.floor_map import Ground
 from device_agent.ports.geometry import Geometry, GeometryError
-from device_agent.ports.ground import Ground
-from device_agent.ports.jail import Jail
+from device_agent.ports.sandbox import Jail
 from device_agent.ports.sensor import RoomDriver, SensorError, Surroundings
 from device_agent.ports.transport import Transport
 from device_agent.ports.uploads import Uploads
 from device_agent.protocol import topics
-from device_agent.protocol.robot_type import RobotType
+from device_agent.protocol.manifests.robot_type import RobotType
 from device_agent.runtime.agent import Agent
-from device_agent.runtime.certificate import OwnCertificate
+from device_agent.runtime.commands.pinned_keys import Pins
 from device_agent.runtime.device import Device
-from device_agent.runtime.home import Configuration, DeviceEntry, Home, HomeError, Pairing
-from device_agent.runtime.instrument import Instrument
-from device_agent.runtime.journal import Journal
-from device_agent.runtime.outbox import Outbox, Publish
-from device_agent.runtime.pins import Pins
-from device_agent.runtime.room import Room
-from device_agent.runtime.round_trips import RoundTrips
-from device_agent.runtime.shelf import Shelf
+from device_agent.runtime.readings import Room
+from device_agent.runtime.room.room_device import Instrument
+from device_agent.runtime.storage.journal import Journal
+from device_agent.runtime.storage.outbox_store import Shelf
+from device_agent.runtime.telemetry.latency_probe import RoundTrips
+from device_agent.runtime.telemetry.outbox import Outbox, Publish
+from device_agent.sandbox.host import WarmJail
 from device_agent.speech import Espeak
-from device_agent.transports.http.api import CloudApi
-from device_agent.transports.http.latencies import HttpLatencies
+from device_agent.transports import factory
+from device_agent.transports.http.client import CloudApi
+from device_agent.transports.http.latency_reports import HttpLatencies
 from device_agent.transports.http.uploads import HttpUploads
 
 
 class Cell:
     """A running agent and what must be closed with it."""
 
-    def __init__(self, agent: Agent, journal: Journal, membership: links.Membership, jail: Jail) -> None:
+    def __init__(self, agent: Agent, journal: Journal, membership: factory.Membership, jail: Jail) -> None:
         self._agent = agent
         self._jail = jail
         self._journal = journal
@@ -166,10 +167,10 @@ def instrument_of(
 def _surroundings(room: str, neighbours: Mapping[str, RoomDriver]) -> Surroundings:
     if not ROOMS.load(room).model:
         return Surroundings(neighbours=neighbours)
-    from device_agent.drivers.mujoco import worlds  # noqa: PLC0415 (a real room needs no simulation)
+    from device_agent.simulation import world_registry  # noqa: PLC0415 (a real room needs no simulation)
 
     try:
-        return Surroundings(neighbours=neighbours, world=worlds.of(ROOMS.folder(room)))
+        return Surroundings(neighbours=neighbours, world=world_registry.of(ROOMS.folder(room)))
     except DriverError as error:
         raise HomeError(str(error)) from error
 
@@ -204,14 +205,14 @@ def build(home: Home, *, trace: Path | None = None) -> Cell:
     journal.open(now_ms=wall_ms())
     journal.end_open(now_ms=wall_ms(), tick_ms=tick_ms())
     pins = Pins(pairing, save=home.save_pairing, now_ms=clock.now_ms)
-    membership = links.Membership(pairing, configuration, enrolled_devices(configuration), pins)
+    membership = factory.Membership(pairing, configuration, enrolled_devices(configuration), pins)
     room = Room(
         space=pairing.space,
         agent=pairing.agent,
         own=[entry.name for entry in configuration.devices],
         named=(*configuration.sources, *_own_streams(configuration)),
     )
-    wiring = links.Wiring(
+    wiring = factory.Wiring(
         configuration=configuration,
         pairing=pairing,
         membership=membership,
@@ -223,7 +224,7 @@ def build(home: Home, *, trace: Path | None = None) -> Cell:
         listen=room.topics(),
     )
     latencies = HttpLatencies(pairing.agent, _carrier(configuration), wiring.open_api)
-    transport = RoundTrips(links.make(wiring), tell=latencies.tell, at_ms=lambda: round(clock.now_ms() or wall_ms()))
+    transport = RoundTrips(factory.make(wiring), tell=latencies.tell, at_ms=lambda: round(clock.now_ms() or wall_ms()))
     outbox = _outbox(home, configuration, pairing, publish=transport.publish, quiet=lambda: agent.quiet)
     jail = WarmJail(trusted=configuration.trusted_scripts)
     uploads = HttpUploads(pairing.agent, lambda: api_of(home, configuration, clock))

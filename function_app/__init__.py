@@ -28,7 +28,7 @@ def run_for_long() -> None:
 
 def __getattr__(name: str) -> Any:
     if name == _AZURE:
-        from function_app.entrypoints.azure import app  # noqa: PLC0415 (only a Functions host needs it)
+        from function_app.entrypoints.hosts.azure import app  # noqa: PLC0415 (only a Functions host needs it)
 
         return app
     raise AttributeError(name)

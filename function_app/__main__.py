@@ -8,19 +8,20 @@ import sys
 from collections.abc import Callable, Coroutine, Sequence
 from typing import Any
 
-from function_app import bootstrap, choices, settings
+from function_app import bootstrap, settings
+from function_app.adapters import factory
 from function_app.bootstrap import Functions
-from function_app.domain.accounts import Identity, Role
-from function_app.domain.audit_chain import CLOUD, Deed
-from function_app.domain.problems import Problem
-from function_app.domain.times import rfc3339
-from function_app.entrypoints import audit
-from function_app.entrypoints.serve import PortTaken, serve
-from function_app.entrypoints.worker import check_models, work
-from function_app.ports.keys import LEARN_MS, OVERLAP_MS, RotationRefused
+from function_app.domain.audit.hash_chain import CLOUD, Deed
+from function_app.domain.common.problems import Problem
+from function_app.domain.common.timestamps import rfc3339
+from function_app.domain.identity.accounts import Identity, Role
+from function_app.entrypoints.cli import audit
+from function_app.entrypoints.hosts.uvicorn import PortTaken, serve
+from function_app.entrypoints.hosts.worker import check_models, work
 from function_app.ports.model_compiler import CompilerMissingError
+from function_app.ports.signing_keys import LEARN_MS, OVERLAP_MS, RotationRefused
 from function_app.ports.tables import StoreError
-from function_app.services.api_keys import Wanted
+from function_app.services.accounts.api_keys import Wanted
 
 _EXIT_FAILED = 1
 _WORKER_NICE = 5
@@ -76,7 +77,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     try:
         known = settings.read()
         if options.command == "prepare":
-            asyncio.run(choices.prepare(known))
+            asyncio.run(factory.prepare(known))
             return 0
         functions = bootstrap.build(known)
         if options.command == "serve":

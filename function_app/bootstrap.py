@@ -5,92 +5,92 @@ As long as there are services: each is made here once, with all that it is given
 
 from dataclasses import dataclass
 
-from function_app import choices
+from function_app.adapters import factory
 from function_app.adapters.local.blobs import FileBlobs
-from function_app.adapters.local.catalogue import FolderCatalogue
 from function_app.adapters.local.clock import SystemClock
-from function_app.adapters.local.model_compiler import MujocoCompiler
-from function_app.adapters.local.orders import MqttOrders
-from function_app.adapters.local.password_hashes import Argon2Hashes
-from function_app.domain.series import Keep
+from function_app.adapters.local.command_feed import MqttOrders
+from function_app.adapters.local.password_hasher import Argon2Hashes
+from function_app.adapters.local.robot_catalogue import FolderCatalogue
+from function_app.adapters.model_compiler.compiler import MujocoCompiler
+from function_app.domain.telemetry.series import Keep
 from function_app.ports.blobs import Blobs, Transfers
 from function_app.ports.broker_access import BrokerAccess
 from function_app.ports.certificates import Certificates
 from function_app.ports.clock import Clock
 from function_app.ports.command_bus import CommandBus
-from function_app.ports.feed import Feed, Telemetry
-from function_app.ports.keys import Keys
-from function_app.ports.orders import Orders
+from function_app.ports.command_feed import Orders
+from function_app.ports.device_feed import Feed, Telemetry
+from function_app.ports.signing_keys import Keys
 from function_app.ports.tables import Tables
-from function_app.ports.xmpp_line import XmppLine
-from function_app.services.action_acks import ActionAcks
-from function_app.services.action_rows import ActionRows
-from function_app.services.actions import Actions
-from function_app.services.api_keys import ApiKeys
-from function_app.services.attempts import Attempts
-from function_app.services.audit import Audit
-from function_app.services.audit_chain import AuditChain
-from function_app.services.audit_trail import AuditTrail
-from function_app.services.certify import Certify
-from function_app.services.claim import Claim
-from function_app.services.commands import Commands
-from function_app.services.conditions import Conditions
-from function_app.services.delete_robot_type import DeleteRobotType
-from function_app.services.delivery import Delivery
-from function_app.services.devices import Devices
-from function_app.services.diagnostics import Diagnostics
-from function_app.services.enroll import Enroll
-from function_app.services.events import Events
-from function_app.services.faults import Faults
-from function_app.services.fence import Fence
-from function_app.services.fleet import StartOnMany
-from function_app.services.forget import DAY_MS, Forget
-from function_app.services.handover import Handovers
-from function_app.services.health import CheckHealth
-from function_app.services.identity import Identify
-from function_app.services.intake import Intake
-from function_app.services.invitations import Invitations
-from function_app.services.latency import Latencies
-from function_app.services.lease import Leases
-from function_app.services.lease_rows import LeaseRows
-from function_app.services.leave import Leave
-from function_app.services.limits import Limits
-from function_app.services.look_at_robot_type import LookAtRobotType
-from function_app.services.mailbox import Mailbox
-from function_app.services.model_checks import ModelChecks
-from function_app.services.movements import Movements
-from function_app.services.mqtt_credentials import MqttCredentials
-from function_app.services.open_id import OpenIdSignIn
-from function_app.services.passwords import Passwords
-from function_app.services.pending import Pending
-from function_app.services.polling import Polling
-from function_app.services.presence import PresenceIngest
-from function_app.services.queue import Queues
-from function_app.services.relay import Relay
-from function_app.services.rename import Rename
-from function_app.services.robot_types import RobotTypes
-from function_app.services.seals import Seals
-from function_app.services.send_action import SendAction
-from function_app.services.series import SeriesWriter
-from function_app.services.series_range import SeriesReader
-from function_app.services.sessions import Sessions
-from function_app.services.sharing import Sharing
-from function_app.services.sign_in import SignIn
-from function_app.services.sign_out import SignOut
-from function_app.services.spaces import Spaces
-from function_app.services.start_action import StartAction
-from function_app.services.stop import StopDevices
-from function_app.services.sweep import Sweep
-from function_app.services.tell_keys import TellKeys
-from function_app.services.tend_robot_types import TendRobotTypes
-from function_app.services.transfer import Transfer
-from function_app.services.type_versions import TypeVersions
-from function_app.services.unpair import Unpair
-from function_app.services.unshare import Unshare
-from function_app.services.upload_robot_type import UploadRobotType
-from function_app.services.uploads import Uploads
-from function_app.services.watchers import Watchers
-from function_app.services.xmpp_access import XmppAccess
+from function_app.ports.xmpp_connection import XmppLine
+from function_app.services.accounts.api_keys import ApiKeys
+from function_app.services.accounts.oidc_sign_in import OpenIdSignIn
+from function_app.services.accounts.passwords import Passwords
+from function_app.services.accounts.sign_out import SignOut
+from function_app.services.actions.acks import ActionAcks
+from function_app.services.actions.action_store import ActionRows
+from function_app.services.actions.dispatcher import SendAction
+from function_app.services.actions.query import Actions
+from function_app.services.actions.queue import Queues
+from function_app.services.actions.start import StartAction
+from function_app.services.actions.start_many import StartOnMany
+from function_app.services.actions.stop import StopDevices
+from function_app.services.audit.audit_log import AuditChain
+from function_app.services.audit.audit_reader import AuditTrail
+from function_app.services.control.control_events import Audit
+from function_app.services.control.control_requests import Handovers
+from function_app.services.control.fencing import Fence
+from function_app.services.control.lease_store import LeaseRows
+from function_app.services.control.leases import Leases
+from function_app.services.control.mqtt_credentials import MqttCredentials
+from function_app.services.devices.device_access import Devices
+from function_app.services.devices.rename import Rename
+from function_app.services.devices.spaces import Spaces
+from function_app.services.devices.viewers import Watchers
+from function_app.services.health.diagnostics import Diagnostics
+from function_app.services.health.faults import Faults
+from function_app.services.health.reported_faults import Conditions
+from function_app.services.identity.authenticator import Identify
+from function_app.services.identity.guess_limiter import Attempts
+from function_app.services.identity.rate_limiter import Limits
+from function_app.services.identity.sessions import Sessions
+from function_app.services.identity.sign_in import SignIn
+from function_app.services.maintenance.readiness import CheckHealth
+from function_app.services.maintenance.scheduler import Sweep
+from function_app.services.messaging.broker_relay import Relay
+from function_app.services.messaging.command_sender import Commands
+from function_app.services.messaging.delivery import Delivery
+from function_app.services.messaging.key_announcer import TellKeys
+from function_app.services.messaging.mailbox import Mailbox
+from function_app.services.messaging.polling import Polling
+from function_app.services.messaging.presence import PresenceIngest
+from function_app.services.messaging.xmpp_credentials import XmppAccess
+from function_app.services.pairing.agent_certificates import Certify
+from function_app.services.pairing.claim import Claim
+from function_app.services.pairing.enroll import Enroll
+from function_app.services.pairing.offboarding import Leave
+from function_app.services.pairing.unpair import Unpair
+from function_app.services.robot_types.catalogue import RobotTypes
+from function_app.services.robot_types.cleanup import TendRobotTypes
+from function_app.services.robot_types.delete import DeleteRobotType
+from function_app.services.robot_types.integrity import Seals
+from function_app.services.robot_types.model_validation import ModelChecks
+from function_app.services.robot_types.movements import Movements
+from function_app.services.robot_types.preview import LookAtRobotType
+from function_app.services.robot_types.upload import UploadRobotType
+from function_app.services.robot_types.versions import TypeVersions
+from function_app.services.sharing.access_revocation import Unshare
+from function_app.services.sharing.invitations import Invitations
+from function_app.services.sharing.ownership_transfer import Transfer
+from function_app.services.sharing.shares import Sharing
+from function_app.services.storage.reminders import Pending
+from function_app.services.storage.retention import DAY_MS, Forget
+from function_app.services.telemetry.event_log import Events
+from function_app.services.telemetry.ingest import Intake
+from function_app.services.telemetry.latency import Latencies
+from function_app.services.telemetry.series_reader import SeriesReader
+from function_app.services.telemetry.series_writer import SeriesWriter
+from function_app.services.telemetry.uploads import Uploads
 from function_app.settings import Settings, SettingsError
 
 OPEN_ID_PATH = "/api/v1/auth/oidc/callback"
@@ -182,16 +182,16 @@ def build(settings: Settings, *, clock: Clock | None = None) -> Functions:
         StoreError: The signing keys cannot be used.
     """
     now = clock or SystemClock()
-    keys = choices.keys(settings, now.now_ms)
-    tables, blobs = choices.stores(settings, keys)
+    keys = factory.keys(settings, now.now_ms)
+    tables, blobs = factory.stores(settings, keys)
     catalogue = FolderCatalogue(settings.robots)
 
     async def publish(topic: str, payload: bytes) -> None:
         await bus.publish(topic, payload)
 
-    access = choices.access(settings, keys, tables, publish)
-    bus = choices.bus(settings, access)
-    feed, telemetry, late = choices.feeds(settings, access)
+    access = factory.access(settings, keys, tables, publish)
+    bus = factory.bus(settings, access)
+    feed, telemetry, late = factory.feeds(settings, access)
 
     forget = Forget(tables=tables, blobs=blobs)
     pending = Pending(tables=tables)
@@ -280,7 +280,7 @@ def build(settings: Settings, *, clock: Clock | None = None) -> Functions:
         pending=pending,
         fence=fence,
         access=access,
-        certificates=choices.certificates(settings),
+        certificates=factory.certificates(settings),
         bus=bus,
         series=writer,
         forget=forget,
@@ -341,8 +341,8 @@ def build(settings: Settings, *, clock: Clock | None = None) -> Functions:
         telemetry=telemetry,
         late=late,
         access=access,
-        certificates=choices.certificates(settings),
-        certify=Certify(certificates=choices.certificates(settings)),
+        certificates=factory.certificates(settings),
+        certify=Certify(certificates=factory.certificates(settings)),
         keys=keys,
         clock=now,
         identify=identify,
@@ -352,7 +352,7 @@ def build(settings: Settings, *, clock: Clock | None = None) -> Functions:
         api_keys=api_keys,
         open_id=OpenIdSignIn(
             tables=tables,
-            provider=choices.open_id(settings, now),
+            provider=factory.open_id(settings, now),
             redirect=f"{settings.public_url}{OPEN_ID_PATH}",
             anyone=settings.open_id is not None and settings.open_id.anyone,
             sign_in=sign_in,
@@ -507,7 +507,7 @@ def xmpp_line(functions: Functions) -> XmppLine:
     Raises:
         SettingsError: The settings name no XMPP server.
     """
-    from function_app.adapters.local.xmpp_line import SlixmppLine  # noqa: PLC0415 (only where it is in use)
+    from function_app.adapters.xmpp.connection import SlixmppLine  # noqa: PLC0415 (only where it is in use)
 
     settings = functions.settings
     if not settings.xmpp_domain:
@@ -523,5 +523,5 @@ def orders(functions: Functions) -> Orders:
     """What the broker brings for agents that a program of ours speaks for, not yet open."""
     settings = functions.settings
     return MqttOrders(
-        host=settings.mqtt_host, port=settings.mqtt_port, access=functions.access, tls=choices.broker_tls(settings)
+        host=settings.mqtt_host, port=settings.mqtt_port, access=functions.access, tls=factory.broker_tls(settings)
     )

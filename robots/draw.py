@@ -11,9 +11,9 @@ sys.path.insert(0, str(Path(__file__).parent.parent))
 
 import msgspec
 
-from device_agent.protocol import robot_type
-from function_app.adapters.local.catalogue import DRAWING
-from function_app.adapters.local.model_compiler import MujocoCompiler
+from device_agent.protocol.manifests import robot_type
+from function_app.adapters.local.robot_catalogue import DRAWING
+from function_app.adapters.model_compiler.compiler import MujocoCompiler
 
 _MODEL_FILES = frozenset({".xml", ".stl", ".obj", ".png"})
 

@@ -25,9 +25,9 @@ os.environ.setdefault("PYOPENGL_PLATFORM", "osmesa")
 import mujoco
 import numpy as np
 
-from device_agent import catalogue
-from device_agent.mjcf.ties import Ties
-from device_agent.protocol import robot_type
+from device_agent.config import catalogue
+from device_agent.protocol.manifests import robot_type
+from device_agent.simulation.mjcf.equality_joints import Ties
 
 WIDTH, HEIGHT, CAMERA = 800, 600, "picture"
 TILE = 180

@@ -5,7 +5,7 @@ from collections.abc import Callable, Iterator
 
 import pytest
 
-from tests.support.stores import StoreKind, start_emulator
+from tests.harness.stores.emulators import StoreKind, start_emulator
 
 Emulators = Callable[[StoreKind], str]
 

@@ -15,10 +15,10 @@ import time
 from pathlib import Path
 from typing import Any
 
-from device_agent.protocol.messages import Command
-from device_agent.runtime.actions import Executor
-from device_agent.runtime.controller import Controller
-from device_agent.runtime.pilot import Tick
+from device_agent.protocol import Command
+from device_agent.runtime.actions.executor import Executor
+from device_agent.runtime.control.command_arbiter import Tick
+from device_agent.runtime.control.controller import Controller
 from tests.faults import agent
 
 JUMP_S = 3600.0

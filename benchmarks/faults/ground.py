@@ -11,11 +11,11 @@ from benchmarks.faults.noted import Noted
 from benchmarks.stand import Line, rights
 from function_app import settings
 from tests.faults.stack import Stack
-from tests.support.brokers import BrokerKind
-from tests.support.cloud import Cloud
-from tests.support.delay import start_delay
-from tests.support.proxy import Proxy
-from tests.support.site import sign_in_link
+from tests.harness.cloud.cloud import Cloud
+from tests.harness.cloud.people import sign_in_link
+from tests.harness.network.brokers import BrokerKind
+from tests.harness.network.delay import start_delay
+from tests.harness.network.proxy import Proxy
 
 STREAMED, ORDERED = "arm0", "arm1"
 """Who streams has the one, who orders actions has the other."""
@@ -23,7 +23,7 @@ _WATCHDOG_S = 0.3
 
 
 class Ground(Stack):
-    """As ``Stack``; the agent's link goes through a network as well (`tests.support.delay`).
+    """As ``Stack``; the agent's link goes through a network as well (`tests.harness.network.delay`).
 
     Attributes:
         noted: What the agent tells of its periods.

@@ -7,9 +7,8 @@ from typing import Final, Self
 
 from benchmarks.faults.ground import STREAMED, Ground
 from benchmarks.stand import LEASE_MS, PATIENCE_S
-from device_agent.protocol import codec
-from device_agent.protocol.messages import JointTarget, JointTelemetry, Setpoint
-from tests.support.brokers import wait_until
+from device_agent.protocol import JointTarget, JointTelemetry, Setpoint, codec
+from tests.harness.network.brokers import wait_until
 
 JOINTS: Final = ("shoulder_pan", "shoulder_lift", "elbow", "wrist_1", "wrist_2", "wrist_3")
 SLOW_RAD_S: Final = 0.1

@@ -17,7 +17,7 @@ from tests.faults import cuts
 from tests.faults.cuts import Bench, Mend
 from tests.faults.judge import Verdict, judge
 from tests.faults.stack import now_ms
-from tests.support.brokers import wait_until
+from tests.harness.network.brokers import wait_until
 
 _KILLED: Final = "console killed"
 """What makes the arm stop where the fault itself does not."""

@@ -11,8 +11,7 @@ import msgspec
 from benchmarks.faults.ground import STREAMED, Ground
 from benchmarks.faults.hand import FULL, SLOW_RAD_S, Hand
 from benchmarks.faults.noted import Period
-from device_agent.protocol import codec
-from device_agent.protocol.messages import Stop
+from device_agent.protocol import Stop, codec
 from tests.faults.stack import now_ms
 
 SPEEDS: Final = {"at rest": 0.0, f"{SLOW_RAD_S} rad/s": SLOW_RAD_S, "full speed": FULL}

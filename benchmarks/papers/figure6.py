@@ -13,10 +13,10 @@ from benchmarks.measure import Exchange, in_turns
 from benchmarks.report import Cell, Chart, Claim, Report, Table, percentile
 from benchmarks.stand import PATIENCE_S, PAYLOAD, Caller, Hand, Line, Stand, start
 from device_agent.ports.clock import CloudClock
-from device_agent.protocol import signing
-from device_agent.transports.http.api import CloudApi
-from tests.support.brokers import HOST
-from tests.support.delay import start_delay
+from device_agent.protocol.security import signing
+from device_agent.transports.http.client import CloudApi
+from tests.harness.network.brokers import HOST
+from tests.harness.network.delay import start_delay
 
 RTT_MS: Final = 15.0
 PRINTED: Final = {"mean": 63.0, "least": 36.0, "most": 103.0}

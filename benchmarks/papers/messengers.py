@@ -16,11 +16,11 @@ from websockets.sync.client import connect
 
 from benchmarks.measure import Exchange
 from benchmarks.stand import PATIENCE_S
-from device_agent.protocol import codec, stanzas
-from device_agent.protocol.messages import JointTarget, Setpoint
-from device_agent.protocol.xmpp_stream import Login, Stream
-from tests.support.brokers import HOST, Client, RunningBroker, Transport
-from tests.support.xmpp import DOMAIN
+from device_agent.protocol import JointTarget, Setpoint, codec
+from device_agent.protocol.xmpp import stanzas
+from device_agent.protocol.xmpp.stream import Login, Stream
+from tests.harness.network.brokers import HOST, Client, RunningBroker, Transport
+from tests.harness.network.xmpp import DOMAIN
 
 JOINTS: Final = ("base", "shoulder", "elbow", "wrist_1", "wrist_2", "wrist_3")
 SETPOINT: Final = codec.encode(

@@ -20,10 +20,10 @@ from typing import Any, Final
 from benchmarks.measure import Exchange
 from benchmarks.papers.messengers import SETPOINT
 from benchmarks.stand import PATIENCE_S, Caller
-from device_agent.protocol.messages import AckStatus
-from tests.support.brokers import HOST, Message, wait_until
-from tests.support.ground import Ground
-from tests.support.polling import PollingRobot, Site
+from device_agent.protocol import AckStatus
+from tests.harness.cloud.cloud_processes import Ground
+from tests.harness.cloud.polling import PollingRobot, Site
+from tests.harness.network.brokers import HOST, Message, wait_until
 
 PERIOD_S: Final = 3.0
 _HELD_MS: Final = 5_000

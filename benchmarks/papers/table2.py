@@ -13,10 +13,10 @@ from benchmarks.measure import SHARES, Exchange, in_turns, median
 from benchmarks.papers import messengers, polled
 from benchmarks.report import Cell, Chart, Claim, Report, Table, percentile
 from benchmarks.stand import free_port, peer
-from tests.support.brokers import HOST, TRANSPORTS, RunningBroker, start_broker
-from tests.support.delay import start_delay
-from tests.support.ground import Ground, start_ground
-from tests.support.xmpp import start_prosody
+from tests.harness.cloud.cloud_processes import Ground, start_ground
+from tests.harness.network.brokers import HOST, TRANSPORTS, RunningBroker, start_broker
+from tests.harness.network.delay import start_delay
+from tests.harness.network.xmpp import start_prosody
 
 HTTP: Final = (
     2762, 3244, 2711, 2859, 3235, 2817, 2935, 2962, 2857, 2999,

@@ -4,9 +4,9 @@ from typing import Final
 
 from device_agent.drivers import mujoco
 from device_agent.ports.clock import tick_ms, wall_ms
-from device_agent.protocol import codec, robot_type
-from device_agent.protocol.messages import JointTarget, JointTelemetry, Mode, Setpoint
-from tests.support.brokers import ROOT
+from device_agent.protocol import JointTarget, JointTelemetry, Mode, Setpoint, codec
+from device_agent.protocol.manifests import robot_type
+from tests.harness.network.brokers import ROOT
 
 FOLDER: Final = ROOT / "robots" / "ur5"
 KIND: Final = robot_type.load(FOLDER)

@@ -14,8 +14,7 @@ from benchmarks.measure import Exchange
 from benchmarks.peers.arm import HOME_RAD, NAMES, setpoint
 from benchmarks.peers.robots import CONTROL, JOINTS, METHOD, ROS_TYPE, zenoh_peer
 from benchmarks.stand import PATIENCE_S, PERIOD_S, free_port, peer
-from device_agent.protocol import codec
-from device_agent.protocol.messages import JointTelemetry
+from device_agent.protocol import JointTelemetry, codec
 
 _PROGRAM: Final = "benchmarks.peers.robots"
 _OURS: Final = 1

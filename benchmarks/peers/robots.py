@@ -13,7 +13,7 @@ from typing import Any, Final
 from benchmarks.echoes import HOST
 from benchmarks.peers import bridge
 from benchmarks.peers.arm import NAMES, Arm
-from device_agent.protocol.messages import JointTarget, JointTelemetry, Setpoint
+from device_agent.protocol import JointTarget, JointTelemetry, Setpoint
 
 CONTROL: Final = "arm/control"
 JOINTS: Final = "arm/joints"

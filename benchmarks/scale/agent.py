@@ -15,8 +15,8 @@ import msgspec
 from benchmarks.report import percentile
 from device_agent import __main__ as agent
 from device_agent import drivers
-from device_agent.runtime import loop
-from device_agent.runtime.controller import Controller
+from device_agent.runtime.control import control_loop
+from device_agent.runtime.control.controller import Controller
 
 LIGHT: Final = "light"
 DIVIDER: Final = "--"
@@ -42,7 +42,7 @@ class Watcher:
 
     def install(self) -> None:
         """In place of what a controller does; it still does it."""
-        step, begin = Controller.step, loop.ControlLoop.__init__
+        step, begin = Controller.step, control_loop.ControlLoop.__init__
         watcher = self
 
         def watched(controller: Controller, *given: Any, **named: Any) -> Any:
@@ -54,7 +54,7 @@ class Watcher:
             begin(made_loop, kind, driver, controller, **more)
 
         Controller.step = watched  # type: ignore[method-assign,assignment]
-        loop.ControlLoop.__init__ = made  # type: ignore[method-assign,assignment]
+        control_loop.ControlLoop.__init__ = made  # type: ignore[method-assign,assignment]
 
     def note(self, controller: int) -> None:
         """It decides now."""
@@ -80,7 +80,7 @@ class Watcher:
 def main(rate_hz: float, arguments: Sequence[str]) -> int:
     """The agent's exit code."""
     drivers._BUILT_IN[LIGHT] = "benchmarks.scale.light"  # type: ignore[index] # noqa: SLF001 (of the bench alone)
-    loop.IDLE_RATE_HZ = rate_hz
+    control_loop.IDLE_RATE_HZ = rate_hz
     watcher = Watcher()
     watcher.install()
     threading.Thread(target=watcher.answer, daemon=True).start()

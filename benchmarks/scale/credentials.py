@@ -11,8 +11,8 @@ from typing import Final
 
 from benchmarks.report import Cell, Table
 from benchmarks.scale.processes import processor_s
-from device_agent.protocol import grants
-from tests.support.brokers import start_broker
+from device_agent.protocol.security import grants
+from tests.harness.network.brokers import start_broker
 
 STEP: Final = 100
 QUICK: Final = 100

@@ -15,8 +15,7 @@ import msgspec
 from benchmarks.report import percentile
 from benchmarks.scale import wire
 from device_agent.ports.clock import tick_ms, wall_ms
-from device_agent.protocol import codec
-from device_agent.protocol.messages import JointTelemetry, Mode, Pose
+from device_agent.protocol import JointTelemetry, Mode, Pose, codec
 
 SENT: Final = b'"setpoint_sent_ms":'
 """Before the moment at which it was sent [ms], of the clock that all processes of a machine share."""

@@ -5,8 +5,8 @@ from pathlib import Path
 from typing import Final
 
 from device_agent.ports.driver import Observation
-from device_agent.protocol.messages import Pose, Twin
-from device_agent.protocol.robot_type import RobotType
+from device_agent.protocol import Pose, Twin
+from device_agent.protocol.manifests.robot_type import RobotType
 
 _SOMEWHERE: Final[Pose] = (0.123456, 0.234567, 0.345678, 0.707107, 0.0, 0.707107, 0.0)
 

@@ -14,7 +14,7 @@ from benchmarks.scale.askers import Request
 from benchmarks.scale.functions import Site
 from benchmarks.scale.processes import resident_mb
 from benchmarks.stand import PATIENCE_S
-from tests.support.brokers import BROKERS, BrokerKind, start_broker
+from tests.harness.network.brokers import BROKERS, BrokerKind, start_broker
 
 COLUMNS: Final = ["", "connections", "MB", "kB a connection"]
 _ANSWER: Final = 65_536

@@ -16,8 +16,8 @@ from benchmarks.report import Cell, Chart, Table
 from benchmarks.scale.agent import DIVIDER, LIGHT, Seen
 from benchmarks.scale.processes import processor_s, resident_mb
 from benchmarks.stand import Stand
-from tests.support.brokers import ROOT
-from tests.support.machine import Api
+from tests.harness.browser.product import Api
+from tests.harness.network.brokers import ROOT
 
 Kind = Literal["light", "simulated"]
 PERIOD_MS: Final = 8.0

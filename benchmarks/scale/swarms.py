@@ -20,10 +20,10 @@ from benchmarks.scale.ear import Ear, Heard
 from benchmarks.scale.functions import Load, Site
 from benchmarks.scale.processes import processor_s, resident_mb
 from benchmarks.stand import PATIENCE_S, Stand
+from device_agent.load_generator.kinematic_arm import DEVICE
 from device_agent.protocol import topics
-from device_agent.swarm.arm import DEVICE
-from tests.support.brokers import ROOT
-from tests.support.machine import Api
+from tests.harness.browser.product import Api
+from tests.harness.network.brokers import ROOT
 
 QUICK: Final = ((100, 5.0, 0.02),)
 WHOLE: Final = ((100, 5.0, 0.02), (300, 5.0, 0.02), (1000, 2.0, 0.07))

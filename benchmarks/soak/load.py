@@ -11,10 +11,10 @@ from typing import Any, Final, Self
 import httpx
 
 from benchmarks.stand import LEASE_MS, PATIENCE_S, Line, Stand
-from device_agent.protocol import codec, robot_type
-from device_agent.protocol.messages import JointTarget, JointTelemetry, Setpoint
-from tests.support.brokers import ROOT
-from tests.support.machine import Api
+from device_agent.protocol import JointTarget, JointTelemetry, Setpoint, codec
+from device_agent.protocol.manifests import robot_type
+from tests.harness.browser.product import Api
+from tests.harness.network.brokers import ROOT
 
 _MOVEMENTS: Final = {"nao": "wave", "qbo": "look_around", "hanson": "look_around"}
 _STOPPED: Final = "hanson"

@@ -12,7 +12,7 @@ import msgspec
 _PARTS: Final = (
     ("function_app serve", "functions"),
     ("function_app work", "worker"),
-    ("infra.amqtt", "broker"),
+    ("infra.embedded_broker", "broker"),
     ("infra.mosquitto", "broker"),
     ("device_agent run", "agent"),
 )

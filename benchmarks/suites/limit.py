@@ -12,7 +12,7 @@ from benchmarks.echoes import HOST
 from benchmarks.measure import Exchange, in_turns, median, table
 from benchmarks.report import Claim, Report, Table
 from benchmarks.stand import PATIENCE_S, PAYLOAD, PERIOD_S, Caller, Hand, Stand, free_port, peer, start
-from tests.support.brokers import BROKERS
+from tests.harness.network.brokers import BROKERS
 
 SETPOINT_MOST: Final = 1.5
 ACTION_MOST: Final = 2.5

@@ -12,7 +12,7 @@ from benchmarks.marks import Mark
 from benchmarks.report import Cell, Chart, Report, Table, percentile
 from benchmarks.stand import Caller, Hand
 from benchmarks.watched import Watched, start
-from tests.support.brokers import BROKERS
+from tests.harness.network.brokers import BROKERS
 
 ROBOT: Final = "ur5"
 JOINT: Final = "wrist_3"

@@ -10,7 +10,7 @@ from benchmarks.measure import Exchange, in_turns, median, table
 from benchmarks.peers import operators, safety
 from benchmarks.report import Chart, Claim, Report, percentile
 from benchmarks.stand import Hand, start
-from tests.support.brokers import BROKERS
+from tests.harness.network.brokers import BROKERS
 
 OURS: Final = "Telescope, mosquitto"
 ROSBRIDGE: Final = "rosbridge-style, roslibpy"

@@ -9,9 +9,9 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Protocol
 
-from device_agent.plug_ins import PlugIns
 from device_agent.ports.driver import Driver, DriverError
-from device_agent.protocol.robot_type import RobotType
+from device_agent.ports.plugins import PlugIns
+from device_agent.protocol.manifests.robot_type import RobotType
 
 __all__ = ["GROUP", "Factory", "load", "names"]
 

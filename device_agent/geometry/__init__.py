@@ -2,9 +2,9 @@
 
 from pathlib import Path
 
-from device_agent.geometry.standing import Standing
+from device_agent.geometry.base_pose import Standing
 from device_agent.ports.geometry import Geometry, GeometryError
-from device_agent.protocol.robot_type import RobotType
+from device_agent.protocol.manifests.robot_type import RobotType
 
 __all__ = ["Standing", "load"]
 
@@ -24,7 +24,7 @@ def load(robot_type: RobotType, folder: Path, *, scene: str = "", standing: Stan
     if not robot_type.model:
         return None
     try:
-        from device_agent.geometry.model import MujocoGeometry  # noqa: PLC0415 (agents without a model need no MuJoCo)
+        from device_agent.geometry.mujoco_geometry import MujocoGeometry  # noqa: PLC0415 (agents without a model need no MuJoCo)
     except ImportError as error:
         raise GeometryError(
             f"'{robot_type.type}' has a model, and nothing here can read it ({error}); install mujoco-core"

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from typing import NamedTuple, Protocol, runtime_checkable
 
 from device_agent.ports.sensor import Frame
-from device_agent.protocol.messages import Pose, Twin
+from device_agent.protocol import Pose, Twin
 
 
 class DriverError(Exception):

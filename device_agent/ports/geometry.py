@@ -8,7 +8,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Protocol
 
-from device_agent.protocol.messages import Pose
+from device_agent.protocol import Pose
 
 
 class GeometryError(Exception):

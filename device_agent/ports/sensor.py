@@ -12,7 +12,7 @@ from typing import Protocol, runtime_checkable
 import numpy as np
 import numpy.typing as npt
 
-from device_agent.ports.world import SimulatedWorld
+from device_agent.ports.simulation import SimulatedWorld
 
 Floats = npt.NDArray[np.float64]
 Depths = npt.NDArray[np.float32]

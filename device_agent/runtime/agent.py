@@ -7,8 +7,8 @@ from device_agent.ports.transport import Transport
 from device_agent.protocol import topics
 from device_agent.protocol.errors import ProtocolError
 from device_agent.runtime.device import Device
-from device_agent.runtime.outbox import Outbox
-from device_agent.runtime.room import Room
+from device_agent.runtime.readings import Room
+from device_agent.runtime.telemetry.outbox import Outbox
 
 _log = logging.getLogger(__name__)
 

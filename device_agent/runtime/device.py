@@ -12,37 +12,36 @@ from collections.abc import Callable, Sequence
 
 from device_agent.ports.clock import CloudClock, tick_ms, wall_ms
 from device_agent.ports.driver import Audible, Driver, Filming, Reporting
+from device_agent.ports.floor_map import Ground
 from device_agent.ports.geometry import Geometry
-from device_agent.ports.ground import Ground
-from device_agent.ports.jail import Jail
+from device_agent.ports.sandbox import Jail
 from device_agent.ports.skills import Skills
 from device_agent.ports.speech import Speech
 from device_agent.ports.uploads import Uploads
-from device_agent.protocol import codec, topics
+from device_agent.protocol import JointTelemetry, Measurements, Setpoint, Stop, StopLatch, codec, topics
 from device_agent.protocol.errors import ProtocolError
 from device_agent.protocol.events import EventKind
-from device_agent.protocol.messages import JointTelemetry, Measurements, Setpoint, Stop, StopLatch
-from device_agent.protocol.robot_type import RobotType
-from device_agent.runtime import tasks
-from device_agent.runtime.actions import Executor
-from device_agent.runtime.audit import Audit, Happened
-from device_agent.runtime.body import Body
-from device_agent.runtime.controller import Controller
-from device_agent.runtime.filming import Filmer
-from device_agent.runtime.instrument import Instrument
-from device_agent.runtime.interlocks import Interlock, Interlocks
-from device_agent.runtime.journal import Journal
-from device_agent.runtime.lease import LeaseGate, Refused
-from device_agent.runtime.loop import ControlLoop
-from device_agent.runtime.office import Office
-from device_agent.runtime.outbox import Outbox, Publish
-from device_agent.runtime.pins import Pins
-from device_agent.runtime.reporter import Reporter
-from device_agent.runtime.room import Room
-from device_agent.runtime.sensing import SensorLoop
-from device_agent.runtime.speaker import Speaker
-from device_agent.runtime.trust import Trust
-from device_agent.runtime.voice import Voice
+from device_agent.protocol.manifests.robot_type import RobotType
+from device_agent.runtime.actions import call_action
+from device_agent.runtime.actions.device_context import Body
+from device_agent.runtime.actions.executor import Executor
+from device_agent.runtime.actions.script_policy import Trust
+from device_agent.runtime.actions.speech_output import Speaker
+from device_agent.runtime.authority.event_recorder import Audit, Happened
+from device_agent.runtime.authority.interlocks import Interlock, Interlocks
+from device_agent.runtime.authority.lease_gate import LeaseGate, Refused
+from device_agent.runtime.commands.command_processor import Office
+from device_agent.runtime.commands.pinned_keys import Pins
+from device_agent.runtime.control.control_loop import ControlLoop
+from device_agent.runtime.control.controller import Controller
+from device_agent.runtime.readings import Room
+from device_agent.runtime.room.room_device import Instrument
+from device_agent.runtime.room.sensor_loop import SensorLoop
+from device_agent.runtime.storage.journal import Journal
+from device_agent.runtime.telemetry.camera_streamer import Filmer
+from device_agent.runtime.telemetry.device_publisher import Voice
+from device_agent.runtime.telemetry.outbox import Outbox, Publish
+from device_agent.runtime.telemetry.stream_sampler import Reporter
 
 _REFUSED = {
     topics.CTL: EventKind.SETPOINTS_REFUSED,
@@ -140,7 +139,7 @@ class Device:
             room_device=None if instrument is None else instrument.manifest,
             simulated=driver.simulated,
             limits=self._controller.limits if robot_type.joints else (),
-            actions=tasks.kinds(body.can()) if instrument is None else instrument.actions,
+            actions=call_action.kinds(body.can()) if instrument is None else instrument.actions,
             interlocks=[rule.shown for rule in interlocks],
             journal=journal,
             publish=publish,

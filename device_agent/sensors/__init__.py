@@ -8,9 +8,9 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Protocol
 
-from device_agent.plug_ins import PlugIns
+from device_agent.ports.plugins import PlugIns
 from device_agent.ports.sensor import RoomDriver, SensorError, Surroundings
-from device_agent.protocol.room import RoomDevice
+from device_agent.protocol.manifests.room import RoomDevice
 
 __all__ = ["GROUP", "Factory", "load", "names"]
 

@@ -1,13 +1,13 @@
 """Who may say and hear what on the broker: credentials made from grants, and taken back.
 
-A grant (``device_agent.protocol.grants``) names one connection's exact topics. How it reaches the broker differs: the
+A grant (``device_agent.protocol.security.grants``) names one connection's exact topics. How it reaches the broker differs: the
 embedded broker reads a signed token, mosquitto gets a client and a role written into it. Callers see neither.
 """
 
 from collections.abc import Sequence
 from typing import NamedTuple, Protocol
 
-from device_agent.protocol.grants import Grant
+from device_agent.protocol.security.grants import Grant
 
 
 class BrokerAccessError(Exception):

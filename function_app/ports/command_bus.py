@@ -8,7 +8,7 @@ from collections.abc import AsyncIterator
 from contextlib import AbstractAsyncContextManager
 from typing import Protocol
 
-from device_agent.protocol.messages import Ack
+from device_agent.protocol import Ack
 
 
 class BusUnavailable(Exception):  # noqa: N818 (an outcome that callers expect)

@@ -4,8 +4,8 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Protocol
 
-from device_agent.protocol.messages import Twin
-from device_agent.protocol.robot_type import RobotType
+from device_agent.protocol import Twin
+from device_agent.protocol.manifests.robot_type import RobotType
 
 
 @dataclass(frozen=True, slots=True)

@@ -20,7 +20,7 @@ import paho.mqtt.client as mqtt
 import requests
 from paho.mqtt.enums import CallbackAPIVersion
 
-from device_agent.transports import trust
+from device_agent.transports import tls as trust
 from infra import programs
 from infra.home_assistant import discovery
 from infra.home_assistant.bridge import Bridge

@@ -6,9 +6,8 @@ import math
 from collections.abc import Callable, Iterable
 from concurrent.futures import ThreadPoolExecutor
 
-from device_agent.protocol import codec, frames, topics
+from device_agent.protocol import Description, Measurements, Presence, camera_frames, codec, topics
 from device_agent.protocol.errors import ProtocolError
-from device_agent.protocol.messages import Description, Measurements, Presence
 from infra.home_assistant import discovery
 from infra.home_assistant.discovery import Announcement
 
@@ -59,7 +58,7 @@ class Bridge:
                 case topics.TELE if device in self._known:
                     self._measured(device, parsed.name, payload)
                 case topics.CAM if device in self._known:
-                    self._say(discovery.topic(device, "cam", parsed.name), frames.decode(payload).jpeg, False)
+                    self._say(discovery.topic(device, "cam", parsed.name), camera_frames.decode(payload).jpeg, False)
         except ProtocolError as error:
             _log.warning("%s: %s", topic, str(error)[:300])
 

@@ -7,7 +7,7 @@ picks the value out, so a new field needs nothing new here.
 from collections.abc import Iterator, Mapping
 from typing import Any, NamedTuple
 
-from device_agent.protocol.messages import Control, Description
+from device_agent.protocol import Control, Description
 
 DISCOVERY = "homeassistant"
 """Where Home Assistant looks, unless it was told otherwise."""

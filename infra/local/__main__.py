@@ -17,7 +17,7 @@ from types import FrameType
 from typing import Any
 
 from infra.local import settings
-from infra.local.processes import Child, StartError
+from infra.local.supervisor import Child, StartError
 
 _NEEDS = ("fastapi", "uvicorn", "msgspec", "jwt", "paho", "amqtt", "mujoco", "ruckig", "requests", "numpy")
 _START_WITHIN_S = 60.0
@@ -139,7 +139,7 @@ class Machine:
             ports += ["--agents-ca", str(agents / "devices-ca.crt"), "--revoked", str(agents / "devices.crl")]
         if chosen.broker == "mosquitto":
             return ["-m", "infra.mosquitto", "--home", str(chosen.home / "mosquitto"), *ports]
-        return ["-m", "infra.amqtt", "--keys", str(chosen.home / "keys" / "public.json"), *ports]
+        return ["-m", "infra.embedded_broker", "--keys", str(chosen.home / "keys" / "public.json"), *ports]
 
     def _prosody(self) -> list[str]:
         chosen = self._chosen

@@ -14,7 +14,8 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from device_agent.protocol import codec, control, grants
+from device_agent.protocol import codec
+from device_agent.protocol.security import grants, revocation
 from infra import files, programs
 
 SERVICE = "service"
@@ -206,7 +207,7 @@ def _by_topic(acls: Iterable[dict[str, Any]]) -> set[tuple[str, str, bool]]:
 
 def _service_acls() -> list[dict[str, Any]]:
     mine = "$CONTROL/dynamic-security/#"
-    acls = [("publishClientSend", topic) for topic in (*grants.SERVICE_PUBLISH, mine) if topic != control.TOPIC]
+    acls = [("publishClientSend", topic) for topic in (*grants.SERVICE_PUBLISH, mine) if topic != revocation.TOPIC]
     for pattern in (*grants.SERVICE_SUBSCRIBE, mine):
         acls += [(kind, pattern) for kind in ("subscribePattern", "publishClientReceive")]
     return [{"acltype": kind, "topic": topic, "priority": 0, "allow": True} for kind, topic in acls]

@@ -6,7 +6,7 @@ import os
 import re
 from pathlib import Path
 
-from device_agent.protocol import jids, stanzas
+from device_agent.protocol.xmpp import jids, stanzas
 from infra import programs
 
 CONFIGURATION_FILE = "prosody.cfg.lua"

@@ -5,8 +5,8 @@ import datetime as dt
 import sys
 from pathlib import Path
 
-from infra.tls import authority, devices
-from infra.tls.authority import TlsError
+from infra.tls import agent_ca, server_ca
+from infra.tls.server_ca import TlsError
 
 _BAD_INPUT = 2
 
@@ -17,18 +17,18 @@ def main() -> int:
     now = dt.datetime.now(dt.UTC)
     try:
         if options.renew:
-            authority.renew(options.home, now=now)
+            server_ca.renew(options.home, now=now)
         elif options.devices:
-            devices.make(options.home, now=now)
-            print(f"agents are vouched for by {options.home / devices.CA_CERTIFICATE}")
+            agent_ca.make(options.home, now=now)
+            print(f"agents are vouched for by {options.home / agent_ca.CA_CERTIFICATE}")
             return 0
         elif options.certificate:
-            authority.take(options.home, certificate=options.certificate, key=options.key, ca=options.ca, now=now)
+            server_ca.take(options.home, certificate=options.certificate, key=options.key, ca=options.ca, now=now)
         elif not options.show:
-            authority.make(options.home, authority.names(tuple(options.name), tuple(options.address)), now=now)
-        print(authority.describe(options.home, now=now))
-        if (options.home / authority.CA_CERTIFICATE).exists():
-            print(f"browsers and agents are to trust {options.home / authority.CA_CERTIFICATE}")
+            server_ca.make(options.home, server_ca.names(tuple(options.name), tuple(options.address)), now=now)
+        print(server_ca.describe(options.home, now=now))
+        if (options.home / server_ca.CA_CERTIFICATE).exists():
+            print(f"browsers and agents are to trust {options.home / server_ca.CA_CERTIFICATE}")
         if options.renew or options.certificate:
             print("restart broker and functions, which read it at their start")
     except TlsError as error:

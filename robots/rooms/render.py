@@ -18,15 +18,15 @@ sys.path.insert(0, str(ROOMS.parent.parent))
 
 import mujoco  # noqa: E402
 
-from device_agent.drivers.mujoco import worlds  # noqa: E402
-from device_agent.drivers.mujoco.assembly import TIMESTEP_S  # noqa: E402
+from device_agent.simulation import world_registry  # noqa: E402
+from device_agent.simulation.scene_assembly import TIMESTEP_S  # noqa: E402
 
 WIDTH, HEIGHT = 480, 360
 
 
 def draw(name: str, camera: str, *, after_s: float, settings: dict[str, float]) -> Any:
     """The picture, shape (height, width, 3), 8 bits a colour."""
-    world = worlds.of(ROOMS / name)
+    world = world_registry.of(ROOMS / name)
     world.build()
     for what, value in settings.items():
         world.set(what, value)

@@ -17,9 +17,9 @@ sys.path.insert(0, str(ROOMS.parent.parent))
 import msgspec  # noqa: E402
 
 from device_agent import sensors  # noqa: E402
-from device_agent.drivers.mujoco import worlds  # noqa: E402
 from device_agent.ports.sensor import RoomDriver, Surroundings  # noqa: E402
-from device_agent.protocol import room  # noqa: E402
+from device_agent.protocol.manifests import room  # noqa: E402
+from device_agent.simulation import world_registry  # noqa: E402
 
 SETTLE_S = 4.0
 """Blinds, door and cameras take that long to where they start [s]."""
@@ -42,7 +42,7 @@ def survey(name: str) -> tuple[Path, bytes]:
     if device is None or not device.options.get("survey"):
         sys.exit(f"room '{name}' has no device with the driver 'perception' whose options name a survey")
     options = {**device.options, "survey": "", "mounts": []}
-    world = worlds.make(msgspec.structs.replace(manifest, robots=(), people=()), folder, {})
+    world = world_registry.make(msgspec.structs.replace(manifest, robots=(), people=()), folder, {})
     world.add(Nobody())
     neighbours: dict[str, RoomDriver] = {}
     surroundings = Surroundings(neighbours=neighbours, world=world)

@@ -5,8 +5,8 @@ from pathlib import Path
 
 import pytest
 
-from function_app.adapters.local.keys import FileKeys
-from tests.support.brokers import RunningBroker, start_broker
+from function_app.adapters.local.signing_keys import FileKeys
+from tests.harness.network.brokers import RunningBroker, start_broker
 
 
 @pytest.fixture(scope="session")

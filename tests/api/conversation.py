@@ -8,14 +8,13 @@ from typing import Any
 
 import httpx
 
-from device_agent.protocol import topics
-from device_agent.protocol.messages import AckStatus, Fault, Measurements, Mode, RunMovement, State
+from device_agent.protocol import AckStatus, Fault, Measurements, Mode, RunMovement, State, topics
 from tests.api.transcript import Transcript
-from tests.support.brokers import Message
-from tests.support.cloud import API, MOVE
-from tests.support.hosts import Host
-from tests.support.polling import PollingRobot, Site, _Line
-from tests.support.site import Visitor
+from tests.harness.cloud.cloud import API, MOVE
+from tests.harness.cloud.people import Visitor
+from tests.harness.cloud.polling import PollingRobot, Site, _Line
+from tests.harness.hosts import Host
+from tests.harness.network.brokers import Message
 
 PUBLIC_URL = "http://telescope.test"
 """What the functions believe to be their address."""
@@ -129,7 +128,7 @@ class Conversation:
         self.robot.connect()
 
     def keys(self) -> dict[str, Any]:
-        from device_agent.protocol import signing
+        from device_agent.protocol.security import signing
 
         return {key["id"]: signing.public_key(key["public"]) for key in self.robot.enrollment()["keys"]}
 

@@ -17,7 +17,7 @@ import requests
 import schemathesis
 from cryptography.hazmat.primitives.serialization import load_pem_private_key
 
-from device_agent.protocol import signing
+from device_agent.protocol.security import signing
 
 WORLD: dict[str, Any] = json.loads(Path(os.environ["TELESCOPE_WORLD"]).read_text(encoding="utf-8"))
 TURN_S = 600

@@ -11,13 +11,13 @@ from typing import Any
 import pytest
 from cryptography.hazmat.primitives import serialization
 
-from device_agent.protocol import signing, topics
-from device_agent.protocol.messages import AckStatus, Fault, Measurements, Mode, State
-from tests.support.brokers import ROOT, RunningBroker
-from tests.support.cloud import API, MOVE
-from tests.support.hosts import Host, start_host
-from tests.support.polling import PollingRobot, Site
-from tests.support.site import Visitor, sign_in
+from device_agent.protocol import AckStatus, Fault, Measurements, Mode, State, topics
+from device_agent.protocol.security import signing
+from tests.harness.cloud.cloud import API, MOVE
+from tests.harness.cloud.people import Visitor, sign_in
+from tests.harness.cloud.polling import PollingRobot, Site
+from tests.harness.hosts import Host, start_host
+from tests.harness.network.brokers import ROOT, RunningBroker
 
 CHECKS = (
     "not_a_server_error",

@@ -8,11 +8,11 @@ import pytest
 
 from tests.api.conversation import PUBLIC_URL, Conversation
 from tests.conftest import Emulators
-from tests.support.aws import use_credentials
-from tests.support.brokers import RunningBroker
-from tests.support.hosts import HOSTS, HostKind, start_host
-from tests.support.site import sign_in_links
-from tests.support.stores import STORES, StoreKind, empty_store, make_places
+from tests.harness.cloud.people import sign_in_links
+from tests.harness.hosts import HOSTS, HostKind, start_host
+from tests.harness.network.brokers import RunningBroker
+from tests.harness.stores.aws import use_credentials
+from tests.harness.stores.emulators import STORES, StoreKind, empty_store, make_places
 
 Talk = Callable[[StoreKind, HostKind, Path], list[str]]
 

@@ -9,7 +9,7 @@ from typing import Any
 
 import httpx
 
-from tests.support.cloud import API
+from tests.harness.cloud.cloud import API
 
 _NAMED = frozenset({"id", "agent", "account", "session", "space", "action", "upload", "client_id", "public", "fault"})
 """Fields whose value is an id: it may stand inside other texts as well."""

@@ -6,8 +6,8 @@ from typing import Any
 import pytest
 from playwright.sync_api import Browser, Playwright, sync_playwright
 
-from tests.support.browser import FLAT, chromium
-from tests.support.machine import Machine, start_machine
+from tests.harness.browser.browser import FLAT, chromium
+from tests.harness.browser.product import Machine, start_machine
 
 LABORATORY = {
     "test_acts",

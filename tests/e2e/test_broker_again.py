@@ -8,9 +8,9 @@ from pathlib import Path
 import pytest
 from playwright.sync_api import Browser, Page, expect
 
-from tests.support.arm import drive, elbow, end_in_mid_motion, operator, release, stopped_in_time
-from tests.support.brokers import BROKERS, wait_until
-from tests.support.machine import Api, Machine, start_machine
+from tests.harness.agent.arm import drive, elbow, end_in_mid_motion, operator, release, stopped_in_time
+from tests.harness.browser.product import Api, Machine, start_machine
+from tests.harness.network.brokers import BROKERS, wait_until
 
 NOTE = """() => {
     window.saidOfTheLink = [];
@@ -28,7 +28,7 @@ TYPED = "0.123"
 def site(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[tuple[Machine, str]]:
     """The product, and what its broker's program is called."""
     if request.param == "amqtt":
-        yield request.getfixturevalue("machine"), "infra.amqtt"
+        yield request.getfixturevalue("machine"), "infra.embedded_broker"
         return
     with start_machine(tmp_path, TELESCOPE_BROKER=request.param) as machine:
         yield machine, f"infra.{request.param}"

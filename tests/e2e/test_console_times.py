@@ -5,8 +5,8 @@ from itertools import pairwise
 from playwright.sync_api import Browser
 
 from benchmarks import console
-from tests.support.browser import pages
-from tests.support.machine import Machine
+from tests.harness.browser.browser import pages
+from tests.harness.browser.product import Machine
 
 CLOCKS_AGREE_MS = 15.0
 """The simulation's record has a line each 10 ms, and the wall clocks of two programs are read in between."""

@@ -2,9 +2,9 @@
 
 from playwright.sync_api import Browser, Page, expect
 
-from tests.support.browser import PATIENCE_MS
-from tests.support.machine import Machine
-from tests.support.pages import assert_good_page
+from tests.harness.browser.browser import PATIENCE_MS
+from tests.harness.browser.pages import assert_good_page
+from tests.harness.browser.product import Machine
 
 
 def test_a_newcomer_is_told_how_to_get_going(browser: Browser, machine: Machine) -> None:

@@ -9,9 +9,9 @@ from playwright.sync_api import Browser, Page, expect
 from benchmarks.console_fleet import ROBOTS, kept, open_together
 from benchmarks.crowd import crowd
 from benchmarks.puppets import puppets
-from tests.support.brokers import wait_until
-from tests.support.browser import PATIENCE_MS, pages
-from tests.support.machine import Machine, start_machine
+from tests.harness.browser.browser import PATIENCE_MS, pages
+from tests.harness.browser.product import Machine, start_machine
+from tests.harness.network.brokers import wait_until
 
 SHOWN_MS = 8_000
 KEEPS = 1.5

@@ -8,10 +8,10 @@ from typing import Any
 import pytest
 from playwright.sync_api import Browser, Error, Page, Route, expect
 
-from tests.support.brokers import wait_until
-from tests.support.browser import PATIENCE_MS, person
-from tests.support.machine import Machine
-from tests.support.pages import assert_good_page
+from tests.harness.browser.browser import PATIENCE_MS, person
+from tests.harness.browser.pages import assert_good_page
+from tests.harness.browser.product import Machine
+from tests.harness.network.brokers import wait_until
 
 SILENCE_MS = 12_000
 

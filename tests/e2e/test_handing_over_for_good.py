@@ -2,9 +2,9 @@
 
 from playwright.sync_api import Browser, Page, expect
 
-from tests.support.browser import PATIENCE_MS, person
-from tests.support.machine import Api, Machine
-from tests.support.pages import assert_good_page
+from tests.harness.browser.browser import PATIENCE_MS, person
+from tests.harness.browser.pages import assert_good_page
+from tests.harness.browser.product import Api, Machine
 
 TO = "Berta"
 ROOM = "Annex"

@@ -8,8 +8,8 @@ from typing import Any
 import httpx
 import pytest
 
-from tests.support.brokers import wait_until
-from tests.support.machine import Api, Machine, Trace
+from tests.harness.browser.product import Api, Machine, Trace
+from tests.harness.network.brokers import wait_until
 
 FAR, NEAR = {"shoulder_pan": 2.0}, {"shoulder_pan": -2.0}
 SLOW = 0.05

@@ -7,10 +7,10 @@ from pathlib import Path
 
 from playwright.sync_api import Browser, Page, expect
 
-from tests.support.brokers import wait_until
-from tests.support.browser import PATIENCE_MS, pages
-from tests.support.machine import Api, Machine
-from tests.support.pages import assert_good_page
+from tests.harness.browser.browser import PATIENCE_MS, pages
+from tests.harness.browser.pages import assert_good_page
+from tests.harness.browser.product import Api, Machine
+from tests.harness.network.brokers import wait_until
 
 MEASURED = 20
 UR5_HTTP_MS, UR5_XMPP_MS = "2994.6", "824.25"

@@ -13,8 +13,8 @@ from typing import Any
 import httpx
 import pytest
 
-from tests.support.brokers import BROKERS, ROOT, wait_until
-from tests.support.machine import Machine, free_ports, moves, ready_link, start_machine
+from tests.harness.browser.product import Machine, free_ports, moves, ready_link, start_machine
+from tests.harness.network.brokers import BROKERS, ROOT, wait_until
 
 
 def clear_line(machine: Machine) -> str:
@@ -70,7 +70,7 @@ def test_it_gets_ready_ends_cleanly_and_keeps_its_data(tmp_path: Path, broker: s
 def test_every_part_that_is_killed_comes_back(tmp_path: Path) -> None:
     with start_machine(tmp_path) as machine, machine.api() as api:
         device = api.device()
-        for words in ("infra.amqtt", "function_app serve", "function_app work", "-m device_agent"):
+        for words in ("infra.embedded_broker", "function_app serve", "function_app work", "-m device_agent"):
             machine.kill(words)
             wait_until(functools.partial(_runs, machine, words), f"{words} to be started again")
         wait_until(lambda: moves(api, device["id"]), "the robot to move again")
@@ -88,7 +88,7 @@ def test_when_the_supervisor_is_killed_nothing_is_left_behind(tmp_path: Path) ->
     with start_machine(tmp_path) as machine:
         children = [
             machine.pid(words)
-            for words in ("infra.amqtt", "function_app serve", "function_app work", "-m device_agent")
+            for words in ("infra.embedded_broker", "function_app serve", "function_app work", "-m device_agent")
         ]
         machine.process.send_signal(signal.SIGKILL)
         wait_until(lambda: not any(Path(f"/proc/{pid}").exists() for pid in children), "the others to end")

@@ -8,10 +8,10 @@ from typing import Any
 import pytest
 from playwright.sync_api import Browser, Locator, Page, expect
 
-from tests.support.brokers import ROOT, wait_until
-from tests.support.browser import PATIENCE_MS, pages
-from tests.support.machine import Api, Machine, Trace
-from tests.support.pages import assert_good_page
+from tests.harness.browser.browser import PATIENCE_MS, pages
+from tests.harness.browser.pages import assert_good_page
+from tests.harness.browser.product import Api, Machine, Trace
+from tests.harness.network.brokers import ROOT, wait_until
 
 SECOND = "second"
 SCRIPT = '''"""Turn the last wrist."""

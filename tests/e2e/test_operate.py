@@ -12,7 +12,7 @@ from typing import Any
 
 from playwright.sync_api import Browser, Page, Playwright, expect
 
-from tests.support.arm import (
+from tests.harness.agent.arm import (
     commanded_speed,
     drive,
     elbow,
@@ -23,9 +23,9 @@ from tests.support.arm import (
     stopped_in_time,
     take,
 )
-from tests.support.brokers import PATIENCE_S, wait_until
-from tests.support.browser import FLAT, PATIENCE_MS
-from tests.support.machine import Machine
+from tests.harness.browser.browser import FLAT, PATIENCE_MS
+from tests.harness.browser.product import Machine
+from tests.harness.network.brokers import PATIENCE_S, wait_until
 
 
 def reset(page: Page) -> None:

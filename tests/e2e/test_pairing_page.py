@@ -15,11 +15,11 @@ from pathlib import Path
 import pytest
 from playwright.sync_api import Browser, Page, expect
 
-from device_agent import claim_link
-from tests.support.brokers import ROOT, wait_until
-from tests.support.browser import PATIENCE_MS, person
-from tests.support.machine import Machine
-from tests.support.pages import assert_good_page
+from device_agent.cli import claim_prompt
+from tests.harness.browser.browser import PATIENCE_MS, person
+from tests.harness.browser.pages import assert_good_page
+from tests.harness.browser.product import Machine
+from tests.harness.network.brokers import ROOT, wait_until
 
 
 class Terminal:
@@ -79,7 +79,7 @@ def test_a_robot_is_paired_by_the_link_in_its_agents_terminal(
 ) -> None:
     link = terminal.link()
     # The same link stands there as a picture.
-    drawn = claim_link.picture(link)
+    drawn = claim_prompt.picture(link)
     wait_until(lambda: all(line in terminal.text for line in drawn), "the QR code")
     with machine.api() as api, person(browser, link) as page:
         known = {device["id"] for device in api.get("/devices")["items"]}

@@ -7,8 +7,8 @@ import subprocess
 import time
 from pathlib import Path
 
-from tests.support.brokers import ROOT, wait_until
-from tests.support.machine import Machine
+from tests.harness.browser.product import Machine
+from tests.harness.network.brokers import ROOT, wait_until
 
 
 def block(name: str, machine: Machine, home: Path) -> str:

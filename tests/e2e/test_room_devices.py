@@ -15,13 +15,12 @@ from typing import Any
 import httpx
 import pytest
 
-from device_agent.protocol import codec, frames, topics
-from device_agent.protocol import room as rooms
-from device_agent.protocol.messages import Measurements
+from device_agent.protocol import Measurements, camera_frames, codec, topics
+from device_agent.protocol.manifests import room as rooms
 from function_app.ports.broker_access import Credentials
 from infra.mosquitto.configuration import binary
-from tests.support.brokers import ROOT, Client, wait_until
-from tests.support.machine import Api, Machine, moves
+from tests.harness.browser.product import Api, Machine, moves
+from tests.harness.network.brokers import ROOT, Client, wait_until
 
 RATE_HZ, FOR_S = 20.0, 3.0
 
@@ -153,7 +152,7 @@ def test_pictures_come_to_who_may_see_them(api: Api) -> None:
             return len(pictures) >= 5
 
         wait_until(enough, "pictures")
-    told = [frames.decode(each) for each in pictures]
+    told = [camera_frames.decode(each) for each in pictures]
     assert {(each.width, each.height) for each in told} == {(320, 240)}
     assert [each.sequence for each in told] == sorted({each.sequence for each in told})
     assert all(each.jpeg.startswith(b"\xff\xd8") for each in told)

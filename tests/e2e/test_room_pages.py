@@ -4,11 +4,11 @@ import math
 
 from playwright.sync_api import Browser, Page, expect
 
-from device_agent.protocol import room as rooms
-from tests.support.brokers import ROOT, wait_until
-from tests.support.browser import PATIENCE_MS, pages
-from tests.support.machine import Machine
-from tests.support.pages import assert_good_page
+from device_agent.protocol.manifests import room as rooms
+from tests.harness.browser.browser import PATIENCE_MS, pages
+from tests.harness.browser.pages import assert_good_page
+from tests.harness.browser.product import Machine
+from tests.harness.network.brokers import ROOT, wait_until
 
 ROBOTS = ("ur5", "nao", "qbo", "hanson")
 FIXED = ("ur5", "hanson")

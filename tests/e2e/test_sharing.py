@@ -4,8 +4,8 @@ import time
 
 import httpx
 
-from tests.support.brokers import wait_until
-from tests.support.machine import Machine, Trace
+from tests.harness.browser.product import Machine, Trace
+from tests.harness.network.brokers import wait_until
 
 
 def target_rad(trace: Trace) -> float:

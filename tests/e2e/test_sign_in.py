@@ -5,12 +5,12 @@ from collections.abc import Iterator
 import pytest
 from playwright.sync_api import Browser, Page, expect
 
-from tests.support.brokers import wait_until
-from tests.support.browser import PATIENCE_MS
-from tests.support.hosts.host import environment_of, start_program
-from tests.support.hosts.uvicorn import _answers, _free_port
-from tests.support.open_id import CLIENT_ID, CLIENT_SECRET, new_key, start_provider
-from tests.support.site import sign_in_link
+from tests.harness.browser.browser import PATIENCE_MS
+from tests.harness.cloud.oidc_provider import CLIENT_ID, CLIENT_SECRET, new_key, start_provider
+from tests.harness.cloud.people import sign_in_link
+from tests.harness.hosts.host import environment_of, start_program
+from tests.harness.hosts.uvicorn import _answers, _free_port
+from tests.harness.network.brokers import wait_until
 
 PASSWORD = "correct horse battery"
 

@@ -6,10 +6,10 @@ from collections.abc import Callable, Iterator
 import pytest
 from playwright.sync_api import Browser, Error, Locator, Page, expect
 
-from tests.support.brokers import wait_until
-from tests.support.browser import PATIENCE_MS, pages
-from tests.support.machine import Machine, Trace
-from tests.support.pages import assert_good_page
+from tests.harness.browser.browser import PATIENCE_MS, pages
+from tests.harness.browser.pages import assert_good_page
+from tests.harness.browser.product import Machine, Trace
+from tests.harness.network.brokers import wait_until
 
 TRIES = 20
 GAMEPAD = """() => {

@@ -15,8 +15,8 @@ import pytest
 from function_app.ports.broker_access import Credentials
 from infra.local.__main__ import taken as taken_port
 from infra.mosquitto.configuration import binary
-from tests.support.brokers import ROOT, Client, wait_until
-from tests.support.machine import Machine, start_machine
+from tests.harness.browser.product import Machine, start_machine
+from tests.harness.network.brokers import ROOT, Client, wait_until
 
 
 @contextlib.contextmanager
@@ -49,7 +49,7 @@ def test_all_of_it_speaks_tls(tmp_path: Path) -> None:
         assert machine.process.poll() is None, "".join(machine.lines)
         assert machine.ready.startswith(f"ready {machine.url}/ ")
         link = subprocess.run(
-            [sys.executable, "-m", "infra.local.link"],
+            [sys.executable, "-m", "infra.local.sign_in_link"],
             cwd=ROOT, env=os.environ | {"TELESCOPE_HOME": str(tmp_path)}, capture_output=True, text=True, check=True,
         ).stdout.strip()  # fmt: skip
         assert link.startswith(f"{machine.url}/#sign-in="), "make link is told the folder alone"

@@ -13,11 +13,10 @@ from typing import Any
 
 import pytest
 
-from device_agent.protocol import codec, topics
-from device_agent.protocol.messages import JointTarget, JointTelemetry, Setpoint
+from device_agent.protocol import JointTarget, JointTelemetry, Setpoint, codec, topics
 from function_app.ports.broker_access import Credentials
-from tests.support.brokers import ROOT, Client, wait_until
-from tests.support.machine import Api, Machine, start_machine
+from tests.harness.browser.product import Api, Machine, start_machine
+from tests.harness.network.brokers import ROOT, Client, wait_until
 
 NUDGE = {"kind": "move_joints", "speed": 1.0}
 LONG = {"kind": "move_joints", "speed": 0.05, "position_rad": {"shoulder_pan": 1.5}}

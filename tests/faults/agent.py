@@ -6,7 +6,7 @@ from typing import Any
 import paho.mqtt.client as paho
 
 from device_agent import __main__
-from device_agent.runtime import stream
+from device_agent.runtime.control import setpoint_stream
 
 
 def main(mqtt_port: str, watchdog_s: str, *arguments: str) -> int:
@@ -16,7 +16,7 @@ def main(mqtt_port: str, watchdog_s: str, *arguments: str) -> int:
         return connect(client, host, int(mqtt_port), **options)
 
     paho.Client.connect = redirected  # type: ignore[method-assign,assignment]
-    stream.WATCHDOG_S = float(watchdog_s)
+    setpoint_stream.WATCHDOG_S = float(watchdog_s)
     return __main__.main(("run", *arguments))
 
 

@@ -22,8 +22,7 @@ import paho.mqtt.client as paho
 import requests
 from paho.mqtt.enums import CallbackAPIVersion
 
-from device_agent.protocol import codec
-from device_agent.protocol.messages import JointTarget, JointTelemetry, Mode, Setpoint, State
+from device_agent.protocol import JointTarget, JointTelemetry, Mode, Setpoint, State, codec
 
 PERIOD_S = 0.025
 FRESH_S = 0.2

@@ -15,7 +15,7 @@ from dataclasses import dataclass, field
 
 import httpx
 
-from infra.local.processes import Child
+from infra.local.supervisor import Child
 from tests.faults.judge import MOST_MS, Record, Verdict, judge, share
 from tests.faults.stack import MOVEMENT, PATIENCE_S, Console, Stack, now_ms
 

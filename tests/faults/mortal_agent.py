@@ -25,17 +25,17 @@ import msgspec
 from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
 
 from device_agent.ports.clock import CloudClock, tick_ms, wall_ms
-from device_agent.protocol import codec, signing, topics
-from device_agent.protocol.messages import Ack, Command
-from device_agent.runtime.controller import Controller
+from device_agent.protocol import Ack, Command, codec, topics
+from device_agent.protocol.security import signing
+from device_agent.runtime.control.controller import Controller
 from device_agent.runtime.device import Device
-from device_agent.runtime.journal import Journal
-from device_agent.runtime.outbox import Outbox
-from device_agent.runtime.room import Room
-from device_agent.runtime.shelf import Shelf
-from tests.support.jail import LateJail
-from tests.support.pins import pins_of
-from tests.support.toys import ToyDriver, robot_type
+from device_agent.runtime.readings import Room
+from device_agent.runtime.storage.journal import Journal
+from device_agent.runtime.storage.outbox_store import Shelf
+from device_agent.runtime.telemetry.outbox import Outbox
+from tests.fakes.drivers import ToyDriver, robot_type
+from tests.harness.agent.pinned_keys import pins_of
+from tests.harness.agent.sandbox import LateJail
 
 TARGET_RAD = 1e-4
 """The elbow's target [rad] times this is the number of the command that moved it: so each move says whose it is."""

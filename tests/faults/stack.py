@@ -20,11 +20,11 @@ from typing import Any
 import httpx
 import msgspec
 
-from infra.local.processes import Child
+from infra.local.supervisor import Child
 from tests.faults.console import Seat
-from tests.support.brokers import ROOT, BrokerKind, wait_until
-from tests.support.machine import free_ports
-from tests.support.proxy import HOST, Proxy
+from tests.harness.browser.product import free_ports
+from tests.harness.network.brokers import ROOT, BrokerKind, wait_until
+from tests.harness.network.proxy import HOST, Proxy
 
 PATIENCE_S = 60.0
 _AGENT_NICE = -10

@@ -7,7 +7,7 @@ import pytest
 from tests.faults.cuts import EVERYBODY, OPERATOR, SCRIPT, Bench, Tally
 from tests.faults.judge import Row, judge
 from tests.faults.stack import start
-from tests.support.brokers import BROKERS, BrokerKind
+from tests.harness.network.brokers import BROKERS, BrokerKind
 
 EVERY_ROUND_MS = 10.0
 

@@ -12,11 +12,11 @@ from typing import Any
 import msgspec
 import pytest
 
-from device_agent.protocol import signing
-from device_agent.protocol.messages import AckStatus, CancelAction, Command, GrantLease, MoveJoints, RunMovement
+from device_agent.protocol import AckStatus, CancelAction, Command, GrantLease, MoveJoints, RunMovement
+from device_agent.protocol.security import signing
 from tests.faults.mortal_agent import AGENT, DEVICE, SPACE, TARGET_RAD, Life
-from tests.support.bench import signed_movement
-from tests.support.brokers import ROOT
+from tests.harness.agent.device_harness import signed_movement
+from tests.harness.network.brokers import ROOT
 
 LIVES = 30
 """Lives on one journal, one after another; the last is not cut short."""

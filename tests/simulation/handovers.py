@@ -12,10 +12,10 @@ from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass, field
 
-from device_agent.protocol.messages import JointTarget, Mode, Setpoint, StopLatch
-from device_agent.runtime.controller import Controller
-from device_agent.runtime.lease import Lease, LeaseGate, Refused
-from tests.support.toys import PERIOD_S, joint, robot_type
+from device_agent.protocol import JointTarget, Mode, Setpoint, StopLatch
+from device_agent.runtime.authority.lease_gate import Lease, LeaseGate, Refused
+from device_agent.runtime.control.controller import Controller
+from tests.fakes.drivers import PERIOD_S, joint, robot_type
 
 HANDOVERS = 50
 """In one history, of one robot."""

@@ -1,9 +1,9 @@
-// Writes src/core/protocol.ts from docs/asyncapi.json; with --check says whether it is what the document says.
+// Writes src/shared/mqtt/protocol.generated.ts from docs/asyncapi.json; with --check says whether it is what the document says.
 // It knows the part of JSON Schema that the document uses and refuses the rest, so that nothing is left out in silence.
 import { readFileSync, writeFileSync } from "node:fs";
 
 const source = new URL("../../docs/asyncapi.json", import.meta.url);
-const target = new URL("../src/core/protocol.ts", import.meta.url);
+const target = new URL("../src/shared/mqtt/protocol.generated.ts", import.meta.url);
 
 const HEAD = `// Generated from docs/asyncapi.json by \`make contract\`; do not edit.
 // Only types: what arrives is checked in messages.ts before anything else sees it. SI units and radians.
@@ -61,7 +61,7 @@ const text = [HEAD, ...Object.entries(schemas).map(([name, schema]) => declarati
 
 if (process.argv.includes("--check")) {
   if (readFileSync(target, "utf8") !== text) {
-    process.stderr.write("web/src/core/protocol.ts is stale; run `make contract`\n");
+    process.stderr.write("web/src/shared/mqtt/protocol.generated.ts is stale; run `make contract`\n");
     process.exit(1);
   }
 } else {

@@ -3,11 +3,11 @@ import { CompletionContext } from "@codemirror/autocomplete";
 import { python } from "@codemirror/lang-python";
 import { EditorState } from "@codemirror/state";
 import { describe, expect, test } from "vitest";
-import type { Scripting } from "../src/core/library";
-import { complete } from "../src/ui/movements/completion";
+import type { Scripting } from "../src/features/movements/model/movement-library";
+import { complete } from "../src/features/movements/completion";
 
 const api = JSON.parse(
-  readFileSync(new URL("../../device_agent/protocol/script_api.json", import.meta.url), "utf8"),
+  readFileSync(new URL("../../device_agent/protocol/documents/script_api.json", import.meta.url), "utf8"),
 ) as Scripting["api"];
 const scripting: Scripting = { api, names: { joints: ["elbow", "wrist_1"], frames: ["flange"], postures: ["Stand"] } };
 

@@ -1,11 +1,11 @@
 /** The lease's life on a clock that the test turns, with the server's answers in the test's hands. */
 import { signal } from "@preact/signals-core";
 import { afterEach, beforeEach, describe, expect, it, vi } from "vitest";
-import { Api, type Device, type Granted, type Lease } from "../src/core/api";
-import { ApiError } from "../src/core/http";
-import { Control, LEASE_MS } from "../src/core/control";
-import { DeviceStore } from "../src/core/device";
-import type { Link, LinkStatus, Receiver } from "../src/core/link";
+import { Api, type Device, type Granted, type Lease } from "../src/shared/api/client";
+import { ApiError } from "../src/shared/api/http";
+import { Control, LEASE_MS } from "../src/features/control/model/lease";
+import { DeviceStore } from "../src/features/devices/model/device-store";
+import type { Link, LinkStatus, Receiver } from "../src/shared/mqtt/mqtt-link";
 import { description } from "./support/arm";
 
 const TOPIC = "ts/v1/lab/a1/arm";

@@ -1,11 +1,11 @@
 import { describe, expect, it } from "vitest";
-import { degrees, radians } from "../src/core/angles";
-import { History, SPAN_MS } from "../src/core/history";
-import type { KnownTelemetry } from "../src/core/messages";
-import { percentile, RoundTrip } from "../src/core/round-trip";
-import { signInFailure, signInToken } from "../src/core/session";
-import { deviceTopics, matches } from "../src/core/topics";
-import { texts } from "../src/texts";
+import { degrees, radians } from "../src/shared/lib/angles";
+import { History, SPAN_MS } from "../src/features/twin/model/recent-telemetry";
+import type { KnownTelemetry } from "../src/shared/mqtt/parse-messages";
+import { percentile, RoundTrip } from "../src/features/latency/model/round-trip";
+import { signInFailure, signInToken } from "../src/features/account/model/session";
+import { deviceTopics, matches } from "../src/shared/mqtt/topics";
+import { texts } from "../src/shared/i18n/texts";
 
 describe("the round trip", () => {
   it("counts each setpoint once, at the first telemetry that names it", () => {

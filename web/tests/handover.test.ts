@@ -1,12 +1,12 @@
 /** Control from hand to hand, as each of the two pages lives it, with the server's answers in the test's hands. */
 import { signal } from "@preact/signals-core";
 import { afterEach, beforeEach, describe, expect, it, vi } from "vitest";
-import { Api, type ControlRequest, type Device, type Granted, type Lease, type Watcher } from "../src/core/api";
-import { Control, LEASE_MS } from "../src/core/control";
-import { DeviceStore } from "../src/core/device";
-import { ApiError } from "../src/core/http";
-import type { Link, LinkStatus, Receiver } from "../src/core/link";
-import { Watching } from "../src/core/watching";
+import { Api, type ControlRequest, type Device, type Granted, type Lease, type Watcher } from "../src/shared/api/client";
+import { Control, LEASE_MS } from "../src/features/control/model/lease";
+import { DeviceStore } from "../src/features/devices/model/device-store";
+import { ApiError } from "../src/shared/api/http";
+import type { Link, LinkStatus, Receiver } from "../src/shared/mqtt/mqtt-link";
+import { Watching } from "../src/features/control/model/watchers";
 import { description } from "./support/arm";
 
 const TOPIC = "ts/v1/lab/a1/arm";

@@ -1,6 +1,6 @@
 /** What the health page says where the device and the cloud do not agree, and what is measured of what. */
 import { describe, expect, it } from "vitest";
-import { around, healthNow, openCount, standings, watchedQuantity, worstFirst, type Fault, type Watched } from "../src/core/health";
+import { around, healthNow, openCount, standings, watchedQuantity, worstFirst, type Fault, type Watched } from "../src/features/health/model/health";
 
 const fault = (code: string, more: Partial<Fault> = {}): Fault => ({
   id: code,

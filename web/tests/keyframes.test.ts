@@ -14,11 +14,11 @@ import {
   type Keyframe,
   type Movement,
   type Problem,
-} from "../src/core/keyframes";
-import { readMovement, readScript, writeScript } from "../src/core/keyframe-script";
-import { Recorder, kept, keyframesOf, trim, type Sample } from "../src/core/recording";
-import { Undoable } from "../src/core/undo";
-import type { KnownTelemetry } from "../src/core/messages";
+} from "../src/features/keyframes/model/keyframes";
+import { readMovement, readScript, writeScript } from "../src/features/keyframes/model/script-codec";
+import { Recorder, kept, keyframesOf, trim, type Sample } from "../src/features/keyframes/model/recording";
+import { Undoable } from "../src/shared/lib/undo-history";
+import type { KnownTelemetry } from "../src/shared/mqtt/parse-messages";
 import { head } from "./support/robots";
 
 const robot = head();

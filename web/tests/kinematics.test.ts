@@ -1,7 +1,7 @@
 import { describe, expect, it } from "vitest";
-import { forward, jointFrames, multiply, placed, rollPitchYaw, rotate, standing } from "../src/core/kinematics";
-import type { Quaternion, Vector3 } from "../src/core/vectors";
-import { readTwin, type KnownBody } from "../src/core/messages";
+import { forward, jointFrames, multiply, placed, rollPitchYaw, rotate, standing } from "../src/features/twin/model/forward-kinematics";
+import type { Quaternion, Vector3 } from "../src/shared/lib/vectors";
+import { readTwin, type KnownBody } from "../src/shared/mqtt/parse-messages";
 import fixture from "./fixtures/ur5.json";
 import { twin as ur5 } from "./support/arm";
 

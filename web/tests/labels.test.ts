@@ -1,5 +1,5 @@
 import { describe, expect, it } from "vitest";
-import { type Box, type Named, placeLabels } from "../src/core/labels";
+import { type Box, type Named, placeLabels } from "../src/features/spaces/model/label-placement";
 
 const ROOM = { width: 360, height: 300 };
 const named = (x: number, y: number, width = 90): Named => ({ x, y, width, height: 18 });

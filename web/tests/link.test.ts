@@ -1,6 +1,6 @@
 import { afterEach, beforeEach, describe, expect, it } from "vitest";
-import { Api } from "../src/core/api";
-import { MqttLink, type LinkState } from "../src/core/link";
+import { Api } from "../src/shared/api/client";
+import { MqttLink, type LinkState } from "../src/shared/mqtt/mqtt-link";
 import { Cloud, problem } from "./support/cloud";
 import { until } from "./support/until";
 

@@ -1,8 +1,8 @@
 import { signal } from "@preact/signals-core";
 import { describe, expect, it } from "vitest";
-import type { Device } from "../src/core/api";
-import type { DeviceStore } from "../src/core/device";
-import { fits, type Wanted } from "../src/core/listing";
+import type { Device } from "../src/shared/api/client";
+import type { DeviceStore } from "../src/features/devices/model/device-store";
+import { fits, type Wanted } from "../src/features/devices/model/filter";
 
 const ALL: Wanted = { search: "", kinds: "all", whose: "all", onlyTrouble: false };
 

@@ -1,9 +1,9 @@
 import { beforeEach, describe, expect, test } from "vitest";
-import { ApiError, type Http } from "../src/core/http";
-import { Kept, keptDraft, type Draft } from "../src/core/kept";
-import { Library, type MovementSource } from "../src/core/library";
-import { Manuscript } from "../src/core/manuscript";
-import { failureMark, placed } from "../src/core/marks";
+import { ApiError, type Http } from "../src/shared/api/http";
+import { Kept, keptDraft, type Draft } from "../src/shared/lib/local-storage";
+import { Library, type MovementSource } from "../src/features/movements/model/movement-library";
+import { Manuscript } from "../src/features/movements/model/script-draft";
+import { failureMark, placed } from "../src/shared/lib/text-offsets";
 
 /** The movements of one account, as the back end keeps them. */
 class Shelf {

@@ -2,8 +2,8 @@ import { describe, expect, it, vi } from "vitest";
 
 vi.stubGlobal("location", { hash: "" });
 vi.stubGlobal("addEventListener", () => undefined);
-const { PAGES, ROWS } = await import("../src/ui/pages");
-const route = await import("../src/ui/route");
+const { PAGES, ROWS } = await import("../src/app/page-registry");
+const route = await import("../src/app/routes");
 
 describe("the table of pages", () => {
   it("reads each address as the page that it was written for", () => {

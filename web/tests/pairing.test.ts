@@ -1,6 +1,6 @@
 /** Claim codes as people type them and links carry them. */
 import { describe, expect, it } from "vitest";
-import { FollowedCode, pairingCode, readCode } from "../src/core/pairing";
+import { FollowedCode, pairingCode, readCode } from "../src/features/pairing/model/claim-code";
 
 describe("a claim code", () => {
   it.each(["BCDF-GHJK", "bcdfghjk", " bcdf ghjk ", "BCDF–GHJK"])("is read as it is typed: %s", (typed) => {

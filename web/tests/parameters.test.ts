@@ -1,7 +1,7 @@
 import { describe, expect, test } from "vitest";
-import { keptDraft, keptParameters } from "../src/core/kept";
-import type { ObjectSchema } from "../src/core/library";
-import { fieldsOf, fill, read } from "../src/core/parameters";
+import { keptDraft, keptParameters } from "../src/shared/lib/local-storage";
+import type { ObjectSchema } from "../src/features/movements/model/movement-library";
+import { fieldsOf, fill, read } from "../src/features/movements/model/parameter-form";
 
 const SCHEMA: ObjectSchema = {
   type: "object",

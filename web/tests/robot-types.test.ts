@@ -1,9 +1,9 @@
 import { describe, expect, it } from "vitest";
-import { readFinding, readFindings } from "../src/core/findings";
-import { ApiError } from "../src/core/http";
-import type { Look, RobotType, RobotTypes, TypeFolder, TypeModel } from "../src/core/robot-types";
-import { TypeDraft } from "../src/core/type-draft";
-import { choose, pack } from "../src/core/type-folder";
+import { readFinding, readFindings } from "../src/features/robot-types/model/parse-findings";
+import { ApiError } from "../src/shared/api/http";
+import type { Look, RobotType, RobotTypes, TypeFolder, TypeModel } from "../src/features/robot-types/model/robot-types";
+import { TypeDraft } from "../src/features/robot-types/model/upload-draft";
+import { choose, pack } from "../src/features/robot-types/model/upload-files";
 
 const bytes = (text: string): Uint8Array => new TextEncoder().encode(text);
 const folder = (...names: string[]): Map<string, Uint8Array> => new Map(names.map((name) => [name, bytes(name)]));

@@ -1,12 +1,12 @@
 import { readFileSync } from "node:fs";
 import { deflateSync } from "node:zlib";
 import { describe, expect, it } from "vitest";
-import { readFrame } from "../src/core/frames";
-import { MessageError, readApplied, readDescription, readMeasurements, readScan, readShot, type KnownDiagnostic } from "../src/core/messages";
-import { readDepth } from "../src/core/png";
-import { judge, quantityOf } from "../src/core/quantities";
-import { apart, extent, readFloor, readPlaces } from "../src/core/room";
-import { Recording } from "../src/core/series";
+import { readFrame } from "../src/shared/mqtt/camera-frame";
+import { MessageError, readApplied, readDescription, readMeasurements, readScan, readShot, type KnownDiagnostic } from "../src/shared/mqtt/parse-messages";
+import { readDepth } from "../src/shared/lib/png";
+import { judge, quantityOf } from "../src/features/sensors/model/quantities";
+import { apart, extent, readFloor, readPlaces } from "../src/features/spaces/model/room-perception";
+import { Recording } from "../src/features/sensors/model/stored-series";
 
 const bytes = (value: unknown): Uint8Array => new TextEncoder().encode(JSON.stringify(value));
 
@@ -245,7 +245,7 @@ describe("a recording", () => {
 });
 
 describe("the colours of the page", () => {
-  const style = readFileSync(new URL("../src/style.css", import.meta.url), "utf8");
+  const style = readFileSync(new URL("../src/shared/ui/style.css", import.meta.url), "utf8");
   const luminance = (hex: string): number => {
     const [red = 0, green = 0, blue = 0] = [1, 3, 5]
       .map((at) => parseInt(hex.slice(at, at + 2), 16) / 255)

@@ -1,5 +1,5 @@
 import { expect, it } from "vitest";
-import { canBeSeen } from "../src/core/seen";
+import { canBeSeen } from "../src/features/twin/model/visible-change";
 
 const LEVER_M = 2;
 const PX_PER_M = 100;

@@ -1,14 +1,14 @@
 /** Sharing, invitations and the record of what was done, against the API's shapes. */
 import { afterEach, beforeEach, describe, expect, it } from "vitest";
-import { Api } from "../src/core/api";
-import { aboutWhat, accountsIn, AuditReader, EVERYTHING } from "../src/core/audit";
-import { Fleet } from "../src/core/fleet";
-import { FollowedInvitation, invitationSecret } from "../src/core/invitation";
-import type { AuditRecord, Share } from "../src/core/rights";
-import { Session } from "../src/core/session";
-import { secondsLeft, Sharing } from "../src/core/sharing";
-import { line, type Names } from "../src/ui/activity-line";
-import { seconds } from "../src/ui/lasting";
+import { Api } from "../src/shared/api/client";
+import { aboutWhat, accountsIn, AuditReader, EVERYTHING } from "../src/features/account/model/audit-log";
+import { Fleet } from "../src/features/devices/model/device-list";
+import { FollowedInvitation, invitationSecret } from "../src/features/sharing/model/invitation-link";
+import type { AuditRecord, Share } from "../src/features/sharing/model/wire-types";
+import { Session } from "../src/features/account/model/session";
+import { secondsLeft, Sharing } from "../src/features/sharing/model/shares";
+import { line, type Names } from "../src/features/account/audit-entry-text";
+import { seconds } from "../src/shared/ui/duration-picker";
 import { Cloud, DEVICE, problem, type Call } from "./support/cloud";
 import { until } from "./support/until";
 

@@ -1,9 +1,9 @@
 import { describe, expect, it } from "vitest";
-import { DEAD_ZONE, readPad, type Pad } from "../src/core/gamepad";
-import { Held } from "../src/core/held";
-import { DRIVE_KEYS, JOG_KEYS, jointOfKey } from "../src/core/keymap";
-import type { KnownDescription } from "../src/core/messages";
-import { direction, driveOf, jogOf, pushed, restOf, sumOf, waysOf } from "../src/core/steering";
+import { DEAD_ZONE, readPad, type Pad } from "../src/features/steering/model/gamepad-mapping";
+import { Held } from "../src/features/steering/model/held-inputs";
+import { DRIVE_KEYS, JOG_KEYS, jointOfKey } from "../src/features/steering/model/keymap";
+import type { KnownDescription } from "../src/shared/mqtt/parse-messages";
+import { direction, driveOf, jogOf, pushed, restOf, sumOf, waysOf } from "../src/features/steering/model/steerable-parts";
 import { description } from "./support/arm";
 
 const LIMITS = { forward_m_s: 0.3, left_m_s: 0, turn_rad_s: 1.5 };

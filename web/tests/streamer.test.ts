@@ -1,7 +1,7 @@
 import { afterEach, beforeEach, describe, expect, it, vi } from "vitest";
-import type { KnownTelemetry } from "../src/core/messages";
-import type { DriveTarget, JogTarget, Joint, Mode, Setpoint } from "../src/core/protocol";
-import { ABANDON_MS, FRESH_MS, LOST_MS, PERIOD_MS, SETTLE_MS, SetpointStreamer, STUCK_MS } from "../src/core/streamer";
+import type { KnownTelemetry } from "../src/shared/mqtt/parse-messages";
+import type { DriveTarget, JogTarget, Joint, Mode, Setpoint } from "../src/shared/mqtt/protocol.generated";
+import { ABANDON_MS, FRESH_MS, LOST_MS, PERIOD_MS, SETTLE_MS, SetpointStreamer, STUCK_MS } from "../src/features/steering/model/setpoint-streamer";
 
 const joint = (name: string): Joint => ({
   name,

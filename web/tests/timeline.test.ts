@@ -1,8 +1,8 @@
 /** The page's reckoning of keyframes is the robot's own. */
 import { readFileSync } from "node:fs";
 import { expect, test } from "vitest";
-import { poseAt, plan, type Movement, type Robot } from "../src/core/keyframes";
-import { Curve, fitted, moments, type Stay } from "../src/core/timeline";
+import { poseAt, plan, type Movement, type Robot } from "../src/features/keyframes/model/keyframes";
+import { Curve, fitted, moments, type Stay } from "../src/features/keyframes/model/timeline-layout";
 import { head } from "./support/robots";
 
 interface Case {
@@ -12,7 +12,7 @@ interface Case {
   reckoned: { reached_s: number[]; position_rad: number[][] };
 }
 
-const cases = JSON.parse(readFileSync(new URL("../../tests/unit/agent/timelines.json", import.meta.url), "utf8")) as Case[];
+const cases = JSON.parse(readFileSync(new URL("../../tests/unit/device_agent/runtime/planning/timelines.json", import.meta.url), "utf8")) as Case[];
 
 /** The robot rests somewhere at first; in a plan that is the first keyframe. */
 function movement({ start_rad, keyframes }: Case, robot: Robot): Movement {

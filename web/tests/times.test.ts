@@ -1,13 +1,13 @@
 /** Times: what is drawn, what it comes to, what is saved; and the papers' figures. */
 import { signal } from "@preact/signals-core";
 import { describe, expect, it } from "vitest";
-import { Api, type Action, type LatencyBatch } from "../src/core/api";
-import type { DeviceStore } from "../src/core/device";
-import { ApiError, Http } from "../src/core/http";
-import type { Link } from "../src/core/link";
-import { Measure, TIMES, waysOf } from "../src/core/measure";
-import { PUBLISHED, publishedFor, UR5_TABLE_2 } from "../src/core/papers";
-import { csv, figuresOf, linesOf, shares, TimesApi, type Line, type Sample, type StoredTimes } from "../src/core/times";
+import { Api, type Action, type LatencyBatch } from "../src/shared/api/client";
+import type { DeviceStore } from "../src/features/devices/model/device-store";
+import { ApiError, Http } from "../src/shared/api/http";
+import type { Link } from "../src/shared/mqtt/mqtt-link";
+import { Measure, TIMES, waysOf } from "../src/features/latency/model/probe";
+import { PUBLISHED, publishedFor, UR5_TABLE_2 } from "../src/features/latency/model/published-figures";
+import { csv, figuresOf, linesOf, shares, TimesApi, type Line, type Sample, type StoredTimes } from "../src/features/latency/model/latency-stats";
 
 const stored = (more: Partial<StoredTimes> = {}): StoredTimes => ({
   transport: "mqtt",

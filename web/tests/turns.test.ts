@@ -1,5 +1,5 @@
 import { afterEach, beforeEach, expect, it, vi } from "vitest";
-import { Turn } from "../src/ui/turns";
+import { Turn } from "../src/shared/hooks/draw-scheduler";
 
 const COST_MS = 40;
 

@@ -3,16 +3,16 @@
 from collections.abc import Mapping
 from pathlib import Path
 
-from device_agent.drivers.mujoco import worlds
-from device_agent.drivers.mujoco.assembly import Placement
+from device_agent.drivers.mujoco.biped_driver import WalkingDriver
 from device_agent.drivers.mujoco.driver import MujocoDriver
-from device_agent.drivers.mujoco.snapshot import Snapshot
-from device_agent.drivers.mujoco.walking import WalkingDriver
-from device_agent.drivers.mujoco.wheels import WheeledDriver
-from device_agent.drivers.mujoco.world import World
-from device_agent.mjcf.twin import draw
+from device_agent.drivers.mujoco.wheeled_driver import WheeledDriver
 from device_agent.ports.driver import DriverError
-from device_agent.protocol.robot_type import RobotType
+from device_agent.protocol.manifests.robot_type import RobotType
+from device_agent.simulation import world_registry
+from device_agent.simulation.mjcf.twin import draw
+from device_agent.simulation.scene_assembly import Placement
+from device_agent.simulation.snapshot import Snapshot
+from device_agent.simulation.world import World
 
 __all__ = [
     "MujocoDriver",
@@ -53,10 +53,10 @@ def create(robot_type: RobotType, folder: Path, options: Mapping[str, object], d
         return _kind(robot_type)(robot_type=robot_type, world=world, device=device, faults=faults)
     if "scene" in options:
         raise DriverError("driver 'mujoco' takes a room or a scene, not both")
-    world = worlds.of(folder / str(options["room"]))
+    world = world_registry.of(folder / str(options["room"]))
     if trace is not None:
-        world.trace(trace, prefix=worlds.prefix(device))
-    prefix = worlds.prefix(device)
+        world.trace(trace, prefix=world_registry.prefix(device))
+    prefix = world_registry.prefix(device)
     return _kind(robot_type)(robot_type=robot_type, world=world, device=device, prefix=prefix, faults=faults)
 
 

@@ -10,20 +10,20 @@ from typing import Any
 import mujoco
 import numpy as np
 
-from device_agent.drivers.mujoco.ailments import WELL, Ailments, Infliction, Sickbed
-from device_agent.drivers.mujoco.assembly import SCALAR_JOINTS
-from device_agent.drivers.mujoco.eyes import Eyes
-from device_agent.drivers.mujoco.health import HEALTH, Health
-from device_agent.drivers.mujoco.snapshot import Floats, Ints, Snapshot
-from device_agent.drivers.mujoco.stiffness import Stiffness
-from device_agent.drivers.mujoco.world import STALE_S, World
-from device_agent.mjcf import twin
+from device_agent.drivers.mujoco.cameras import Eyes
+from device_agent.drivers.mujoco.fault_injection import WELL, Ailments, Infliction, Sickbed
+from device_agent.drivers.mujoco.motor_model import HEALTH, Health
+from device_agent.drivers.mujoco.servo_gains import Stiffness
 from device_agent.ports import skills
 from device_agent.ports.driver import DriverError, Observation
 from device_agent.ports.sensor import Frame
 from device_agent.ports.skills import Skill, SkillError, Stage
-from device_agent.protocol.messages import Pose, Twin
-from device_agent.protocol.robot_type import RobotType
+from device_agent.protocol import Pose, Twin
+from device_agent.protocol.manifests.robot_type import RobotType
+from device_agent.simulation.mjcf import twin
+from device_agent.simulation.scene_assembly import SCALAR_JOINTS
+from device_agent.simulation.snapshot import Floats, Ints, Snapshot
+from device_agent.simulation.world import STALE_S, World
 
 log = logging.getLogger(__name__)
 

@@ -7,14 +7,14 @@ from pathlib import Path
 import msgspec
 
 from device_agent.ports.sensor import RoomDriver, SensorError, Surroundings
-from device_agent.ports.world import SimulatedWorld
-from device_agent.protocol.room import RoomDevice
-from device_agent.sensors.mujoco.ailments import patient
+from device_agent.ports.simulation import SimulatedWorld
+from device_agent.protocol.manifests.room import RoomDevice
+from device_agent.sensors.mujoco.base import Part
 from device_agent.sensors.mujoco.cameras import ColourCamera, DepthCamera
+from device_agent.sensors.mujoco.fault_injection import patient
 from device_agent.sensors.mujoco.lidar import Lidar
-from device_agent.sensors.mujoco.meters import Contact, Meter
-from device_agent.sensors.mujoco.part import Part
 from device_agent.sensors.mujoco.pir import Pir
+from device_agent.sensors.mujoco.scalar_sensors import Contact, Meter
 
 __all__ = ["FAULTS", "KINDS", "create"]
 

@@ -8,13 +8,13 @@ from typing import Any
 import numpy as np
 import simplejpeg
 
-from device_agent.mjcf.studio import Shot, Studio, studio_of
 from device_agent.ports.sensor import Bytes, Capture, Frame, Image, SensorError
-from device_agent.ports.world import SimulatedWorld
-from device_agent.protocol.room import RoomDevice
+from device_agent.ports.simulation import SimulatedWorld
+from device_agent.protocol.manifests.room import RoomDevice
 from device_agent.sensors import png
+from device_agent.sensors.mujoco.base import Part
 from device_agent.sensors.mujoco.noise import generator
-from device_agent.sensors.mujoco.part import Part
+from device_agent.simulation.renderer import Shot, Studio, studio_of
 
 FRESH_S = 0.1
 """What ``raw`` gives is no older than this."""

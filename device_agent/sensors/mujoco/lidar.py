@@ -10,10 +10,10 @@ import numpy as np
 
 from device_agent.ports.clock import wall_ms
 from device_agent.ports.sensor import Capture, Floats, Scan, Values
-from device_agent.ports.world import SimulatedWorld
-from device_agent.protocol.room import RoomDevice
+from device_agent.ports.simulation import SimulatedWorld
+from device_agent.protocol.manifests.room import RoomDevice
+from device_agent.sensors.mujoco.base import Part
 from device_agent.sensors.mujoco.noise import generator
-from device_agent.sensors.mujoco.part import Part
 
 STREAM = "range"
 _BEAMS = 360

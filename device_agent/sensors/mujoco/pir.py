@@ -8,9 +8,9 @@ import mujoco
 import numpy as np
 
 from device_agent.ports.sensor import Floats, Values
-from device_agent.ports.world import SimulatedWorld
-from device_agent.protocol.room import RoomDevice
-from device_agent.sensors.mujoco.part import Part
+from device_agent.ports.simulation import SimulatedWorld
+from device_agent.protocol.manifests.room import RoomDevice
+from device_agent.sensors.mujoco.base import Part
 
 STREAM = "motion"
 _FURTHEST_M = 7.0

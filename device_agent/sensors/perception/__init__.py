@@ -3,7 +3,7 @@
 from pathlib import Path
 
 from device_agent.ports.sensor import Surroundings
-from device_agent.protocol.room import RoomDevice
+from device_agent.protocol.manifests.room import RoomDevice
 from device_agent.sensors.perception.driver import PerceptionDriver
 
 __all__ = ["PerceptionDriver", "create"]

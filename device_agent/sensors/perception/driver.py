@@ -11,17 +11,17 @@ import msgspec
 import numpy as np
 from msgspec import Struct, field
 
-from device_agent.perception import picture
-from device_agent.perception.grid import OccupancyGrid
-from device_agent.perception.kinds import Kind, Mount, Place
-from device_agent.perception.rows import rows
-from device_agent.perception.sight import Sight, Zone
-from device_agent.perception.survey import Survey, SurveyError
-from device_agent.perception.tracks import Box
+from device_agent.perception import grid_image
+from device_agent.perception.background_model import Survey, SurveyError
+from device_agent.perception.grid_rows import rows
+from device_agent.perception.object_classes import Kind, Mount, Place
+from device_agent.perception.occupancy_grid import OccupancyGrid
+from device_agent.perception.sensor_fusion import Sight, Zone
+from device_agent.perception.tracker import Box
 from device_agent.ports.sensor import Capture, Image, RoomDriver, Scan, SensorError, Values
-from device_agent.protocol import room as rooms
 from device_agent.protocol.errors import ProtocolError
-from device_agent.protocol.room import Room, RoomDevice
+from device_agent.protocol.manifests import room as rooms
+from device_agent.protocol.manifests.room import Room, RoomDevice
 from device_agent.sensors import png
 
 log = logging.getLogger(__name__)
@@ -179,7 +179,7 @@ class PerceptionDriver:
         sight = self._require()
         now_s = time.monotonic()
         if name == OCCUPANCY:
-            return Capture("image/png", png.encode(picture.draw(sight.grid, sight.places(now_s))))
+            return Capture("image/png", png.encode(grid_image.draw(sight.grid, sight.places(now_s))))
         if name == MAP:
             return Capture("application/json", msgspec.json.encode(_map(sight.grid, sight.places(now_s))))
         if name == SURVEY:

@@ -18,12 +18,11 @@ from typing import TypeVar
 
 from device_agent.ports.clock import wall_ms
 from device_agent.ports.transport import LinkChanged, Receive
-from device_agent.protocol import codec, topics
+from device_agent.protocol import Ack, Presence, codec, topics
 from device_agent.protocol.errors import ProtocolError
-from device_agent.protocol.messages import Ack, Presence
-from device_agent.transports.back_off import BackOff
-from device_agent.transports.http.api import ANSWER_WITHIN_S, CloudApi, CloudError, Letter
-from device_agent.transports.http.out_tray import Message, OutTray
+from device_agent.transports.backoff import BackOff
+from device_agent.transports.http.client import ANSWER_WITHIN_S, CloudApi, CloudError, Letter
+from device_agent.transports.http.send_queue import Message, OutTray
 
 LONG_POLL_S = 25.0
 """Below what proxies and hosts cut as idle."""

@@ -8,7 +8,7 @@ from urllib.parse import urljoin
 import requests
 
 from device_agent.ports.uploads import UploadError
-from device_agent.transports.http.api import CloudApi, CloudError
+from device_agent.transports.http.client import CloudApi, CloudError
 
 _WITHIN_S = 60.0
 

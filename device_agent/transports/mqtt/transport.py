@@ -16,9 +16,8 @@ from paho.mqtt.reasoncodes import ReasonCode
 
 from device_agent.ports.clock import wall_ms
 from device_agent.ports.transport import LinkChanged, Receive
-from device_agent.protocol import codec, topics
-from device_agent.protocol.messages import Presence
-from device_agent.transports.back_off import BackOff
+from device_agent.protocol import Presence, codec, topics
+from device_agent.transports.backoff import BackOff
 from device_agent.transports.mqtt.connection import Connection
 
 KEEP_ALIVE_S = 4

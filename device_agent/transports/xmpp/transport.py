@@ -17,10 +17,10 @@ from xml.etree.ElementTree import Element
 
 from device_agent.ports.clock import wall_ms
 from device_agent.ports.transport import LinkChanged, Receive
-from device_agent.protocol import codec, stanzas
+from device_agent.protocol import Presence, codec
 from device_agent.protocol.errors import ProtocolError
-from device_agent.protocol.messages import Presence
-from device_agent.protocol.xmpp_stream import Login, Stream, StreamError
+from device_agent.protocol.xmpp import stanzas
+from device_agent.protocol.xmpp.stream import Login, Stream, StreamError
 
 _CONFIRM_S = 5.0
 _GOODBYE_S = 0.5

@@ -11,9 +11,9 @@ import re
 from typing import Any
 from weakref import WeakValueDictionary
 
-from function_app.adapters import rows
 from function_app.adapters.aws import names
 from function_app.adapters.aws.client import Client, Refused
+from function_app.adapters.shared import row_codec
 from function_app.ports.blobs import MAX_BYTES, MAX_NAME_LENGTH, Upload, check_upload
 from function_app.ports.tables import StoreError
 
@@ -93,7 +93,7 @@ class S3Blobs:
 
     async def list(self, prefix: str, *, limit: int = 1000) -> tuple[str, ...]:
         """See ``Blobs``."""
-        if not rows.is_text(prefix):
+        if not row_codec.is_text(prefix):
             raise ValueError(_NO_NAME)
         if limit < 1:
             return ()
@@ -169,7 +169,7 @@ class S3Blobs:
     def _place(self, name: str) -> dict[str, str]:
         if not 1 <= len(name) <= MAX_NAME_LENGTH:
             raise ValueError(f"a blob's name has 1 to {MAX_NAME_LENGTH} characters, not {len(name)}")
-        if not rows.is_text(name):
+        if not row_codec.is_text(name):
             raise ValueError(_NO_NAME)
         key = encode(name[: names.HEAD])
         return {"Bucket": self._bucket, "Key": key if not names.is_long(name) else key + names.digest(name)}

@@ -8,12 +8,12 @@ import time
 from collections.abc import Sequence
 from typing import Any
 
-from device_agent.protocol.grants import Grant
-from function_app.adapters.aws import policies
+from device_agent.protocol.security.grants import Grant
+from function_app.adapters.aws import iot_policies
 from function_app.adapters.aws.client import Client, Refused
-from function_app.adapters.broker_rights import BrokerRights, each
+from function_app.adapters.shared.grant_registry import BrokerRights, each
 from function_app.ports.broker_access import BrokerAccessError, Credentials, ServiceCredentials
-from function_app.ports.keys import Keys
+from function_app.ports.signing_keys import Keys
 from function_app.ports.tables import StoreError, Tables
 
 _MISSING = "ResourceNotFoundException"
@@ -45,7 +45,7 @@ class IotBrokerAccess:
 
     async def issue(self, grant: Grant) -> Credentials:
         """As the port says."""
-        policies.documents(grant, place=_LONGEST)  # whether there is room for it
+        iot_policies.documents(grant, place=_LONGEST)  # whether there is room for it
         return await self._rights.issue(grant)
 
     def takes(self, publish: Sequence[str], subscribe: Sequence[str]) -> bool:
@@ -59,7 +59,7 @@ class IotBrokerAccess:
             expires_at=0,
         )
         try:
-            policies.documents(grant, place=_LONGEST)
+            iot_policies.documents(grant, place=_LONGEST)
         except BrokerAccessError:
             return False
         return True
@@ -90,7 +90,7 @@ class IotBrokerAccess:
             StoreError: It is not known whether the grant was taken back: nobody is let in.
         """
         grant = await self._rights.judge(username=username.partition("?")[0], password=password, client_id=client_id)
-        return policies.refusal() if grant is None else policies.answer(grant, place=place, now_s=time.time())
+        return iot_policies.refusal() if grant is None else iot_policies.answer(grant, place=place, now_s=time.time())
 
     async def close(self) -> None:
         """As the port says."""

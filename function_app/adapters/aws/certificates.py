@@ -2,9 +2,9 @@
 
 import contextlib
 
-from function_app.adapters import certificate_requests
-from function_app.adapters.aws import policies
+from function_app.adapters.aws import iot_policies
 from function_app.adapters.aws.client import Client, Refused
+from function_app.adapters.shared import csr
 from function_app.ports.broker_access import BrokerAccessError
 from function_app.ports.certificates import Issued
 from function_app.ports.tables import StoreError
@@ -44,7 +44,7 @@ class IotCertificates:
         """See ``Certificates``."""
         from cryptography import x509  # noqa: PLC0415 (only where certificates are in use)
 
-        certificate_requests.read(request)
+        csr.read(request)
         try:
             made = await self._client.call(
                 "create_certificate_from_csr", certificateSigningRequest=request, setAsActive=False
@@ -101,7 +101,7 @@ class IotCertificates:
         await self._client.call("create_policy_version", policyName=name, policyDocument=document, setAsDefault=True)
 
     def _policies(self, place: str) -> dict[str, str]:
-        return {f"{self._policy}-{number}": text for number, text in enumerate(policies.agents(place=place))}
+        return {f"{self._policy}-{number}": text for number, text in enumerate(iot_policies.agents(place=place))}
 
     async def revoke(self, agent: str) -> None:
         """See ``Certificates``."""

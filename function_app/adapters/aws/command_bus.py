@@ -4,7 +4,7 @@ import asyncio
 import contextlib
 from collections.abc import AsyncGenerator, AsyncIterator
 
-from device_agent.protocol.messages import Ack
+from device_agent.protocol import Ack
 from function_app.adapters.aws.client import Client, Refused
 from function_app.ports.command_bus import BusUnavailable
 from function_app.ports.tables import StoreError

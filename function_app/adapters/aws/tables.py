@@ -17,9 +17,9 @@ import time
 from collections.abc import Sequence
 from typing import Any
 
-from function_app.adapters import rows
 from function_app.adapters.aws import names
 from function_app.adapters.aws.client import Client, Refused
+from function_app.adapters.shared import row_codec
 from function_app.ports.tables import Conflict, Page, Row, StoreError, Write
 
 TRIES = 8
@@ -109,8 +109,8 @@ class DynamoTables:
         cursor: str | None = None,
     ) -> Page:
         """See ``Tables``."""
-        rows.check_limit(limit)
-        start = first if cursor is None else max(first, rows.read_cursor(cursor))
+        row_codec.check_limit(limit)
+        start = first if cursor is None else max(first, row_codec.read_cursor(cursor))
         _check_text(partition, start, last or "")
         if last is not None and last <= start:
             return Page((), None)
@@ -130,11 +130,11 @@ class DynamoTables:
                 break
             question["ExclusiveStartKey"] = answer["LastEvaluatedKey"]
         found.sort(key=lambda row: row.key)
-        return Page(tuple(found[:limit]), rows.write_cursor(found[limit].key) if len(found) > limit else None)
+        return Page(tuple(found[:limit]), row_codec.write_cursor(found[limit].key) if len(found) > limit else None)
 
     async def batch(self, table: str, writes: Sequence[Write]) -> tuple[Row, ...]:
         """See ``Tables``."""
-        texts = rows.check_batch(writes)
+        texts = row_codec.check_batch(writes)
         written = tuple(_written(write) for write in writes)
         items = [_change(table, *each) for each in zip(writes, written, texts, strict=True)]
         changes = [{kind: {"TableName": self._table, **what} for kind, what in item.items()} for item in items]
@@ -152,9 +152,9 @@ class DynamoTables:
         await self._client.close()
 
     async def _put(self, table: str, write: Write) -> Row:
-        rows.check(write.row)
+        row_codec.check(write.row)
         row = _written(write)
-        change = _change(table, write, row, rows.encode(row.data))["Put"]
+        change = _change(table, write, row, row_codec.encode(row.data))["Put"]
         try:
             await self._write("put_item", TableName=self._table, **change)
         except Refused as error:
@@ -228,7 +228,7 @@ def _partition(table: str, partition: str) -> str:
 
 def _row(partition: str, item: dict[str, Any]) -> Row:
     key = item.get("name", item["k"])["S"]
-    return Row(partition, key, rows.decode(item["data"]["S"]), item["etag"]["S"])
+    return Row(partition, key, row_codec.decode(item["data"]["S"]), item["etag"]["S"])
 
 
 def _range(place: str, start: str, last: str | None) -> dict[str, Any]:
@@ -255,5 +255,5 @@ def _whole(found: list[Row], limit: int) -> bool:
 
 
 def _check_text(*texts: str) -> None:
-    if not all(map(rows.is_text, texts)):
+    if not all(map(row_codec.is_text, texts)):
         raise ValueError("partitions and keys are Unicode text without lone surrogates")

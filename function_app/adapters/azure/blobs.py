@@ -19,7 +19,7 @@ from weakref import WeakValueDictionary
 
 from function_app.adapters.azure import names
 from function_app.adapters.azure.client import ATTEMPTS, Client, Place, Refused, code_of, credential, transport
-from function_app.adapters.azure.signing_keys import SigningKeys
+from function_app.adapters.azure.sas_keys import SigningKeys
 from function_app.ports.blobs import MAX_BYTES, MAX_NAME_LENGTH, Upload, check_upload
 from function_app.ports.tables import StoreError
 

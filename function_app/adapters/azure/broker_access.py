@@ -20,11 +20,11 @@ import time
 from collections.abc import Awaitable, Callable, Sequence
 from typing import Any
 
-from device_agent.protocol.grants import Grant
+from device_agent.protocol.security.grants import Grant
 from function_app.adapters.azure import topic_spaces
-from function_app.adapters.broker_rights import BrokerRights, each
+from function_app.adapters.shared.grant_registry import BrokerRights, each
 from function_app.ports.broker_access import BrokerAccessError, Credentials, ServiceCredentials
-from function_app.ports.keys import Keys
+from function_app.ports.signing_keys import Keys
 from function_app.ports.tables import StoreError, Tables
 
 CUTTER = "service:cutter"

@@ -13,7 +13,7 @@ from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 from urllib.parse import quote
 
-from device_agent.protocol.messages import Ack
+from device_agent.protocol import Ack
 from function_app.adapters.azure.client import THREADS, Place, credential, transport
 from function_app.ports.command_bus import BusUnavailable
 

@@ -1,45 +1,84 @@
-"""With what addresses of blobs are signed: the account's key, or one that Azure lends to the functions' identity."""
+"""Signing keys in Azure's Key Vault, as one of its secrets: its keys know no Ed25519."""
 
-import threading
-from datetime import UTC, datetime, timedelta
-from typing import TYPE_CHECKING, Any
+import contextlib
+from collections.abc import Callable
+from typing import TYPE_CHECKING
 
-from function_app.adapters.azure.client import ATTEMPTS, Place, transport
+from function_app.adapters.azure.client import ATTEMPTS, Client, Place, Refused, credential, transport
+from function_app.adapters.shared.key_ring_keys import wall_ms
+from function_app.adapters.shared.vault_keys import AGAIN_MS, LOOK_EVERY_MS, Secret, VaultKeys
 
 if TYPE_CHECKING:
-    from azure.storage.blob import ContainerClient, UserDelegationKey
+    from azure.keyvault.secrets import SecretClient
 
-LENT = timedelta(hours=12)
-_RETRY_WITHIN_S = 1
-_CLOCKS = timedelta(minutes=5)
-"""Azure's clock and ours may differ by this much."""
+_MISSING = 404
+_TYPE = "application/json"
 
 
-class SigningKeys:
-    """Used in threads. A lent key is kept until an address signed with it could outlive it."""
+class KeyVaultKeys(VaultKeys):
+    """``Keys`` in one secret.
 
-    def __init__(self, place: Place) -> None:
-        self._place = place
-        self._lock = threading.Lock()
-        self._lent: UserDelegationKey | None = None
-        self._ends = datetime.min.replace(tzinfo=UTC)
+    Args:
+        secret: Its name.
+        place: The vault's address, and the identity to show there.
+        now_ms: The wall clock, by which overlaps end.
+        look_every_ms: How long what was read is good [ms].
+        again_ms: Least time between two looks [ms].
+    """
 
-    def of(self, container: "ContainerClient", lifetime_s: int) -> dict[str, Any]:
-        """The key for an address that is good for ``lifetime_s`` [s], as the SDK wants to be given it."""
-        if not self._place.url:
-            return {"account_key": container.credential.account_key}
-        now = datetime.now(UTC)
-        with self._lock:
-            if self._lent is None or now + timedelta(seconds=lifetime_s) > self._ends:
-                ends = now + timedelta(seconds=lifetime_s) + LENT
-                self._lent = self._borrow(container.credential, now - _CLOCKS, ends)
-                self._ends = ends
-            return {"user_delegation_key": self._lent}
+    def __init__(
+        self,
+        *,
+        secret: str,
+        place: Place,
+        now_ms: Callable[[], int] = wall_ms,
+        look_every_ms: int = LOOK_EVERY_MS,
+        again_ms: int = AGAIN_MS,
+    ) -> None:
+        what = f"the secret '{secret}'"
+        super().__init__(what=what, now_ms=now_ms, look_every_ms=look_every_ms, again_ms=again_ms)
+        self._secret = secret
 
-    def _borrow(self, credential: Any, start: datetime, end: datetime) -> "UserDelegationKey":
-        from azure.storage.blob import BlobServiceClient, LinearRetry  # noqa: PLC0415 (costs half a second)
+        def open_(things: contextlib.ExitStack) -> "SecretClient":
+            from azure.keyvault.secrets import SecretClient  # noqa: PLC0415 (see the client's first lines)
 
-        retry = LinearRetry(backoff=0, retry_total=ATTEMPTS - 1, random_jitter_range=_RETRY_WITHIN_S)
-        options: dict[str, Any] = {"transport": transport(), "retry_policy": retry}
-        with BlobServiceClient(self._place.url, credential=credential, **options) as service:
-            return service.get_user_delegation_key(start, end)
+            return things.enter_context(
+                SecretClient(
+                    place.url,
+                    credential(place, things),
+                    transport=transport(),
+                    retry_total=ATTEMPTS - 1,
+                    retry_backoff_factor=0.1,
+                )
+            )
+
+        self._client = Client(
+            open_,
+            place=place,
+            what=what,
+            role="Key Vault Secrets User' (to make and rotate them: 'Key Vault Secrets Officer",
+            settings="TELESCOPE_KEYVAULT_URL, this machine's managed identity",
+            service="the key vault",
+        )
+
+    async def close(self) -> None:
+        """See ``Keys``."""
+        await self._client.close()
+
+    async def _fetch(self) -> Secret | None:
+        try:
+            found = await self._client.call(lambda sdk: sdk.get_secret(self._secret))
+        except Refused as error:
+            if error.status == _MISSING:
+                return None
+            raise self._client.unusable(error) from error
+        return Secret(found.value or "", found.properties.version or "")
+
+    async def _create(self, text: str) -> None:
+        await self._put(text)
+
+    async def _put(self, text: str) -> None:
+        try:
+            await self._client.call(lambda sdk: sdk.set_secret(self._secret, text, content_type=_TYPE))
+        except Refused as error:
+            raise self._client.unusable(error) from error

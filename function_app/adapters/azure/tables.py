@@ -17,9 +17,9 @@ import secrets
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import TYPE_CHECKING, Any, TypeVar
 
-from function_app.adapters import rows
 from function_app.adapters.azure import names
 from function_app.adapters.azure.client import ATTEMPTS, Client, Place, Refused, credential, transport
+from function_app.adapters.shared import row_codec
 from function_app.ports.tables import Conflict, Page, Row, Write
 
 if TYPE_CHECKING:
@@ -67,15 +67,15 @@ class AzureTables:
 
     async def create(self, table: str, row: Row) -> Row:
         """See ``Tables``."""
-        rows.check(row)
-        entity = _entity(row, rows.encode(row.data))
+        row_codec.check(row)
+        entity = _entity(row, row_codec.encode(row.data))
         return await self._put(table, row, entity, lambda to: to.create_entity(entity, retry_on_methods=_ALWAYS))
 
     async def replace(self, table: str, row: Row) -> Row:
         """See ``Tables``."""
-        rows.check(row)
+        row_codec.check(row)
         _check_etag(table, row)
-        entity = _entity(row, rows.encode(row.data))
+        entity = _entity(row, row_codec.encode(row.data))
         return await self._put(
             table, row, entity, lambda to: to.update_entity(entity, **_unchanged(row), **_WHOLE), makes=False
         )
@@ -96,8 +96,8 @@ class AzureTables:
         cursor: str | None = None,
     ) -> Page:
         """See ``Tables``."""
-        rows.check_limit(limit)
-        start = first if cursor is None else max(first, rows.read_cursor(cursor))
+        row_codec.check_limit(limit)
+        start = first if cursor is None else max(first, row_codec.read_cursor(cursor))
         condition, parameters = _range(partition, start, last)
         if last is not None and last <= start:
             return Page((), None)
@@ -118,13 +118,13 @@ class AzureTables:
             if error.status != _GONE:
                 raise self._client.unusable(error) from error
             found = []
-        return Page(tuple(found[:limit]), rows.write_cursor(found[limit].key) if len(found) > limit else None)
+        return Page(tuple(found[:limit]), row_codec.write_cursor(found[limit].key) if len(found) > limit else None)
 
     async def batch(self, table: str, writes: Sequence[Write]) -> tuple[Row, ...]:
         """See ``Tables``."""
         entities = [
             _place(write.row.partition, write.row.key) if write.kind == "delete" else _entity(write.row, text)
-            for write, text in zip(writes, rows.check_batch(writes), strict=True)
+            for write, text in zip(writes, row_codec.check_batch(writes), strict=True)
         ]
         for write in writes:
             if write.kind != "create":
@@ -274,7 +274,7 @@ def _parts(text: str) -> Iterator[str]:
 
 def _row(partition: str, entity: Mapping[str, Any]) -> Row:
     parts = itertools.takewhile(bool, (entity.get(f"Data{number}", "") for number in itertools.count()))
-    return Row(partition, _key(entity), rows.decode("".join(parts)), _etag(entity))
+    return Row(partition, _key(entity), row_codec.decode("".join(parts)), _etag(entity))
 
 
 def _row_key(entity: Mapping[str, Any]) -> str:

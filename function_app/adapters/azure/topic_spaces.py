@@ -20,8 +20,9 @@ from typing import Literal, NamedTuple
 
 import msgspec
 
-from device_agent.protocol import control, grants, topics
-from device_agent.protocol.grants import Grant
+from device_agent.protocol import topics
+from device_agent.protocol.security import grants, revocation
+from device_agent.protocol.security.grants import Grant
 from function_app.ports.broker_access import BrokerAccessError
 
 KIND = "kind"
@@ -118,7 +119,7 @@ def spaces() -> dict[str, tuple[str, ...]]:
         said, heard = _templates(families)
         found |= _parted(f"{group}-say", said) | _parted(f"{group}-hear", heard)
     # Revocations need no topic here: they are rows, which the webhook looks at.
-    ours = tuple(topic for topic in grants.SERVICE_PUBLISH if topic != control.TOPIC)
+    ours = tuple(topic for topic in grants.SERVICE_PUBLISH if topic != revocation.TOPIC)
     return found | _parted(FUNCTIONS_SAY, ours)
 
 

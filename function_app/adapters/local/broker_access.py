@@ -16,10 +16,11 @@ from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
 from paho.mqtt.enums import CallbackAPIVersion
 from paho.mqtt.reasoncodes import ReasonCode
 
-from device_agent.protocol import codec, control, grants
-from device_agent.protocol.control import Control, Revoke
+from device_agent.protocol import codec
 from device_agent.protocol.errors import ProtocolError
-from device_agent.protocol.grants import Grant
+from device_agent.protocol.security import grants, revocation
+from device_agent.protocol.security.grants import Grant
+from device_agent.protocol.security.revocation import Control, Revoke
 from function_app.ports.broker_access import BrokerAccessError, Credentials, ServiceCredentials
 
 Publish = Callable[[str, bytes], Awaitable[None]]
@@ -67,7 +68,7 @@ class TokenBrokerAccess:
         _exactly_one(client_id, principal)
         message = Control(revoke=Revoke(client_id=client_id, principal=principal, before_s=time.time()))
         try:
-            await self._publish(control.TOPIC, codec.encode(message))
+            await self._publish(revocation.TOPIC, codec.encode(message))
         except Exception as error:
             raise BrokerAccessError(f"the broker could not be told of a revocation: {error}") from error
 

@@ -11,8 +11,8 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-from function_app.adapters import certificate_requests
-from function_app.adapters.local import files
+from function_app.adapters.local import atomic_files
+from function_app.adapters.shared import csr
 from function_app.ports.broker_access import BrokerAccessError
 from function_app.ports.certificates import Issued
 
@@ -70,7 +70,7 @@ class FileCertificates:
         from cryptography.hazmat.primitives import hashes, serialization  # noqa: PLC0415
         from cryptography.x509.oid import ExtendedKeyUsageOID, NameOID  # noqa: PLC0415
 
-        request = certificate_requests.read(text)
+        request = csr.read(text)
         with self._changing() as ledger:
             authority, signer = self._authority()
             now = dt.datetime.now(dt.UTC)
@@ -116,7 +116,7 @@ class FileCertificates:
                     .build()
                 )
             content = listed.sign(signer, hashes.SHA256()).public_bytes(serialization.Encoding.PEM)
-            files.write(self._folder / REVOKED, content, mode=0o644)
+            atomic_files.write(self._folder / REVOKED, content, mode=0o644)
 
     def _authority(self) -> tuple[Any, Any]:
         from cryptography import x509  # noqa: PLC0415
@@ -137,7 +137,7 @@ class FileCertificates:
                 path = self._folder / LEDGER
                 ledger: dict[str, list[dict[str, Any]]] = json.loads(path.read_bytes()) if path.exists() else {}
                 yield ledger
-                files.write(path, json.dumps(ledger, indent=1).encode(), mode=0o600)
+                atomic_files.write(path, json.dumps(ledger, indent=1).encode(), mode=0o600)
         except (OSError, ValueError, sqlite3.Error) as error:
             raise BrokerAccessError(
                 f"the authority for agents in {self._folder} cannot be used: {error}; "

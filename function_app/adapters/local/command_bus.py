@@ -6,10 +6,9 @@ from collections.abc import AsyncGenerator, AsyncIterator
 
 from paho.mqtt.client import MQTTMessage
 
-from device_agent.protocol import codec, topics
+from device_agent.protocol import Ack, codec, topics
 from device_agent.protocol.errors import ProtocolError
-from device_agent.protocol.messages import Ack
-from function_app.adapters.local.mqtt_link import Broker, MqttLink
+from function_app.adapters.mqtt.connection import Broker, MqttLink
 
 _READY_S = 2.0
 

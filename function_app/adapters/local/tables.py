@@ -12,7 +12,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from function_app.adapters import rows
+from function_app.adapters.shared import row_codec
 from function_app.ports.tables import Conflict, Page, Row, StoreError, Write
 
 BUSY_TIMEOUT_MS = 5_000
@@ -44,7 +44,7 @@ class SqliteTables:
     async def get(self, table: str, partition: str, key: str) -> Row | None:
         """See ``Tables``."""
         found = self._run(_GET, (table, partition, key)).fetchone()
-        return None if found is None else Row(partition, key, rows.decode(found[1]), found[0])
+        return None if found is None else Row(partition, key, row_codec.decode(found[1]), found[0])
 
     async def create(self, table: str, row: Row) -> Row:
         """See ``Tables``."""
@@ -69,18 +69,18 @@ class SqliteTables:
         cursor: str | None = None,
     ) -> Page:
         """See ``Tables``."""
-        rows.check_limit(limit)
-        start = first if cursor is None else max(first, rows.read_cursor(cursor))
+        row_codec.check_limit(limit)
+        start = first if cursor is None else max(first, row_codec.read_cursor(cursor))
         if last is None:
             found = self._run(_QUERY_OPEN, (table, partition, start, limit + 1)).fetchall()
         else:
             found = self._run(_QUERY_CLOSED, (table, partition, start, last, limit + 1)).fetchall()
-        page = tuple(Row(partition, key, rows.decode(data), etag) for key, etag, data in found[:limit])
-        return Page(page, rows.write_cursor(found[limit][0]) if len(found) > limit else None)
+        page = tuple(Row(partition, key, row_codec.decode(data), etag) for key, etag, data in found[:limit])
+        return Page(page, row_codec.write_cursor(found[limit][0]) if len(found) > limit else None)
 
     async def batch(self, table: str, writes: Sequence[Write]) -> tuple[Row, ...]:
         """See ``Tables``."""
-        texts = rows.check_batch(writes)
+        texts = row_codec.check_batch(writes)
         self._run("BEGIN IMMEDIATE")
         try:
             written = tuple(self._write(table, *each) for each in zip(writes, texts, strict=True))
@@ -97,8 +97,8 @@ class SqliteTables:
             self._db = None
 
     def _write_one(self, table: str, write: Write) -> Row:
-        rows.check(write.row)
-        return self._write(table, write, b"" if write.kind == "delete" else rows.encode(write.row.data))
+        row_codec.check(write.row)
+        return self._write(table, write, b"" if write.kind == "delete" else row_codec.encode(write.row.data))
 
     def _write(self, table: str, write: Write, data: bytes) -> Row:
         row = write.row

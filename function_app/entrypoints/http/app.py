@@ -13,47 +13,34 @@ from starlette.requests import ClientDisconnect
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from function_app.bootstrap import Functions
-from function_app.domain.problems import Problem, invalid, store_unavailable
-from function_app.entrypoints.http import (
-    accounts,
-    actions,
-    agents,
-    api_keys,
-    audit,
-    auth,
-    broker,
-    data,
-    devices,
-    diagnostics,
-    events,
-    faults,
-    fleet,
-    health,
-    invitations,
-    latency,
-    lease,
-    library,
-    messages,
-    movements,
-    open_id,
-    robot_type_looks,
-    robot_types,
-    scripting,
-    shares,
-    stop,
-    transfers,
-    uploads,
-    xmpp,
-)
-from function_app.entrypoints.http.address import client_address
-from function_app.entrypoints.http.answers import JSON, problem
-from function_app.entrypoints.http.caller import COOKIE, Caller, is_stop
+from function_app.domain.common.problems import Problem, invalid, store_unavailable
+from function_app.entrypoints.http import health_check
+from function_app.entrypoints.http.accounts import api_keys, audit, auth, me, oidc
+from function_app.entrypoints.http.actions import actions, many, stop
 from function_app.entrypoints.http.console import Console
-from function_app.entrypoints.http.reference import reference
-from function_app.entrypoints.http.routing import ACCOUNT_SCHEMES, AGENT_SCHEME, KEY_SCHEME, PREFIX, VERSION, schemas
+from function_app.entrypoints.http.control import lease, mqtt_credentials
+from function_app.entrypoints.http.devices import devices
+from function_app.entrypoints.http.framework.api_reference import reference
+from function_app.entrypoints.http.framework.authentication import COOKIE, Caller, is_stop
+from function_app.entrypoints.http.framework.client_address import client_address
+from function_app.entrypoints.http.framework.responses import JSON, problem
+from function_app.entrypoints.http.framework.routing import (
+    ACCOUNT_SCHEMES,
+    AGENT_SCHEME,
+    KEY_SCHEME,
+    PREFIX,
+    VERSION,
+    schemas,
+)
+from function_app.entrypoints.http.health import diagnostics, faults
+from function_app.entrypoints.http.messaging import polling, xmpp
+from function_app.entrypoints.http.pairing import agents
+from function_app.entrypoints.http.robot_types import device_library, movements, previews, robot_types, script_editor
+from function_app.entrypoints.http.sharing import invitations, shares
+from function_app.entrypoints.http.telemetry import blob_transfers, events, latency, series, uploads
 from function_app.ports.clock import Clock
 from function_app.ports.tables import StoreError
-from function_app.services.limits import Limits
+from function_app.services.identity.rate_limiter import Limits
 
 _SECURE_FOR = b"max-age=31536000"
 """A year: a browser that has once come by TLS comes no other way."""
@@ -85,37 +72,37 @@ def create_app(functions: Functions) -> FastAPI:
     caller = Caller(functions.identify, functions.api_keys, functions.limits)
     resources = (
         auth.router(functions, caller),
-        accounts.router(functions, caller),
-        open_id.router(functions),
+        me.router(functions, caller),
+        oidc.router(functions),
         api_keys.router(functions, caller),
         agents.router(functions, caller),
-        messages.router(functions, caller),
+        polling.router(functions, caller),
         audit.router(functions, caller),
         devices.router(functions, caller),
-        library.router(functions, caller),
+        device_library.router(functions, caller),
         shares.router(functions, caller),
         invitations.router(functions, caller),
         lease.router(functions, caller),
         stop.router(functions, caller),
         actions.router(functions, caller),
-        fleet.router(functions, caller),
+        many.router(functions, caller),
         robot_types.router(functions, caller),
-        robot_type_looks.router(functions, caller),
+        previews.router(functions, caller),
         movements.router(functions, caller),
-        scripting.router(functions, caller),
-        broker.router(functions, caller),
+        script_editor.router(functions, caller),
+        mqtt_credentials.router(functions, caller),
         xmpp.router(functions, caller),
         latency.router(functions, caller),
         faults.router(functions, caller),
         events.router(functions, caller),
         diagnostics.router(functions, caller),
-        data.router(functions, caller),
+        series.router(functions, caller),
         uploads.router(functions, caller),
-        health.router(functions),
+        health_check.router(functions),
     )
     app.state.routes = [route for routes in resources for route in routes.router.routes]
     # Side by side and not as routers within the router, each of which would be looked through twice.
-    app.router.routes += [*app.state.routes, *transfers.router(functions.transfers).routes]
+    app.router.routes += [*app.state.routes, *blob_transfers.router(functions.transfers).routes]
     _document(app, [kind for routes in resources for kind in routes.kinds])
     app.add_exception_handler(Problem, _on_problem)
     app.add_exception_handler(StoreError, _on_store)

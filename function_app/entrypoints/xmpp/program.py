@@ -5,7 +5,7 @@ import signal
 
 from function_app import bootstrap
 from function_app.bootstrap import Functions
-from function_app.entrypoints.xmpp.speaker import Speaker
+from function_app.entrypoints.xmpp.gateway import Speaker
 
 
 async def speak(functions: Functions) -> None:

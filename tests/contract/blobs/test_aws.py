@@ -20,7 +20,7 @@ from function_app.adapters.aws.blobs import TRIES, S3Blobs, decode, encode
 from function_app.ports.blobs import Blobs
 from function_app.ports.tables import StoreError
 from tests.contract.blobs.suite import Again, BlobsSuite, Direct
-from tests.support.aws import HOST, REGION, Refusal, Wire, reset, start_moto, start_wire, use_credentials
+from tests.harness.stores.aws import HOST, REGION, Refusal, Wire, reset, start_moto, start_wire, use_credentials
 
 Open = Callable[..., S3Blobs]
 NAME = "telescope"

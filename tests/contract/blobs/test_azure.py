@@ -14,8 +14,8 @@ from function_app.adapters.azure.client import ATTEMPTS, Place
 from function_app.ports.blobs import MAX_BYTES, Blobs
 from function_app.ports.tables import StoreError
 from tests.contract.blobs.suite import Again, BlobsSuite, Direct
-from tests.support.aws import Fault, Refusal, Wire, start_wire
-from tests.support.azure import KEY, endpoint, start_azurite, through
+from tests.harness.stores.aws import Fault, Refusal, Wire, start_wire
+from tests.harness.stores.azure import KEY, endpoint, start_azurite, through
 
 
 @pytest.fixture

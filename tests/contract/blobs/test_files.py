@@ -12,9 +12,9 @@ import uvicorn
 from fastapi import FastAPI, Response
 
 from function_app.adapters.local.blobs import FileBlobs
-from function_app.domain.problems import Problem
-from function_app.entrypoints.http import transfers
-from function_app.entrypoints.http.routing import PREFIX
+from function_app.domain.common.problems import Problem
+from function_app.entrypoints.http.framework.routing import PREFIX
+from function_app.entrypoints.http.telemetry import blob_transfers
 from function_app.ports.blobs import Blobs
 from function_app.ports.tables import StoreError
 from tests.contract.blobs.suite import NAMES, Again, BlobsSuite, Direct
@@ -46,7 +46,7 @@ def again(tmp_path: Path) -> Again:
 async def direct(tmp_path: Path) -> AsyncIterator[Direct]:
     blobs = FileBlobs(tmp_path / "blobs", keys=lambda: (b"k" * 32,))
     app = FastAPI()
-    app.include_router(transfers.router(blobs))
+    app.include_router(blob_transfers.router(blobs))
     app.add_exception_handler(Problem, lambda _, error: Response(str(error), error.status))
 
     def renamed(url: str, name: str, other: str) -> str:

@@ -3,7 +3,7 @@ from itertools import count
 
 import pytest
 
-from tests.support.brokers import BROKERS, TRANSPORTS, BrokerKind, RunningBroker, Transport, start_broker
+from tests.harness.network.brokers import BROKERS, TRANSPORTS, BrokerKind, RunningBroker, Transport, start_broker
 
 _spaces = count()
 

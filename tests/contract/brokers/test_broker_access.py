@@ -7,11 +7,11 @@ from pathlib import Path
 
 import pytest
 
-from device_agent.protocol import signing
 from device_agent.protocol.errors import ProtocolError
+from device_agent.protocol.security import signing
 from function_app.adapters.local.broker_access import MosquittoBrokerAccess, TokenBrokerAccess
 from function_app.ports.broker_access import BrokerAccess, BrokerAccessError, Credentials
-from tests.support.brokers import HOST, PATIENCE_S, BrokerKind, RunningBroker, start_broker
+from tests.harness.network.brokers import HOST, PATIENCE_S, BrokerKind, RunningBroker, start_broker
 
 
 def another_instance(broker: RunningBroker) -> BrokerAccess:

@@ -12,22 +12,22 @@ from cryptography import x509
 from cryptography.hazmat.primitives import hashes, serialization
 from cryptography.hazmat.primitives.asymmetric import ec, ed25519
 
-from device_agent.protocol.grants import agent_grant
-from device_agent.runtime.certificate import OwnCertificate
+from device_agent.config.client_certificate import OwnCertificate
+from device_agent.protocol.security.grants import agent_grant
 from function_app.adapters.local.certificates import FileCertificates
-from function_app.adapters.local.tls import client_context
-from function_app.domain.ids import new_id
+from function_app.adapters.mqtt.tls import client_context
+from function_app.domain.common.ids import new_id
 from function_app.ports.broker_access import BrokerAccessError, Credentials
 from function_app.ports.certificates import CertificateRefused
-from infra.tls import authority, devices
-from tests.support.brokers import HOST, Client, RunningBroker, start_broker, wait_until
+from infra.tls import agent_ca, server_ca
+from tests.harness.network.brokers import HOST, Client, RunningBroker, start_broker, wait_until
 
 
 @pytest.fixture(scope="module")
 def site(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder, now = tmp_path_factory.mktemp("site") / "tls", dt.datetime.now(dt.UTC)
-    authority.make(folder, authority.names((), ()), now=now)
-    devices.make(folder, now=now)
+    server_ca.make(folder, server_ca.names((), ()), now=now)
+    agent_ca.make(folder, now=now)
     return folder
 
 
@@ -83,7 +83,7 @@ def test_without_one_the_right_credentials_are_not_heard(agent: Agent) -> None:
 
 def test_one_of_another_authority_is_none(agent: Agent, tmp_path: Path) -> None:
     other = tmp_path / "other"
-    devices.make(other, now=dt.datetime.now(dt.UTC))
+    agent_ca.make(other, now=dt.datetime.now(dt.UTC))
     agent.authority = FileCertificates(other)
     assert not agent.connect().connected.is_set()
 

@@ -7,9 +7,9 @@ import paho.mqtt.client as paho
 import pytest
 
 from device_agent.protocol import codec
-from tests.support import wire
-from tests.support.brokers import SILENCE_S, Message, RunningBroker, Transport, wait_until
-from tests.support.wire import Wire
+from tests.harness.network import raw_mqtt
+from tests.harness.network.brokers import SILENCE_S, Message, RunningBroker, Transport, wait_until
+from tests.harness.network.raw_mqtt import Wire
 
 
 @pytest.mark.parametrize(("said", "heard"), [(0, 0), (0, 1), (1, 0), (1, 1)])
@@ -186,24 +186,24 @@ def test_small_messages_are_sent_at_once(broker: RunningBroker, space: str, tran
         broker.client(f"{space}-arm", publish=(topic,)) as arm,
         Wire(broker.port(transport), transport) as listener,
     ):
-        listener.send(wire.connect_packet(space, credentials))
-        assert listener.read() == (wire.CONNACK, 0, b"\0\0")
-        listener.send(wire.subscribe_packet(topic))
-        assert listener.read() == (wire.SUBACK, 0, b"\0\1\0")
+        listener.send(raw_mqtt.connect_packet(space, credentials))
+        assert listener.read() == (raw_mqtt.CONNACK, 0, b"\0\0")
+        listener.send(raw_mqtt.subscribe_packet(topic))
+        assert listener.read() == (raw_mqtt.SUBACK, 0, b"\0\1\0")
         medians = []
         for _ in range(25):
             gaps = []
             for _ in range(9):
                 for _ in range(CONVERSATION):
-                    listener.send(wire.PINGREQ)
-                    assert listener.read() == (wire.PINGRESP, 0, b"")
+                    listener.send(raw_mqtt.PINGREQ)
+                    assert listener.read() == (raw_mqtt.PINGRESP, 0, b"")
                 arm.publish(topic, b"first", qos=0)
                 time.sleep(0.003)  # so that the broker does not send both together
                 began = time.perf_counter()
                 arm.publish(topic, b"second", qos=0)
                 # Not read before: reading would acknowledge the first, and Nagle's algorithm let the second go.
-                assert listener.read() == (wire.PUBLISH, 0, wire.text(topic) + b"first")
-                assert listener.read() == (wire.PUBLISH, 0, wire.text(topic) + b"second")
+                assert listener.read() == (raw_mqtt.PUBLISH, 0, raw_mqtt.text(topic) + b"first")
+                assert listener.read() == (raw_mqtt.PUBLISH, 0, raw_mqtt.text(topic) + b"second")
                 gaps.append(time.perf_counter() - began)
             medians.append(statistics.median(gaps))
             if medians[-1] < NAGLE_S / 2:

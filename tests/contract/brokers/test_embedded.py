@@ -7,11 +7,12 @@ from pathlib import Path
 
 import pytest
 
-from device_agent.protocol import codec, control, grants, signing
+from device_agent.protocol import codec
+from device_agent.protocol.security import grants, revocation, signing
 from function_app.ports.broker_access import Credentials
-from tests.support import wire
-from tests.support.brokers import SILENCE_S, Message, RunningBroker, start_broker, wait_until
-from tests.support.wire import Wire
+from tests.harness.network import raw_mqtt
+from tests.harness.network.brokers import SILENCE_S, Message, RunningBroker, start_broker, wait_until
+from tests.harness.network.raw_mqtt import Wire
 
 
 @pytest.fixture(scope="module")
@@ -44,7 +45,7 @@ def test_one_token_can_be_revoked_alone(broker: RunningBroker, space: str) -> No
     first, second = broker.grant(space), broker.grant(space)
     with broker.service() as functions, broker.connect(space, broker.issue(first)) as client:
         order = json.dumps({"revoke": {"token_id": first.token_id}})
-        functions.publish_acknowledged(control.TOPIC, order)
+        functions.publish_acknowledged(revocation.TOPIC, order)
         wait_until(client.disconnected.is_set, "the end of a revoked session")
         with broker.connect(space, broker.issue(first)) as again:
             assert not again.connected.is_set()
@@ -65,7 +66,7 @@ def test_one_token_can_be_revoked_alone(broker: RunningBroker, space: str) -> No
 )
 def test_an_instruction_that_cannot_be_followed_is_not_acknowledged(broker: RunningBroker, order: bytes) -> None:
     with broker.service() as functions:
-        sent = functions.publish(control.TOPIC, order)
+        sent = functions.publish(revocation.TOPIC, order)
         wait_until(functions.disconnected.is_set, "the end of the connection")
         assert not functions.acknowledged(sent)
 
@@ -73,19 +74,19 @@ def test_an_instruction_that_cannot_be_followed_is_not_acknowledged(broker: Runn
 def test_instructions_reach_no_subscriber_and_are_not_kept(broker: RunningBroker, space: str) -> None:
     own = f"ts/v1/{space}/nosy/conn"
     with (
-        broker.client(f"{space}-nosy", publish=(own,), subscribe=(own, control.TOPIC, "$CONTROL/#")) as nosy,
+        broker.client(f"{space}-nosy", publish=(own,), subscribe=(own, revocation.TOPIC, "$CONTROL/#")) as nosy,
         broker.service() as functions,
     ):
-        nosy.subscribe(control.TOPIC, "$CONTROL/#", own)
-        functions.publish_acknowledged(control.TOPIC, json.dumps({"revoke": {"client_id": "nobody"}}), retain=True)
-        nosy.subscribe(control.TOPIC)
+        nosy.subscribe(revocation.TOPIC, "$CONTROL/#", own)
+        functions.publish_acknowledged(revocation.TOPIC, json.dumps({"revoke": {"client_id": "nobody"}}), retain=True)
+        nosy.subscribe(revocation.TOPIC)
         nosy.publish_acknowledged(own, b"end")
         assert [m.topic for m in (nosy.receive(), *nosy.heard())] == [own]
 
 
 def test_a_will_cannot_instruct_the_broker(broker: RunningBroker) -> None:
     service = broker.access.service_credentials()
-    will = Message(control.TOPIC, b'{"revoke":{"client_id":"x"}}', 1, retain=False)
+    will = Message(revocation.TOPIC, b'{"revoke":{"client_id":"x"}}', 1, retain=False)
     with broker.connect(service.client_id, Credentials(service.username, service.password), will=will) as functions:
         assert not functions.connected.is_set()
 
@@ -93,8 +94,8 @@ def test_a_will_cannot_instruct_the_broker(broker: RunningBroker) -> None:
 def test_mqtt_5_gets_the_old_refusal_at_once_also_with_credentials(broker: RunningBroker, space: str) -> None:
     for credentials in (None, broker.issue(broker.grant(space))):
         with Wire(broker.tcp_port) as raw:
-            raw.send(wire.connect_packet(space, credentials, level=5))
-            assert raw.read() == (wire.CONNACK, 0, b"\0\1")
+            raw.send(raw_mqtt.connect_packet(space, credentials, level=5))
+            assert raw.read() == (raw_mqtt.CONNACK, 0, b"\0\1")
             assert raw.closed()
 
 
@@ -118,10 +119,10 @@ def test_a_denied_filter_is_refused_and_its_neighbours_are_not(broker: RunningBr
     mine = f"ts/v1/{space}/arm/+"
     refused = ("#", "ts/v1/+/arm/conn", f"{mine}/#", "$SYS/#", "", "ts/v1/#/conn", f"ts/v1/{space}/arm/a+", "x" * 600)
     with Wire(broker.tcp_port) as raw:
-        raw.send(wire.connect_packet(space, broker.issue(broker.grant(space, subscribe=(mine,)))))
-        assert raw.read() == (wire.CONNACK, 0, b"\0\0")
-        raw.send(wire.subscribe_packet(*refused[:4], mine, *refused[4:]))
-        assert raw.read() == (wire.SUBACK, 0, b"\0\1" + b"\x80" * 4 + b"\0" + b"\x80" * 4)
+        raw.send(raw_mqtt.connect_packet(space, broker.issue(broker.grant(space, subscribe=(mine,)))))
+        assert raw.read() == (raw_mqtt.CONNACK, 0, b"\0\0")
+        raw.send(raw_mqtt.subscribe_packet(*refused[:4], mine, *refused[4:]))
+        assert raw.read() == (raw_mqtt.SUBACK, 0, b"\0\1" + b"\x80" * 4 + b"\0" + b"\x80" * 4)
 
 
 def test_a_session_is_never_kept(broker: RunningBroker, space: str) -> None:
@@ -129,12 +130,12 @@ def test_a_session_is_never_kept(broker: RunningBroker, space: str) -> None:
     credentials = broker.issue(broker.grant(space, publish=(topic,), subscribe=(topic,)))
     for _ in range(2):
         with Wire(broker.tcp_port) as raw:
-            raw.send(wire.connect_packet(space, credentials, clean=False))
-            assert raw.read() == (wire.CONNACK, 0, b"\0\0")
-            raw.send(wire.publish_packet(topic, b"x", qos=1))
-            assert raw.read() == (wire.PUBACK, 0, b"\0\1"), "a subscription of the session before has survived"
-            raw.send(wire.subscribe_packet(topic, qos=1))
-            assert raw.read() == (wire.SUBACK, 0, b"\0\1\1")
+            raw.send(raw_mqtt.connect_packet(space, credentials, clean=False))
+            assert raw.read() == (raw_mqtt.CONNACK, 0, b"\0\0")
+            raw.send(raw_mqtt.publish_packet(topic, b"x", qos=1))
+            assert raw.read() == (raw_mqtt.PUBACK, 0, b"\0\1"), "a subscription of the session before has survived"
+            raw.send(raw_mqtt.subscribe_packet(topic, qos=1))
+            assert raw.read() == (raw_mqtt.SUBACK, 0, b"\0\1\1")
 
 
 def test_one_byte_over_the_limit_is_too_much(broker: RunningBroker, space: str) -> None:

@@ -7,9 +7,9 @@ import socket
 
 import pytest
 
-from tests.support import wire
-from tests.support.brokers import HOST, PATIENCE_S, RunningBroker, Transport
-from tests.support.wire import Wire
+from tests.harness.network import raw_mqtt
+from tests.harness.network.brokers import HOST, PATIENCE_S, RunningBroker, Transport
+from tests.harness.network.raw_mqtt import Wire
 
 GARBAGE = {
     "nothing": b"",
@@ -21,26 +21,29 @@ GARBAGE = {
     "endless length": b"\x10\xff\xff\xff\xff\xff\x7f",
     "huge length": b"\x10\xff\xff\xff\x7f" + b"MQTT" * 1_000,
     "connect of nothing": b"\x10\x00",
-    "connect with lying lengths": b"\x10\x10" + wire.text("MQTT") + b"\x04\xc2\x00\x3c\xff\xff\xff\xff\xff\xff",
-    "connect with broken text": b"\x10\x12" + wire.text("MQTT") + b"\x04\x02\x00\x3c" + wire.text(b"\xc3\x28\xff\xfe"),
-    "connect of another protocol": wire.packet(1, wire.text("HTTP") + b"\x04\x02\x00\x3c" + wire.text("x")),
-    "publish first": wire.publish_packet("ts/v1/a/b/conn", b"x"),
-    "subscribe first": wire.subscribe_packet("#"),
+    "connect with lying lengths": b"\x10\x10" + raw_mqtt.text("MQTT") + b"\x04\xc2\x00\x3c\xff\xff\xff\xff\xff\xff",
+    "connect with broken text": b"\x10\x12"
+    + raw_mqtt.text("MQTT")
+    + b"\x04\x02\x00\x3c"
+    + raw_mqtt.text(b"\xc3\x28\xff\xfe"),
+    "connect of another protocol": raw_mqtt.packet(1, raw_mqtt.text("HTTP") + b"\x04\x02\x00\x3c" + raw_mqtt.text("x")),
+    "publish first": raw_mqtt.publish_packet("ts/v1/a/b/conn", b"x"),
+    "subscribe first": raw_mqtt.subscribe_packet("#"),
 }
 NOT_MQTT = {
-    "publish that ends in its topic": wire.packet(3, b"\xff\xffts/v1"),
-    "publish without packet id": wire.packet(3, wire.text("ts/v1/a/b/conn"), flags=2),
-    "publish at qos 3": wire.packet(3, wire.text("ts/v1/a/b/conn") + b"\0\1x", flags=6),
-    "publish to nothing": wire.publish_packet("", b"x"),
-    "publish to broken text": wire.publish_packet(b"ts/\xff\xfe/\xc3\x28", b"x"),
-    "subscribe without filters": wire.packet(8, b"\0\1", flags=2),
-    "subscribe with wrong flags": wire.packet(8, b"\0\1" + wire.text("a") + b"\0", flags=0),
-    "subscribe that ends in its filter": wire.packet(8, b"\0\1\0\x40abc", flags=2),
-    "subscribe at qos 3": wire.packet(8, b"\0\1" + wire.text("a") + b"\3", flags=2),
-    "unsubscribe that ends in its filter": wire.packet(10, b"\0\1\0\x40abc", flags=2),
-    "connect again": wire.connect_packet("again"),
-    "packet of the broker": wire.packet(2, b"\0\0"),
-    "reserved packet": wire.packet(15, b""),
+    "publish that ends in its topic": raw_mqtt.packet(3, b"\xff\xffts/v1"),
+    "publish without packet id": raw_mqtt.packet(3, raw_mqtt.text("ts/v1/a/b/conn"), flags=2),
+    "publish at qos 3": raw_mqtt.packet(3, raw_mqtt.text("ts/v1/a/b/conn") + b"\0\1x", flags=6),
+    "publish to nothing": raw_mqtt.publish_packet("", b"x"),
+    "publish to broken text": raw_mqtt.publish_packet(b"ts/\xff\xfe/\xc3\x28", b"x"),
+    "subscribe without filters": raw_mqtt.packet(8, b"\0\1", flags=2),
+    "subscribe with wrong flags": raw_mqtt.packet(8, b"\0\1" + raw_mqtt.text("a") + b"\0", flags=0),
+    "subscribe that ends in its filter": raw_mqtt.packet(8, b"\0\1\0\x40abc", flags=2),
+    "subscribe at qos 3": raw_mqtt.packet(8, b"\0\1" + raw_mqtt.text("a") + b"\3", flags=2),
+    "unsubscribe that ends in its filter": raw_mqtt.packet(10, b"\0\1\0\x40abc", flags=2),
+    "connect again": raw_mqtt.connect_packet("again"),
+    "packet of the broker": raw_mqtt.packet(2, b"\0\0"),
+    "reserved packet": raw_mqtt.packet(15, b""),
     "garbage": b"\xff\xfe\xfd" * 100,
 }
 
@@ -77,8 +80,8 @@ def test_what_is_not_mqtt_ends_the_connection_that_sent_it(
     credentials = broker.issue(broker.grant(space, publish=("ts/v1/#",), subscribe=("ts/v1/#",)))
     with broker.client(f"{space}-other") as other:
         with Wire(broker.port(transport), transport) as raw:
-            raw.send(wire.connect_packet(space, credentials))
-            assert raw.read() == (wire.CONNACK, 0, b"\0\0")
+            raw.send(raw_mqtt.connect_packet(space, credentials))
+            assert raw.read() == (raw_mqtt.CONNACK, 0, b"\0\0")
             raw.send(sent)
             assert raw.closed()
         assert not other.disconnected.is_set()
@@ -87,9 +90,9 @@ def test_what_is_not_mqtt_ends_the_connection_that_sent_it(
 
 def test_a_connect_in_single_bytes_is_understood(broker: RunningBroker, space: str, transport: Transport) -> None:
     with Wire(broker.port(transport), transport) as raw:
-        for byte in wire.connect_packet(space, broker.issue(broker.grant(space))):
+        for byte in raw_mqtt.connect_packet(space, broker.issue(broker.grant(space))):
             raw.send(bytes([byte]))
-        assert raw.read() == (wire.CONNACK, 0, b"\0\0")
+        assert raw.read() == (raw_mqtt.CONNACK, 0, b"\0\0")
 
 
 def test_packets_that_come_together_are_all_answered(broker: RunningBroker, space: str, transport: Transport) -> None:
@@ -97,17 +100,17 @@ def test_packets_that_come_together_are_all_answered(broker: RunningBroker, spac
     credentials = broker.issue(broker.grant(space, publish=(topic,), subscribe=(topic,)))
     with Wire(broker.port(transport), transport) as raw:
         raw.send(
-            wire.connect_packet(space, credentials)
-            + wire.subscribe_packet(topic)
-            + wire.publish_packet(topic, b"x", qos=1, packet_id=7)
-            + wire.PINGREQ
+            raw_mqtt.connect_packet(space, credentials)
+            + raw_mqtt.subscribe_packet(topic)
+            + raw_mqtt.publish_packet(topic, b"x", qos=1, packet_id=7)
+            + raw_mqtt.PINGREQ
         )
         answers = [raw.read() for _ in range(5)]
-        assert answers[0] == (wire.CONNACK, 0, b"\0\0")
-        assert answers[1] == (wire.SUBACK, 0, b"\0\1\0")
-        assert (wire.PUBLISH, 0, wire.text(topic) + b"x") in answers
-        assert (wire.PUBACK, 0, b"\0\7") in answers
-        assert answers[-1] == (wire.PINGRESP, 0, b"")
+        assert answers[0] == (raw_mqtt.CONNACK, 0, b"\0\0")
+        assert answers[1] == (raw_mqtt.SUBACK, 0, b"\0\1\0")
+        assert (raw_mqtt.PUBLISH, 0, raw_mqtt.text(topic) + b"x") in answers
+        assert (raw_mqtt.PUBACK, 0, b"\0\7") in answers
+        assert answers[-1] == (raw_mqtt.PINGRESP, 0, b"")
 
 
 def test_a_subscriber_that_never_reads_holds_nobody_up(broker: RunningBroker, space: str, transport: Transport) -> None:
@@ -118,9 +121,9 @@ def test_a_subscriber_that_never_reads_holds_nobody_up(broker: RunningBroker, sp
         broker.client(f"{space}-page", subscribe=(topic,)) as page,
         Wire(broker.port(transport), transport) as stuck,
     ):
-        stuck.send(wire.connect_packet(f"{space}-stuck", credentials))
-        assert stuck.read() == (wire.CONNACK, 0, b"\0\0")
-        stuck.send(wire.subscribe_packet(topic))
+        stuck.send(raw_mqtt.connect_packet(f"{space}-stuck", credentials))
+        assert stuck.read() == (raw_mqtt.CONNACK, 0, b"\0\0")
+        stuck.send(raw_mqtt.subscribe_packet(topic))
         page.subscribe(topic)
         for _ in range(200):
             arm.publish_acknowledged(topic, bytes(100_000))

@@ -13,7 +13,7 @@ from cryptography.hazmat.primitives.asymmetric import ec
 from function_app.adapters.aws.certificates import IotCertificates
 from function_app.ports.broker_access import BrokerAccessError
 from function_app.ports.certificates import CertificateRefused
-from tests.support.aws import REGION, start_moto, use_credentials
+from tests.harness.stores.aws import REGION, start_moto, use_credentials
 
 POLICY, AGENT = "telescope-agents", "agentaaaaa"
 

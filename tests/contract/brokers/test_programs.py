@@ -11,7 +11,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.support.brokers import HOST, PATIENCE_S, ROOT, BrokerKind, start_broker, wait_until
+from tests.harness.network.brokers import HOST, PATIENCE_S, ROOT, BrokerKind, start_broker, wait_until
 
 
 def run(*arguments: str) -> "subprocess.CompletedProcess[str]":
@@ -25,11 +25,11 @@ def arguments_for(kind: BrokerKind, home: Path) -> list[str]:
     if kind == "mosquitto":
         return ["infra.mosquitto", "--home", str(home)]
     keys = home / "keys.json"
-    from device_agent.protocol import signing
+    from device_agent.protocol.security import signing
 
     public = signing.generate().public_key()
     keys.write_text(json.dumps({signing.key_id(public): signing.public_text(public)}))
-    return ["infra.amqtt", "--keys", str(keys)]
+    return ["infra.embedded_broker", "--keys", str(keys)]
 
 
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
@@ -106,7 +106,7 @@ def test_keys_that_cannot_be_used_are_one_clear_line(tmp_path: Path, text: str |
     keys = tmp_path / "keys.json"
     if text is not None:
         keys.write_text(text)
-    ended = run("infra.amqtt", "--tcp-port", "0", "--websocket-port", "0", "--keys", str(keys))
+    ended = run("infra.embedded_broker", "--tcp-port", "0", "--websocket-port", "0", "--keys", str(keys))
     assert (ended.returncode, ended.stdout) == (2, "")
     assert ended.stderr.count("\n") == 1
     assert said in ended.stderr

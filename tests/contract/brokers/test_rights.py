@@ -2,11 +2,11 @@
 
 import pytest
 
-from device_agent.protocol import grants
+from device_agent.protocol.security import grants
 from function_app.ports.broker_access import Credentials
-from tests.support import wire
-from tests.support.brokers import SILENCE_S, Client, Message, RunningBroker, Transport, wait_until
-from tests.support.wire import Wire
+from tests.harness.network import raw_mqtt
+from tests.harness.network.brokers import SILENCE_S, Client, Message, RunningBroker, Transport, wait_until
+from tests.harness.network.raw_mqtt import Wire
 
 
 def echo(broker: RunningBroker, space: str, *filters: str) -> tuple[Client, Client]:
@@ -232,9 +232,9 @@ def test_a_topic_with_wildcards_cannot_be_published(broker: RunningBroker, space
     with ear, marker:
         for name in ("+", "#", "a+", "jo\0ints"):
             with Wire(broker.tcp_port) as raw:
-                raw.send(wire.connect_packet(f"{space}-arm", credentials))
-                assert raw.read() == (wire.CONNACK, 0, b"\0\0")
-                raw.send(wire.publish_packet(f"ts/v1/{space}/arm/ur5/tele/{name}", b"x"))
+                raw.send(raw_mqtt.connect_packet(f"{space}-arm", credentials))
+                assert raw.read() == (raw_mqtt.CONNACK, 0, b"\0\0")
+                raw.send(raw_mqtt.publish_packet(f"ts/v1/{space}/arm/ur5/tele/{name}", b"x"))
                 assert raw.closed()
         assert heard_before_mark(ear, marker, space) == []
 

@@ -6,9 +6,9 @@ from itertools import pairwise
 import paho.mqtt.client as paho
 import pytest
 
-from tests.support import wire
-from tests.support.brokers import SILENCE_S, Message, RunningBroker, Transport, wait_until
-from tests.support.wire import Wire
+from tests.harness.network import raw_mqtt
+from tests.harness.network.brokers import SILENCE_S, Message, RunningBroker, Transport, wait_until
+from tests.harness.network.raw_mqtt import Wire
 
 
 def test_a_wrong_password_with_the_victims_client_id_leaves_the_victim_in_peace(
@@ -31,8 +31,8 @@ def test_a_wrong_password_with_the_victims_client_id_leaves_the_victim_in_peace(
 def test_a_takeover_closes_the_old_socket(broker: RunningBroker, space: str, transport: Transport) -> None:
     credentials = broker.issue(broker.grant(space))
     with Wire(broker.port(transport), transport) as old:
-        old.send(wire.connect_packet(space, credentials))
-        assert old.read() == (wire.CONNACK, 0, b"\0\0")
+        old.send(raw_mqtt.connect_packet(space, credentials))
+        assert old.read() == (raw_mqtt.CONNACK, 0, b"\0\0")
         with broker.connect(space, credentials) as new:
             assert new.connected.is_set()
             assert old.closed()
@@ -76,8 +76,8 @@ def test_a_lost_keep_alive_lets_the_will_be_said(broker: RunningBroker, space: s
     with broker.client(f"{space}-page", subscribe=(topic,)) as page, Wire(broker.port(transport), transport) as silent:
         page.subscribe(topic)
         began = time.monotonic()
-        silent.send(wire.connect_with_will(space, credentials, topic, b"offline", keep_alive_s=1))
-        assert silent.read() == (wire.CONNACK, 0, b"\0\0")
+        silent.send(raw_mqtt.connect_with_will(space, credentials, topic, b"offline", keep_alive_s=1))
+        assert silent.read() == (raw_mqtt.CONNACK, 0, b"\0\0")
         assert page.receive().payload == b"offline"
         assert time.monotonic() - began > 1.0, "a client may be silent for its keep-alive and half of it again"
         assert silent.closed()
@@ -88,15 +88,15 @@ def test_pings_keep_a_silent_client_alive(broker: RunningBroker, space: str) -> 
     for keep_alive_s in (1, 2, 4, 8, 16):
         with Wire(broker.tcp_port) as silent:
             said_s = [time.monotonic()]
-            silent.send(wire.connect_packet(space, credentials, keep_alive_s=keep_alive_s))
+            silent.send(raw_mqtt.connect_packet(space, credentials, keep_alive_s=keep_alive_s))
             answers = [silent.read()]
             while said_s[-1] - said_s[0] < 2 * keep_alive_s and answers[-1] is not None:
                 time.sleep(0.5)
                 said_s.append(time.monotonic())
-                silent.send(wire.PINGREQ)
+                silent.send(raw_mqtt.PINGREQ)
                 answers.append(silent.read())
         if max(after - before for before, after in pairwise(said_s)) < keep_alive_s:
-            assert answers == [(wire.CONNACK, 0, b"\0\0"), *[(wire.PINGRESP, 0, b"")] * (len(said_s) - 1)]
+            assert answers == [(raw_mqtt.CONNACK, 0, b"\0\0"), *[(raw_mqtt.PINGRESP, 0, b"")] * (len(said_s) - 1)]
             return
         # The machine itself was silent for too long: with more time, once more.
     pytest.fail("this machine says nothing for as long as 16 s")
@@ -214,28 +214,28 @@ def test_what_was_said_to_somebody_away_is_not_passed_off_as_retained(broker: Ru
     credentials = broker.issue(broker.grant(space, subscribe=(topic,)))
     with broker.client(f"{space}-agent", publish=(topic,)) as agent:
         with Wire(broker.tcp_port) as away:
-            away.send(wire.connect_packet(space, credentials, clean=False))
-            assert away.read() == (wire.CONNACK, 0, b"\0\0")
-            away.send(wire.subscribe_packet(topic, qos=1))
-            assert away.read() == (wire.SUBACK, 0, b"\0\1\1")
+            away.send(raw_mqtt.connect_packet(space, credentials, clean=False))
+            assert away.read() == (raw_mqtt.CONNACK, 0, b"\0\0")
+            away.send(raw_mqtt.subscribe_packet(topic, qos=1))
+            assert away.read() == (raw_mqtt.SUBACK, 0, b"\0\1\1")
         for number in range(20):
             agent.publish_acknowledged(topic, b"%d" % number)
         with Wire(broker.tcp_port) as back:
-            back.send(wire.connect_packet(space, credentials, clean=False))
+            back.send(raw_mqtt.connect_packet(space, credentials, clean=False))
             answer = back.read()
             assert answer is not None
-            assert answer[0] == wire.CONNACK
+            assert answer[0] == raw_mqtt.CONNACK
             agent.publish_acknowledged(topic, b"end")
             numbers = []
             if not answer[2][0]:  # no session was kept, so nothing may be queued either
-                back.send(wire.subscribe_packet(topic, qos=1))
-                assert back.read() == (wire.SUBACK, 0, b"\0\1\1")
+                back.send(raw_mqtt.subscribe_packet(topic, qos=1))
+                assert back.read() == (raw_mqtt.SUBACK, 0, b"\0\1\1")
                 agent.publish_acknowledged(topic, b"end")
             while (packet := back.read()) and not packet[2].endswith(b"end"):
-                assert packet[0] == wire.PUBLISH
+                assert packet[0] == raw_mqtt.PUBLISH
                 assert not packet[1] & 1, "nothing was retained"
-                numbers.append(int(packet[2][len(wire.text(topic)) + 2 :]))
-                back.send(wire.packet(wire.PUBACK, packet[2][len(wire.text(topic)) :][:2]))
+                numbers.append(int(packet[2][len(raw_mqtt.text(topic)) + 2 :]))
+                back.send(raw_mqtt.packet(raw_mqtt.PUBACK, packet[2][len(raw_mqtt.text(topic)) :][:2]))
             assert all(first < second for first, second in pairwise(numbers))
             assert answer[2][0] or numbers == []
 
@@ -262,8 +262,8 @@ PAHO_GIVES_UP_S = 5.0
 @pytest.mark.parametrize("level", [3, 5, 6, 255])
 def test_another_protocol_version_is_answered_at_once(broker: RunningBroker, space: str, level: int) -> None:
     with Wire(broker.tcp_port) as raw:
-        raw.send(wire.connect_packet(space, broker.issue(broker.grant(space)), level=level))
+        raw.send(raw_mqtt.connect_packet(space, broker.issue(broker.grant(space)), level=level))
         answer = raw.read()
         if broker.kind == "amqtt":
-            assert answer == (wire.CONNACK, 0, b"\0\1")
-        assert answer is None or answer[0] == wire.CONNACK
+            assert answer == (raw_mqtt.CONNACK, 0, b"\0\1")
+        assert answer is None or answer[0] == raw_mqtt.CONNACK

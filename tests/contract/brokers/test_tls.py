@@ -10,17 +10,17 @@ from pathlib import Path
 import pytest
 
 from device_agent.protocol import topics
-from function_app.adapters.local.mqtt_link import Broker, MqttLink
-from function_app.adapters.local.tls import client_context
+from function_app.adapters.mqtt.connection import Broker, MqttLink
+from function_app.adapters.mqtt.tls import client_context
 from function_app.ports.broker_access import Credentials
-from infra.tls import authority
-from tests.support.brokers import HOST, BrokerKind, Client, RunningBroker, Transport, start_broker, wait_until
+from infra.tls import server_ca
+from tests.harness.network.brokers import HOST, BrokerKind, Client, RunningBroker, Transport, start_broker, wait_until
 
 
 @pytest.fixture(scope="module")
 def site(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("site") / "tls"
-    authority.make(folder, authority.names((), ()), now=dt.datetime.now(dt.UTC))
+    server_ca.make(folder, server_ca.names((), ()), now=dt.datetime.now(dt.UTC))
     return folder
 
 
@@ -61,7 +61,7 @@ def port_of(broker: RunningBroker, transport: Transport) -> int:
 
 
 def test_who_trusts_another_does_not_connect(broker: RunningBroker, transport: Transport, tmp_path: Path) -> None:
-    authority.make(tmp_path, authority.names((), ()), now=dt.datetime.now(dt.UTC))
+    server_ca.make(tmp_path, server_ca.names((), ()), now=dt.datetime.now(dt.UTC))
     for context in (client_context(tmp_path / "ca.crt"), client_context(None)):
         with (
             socket.create_connection((HOST, port_of(broker, transport))) as plain,

@@ -4,7 +4,7 @@ from collections.abc import Iterator
 
 import pytest
 
-from tests.support.brokers import BROKERS, BrokerKind, RunningBroker, start_broker
+from tests.harness.network.brokers import BROKERS, BrokerKind, RunningBroker, start_broker
 
 
 @pytest.fixture

@@ -11,7 +11,7 @@ import pytest
 
 from device_agent.protocol import codec
 from function_app.ports.command_bus import BusUnavailable, CommandBus
-from tests.support.brokers import PATIENCE_S
+from tests.harness.network.brokers import PATIENCE_S
 
 
 class Heard(NamedTuple):

@@ -12,8 +12,8 @@ from function_app.adapters.aws import command_bus as adapter
 from function_app.adapters.aws.command_bus import IotCommandBus
 from function_app.ports.command_bus import BusUnavailable
 from tests.contract.bus.suite import BEATS, WAITS_IN_VAIN_S, BusContract, Heard, Stage, beats_until
-from tests.support.aws import REGION, Refusal, Wire, start_moto, start_wire, use_credentials
-from tests.support.brokers import PATIENCE_S
+from tests.harness.network.brokers import PATIENCE_S
+from tests.harness.stores.aws import REGION, Refusal, Wire, start_moto, start_wire, use_credentials
 
 _spaces = count()
 ACCOUNT = "123456789012"

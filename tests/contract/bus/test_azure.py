@@ -21,8 +21,8 @@ from function_app.adapters.azure import command_bus as adapter
 from function_app.adapters.azure.command_bus import EventGridCommandBus
 from function_app.ports.command_bus import BusUnavailable
 from tests.contract.bus.suite import BEATS, WAITS_IN_VAIN_S, BusContract, Heard, Stage, beats_until
-from tests.support.brokers import PATIENCE_S
-from tests.support.identity import HOST, Host, make_certificate, start_host
+from tests.harness.cloud.identity import HOST, Host, make_certificate, start_host
+from tests.harness.network.brokers import PATIENCE_S
 
 _spaces = count()
 AUDIENCE = "https://eventgrid.azure.net"

@@ -8,10 +8,10 @@ from itertools import count
 import pytest
 
 from function_app.adapters.local.command_bus import MqttCommandBus
-from function_app.adapters.local.mqtt_link import Broker
+from function_app.adapters.mqtt.connection import Broker
 from function_app.ports.broker_access import ServiceCredentials
 from tests.contract.bus.suite import BusContract, Heard, Stage
-from tests.support.brokers import HOST, SILENCE_S, RunningBroker
+from tests.harness.network.brokers import HOST, SILENCE_S, RunningBroker
 
 _spaces = count()
 

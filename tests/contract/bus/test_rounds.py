@@ -8,9 +8,9 @@ from pathlib import Path
 
 import pytest
 
-from function_app.adapters.local import mqtt_socket
-from function_app.adapters.local.mqtt_link import Broker, MqttLink
-from tests.support.brokers import HOST, PATIENCE_S, RunningBroker, start_broker
+from function_app.adapters.mqtt import event_loop
+from function_app.adapters.mqtt.connection import Broker, MqttLink
+from tests.harness.network.brokers import HOST, PATIENCE_S, RunningBroker, start_broker
 
 EVERY_S = 0.2
 TOPIC = "ts/v1/rounds/bench/arm/tele/joints"
@@ -21,13 +21,13 @@ COUNT = 300
 def begun(monkeypatch: pytest.MonkeyPatch) -> list[float]:
     """When each round began."""
     moments: list[float] = []
-    begin = mqtt_socket._Unhurried._begin
+    begin = event_loop._Unhurried._begin
 
-    def watched(reader: mqtt_socket._Unhurried) -> None:
+    def watched(reader: event_loop._Unhurried) -> None:
         moments.append(time.monotonic())
         begin(reader)
 
-    monkeypatch.setattr(mqtt_socket._Unhurried, "_begin", watched)
+    monkeypatch.setattr(event_loop._Unhurried, "_begin", watched)
     return moments
 
 

@@ -8,7 +8,7 @@ import pytest
 
 from device_agent.ports.driver import Driver, DriverError, Observation
 from device_agent.protocol import codec
-from device_agent.protocol.robot_type import RobotType
+from device_agent.protocol.manifests.robot_type import RobotType
 
 DEADLINE_S = 60.0
 

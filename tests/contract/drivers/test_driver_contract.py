@@ -5,12 +5,12 @@ from pathlib import Path
 
 import pytest
 
-from device_agent import catalogue
+from device_agent.config import catalogue
 from device_agent.drivers import load
 from device_agent.drivers.mujoco import MujocoDriver, Placement, World
 from device_agent.ports.driver import Driver
-from device_agent.protocol import robot_type
-from device_agent.protocol.robot_type import RobotType
+from device_agent.protocol.manifests import robot_type
+from device_agent.protocol.manifests.robot_type import RobotType
 from tests.contract.drivers.suite import DriverContract
 
 ROBOTS = catalogue.ROBOTS

@@ -9,10 +9,11 @@ from collections.abc import Awaitable, Callable
 import jwt
 import pytest
 
-from device_agent.protocol import codec, signing
+from device_agent.protocol import codec
 from device_agent.protocol.errors import SignatureError
-from device_agent.protocol.keys import KEYS_CONTEXT, NewKey
-from function_app.ports.keys import Keys, RotationRefused
+from device_agent.protocol.security import signing
+from device_agent.protocol.security.key_rotation import KEYS_CONTEXT, NewKey
+from function_app.ports.signing_keys import Keys, RotationRefused
 
 Again = Callable[[], Awaitable[Keys]]
 LEARN_MS, OVERLAP_MS = 1000, 5000

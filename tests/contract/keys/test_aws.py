@@ -4,11 +4,11 @@ from collections.abc import AsyncIterator, Iterator
 
 import pytest
 
-from function_app.adapters.aws.keys import SecretsManagerKeys
-from function_app.ports.keys import Keys
+from function_app.adapters.aws.signing_keys import SecretsManagerKeys
+from function_app.ports.signing_keys import Keys
 from function_app.ports.tables import StoreError
 from tests.contract.keys.suite import Again, KeysSuite, Time
-from tests.support.aws import REGION, reset, start_moto, use_credentials
+from tests.harness.stores.aws import REGION, reset, start_moto, use_credentials
 
 LOOK_MS = 100
 

@@ -14,11 +14,11 @@ from urllib.parse import urlsplit
 import pytest
 
 from function_app.adapters.azure.client import Place
-from function_app.adapters.azure.keys import KeyVaultKeys
-from function_app.ports.keys import Keys
+from function_app.adapters.azure.signing_keys import KeyVaultKeys
+from function_app.ports.signing_keys import Keys
 from function_app.ports.tables import StoreError
 from tests.contract.keys.suite import Again, KeysSuite, Time
-from tests.support.identity import HOST, make_certificate, start_host
+from tests.harness.cloud.identity import HOST, make_certificate, start_host
 
 LOOK_MS = 100
 

@@ -4,8 +4,8 @@ from pathlib import Path
 
 import pytest
 
-from function_app.adapters.local.keys import FileKeys
-from function_app.ports.keys import Keys
+from function_app.adapters.local.signing_keys import FileKeys
+from function_app.ports.signing_keys import Keys
 from tests.contract.keys.suite import Again, KeysSuite, Time
 
 

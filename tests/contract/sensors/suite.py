@@ -11,10 +11,9 @@ import pytest
 import simplejpeg
 
 from device_agent.ports.sensor import Camera, Image, Movable, RoomDriver, Scan, SensorError
-from device_agent.protocol import codec, frames
-from device_agent.protocol.frames import CameraFrame
-from device_agent.protocol.messages import FIELD_PATTERN, MAX_VALUES, Measurements
-from device_agent.protocol.room import RoomDevice
+from device_agent.protocol import FIELD_PATTERN, MAX_VALUES, Measurements, camera_frames, codec
+from device_agent.protocol.camera_frames import CameraFrame
+from device_agent.protocol.manifests.room import RoomDevice
 
 PNG = b"\x89PNG\r\n\x1a\n"
 
@@ -74,7 +73,7 @@ class RoomDriverContract:
                 frame = connected.frame(camera.name)
                 assert frame is not None
                 assert simplejpeg.decode_jpeg(frame.content).shape == (frame.height, frame.width, 3)
-                frames.encode(CameraFrame(1, 1, frame.width, frame.height, frame.content))
+                camera_frames.encode(CameraFrame(1, 1, frame.width, frame.height, frame.content))
 
     def test_each_control_applies_what_it_says_within_its_limits(
         self, connected: RoomDriver, entry: RoomDevice

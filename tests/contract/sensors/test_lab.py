@@ -5,11 +5,11 @@ from collections.abc import Iterator
 import pytest
 
 from device_agent.ports.sensor import RoomDriver
-from device_agent.protocol import room
-from device_agent.protocol.room import RoomDevice
+from device_agent.protocol.manifests import room
+from device_agent.protocol.manifests.room import RoomDevice
 from device_agent.sensors.perception import driver as perception
 from tests.contract.sensors.suite import RoomDriverContract
-from tests.support.rooms import LAB, StillWorld
+from tests.harness.agent.rooms import LAB, StillWorld
 
 DEVICES = {device.name: device for device in room.load(LAB).devices}
 

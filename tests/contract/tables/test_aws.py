@@ -15,7 +15,7 @@ from function_app.adapters.aws.client import ATTEMPTS
 from function_app.adapters.aws.tables import TRIES, DynamoTables
 from function_app.ports.tables import Conflict, Page, Row, StoreError, Tables, Write
 from tests.contract.tables.suite import Again, TablesSuite
-from tests.support.aws import HOST, REGION, Refusal, Wire, reset, start_moto, start_wire, use_credentials
+from tests.harness.stores.aws import HOST, REGION, Refusal, Wire, reset, start_moto, start_wire, use_credentials
 
 Open = Callable[..., DynamoTables]
 NAME = "telescope"

@@ -23,8 +23,8 @@ from function_app.ports.tables import (
     Write,
 )
 from tests.contract.tables.suite import Again, TablesSuite
-from tests.support.aws import Fault, Refusal, Wire, start_wire
-from tests.support.azure import KEY, endpoint, run_count_up, start_azurite, through
+from tests.harness.stores.aws import Fault, Refusal, Wire, start_wire
+from tests.harness.stores.azure import KEY, endpoint, run_count_up, start_azurite, through
 
 ROUNDS = 25
 _SPAWN = multiprocessing.get_context("spawn")

@@ -10,11 +10,11 @@ import pytest
 from function_app.adapters.azure import blobs as adapter
 from function_app.adapters.azure.blobs import AzureBlobs
 from function_app.adapters.azure.client import Place
-from function_app.adapters.azure.signing_keys import SigningKeys
+from function_app.adapters.azure.sas_keys import SigningKeys
 from function_app.adapters.azure.tables import AzureTables
 from function_app.ports.tables import Row, StoreError
-from tests.support.azure import endpoint, start_azurite
-from tests.support.identity import HOST, OBJECT_ID, SECRET, TENANT_ID, Host, make_certificate, start_host
+from tests.harness.cloud.identity import HOST, OBJECT_ID, SECRET, TENANT_ID, Host, make_certificate, start_host
+from tests.harness.stores.azure import endpoint, start_azurite
 
 CLIENT_ID = "11059fcc-5514-4800-b5f8-49808b9cfab6"
 

@@ -11,16 +11,16 @@ from typing import Any
 
 import pytest
 
-from device_agent import bootstrap, catalogue
-from device_agent.links import SOFTWARE
+from device_agent import bootstrap
+from device_agent.config import catalogue
+from device_agent.config.agent_config import Configuration, DeviceEntry, Home, HttpPolling, Pairing
 from device_agent.ports.clock import CloudClock
-from device_agent.protocol import codec, topics
-from device_agent.protocol.messages import Ack, AckStatus, MoveJoints, State
-from device_agent.runtime.home import Configuration, DeviceEntry, Home, HttpPolling, Pairing
-from device_agent.transports.http.api import CloudApi
+from device_agent.protocol import Ack, AckStatus, MoveJoints, State, codec, topics
+from device_agent.transports.factory import SOFTWARE
+from device_agent.transports.http.client import CloudApi
 from tests.contract.transports.suite import Spoken
-from tests.support.brokers import wait_until
-from tests.support.ground import Ground
+from tests.harness.cloud.cloud_processes import Ground
+from tests.harness.network.brokers import wait_until
 
 FAR = {"shoulder_pan": 6.0}
 """From home almost two seconds away, at any speed, and nothing is in the way."""

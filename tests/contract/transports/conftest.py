@@ -4,7 +4,7 @@ from typing import Any
 import pytest
 
 from tests.contract.transports.suite import Spoken
-from tests.support.ground import Ground, Link, shared_grounds
+from tests.harness.cloud.cloud_processes import Ground, Link, shared_grounds
 
 
 @pytest.fixture(scope="module")

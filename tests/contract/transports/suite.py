@@ -14,11 +14,10 @@ from typing import Any
 
 import pytest
 
-from device_agent.protocol import codec, topics
-from device_agent.protocol.messages import Ack, AckStatus, Event, Fault, Measurements, Mode, State
-from function_app.domain.ids import command_id
-from tests.support.brokers import BrokerKind, wait_until
-from tests.support.ground import Ground, Link
+from device_agent.protocol import Ack, AckStatus, Event, Fault, Measurements, Mode, State, codec, topics
+from function_app.domain.common.ids import command_id
+from tests.harness.cloud.cloud_processes import Ground, Link
+from tests.harness.network.brokers import BrokerKind, wait_until
 
 ODD = '{"b" : "grüß 🤖 \\u00fc\\n\\"\\\\", "a":1.50,\t"c": [ ]}'.encode()
 """JSON as none of our own encoders writes it."""

@@ -2,7 +2,7 @@
 
 import pytest
 
-from device_agent.runtime.home import HttpPolling
+from device_agent.config.agent_config import HttpPolling
 from device_agent.transports.http.transport import NOTICED_WITHIN_S
 from tests.contract.transports.agent_suite import AgentSuite
 from tests.contract.transports.suite import Spoken, TransportSuite

@@ -8,8 +8,8 @@ from device_agent.protocol import topics
 from device_agent.transports.mqtt.transport import NOTICED_WITHIN_S
 from tests.contract.transports.agent_suite import FAR, AgentSuite, Resident
 from tests.contract.transports.suite import Spoken, TransportSuite
-from tests.support.brokers import PATIENCE_S, SILENCE_S, wait_until
-from tests.support.ground import Link
+from tests.harness.cloud.cloud_processes import Link
+from tests.harness.network.brokers import PATIENCE_S, SILENCE_S, wait_until
 
 
 class _OverMqtt(TransportSuite):

@@ -7,8 +7,8 @@ import pytest
 from device_agent.transports.xmpp.transport import NOTICED_WITHIN_S
 from tests.contract.transports.agent_suite import AgentSuite
 from tests.contract.transports.suite import Spoken, TransportSuite
-from tests.support.ground import Ground
-from tests.support.xmpp import start_xmpp_ground
+from tests.harness.cloud.cloud_processes import Ground
+from tests.harness.network.xmpp import start_xmpp_ground
 
 
 @pytest.fixture(scope="module")

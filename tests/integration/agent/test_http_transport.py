@@ -13,13 +13,13 @@ from urllib.parse import parse_qs, urlsplit
 import pytest
 
 from device_agent.ports.clock import CloudClock
-from device_agent.protocol import codec, signing, topics
-from device_agent.protocol.messages import Ack, AckStatus, Presence
+from device_agent.protocol import Ack, AckStatus, Presence, codec, topics
+from device_agent.protocol.security import signing
 from device_agent.transports.http import transport as http
-from device_agent.transports.http.api import CloudApi, CloudError
-from device_agent.transports.http.out_tray import Message, OutTray
+from device_agent.transports.http.client import CloudApi, CloudError
+from device_agent.transports.http.send_queue import Message, OutTray
 from device_agent.transports.http.transport import HttpTransport
-from tests.support.brokers import PATIENCE_S, wait_until
+from tests.harness.network.brokers import PATIENCE_S, wait_until
 
 CONN = topics.conn("lab", "arm1")
 CMD = topics.device("lab", "arm1", "arm", topics.CMD)

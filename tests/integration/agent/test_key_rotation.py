@@ -7,14 +7,14 @@ from typing import Any
 import pytest
 from msgspec.structs import replace
 
-from device_agent.protocol import signing
-from device_agent.protocol.messages import GrantLease
-from function_app.adapters.key_ring import Ring
-from function_app.adapters.local.keys import FileKeys
+from device_agent.protocol import GrantLease
+from device_agent.protocol.security import signing
+from function_app.adapters.local.signing_keys import FileKeys
+from function_app.adapters.shared.key_ring import Ring
 from tests.contract.transports.agent_suite import Resident
 from tests.contract.transports.suite import Spoken
-from tests.support.brokers import wait_until
-from tests.support.ground import Ground, start_ground
+from tests.harness.cloud.cloud_processes import Ground, start_ground
+from tests.harness.network.brokers import wait_until
 
 LEARN_MS, OVERLAP_MS = 3_600_000, 7_200_000
 MOVEMENT = "/robot-types/ur5/movements/nod"

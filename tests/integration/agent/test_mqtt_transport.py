@@ -12,11 +12,11 @@ from typing import Any, ClassVar
 
 import pytest
 
-from device_agent.protocol import codec, grants, topics
-from device_agent.protocol.messages import Presence
+from device_agent.protocol import Presence, codec, topics
+from device_agent.protocol.security import grants
 from device_agent.transports.mqtt import BrokerAccess, MqttTransport
-from tests.support.brokers import BROKERS, HOST, ROOT, Client, RunningBroker, start_broker, wait_until
-from tests.support.proxy import start_proxy
+from tests.harness.network.brokers import BROKERS, HOST, ROOT, Client, RunningBroker, start_broker, wait_until
+from tests.harness.network.proxy import start_proxy
 
 CONN = topics.conn("lab", "arm1")
 ACK = topics.device("lab", "arm1", "arm", topics.ACK)

@@ -6,11 +6,10 @@ from itertools import pairwise
 from pathlib import Path
 
 from device_agent.ports.clock import wall_ms
-from device_agent.protocol import topics
+from device_agent.protocol import AckStatus, GrantLease, JointTelemetry, MoveJoints, StopDevice, topics
 from device_agent.protocol.events import EventKind
-from device_agent.protocol.messages import AckStatus, GrantLease, JointTelemetry, MoveJoints, StopDevice
-from tests.support.brokers import start_broker, wait_until
-from tests.support.own_agent import OwnAgent
+from tests.harness.agent.custom_agent import OwnAgent
+from tests.harness.network.brokers import start_broker, wait_until
 
 TOML = """
 [buffer]

@@ -9,9 +9,9 @@ import pytest
 from device_agent import geometry
 from device_agent.drivers import load
 from device_agent.drivers.mujoco import WheeledDriver
-from device_agent.protocol import robot_type, topics
-from device_agent.protocol.messages import AckStatus, Measurements
-from tests.support.bench import Bench, eventually
+from device_agent.protocol import AckStatus, Measurements, topics
+from device_agent.protocol.manifests import robot_type
+from tests.harness.agent.device_harness import Bench, eventually
 from tests.unit.robots.folders import ROBOTS
 
 FOLDER = ROBOTS / "qbo"

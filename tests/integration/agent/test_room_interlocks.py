@@ -6,10 +6,10 @@ from pathlib import Path
 
 import pytest
 
+from device_agent.protocol import AckStatus
 from device_agent.protocol.events import EventKind
-from device_agent.protocol.messages import AckStatus
-from tests.support.brokers import RunningBroker, start_broker, wait_until
-from tests.support.own_agent import OwnAgent, Sensor
+from tests.harness.agent.custom_agent import OwnAgent, Sensor
+from tests.harness.network.brokers import RunningBroker, start_broker, wait_until
 
 STALE_S = 2.5
 SLOW = 0.2

@@ -21,8 +21,8 @@ from typing import Any
 
 import pytest
 
-from tests.support.brokers import ROOT, wait_until
-from tests.support.ground import Ground, start_ground
+from tests.harness.cloud.cloud_processes import Ground, start_ground
+from tests.harness.network.brokers import ROOT, wait_until
 
 NOBODY = 65_534
 PATIENCE_S = 60.0

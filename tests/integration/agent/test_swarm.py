@@ -9,8 +9,8 @@ from typing import Any
 
 import pytest
 
-from tests.support.brokers import ROOT, BrokerKind, wait_until
-from tests.support.ground import Ground, start_ground
+from tests.harness.cloud.cloud_processes import Ground, start_ground
+from tests.harness.network.brokers import ROOT, BrokerKind, wait_until
 
 COUNT = 20
 

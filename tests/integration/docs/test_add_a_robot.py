@@ -9,8 +9,8 @@ from pathlib import Path
 
 import pytest
 
-from tests.support.brokers import ROOT
-from tests.support.ground import Ground, start_ground
+from tests.harness.cloud.cloud_processes import Ground, start_ground
+from tests.harness.network.brokers import ROOT
 
 PAGE = ROOT / "docs" / "add-a-robot.md"
 BLOCK = re.compile(r"^```(\w+)(?: (\S+))?\n(.*?)^```$", re.MULTILINE | re.DOTALL)

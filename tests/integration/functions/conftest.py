@@ -8,16 +8,16 @@ from typing import Any
 import pytest
 
 from function_app.adapters.local import tables as adapter
-from function_app.adapters.local.keys import FileKeys
+from function_app.adapters.local.signing_keys import FileKeys
 from function_app.adapters.local.tables import SqliteTables
 from tests.conftest import Emulators
-from tests.support.aws import use_credentials
-from tests.support.brokers import BrokerKind, RunningBroker, start_broker
-from tests.support.cloud import Cloud, MovingClock, Person, paired, settings
-from tests.support.knife import CutTables, Knife
-from tests.support.processes import Place
-from tests.support.robot import Robot
-from tests.support.stores import StoreKind, empty_store, make_places
+from tests.fakes.agent import Robot
+from tests.harness.cloud.cloud import Cloud, MovingClock, Person, paired, settings
+from tests.harness.crash_injection import CutTables, Knife
+from tests.harness.network.brokers import BrokerKind, RunningBroker, start_broker
+from tests.harness.processes import Place
+from tests.harness.stores.aws import use_credentials
+from tests.harness.stores.emulators import StoreKind, empty_store, make_places
 
 Open = Callable[..., Cloud]
 Mortal = Callable[[MovingClock], tuple[Cloud, Knife]]

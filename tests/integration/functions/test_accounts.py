@@ -11,9 +11,9 @@ from hypothesis import given
 from hypothesis import settings as quickly
 from hypothesis import strategies as st
 
-from device_agent.protocol import signing
+from device_agent.protocol.security import signing
+from tests.harness.cloud.cloud import API, Cloud, MovingClock, problem, settings
 from tests.integration.functions.conftest import Open
-from tests.support.cloud import API, Cloud, MovingClock, problem, settings
 
 SIGN_IN = f"{API}/auth/sign-in"
 

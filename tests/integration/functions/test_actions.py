@@ -4,8 +4,7 @@ from typing import Any
 
 import pytest
 
-from device_agent.protocol import topics
-from device_agent.protocol.messages import (
+from device_agent.protocol import (
     AckStatus,
     CancelAction,
     Description,
@@ -13,10 +12,11 @@ from device_agent.protocol.messages import (
     RunMovement,
     Say,
     TakePosture,
+    topics,
 )
-from tests.support.brokers import BROKERS, wait_until
-from tests.support.cloud import API, MOVE, Cloud, Person, paired, problem
-from tests.support.robot import Robot
+from tests.fakes.agent import Robot
+from tests.harness.cloud.cloud import API, MOVE, Cloud, Person, paired, problem
+from tests.harness.network.brokers import BROKERS, wait_until
 
 Pair = tuple[Person, Robot]
 both_brokers = pytest.mark.parametrize("broker", BROKERS, indirect=True)

@@ -10,14 +10,14 @@ from cryptography.hazmat.primitives import hashes, serialization
 from cryptography.hazmat.primitives.asymmetric import ec
 from fastapi import Request
 
-from device_agent.protocol import signing
+from device_agent.protocol.security import signing
 from function_app.adapters.local.certificates import FileCertificates
-from function_app.entrypoints.http.address import client_address
+from function_app.entrypoints.http.framework.client_address import client_address
 from function_app.ports.broker_access import Credentials
-from infra.tls import devices
-from tests.support.brokers import BROKERS, RunningBroker, wait_until
-from tests.support.cloud import API, Cloud, MovingClock, Person, paired, problem, settings
-from tests.support.robot import Robot
+from infra.tls import agent_ca as devices
+from tests.fakes.agent import Robot
+from tests.harness.cloud.cloud import API, Cloud, MovingClock, Person, paired, problem, settings
+from tests.harness.network.brokers import BROKERS, RunningBroker, wait_until
 
 Pair = tuple[Person, Robot]
 

@@ -5,13 +5,13 @@ from typing import Any
 
 import pytest
 
-from device_agent.protocol.messages import ReleaseLease
+from device_agent.protocol import ReleaseLease
 from function_app.ports.broker_access import Credentials
-from function_app.services import store
+from function_app.services.storage import records
+from tests.fakes.agent import Robot
+from tests.harness.cloud.cloud import API, MOVE, Cloud, MovingClock, Person, paired, problem
+from tests.harness.network.brokers import BROKERS, RunningBroker, wait_until
 from tests.integration.functions.conftest import Open
-from tests.support.brokers import BROKERS, RunningBroker, wait_until
-from tests.support.cloud import API, MOVE, Cloud, MovingClock, Person, paired, problem
-from tests.support.robot import Robot
 
 KEYS = "/api-keys"
 Pair = tuple[Person, Robot]
@@ -105,7 +105,7 @@ def test_a_key_may_do_what_its_description_says_and_nothing_else(
 
 
 def test_every_operation_that_takes_keys_is_there(operations: dict[str, tuple[str, str, bool]]) -> None:
-    from function_app.entrypoints.http.for_keys import FOR_KEYS
+    from function_app.entrypoints.http.framework.api_key_scopes import FOR_KEYS
 
     assert {name for name, (_, _, takes_keys) in operations.items() if takes_keys} == FOR_KEYS
 
@@ -194,7 +194,7 @@ def test_its_use_is_noted_once_an_hour(alone_clock: tuple[Cloud, MovingClock]) -
     key, program = make(anna)
 
     def version() -> str:
-        row = cloud.run(cloud.functions.tables.get(store.API_KEYS, key, "key"))
+        row = cloud.run(cloud.functions.tables.get(records.API_KEYS, key, "key"))
         assert row is not None
         return row.etag
 
@@ -251,7 +251,7 @@ class TestRevoking:
 
 
 def test_an_account_has_at_most_fifty(cloud: Cloud, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("function_app.services.api_keys.MOST", 2)
+    monkeypatch.setattr("function_app.services.accounts.api_keys.MOST", 2)
     anna = cloud.sign_in("anna")
     for _ in range(2):
         make(anna)
@@ -268,7 +268,7 @@ def test_one_that_is_used_while_it_is_revoked_is_revoked(
     used: list[Any] = []
 
     async def between(table: str, row: Any) -> None:
-        if table == store.API_KEYS and not used:
+        if table == records.API_KEYS and not used:
             client = cloud.client(headers={"Authorization": f"Bearer {program.token}"})
             used.append(await client.get(f"{API}/devices"))
         await delete(table, row)

@@ -13,14 +13,14 @@ import pytest
 
 from function_app.__main__ import main
 from function_app.bootstrap import Functions
-from function_app.domain.accounts import Identity
-from function_app.domain.audit_chain import CLOUD, Head, entry
+from function_app.domain.audit.hash_chain import CLOUD, Head, entry
+from function_app.domain.identity.accounts import Identity
 from function_app.ports.tables import Conflict
-from function_app.services import store
-from function_app.services.audit_chain import ABANDON_MS, ANCHOR_MS, LOOK_MS, anchors
+from function_app.services.audit.audit_log import ABANDON_MS, ANCHOR_MS, LOOK_MS, anchors
+from function_app.services.storage import records as store
+from tests.harness.cloud.cloud import API, Cloud, MovingClock, Person, problem, settings
+from tests.harness.processes import Place, begin, killed, open_functions, run_here, show_code
 from tests.integration.functions.conftest import Open
-from tests.support.cloud import API, Cloud, MovingClock, Person, problem, settings
-from tests.support.processes import Place, begin, killed, open_functions, run_here, show_code
 
 OWNER = "owner"
 WHO = Identity(OWNER, "anna", "s")

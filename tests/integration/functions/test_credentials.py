@@ -4,9 +4,9 @@ import pytest
 
 from device_agent.protocol import topics
 from function_app.ports.broker_access import Credentials
-from tests.support.brokers import BROKERS, PATIENCE_S, SILENCE_S, Client, RunningBroker, wait_until
-from tests.support.cloud import Cloud, Person, paired, problem
-from tests.support.robot import Robot
+from tests.fakes.agent import Robot
+from tests.harness.cloud.cloud import Cloud, Person, paired, problem
+from tests.harness.network.brokers import BROKERS, PATIENCE_S, SILENCE_S, Client, RunningBroker, wait_until
 
 Pair = tuple[Person, Robot]
 WATCHED = ("desc", "desc/twin", "state", "tele/+", "cam/+", "event", "ack")

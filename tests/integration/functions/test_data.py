@@ -4,15 +4,14 @@ from typing import Any
 
 import pytest
 
-from device_agent.protocol import codec, topics
-from device_agent.protocol.messages import JointTelemetry, Measurements, Mode
-from function_app.adapters.local import feed
-from function_app.services import store
-from function_app.services.series import Place
+from device_agent.protocol import JointTelemetry, Measurements, Mode, codec, topics
+from function_app.adapters.local import device_feed
+from function_app.services.storage import records
+from function_app.services.telemetry.series_writer import Place
+from tests.fakes.agent import Robot
+from tests.harness.cloud.cloud import Cloud, Person, paired, problem
+from tests.harness.network.brokers import wait_until
 from tests.integration.functions.conftest import Open
-from tests.support.brokers import wait_until
-from tests.support.cloud import Cloud, Person, paired, problem
-from tests.support.robot import Robot
 
 
 def measure(robot: Robot, stream: str, at_ms: int, **values: float) -> None:
@@ -100,7 +99,7 @@ def test_what_cannot_be_read_is_refused(cloud: Cloud, pair: tuple[Person, Robot]
 def test_what_cannot_be_kept_until_it_is_stored_is_dropped_and_said(
     cloud: Cloud, pair: tuple[Person, Robot], monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
-    monkeypatch.setattr(feed, "MAX_COLLECTED", 10)
+    monkeypatch.setattr(device_feed, "MAX_COLLECTED", 10)
     cloud.start_telemetry()
     anna, robot = pair
     begin_ms = cloud.clock.now_ms() - 600_000
@@ -117,14 +116,14 @@ def test_what_an_unpaired_robot_has_measured_is_forgotten(cloud: Cloud, pair: tu
     for stream in ("health", "power"):
         measure(robot, stream, cloud.clock.now_ms(), a=1.0)
     wait_until(lambda: len(streams(anna, robot)) == 2, "the samples to be stored")
-    row = cloud.run(cloud.functions.tables.get(store.AGENTS, robot.id, "agent"))
+    row = cloud.run(cloud.functions.tables.get(records.AGENTS, robot.id, "agent"))
     assert row is not None
     place = Place(robot.device, row.data["pairing"], "health")
     assert anna.delete(f"/agents/{robot.id}").status_code == 204
 
     def left() -> int:
         places = (place.streams, place.partition, place._replace(stream="power").partition)
-        pages = [cloud.run(cloud.functions.tables.query(store.SERIES, each)) for each in places]
+        pages = [cloud.run(cloud.functions.tables.query(records.SERIES, each)) for each in places]
         return sum(len(page.rows) for page in pages)
 
     assert left() == 2 + 2 * 8

@@ -5,14 +5,24 @@ from typing import Any
 
 import pytest
 
-from device_agent.protocol import codec, topics
-from device_agent.protocol.messages import AckStatus, Description, Event, LeaseState, Mode, Presence, State, StopLatch
-from function_app.domain.devices import SILENT_MS
-from function_app.entrypoints.ingest import ingest
-from function_app.services import store
-from tests.support.brokers import BROKERS, wait_until
-from tests.support.cloud import Cloud, Person, paired
-from tests.support.robot import Robot
+from device_agent.protocol import (
+    AckStatus,
+    Description,
+    Event,
+    LeaseState,
+    Mode,
+    Presence,
+    State,
+    StopLatch,
+    codec,
+    topics,
+)
+from function_app.domain.devices.devices import SILENT_MS
+from function_app.entrypoints.ingest.router import ingest
+from function_app.services.storage import records
+from tests.fakes.agent import Robot
+from tests.harness.cloud.cloud import Cloud, Person, paired
+from tests.harness.network.brokers import BROKERS, wait_until
 
 Pair = tuple[Person, Robot]
 
@@ -106,7 +116,7 @@ def test_an_event_and_a_description_are_stored_once(cloud: Cloud, pair: Pair) ->
         hear(cloud, robot.topic(topics.DESC), description)
     page = anna.get(f"/devices/{robot.device}/events").json()
     assert [event["id"] for event in page["items"]] == ["e2", "e1"], "newest first"
-    row = cloud.run(cloud.functions.tables.get(store.DESCRIPTIONS, robot.id, "arm"))
+    row = cloud.run(cloud.functions.tables.get(records.DESCRIPTIONS, robot.id, "arm"))
     assert row is not None
     assert row.data["label"] == "Arm"
 

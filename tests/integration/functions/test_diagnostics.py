@@ -7,14 +7,13 @@ from typing import Any
 
 import pytest
 
-from device_agent.protocol import codec, topics
-from device_agent.protocol.messages import JointTelemetry, Measurements, Mode, State
-from function_app.adapters.local import feed
-from function_app.entrypoints.ingest import ingest, ingest_telemetry
-from function_app.services import store
-from tests.support.brokers import wait_until
-from tests.support.cloud import Cloud, Person, paired, problem
-from tests.support.robot import Robot
+from device_agent.protocol import JointTelemetry, Measurements, Mode, State, codec, topics
+from function_app.adapters.local import device_feed
+from function_app.entrypoints.ingest.router import ingest, ingest_telemetry
+from function_app.services.storage import records
+from tests.fakes.agent import Robot
+from tests.harness.cloud.cloud import Cloud, Person, paired, problem
+from tests.harness.network.brokers import wait_until
 
 Pair = tuple[Person, Robot]
 Temperature = Callable[[int], float]
@@ -88,7 +87,7 @@ def open_faults(who: Person, robot: Robot) -> list[dict[str, Any]]:
 def test_a_joint_that_heats_up_is_told_before_its_limit_over_the_broker(
     cloud: Cloud, pair: Pair, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(feed, "COLLECT_S", 0.1)
+    monkeypatch.setattr(device_feed, "COLLECT_S", 0.1)
     cloud.start_telemetry()
     anna, robot = pair
     life = Life(cloud, robot)
@@ -102,13 +101,13 @@ def test_a_joint_that_heats_up_is_told_before_its_limit_over_the_broker(
         wait_until(
             lambda: any(
                 row.data["window_ms"] > newest_ms
-                for row in cloud.run(cloud.functions.tables.query(store.DIAGNOSTICS, partition)).rows
+                for row in cloud.run(cloud.functions.tables.query(records.DIAGNOSTICS, partition)).rows
             ),
             "the newest window",
         )
         return cloud.sign_in("anna")
 
-    row = cloud.run(cloud.functions.tables.get(store.AGENTS, robot.id, "agent"))
+    row = cloud.run(cloud.functions.tables.get(records.AGENTS, robot.id, "agent"))
     assert row is not None
     partition = f"{robot.device}/{row.data['pairing']}"
     anna = publish(12 * MINUTE, temperature_c__elbow=still(35), temperature_c__wrist_1=still(30))
@@ -296,7 +295,7 @@ def test_what_a_killed_worker_left_is_put_right_within_a_minute(
     real = cloud.functions.tables.replace
 
     async def dying(table: str, row: Any) -> Any:
-        if table == store.DIAGNOSTICS:
+        if table == records.DIAGNOSTICS:
             raise RuntimeError("killed")
         return await real(table, row)
 
@@ -320,10 +319,10 @@ def test_a_robot_type_nobody_knows_and_a_hundred_fields_are_watched_without_limi
         life.live(130, **many)
         fields = diagnostics(anna, robot)["fields"]
         assert [item["field"] for item in fields] == sorted(many)[:100]
-        row = cloud.run(cloud.functions.tables.get(store.AGENTS, robot.id, "agent"))
+        row = cloud.run(cloud.functions.tables.get(records.AGENTS, robot.id, "agent"))
         assert row is not None
         partition = f"{robot.device}/{row.data['pairing']}"
-        kept = cloud.run(cloud.functions.tables.get(store.DIAGNOSTICS, partition, "health"))
+        kept = cloud.run(cloud.functions.tables.get(records.DIAGNOSTICS, partition, "health"))
         assert kept is not None
         assert len(codec.encode(kept.data)) < 200_000
 
@@ -334,17 +333,17 @@ def test_what_an_earlier_pairing_left_is_forgotten(cloud: Cloud, pair: Pair) -> 
     sample = {"at_ms": cloud.clock.now_ms(), "ms": 5.0}
     latency = {"transport": "mqtt", "path": "operator-device", "samples": [sample]}
     assert anna.post(f"/devices/{robot.device}/latency", latency).status_code == 204
-    row = cloud.run(cloud.functions.tables.get(store.AGENTS, robot.id, "agent"))
+    row = cloud.run(cloud.functions.tables.get(records.AGENTS, robot.id, "agent"))
     assert row is not None
     partition = f"{robot.device}/{row.data['pairing']}"
 
     def left() -> set[str]:
-        tables = (store.FAULTS, store.DIAGNOSTICS, store.LATENCY)
+        tables = (records.FAULTS, records.DIAGNOSTICS, records.LATENCY)
         pages = {table: cloud.run(cloud.functions.tables.query(table, partition)) for table in tables}
         # How often a code was raised has a note of its own, and says itself how long it stays.
         return {table for table, page in pages.items() if any("expires_ms" not in row.data for row in page.rows)}
 
-    assert left() == {store.FAULTS, store.DIAGNOSTICS, store.LATENCY}
+    assert left() == {records.FAULTS, records.DIAGNOSTICS, records.LATENCY}
     anna.delete(f"/agents/{robot.id}")
     cloud.clock.advance(2 * 3600)
     cloud.sweep()

@@ -7,17 +7,17 @@ from typing import Any
 
 import pytest
 
-from device_agent.protocol.messages import AckStatus, MoveJoints, ReleaseLease
-from function_app.domain.accounts import Role
-from function_app.domain.api_keys import ApiKey
-from function_app.domain.sharing import Share
+from device_agent.protocol import AckStatus, MoveJoints, ReleaseLease
+from function_app.domain.devices.access import Share
+from function_app.domain.identity.accounts import Role
+from function_app.domain.identity.api_keys import ApiKey
 from function_app.ports.broker_access import Credentials
-from function_app.services import store
-from function_app.services.identity import SESSION_S
+from function_app.services.identity.authenticator import SESSION_S
+from function_app.services.storage import records
+from tests.fakes.agent import Robot
+from tests.harness.cloud.cloud import API, Cloud, Person, problem
+from tests.harness.network.brokers import BROKERS, RunningBroker, wait_until
 from tests.integration.functions.test_api_keys import KEYS, Program, make
-from tests.support.brokers import BROKERS, RunningBroker, wait_until
-from tests.support.cloud import API, Cloud, Person, problem
-from tests.support.robot import Robot
 
 Pair = tuple[Person, Robot]
 DAY_S = 86_400
@@ -29,7 +29,7 @@ def edit(cloud: Cloud, table: str, place: tuple[str, str], kind: type[Any], **ch
     tables = cloud.functions.tables
     row = cloud.run(tables.get(table, *place))
     assert row is not None
-    cloud.run(tables.replace(table, replace(row, data=store.fields(replace(store.read(row, kind), **changes)))))
+    cloud.run(tables.replace(table, replace(row, data=records.fields(replace(records.read(row, kind), **changes)))))
 
 
 class TestItsTurn:
@@ -62,11 +62,11 @@ class TestItsTurn:
             if how == "revoked":
                 assert anna.delete(f"{KEYS}/{key}").status_code == 204
             elif how == "expired":
-                edit(cloud, store.API_KEYS, place, ApiKey, expires_ms=cloud.clock.now_ms())
+                edit(cloud, records.API_KEYS, place, ApiKey, expires_ms=cloud.clock.now_ms())
             elif how == "viewer":
-                edit(cloud, store.API_KEYS, place, ApiKey, most=Role.VIEWER)
+                edit(cloud, records.API_KEYS, place, ApiKey, most=Role.VIEWER)
             else:
-                edit(cloud, store.API_KEYS, place, ApiKey, only=("aaaaaaaaaa-leg",))
+                edit(cloud, records.API_KEYS, place, ApiKey, only=("aaaaaaaaaa-leg",))
 
         self.expect_no_turn(pair, program, change, "api-key-ended")
 
@@ -80,9 +80,9 @@ class TestItsTurn:
         def change(_: str) -> None:
             # Before the timer has seen to it, and as if who un-shared had been killed.
             if how == "over":
-                edit(cloud, store.SHARES, place, Share, expires_ms=cloud.clock.now_ms())
+                edit(cloud, records.SHARES, place, Share, expires_ms=cloud.clock.now_ms())
             else:
-                edit(cloud, store.SHARES, place, Share, role=Role.VIEWER)
+                edit(cloud, records.SHARES, place, Share, role=Role.VIEWER)
 
         self.expect_no_turn(pair, bert, change, "unshared")
 
@@ -199,9 +199,9 @@ def test_what_a_key_asks_for_while_it_is_revoked_comes_to_nothing(
 
     async def meanwhile(*given: Any) -> Any:
         # All of a revocation but what looks for what is there to be ended: that was a moment ago.
-        row = await tables.get(store.API_KEYS, key, "key")
+        row = await tables.get(records.API_KEYS, key, "key")
         if row is not None:
-            await tables.delete(store.API_KEYS, row)
+            await tables.delete(records.API_KEYS, row)
         return await real(*given)
 
     monkeypatch.setattr(devices, name, meanwhile)

@@ -2,12 +2,11 @@
 
 from typing import Any
 
-from device_agent.protocol import codec, topics
+from device_agent.protocol import Event, codec, topics
 from device_agent.protocol.events import EventKind
-from device_agent.protocol.messages import Event
-from function_app.entrypoints.ingest import ingest
-from tests.support.cloud import Cloud, Person
-from tests.support.robot import Robot
+from function_app.entrypoints.ingest.router import ingest
+from tests.fakes.agent import Robot
+from tests.harness.cloud.cloud import Cloud, Person
 
 Pair = tuple[Person, Robot]
 

@@ -5,17 +5,16 @@ from typing import Any
 
 import pytest
 
-from device_agent.protocol import codec, topics
-from device_agent.protocol.messages import Fault, Mode, Presence, State
-from function_app.domain.accounts import Identity
-from function_app.domain.devices import SILENT_MS, Device
-from function_app.domain.faults import Report, Severity, Source
-from function_app.entrypoints.ingest import ingest
-from function_app.services import store
-from function_app.services.faults import KEEP_FAULTS_MS, MAX_OPEN
-from tests.support.brokers import BROKERS, wait_until
-from tests.support.cloud import Cloud, Person, paired, problem
-from tests.support.robot import Robot
+from device_agent.protocol import Fault, Mode, Presence, State, codec, topics
+from function_app.domain.devices.devices import SILENT_MS, Device
+from function_app.domain.health.faults import Report, Severity, Source
+from function_app.domain.identity.accounts import Identity
+from function_app.entrypoints.ingest.router import ingest
+from function_app.services.health.faults import KEEP_FAULTS_MS, MAX_OPEN
+from function_app.services.storage import records
+from tests.fakes.agent import Robot
+from tests.harness.cloud.cloud import Cloud, Person, paired, problem
+from tests.harness.network.brokers import BROKERS, wait_until
 
 Pair = tuple[Person, Robot]
 
@@ -226,7 +225,7 @@ class TestSilence:
         notes = [
             row
             for shard in range(4)
-            for row in cloud.run(cloud.functions.tables.query(store.WATCHED, str(shard))).rows
+            for row in cloud.run(cloud.functions.tables.query(records.WATCHED, str(shard))).rows
             if row.key.endswith(robot.id) and not row.key.startswith("agent:")
         ]
         assert len(notes) == 1
@@ -275,7 +274,7 @@ def test_the_history_pages_and_is_forgotten_in_time(cloud: Cloud, pair: Pair) ->
     cloud.clock.advance(KEEP_FAULTS_MS / 1000 + 10)
     cloud.sweep()
     arm = device(cloud, anna, robot)
-    rows = cloud.run(cloud.functions.tables.query(store.FAULTS, f"{arm.id}/{arm.pairing}")).rows
+    rows = cloud.run(cloud.functions.tables.query(records.FAULTS, f"{arm.id}/{arm.pairing}")).rows
     assert [row.key for row in rows if ":cloud:" not in row.key] == []
 
 

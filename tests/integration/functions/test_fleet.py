@@ -5,11 +5,11 @@ from typing import Any
 
 import pytest
 
-from device_agent.protocol.messages import AckStatus, MoveJoints
-from function_app.services.fleet import AT_ONCE, MOST
-from tests.support.brokers import wait_until
-from tests.support.cloud import MOVE, Cloud, Person, paired, problem
-from tests.support.robot import Robot
+from device_agent.protocol import AckStatus, MoveJoints
+from function_app.services.actions.start_many import AT_ONCE, MOST
+from tests.fakes.agent import Robot
+from tests.harness.cloud.cloud import MOVE, Cloud, Person, paired, problem
+from tests.harness.network.brokers import wait_until
 
 Pair = tuple[Person, Robot]
 NAMES = tuple(f"arm{number}" for number in range(5))

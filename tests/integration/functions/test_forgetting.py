@@ -6,15 +6,14 @@ from typing import Any
 
 import pytest
 
-from device_agent.protocol import topics
-from device_agent.protocol.messages import AckStatus, Event
+from device_agent.protocol import AckStatus, Event, topics
 from function_app.ports.tables import Row
-from function_app.services import store
-from function_app.services.events import KEEP_EVENTS_MS
-from function_app.services.forget import DAY_MS, NOTES, ROWS, SHARDS, Forget
-from tests.support.brokers import wait_until
-from tests.support.cloud import Cloud, MovingClock, Person, settings
-from tests.support.robot import Robot
+from function_app.services.storage import records
+from function_app.services.storage.retention import DAY_MS, NOTES, ROWS, SHARDS, Forget
+from function_app.services.telemetry.event_log import KEEP_EVENTS_MS
+from tests.fakes.agent import Robot
+from tests.harness.cloud.cloud import Cloud, MovingClock, Person, settings
+from tests.harness.network.brokers import wait_until
 
 Pair = tuple[Person, Robot]
 NOW_MS = 1_800_000_000_000
@@ -45,7 +44,7 @@ def left(cloud: Cloud, table: str = "Things", partition: str = "p") -> list[str]
 
 def notes(cloud: Cloud, table: str = "") -> list[str]:
     """Notes, or those about rows of one table: the silence of a robot is remembered too."""
-    pages = [cloud.run(cloud.functions.tables.query(store.FORGET, str(shard), limit=1000)) for shard in range(SHARDS)]
+    pages = [cloud.run(cloud.functions.tables.query(records.FORGET, str(shard), limit=1000)) for shard in range(SHARDS)]
     return [row.key for page in pages for row in page.rows if table in {"", row.data.get("table")}]
 
 
@@ -164,12 +163,12 @@ def test_an_action_is_kept_for_30_days_after_its_end_and_its_key_for_one(cloud: 
     cloud.sweep()
     anna = cloud.sign_in("anna")
     assert [item["id"] for item in anna.get(f"/devices/{robot.device}/actions").json()["items"]] == [action]
-    assert [key for key in left(cloud, store.CONTROL, robot.device) if key.startswith("once:")] == []
+    assert [key for key in left(cloud, records.CONTROL, robot.device) if key.startswith("once:")] == []
     cloud.clock.advance(29 * 24 * 3600)
     cloud.sweep()
-    assert [key for key in left(cloud, store.CONTROL, robot.device) if key.startswith("action:")] == []
-    assert [key for key in left(cloud, store.CONTROL, robot.device) if key.startswith("now:")] != []
-    assert notes(cloud, store.CONTROL) == []
+    assert [key for key in left(cloud, records.CONTROL, robot.device) if key.startswith("action:")] == []
+    assert [key for key in left(cloud, records.CONTROL, robot.device) if key.startswith("now:")] != []
+    assert notes(cloud, records.CONTROL) == []
 
 
 def test_an_agents_clock_decides_nothing_about_how_long_its_actions_are_kept(cloud: Cloud, pair: Pair) -> None:
@@ -180,7 +179,7 @@ def test_an_agents_clock_decides_nothing_about_how_long_its_actions_are_kept(clo
     cloud.sweep()
     cloud.clock.advance(30 * 24 * 3600 + 300)
     cloud.sweep()
-    assert [key for key in left(cloud, store.CONTROL, robot.device) if key.startswith("action:")] == []
+    assert [key for key in left(cloud, records.CONTROL, robot.device) if key.startswith("action:")] == []
 
 
 def test_events_are_kept_for_90_days_with_one_note_a_day(cloud: Cloud, pair: Pair) -> None:
@@ -208,21 +207,21 @@ def test_a_signed_out_session_is_remembered_as_long_as_its_token_could_be_used(a
     assert anna.post("/auth/sign-out").status_code == 204
     alone.clock.advance(12 * 3600 - 5)
     alone.sweep()
-    assert any(key.startswith("signed-out:") for key in left(alone, store.ACCOUNTS, anna.account))
+    assert any(key.startswith("signed-out:") for key in left(alone, records.ACCOUNTS, anna.account))
     alone.clock.advance(10)
     alone.sweep()
-    assert not any(key.startswith("signed-out:") for key in left(alone, store.ACCOUNTS, anna.account))
+    assert not any(key.startswith("signed-out:") for key in left(alone, records.ACCOUNTS, anna.account))
 
 
 def test_wrong_tries_are_forgotten_when_they_no_longer_count(alone: Cloud) -> None:
     anna = alone.sign_in("anna")
     for _ in range(3):
         anna.post("/agents/claim", {"code": "BCDF-GHJK"})
-    assert len(left(alone, store.ATTEMPTS, anna.account)) == 1
+    assert len(left(alone, records.ATTEMPTS, anna.account)) == 1
     alone.clock.advance(601)
     alone.sweep()
-    assert left(alone, store.ATTEMPTS, anna.account) == []
-    assert notes(alone, store.ATTEMPTS) == []
+    assert left(alone, records.ATTEMPTS, anna.account) == []
+    assert notes(alone, records.ATTEMPTS) == []
 
 
 def test_an_agent_that_nobody_claims_is_forgotten_after_a_week_and_no_other(cloud: Cloud) -> None:
@@ -239,14 +238,14 @@ def test_an_agent_that_nobody_claims_is_forgotten_after_a_week_and_no_other(clou
         cloud.sweep()
     for _ in range(3):
         cloud.sweep()
-    found = [len(left(cloud, store.AGENTS, robot.id)) for robot in (lost, waiting, claimed, given_back)]
+    found = [len(left(cloud, records.AGENTS, robot.id)) for robot in (lost, waiting, claimed, given_back)]
     assert found == [0, 1, 1, 0]
     cloud.clock.advance(100 * 24 * 3600)
     for _ in range(5):
         cloud.sweep()
     anna = cloud.sign_in("anna")
     assert [item["id"] for item in anna.get("/agents").json()["items"]] == [claimed.id]
-    assert left(cloud, store.AGENTS, waiting.id) == []
+    assert left(cloud, records.AGENTS, waiting.id) == []
     given_back.pair(anna)
     assert len(anna.get("/agents").json()["items"]) == 2
 

@@ -6,12 +6,12 @@ from pathlib import Path
 
 import pytest
 
-from function_app.domain.accounts import Identity
-from function_app.domain.ids import new_claim_code
-from function_app.domain.problems import Problem
-from function_app.services import store
-from tests.support.cloud import Cloud, settings
-from tests.support.processes import show_code
+from function_app.domain.common.ids import new_claim_code
+from function_app.domain.common.problems import Problem
+from function_app.domain.identity.accounts import Identity
+from function_app.services.storage import records
+from tests.harness.cloud.cloud import Cloud, settings
+from tests.harness.processes import show_code
 
 LIVE = 20
 """Codes that are shown at the same time."""
@@ -30,9 +30,9 @@ def guess(folder: Path, guesses: int) -> None:
             for number in range(guesses):
                 if number % 100 == 0:
                     for account in accounts:
-                        row = await functions.tables.get(store.ATTEMPTS, account, "claim")
+                        row = await functions.tables.get(records.ATTEMPTS, account, "claim")
                         if row is not None:
-                            await functions.tables.delete(store.ATTEMPTS, row)
+                            await functions.tables.delete(records.ATTEMPTS, row)
                 who = Identity(accounts[number // 5 % 20], "x", f"s{chance.randrange(9)}")
                 try:
                     await functions.claim.claim(who, new_claim_code(), None)
@@ -40,7 +40,7 @@ def guess(folder: Path, guesses: int) -> None:
                 except Problem as problem:
                     answers.add(problem.code)
             for agent, _ in shown:
-                row = await functions.tables.get(store.AGENTS, agent, "agent")
+                row = await functions.tables.get(records.AGENTS, agent, "agent")
                 assert row is not None
                 claimed += row.data["account"] is not None
             assert answers == {"claim-code-unknown"}
@@ -75,7 +75,7 @@ def test_of_a_hundred_who_redeem_one_code_at_once_one_wins(tmp_path: Path) -> No
                 return account
 
             found = await asyncio.gather(*(one(account) for account in accounts))
-            row = await functions.tables.get(store.AGENTS, agent, "agent")
+            row = await functions.tables.get(records.AGENTS, agent, "agent")
             assert row is not None
             assert [each for each in found if each in accounts] == [row.data["account"]]
             replayed = await one(accounts[0])

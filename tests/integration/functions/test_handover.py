@@ -5,15 +5,15 @@ from typing import Any
 
 import pytest
 
-from device_agent.protocol.messages import AskLease, DropRequest, GrantLease, Mode, ReleaseLease, State
-from function_app.domain.accounts import Role
+from device_agent.protocol import AskLease, DropRequest, GrantLease, Mode, ReleaseLease, State
+from function_app.domain.identity.accounts import Role
 from function_app.ports.broker_access import BrokerAccessError, Credentials
 from function_app.ports.command_bus import BusUnavailable
 from function_app.ports.tables import StoreError
-from function_app.services import devices as devices_service
-from tests.support.brokers import BROKERS, RunningBroker, wait_until
-from tests.support.cloud import Cloud, Person, problem
-from tests.support.robot import Robot
+from function_app.services.devices import device_access as devices_service
+from tests.fakes.agent import Robot
+from tests.harness.cloud.cloud import Cloud, Person, problem
+from tests.harness.network.brokers import BROKERS, RunningBroker, wait_until
 
 Three = tuple[Person, Person, Robot]
 WITHIN_MS = 30_000

@@ -11,19 +11,11 @@ from unittest import mock
 import pytest
 
 from function_app.bootstrap import Functions
-from function_app.domain.accounts import Identity
-from function_app.domain.problems import Problem
-from function_app.services import stop, store
-from tests.support.processes import (
-    PATIENCE_S,
-    PROCESSES,
-    Place,
-    begin,
-    commands_sent,
-    killed,
-    run_here,
-    show_code,
-)
+from function_app.domain.common.problems import Problem
+from function_app.domain.identity.accounts import Identity
+from function_app.services.actions import stop
+from function_app.services.storage import records
+from tests.harness.processes import PATIENCE_S, PROCESSES, Place, begin, commands_sent, killed, run_here, show_code
 
 RACERS = ("accept", "refuse", "withdraw", "release", "take over", "reset")
 RAISES = {"accept", "take over", "reset"}
@@ -103,7 +95,7 @@ async def race(functions: Functions, scene: Scene, what: str, barrier: Any, resu
 async def look(functions: Functions, scene: Scene, number: int, did: dict[str, str]) -> str:
     """That rows, answers, events and orders tell of one and the same course; gives what became of the request."""
     device = scene.devices[number]
-    row = await functions.tables.get(store.CONTROL, device, "now:lease")
+    row = await functions.tables.get(records.CONTROL, device, "now:lease")
     assert row is not None
     raised = {what for what in RAISES if did[what] == "done"}
     assert row.data["epoch"] == 1 + len(raised), (did, row.data)

@@ -8,15 +8,15 @@ import pytest
 
 from device_agent.drivers import load
 from device_agent.drivers.mujoco import MujocoDriver
-from device_agent.drivers.mujoco.ailments import Sickbed
-from device_agent.drivers.mujoco.health import Health
-from device_agent.protocol import codec, robot_type, topics
-from device_agent.protocol.messages import AckStatus, Measurements, Mode, MoveJoints, State
-from function_app.entrypoints.ingest import ingest, ingest_telemetry
+from device_agent.drivers.mujoco.fault_injection import Sickbed
+from device_agent.drivers.mujoco.motor_model import Health
+from device_agent.protocol import AckStatus, Measurements, Mode, MoveJoints, State, codec, topics
+from device_agent.protocol.manifests import robot_type
+from function_app.entrypoints.ingest.router import ingest, ingest_telemetry
+from tests.fakes.agent import Robot
+from tests.harness.agent.device_harness import Bench, eventually
+from tests.harness.cloud.cloud import Cloud
 from tests.integration.functions.test_diagnostics import MINUTE, Pair, field, open_faults
-from tests.support.bench import Bench, eventually
-from tests.support.cloud import Cloud
-from tests.support.robot import Robot
 from tests.unit.robots.folders import ROBOTS
 
 UR5 = robot_type.load(ROBOTS / "ur5")

@@ -4,14 +4,14 @@ from typing import Any
 
 import pytest
 
-from device_agent.protocol.messages import ReleaseLease
-from function_app.services import store
-from function_app.services.leave import LOOK_MS
+from device_agent.protocol import ReleaseLease
+from function_app.services.pairing.offboarding import LOOK_MS
+from function_app.services.storage import records
+from tests.fakes.agent import Robot
+from tests.harness.cloud.cloud import Cloud, Person, paired, problem
+from tests.harness.crash_injection import elsewhere
+from tests.harness.network.brokers import wait_until
 from tests.integration.functions.conftest import Mortal
-from tests.support.brokers import wait_until
-from tests.support.cloud import Cloud, Person, paired, problem
-from tests.support.knife import elsewhere
-from tests.support.robot import Robot
 
 Three = tuple[Person, Person, Robot]
 DAY_S = 86_400
@@ -235,4 +235,4 @@ def test_whoever_accepts_killed_after_any_write_leaves_the_rest_to_the_timer(
         assert redeem(bert, made).status_code == 200
     assert (roles(anna), roles(bert)) == ({}, {robot.device: "owner"})
     assert [item["name"] for item in bert.get("/spaces").json()["items"]] == ["Home", "Attic"]
-    assert cloud.run(cloud.functions.tables.query(store.SHARES, f"space:{attic}")).rows == ()
+    assert cloud.run(cloud.functions.tables.query(records.SHARES, f"space:{attic}")).rows == ()

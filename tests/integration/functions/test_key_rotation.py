@@ -9,15 +9,15 @@ import jwt
 import pytest
 from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
 
-from device_agent.protocol import codec, signing
-from device_agent.protocol.keys import KEYS_CONTEXT, NewKey
-from device_agent.protocol.messages import AckStatus, FollowKey, Mode, RunMovement, State
-from function_app.adapters.local.keys import FileKeys
+from device_agent.protocol import AckStatus, FollowKey, Mode, RunMovement, State, codec
+from device_agent.protocol.security import signing
+from device_agent.protocol.security.key_rotation import KEYS_CONTEXT, NewKey
+from function_app.adapters.local.signing_keys import FileKeys
+from tests.fakes.agent import Robot
+from tests.harness.cloud.cloud import Cloud, Person
+from tests.harness.network.brokers import RunningBroker, start_broker, wait_until
 from tests.integration.functions.conftest import Open
 from tests.integration.functions.test_movements import MINE, SOURCE
-from tests.support.brokers import RunningBroker, start_broker, wait_until
-from tests.support.cloud import Cloud, Person
-from tests.support.robot import Robot
 
 LEARN_S, OVERLAP_S = 1800, 86_400
 WAIT_MS = 20_000

@@ -10,16 +10,15 @@ from typing import Any, cast
 
 import pytest
 
-from device_agent.protocol import codec, topics
-from device_agent.protocol.messages import Ack, AckStatus, MoveJoints
+from device_agent.protocol import Ack, AckStatus, MoveJoints, codec, topics
 from function_app.bootstrap import Functions
-from function_app.domain.accounts import Identity
-from function_app.domain.problems import Problem
-from function_app.services import store
-from function_app.services.pending import SHARDS
-from function_app.services.start_action import Start
-from function_app.services.sweep import ORPHAN_MS
-from tests.support.processes import (
+from function_app.domain.common.problems import Problem
+from function_app.domain.identity.accounts import Identity
+from function_app.services.actions.start import Start
+from function_app.services.maintenance.scheduler import ORPHAN_MS
+from function_app.services.storage import records
+from function_app.services.storage.reminders import SHARDS
+from tests.harness.processes import (
     Place,
     SetClock,
     Work,
@@ -225,7 +224,7 @@ async def again(functions: Functions, work: Work, scene: Scene) -> None:
         await work(functions, scene)
     if work in {start_once, join_queue}:
         device = await functions.devices.get(scene.who, scene.device)
-        rows = await rows_of(functions, store.CONTROL, device.id)
+        rows = await rows_of(functions, records.CONTROL, device.id)
         keyed = [key for key, data in rows.items() if key.startswith("action:") and data["once"]]
         assert len(keyed) == 1, "the same key is the same action, also after a kill"
 
@@ -250,7 +249,7 @@ async def settle(functions: Functions) -> None:
     for step_s in (*([1.0] * (TIMEOUT_S + QUEUE_S + 4)), *([ORPHAN_MS / 2000 + 1] * 3)):
         clock.advance(step_s)
         await functions.sweep.run()
-    notes = [key for shard in range(SHARDS) for key in await rows_of(functions, store.PENDING, str(shard))]
+    notes = [key for shard in range(SHARDS) for key in await rows_of(functions, records.PENDING, str(shard))]
     # A lease that lasts longer than this has one, for its end; a chain has one for the hour.
     notes = [key for key in notes if ":anchor:" not in key]
     leases = [key for key in notes if ":lease:" in key]
@@ -266,7 +265,7 @@ async def look(functions: Functions, place: Place, scenes: list[Scene]) -> None:
         assert len(payloads) == 1, f"{command} went out as different commands"
     written = set()
     for scene in scenes:
-        rows = await rows_of(functions, store.CONTROL, scene.device)
+        rows = await rows_of(functions, records.CONTROL, scene.device)
         for key, data in rows.items():
             if key.startswith("action:"):
                 assert data["status"] in TERMINAL, data
@@ -283,7 +282,7 @@ async def look(functions: Functions, place: Place, scenes: list[Scene]) -> None:
             owner = await person(functions, f"next owner of {agent}")
             await functions.claim.claim(owner, code, None)
             assert (await functions.actions.list(owner, scene.device, cursor=None, limit=10))[0] == []
-        row = await functions.tables.get(store.AGENTS, agent, "agent")
+        row = await functions.tables.get(records.AGENTS, agent, "agent")
         assert row is not None
         owner = Identity(row.data["account"], "whoever", owner.session)
         action, _ = await functions.start_action.start(owner, scene.device, asked())

@@ -5,15 +5,14 @@ from typing import Any
 
 import pytest
 
-from device_agent.protocol import codec, topics
-from device_agent.protocol.messages import Measurements
-from function_app.adapters.local import feed
+from device_agent.protocol import Measurements, codec, topics
+from function_app.adapters.local import device_feed
 from function_app.ports.broker_access import Credentials
 from function_app.ports.tables import StoreError
-from tests.support.brokers import Client, RunningBroker, wait_until
-from tests.support.cloud import Cloud, Person
-from tests.support.polling import PollingRobot
-from tests.support.robot import Robot
+from tests.fakes.agent import Robot
+from tests.harness.cloud.cloud import Cloud, Person
+from tests.harness.cloud.polling import PollingRobot
+from tests.harness.network.brokers import Client, RunningBroker, wait_until
 
 HOUR_MS = 3_600_000
 
@@ -61,7 +60,7 @@ def test_over_http_they_are_stored_and_not_told_to_the_broker(cloud: Cloud, brok
 
 
 def test_it_is_tried_until_the_store_takes_it(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(feed, "COLLECT_S", 0.01)
+    monkeypatch.setattr(device_feed, "COLLECT_S", 0.01)
     tries: list[int] = []
 
     async def away(batch: Any) -> None:
@@ -69,5 +68,5 @@ def test_it_is_tried_until_the_store_takes_it(monkeypatch: pytest.MonkeyPatch) -
         if len(tries) < 20:
             raise StoreError("the store is away")
 
-    asyncio.run(feed.MqttLate._store([("t", b"")], away))
+    asyncio.run(device_feed.MqttLate._store([("t", b"")], away))
     assert tries == [1] * 20

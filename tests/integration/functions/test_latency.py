@@ -7,17 +7,16 @@ from typing import Any
 
 import pytest
 
-from device_agent.protocol import codec, topics
-from device_agent.protocol.messages import Ack, AckStatus
-from function_app.domain.accounts import Identity
-from function_app.domain.histogram import ERROR
-from function_app.entrypoints.ingest import ingest
-from function_app.services import store
-from function_app.services.forget import DAY_MS
-from function_app.services.latency import HOUR_MS, KEEP_HOURS_MS
-from tests.support.brokers import wait_until
-from tests.support.cloud import Cloud, Person, paired, problem
-from tests.support.robot import Robot
+from device_agent.protocol import Ack, AckStatus, codec, topics
+from function_app.domain.identity.accounts import Identity
+from function_app.domain.telemetry.histogram import ERROR
+from function_app.entrypoints.ingest.router import ingest
+from function_app.services.storage import records
+from function_app.services.storage.retention import DAY_MS
+from function_app.services.telemetry.latency import HOUR_MS, KEEP_HOURS_MS
+from tests.fakes.agent import Robot
+from tests.harness.cloud.cloud import Cloud, Person, paired, problem
+from tests.harness.network.brokers import wait_until
 
 Pair = tuple[Person, Robot]
 Samples = list[tuple[int, float]]
@@ -185,8 +184,8 @@ def test_a_stop_between_two_parts_of_a_batch_is_made_good_by_sending_it_again(
 
     async def once(table: str, writes: Any) -> Any:
         nonlocal calls
-        calls += table == store.LATENCY
-        if table == store.LATENCY and calls > 1:
+        calls += table == records.LATENCY
+        if table == records.LATENCY and calls > 1:
             raise RuntimeError("killed")
         return await real(table, writes)
 
@@ -207,7 +206,7 @@ def test_hours_are_forgotten_after_their_time_and_days_stay(cloud: Cloud, pair: 
     def kinds() -> set[str]:
         view = cloud.run(cloud.functions.devices.view(_identity(anna), robot.device))
         partition = f"{robot.device}/{view.device.pairing}"
-        page = cloud.run(cloud.functions.tables.query(store.LATENCY, partition, limit=1000))
+        page = cloud.run(cloud.functions.tables.query(records.LATENCY, partition, limit=1000))
         return {row.key.partition(":")[0] for row in page.rows}
 
     assert kinds() == {"day", "hour", "once", "recent"}

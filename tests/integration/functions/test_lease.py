@@ -2,11 +2,11 @@
 
 import pytest
 
-from device_agent.protocol.messages import AckStatus, GrantLease, ReleaseLease
+from device_agent.protocol import AckStatus, GrantLease, ReleaseLease
 from function_app.ports.broker_access import Credentials
-from tests.support.brokers import BROKERS, RunningBroker, wait_until
-from tests.support.cloud import Cloud, Person, problem
-from tests.support.robot import Robot
+from tests.fakes.agent import Robot
+from tests.harness.cloud.cloud import Cloud, Person, problem
+from tests.harness.network.brokers import BROKERS, RunningBroker, wait_until
 
 Pair = tuple[Person, Robot]
 

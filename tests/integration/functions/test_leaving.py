@@ -5,17 +5,16 @@ from typing import Any
 
 import pytest
 
-from device_agent.protocol import topics
-from device_agent.protocol.messages import Description, Mode, MoveJoints, State
-from function_app.services import store
-from function_app.services.leave import LOOK_MS
-from function_app.services.pending import SHARDS
-from function_app.services.sweep import ORPHAN_MS
+from device_agent.protocol import Description, Mode, MoveJoints, State, topics
+from function_app.services.maintenance.scheduler import ORPHAN_MS
+from function_app.services.pairing.offboarding import LOOK_MS
+from function_app.services.storage import records
+from function_app.services.storage.reminders import SHARDS
+from tests.fakes.agent import Robot
+from tests.harness.cloud.cloud import Cloud, Person, paired, problem
+from tests.harness.crash_injection import elsewhere
+from tests.harness.network.brokers import BROKERS, RunningBroker, wait_until
 from tests.integration.functions.conftest import Mortal, Open
-from tests.support.brokers import BROKERS, RunningBroker, wait_until
-from tests.support.cloud import Cloud, Person, paired, problem
-from tests.support.knife import elsewhere
-from tests.support.robot import Robot
 
 Pair = tuple[Person, Robot]
 both_brokers = pytest.mark.parametrize("broker", BROKERS, indirect=True)
@@ -62,8 +61,8 @@ def ends(cloud: Cloud, *actions: str) -> set[tuple[str, str]]:
 
 def rest(cloud: Cloud, robot: Robot) -> dict[str, Any]:
     """What the tables still mean to do about an agent."""
-    row = cloud.run(cloud.functions.tables.get(store.AGENTS, robot.id, "agent"))
-    pages = [cloud.run(cloud.functions.tables.query(store.PENDING, str(shard))) for shard in range(SHARDS)]
+    row = cloud.run(cloud.functions.tables.get(records.AGENTS, robot.id, "agent"))
+    pages = [cloud.run(cloud.functions.tables.query(records.PENDING, str(shard))) for shard in range(SHARDS)]
     notes = [note.key for page in pages for note in page.rows if ":leave:" in note.key or ":queue:" in note.key]
     assert row is not None
     return {"leaving": list(row.data["leaving"]), "notes": notes}
@@ -89,17 +88,17 @@ def test_unpairing_ends_what_runs_and_waits_and_clears_what_the_broker_keeps(
     assert [command.id for command in robot.heard(MoveJoints)] == [running]
     pass_time(cloud)
     assert rest(cloud, robot) == {"leaving": [], "notes": []}
-    for table, partition in ((store.MEMBERS, anna.account), (store.DESCRIPTIONS, robot.id)):
+    for table, partition in ((records.MEMBERS, anna.account), (records.DESCRIPTIONS, robot.id)):
         assert cloud.run(cloud.functions.tables.query(table, partition)).rows == ()
 
 
 def test_nothing_of_what_an_agent_said_under_one_owner_shows_to_the_next(cloud: Cloud, pair: Pair) -> None:
     anna, robot = pair
     furnish(anna, robot)
-    row = cloud.run(cloud.functions.tables.get(store.AGENTS, robot.id, f"state:{robot.names[0]}"))
+    row = cloud.run(cloud.functions.tables.get(records.AGENTS, robot.id, f"state:{robot.names[0]}"))
     assert anna.delete(f"/agents/{robot.id}").status_code == 204
     assert row is not None
-    cloud.run(cloud.functions.tables.create(store.AGENTS, row))  # as if it had come late
+    cloud.run(cloud.functions.tables.create(records.AGENTS, row))  # as if it had come late
     bert = cloud.sign_in("bert")
     robot.pair(bert)
     found = bert.get(f"/devices/{robot.device}").json()

@@ -17,11 +17,11 @@ from hypothesis.stateful import (
     run_state_machine_as_test,
 )
 
-from device_agent.protocol.messages import AckStatus
-from tests.support.brokers import RunningBroker
-from tests.support.cloud import MOVE, Cloud, Person
-from tests.support.cloud import settings as cloud_settings
-from tests.support.polling import PollingRobot
+from device_agent.protocol import AckStatus
+from tests.harness.cloud.cloud import MOVE, Cloud, Person
+from tests.harness.cloud.cloud import settings as cloud_settings
+from tests.harness.cloud.polling import PollingRobot
+from tests.harness.network.brokers import RunningBroker
 
 TERMINAL = {"done", "failed", "expired", "cancelled"}
 WAITING = {"queued"}

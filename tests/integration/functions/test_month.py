@@ -17,15 +17,15 @@ import pytest
 from function_app import bootstrap
 from function_app.adapters.aws.blobs import S3Blobs
 from function_app.adapters.aws.tables import DynamoTables
-from function_app.domain.devices import Agent
-from function_app.domain.series import DAY, WINDOW_MS, Samples
+from function_app.domain.devices.devices import Agent
+from function_app.domain.telemetry.series import DAY, WINDOW_MS, Samples
 from function_app.ports.tables import Page, Tables
-from function_app.services import store
-from function_app.services.series import Place
+from function_app.services.storage import records
+from function_app.services.telemetry.series_writer import Place
 from function_app.settings import AwsStore, AzureStore, Settings
-from tests.support.aws import REGION, start_moto, use_credentials
-from tests.support.azure import start_azurite
-from tests.support.cloud import Cloud, settings
+from tests.harness.cloud.cloud import Cloud, settings
+from tests.harness.stores.aws import REGION, start_moto, use_credentials
+from tests.harness.stores.azure import start_azurite
 
 PERIOD_MS = 50
 PER_WINDOW = WINDOW_MS // PERIOD_MS
@@ -104,9 +104,9 @@ def assert_read_in_one_page(cloud: Cloud, days: float) -> None:
     anna = cloud.sign_in("anna")
     robot = cloud.robot()
     robot.pair(anna)
-    agent = cloud.run(cloud.functions.tables.get(store.AGENTS, robot.id, "agent"))
+    agent = cloud.run(cloud.functions.tables.get(records.AGENTS, robot.id, "agent"))
     assert agent is not None
-    place = Place(robot.device, store.read(agent, Agent).pairing, "health")
+    place = Place(robot.device, records.read(agent, Agent).pairing, "health")
     hours = build(cloud, place, days)
     anna = cloud.sign_in("anna")
     tables = Counting(cloud.functions.tables)

@@ -9,18 +9,18 @@ from typing import Any, ClassVar
 import pytest
 from cryptography.exceptions import InvalidSignature
 
-from device_agent.protocol import signing
-from device_agent.protocol.messages import SHIPPED, AckStatus, RunMovement
-from device_agent.runtime.journal import Journal
-from device_agent.runtime.lease import Refused
-from device_agent.runtime.trust import Trust
+from device_agent.protocol import SHIPPED, AckStatus, RunMovement
+from device_agent.protocol.security import signing
+from device_agent.runtime.actions.script_policy import Trust
+from device_agent.runtime.authority.lease_gate import Refused
+from device_agent.runtime.storage.journal import Journal
 from function_app.ports.tables import Row
-from function_app.services import store
-from function_app.services.movements import KEPT_MS
-from function_app.services.parameters import MAX_PARAMETERS_BYTES
-from function_app.services.scripts import MAX_SOURCE
-from tests.support.cloud import Cloud, Person, problem, settings
-from tests.support.robot import Robot
+from function_app.services.robot_types.movements import KEPT_MS
+from function_app.services.robot_types.parameter_schema import MAX_PARAMETERS_BYTES
+from function_app.services.robot_types.script_metadata import MAX_SOURCE
+from function_app.services.storage import records
+from tests.fakes.agent import Robot
+from tests.harness.cloud.cloud import Cloud, Person, problem, settings
 
 UR5 = "/robot-types/ur5"
 MINE = f"{UR5}/movements/mine"
@@ -293,7 +293,7 @@ class TestVersions:
         assert scripts(home) == ["# 1"]
         again = alone.sign_in("anna")
         assert again.get(MINE).json()["source"] == "# 1"
-        page = alone.run(alone.functions.tables.query(store.MOVEMENTS, f"{anna.account}/ur5"))
+        page = alone.run(alone.functions.tables.query(records.MOVEMENTS, f"{anna.account}/ur5"))
         assert len(page.rows) == 2, "a name and a version"
 
     def test_of_a_deleted_one_its_name_is_all_that_stays(self, home: Path, alone: Cloud, anna: Person) -> None:
@@ -303,7 +303,7 @@ class TestVersions:
         alone.clock.advance((KEPT_MS + 1_000) / 1000)
         alone.run(alone.functions.forget.run(alone.clock.now_ms()))
         assert scripts(home) == []
-        page = alone.run(alone.functions.tables.query(store.MOVEMENTS, f"{anna.account}/ur5"))
+        page = alone.run(alone.functions.tables.query(records.MOVEMENTS, f"{anna.account}/ur5"))
         assert [row.key for row in page.rows] == ["mine"]
 
     def test_many_who_save_at_once_get_a_version_each_and_leave_no_other_script(self, home: Path, anna: Person) -> None:
@@ -356,13 +356,15 @@ class TestSignatures:
     def test_a_row_that_was_changed_in_the_store_is_not_run(self, alone: Cloud, anna: Person, change: str) -> None:
         anna.put(MINE, {"source": SOURCE})
         tables = alone.functions.tables
-        row = alone.run(tables.get(store.MOVEMENTS, f"{anna.account}/ur5", "mine"))
+        row = alone.run(tables.get(records.MOVEMENTS, f"{anna.account}/ur5", "mine"))
         assert row is not None
         evil = "evil()"
         sha256 = hashlib.sha256(evil.encode()).hexdigest()
         values = {"sha256": sha256, "version": 2, "signature": "A" * 86, "key": "0" * 16}
         alone.run(
-            tables.replace(store.MOVEMENTS, Row(row.partition, row.key, {**row.data, change: values[change]}, row.etag))
+            tables.replace(
+                records.MOVEMENTS, Row(row.partition, row.key, {**row.data, change: values[change]}, row.etag)
+            )
         )
         version = 2 if change == "version" else 1
         for digest in (sha256, row.data["sha256"]):

@@ -16,13 +16,13 @@ import httpx
 import jwt
 import pytest
 
-from function_app.adapters.local.open_id import HttpOpenId
-from function_app.domain.audit_chain import CLOUD
-from function_app.ports.open_id import OpenIdError, Subject
-from function_app.services import store
+from function_app.adapters.oidc.provider import HttpOpenId
+from function_app.domain.audit.hash_chain import CLOUD
+from function_app.ports.oidc_provider import OpenIdError, Subject
+from function_app.services.storage import records
 from function_app.settings import OpenIdClient
-from tests.support.cloud import API, BASE, Cloud, MovingClock, Person, problem, settings
-from tests.support.open_id import (
+from tests.harness.cloud.cloud import API, BASE, Cloud, MovingClock, Person, problem, settings
+from tests.harness.cloud.oidc_provider import (
     CLIENT_ID,
     CLIENT_SECRET,
     REDIRECT,
@@ -144,7 +144,7 @@ class TestWhoMayCome:
     @staticmethod
     def accounts(cloud: Cloud) -> set[str]:
         with sqlite3.connect(cloud.functions.settings.home / "tables.sqlite") as tables:
-            return {row for (row,) in tables.execute("SELECT part FROM rows WHERE tab = ?", (store.ACCOUNTS,))}
+            return {row for (row,) in tables.execute("SELECT part FROM rows WHERE tab = ?", (records.ACCOUNTS,))}
 
     def test_a_stranger_gets_no_account_and_leaves_nothing(self, closed: Cloud) -> None:
         closed.sign_in("anna")
@@ -153,7 +153,7 @@ class TestWhoMayCome:
         failed(browser.sign_in("mallory"), "uninvited")
         assert browser.me().status_code == 401
         assert self.accounts(closed) == before
-        refused = closed.run(closed.functions.tables.query(store.AUDIT, CLOUD, first="record:", last="record;")).rows
+        refused = closed.run(closed.functions.tables.query(records.AUDIT, CLOUD, first="record:", last="record;")).rows
         assert "open-id-uninvited" in {row.data["data"].get("code") for row in refused}
 
     def test_who_was_invited_has_an_account_and_what_was_offered_and_comes_again(self, closed: Cloud) -> None:

@@ -4,8 +4,8 @@ from typing import Any
 
 import pytest
 
-from tests.support.cloud import Cloud, Person, problem
-from tests.support.robot import Robot
+from tests.fakes.agent import Robot
+from tests.harness.cloud.cloud import Cloud, Person, problem
 
 Three = tuple[Person, Person, Robot]
 

@@ -6,12 +6,12 @@ from typing import Any
 import httpx
 import pytest
 
-from function_app.adapters.local import password_hashes
-from function_app.domain.problems import Problem
+from function_app.adapters.local import password_hasher
+from function_app.domain.common.problems import Problem
 from function_app.ports.tables import Row
-from function_app.services import store
-from tests.support.cloud import API, Cloud, Person, problem
-from tests.support.robot import Robot
+from function_app.services.storage import records
+from tests.fakes.agent import Robot
+from tests.harness.cloud.cloud import API, Cloud, Person, problem
 
 GOOD, BETTER = "correct horse battery", "staple correct horse"
 PASSWORD = "/accounts/me/password"
@@ -47,18 +47,18 @@ def test_one_text_written_in_two_ways_is_one_password(cloud: Cloud) -> None:
 
 
 def test_only_a_slow_hash_of_it_is_stored(cloud: Cloud, anna: Person) -> None:
-    row = cloud.run(cloud.functions.tables.get(store.ACCOUNTS, anna.account, "password"))
+    row = cloud.run(cloud.functions.tables.get(records.ACCOUNTS, anna.account, "password"))
     assert row is not None
     assert row.data["hash"].startswith("$argon2id$v=19$m=19456,t=2,p=1$")
     assert GOOD not in str(row.data)
 
 
 def test_a_hash_of_older_parameters_is_made_again(cloud: Cloud, anna: Person, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(password_hashes, "PASSES", 3)
+    monkeypatch.setattr(password_hasher, "PASSES", 3)
     hashes: Any = cloud.functions.passwords._hashes
     hashes._made = None
     assert sign_in(cloud, "anna", GOOD).status_code == 200
-    row = cloud.run(cloud.functions.tables.get(store.ACCOUNTS, anna.account, "password"))
+    row = cloud.run(cloud.functions.tables.get(records.ACCOUNTS, anna.account, "password"))
     assert row is not None
     assert "t=3" in row.data["hash"]
     assert sign_in(cloud, "anna", GOOD).status_code == 200
@@ -126,7 +126,7 @@ class TestNames:
     def test_an_account_from_before_is_found_by_its_own_spelling(self, cloud: Cloud) -> None:
         """Names were once told apart by their case; nobody who had one loses it, or finds somebody else's there."""
         old = {"account": "o" * 20, "space": "s" * 20}
-        cloud.run(cloud.functions.tables.create(store.ACCOUNTS, Row("name:Dora", "account", old)))
+        cloud.run(cloud.functions.tables.create(records.ACCOUNTS, Row("name:Dora", "account", old)))
         assert cloud.sign_in("Dora").account == old["account"]
         with pytest.raises(Problem, match="Choose another"):
             cloud.run(cloud.functions.passwords.register("Dora", BETTER))
@@ -225,7 +225,7 @@ class TestSessions:
         newest = cloud.sign_in("anna")
         assert [each["id"] for each in newest.get(SESSIONS).json()["items"]] == [newest.session]
         cloud.sweep()
-        keys = [row.key for row in cloud.run(cloud.functions.tables.query(store.ACCOUNTS, anna.account)).rows]
+        keys = [row.key for row in cloud.run(cloud.functions.tables.query(records.ACCOUNTS, anna.account)).rows]
         assert [key for key in keys if key.startswith("session:")] == [f"session:{newest.session}"]
 
 

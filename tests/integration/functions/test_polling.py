@@ -7,8 +7,7 @@ from typing import Any
 
 import pytest
 
-from device_agent.protocol import topics
-from device_agent.protocol.messages import (
+from device_agent.protocol import (
     AckStatus,
     CancelAction,
     GrantLease,
@@ -16,15 +15,16 @@ from device_agent.protocol.messages import (
     ReleaseLease,
     RunMovement,
     StopDevice,
+    topics,
 )
-from function_app.domain.devices import POLL_MARK_MS, POLL_SILENT_MS
-from function_app.services import store
-from function_app.services.commands import SHORT_TTL_MS, STOP_KEPT_MS
+from function_app.domain.devices.devices import POLL_MARK_MS, POLL_SILENT_MS
+from function_app.services.messaging.command_sender import SHORT_TTL_MS, STOP_KEPT_MS
+from function_app.services.storage import records
+from tests.fakes.agent import Robot
+from tests.harness.cloud.cloud import Cloud, Person, problem
+from tests.harness.cloud.polling import PollingRobot
+from tests.harness.network.brokers import wait_until
 from tests.integration.functions.conftest import Open
-from tests.support.brokers import wait_until
-from tests.support.cloud import Cloud, Person, problem
-from tests.support.polling import PollingRobot
-from tests.support.robot import Robot
 
 BOTH = pytest.mark.parametrize("wait_ms", [0, 500], ids=["plain", "long"])
 MINE = "/robot-types/ur5/movements/mine"
@@ -45,7 +45,7 @@ def robot(cloud: Cloud, anna: Person) -> Iterator[PollingRobot]:
 
 
 def mailbox(cloud: Cloud, robot: PollingRobot) -> list[str]:
-    page = cloud.run(cloud.functions.tables.query(store.MAILBOX, robot.id, limit=1000))
+    page = cloud.run(cloud.functions.tables.query(records.MAILBOX, robot.id, limit=1000))
     return [row.key for row in page.rows]
 
 
@@ -211,7 +211,7 @@ class TestMailbox:
         time.sleep(0.2)
         assert found == []
         if there == "elsewhere":
-            from tests.support.knife import elsewhere
+            from tests.harness.crash_injection import elsewhere
 
             anna = elsewhere(open_cloud(clock=cloud.clock), anna)
         action = anna.start(robot.device).json()["id"]
@@ -230,7 +230,7 @@ class TestPresence:
         self, cloud: Cloud, anna: Person, robot: PollingRobot
     ) -> None:
         def link() -> Any:
-            return cloud.run(cloud.functions.tables.get(store.AGENTS, robot.id, "link"))
+            return cloud.run(cloud.functions.tables.get(records.AGENTS, robot.id, "link"))
 
         assert not anna.get(f"/devices/{robot.device}").json()["online"]
         robot.fetch()
@@ -272,9 +272,9 @@ def test_where_the_bus_hears_no_acks_confirmation_is_read_from_the_tables(
     import contextlib
     from collections.abc import AsyncIterator
 
-    from function_app import choices
+    from function_app.adapters import factory
     from function_app.adapters.local.command_bus import MqttCommandBus
-    from tests.support.cloud import paired
+    from tests.harness.cloud.cloud import paired
 
     class Deaf(MqttCommandBus):
         @contextlib.asynccontextmanager
@@ -283,7 +283,7 @@ def test_where_the_bus_hears_no_acks_confirmation_is_read_from_the_tables(
 
     ingesting = open_cloud()
     ingesting.start_ingest()
-    monkeypatch.setattr(choices, "MqttCommandBus", Deaf)
+    monkeypatch.setattr(factory, "MqttCommandBus", Deaf)
     cloud = open_cloud(clock=ingesting.clock)
     with paired(cloud) as (anna, robot):
         assert anna.take(robot.device, wait_ms=20_000).json()["confirmed"]

@@ -5,14 +5,13 @@ from collections.abc import Callable, Iterator
 
 import pytest
 
-from device_agent.protocol import codec, topics
-from device_agent.protocol.messages import AckStatus, MoveJoints, RunMovement
-from function_app.services import store
-from function_app.services.sweep import ORPHAN_MS
-from tests.support.brokers import wait_until
-from tests.support.cloud import Cloud, MovingClock, Person
-from tests.support.knife import Killed, Knife, elsewhere
-from tests.support.polling import PollingRobot
+from device_agent.protocol import AckStatus, MoveJoints, RunMovement, codec, topics
+from function_app.services.maintenance.scheduler import ORPHAN_MS
+from function_app.services.storage import records
+from tests.harness.cloud.cloud import Cloud, MovingClock, Person
+from tests.harness.cloud.polling import PollingRobot
+from tests.harness.crash_injection import Killed, Knife, elsewhere
+from tests.harness.network.brokers import wait_until
 
 Mortal = Callable[[MovingClock], tuple[Cloud, Knife]]
 TTL_S, TIMEOUT_S = 2, 6
@@ -34,7 +33,7 @@ def robot(cloud: Cloud, anna: Person) -> Iterator[PollingRobot]:
 
 
 def letters(cloud: Cloud, robot: PollingRobot) -> list[str]:
-    page = cloud.run(cloud.functions.tables.query(store.MAILBOX, robot.id, first="0", last="2"))
+    page = cloud.run(cloud.functions.tables.query(records.MAILBOX, robot.id, first="0", last="2"))
     return [row.key for row in page.rows]
 
 
@@ -53,7 +52,7 @@ def settled(cloud: Cloud, anna: Person, robot: PollingRobot) -> None:
     """Nothing is left open, each action ran at most once, and the device is free."""
     pass_time(cloud, robot, TIMEOUT_S + 4)
     pass_time(cloud, robot, ORPHAN_MS / 1000 + 2, step_s=31)
-    page = cloud.run(cloud.functions.tables.query(store.CONTROL, robot.device, first="action:", last="action;"))
+    page = cloud.run(cloud.functions.tables.query(records.CONTROL, robot.device, first="action:", last="action;"))
     ended = {row.data["id"]: row.data["status"] for row in page.rows}
     assert set(ended.values()) <= {"done", "failed", "expired", "cancelled"}
     for action, payloads in robot.payloads.items():

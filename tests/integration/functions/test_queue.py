@@ -8,19 +8,18 @@ from typing import Any
 
 import pytest
 
-from device_agent.protocol import codec, topics
-from device_agent.protocol.messages import AckStatus, CancelAction, Command, MoveJoints, ResetStop
-from function_app.domain.actions import GRACE_MS
-from function_app.domain.queue import MOST
-from function_app.services import store
-from function_app.services.pending import SHARDS
-from function_app.services.queue import LOOK_MS
-from function_app.services.sweep import ORPHAN_MS
+from device_agent.protocol import AckStatus, CancelAction, Command, MoveJoints, ResetStop, codec, topics
+from function_app.domain.actions.action import GRACE_MS
+from function_app.domain.actions.queue import MOST
+from function_app.services.actions.queue import LOOK_MS
+from function_app.services.maintenance.scheduler import ORPHAN_MS
+from function_app.services.storage import records
+from function_app.services.storage.reminders import SHARDS
+from tests.fakes.agent import Robot
+from tests.harness.cloud.cloud import Cloud, Person, problem
+from tests.harness.crash_injection import Killed, elsewhere
+from tests.harness.network.brokers import wait_until
 from tests.integration.functions.conftest import Mortal, Open
-from tests.support.brokers import wait_until
-from tests.support.cloud import Cloud, Person, problem
-from tests.support.knife import Killed, elsewhere
-from tests.support.robot import Robot
 
 Pair = tuple[Person, Robot]
 QUEUE: dict[str, Any] = {"policy": "queue"}
@@ -51,7 +50,7 @@ def reason(person: Person, action: str) -> tuple[str, str]:
 
 
 def notes(cloud: Cloud) -> list[str]:
-    pages = [cloud.run(cloud.functions.tables.query(store.PENDING, str(shard))) for shard in range(SHARDS)]
+    pages = [cloud.run(cloud.functions.tables.query(records.PENDING, str(shard))) for shard in range(SHARDS)]
     keys = [row.key for page in pages for row in page.rows]
     return [key for key in keys if key.split(":")[1] not in {"anchor", "audit"}]
 
@@ -324,7 +323,7 @@ def settled(cloud: Cloud, robot: Robot, anna: Person) -> dict[str, dict[str, Any
     pass_time(cloud, 20, step_s=0.5)
     pass_time(cloud, 10 + ORPHAN_MS / 1000, step_s=15)
     pass_time(cloud, 400, step_s=200)
-    page = cloud.run(cloud.functions.tables.query(store.CONTROL, robot.device, limit=1000))
+    page = cloud.run(cloud.functions.tables.query(records.CONTROL, robot.device, limit=1000))
     rows = {row.key: dict(row.data) for row in page.rows}
     actions = {data["id"]: data for key, data in reversed(rows.items()) if key.startswith("action:")}
     assert {data["status"] for data in actions.values()} <= ENDED, actions

@@ -8,12 +8,12 @@ from typing import Any
 
 import pytest
 
-from device_agent.protocol.messages import MoveJoints
+from device_agent.protocol import MoveJoints
 from function_app.bootstrap import Functions
-from function_app.domain.accounts import Identity
-from function_app.domain.problems import Problem
-from function_app.services.start_action import Start
-from tests.support.processes import PATIENCE_S, PROCESSES, Place, begin, killed, run_here, show_code
+from function_app.domain.common.problems import Problem
+from function_app.domain.identity.accounts import Identity
+from function_app.services.actions.start import Start
+from tests.harness.processes import PATIENCE_S, PROCESSES, Place, begin, killed, run_here, show_code
 
 RACERS = 8
 DEVICES_OF_AGENT = 20
@@ -133,7 +133,7 @@ def see_exactly_one_winner(place: Place, rounds: int) -> None:
 
 @pytest.mark.parametrize(("place", "rounds"), [("local", 250), ("azure", 6), ("aws", 5)], indirect=["place"])
 def test_of_eight_processes_exactly_one_gets_it(place: Place, rounds: int) -> None:
-    """At moto one request after the other is answered (``tests/support/aws.py``): the processes still interleave."""
+    """At moto one request after the other is answered (``tests/harness/stores/aws.py``): the processes still interleave."""
     see_exactly_one_winner(place, rounds)
 
 

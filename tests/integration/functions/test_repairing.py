@@ -11,8 +11,8 @@ from pathlib import Path
 
 import uvicorn
 
-from tests.support.brokers import wait_until
-from tests.support.cloud import Cloud, Person
+from tests.harness.cloud.cloud import Cloud, Person
+from tests.harness.network.brokers import wait_until
 
 ROOT = Path(__file__).resolve().parents[3]
 NUDGE = {"kind": "move_joints", "position_rad": {"wrist_3": 0.1}, "speed": 1.0}

@@ -16,16 +16,15 @@ from typing import Any, Literal
 
 import pytest
 
-from device_agent.protocol import topics
-from device_agent.protocol.messages import GrantLease, MoveJoints, ReleaseLease
-from function_app.domain.accounts import Identity
-from function_app.domain.problems import Problem
+from device_agent.protocol import GrantLease, MoveJoints, ReleaseLease, topics
+from function_app.domain.common.problems import Problem
+from function_app.domain.identity.accounts import Identity
 from function_app.ports.broker_access import Credentials
-from function_app.services import store
-from function_app.services.pending import SHARDS
-from tests.support.brokers import BROKERS, Client, Message, RunningBroker, start_broker, wait_until
-from tests.support.cloud import Cloud, Person, paired, problem, settings
-from tests.support.robot import Robot
+from function_app.services.storage import records
+from function_app.services.storage.reminders import SHARDS
+from tests.fakes.agent import Robot
+from tests.harness.cloud.cloud import Cloud, Person, paired, problem, settings
+from tests.harness.network.brokers import BROKERS, Client, Message, RunningBroker, start_broker, wait_until
 
 STREAM_S = 0.01
 """Between two setpoints [s]."""
@@ -376,7 +375,7 @@ def test_who_unshares_while_the_broker_is_away_is_told_so_at_once_and_nothing_is
 
 
 def pending(cloud: Cloud, shard: int) -> Any:
-    return cloud.functions.tables.query(store.PENDING, str(shard))
+    return cloud.functions.tables.query(records.PENDING, str(shard))
 
 
 def test_a_broker_that_is_there_and_never_answers_holds_nobody_up(
@@ -392,7 +391,7 @@ def test_a_broker_that_is_there_and_never_answers_holds_nobody_up(
         await asyncio.Event().wait()
 
     with monkeypatch.context() as patch:
-        patch.setattr("function_app.services.unshare.TELL_S", 0.2)
+        patch.setattr("function_app.services.sharing.access_revocation.TELL_S", 0.2)
         patch.setattr(cloud.functions.access, "revoke", never)
         patch.setattr(cloud.functions.bus, "publish", never)
         answer = anna.post(at, {"account": "bert", "role": "viewer"})

@@ -6,10 +6,11 @@ from typing import Any
 
 import pytest
 
-from function_app.services import store
-from function_app.services.forget import DAY_MS
-from function_app.services.look_at_robot_type import MAX_LOOKS
-from function_app.services.type_versions import GIVE_UP_MS, KEEP_LOOK_MS
+from function_app.services.robot_types.preview import MAX_LOOKS
+from function_app.services.robot_types.versions import GIVE_UP_MS, KEEP_LOOK_MS
+from function_app.services.storage import records
+from function_app.services.storage.retention import DAY_MS
+from tests.harness.cloud.cloud import Cloud, MovingClock, Person, problem, settings
 from tests.integration.functions.test_robot_types import (
     FILES,
     LEVER,
@@ -24,7 +25,6 @@ from tests.integration.functions.test_robot_types import (
     rows,
     stop_after,
 )
-from tests.support.cloud import Cloud, MovingClock, Person, problem, settings
 
 LOOKS = "/robot-type-looks"
 _SLOW_MS = 600_000
@@ -61,7 +61,7 @@ def checked(cloud: Cloud, who: Person, text: str = "", **more: Any) -> dict[str,
 
 
 def trials(cloud: Cloud, who: Person) -> list[str]:
-    return [key for key in rows(cloud, store.MEMBERS, who.account) if key.startswith("type-look:")]
+    return [key for key in rows(cloud, records.MEMBERS, who.account) if key.startswith("type-look:")]
 
 
 class TestLook:
@@ -183,9 +183,9 @@ class TestEnd:
         advance(cloud, 1)
         assert blobs(cloud) == ()
         assert trials(cloud, anna) == []
-        assert rows(cloud, store.ROBOT_TYPES, f"{anna.account}/~{found['id']}") == []
+        assert rows(cloud, records.ROBOT_TYPES, f"{anna.account}/~{found['id']}") == []
         advance(cloud, DAY_MS)
-        assert rows(cloud, store.MODEL_CHECKS, "looks") == []
+        assert rows(cloud, records.MODEL_CHECKS, "looks") == []
 
     def test_one_that_is_ended_goes_at_once(self, cloud: Cloud, anna: Person) -> None:
         found = checked(cloud, anna)
@@ -228,7 +228,7 @@ class TestEnd:
         assert trials(cloud, anna) == []
         left = {name.split("/")[2] for name in blobs(cloud)}
         assert left == ({"lever"} if saving else set())
-        assert rows(cloud, store.MODEL_CHECKS, "checks") == []
+        assert rows(cloud, records.MODEL_CHECKS, "checks") == []
         if saving:
             assert anna.get("/robot-types/lever").json()["state"] == "ready"
 
@@ -239,9 +239,9 @@ class TestEnd:
 
         class Slow:
             async def check(self, *asked: Any) -> Any:
-                where = (await cloud.functions.tables.query(store.ROBOT_TYPES, f"{anna.account}/~{found}")).rows
+                where = (await cloud.functions.tables.query(records.ROBOT_TYPES, f"{anna.account}/~{found}")).rows
                 for row in where:
-                    await cloud.functions.tables.delete(store.ROBOT_TYPES, row)
+                    await cloud.functions.tables.delete(records.ROBOT_TYPES, row)
                 for name in await cloud.functions.blobs.list("robot-types/"):
                     await cloud.functions.blobs.delete(name)
                 return await compiler.check(*asked)

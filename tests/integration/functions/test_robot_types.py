@@ -16,23 +16,23 @@ from typing import Any
 
 import pytest
 
-from device_agent.protocol import robot_type as manifests
-from device_agent.protocol.robot_type import RobotType
-from function_app.adapters.local.model_compiler import MujocoCompiler
-from function_app.entrypoints.http.contract.robot_types import MAX_UPLOAD
-from function_app.entrypoints.worker import check_models
+from device_agent.protocol.manifests import robot_type as manifests
+from device_agent.protocol.manifests.robot_type import RobotType
+from function_app.adapters.model_compiler.compiler import MujocoCompiler
+from function_app.entrypoints.hosts.worker import check_models
+from function_app.entrypoints.http.robot_types.schemas import MAX_UPLOAD
 from function_app.ports.model_compiler import CompilerMissingError, Looked
 from function_app.ports.tables import Row
-from function_app.services import store
-from function_app.services.delete_robot_type import AFTER_MS
-from function_app.services.forget import DAY_MS
-from function_app.services.model_checks import LEASE_MS, MAX_TRIES
-from function_app.services.model_files import MAX_BYTES, MAX_FILES
-from function_app.services.robot_type_rows import Place
-from function_app.services.tend_robot_types import CUT_OFF, NO_CHECKER
-from function_app.services.type_versions import GIVE_UP_MS
-from tests.support.brokers import PATIENCE_S, wait_until
-from tests.support.cloud import Cloud, MovingClock, Person, problem, settings
+from function_app.services.robot_types.cleanup import CUT_OFF, NO_CHECKER
+from function_app.services.robot_types.delete import AFTER_MS
+from function_app.services.robot_types.model_validation import LEASE_MS, MAX_TRIES
+from function_app.services.robot_types.package_reader import MAX_BYTES, MAX_FILES
+from function_app.services.robot_types.rows import Place
+from function_app.services.robot_types.versions import GIVE_UP_MS
+from function_app.services.storage import records
+from function_app.services.storage.retention import DAY_MS
+from tests.harness.cloud.cloud import Cloud, MovingClock, Person, problem, settings
+from tests.harness.network.brokers import PATIENCE_S, wait_until
 
 UR5 = Path(__file__).parents[3] / "robots" / "ur5"
 MANIFEST = """
@@ -233,9 +233,9 @@ class TestLife:
         assert jump.json()["version"] == 7
         assert add(anna, text=manifest(version="7")).json()["version"] == 8
         advance(cloud, GIVE_UP_MS)
-        assert len(rows(cloud, store.ROBOT_TYPES, f"{anna.account}/lever")) == 5, "a day for who has begun a download"
+        assert len(rows(cloud, records.ROBOT_TYPES, f"{anna.account}/lever")) == 5, "a day for who has begun a download"
         advance(cloud, DAY_MS + GIVE_UP_MS)
-        assert rows(cloud, store.ROBOT_TYPES, f"{anna.account}/lever") == ["type", "version:00000008"]
+        assert rows(cloud, records.ROBOT_TYPES, f"{anna.account}/lever") == ["type", "version:00000008"]
         assert len(blobs(cloud)) == 4
         assert anna.cloud.sign_in("anna").get("/robot-types/lever").json()["version"] == 8
 
@@ -249,7 +249,7 @@ class TestLife:
         assert shown["upload"]["errors"] == refused["errors"]
         assert add(anna).json()["version"] == 3
         advance(cloud, GIVE_UP_MS)
-        assert rows(cloud, store.ROBOT_TYPES, f"{anna.account}/lever") == [
+        assert rows(cloud, records.ROBOT_TYPES, f"{anna.account}/lever") == [
             "type",
             "version:00000001",
             "version:00000003",
@@ -325,8 +325,8 @@ class TestDeletion:
         assert anna.delete("/robot-types/lever").status_code == 204
         advance(cloud, AFTER_MS)
         assert blobs(cloud) == ()
-        assert rows(cloud, store.ROBOT_TYPES, f"{anna.account}/lever") == ["type"]
-        assert not [key for key in rows(cloud, store.MEMBERS, anna.account) if key.startswith("type:")]
+        assert rows(cloud, records.ROBOT_TYPES, f"{anna.account}/lever") == ["type"]
+        assert not [key for key in rows(cloud, records.MEMBERS, anna.account) if key.startswith("type:")]
 
 
 class TestChecker:
@@ -347,13 +347,13 @@ class TestChecker:
         assert add(anna, wait_ms=0).json()["version"] == 2
         check_all(cloud)
         assert anna.get("/robot-types/lever").json()["state"] == "ready"
-        assert rows(cloud, store.MODEL_CHECKS, "checks") == []
+        assert rows(cloud, records.MODEL_CHECKS, "checks") == []
 
     def test_one_that_is_killed_is_followed_by_another(self, cloud: Cloud, anna: Person) -> None:
         add(anna, wait_ms=0)
         with dies_in(cloud):
             check_all(cloud)
-        assert rows(cloud, store.MODEL_CHECKS, "checks"), "the note outlives it"
+        assert rows(cloud, records.MODEL_CHECKS, "checks"), "the note outlives it"
         check_all(cloud)
         assert anna.get("/robot-types/lever").json()["state"] == "checking", "somebody may still be at it"
         advance(cloud, LEASE_MS)
@@ -451,8 +451,8 @@ class TestChecker:
         advance(cloud, DAY_MS)
         advance(cloud, DAY_MS)
         assert len({name.split("/")[3] for name in blobs(cloud)}) == 1
-        assert rows(cloud, store.MODEL_CHECKS, "checks") == []
-        assert rows(cloud, store.MODEL_CHECKS, "looks") == []
+        assert rows(cloud, records.MODEL_CHECKS, "checks") == []
+        assert rows(cloud, records.MODEL_CHECKS, "looks") == []
 
 
 @contextlib.contextmanager
@@ -703,7 +703,7 @@ class TestProcesses:
 
 def taken(cloud: Cloud) -> bool:
     """Whether a checker holds a note."""
-    page = cloud.run(cloud.functions.tables.query(store.MODEL_CHECKS, "checks"))
+    page = cloud.run(cloud.functions.tables.query(records.MODEL_CHECKS, "checks"))
     return any(note.data["until_ms"] for note in page.rows)
 
 
@@ -732,7 +732,7 @@ class TestLimits:
     ) -> None:
         child = tmp_path / "child.py"
         child.write_text("import time\ntime.sleep(1000)\n")
-        monkeypatch.setattr("function_app.adapters.local.model_compiler._CHILD", child)
+        monkeypatch.setattr("function_app.adapters.model_compiler.compiler._CHILD", child)
         compiler = MujocoCompiler(wall_s=1)
         found = cloud.run(compiler.check(manifests.parse(manifest()), {"lever.xml": b""}))
         assert "Simplify" in found.errors[0]
@@ -759,11 +759,11 @@ class TestSeal:
         return Place(anna.account, "lever")
 
     def change(self, cloud: Cloud, place: Place, key: str, edit: Callable[[dict[str, Any]], object]) -> None:
-        row = cloud.run(cloud.functions.tables.get(store.ROBOT_TYPES, place.partition, key))
+        row = cloud.run(cloud.functions.tables.get(records.ROBOT_TYPES, place.partition, key))
         assert row is not None
         data = copy.deepcopy(dict(row.data))
         edit(data)
-        cloud.run(cloud.functions.tables.replace(store.ROBOT_TYPES, Row(row.partition, row.key, data, row.etag)))
+        cloud.run(cloud.functions.tables.replace(records.ROBOT_TYPES, Row(row.partition, row.key, data, row.etag)))
 
     def test_no_byte_of_a_manifest_or_a_model_may_differ(self, cloud: Cloud, anna: Person, lever: Place) -> None:
         for name in ("robot.toml", "lever.xml"):
@@ -778,7 +778,7 @@ class TestSeal:
             assert anna.get(f"/robot-types/lever/files/{name}").content == good
 
     def test_no_field_of_it_may_differ_and_no_other_seal_fits(self, cloud: Cloud, anna: Person, lever: Place) -> None:
-        first = cloud.run(cloud.functions.tables.get(store.ROBOT_TYPES, lever.partition, "type"))
+        first = cloud.run(cloud.functions.tables.get(records.ROBOT_TYPES, lever.partition, "type"))
         assert first is not None
         good = copy.deepcopy(dict(first.data))
         edits: tuple[Callable[[dict[str, Any]], object], ...] = (

@@ -9,11 +9,11 @@ from typing import Any, NamedTuple
 
 import pytest
 
-from device_agent.protocol import document
+from device_agent.protocol.documents import asyncapi
 from function_app.ports.broker_access import Credentials
-from tests.support.brokers import BROKERS, Client, Message, RunningBroker, wait_until
-from tests.support.cloud import MOVE, Cloud, Person, paired
-from tests.support.robot import Robot
+from tests.fakes.agent import Robot
+from tests.harness.cloud.cloud import MOVE, Cloud, Person, paired
+from tests.harness.network.brokers import BROKERS, Client, Message, RunningBroker, wait_until
 
 NAMED = {"device", "agent", "action", "space"}
 """What a route names in its path when it is about something of somebody's."""
@@ -55,7 +55,7 @@ BODIES: dict[str, Any] = {
     "transfer_space": {},
 }
 REFUSED = {401, 403, 404}
-CHANNELS = {name: channel["address"] for name, channel in document.document()["channels"].items()}
+CHANNELS = {name: channel["address"] for name, channel in asyncapi.document()["channels"].items()}
 HEARD = {"presence", "description", "twin", "state", "joints", "measurements", "camera", "event", "ack"}
 """By whoever may see the device."""
 UNHEARD = {"late_joints", "late_measurements", "command", "setpoint", "stop"}

@@ -6,19 +6,19 @@ from pathlib import Path
 import msgspec
 import pytest
 
-from device_agent.drivers.mujoco.climate import Climate
-from device_agent.drivers.mujoco.person import Walker
-from device_agent.protocol import codec, room, topics
-from device_agent.protocol.messages import Description, Measurements, Mode, State
-from device_agent.protocol.room import RoomDevice, Watch
-from device_agent.runtime.instrument import Instrument
-from device_agent.sensors.mujoco import meters
-from function_app.entrypoints.ingest import ingest, ingest_telemetry
+from device_agent.protocol import Description, Measurements, Mode, State, codec, topics
+from device_agent.protocol.manifests import room
+from device_agent.protocol.manifests.room import RoomDevice, Watch
+from device_agent.runtime.room.room_device import Instrument
+from device_agent.sensors.mujoco import scalar_sensors
+from device_agent.simulation.room.climate import Climate
+from device_agent.simulation.room.pedestrian import Walker
+from function_app.entrypoints.ingest.router import ingest, ingest_telemetry
+from tests.fakes.agent import Robot
+from tests.harness.agent.device_harness import Bench, eventually
+from tests.harness.agent.rooms import LAB, StillWorld
+from tests.harness.cloud.cloud import Cloud, Person
 from tests.integration.functions.test_diagnostics import MINUTE, diagnostics, open_faults
-from tests.support.bench import Bench, eventually
-from tests.support.cloud import Cloud, Person
-from tests.support.robot import Robot
-from tests.support.rooms import LAB, StillWorld
 
 WINDOW_S = 10.0
 HURRY = 20.0
@@ -34,7 +34,7 @@ class Air:
         self.world = StillWorld(manifest=manifest)
         self.people: list[Walker] = []
         self.world.add(Climate(manifest, self.world.world, self.people, hurry=HURRY))
-        monkeypatch.setattr(meters, "time", self)
+        monkeypatch.setattr(scalar_sensors, "time", self)
         self.meter = self.world.driver("co2")
         self.meter.connect()
         entry = self.world.entry("co2")

@@ -8,23 +8,22 @@ from typing import Any
 
 import pytest
 
-from device_agent.protocol import codec, topics
-from device_agent.protocol.messages import Description, Joint, JointTelemetry, Measurements, Mode
+from device_agent.protocol import Description, Joint, JointTelemetry, Measurements, Mode, codec, topics
 from device_agent.protocol.topics import Topic
 from function_app.adapters.local.blobs import FileBlobs
 from function_app.adapters.local.tables import SqliteTables
-from function_app.domain import series
-from function_app.domain.accounts import Identity
-from function_app.domain.devices import Agent, Device, DeviceSpec
-from function_app.domain.problems import Problem
-from function_app.domain.series import DAY, FINEST, LEVELS, RAW, Keep, Samples
+from function_app.domain.common.problems import Problem
+from function_app.domain.devices.devices import Agent, Device, DeviceSpec
+from function_app.domain.identity.accounts import Identity
+from function_app.domain.telemetry import series
+from function_app.domain.telemetry.series import DAY, FINEST, LEVELS, RAW, Keep, Samples
 from function_app.ports.tables import Row, StoreError, Tables
-from function_app.services import store
-from function_app.services.devices import Devices
-from function_app.services.forget import Forget
-from function_app.services.intake import GIVE_UP_MS, LEFT_MS, SHARDS, Arrived, Intake, Values, _Part
-from function_app.services.series import ABOUT, MAX_STREAMS, Place, SeriesWriter
-from function_app.services.series_range import Part, Range, SeriesReader
+from function_app.services.devices.device_access import Devices
+from function_app.services.storage import records
+from function_app.services.storage.retention import Forget
+from function_app.services.telemetry.ingest import GIVE_UP_MS, LEFT_MS, SHARDS, Arrived, Intake, Values, _Part
+from function_app.services.telemetry.series_reader import Part, Range, SeriesReader
+from function_app.services.telemetry.series_writer import ABOUT, MAX_STREAMS, Place, SeriesWriter
 
 pytestmark = pytest.mark.anyio
 
@@ -114,7 +113,7 @@ class House:
             space="space",
             pairing=pairing,
         )
-        await store.upsert(self.tables, store.AGENTS, AGENT, "agent", lambda _: agent, Agent)
+        await records.upsert(self.tables, records.AGENTS, AGENT, "agent", lambda _: agent, Agent)
 
     async def read(self, stream: str = "health", **wanted: Any) -> Part:
         return await self.reader.read(ANNA, DEVICE, stream, Range(**wanted))
@@ -338,7 +337,7 @@ async def test_measurements_of_claimed_devices_are_stored(house: House) -> None:
     await house.intake.take(arrived[10:20])
     await assert_whole(house, rows)
     for shard in range(SHARDS):
-        assert not (await house.tables.query(store.DATA, str(shard))).rows
+        assert not (await house.tables.query(records.DATA, str(shard))).rows
     (seen,) = house.seen
     assert seen[:2] == (DEVICE, "health")
     assert [set(values) for _, values in seen[2]] == [{"temperature_c.elbow", "fan"}] * len(seen[2])
@@ -356,7 +355,7 @@ async def test_joints_are_stored_under_their_names(house: House) -> None:
     )
     description = Description(device="arm", kind="arm", robot_type="ur5", label="Arm", joints=joints)
     tables: Any = house.tables
-    await store.upsert(tables, store.DESCRIPTIONS, AGENT, "arm", lambda _: description, Description)
+    await records.upsert(tables, records.DESCRIPTIONS, AGENT, "arm", lambda _: description, Description)
     telemetry = JointTelemetry(
         tick_ms=1, at_ms=NOW_MS, sequence=1, mode=Mode.STREAMING, position_rad=(0.1, 0.2, 0.3, 0.4),
         velocity_rad_s=(1.0, 2.0, 3.0, 4.0), effort_nm=(5.0,), commanded_rad=(), loop_age_ms=12.0,
@@ -461,7 +460,7 @@ async def test_a_kill_between_any_two_writes_loses_and_doubles_nothing(house: Ho
 
 
 async def _queued(house: House) -> int:
-    return sum([len((await house.tables.query(store.DATA, str(shard))).rows) for shard in range(SHARDS)])
+    return sum([len((await house.tables.query(records.DATA, str(shard))).rows) for shard in range(SHARDS)])
 
 
 async def test_what_can_never_be_distributed_is_given_up(house: House) -> None:
@@ -520,10 +519,10 @@ async def test_no_row_is_written_that_will_not_be_forgotten(house: House) -> Non
     await house.writer.add(PLACE, series.gather(rows.items()))
     notes: list[Row] = []
     for shard in range(8):
-        notes += (await house.tables.query(store.FORGET, str(shard), limit=1000)).rows
+        notes += (await house.tables.query(records.FORGET, str(shard), limit=1000)).rows
     ranges = [(note.data["first"], note.data["last"]) for note in notes]
     assert len(ranges) == 2 * 4  # two days, four levels that end
-    page = await house.tables.query(store.SERIES, PLACE.partition, limit=1000)
+    page = await house.tables.query(records.SERIES, PLACE.partition, limit=1000)
     for row in page.rows:
         kept = row.key == ABOUT or row.key.startswith(("1h:", "6h:", "1d:"))
         assert any(first <= row.key < last for first, last in ranges) != kept, row.key

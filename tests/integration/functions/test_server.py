@@ -11,9 +11,9 @@ from pathlib import Path
 import httpx
 import pytest
 
-from function_app.entrypoints.http.answers import MAX_BODY
-from tests.support.brokers import PATIENCE_S, ROOT, wait_until
-from tests.support.cloud import API, problem
+from function_app.entrypoints.http.framework.responses import MAX_BODY
+from tests.harness.cloud.cloud import API, problem
+from tests.harness.network.brokers import PATIENCE_S, ROOT, wait_until
 
 
 def environment(home: Path, port: int) -> dict[str, str]:

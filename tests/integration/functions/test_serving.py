@@ -5,7 +5,7 @@ import socket
 
 import pytest
 
-from function_app.entrypoints.serve import PortTaken, listen
+from function_app.entrypoints.hosts.uvicorn import PortTaken, listen
 
 
 def test_answers_leave_at_once_on_every_accepted_connection() -> None:

@@ -4,15 +4,14 @@ from typing import Any, NamedTuple
 
 import pytest
 
-from device_agent.protocol import topics
-from device_agent.protocol.messages import AckStatus, CancelAction, GrantLease, MoveJoints, ReleaseLease, RunMovement
-from function_app.domain.accounts import Identity, Role
+from device_agent.protocol import AckStatus, CancelAction, GrantLease, MoveJoints, ReleaseLease, RunMovement, topics
+from function_app.domain.identity.accounts import Identity, Role
 from function_app.ports.broker_access import Credentials
-from function_app.services import store
-from tests.support.brokers import BROKERS, Client, RunningBroker, wait_until
-from tests.support.cloud import Cloud, Person, paired, problem
-from tests.support.knife import elsewhere
-from tests.support.robot import Robot
+from function_app.services.storage import records
+from tests.fakes.agent import Robot
+from tests.harness.cloud.cloud import Cloud, Person, paired, problem
+from tests.harness.crash_injection import elsewhere
+from tests.harness.network.brokers import BROKERS, Client, RunningBroker, wait_until
 
 Three = tuple[Person, Person, Robot]
 SHARED_S = 120
@@ -256,8 +255,8 @@ def test_an_unpaired_agent_is_shared_with_nobody_not_even_when_it_comes_back(thr
     problem(bert.get(f"/devices/{robot.device}"), 404, "device-unknown")
     assert anna.get(f"/devices/{robot.device}/shares").json()["items"] == []
     cloud = anna.cloud
-    assert cloud.run(cloud.functions.tables.query(store.SHARES, f"device:{robot.device}")).rows == ()
-    index = cloud.run(cloud.functions.tables.query(store.MEMBERS, bert.account, first="share:", last="share;"))
+    assert cloud.run(cloud.functions.tables.query(records.SHARES, f"device:{robot.device}")).rows == ()
+    index = cloud.run(cloud.functions.tables.query(records.MEMBERS, bert.account, first="share:", last="share;"))
     assert index.rows == ()
 
 

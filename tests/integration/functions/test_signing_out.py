@@ -6,9 +6,9 @@ from typing import Any
 import pytest
 
 from function_app.ports.broker_access import Credentials
-from tests.support.brokers import BROKERS, Client, RunningBroker, wait_until
-from tests.support.cloud import Cloud, Person
-from tests.support.robot import Robot
+from tests.fakes.agent import Robot
+from tests.harness.cloud.cloud import Cloud, Person
+from tests.harness.network.brokers import BROKERS, Client, RunningBroker, wait_until
 
 
 def watching(broker: RunningBroker, person: Person) -> Client:

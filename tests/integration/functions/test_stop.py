@@ -5,11 +5,11 @@ from typing import Any
 
 import pytest
 
-from device_agent.protocol.messages import ResetStop, StopDevice
-from tests.support.brokers import BROKERS, wait_until
-from tests.support.cloud import Cloud, Person, paired, problem
-from tests.support.knife import elsewhere
-from tests.support.robot import Robot
+from device_agent.protocol import ResetStop, StopDevice
+from tests.fakes.agent import Robot
+from tests.harness.cloud.cloud import Cloud, Person, paired, problem
+from tests.harness.crash_injection import elsewhere
+from tests.harness.network.brokers import BROKERS, wait_until
 
 Pair = tuple[Person, Robot]
 

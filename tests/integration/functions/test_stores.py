@@ -10,18 +10,17 @@ from typing import Any
 
 import pytest
 
-from device_agent.protocol import codec, topics
-from device_agent.protocol.messages import AckStatus, Fault, Measurements, Mode, RunMovement, State, StopDevice
-from function_app import choices
-from function_app.entrypoints.ingest import ingest, ingest_telemetry
-from function_app.services.delete_robot_type import AFTER_MS
-from function_app.services.store import CONTROL
+from device_agent.protocol import AckStatus, Fault, Measurements, Mode, RunMovement, State, StopDevice, codec, topics
+from function_app.adapters import factory
+from function_app.entrypoints.ingest.router import ingest, ingest_telemetry
+from function_app.services.robot_types.delete import AFTER_MS
+from function_app.services.storage.records import CONTROL
 from function_app.settings import AwsStore, AzureStore
-from tests.support.aws import REGION, start_moto, use_credentials
-from tests.support.azure import start_azurite
-from tests.support.brokers import RunningBroker, wait_until
-from tests.support.cloud import MOVE, Cloud, Person, paired, problem, settings
-from tests.support.polling import PollingRobot
+from tests.harness.cloud.cloud import MOVE, Cloud, Person, paired, problem, settings
+from tests.harness.cloud.polling import PollingRobot
+from tests.harness.network.brokers import RunningBroker, wait_until
+from tests.harness.stores.aws import REGION, start_moto, use_credentials
+from tests.harness.stores.azure import start_azurite
 
 UR5 = Path(__file__).parents[3] / "robots" / "ur5"
 MINE = "/robot-types/ur5/movements/mine"
@@ -57,7 +56,7 @@ def store(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> Az
 def clouds(home: Path, broker: RunningBroker, store: AzureStore | AwsStore | None) -> Iterator[tuple[Cloud, Cloud]]:
     """Two instances; the ingest runs in the second."""
     chosen = replace(settings(home, broker), store=store)
-    asyncio.run(choices.prepare(chosen))
+    asyncio.run(factory.prepare(chosen))
     with contextlib.ExitStack() as stack:
         one, other = (stack.enter_context(Cloud(chosen)) for _ in range(2))
         other.start_ingest()

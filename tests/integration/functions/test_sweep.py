@@ -7,17 +7,17 @@ from typing import Any
 
 import pytest
 
-from device_agent.protocol.messages import AckStatus, CancelAction, Command, MoveJoints, RunMovement
+from device_agent.protocol import AckStatus, CancelAction, Command, MoveJoints, RunMovement
 from function_app.adapters.local import tables as adapter
 from function_app.adapters.local.tables import SqliteTables
-from function_app.services import store
-from function_app.services.pending import SHARDS
-from function_app.services.sweep import ORPHAN_MS
+from function_app.services.maintenance.scheduler import ORPHAN_MS
+from function_app.services.storage import records
+from function_app.services.storage.reminders import SHARDS
+from tests.fakes.agent import Answers, Robot
+from tests.harness.cloud.cloud import Cloud, Person, problem, settings
+from tests.harness.crash_injection import CutTables, Killed, Knife, elsewhere
+from tests.harness.network.brokers import start_broker, wait_until
 from tests.integration.functions.conftest import Mortal, Open
-from tests.support.brokers import start_broker, wait_until
-from tests.support.cloud import Cloud, Person, problem, settings
-from tests.support.knife import CutTables, Killed, Knife, elsewhere
-from tests.support.robot import Answers, Robot
 
 Pair = tuple[Person, Robot]
 TTL_S, TIMEOUT_S = 2, 6
@@ -27,13 +27,13 @@ WAVE = {"kind": "run_movement", "name": "slow_square", "parameters": {"side_m": 
 
 def notes(cloud: Cloud) -> list[str]:
     """Actions that the timer still means to look at, beside the chains of who did what."""
-    pages = [cloud.run(cloud.functions.tables.query(store.PENDING, str(shard))) for shard in range(SHARDS)]
+    pages = [cloud.run(cloud.functions.tables.query(records.PENDING, str(shard))) for shard in range(SHARDS)]
     keys = [row.key for page in pages for row in page.rows]
     return [key for key in keys if key.split(":")[1] not in {"anchor", "audit"}]
 
 
 def rows(cloud: Cloud, device: str) -> dict[str, dict[str, Any]]:
-    page = cloud.run(cloud.functions.tables.query(store.CONTROL, device, limit=1000))
+    page = cloud.run(cloud.functions.tables.query(records.CONTROL, device, limit=1000))
     return {row.key: dict(row.data) for row in page.rows}
 
 

@@ -9,19 +9,12 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from device_agent.protocol import codec, topics
-from device_agent.protocol.messages import (
-    AckStatus,
-    Event,
-    Measurements,
-    Mode,
-    State,
-)
-from function_app.entrypoints.ingest import ingest
+from device_agent.protocol import AckStatus, Event, Measurements, Mode, State, codec, topics
+from function_app.entrypoints.ingest.router import ingest
+from tests.harness.cloud.cloud import Cloud, Person, problem
+from tests.harness.cloud.polling import PollingRobot
+from tests.harness.network.brokers import RunningBroker
 from tests.integration.functions.conftest import Open
-from tests.support.brokers import RunningBroker
-from tests.support.cloud import Cloud, Person, problem
-from tests.support.polling import PollingRobot
 
 
 @pytest.fixture
@@ -109,7 +102,7 @@ class TestTelling:
     ) -> None:
         issued = anna.post("/mqtt/credentials", {"purpose": "watch"}).json()
         from function_app.ports.broker_access import Credentials
-        from tests.support.brokers import Client
+        from tests.harness.network.brokers import Client
 
         def page(number: int) -> Client:
             again = anna.post("/mqtt/credentials", {"purpose": "watch"}).json() if number else issued

@@ -5,10 +5,10 @@ from typing import Any
 
 import pytest
 
-from device_agent.protocol.messages import Fault, Mode, State
-from tests.support.brokers import wait_until
-from tests.support.cloud import Cloud, Person, paired, problem
-from tests.support.robot import Robot
+from device_agent.protocol import Fault, Mode, State
+from tests.fakes.agent import Robot
+from tests.harness.cloud.cloud import Cloud, Person, paired, problem
+from tests.harness.network.brokers import wait_until
 
 BODIES: dict[str, Any] = {
     "take_lease": {},

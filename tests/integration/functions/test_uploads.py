@@ -6,12 +6,13 @@ from typing import Any
 import httpx
 import pytest
 
-from function_app.domain.devices import Agent
-from function_app.services import store, uploads
-from function_app.services.devices import devices_of
-from function_app.services.uploads import LIFETIME_S, SHARDS, UNREGISTERED_MS
-from tests.support.cloud import API, Cloud, Person, problem
-from tests.support.robot import Robot
+from function_app.domain.devices.devices import Agent
+from function_app.services.devices.device_access import devices_of
+from function_app.services.storage import records
+from function_app.services.telemetry import uploads
+from function_app.services.telemetry.uploads import LIFETIME_S, SHARDS, UNREGISTERED_MS
+from tests.fakes.agent import Robot
+from tests.harness.cloud.cloud import API, Cloud, Person, problem
 
 PICTURE = bytes(range(256)) * 100
 WANTED = {"stream": "camera", "length": len(PICTURE), "content_type": "image/png", "name": "Küche 1.png", "at_ms": 1000}
@@ -53,11 +54,11 @@ def rows(cloud: Cloud, robot: Robot) -> int:
 
     async def count() -> int:
         found = 0
-        row = await cloud.functions.tables.get(store.AGENTS, robot.id, "agent")
+        row = await cloud.functions.tables.get(records.AGENTS, robot.id, "agent")
         assert row is not None
-        pairing = store.read(row, Agent).pairing
+        pairing = records.read(row, Agent).pairing
         for partition in (f"{robot.device}/{pairing}", *(f"due:{shard}" for shard in range(SHARDS))):
-            found += len((await cloud.functions.tables.query(store.UPLOADS, partition)).rows)
+            found += len((await cloud.functions.tables.query(records.UPLOADS, partition)).rows)
         return found
 
     return cloud.run(count())
@@ -121,9 +122,9 @@ def test_what_is_not_what_was_announced_is_not_registered(cloud: Cloud, pair: tu
 
 
 def pairing(cloud: Cloud, robot: Robot) -> str:
-    row = cloud.run(cloud.functions.tables.get(store.AGENTS, robot.id, "agent"))
+    row = cloud.run(cloud.functions.tables.get(records.AGENTS, robot.id, "agent"))
     assert row is not None
-    return store.read(row, Agent).pairing
+    return records.read(row, Agent).pairing
 
 
 def test_an_agent_uploads_of_its_own_devices(cloud: Cloud, pair: tuple[Person, Robot]) -> None:
@@ -275,9 +276,9 @@ def test_a_kill_between_any_two_writes_leaves_nothing_for_ever(
 ) -> None:
     anna, robot = pair
     service = cloud.functions.uploads
-    row = cloud.run(cloud.functions.tables.get(store.AGENTS, robot.id, "agent"))
+    row = cloud.run(cloud.functions.tables.get(records.AGENTS, robot.id, "agent"))
     assert row is not None
-    (device,) = devices_of(store.read(row, Agent))
+    (device,) = devices_of(records.read(row, Agent))
     wanted = uploads.Announced(stream="camera", length=1, content_type="image/png")
     for number in range(4):
         begun = begin(anna, robot)

@@ -2,9 +2,9 @@
 
 import time
 
-from device_agent.protocol.messages import AckStatus
-from tests.support.cloud import Person
-from tests.support.robot import Robot
+from device_agent.protocol import AckStatus
+from tests.fakes.agent import Robot
+from tests.harness.cloud.cloud import Person
 
 ENDLESS_MS = 30_000
 

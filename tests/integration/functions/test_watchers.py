@@ -6,9 +6,10 @@ from typing import Any
 
 import pytest
 
-from function_app.services import store, watchers
-from tests.support.cloud import Cloud, MovingClock, Person, problem, settings
-from tests.support.robot import Robot
+from function_app.services.devices import viewers
+from function_app.services.storage import records
+from tests.fakes.agent import Robot
+from tests.harness.cloud.cloud import Cloud, MovingClock, Person, problem, settings
 
 
 @pytest.fixture
@@ -42,7 +43,7 @@ def looks(person: Person, robot: Robot) -> list[tuple[str, str, bool]]:
 
 
 def rows(cloud: Cloud, robot: Robot) -> int:
-    return len(cloud.run(cloud.functions.tables.query(store.WATCHERS, robot.device, limit=1000)).rows)
+    return len(cloud.run(cloud.functions.tables.query(records.WATCHERS, robot.device, limit=1000)).rows)
 
 
 class TestWatching:
@@ -100,7 +101,7 @@ class TestWatching:
     def test_rows_stay_few_and_are_forgotten(
         self, alone: Cloud, clock: MovingClock, monkeypatch: pytest.MonkeyPatch
     ) -> None:
-        monkeypatch.setattr(watchers, "MOST", 3)
+        monkeypatch.setattr(viewers, "MOST", 3)
         people = [alone.sign_in("anna") for _ in range(5)]
         robot = claimed(alone, people[0])
         told = [len(looks(person, robot)) for person in people]
@@ -117,7 +118,7 @@ class TestWatching:
         robot = claimed(alone, anna)
 
         def etag() -> Any:
-            return alone.run(alone.functions.tables.get(store.WATCHERS, robot.device, anna.session))
+            return alone.run(alone.functions.tables.get(records.WATCHERS, robot.device, anna.session))
 
         looks(anna, robot)
         first = etag()

@@ -1,6 +1,6 @@
 """Event Grid as the broker: its webhook as it is asked, and what taking rights back does to connections.
 
-The namespace is a fake (``tests/support/event_grid.py``); connections to it, and the functions' own, are real.
+The namespace is a fake (``tests/fakes/event_grid.py``); connections to it, and the functions' own, are real.
 """
 
 import base64
@@ -11,18 +11,18 @@ from typing import Any, NamedTuple
 
 import pytest
 
-from device_agent.protocol import grants, signing
-from device_agent.protocol.grants import Grant, agent_grant
+from device_agent.protocol.security import grants, signing
+from device_agent.protocol.security.grants import Grant, agent_grant
 from function_app.adapters.azure import topic_spaces
-from function_app.adapters.azure.session_taker import SessionTaker
-from function_app.adapters.broker_rights import SETTLE_S
-from function_app.domain.ids import new_id
-from function_app.entrypoints.admission import admit
+from function_app.adapters.azure.session_takeover import SessionTaker
+from function_app.adapters.shared.grant_registry import SETTLE_S
+from function_app.domain.common.ids import new_id
+from function_app.entrypoints.broker_auth.event_grid import admit
 from function_app.ports.broker_access import BrokerAccessError, Credentials
 from function_app.ports.tables import StoreError
-from tests.support.brokers import HOST, PATIENCE_S, Client, RunningBroker
-from tests.support.cloud import Cloud
-from tests.support.event_grid import CALLER, EventGrid, event_grid_cloud
+from tests.fakes.event_grid import CALLER, EventGrid, event_grid_cloud
+from tests.harness.cloud.cloud import Cloud
+from tests.harness.network.brokers import HOST, PATIENCE_S, Client, RunningBroker
 
 _numbers = iter(range(1_000))
 

@@ -16,14 +16,14 @@ from urllib.parse import urlsplit
 
 import pytest
 
-from device_agent.protocol import grants, signing
-from device_agent.protocol.grants import Grant
+from device_agent.protocol.security import grants, signing
+from device_agent.protocol.security.grants import Grant
 from function_app.adapters.aws.broker_access import IotBrokerAccess
-from function_app.domain.ids import new_id
-from function_app.entrypoints.authoriser import authorise
+from function_app.domain.common.ids import new_id
+from function_app.entrypoints.broker_auth.iot_core import authorise
 from function_app.settings import IotBus
-from tests.support.aws import HOST, REGION, use_credentials
-from tests.support.cloud import Cloud, settings
+from tests.harness.cloud.cloud import Cloud, settings
+from tests.harness.stores.aws import HOST, REGION, use_credentials
 
 ARN = "arn:aws:lambda:eu-west-1:123456789012:function:telescope"
 POLICY = "telescope-agents"

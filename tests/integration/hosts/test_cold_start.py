@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.support.hosts.host import ROOT
+from tests.harness.hosts.host import ROOT
 
 LIMIT = 600 / 330
 """Of the time that importing FastAPI takes."""
@@ -41,7 +41,7 @@ def importing_s(code: str, byte_code: Path) -> float:
         ("import function_app.entrypoints.http, function_app.bootstrap", NOTHING),
         # Azure's worker has the binding classes before it looks for functions.
         ("import function_app; function_app.app", "import azure.functions"),
-        ("import function_app.entrypoints.aws", NOTHING),
+        ("import function_app.entrypoints.hosts.aws", NOTHING),
     ],
     ids=["application", "azure", "lambda"],
 )
@@ -63,7 +63,7 @@ def test_the_cold_import_stays_near_fastapis_own(code: str, there: str, byte_cod
 def test_no_entry_loads_what_only_some_stores_or_other_programs_need() -> None:
     heavy = ("boto3", "botocore", "azure.data", "azure.storage", "azure.identity", "numpy", "jsonschema", "uvicorn")
     code = (
-        "import sys, function_app.bootstrap, function_app.entrypoints.aws; import function_app; function_app.app\n"
+        "import sys, function_app.bootstrap, function_app.entrypoints.hosts.aws; import function_app; function_app.app\n"
         f"found = [name for name in {heavy} if name in sys.modules]\n"
         "sys.exit(', '.join(found) or 0)"
     )

@@ -7,16 +7,16 @@ from pathlib import Path
 
 import pytest
 
-from device_agent.protocol import codec, topics
-from device_agent.protocol.messages import AckStatus, Presence
-from function_app.adapters.local import command_bus, mqtt_link
+from device_agent.protocol import AckStatus, Presence, codec, topics
+from function_app.adapters.local import command_bus
 from function_app.adapters.local.command_bus import MqttCommandBus
-from function_app.adapters.local.keys import FileKeys
-from tests.support.brokers import PATIENCE_S, Client, RunningBroker, start_broker
-from tests.support.cloud import MOVE
-from tests.support.hosts.aws import start_lambda
-from tests.support.hosts.reached import Reached
-from tests.support.proxy import Proxy, start_proxy
+from function_app.adapters.local.signing_keys import FileKeys
+from function_app.adapters.mqtt import connection
+from tests.harness.cloud.cloud import MOVE
+from tests.harness.hosts.aws import start_lambda
+from tests.harness.hosts.reached import Reached
+from tests.harness.network.brokers import PATIENCE_S, Client, RunningBroker, start_broker
+from tests.harness.network.proxy import Proxy, start_proxy
 
 TOPIC = "ts/v1/space/agent/arm/cmd"
 
@@ -46,7 +46,7 @@ class Frozen:
     def __init__(self, broker: RunningBroker, proxy: Proxy) -> None:
         self.loop = asyncio.new_event_loop()
         self.bus = MqttCommandBus(
-            mqtt_link.Broker(host="127.0.0.1", port=proxy.port, credentials=broker.access.service_credentials)
+            connection.Broker(host="127.0.0.1", port=proxy.port, credentials=broker.access.service_credentials)
         )
 
     def publish(self, text: str, qos: int = 1) -> None:
@@ -55,8 +55,8 @@ class Frozen:
 
 @pytest.fixture
 def frozen(broker: RunningBroker, proxy: Proxy, monkeypatch: pytest.MonkeyPatch) -> Iterator[Frozen]:
-    monkeypatch.setattr(mqtt_link, "FROST_S", 0.2)
-    for place, name in ((mqtt_link, "READY_TIMEOUT_S"), (mqtt_link, "CONFIRM_TIMEOUT_S"), (command_bus, "_READY_S")):
+    monkeypatch.setattr(connection, "FROST_S", 0.2)
+    for place, name in ((connection, "READY_TIMEOUT_S"), (connection, "CONFIRM_TIMEOUT_S"), (command_bus, "_READY_S")):
         monkeypatch.setattr(place, name, PATIENCE_S)
     found = Frozen(broker, proxy)
     yield found
@@ -77,7 +77,7 @@ def test_a_message_reaches_the_device_though_the_connection_died_in_the_frost(
     time.sleep(0.3)
     frozen.publish("after", qos)
     assert robot.receive().payload == b"after"
-    monkeypatch.setattr(mqtt_link, "FROST_S", PATIENCE_S)
+    monkeypatch.setattr(connection, "FROST_S", PATIENCE_S)
     frozen.publish("and again")
     assert robot.receive().payload == b"and again"
     assert proxy.accepted == known + 1
@@ -86,7 +86,7 @@ def test_a_message_reaches_the_device_though_the_connection_died_in_the_frost(
 def test_a_connection_that_lived_through_the_frost_is_used_on(
     frozen: Frozen, proxy: Proxy, robot: Client, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(mqtt_link, "PROOF_TIMEOUT_S", PATIENCE_S)
+    monkeypatch.setattr(connection, "PROOF_TIMEOUT_S", PATIENCE_S)
     frozen.publish("0")
     known = proxy.accepted
     for number in (1, 2):
@@ -100,8 +100,8 @@ def test_a_connection_that_lived_through_the_frost_is_used_on(
 def test_what_the_broker_must_have_given_up_is_not_tried_first(
     frozen: Frozen, proxy: Proxy, robot: Client, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(mqtt_link, "DEAD_S", 0.25)
-    monkeypatch.setattr(mqtt_link, "PROOF_TIMEOUT_S", PATIENCE_S)
+    monkeypatch.setattr(connection, "DEAD_S", 0.25)
+    monkeypatch.setattr(connection, "PROOF_TIMEOUT_S", PATIENCE_S)
     frozen.publish("before")
     known = proxy.accepted
     proxy.swallow()
@@ -113,12 +113,12 @@ def test_what_the_broker_must_have_given_up_is_not_tried_first(
 
 def test_health_tells_of_a_connection_that_works(frozen: Frozen, proxy: Proxy, monkeypatch: pytest.MonkeyPatch) -> None:
     assert frozen.loop.run_until_complete(frozen.bus.status()) == "ok"
-    monkeypatch.setattr(mqtt_link, "DEAD_S", 0.25)
+    monkeypatch.setattr(connection, "DEAD_S", 0.25)
     proxy.swallow()
     time.sleep(0.3)
     assert "given up" in frozen.loop.run_until_complete(frozen.bus.status())
     frozen.loop.run_until_complete(frozen.bus.start())
-    monkeypatch.setattr(mqtt_link, "DEAD_S", PATIENCE_S)
+    monkeypatch.setattr(connection, "DEAD_S", PATIENCE_S)
     assert frozen.loop.run_until_complete(frozen.bus.status()) == "ok"
 
 

@@ -7,16 +7,15 @@ from pathlib import Path
 import httpx
 import pytest
 
-from device_agent.protocol import codec, topics
-from device_agent.protocol.messages import AckStatus, MoveJoints, Presence
-from function_app.entrypoints.http.answers import MAX_BODY
-from function_app.entrypoints.http.caller import CSRF_HEADER
-from tests.support.brokers import wait_until
-from tests.support.cloud import API, MOVE, problem
-from tests.support.hosts import HOSTS, HostFailed, HostKind, start_host
-from tests.support.hosts.host import PATIENCE_S
-from tests.support.hosts.reached import Reached
-from tests.support.polling import PollingRobot
+from device_agent.protocol import AckStatus, MoveJoints, Presence, codec, topics
+from function_app.entrypoints.http.framework.authentication import CSRF_HEADER
+from function_app.entrypoints.http.framework.responses import MAX_BODY
+from tests.harness.cloud.cloud import API, MOVE, problem
+from tests.harness.cloud.polling import PollingRobot
+from tests.harness.hosts import HOSTS, HostFailed, HostKind, start_host
+from tests.harness.hosts.host import PATIENCE_S
+from tests.harness.hosts.reached import Reached
+from tests.harness.network.brokers import wait_until
 
 
 @pytest.fixture(scope="module", params=HOSTS)

@@ -9,11 +9,11 @@ from pathlib import Path
 import httpx
 import pytest
 
-from tests.support.brokers import wait_until
-from tests.support.cloud import API
-from tests.support.hosts import HostFailed
-from tests.support.hosts.aws import Lambda, start_lambda
-from tests.support.hosts.host import PATIENCE_S
+from tests.harness.cloud.cloud import API
+from tests.harness.hosts import HostFailed
+from tests.harness.hosts.aws import Lambda, start_lambda
+from tests.harness.hosts.host import PATIENCE_S
+from tests.harness.network.brokers import wait_until
 
 
 @pytest.fixture(scope="module")

@@ -9,15 +9,16 @@ from pathlib import Path
 import httpx
 import pytest
 
-from function_app import choices, settings
+from function_app import settings
+from function_app.adapters import factory
 from infra.aws.__main__ import SERVICES
 from infra.aws.__main__ import main as package_for_aws
-from tests.support.aws import REGION, start_moto, use_credentials
-from tests.support.azure import start_azurite
-from tests.support.cloud import API
-from tests.support.hosts.aws import start_lambda
-from tests.support.hosts.azure import start_azure
-from tests.support.hosts.host import PATIENCE_S, ROOT
+from tests.harness.cloud.cloud import API
+from tests.harness.hosts.aws import start_lambda
+from tests.harness.hosts.azure import start_azure
+from tests.harness.hosts.host import PATIENCE_S, ROOT
+from tests.harness.stores.aws import REGION, start_moto, use_credentials
+from tests.harness.stores.azure import start_azurite
 
 MAX_BYTES = 60_000_000
 NEVER = ("numpy", "pandas", "mujoco", "scipy", "uvicorn")
@@ -88,7 +89,7 @@ def test_the_package_for_aws_answers_and_reaches_its_store(for_aws: Path, moto: 
         "AWS_ACCESS_KEY_ID": "testing",
         "AWS_SECRET_ACCESS_KEY": "testing",
     }
-    asyncio.run(choices.prepare(settings.read(environment)))
+    asyncio.run(factory.prepare(settings.read(environment)))
     with start_lambda(environment, package=for_aws) as host:
         assert httpx.get(f"{host.url}{API}/health", timeout=PATIENCE_S).json()["tables"] == "ok"
         host.tick()

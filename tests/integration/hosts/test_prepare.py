@@ -7,8 +7,8 @@ from pathlib import Path
 
 import pytest
 
-from tests.support.aws import REGION, reset, start_moto, use_credentials
-from tests.support.hosts.host import PATIENCE_S, ROOT
+from tests.harness.hosts.host import PATIENCE_S, ROOT
+from tests.harness.stores.aws import REGION, reset, start_moto, use_credentials
 
 
 def test_without_its_table_a_program_ends_with_one_line_and_prepare_makes_it(

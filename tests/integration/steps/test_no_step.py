@@ -18,10 +18,10 @@ from typing import Any
 import pytest
 
 from device_agent.protocol import topics
-from tests.support.brokers import BROKERS, HOST, TRANSPORTS, BrokerKind, Client, Transport, wait_until
-from tests.support.ground import Ground, Link, shared_grounds
-from tests.support.proxy import Proxy, start_proxy
-from tests.support.xmpp import start_xmpp_ground
+from tests.harness.cloud.cloud_processes import Ground, Link, shared_grounds
+from tests.harness.network.brokers import BROKERS, HOST, TRANSPORTS, BrokerKind, Client, Transport, wait_until
+from tests.harness.network.proxy import Proxy, start_proxy
+from tests.harness.network.xmpp import start_xmpp_ground
 
 PAIRS = 40
 APART_S = 0.003

@@ -4,11 +4,11 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from function_app.adapters.local.keys import FileKeys
+from function_app.adapters.local.signing_keys import FileKeys
 from function_app.settings import Settings
-from tests.support.brokers import BrokerKind, RunningBroker, start_broker
-from tests.support.cloud import Cloud, Person, settings
-from tests.support.xmpp import XmppRobot, XmppSite, open_site
+from tests.harness.cloud.cloud import Cloud, Person, settings
+from tests.harness.network.brokers import BrokerKind, RunningBroker, start_broker
+from tests.harness.network.xmpp import XmppRobot, XmppSite, open_site
 
 if TYPE_CHECKING:
     from pathlib import Path

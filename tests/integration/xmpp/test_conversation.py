@@ -2,8 +2,7 @@
 
 import time
 
-from device_agent.protocol import codec, topics
-from device_agent.protocol.messages import (
+from device_agent.protocol import (
     AckStatus,
     CancelAction,
     GrantLease,
@@ -16,11 +15,13 @@ from device_agent.protocol.messages import (
     State,
     Stop,
     StopDevice,
+    codec,
+    topics,
 )
-from function_app.services import store
-from tests.support.brokers import RunningBroker, wait_until
-from tests.support.cloud import Person, problem
-from tests.support.xmpp import XmppRobot, XmppSite
+from function_app.services.storage import records
+from tests.harness.cloud.cloud import Person, problem
+from tests.harness.network.brokers import RunningBroker, wait_until
+from tests.harness.network.xmpp import XmppRobot, XmppSite
 
 ODD = 'grüß 🤖 " \\ \n <&> \uffff'
 
@@ -52,7 +53,7 @@ def test_a_cancel_reaches_it_and_a_mailbox_is_empty_in_the_end(site: XmppSite, a
     assert anna.action(action["id"], wait_ms=10_000, wait_for="done")["status"] == "cancelled"
 
     def letters() -> list[str]:
-        page = site.cloud.run(site.cloud.functions.tables.query(store.MAILBOX, robot.id, limit=1000))
+        page = site.cloud.run(site.cloud.functions.tables.query(records.MAILBOX, robot.id, limit=1000))
         return [row.key for row in page.rows if not row.key.startswith("ack:")]
 
     wait_until(lambda: letters() == [], "an empty mailbox")

@@ -1,9 +1,9 @@
 """Whoever is killed and comes back: nothing runs twice, and nothing that was promised is lost."""
 
-from device_agent.protocol.messages import AckStatus, MoveJoints, StopDevice
-from tests.support.brokers import wait_until
-from tests.support.cloud import Person
-from tests.support.xmpp import XmppRobot, XmppSite, start_prosody
+from device_agent.protocol import AckStatus, MoveJoints, StopDevice
+from tests.harness.cloud.cloud import Person
+from tests.harness.network.brokers import wait_until
+from tests.harness.network.xmpp import XmppRobot, XmppSite, start_prosody
 
 
 def test_of_two_who_speak_one_may_go_and_no_agent_is_served_twice(

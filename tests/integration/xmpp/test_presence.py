@@ -3,11 +3,11 @@
 import time
 from typing import Any
 
-from device_agent.protocol import codec, stanzas, topics
-from device_agent.protocol.messages import Mode, Presence, State
-from tests.support.brokers import RunningBroker, wait_until
-from tests.support.cloud import Person
-from tests.support.xmpp import XmppRobot, XmppSite
+from device_agent.protocol import Mode, Presence, State, codec, topics
+from device_agent.protocol.xmpp import stanzas
+from tests.harness.cloud.cloud import Person
+from tests.harness.network.brokers import RunningBroker, wait_until
+from tests.harness.network.xmpp import XmppRobot, XmppSite
 
 
 def online(anna: Person, robot: XmppRobot) -> bool:

@@ -8,12 +8,12 @@ from xml.sax.saxutils import quoteattr
 
 import pytest
 
-from device_agent.protocol import codec, jids, stanzas, topics
-from device_agent.protocol.messages import Presence
-from function_app.services.xmpp_access import AGENT_S
-from tests.support.brokers import wait_until
-from tests.support.cloud import Person
-from tests.support.xmpp import DOMAIN, XmppClient, XmppRobot, XmppSite
+from device_agent.protocol import Presence, codec, topics
+from device_agent.protocol.xmpp import jids, stanzas
+from function_app.services.messaging.xmpp_credentials import AGENT_S
+from tests.harness.cloud.cloud import Person
+from tests.harness.network.brokers import wait_until
+from tests.harness.network.xmpp import DOMAIN, XmppClient, XmppRobot, XmppSite
 
 QUIET_S = 0.3
 

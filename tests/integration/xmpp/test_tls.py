@@ -13,10 +13,10 @@ from cryptography.hazmat.primitives import hashes, serialization
 from cryptography.hazmat.primitives.asymmetric import ec
 from cryptography.x509.oid import NameOID
 
-from device_agent.protocol import xmpp_stream
-from device_agent.protocol.xmpp_stream import Login, Stream, StreamError
-from tests.support.brokers import HOST
-from tests.support.xmpp import DOMAIN, Prosody, start_prosody
+from device_agent.protocol.xmpp import stream as xmpp_stream
+from device_agent.protocol.xmpp.stream import Login, Stream, StreamError
+from tests.harness.network.brokers import HOST
+from tests.harness.network.xmpp import DOMAIN, Prosody, start_prosody
 
 NOWHERE = "http://127.0.0.1:9/verify"
 

@@ -7,8 +7,8 @@ from contextlib import closing, contextmanager
 
 import pytest
 
-from tests.support.brokers import HOST
-from tests.support.delay import RTO_MIN_S, start_delay
+from tests.harness.network.brokers import HOST
+from tests.harness.network.delay import RTO_MIN_S, start_delay
 
 RTT_S = 0.04
 

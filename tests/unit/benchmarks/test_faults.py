@@ -7,7 +7,7 @@ from benchmarks.faults.orders import STEP_RAD, Order, doubled, lost, went_back
 from benchmarks.faults.rounds import Found
 from benchmarks.faults.stops import CALL, MESSAGE, SPEEDS, Stopped, judged
 from benchmarks.suites.faults import claims, faults_table, stops_table
-from tests.support.brokers import wait_until
+from tests.harness.network.brokers import wait_until
 
 
 def order(number: int, status: str, action: str = "a") -> Order:

@@ -8,8 +8,7 @@ from benchmarks.peers import operators
 from benchmarks.peers.arm import HOME_RAD, NAMES, setpoint
 from benchmarks.peers.robots import from_ros, to_ros
 from benchmarks.peers.safety import COLUMNS, table
-from device_agent.protocol import codec
-from device_agent.protocol.messages import JointTarget, JointTelemetry, Mode, Setpoint
+from device_agent.protocol import JointTarget, JointTelemetry, Mode, Setpoint, codec
 
 
 def test_a_setpoint_asks_for_where_the_arm_is() -> None:

@@ -14,8 +14,7 @@ from benchmarks.scale.fleet import SENT, Told, telemetry
 from benchmarks.scale.functions import Load
 from benchmarks.scale.processes import family, processor_s, resident_mb
 from benchmarks.scale.robots import Crew, ceilings
-from device_agent.protocol import codec
-from device_agent.protocol.messages import JointTelemetry
+from device_agent.protocol import JointTelemetry, codec
 
 
 def test_packets_are_taken_when_they_are_whole_and_no_sooner() -> None:

@@ -3,7 +3,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.support.cloud import Cloud, settings
+from tests.harness.cloud.cloud import Cloud, settings
 
 
 @pytest.fixture(scope="module")

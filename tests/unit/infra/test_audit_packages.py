@@ -10,7 +10,7 @@ from typing import Any
 
 import pytest
 
-from tests.support.brokers import ROOT
+from tests.harness.network.brokers import ROOT
 
 Answer = Callable[[list[Any]], bytes]
 

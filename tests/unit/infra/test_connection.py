@@ -9,17 +9,17 @@ from pathlib import Path
 
 import pytest
 
-from device_agent.protocol import grants, signing
-from device_agent.protocol.grants import Grant
+from device_agent.protocol.security import grants, signing
+from device_agent.protocol.security.grants import Grant
 from function_app.ports.broker_access import Credentials
-from infra.amqtt.broker import TCP, WEBSOCKET, TelescopeBroker
-from infra.amqtt.connection import Connection
-from infra.amqtt.keys import KeyRing
-from infra.amqtt.limits import Limits
-from infra.amqtt.links import TcpLink, WebSocketLink
-from infra.amqtt.revocations import Revocations
-from tests.support import wire
-from tests.support.wire import Wire
+from infra.embedded_broker.broker import TCP, WEBSOCKET, TelescopeBroker
+from infra.embedded_broker.connection import Connection
+from infra.embedded_broker.limits import Limits
+from infra.embedded_broker.listeners import TcpLink, WebSocketLink
+from infra.embedded_broker.public_keys import KeyRing
+from infra.embedded_broker.revocations import Revocations
+from tests.harness.network import raw_mqtt
+from tests.harness.network.raw_mqtt import Wire
 
 TOPIC = "ts/v1/s/a/conn"
 Attached = tuple["Link", Connection]
@@ -71,9 +71,9 @@ class Bench:
     def client(self, client_id: str, *subscriptions: str, qos: int = 1) -> Attached:
         link = Link()
         connection = self.broker._connected(link)
-        connection.received(wire.connect_packet(client_id, self.credentials(client_id)))
+        connection.received(raw_mqtt.connect_packet(client_id, self.credentials(client_id)))
         if subscriptions:
-            connection.received(wire.subscribe_packet(*subscriptions, qos=qos))
+            connection.received(raw_mqtt.subscribe_packet(*subscriptions, qos=qos))
         link.written.clear()
         return link, connection
 
@@ -104,7 +104,7 @@ def test_qos_1_waits_for_a_client_that_acknowledges_late_and_keeps_its_order(tmp
             bench.broker.publish(TOPIC, b"%d" % number, qos=1, retain=False, owner="x")
         assert len(link.written) == 2
         for packet_id in range(1, 4):
-            slow.received(wire.packet(4, packet_id.to_bytes(2)))
+            slow.received(raw_mqtt.packet(4, packet_id.to_bytes(2)))
         assert [packet[-1:] for packet in link.written] == [b"0", b"1", b"2", b"3", b"4"]
 
     with_bench(tmp_path, use, inflight=2)
@@ -143,7 +143,7 @@ def test_retained_messages_wait_for_a_congested_client(tmp_path: Path) -> None:
         bench.broker.publish(TOPIC, b"state", qos=1, retain=True, owner="x")
         link, slow = bench.client("slow")
         link.congested = True
-        slow.received(wire.subscribe_packet(TOPIC))
+        slow.received(raw_mqtt.subscribe_packet(TOPIC))
         assert len(link.written) == 1, "the SUBACK only"
         link.congested = False
         slow.drained()
@@ -156,7 +156,7 @@ def test_a_client_that_asks_and_never_reads_is_cut_off(tmp_path: Path) -> None:
     def use(bench: Bench) -> None:
         link, rude = bench.client("rude")
         link.unsent = 101
-        rude.received(wire.PINGREQ)
+        rude.received(raw_mqtt.PINGREQ)
         assert link.gone
 
     with_bench(tmp_path, use, unsent_bytes=100)
@@ -165,13 +165,13 @@ def test_a_client_that_asks_and_never_reads_is_cut_off(tmp_path: Path) -> None:
 def test_filters_are_bounded_in_one_subscribe_and_for_one_client(tmp_path: Path) -> None:
     def use(bench: Bench) -> None:
         link, greedy = bench.client("greedy")
-        greedy.received(wire.subscribe_packet(*(f"ts/{number}" for number in range(8))))
-        greedy.received(wire.subscribe_packet(*(f"ts/{number}" for number in range(6, 12))))
+        greedy.received(raw_mqtt.subscribe_packet(*(f"ts/{number}" for number in range(8))))
+        greedy.received(raw_mqtt.subscribe_packet(*(f"ts/{number}" for number in range(6, 12))))
         assert link.written == [
-            wire.packet(wire.SUBACK, b"\0\1" + bytes(8)),
-            wire.packet(wire.SUBACK, b"\0\1" + bytes(4) + b"\x80\x80"),
+            raw_mqtt.packet(raw_mqtt.SUBACK, b"\0\1" + bytes(8)),
+            raw_mqtt.packet(raw_mqtt.SUBACK, b"\0\1" + bytes(4) + b"\x80\x80"),
         ]
-        greedy.received(wire.subscribe_packet(*(f"ts/{number}" for number in range(9))))
+        greedy.received(raw_mqtt.subscribe_packet(*(f"ts/{number}" for number in range(9))))
         assert link.gone
 
     with_bench(tmp_path, use, filters_per_subscribe=8, filters_per_client=10)
@@ -182,7 +182,7 @@ def test_more_retained_topics_than_a_clients_share_end_its_connection(tmp_path: 
         link, greedy = bench.client("greedy")
         for number in range(3):
             assert not link.gone
-            greedy.received(wire.publish_packet(f"ts/{number}", b"x", retain=True))
+            greedy.received(raw_mqtt.publish_packet(f"ts/{number}", b"x", retain=True))
         assert link.gone
 
     with_bench(tmp_path, use, retained_per_client=2)
@@ -208,7 +208,7 @@ def test_a_client_may_be_silent_for_one_and_a_half_times_its_keep_alive(tmp_path
         client.tick(1_000.0, time.time())
         client.tick(1_089.0, time.time())
         assert not link.gone
-        client.received(wire.PINGREQ)
+        client.received(raw_mqtt.PINGREQ)
         client.tick(1_091.0, time.time())
         assert not link.gone
         client.tick(1_182.0, time.time())

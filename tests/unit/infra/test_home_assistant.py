@@ -8,12 +8,12 @@ from typing import Any
 
 import pytest
 
-from device_agent.protocol import codec, frames, room, topics
-from device_agent.protocol.frames import CameraFrame
-from device_agent.protocol.messages import Control, Description, Measurements, Presence
+from device_agent.protocol import Control, Description, Measurements, Presence, camera_frames, codec, topics
+from device_agent.protocol.camera_frames import CameraFrame
+from device_agent.protocol.manifests import room
 from infra.home_assistant import discovery
 from infra.home_assistant.bridge import Bridge
-from tests.support.brokers import ROOT
+from tests.harness.network.brokers import ROOT
 
 OWN: dict[str, Any] = json.loads((Path(__file__).parent / "home_assistant.json").read_text())
 LAB = room.load(Path(ROOT) / "robots" / "rooms" / "lab")
@@ -123,7 +123,7 @@ def test_measurements_and_pictures_are_carried_as_they_are(both: Both) -> None:
     measured = Measurements(tick_ms=1, at_ms=1, sequence=1, values={"temperature_c": 20.5})
     both.hear("thermometer", topics.TELE, measured, "temperature")
     assert both.said[-1] == ("telescope/a-thermometer/tele/temperature", codec.encode(measured), False)
-    both.hear("camera", topics.CAM, frames.encode(CameraFrame(1, 1, 4, 3, b"JPEG")), "colour")
+    both.hear("camera", topics.CAM, camera_frames.encode(CameraFrame(1, 1, 4, 3, b"JPEG")), "colour")
     assert both.said[-1] == ("telescope/a-camera/cam/colour", b"JPEG", False)
 
 

@@ -4,10 +4,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from infra.amqtt import packets
-from infra.amqtt.limits import Limits
-from infra.amqtt.packets import Frame, Framer, MalformedPacket, UnacceptableProtocol
-from tests.support import wire
+from infra.embedded_broker import packets
+from infra.embedded_broker.limits import Limits
+from infra.embedded_broker.packets import Frame, Framer, MalformedPacket, UnacceptableProtocol
+from tests.harness.network import raw_mqtt
 
 LIMITS = Limits()
 READERS = (
@@ -74,26 +74,26 @@ def test_the_largest_publish_passes() -> None:
 
 def test_before_it_is_opened_up_nothing_but_a_connect_passes() -> None:
     with pytest.raises(MalformedPacket, match="no place"):
-        list(Framer(LIMITS).feed(wire.PINGREQ))
+        list(Framer(LIMITS).feed(raw_mqtt.PINGREQ))
     with pytest.raises(MalformedPacket, match="no place"):
-        list(framer().feed(wire.connect_packet("x")))
+        list(framer().feed(raw_mqtt.connect_packet("x")))
 
 
 def test_a_length_inside_a_packet_cannot_reach_into_the_next() -> None:
-    lying = wire.packet(3, b"\x00\x10ts")
-    frames = framer().feed(lying + wire.publish_packet("secret/topic", b"x"))
+    lying = raw_mqtt.packet(3, b"\x00\x10ts")
+    frames = framer().feed(lying + raw_mqtt.publish_packet("secret/topic", b"x"))
     with pytest.raises(MalformedPacket, match="ends inside"):
         packets.read_publish(next(frames))
 
 
 @pytest.mark.parametrize("flags", [0b1, 0b1000, 0b10000, 0b11100, 0b11110100, 0b01000000])
 def test_a_connect_whose_flags_do_not_fit_is_malformed(flags: int) -> None:
-    body = wire.text("MQTT") + bytes([4, flags]) + b"\0\0" + wire.text("id")
+    body = raw_mqtt.text("MQTT") + bytes([4, flags]) + b"\0\0" + raw_mqtt.text("id")
     with pytest.raises(MalformedPacket):
         packets.read_connect(body)
 
 
 def test_a_connect_with_more_behind_it_is_malformed() -> None:
-    (frame,) = Framer(LIMITS).feed(wire.packet(1, wire.connect_packet("x")[2:] + b"more"))
+    (frame,) = Framer(LIMITS).feed(raw_mqtt.packet(1, raw_mqtt.connect_packet("x")[2:] + b"more"))
     with pytest.raises(MalformedPacket, match="add up"):
         packets.read_connect(frame.body)

@@ -4,10 +4,10 @@ from pathlib import Path
 import msgspec
 import pytest
 
-from device_agent.protocol.control import Revoke
-from device_agent.protocol.grants import Grant
-from infra.amqtt import revocations as module
-from infra.amqtt.revocations import Revocations, RevocationsError
+from device_agent.protocol.security.grants import Grant
+from device_agent.protocol.security.revocation import Revoke
+from infra.embedded_broker import revocations as module
+from infra.embedded_broker.revocations import Revocations, RevocationsError
 
 GRANT = Grant(principal="p", client_id="c", publish=(), subscribe=(), token_id="t", expires_at=0)
 

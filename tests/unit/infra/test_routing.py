@@ -1,6 +1,6 @@
 import pytest
 
-from infra.amqtt.routing import Kept, Retained, Subscriptions, valid_filter, valid_topic
+from infra.embedded_broker.routing import Kept, Retained, Subscriptions, valid_filter, valid_topic
 
 
 def test_hearers_are_those_whose_filters_cover_the_topic_once_with_their_highest_qos() -> None:

@@ -13,17 +13,17 @@ from cryptography.hazmat.primitives import hashes
 from cryptography.hazmat.primitives.asymmetric import ec
 from cryptography.hazmat.primitives.serialization import load_pem_private_key
 
-from infra.tls import authority
-from infra.tls.authority import TlsError
-from tests.support.brokers import ROOT
+from infra.tls import server_ca
+from infra.tls.server_ca import TlsError
+from tests.harness.network.brokers import ROOT
 
 NOW = dt.datetime.now(dt.UTC)
-SITE = authority.names(("site.example",), ("192.0.2.1",))
+SITE = server_ca.names(("site.example",), ("192.0.2.1",))
 
 
 @pytest.fixture
 def home(tmp_path: Path) -> Path:
-    authority.make(tmp_path / "tls", SITE, now=NOW)
+    server_ca.make(tmp_path / "tls", SITE, now=NOW)
     return tmp_path / "tls"
 
 
@@ -63,7 +63,7 @@ def test_keys_are_their_owners_alone(home: Path) -> None:
 
 def test_the_authority_can_pretend_to_be_nobody_else(home: Path) -> None:
     """With its key in hand a certificate for another name can be signed; nobody takes it."""
-    ca = authority.load(home / "ca.crt")
+    ca = server_ca.load(home / "ca.crt")
     signer = load_pem_private_key((home / "ca.key").read_bytes(), None)
     assert isinstance(signer, ec.EllipticCurvePrivateKey)
     for name in (x509.DNSName("bank.example"), x509.IPAddress(ipaddress.ip_address("192.0.2.7"))):
@@ -79,60 +79,60 @@ def test_the_authority_can_pretend_to_be_nobody_else(home: Path) -> None:
             .add_extension(x509.SubjectAlternativeName([name]), critical=True)
             .sign(signer, hashes.SHA256())
         )
-        (home / "forged.crt").write_bytes(authority.pem(forged) + authority.pem(ca))
-        (home / "forged.key").write_bytes(authority.key_pem(key))
+        (home / "forged.crt").write_bytes(server_ca.pem(forged) + server_ca.pem(ca))
+        (home / "forged.key").write_bytes(server_ca.key_pem(key))
         assert not accepted(home / "ca.crt", home / "forged.crt", home / "forged.key", str(name.value))
 
 
 def test_a_renewed_certificate_is_another_for_the_same_names_by_the_same_authority(home: Path) -> None:
-    before = authority.load(home / "server.crt")
+    before = server_ca.load(home / "server.crt")
     ca = (home / "ca.crt").read_bytes()
-    authority.renew(home, now=NOW + dt.timedelta(days=300))
-    after = authority.load(home / "server.crt")
+    server_ca.renew(home, now=NOW + dt.timedelta(days=300))
+    after = server_ca.load(home / "server.crt")
     assert after.not_valid_after_utc > before.not_valid_after_utc
     assert (home / "ca.crt").read_bytes() == ca
     assert accepted(home / "ca.crt", home / "server.crt", home / "server.key", "site.example") is False, "not yet valid"
-    authority.renew(home, now=NOW)
+    server_ca.renew(home, now=NOW)
     assert accepted(home / "ca.crt", home / "server.crt", home / "server.key", "site.example")
 
 
 def test_its_end_is_told_in_time(home: Path) -> None:
-    assert "soon" not in authority.describe(home, now=NOW)
-    late = NOW + dt.timedelta(days=authority.SERVER_DAYS - authority.RENEW_DAYS)
-    assert "ends soon, renew it" in authority.describe(home, now=late)
+    assert "soon" not in server_ca.describe(home, now=NOW)
+    late = NOW + dt.timedelta(days=server_ca.SERVER_DAYS - server_ca.RENEW_DAYS)
+    assert "ends soon, renew it" in server_ca.describe(home, now=late)
     with pytest.raises(TlsError, match="ended on"):
-        authority.describe(home, now=NOW + dt.timedelta(days=authority.SERVER_DAYS))
+        server_ca.describe(home, now=NOW + dt.timedelta(days=server_ca.SERVER_DAYS))
 
 
 def test_no_authority_is_made_over_another(home: Path) -> None:
     with pytest.raises(TlsError, match="renew with --renew"):
-        authority.make(home, SITE, now=NOW)
+        server_ca.make(home, SITE, now=NOW)
 
 
 def test_certificates_from_elsewhere_are_looked_at_before_they_are_taken(home: Path, tmp_path: Path) -> None:
     other = tmp_path / "other"
-    authority.make(other, SITE, now=NOW)
+    server_ca.make(other, SITE, now=NOW)
     new = tmp_path / "new"
     with pytest.raises(TlsError, match="is not the key of"):
-        authority.take(new, certificate=home / "server.crt", key=other / "server.key", ca=None, now=NOW)
-    end = NOW + dt.timedelta(days=authority.SERVER_DAYS)
+        server_ca.take(new, certificate=home / "server.crt", key=other / "server.key", ca=None, now=NOW)
+    end = NOW + dt.timedelta(days=server_ca.SERVER_DAYS)
     with pytest.raises(TlsError, match="ended on"):
-        authority.take(new, certificate=home / "server.crt", key=home / "server.key", ca=None, now=end)
-    authority.take(new, certificate=home / "server.crt", key=home / "server.key", ca=home / "ca.crt", now=NOW)
+        server_ca.take(new, certificate=home / "server.crt", key=home / "server.key", ca=None, now=end)
+    server_ca.take(new, certificate=home / "server.crt", key=home / "server.key", ca=home / "ca.crt", now=NOW)
     assert accepted(new / "ca.crt", new / "server.crt", new / "server.key", "site.example")
     with pytest.raises(TlsError, match="only its own certificates renew"):
-        authority.renew(new, now=NOW)
+        server_ca.renew(new, now=NOW)
 
 
 @pytest.mark.parametrize("name", ["", "a b", "*.example", "-", "ä.example", "a..b", "x" * 64])
 def test_a_wrong_name_is_named(name: str) -> None:
     with pytest.raises(TlsError, match="is no DNS name"):
-        authority.names((name,), ())
+        server_ca.names((name,), ())
 
 
 def test_a_name_is_no_address() -> None:
     with pytest.raises(TlsError, match="give a name with --name"):
-        authority.names((), ("site.example",))
+        server_ca.names((), ("site.example",))
 
 
 def test_one_command_makes_it_and_says_what_for(tmp_path: Path) -> None:

@@ -9,12 +9,12 @@ import numpy as np
 import numpy.typing as npt
 
 from device_agent.drivers.mujoco import WalkingDriver, World
-from device_agent.drivers.mujoco.walking import heading, upright
+from device_agent.drivers.mujoco.biped_driver import heading, upright
 from device_agent.ports.driver import REST, Twist
-from device_agent.protocol import robot_type
-from device_agent.runtime.controller import Controller
-from device_agent.runtime.courses import Course, Outcome
-from device_agent.runtime.lease import LeaseGate
+from device_agent.protocol.manifests import robot_type
+from device_agent.runtime.authority.lease_gate import LeaseGate
+from device_agent.runtime.control.controller import Controller
+from device_agent.runtime.control.goals import Course, Outcome
 
 STEP_S = 0.002
 LONGEST_S = 30.0

@@ -10,8 +10,8 @@ import mujoco
 import numpy as np
 import numpy.typing as npt
 
-from device_agent import catalogue
-from device_agent.protocol import robot_type
+from device_agent.config import catalogue
+from device_agent.protocol.manifests import robot_type
 
 ROBOTS = catalogue.ROBOTS
 FOLDERS = sorted(path.parent for place in catalogue.places() for path in place.glob("*/robot.toml"))

@@ -10,7 +10,8 @@ import numpy as np
 import pytest
 
 from device_agent import geometry
-from device_agent.protocol import robot_type, topics
+from device_agent.protocol import topics
+from device_agent.protocol.manifests import robot_type
 from tests.unit.robots.folders import FOLDERS, MOVEMENTS, ROBOTS, SHIPPED, Bench
 
 pytestmark = pytest.mark.filterwarnings("error")

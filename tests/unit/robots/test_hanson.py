@@ -8,9 +8,10 @@ import numpy as np
 import pytest
 
 from device_agent import geometry
-from device_agent.mjcf.ties import Ties
-from device_agent.runtime import gaze, mouth
-from device_agent.runtime.score import Line, Score
+from device_agent.runtime.planning import gaze
+from device_agent.runtime.planning import visemes as mouth
+from device_agent.runtime.planning.behaviour_trajectory import Line, Score
+from device_agent.simulation.mjcf.equality_joints import Ties
 from tests.unit.robots.folders import ROBOTS, Bench
 
 FOLDER = ROBOTS / "hanson"

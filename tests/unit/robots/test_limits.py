@@ -10,11 +10,11 @@ import pytest
 
 from device_agent import geometry
 from device_agent.ports.driver import Twist
-from device_agent.protocol import robot_type
-from device_agent.runtime import gaze, shows
-from device_agent.runtime.controller import Controller
-from device_agent.runtime.courses import Course, Outcome
-from device_agent.runtime.lease import LeaseGate, Refused
+from device_agent.protocol.manifests import robot_type
+from device_agent.runtime.authority.lease_gate import LeaseGate, Refused
+from device_agent.runtime.control.controller import Controller
+from device_agent.runtime.control.goals import Course, Outcome
+from device_agent.runtime.planning import gaze, named_poses
 from tests.unit.robots.folders import MOVEMENTS, ROBOTS, heard, whereabouts
 
 LONGEST_S = 60.0
@@ -64,7 +64,7 @@ class LimitedRobot:
         self.move_joints(gaze.aim(self.type, self.shape, self.position, position_m), speed=speed)
 
     def express(self, name: str, strength: float = 1.0) -> None:
-        self.move_joints(shows.expression(self.type, name, strength), speed=shows.EXPRESSION_SPEED)
+        self.move_joints(named_poses.expression(self.type, name, strength), speed=named_poses.EXPRESSION_SPEED)
 
     def say(self, text: str, language: str = "") -> None:
         assert text

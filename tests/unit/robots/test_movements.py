@@ -9,9 +9,9 @@ import mujoco
 import numpy as np
 import pytest
 
-from device_agent.drivers.mujoco.wheels import wheel_speeds
+from device_agent.drivers.mujoco.wheeled_driver import wheel_speeds
 from device_agent.ports.driver import Twist
-from device_agent.runtime import shows
+from device_agent.runtime.planning import named_poses
 from tests.unit.robots.balance import WalkedRobot
 from tests.unit.robots.folders import MOVEMENTS, ROBOTS, Bench, heard, whereabouts
 
@@ -86,7 +86,7 @@ class PlayedRobot:
         self.move_joints(self.home_rad | dict.fromkeys(self.bench.type.gaze.joints, 0.0), speed=speed)
 
     def express(self, name: str, strength: float = 1.0) -> None:
-        self.move_joints(shows.expression(self.bench.type, name, strength), speed=shows.EXPRESSION_SPEED)
+        self.move_joints(named_poses.expression(self.bench.type, name, strength), speed=named_poses.EXPRESSION_SPEED)
 
     def say(self, text: str, language: str = "") -> None:
         assert text

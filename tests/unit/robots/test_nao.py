@@ -14,8 +14,8 @@ import pytest
 from device_agent import geometry
 from device_agent.drivers.mujoco import MujocoDriver, WalkingDriver, World, create
 from device_agent.ports.driver import REST, DriverError, Twist
-from device_agent.protocol import robot_type
-from device_agent.protocol.messages import StopLatch
+from device_agent.protocol import StopLatch
+from device_agent.protocol.manifests import robot_type
 from tests.unit.robots.balance import Walking
 from tests.unit.robots.folders import ROBOTS
 

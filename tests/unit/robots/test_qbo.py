@@ -9,10 +9,11 @@ import numpy as np
 import pytest
 
 from device_agent.drivers import load
-from device_agent.drivers.mujoco import WheeledDriver, worlds
+from device_agent.drivers.mujoco import WheeledDriver
 from device_agent.ports.driver import REST, DriverError, MobileDriver, Reporting, Twist
-from device_agent.protocol import robot_type
-from device_agent.runtime.base import BaseMotion
+from device_agent.protocol.manifests import robot_type
+from device_agent.runtime.control.base_motion import BaseMotion
+from device_agent.simulation import world_registry
 from tests.unit.robots.folders import ROBOTS
 
 FOLDER = ROBOTS / "qbo"
@@ -254,10 +255,12 @@ def test_every_stream_of_its_manifest_is_told(connected: WheeledDriver) -> None:
 
 
 def test_in_the_laboratory_its_sonars_hear_a_person_who_steps_before_it() -> None:
-    world = worlds.of(ROBOTS / "rooms" / "lab")
+    world = world_registry.of(ROBOTS / "rooms" / "lab")
     world.build()
     world._processes = ()  # nobody walks by himself
-    driver = WheeledDriver(robot_type=robot_type.load(FOLDER), world=world, device="qbo", prefix=worlds.prefix("qbo"))
+    driver = WheeledDriver(
+        robot_type=robot_type.load(FOLDER), world=world, device="qbo", prefix=world_registry.prefix("qbo")
+    )
     driver._resolve(world.model)
     driver._connected = True
     driver.observe()

@@ -1,6 +1,6 @@
 /** A small robot for tests: follows setpoints at a limited speed, brakes without them, latches Stop. */
-import type { Description, JointTelemetry, Mode, Setpoint, State, Twin } from "../../src/core/protocol";
-import type { Pose } from "../../src/core/vectors";
+import type { Description, JointTelemetry, Mode, Setpoint, State, Twin } from "../../src/shared/mqtt/protocol.generated";
+import type { Pose } from "../../src/shared/lib/vectors";
 import fixture from "../fixtures/ur5.json";
 
 export const description = fixture.description as unknown as Required<Description>;

@@ -9,9 +9,9 @@ import type { AddressInfo } from "node:net";
 import { extname, join } from "node:path";
 import { Aedes, type AedesPublishPacket, type Client } from "aedes";
 import { createWebSocketStream, WebSocketServer } from "ws";
-import type { Action, Device, Granted, Lease } from "../../src/core/api";
-import type { Presence, Setpoint, Stop } from "../../src/core/protocol";
-import { matches } from "../../src/core/topics";
+import type { Action, Device, Granted, Lease } from "../../src/shared/api/client";
+import type { Presence, Setpoint, Stop } from "../../src/shared/mqtt/protocol.generated";
+import { matches } from "../../src/shared/mqtt/topics";
 import { Arm, description } from "./arm";
 
 export const DEVICE = "agent00001-arm";

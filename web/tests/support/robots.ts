@@ -1,5 +1,5 @@
-/** The toy head of `tests/support/head.py`: what the editor knows of it. */
-import type { Robot } from "../../src/core/keyframes";
+/** The toy head of `tests/fakes/head_driver.py`: what the editor knows of it. */
+import type { Robot } from "../../src/features/keyframes/model/keyframes";
 
 const RANGES = { yaw: [-2, 2], pitch: [-0.7, 0.5], left: [-1, 0.5], right: [-0.25, 0.5] } as const;
 

@@ -1,0 +1,282 @@
+"""Robots on two driven wheels: how a twist turns wheels, and what wheels, sonars and floor sensors notice."""
+
+import math
+import zlib
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import mujoco
+import numpy as np
+
+from device_agent.drivers.mujoco.driver import MujocoDriver
+from device_agent.ports.driver import DriverError, Twist
+from device_agent.protocol.manifests.capabilities import Wheels
+from device_agent.protocol.manifests.robot_type import RobotType
+from device_agent.simulation.snapshot import Floats, Ints, Snapshot
+from device_agent.simulation.world import World
+
+ODOMETRY, SONAR = "odometry", "sonar"
+"""The streams that such a robot has besides those of every simulated one."""
+
+SONAR_MAX_M = 4.0
+"""Farthest that a sonar hears its echo; it reads this where there is none. Approximate, as are the next three."""
+SONAR_MIN_M = 0.03
+_BEAM_YAW_RAD = (-0.26, -0.13, 0.0, 0.13, 0.26)
+_BEAM_PITCH_RAD = (0.0, 0.17)
+"""Directions in which a beam is looked along, left and up. A smooth floor sends no echo back, so none looks down."""
+_STEP_M = 0.01
+_NOISE_M = 0.004
+FLOOR_MAX_M = 0.3
+"""Farthest that a floor sensor sees: at the edge of a stair it reads this."""
+_ALL_GROUPS = np.ones(6, dtype=np.uint8)
+_SILENT_S = 0.3
+"""Wheels that nobody has driven for so long stop, as those of real bases do: whoever drove may be gone."""
+
+
+@dataclass(slots=True)
+class Odometry:
+    """Where the wheels say that the robot is. It starts where the robot was put, and drifts as wheels slip.
+
+    Attributes:
+        x_m: Place in the world, or rather in what the robot takes for it [m]; ``y_m``.
+        yaw_rad: Heading, counter-clockwise, -pi…pi [rad].
+        forward_m_s: Speed [m/s]; ``turn_rad_s``: of turning [rad/s].
+    """
+
+    x_m: float = 0.0
+    y_m: float = 0.0
+    yaw_rad: float = 0.0
+    forward_m_s: float = 0.0
+    turn_rad_s: float = 0.0
+
+    def roll(self, wheels: Wheels, turned_rad: Floats, velocity_rad_s: Floats) -> None:
+        """Go on by what the wheels have turned since last time.
+
+        Args:
+            wheels: Their measures, as the robot believes them.
+            turned_rad: Left, right [rad].
+            velocity_rad_s: Left, right, now [rad/s].
+        """
+        left_m, right_m = (turned_rad * wheels.radius_m).tolist()
+        along_m, turn_rad = (left_m + right_m) / 2, (right_m - left_m) / wheels.track_m
+        heading = self.yaw_rad + turn_rad / 2
+        self.x_m += along_m * math.cos(heading)
+        self.y_m += along_m * math.sin(heading)
+        self.yaw_rad = math.remainder(self.yaw_rad + turn_rad, 2 * math.pi)
+        left_m_s, right_m_s = (velocity_rad_s * wheels.radius_m).tolist()
+        self.forward_m_s = (left_m_s + right_m_s) / 2
+        self.turn_rad_s = (right_m_s - left_m_s) / wheels.track_m
+
+    def values(self) -> dict[str, float]:
+        """As a stream tells it."""
+        return {
+            "x_m": round(self.x_m, 4),
+            "y_m": round(self.y_m, 4),
+            "yaw_rad": round(self.yaw_rad, 4),
+            "forward_m_s": round(self.forward_m_s, 4),
+            "turn_rad_s": round(self.turn_rad_s, 4),
+        }
+
+
+def wheel_speeds(wheels: Wheels, twist: Twist, *, fastest_rad_s: float) -> tuple[Floats, Twist]:
+    """What the wheels have to turn for a twist, left and right [rad/s], and the twist that comes of it.
+
+    Where a wheel cannot turn so fast both are slowed, so that the robot keeps to its curve. Two wheels go nowhere
+    sideways.
+    """
+    across_m_s = twist.turn_rad_s * wheels.track_m / 2
+    left, right = (twist.forward_m_s - across_m_s) / wheels.radius_m, (twist.forward_m_s + across_m_s) / wheels.radius_m
+    share = min(1.0, fastest_rad_s / max(abs(left), abs(right), 1e-9))
+    return np.array([left, right]) * share, Twist(twist.forward_m_s * share, 0.0, twist.turn_rad_s * share)
+
+
+class Brake:
+    """Stops wheels that nobody drives any more. A ``Process`` of the world.
+
+    Args:
+        actuators: The wheels'.
+        braking_rad_s2: How hard.
+    """
+
+    def __init__(self, actuators: Ints, braking_rad_s2: float) -> None:
+        self._actuators = actuators
+        self._braking_rad_s2 = braking_rad_s2
+        self._now_s = 0.0
+        self.driven_s = -math.inf
+
+    def step(self, model: Any, data: Any, time_s: float) -> None:
+        """See ``Process``."""
+        del model
+        elapsed_s, self._now_s = time_s - self._now_s, time_s
+        if time_s - self.driven_s > _SILENT_S:
+            speeds = data.ctrl[self._actuators]
+            left = np.maximum(np.abs(speeds) - self._braking_rad_s2 * elapsed_s, 0.0)
+            data.ctrl[self._actuators] = np.copysign(left, speeds)
+
+
+class WheeledDriver(MujocoDriver):
+    """A ``MobileDriver`` for robot types with ``[simulation.wheels]``.
+
+    Its model has a velocity servo for each wheel, and a site ``sonar_<part>`` or ``floor_<part>`` for each such sensor,
+    which looks along the site's x axis.
+    """
+
+    def __init__(self, *, robot_type: RobotType, world: World, device: str, prefix: str = "", **more: Any) -> None:
+        super().__init__(robot_type=robot_type, world=world, device=device, prefix=prefix, **more)
+        if robot_type.simulation is None or robot_type.simulation.wheels is None:
+            raise DriverError(f"robot type '{robot_type.type}' has no [simulation.wheels]; it cannot be driven so")
+        if robot_type.base is None:
+            raise DriverError(f"robot type '{robot_type.type}' has no [base]; nobody knows how hard it may brake")
+        self._wheels = robot_type.simulation.wheels
+        self._braking_rad_s2 = robot_type.base.braking_linear_m_s2 / self._wheels.radius_m
+        self._brake: Brake | None = None
+        self._wheel_actuators: Ints = np.zeros(2, dtype=np.intp)
+        self._wheel_qpos: Ints = np.zeros(2, dtype=np.intp)
+        self._wheel_dof: Ints = np.zeros(2, dtype=np.intp)
+        self._fastest_rad_s = 0.0
+        self._turned: Floats | None = None
+        self._odometry = Odometry()
+        self._told: Mapping[str, float] = {}
+        self._eyes: Any = None
+        self._sites: dict[str, tuple[int, bool]] = {}
+        self._noise = np.random.default_rng(zlib.crc32(device.encode()))
+
+    def drive(self, twist: Twist) -> Twist:
+        """Command the wheels' speeds for the next period.
+
+        Raises:
+            DriverError: A number is not finite, not connected, or the simulation has stopped.
+        """
+        snapshot = self._live()
+        if not all(map(math.isfinite, twist)):
+            raise DriverError("a commanded twist is not finite")
+        speeds, applied = wheel_speeds(self._wheels, twist, fastest_rad_s=self._fastest_rad_s)
+        if self._brake is not None:
+            self._brake.driven_s = snapshot.time_s
+        self._world.command(f"{self._device}/wheels", self._wheel_actuators, speeds, ramp_s=self._ramp_s)
+        return applied
+
+    def report(self, stream: str) -> Mapping[str, float | bool]:
+        """``odometry``, ``sonar`` and what every simulated robot tells.
+
+        Raises:
+            DriverError: Not connected.
+        """
+        if stream == ODOMETRY:
+            self._require()
+            return self._told
+        if stream == SONAR:
+            self._require()
+            return self._listen()
+        return super().report(stream)
+
+    def _note(self, snapshot: Snapshot) -> None:
+        super()._note(snapshot)
+        wheels: Floats = snapshot.qpos[self._wheel_qpos]
+        if self._turned is None:
+            self._put(snapshot)
+        else:
+            self._odometry.roll(self._wheels, wheels - self._turned, snapshot.qvel[self._wheel_dof])
+        self._turned = wheels
+        self._told = self._odometry.values()
+
+    def _power_w(self, snapshot: Snapshot) -> float:
+        work = snapshot.effort[self._wheel_dof] * snapshot.qvel[self._wheel_dof]
+        return super()._power_w(snapshot) + float(np.abs(work).sum())
+
+    def _put(self, snapshot: Snapshot) -> None:
+        """Whoever put the robot somewhere told it where; from then on it has only its wheels."""
+        x, y, _ = snapshot.body_position_m[self._base].tolist()
+        w, _, _, k = snapshot.body_quaternion[self._base].tolist()
+        self._odometry = Odometry(x, y, math.remainder(2 * math.atan2(k, w), 2 * math.pi))
+
+    # ------------------------------------------------------------ sonars and floor sensors
+
+    def _listen(self) -> dict[str, float | bool]:
+        self._world.copy(self._eyes)
+        found: dict[str, float | bool] = {}
+        for part, (site, floor) in self._sites.items():
+            if floor:
+                distance_m = self._nearest(site, np.array([[1.0, 0.0, 0.0]]), FLOOR_MAX_M)
+                found[f"distance_m.{part}"] = round(min(distance_m, FLOOR_MAX_M), 3)
+            else:
+                distance_m = self._nearest(site, _BEAMS, SONAR_MAX_M) + float(self._noise.normal(0.0, _NOISE_M))
+                heard_m = min(max(distance_m, SONAR_MIN_M), SONAR_MAX_M)
+                found[f"distance_m.{part}"] = round(round(heard_m / _STEP_M) * _STEP_M, 2)
+        return found
+
+    def _nearest(self, site: int, beams: Floats, farthest_m: float) -> float:
+        """How near the next thing is along the beams, given in the site's frame [m]; far where there is none."""
+        data = self._eyes
+        ways = np.ascontiguousarray(beams @ data.site_xmat[site].reshape(3, 3).T).ravel()
+        things, distances = np.empty(len(beams), dtype=np.int32), np.empty(len(beams))
+        mujoco.mj_multiRay(
+            self._world.model,
+            data,
+            data.site_xpos[site],
+            ways,
+            _ALL_GROUPS,
+            True,
+            self._base,
+            things,
+            distances,
+            None,
+            len(beams),
+            farthest_m,
+        )
+        hit = distances[distances >= 0]
+        return float(hit.min()) if len(hit) else 2 * farthest_m
+
+    # ------------------------------------------------------------ names
+
+    def _resolve(self, model: Any) -> None:
+        super()._resolve(model)
+        self._odometry, self._turned = Odometry(), None
+        kinds = mujoco.mjtObj
+        for index, name in enumerate((self._wheels.left, self._wheels.right)):
+            actuator = self._find(model, kinds.mjOBJ_ACTUATOR, "actuator", model.nu, name)
+            if not _is_velocity_servo(model, actuator):
+                raise DriverError(
+                    f"actuator '{name}' of '{self._type.type}' is not a velocity servo on a wheel's joint"
+                )
+            joint = int(model.actuator_trnid[actuator, 0])
+            self._wheel_actuators[index] = actuator
+            self._wheel_qpos[index] = model.jnt_qposadr[joint]
+            self._wheel_dof[index] = model.jnt_dofadr[joint]
+        if self._brake is None:
+            self._brake = Brake(self._wheel_actuators, self._braking_rad_s2)
+            self._world.add(self._brake)
+        self._fastest_rad_s = float(model.actuator_ctrlrange[self._wheel_actuators, 1].min())
+        self._eyes = mujoco.MjData(model)
+        self._sites = {}
+        for site in range(model.nsite):
+            name = model.site(site).name
+            kind, _, part = name.removeprefix(self._prefix).partition("_")
+            if name.startswith(self._prefix) and kind in {"sonar", "floor"} and part:
+                self._sites[part] = (site, kind == "floor")
+
+
+def _beams() -> Floats:
+    return np.array(
+        [
+            (math.cos(pitch) * math.cos(yaw), math.cos(pitch) * math.sin(yaw), math.sin(pitch))
+            for pitch in _BEAM_PITCH_RAD
+            for yaw in _BEAM_YAW_RAD
+        ]
+    )
+
+
+_BEAMS = _beams()
+
+
+def _is_velocity_servo(model: Any, actuator: int) -> bool:
+    gain = model.actuator_gainprm[actuator, 0]
+    return bool(
+        model.actuator_trntype[actuator] == int(mujoco.mjtTrn.mjTRN_JOINT)
+        and model.jnt_type[model.actuator_trnid[actuator, 0]] == int(mujoco.mjtJoint.mjJNT_HINGE)
+        and model.actuator_ctrllimited[actuator]
+        and model.actuator_biastype[actuator] == int(mujoco.mjtBias.mjBIAS_AFFINE)
+        and gain > 0
+        and model.actuator_biasprm[actuator, 2] == -gain
+    )

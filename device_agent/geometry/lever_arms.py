@@ -1,0 +1,124 @@
+"""How far a joint can carry a point: the lever arms that bound speeds and ways, in whatever position."""
+
+from collections.abc import Sequence
+from typing import Any
+
+import mujoco
+import numpy as np
+import numpy.typing as npt
+
+from device_agent.simulation.mjcf.equality_joints import Ties
+
+Floats = npt.NDArray[np.float64]
+
+_ROUND = frozenset(
+    int(kind) for kind in (mujoco.mjtGeom.mjGEOM_SPHERE, mujoco.mjtGeom.mjGEOM_CAPSULE, mujoco.mjtGeom.mjGEOM_CYLINDER)
+)
+_SAME = 1e-6
+
+
+class Levers:
+    """Upper bounds of metres per radian (or per metre, for a slide), joint by joint.
+
+    A joint that is tied to others counts for those, by as much as it moves with them.
+
+    Args:
+        model: ``MjModel``.
+        joints: The joints' indices in the model.
+        ties: Which joints go with these.
+    """
+
+    def __init__(self, model: Any, joints: Sequence[int], ties: Ties) -> None:
+        self._model = model
+        tied = [tie.joint for tie in ties.all if tie.joint not in joints]
+        self._joints = [*joints, *tied]
+        self._share = np.zeros((len(self._joints), len(joints)))
+        self._share[: len(joints)] = np.eye(len(joints))
+        for row, joint in enumerate(tied, len(joints)):
+            for other, factor in ties.of(joint).items():
+                if other in joints:
+                    self._share[row, self._joints.index(other)] = abs(factor)
+
+    def of_geoms(self, geoms: Sequence[int]) -> Floats:
+        """Of every point of each shape, shape (geoms, joints)."""
+        levers = np.array([self._of_ball(int(geom)) for geom in dict.fromkeys(geoms)])
+        return levers.reshape(-1, len(self._joints)) @ self._share
+
+    def of_frame(self, is_site: bool, index: int) -> Floats:
+        """Of the origin of a site or body, shape (joints,)."""
+        model = self._model
+        body = int(model.site_bodyid[index]) if is_site else index
+        return self._of_point(body, model.site_pos[index] if is_site else np.zeros(3), 0.0) @ self._share
+
+    def reach_m(self, geom: int, base: int) -> float:
+        """How far any point of a shape can come from the origin of the robot's base, whatever its joints do [m]."""
+        model = self._model
+        box = model.geom_aabb[geom]
+        reach = float(np.linalg.norm(box[:3]) + np.linalg.norm(box[3:]) + np.linalg.norm(model.geom_pos[geom]))
+        at = int(model.geom_bodyid[geom])
+        while at not in (0, base):
+            for joint in np.flatnonzero(model.jnt_bodyid == at).tolist():
+                slides = model.jnt_type[joint] == int(mujoco.mjtJoint.mjJNT_SLIDE)
+                offset = float(np.linalg.norm(model.jnt_pos[joint]))
+                reach += float(np.max(np.abs(model.jnt_range[joint]))) if slides else 2 * offset
+            reach += float(np.linalg.norm(model.body_pos[at]))
+            at = int(model.body_parentid[at])
+        return reach
+
+    def between(self, a: int, b: int) -> Floats:
+        """How fast two shapes can near each other, shape (joints,): joints that carry both do not count."""
+        first, second = self._of_geom(a), self._of_geom(b)
+        both = np.array([self._carries(joint, a) and self._carries(joint, b) for joint in self._joints], dtype=bool)
+        lever: Floats = np.where(both, 0.0, first + second) @ self._share
+        return lever
+
+    def _of_geom(self, geom: int) -> Floats:
+        """How far a joint can move where a shape is; turning it about its own axis does not."""
+        lever = self._of_ball(geom)
+        for index, joint in enumerate(self._joints):
+            if self._model.jnt_bodyid[joint] == self._model.geom_bodyid[geom] and self._turns_in_place(geom, joint):
+                lever[index] = 0.0
+        return lever
+
+    def _of_ball(self, geom: int) -> Floats:
+        """Of the ball around a shape."""
+        model = self._model
+        box = model.geom_aabb[geom]
+        radius_m = float(np.linalg.norm(box[:3]) + np.linalg.norm(box[3:]))
+        return self._of_point(int(model.geom_bodyid[geom]), model.geom_pos[geom], radius_m)
+
+    def _of_point(self, body: int, position: Floats, radius_m: float) -> Floats:
+        """Of a ball that is fixed in a body."""
+        model = self._model
+        lever = np.zeros(len(self._joints))
+        reach, at = float(np.linalg.norm(position)) + radius_m, body
+        while at > 0:
+            for joint in np.flatnonzero(model.jnt_bodyid == at).tolist():
+                offset = float(np.linalg.norm(model.jnt_pos[joint]))
+                slides = model.jnt_type[joint] == int(mujoco.mjtJoint.mjJNT_SLIDE)
+                if joint in self._joints:
+                    lever[self._joints.index(joint)] = 1.0 if slides else reach + offset
+                reach += float(np.max(np.abs(model.jnt_range[joint]))) if slides else 2 * offset
+            reach += float(np.linalg.norm(model.body_pos[at]))
+            at = int(model.body_parentid[at])
+        return lever
+
+    def _carries(self, joint: int, geom: int) -> bool:
+        at = int(self._model.geom_bodyid[geom])
+        while at > 0 and at != self._model.jnt_bodyid[joint]:
+            at = int(self._model.body_parentid[at])
+        return at > 0
+
+    def _turns_in_place(self, geom: int, joint: int) -> bool:
+        """Whether a shape is round about the joint's own axis, so that the joint does not change where it is."""
+        model = self._model
+        if model.jnt_type[joint] != int(mujoco.mjtJoint.mjJNT_HINGE) or int(model.geom_type[geom]) not in _ROUND:
+            return False
+        axis = model.jnt_axis[joint] / np.linalg.norm(model.jnt_axis[joint])
+        matrix = np.empty(9)
+        mujoco.mju_quat2Mat(matrix, model.geom_quat[geom])
+        offset = model.geom_pos[geom] - model.jnt_pos[joint]
+        on_axis = np.linalg.norm(np.cross(axis, offset)) < _SAME
+        sphere = int(model.geom_type[geom]) == int(mujoco.mjtGeom.mjGEOM_SPHERE)
+        along = sphere or np.linalg.norm(np.cross(axis, matrix.reshape(3, 3)[:, 2])) < _SAME
+        return bool(on_axis and along)

@@ -1,0 +1,237 @@
+"""One agent's connection to the broker, without a thread: paho does MQTT, the swarm's event loop does the waiting."""
+
+import asyncio
+import contextlib
+import socket
+import time
+from collections.abc import Callable
+from concurrent.futures import Executor
+from typing import Any
+
+import paho.mqtt.client as mqtt
+from paho.mqtt.enums import CallbackAPIVersion, MQTTProtocolVersion
+
+from device_agent.load_generator.metrics import Figures
+from device_agent.transports.mqtt.transport import KEEP_ALIVE_S, BrokerAccess
+
+ANSWER_WITHIN_S = 10.0
+"""Longer than an agent on its own waits: many ask at once, and from one process."""
+_GOODBYE_S = 2.0
+
+
+class Dialect:
+    """The version of MQTT that the swarm speaks: 5, until a broker shows that it does not."""
+
+    def __init__(self) -> None:
+        self.version = MQTTProtocolVersion.MQTTv5
+
+    def fall_back(self) -> None:
+        """Speak 3.1.1 from now on."""
+        self.version = MQTTProtocolVersion.MQTTv311
+
+
+class OlderDialect(Exception):  # noqa: N818 (an answer, not a fault)
+    """The broker is there and speaks an older MQTT: the next connection does too."""
+
+
+class Link:
+    """One connection, from its CONNECT to its end. Everything but the connecting itself runs in the event loop.
+
+    Args:
+        access: Where and as whom.
+        dialect: Shared by all.
+        will: Topic and payload of the will.
+        figures: What counts.
+        receive: Called with topic and payload of what arrives and was not kept by the broker.
+    """
+
+    def __init__(
+        self,
+        access: BrokerAccess,
+        dialect: Dialect,
+        *,
+        will: tuple[str, bytes],
+        figures: Figures,
+        receive: Callable[[str, bytes], None],
+    ) -> None:
+        self.up = False
+        self._older = False
+        self._access = access
+        self._dialect = dialect
+        self._figures = figures
+        self._receive = receive
+        self._loop = asyncio.get_running_loop()
+        self._gone = self._loop.create_future()
+        self._subscribed = self._loop.create_future()
+        self._socket: Any = None
+        self._flushing = False
+        self._sent: dict[int, float] = {}
+        self._all_confirmed: asyncio.Future[None] | None = None
+        self._client = self._new_client(will)
+
+    async def open(self, pool: Executor) -> None:
+        """Connect and subscribe.
+
+        Raises:
+            OSError: Not reached, refused, or no answer in time.
+            OlderDialect: It is to be tried again at once.
+        """
+        access = self._access
+        # Resolving a name and a TLS handshake block: a thread of the pool does that, and nothing after it.
+        await self._loop.run_in_executor(pool, self._client.connect, access.host, access.port, KEEP_ALIVE_S)
+        self._socket = self._client.socket()
+        if self._socket is None:
+            raise OSError("the broker closed the connection at once")
+        self._loop.add_reader(self._socket, self._read)
+        self._flush()
+        await asyncio.wait({self._subscribed, self._gone}, timeout=ANSWER_WITHIN_S, return_when="FIRST_COMPLETED")
+        if self._older:
+            raise OlderDialect
+        if self._gone.done():
+            raise OSError(self._gone.result() or "the broker closed the connection")
+        if not self._subscribed.done():
+            self._dialect.fall_back()
+            raise OSError(f"{access.host}:{access.port} does not answer as an MQTT broker")
+        self.up = True
+
+    async def stay(self, within_s: float) -> None:
+        """Return when the link has gone, or after so long."""
+        await asyncio.wait({self._gone}, timeout=within_s)
+
+    @property
+    def gone(self) -> bool:
+        """Whether it has ended by itself."""
+        return bool(self._gone.done())
+
+    def publish(self, topic: str, payload: bytes, *, qos: int, retain: bool = False) -> None:
+        """Send, as ``Transport.publish`` does."""
+        counts = self._figures.counts
+        if not self.up or self._gone.done():
+            counts.dropped += 1
+            return
+        sent = self._client.publish(topic, payload, qos=qos, retain=retain)
+        if sent.rc != mqtt.MQTT_ERR_SUCCESS:
+            counts.dropped += 1
+            return
+        counts.out += 1
+        counts.out_bytes += len(topic) + len(payload)
+        if qos:
+            counts.asked += 1
+            self._sent[sent.mid] = time.monotonic()
+
+    def look(self) -> None:
+        """Keep the connection alive; to be called about once a second."""
+        if self.up and not self._gone.done():
+            self._client.loop_misc()
+
+    async def close(self, last: tuple[str, bytes] | None = None) -> None:
+        """End it, with last words."""
+        if self.up and not self._gone.done():
+            if last is not None:
+                self.publish(last[0], last[1], qos=1, retain=True)
+                self._all_confirmed = self._loop.create_future()
+                await asyncio.wait({self._all_confirmed, self._gone}, timeout=_GOODBYE_S, return_when="FIRST_COMPLETED")
+            self._client.disconnect()
+            self._flush()
+        self._let_go()
+        opened = self._client.socket()
+        if opened is not None:
+            opened.close()
+
+    # ------------------------------------------------------------ paho and the event loop
+
+    def _new_client(self, will: tuple[str, bytes]) -> mqtt.Client:
+        version = self._dialect.version
+        options: dict[str, Any] = {} if version is MQTTProtocolVersion.MQTTv5 else {"clean_session": True}
+        access = self._access
+        client = mqtt.Client(
+            CallbackAPIVersion.VERSION2, access.client_id, protocol=version, reconnect_on_failure=False, **options
+        )
+        client.username_pw_set(access.username, access.password)
+        if access.tls is not None:
+            client.tls_set_context(access.tls)
+        client.will_set(will[0], will[1], qos=1, retain=True)
+        client.max_inflight_messages_set(100)
+        client.connect_timeout = ANSWER_WITHIN_S
+        client.on_socket_open = _no_delay
+        client.on_socket_close = lambda *_: self._let_go()
+        client.on_socket_register_write = lambda *_: self._to_flush()
+        client.on_connect = self._on_connect
+        client.on_disconnect = self._on_disconnect
+        client.on_subscribe = self._on_subscribe
+        client.on_publish = self._on_publish
+        client.on_message = self._on_message
+        return client
+
+    def _read(self) -> None:
+        self._client.loop_read()
+        pending = getattr(self._socket, "pending", None)  # TLS keeps what it has decrypted to itself
+        while pending is not None and self._socket is not None and pending() > 0:
+            self._client.loop_read()
+
+    def _to_flush(self) -> None:
+        """Something is to be written: all of it at once, when what runs now has run."""
+        if self._socket is not None and not self._flushing:
+            self._flushing = True
+            self._loop.call_soon(self._flush)
+
+    def _flush(self) -> None:
+        self._flushing = False
+        if self._socket is None:
+            return
+        self._client.loop_write()
+        if self._socket is None:
+            return
+        if self._client.want_write():
+            self._loop.add_writer(self._socket, self._flush)
+        else:
+            self._loop.remove_writer(self._socket)
+
+    def _let_go(self) -> None:
+        opened, self._socket = self._socket, None
+        if opened is not None:
+            self._loop.remove_reader(opened)
+            self._loop.remove_writer(opened)
+
+    def _end(self, why: str) -> None:
+        if not self._gone.done():
+            self._gone.set_result(why)
+
+    def _on_connect(self, client: mqtt.Client, _data: object, _flags: object, code: Any, _properties: object) -> None:
+        if code.is_failure:
+            if "protocol" in str(code).lower() and self._client.protocol is MQTTProtocolVersion.MQTTv5:
+                self._older = True
+                self._dialect.fall_back()
+            self._end(f"the broker refused the connection: {code}")
+            return
+        client.subscribe([(pattern, 1) for pattern in self._access.subscribe])
+
+    def _on_subscribe(self, _client: object, _data: object, _mid: int, codes: list[Any], _properties: object) -> None:
+        if any(code.is_failure for code in codes):
+            self._end("the broker refused a subscription")
+        elif not self._subscribed.done():
+            self._subscribed.set_result(None)
+
+    def _on_disconnect(self, _client: object, _data: object, _flags: object, code: Any, _properties: object) -> None:
+        self._end(f"the broker ended the connection: {code}" if code.is_failure else "")
+
+    def _on_publish(self, _client: object, _data: object, mid: int, code: Any, _properties: object) -> None:
+        sent_s = self._sent.pop(mid, None)
+        if sent_s is not None and not code.is_failure:
+            self._figures.counts.confirmed += 1
+            self._figures.confirm_ms.append((time.monotonic() - sent_s) * 1000)
+        waiting = self._all_confirmed
+        if waiting is not None and not self._sent and not waiting.done():
+            waiting.set_result(None)
+
+    def _on_message(self, _client: object, _data: object, message: mqtt.MQTTMessage) -> None:
+        self._figures.counts.heard += 1
+        self._figures.counts.heard_bytes += len(message.topic) + len(message.payload)
+        if not message.retain:
+            self._receive(message.topic, bytes(message.payload))
+
+
+def _no_delay(_client: mqtt.Client, _userdata: object, opened: Any) -> None:
+    """As ``transports.mqtt`` does: without this a small message can wait 40 ms."""
+    with contextlib.suppress(OSError, AttributeError):
+        opened.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)

@@ -1,0 +1,138 @@
+"""Makes a swarm's agents known to the cloud: each with a key of its own, enrolled, and claimed by code."""
+
+import base64
+import time
+from collections.abc import Callable
+from concurrent.futures import Executor
+from pathlib import Path
+from typing import TypeVar
+
+import msgspec
+from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
+
+from device_agent.config.agent_config import Pairing
+from device_agent.load_generator.account import Account
+from device_agent.load_generator.kinematic_arm import DEVICE
+from device_agent.load_generator.options import Plan, SwarmError
+from device_agent.ports.clock import CloudClock
+from device_agent.protocol.manifests.robot_type import RobotType
+from device_agent.protocol.security import signing
+from device_agent.transports import factory
+from device_agent.transports.backoff import BackOff
+from device_agent.transports.http import responses
+from device_agent.transports.http.client import CloudApi, CloudError
+
+T = TypeVar("T")
+_TRIES = 8
+FILE = "keys.json"
+
+
+class Keys:
+    """The private keys of all agents of all runs, in one file that is nobody else's to read."""
+
+    def __init__(self, folder: Path) -> None:
+        self._path = folder / FILE
+
+    def first(self, count: int) -> list[Ed25519PrivateKey]:
+        """So many: those on file, and new ones that are put there.
+
+        Raises:
+            SwarmError: The file is not one of these.
+            OSError: It cannot be read or written.
+        """
+        known = self._read()
+        missing = count - len(known)
+        if missing > 0:
+            known += [signing.generate().private_bytes_raw() for _ in range(missing)]
+            self._path.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
+            fresh = self._path.with_suffix(".new")
+            fresh.touch(mode=0o600)
+            fresh.write_bytes(msgspec.json.encode([base64.b64encode(key).decode() for key in known]))
+            fresh.replace(self._path)
+        return [Ed25519PrivateKey.from_private_bytes(key) for key in known[:count]]
+
+    def _read(self) -> list[bytes]:
+        if not self._path.exists():
+            return []
+        try:
+            return [
+                base64.b64decode(text, validate=True)
+                for text in msgspec.json.decode(self._path.read_bytes(), type=list[str])
+            ]
+        except ValueError as error:
+            raise SwarmError(f"{self._path} is no file of a swarm's keys; name another --home") from error
+
+
+class Register:
+    """Enrols and claims. Blocks: for the threads of a pool.
+
+    Args:
+        plan: The run.
+        kind: What the robots say they are.
+        clock: Learns the cloud's time.
+    """
+
+    def __init__(self, plan: Plan, kind: RobotType, clock: CloudClock) -> None:
+        self._plan = plan
+        self._kind = kind
+        self._clock = clock
+        self._account = Account(plan.cloud, sign_in=plan.sign_in, token=plan.token, ca=plan.ca)
+
+    def api(self, key: Ed25519PrivateKey) -> CloudApi:
+        """One agent's view of the HTTP API."""
+        return CloudApi(self._plan.cloud, key, self._clock, ca=self._plan.ca)
+
+    def all(self, keys: list[Ed25519PrivateKey], pool: Executor, tell: Callable[[str], None]) -> list[Pairing]:
+        """Every agent, known and claimed.
+
+        Raises:
+            SwarmError: Nobody claims them, or the server refuses that.
+            CloudError: The server refuses one.
+            OSError: Not reached.
+        """
+        pairings, told_s = [], time.monotonic()
+        asked = [pool.submit(self._one, number, key) for number, key in enumerate(keys, start=1)]
+        try:
+            for number, future in enumerate(asked, start=1):
+                pairings.append(future.result())
+                if time.monotonic() - told_s > self._plan.every_s:
+                    told_s = time.monotonic()
+                    tell(f"{number} of {len(keys)} agents are known to the server")
+        finally:
+            for future in asked:
+                future.cancel()
+        self._account.close()
+        return pairings
+
+    def _one(self, number: int, key: Ed25519PrivateKey) -> Pairing:
+        api = self.api(key)
+        device = {"name": DEVICE, "kind": self._kind.kind, "robot_type": self._kind.type, "label": f"Arm {number}"}
+        claim = _patiently(
+            lambda: api.enroll(
+                name=f"swarm-{number:05d}", software=factory.SOFTWARE, transport="mqtt", devices=[device]
+            )
+        )
+        if claim.code is not None:
+            self._account.claim(claim.code)
+        return factory.pairing_of(responses.read(_patiently(api.enrollment), responses.Claimed))
+
+
+def _patiently(call: Callable[[], T]) -> T:
+    """Ask again while the server has too much to do.
+
+    Raises:
+        CloudError: It refuses, or still has.
+        OSError: Not reached.
+    """
+    back_off = BackOff()
+    for _ in range(_TRIES):
+        back_off.attempt()
+        try:
+            return call()
+        except CloudError as error:
+            if not error.passing:
+                raise
+            time.sleep(back_off.wait_s())
+        except TimeoutError:
+            time.sleep(back_off.wait_s())
+    return call()

@@ -1,0 +1,169 @@
+"""The published contract: an AsyncAPI 3 document made from ``messages`` and ``topics``.
+
+``python -m device_agent.protocol.documents.asyncapi`` prints it; ``make contract`` keeps ``docs/asyncapi.json`` equal to it.
+"""
+
+import inspect
+import json
+import sys
+from typing import Any, NamedTuple
+
+from device_agent import protocol
+from device_agent.protocol import camera_frames, codec, topics
+
+
+class _Channel(NamedTuple):
+    name: str
+    address: str
+    message: str
+    qos: int
+    retain: bool
+    summary: str
+    to_agent: bool = False
+
+
+_DEVICE = f"{topics.ROOT}/{{space}}/{{agent}}/{{device}}"
+_CHANNELS = (
+    _Channel(
+        "presence", f"{topics.ROOT}/{{space}}/{{agent}}/conn", "Presence", 1, True, "Online or offline; also the will."
+    ),
+    _Channel("description", f"{_DEVICE}/desc", "Description", 1, True, "What the device is and can do."),
+    _Channel("twin", f"{_DEVICE}/desc/twin", "Twin", 1, True, "The drawing for live views."),
+    _Channel(
+        "state", f"{_DEVICE}/state", "State", 1, True, "Current condition: on change and every 30 s, at most 1 Hz."
+    ),
+    _Channel(
+        "joints",
+        f"{_DEVICE}/tele/joints",
+        "JointTelemetry",
+        0,
+        False,
+        "All joints: 20 Hz at rest, 50 Hz in motion, with each setpoint while they come.",
+    ),
+    _Channel(
+        "measurements",
+        f"{_DEVICE}/tele/{{stream}}",
+        "Measurements",
+        0,
+        False,
+        "Named values measured at one moment; every stream but `joints`.",
+    ),
+    _Channel(
+        "late_joints",
+        f"{_DEVICE}/late/joints",
+        "JointTelemetry",
+        1,
+        False,
+        "Joints measured while the link was down, thinned, with their own times; for the series, never for live views.",
+    ),
+    _Channel(
+        "late_measurements",
+        f"{_DEVICE}/late/{{stream}}",
+        "Measurements",
+        1,
+        False,
+        "As `late_joints`; every stream but `joints`.",
+    ),
+    _Channel("camera", f"{_DEVICE}/cam/{{camera}}", "CameraFrame", 0, False, "A picture: header, then JPEG."),
+    _Channel("event", f"{_DEVICE}/event", "Event", 1, False, "A fact that happened; stored."),
+    _Channel("ack", f"{_DEVICE}/ack", "Ack", 1, False, "The answer to one command."),
+    _Channel("command", f"{_DEVICE}/cmd", "Signed", 1, False, "A signed request; `body` is a Command.", to_agent=True),
+    _Channel(
+        "setpoint",
+        f"{_DEVICE}/ctl/{{epoch}}",
+        "Setpoint",
+        0,
+        False,
+        "A streamed setpoint; the newest wins.",
+        to_agent=True,
+    ),
+    _Channel(
+        "stop",
+        f"{_DEVICE}/stop",
+        "Stop",
+        1,
+        False,
+        "Latch Stop now; repeat until `state` shows the latch.",
+        to_agent=True,
+    ),
+)
+_PARAMETERS = {
+    "space": "Id of the space, the room and its people's data.",
+    "agent": "Id of the agent; also its MQTT client id.",
+    "device": "The device's name at its agent.",
+    "camera": "Name of the camera.",
+    "stream": "Name of the stream, any but `joints`.",
+    "epoch": "Epoch of the lease under which the setpoints are sent.",
+}
+
+
+def document() -> dict[str, Any]:
+    """The contract as AsyncAPI 3.0, seen from the agent: it sends what devices say, receives what they are told."""
+    references, schemas = protocol.schema_components()
+    references["Signed"] = {"$ref": "#/components/schemas/Signed"}
+    schemas["Signed"] = {
+        "title": "Signed",
+        "description": "Ed25519 over `telescope/v1/command` + line feed + the exact bytes of `body`.",
+        "type": "object",
+        "properties": {
+            "key": {"type": "string", "description": "Id of the signing key."},
+            "signature": {"type": "string", "description": "base64url, without padding."},
+            "body": references["Command"],
+        },
+        "required": ["key", "signature", "body"],
+        "additionalProperties": False,
+    }
+    picture = inspect.cleandoc(camera_frames.__doc__ or "")
+    references["CameraFrame"] = {"type": "string", "format": "binary", "description": picture}
+    return {
+        "asyncapi": "3.0.0",
+        "info": {
+            "title": "Telescope, wire contract",
+            "version": "1.0.0",
+            "description": (
+                "MQTT topics and messages between robots, their operators and the cloud. JSON, finite numbers only, "
+                f"at most {codec.MAX_BYTES // 1024} KB a message and {codec.MAX_RETAINED_BYTES // 1024} KB a retained "
+                f"one. Ids match `{topics.ID_PATTERN}`."
+            ),
+        },
+        "defaultContentType": "application/json",
+        "channels": {channel.name: _channel(channel) for channel in _CHANNELS},
+        "operations": {channel.name: _operation(channel) for channel in _CHANNELS},
+        "components": {
+            "schemas": schemas,
+            "messages": {
+                channel.message: {
+                    "name": channel.message,
+                    "payload": references[channel.message],
+                    **({"contentType": "application/octet-stream"} if channel.message == "CameraFrame" else {}),
+                }
+                for channel in _CHANNELS
+            },
+        },
+    }
+
+
+def _channel(channel: _Channel) -> dict[str, Any]:
+    return {
+        "address": channel.address,
+        "description": channel.summary,
+        "messages": {channel.message: {"$ref": f"#/components/messages/{channel.message}"}},
+        "parameters": {
+            name: {"description": text} for name, text in _PARAMETERS.items() if f"{{{name}}}" in channel.address
+        },
+    }
+
+
+def _operation(channel: _Channel) -> dict[str, Any]:
+    return {
+        "action": "receive" if channel.to_agent else "send",
+        "summary": channel.summary,
+        "channel": {"$ref": f"#/channels/{channel.name}"},
+        "messages": [{"$ref": f"#/channels/{channel.name}/messages/{channel.message}"}],
+        "bindings": {"mqtt": {"qos": channel.qos, "retain": channel.retain}},
+    }
+
+
+if __name__ == "__main__":
+    json.dump(document(), sys.stdout, indent=1, ensure_ascii=False)
+    sys.stdout.write("\n")

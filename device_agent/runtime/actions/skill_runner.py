@@ -1,0 +1,213 @@
+"""What a robot shows: speech, expressions, postures, behaviours, stiffness. By its manifest, or by its driver."""
+
+import contextlib
+import threading
+import time
+from typing import Protocol
+
+from device_agent.ports import script_calls, skills
+from device_agent.ports.skills import Skill, SkillError
+from device_agent.runtime.actions.device_context import Body
+from device_agent.runtime.actions.speech_output import Utterance
+from device_agent.runtime.authority.authority import Tenure
+from device_agent.runtime.authority.lease_gate import Refused
+from device_agent.runtime.control.goals import Course
+from device_agent.runtime.planning import named_poses
+from device_agent.runtime.planning.behaviour_trajectory import Line, Score
+
+_REST_WITHIN_S = 3.0
+_PERIODS = 4
+"""Control periods after which the servos surely have what was commanded."""
+
+
+class Mover(Protocol):
+    """The action that shows something."""
+
+    tenure: Tenure
+    over: threading.Event
+
+    def move_joints(self, position_rad: dict[str, float], speed: float) -> None:
+        """Move and wait until there [rad].
+
+        Raises:
+            Refused: It did not get there.
+        """
+
+    def follow(self, course: Course) -> None:
+        """Wait for the end of a course.
+
+        Raises:
+            Refused: It was interrupted.
+        """
+
+
+class Performer:
+    """Shows what one action asks for.
+
+    Args:
+        body: The device.
+        mover: The action.
+    """
+
+    def __init__(self, body: Body, mover: Mover) -> None:
+        self._body = body
+        self._mover = mover
+
+    def show(self, call: script_calls.Show) -> None:
+        """Do it to its end; the driver goes first.
+
+        Raises:
+            Refused: It was not done.
+        """
+        kind = self._body.robot_type
+        match call:
+            case script_calls.Express(name=name, strength=strength) if not self._body.performs(skills.EXPRESSIONS):
+                check_share("strength", strength)
+                self._mover.move_joints(named_poses.expression(kind, name, strength), named_poses.EXPRESSION_SPEED)
+            case script_calls.Posture(name=name, speed=speed) if not self._body.performs(skills.POSTURES):
+                self._mover.move_joints(named_poses.posture(kind, name), speed)
+            case script_calls.Behaviour(name=name) if not self._body.performs(skills.BEHAVIOURS):
+                self._behave(name)
+            case script_calls.Say(text=text, language=language) if not self._body.performs(skills.SPEECH):
+                self._say(text, language)
+            case script_calls.Stiffness(value=value, joints=joints):
+                check_share("stiffness", value)
+                self._stiffen(value, joints)
+            case _:
+                self.perform(_skill(call))
+
+    def perform(self, skill: Skill) -> None:
+        """Have the driver do it, to its end.
+
+        Raises:
+            Refused: It cannot, or the action has lost the device.
+        """
+        if self._body.skills is None:
+            raise Refused("cannot", "this robot's driver has no skills")
+        if not self._mover.over.is_set():
+            try:
+                self._body.skills.perform(skill, _Stage(self._mover))
+            except SkillError as error:
+                raise self._mover.tenure.why or Refused("skill_failed", str(error)) from error
+        self._check()
+
+    # ------------------------------------------------------------ speech and behaviours
+
+    def _say(self, text: str, language: str) -> None:
+        utterance = self._body.speaker.prepare(text, language)
+        kind = self._body.robot_type
+        if not kind.visemes:
+            self._body.speaker.begin(utterance)
+            self._mover.over.wait(utterance.duration_s)
+            self._check()
+            return
+        self.come_to_rest()
+        score = Score(kind, self._body.controller.commanded_rad)
+        score.speak(Line(0.0, text, utterance.duration_s))
+        course = self._body.controller.go_along(self._mover.tenure, score.way())
+        self._body.speaker.begin(utterance)
+        self._mover.follow(course)
+
+    def _behave(self, name: str) -> None:
+        kind = self._body.robot_type
+        keyframes = named_poses.named("behaviour", name, kind.behaviours)
+        said = {one.say: self._body.speaker.prepare(one.say, "") for one in keyframes if one.say}
+        self.come_to_rest()
+        score = Score(kind, self._body.controller.commanded_rad)
+        lines = score.keyframes(keyframes, {text: utterance.duration_s for text, utterance in said.items()})
+        course = self._body.controller.go_along(self._mover.tenure, score.way())
+        begun_s = time.monotonic()
+        for line in lines:
+            if course.finished.wait(max(0.0, begun_s + line.begin_s - time.monotonic())):
+                break
+            self._speak(said[line.text])
+        self._mover.follow(course)
+
+    def _speak(self, utterance: Utterance) -> None:
+        """While something moves."""
+        self._body.speaker.begin(utterance)
+        if self._body.performs(skills.SPEECH):
+            threading.Thread(target=self._aloud, args=(utterance.text,), name="speech", daemon=True).start()
+
+    def _aloud(self, text: str) -> None:
+        with contextlib.suppress(Refused):  # the words of a behaviour that is over, or of a robot that lost its voice
+            self.perform(skills.Say(text))
+
+    # ------------------------------------------------------------ stiffness
+
+    def _stiffen(self, value: float, joints: tuple[str, ...]) -> None:
+        """While servos change their strength their joints are commanded to where they are: nothing jumps or drops."""
+        controller = self._body.controller
+        held = before = controller.stiffness(joints)
+        self.come_to_rest()
+        controller.stiffen(self._mover.tenure, dict.fromkeys(before, 0.0))
+        try:
+            self._mover.over.wait(_PERIODS * self._body.robot_type.period_ms / 1000)
+            self.perform(skills.Stiffen(value, joints))
+            held = dict.fromkeys(before, value)
+            self._mover.over.wait(_PERIODS * self._body.robot_type.period_ms / 1000)
+        finally:
+            controller.stiffened(held)
+
+    # ------------------------------------------------------------ for all of them
+
+    def come_to_rest(self) -> None:
+        """Wait for what the action before left in motion: it brakes by itself.
+
+        Raises:
+            Refused: The action has lost the device.
+        """
+        until_s = time.monotonic() + _REST_WITHIN_S
+        while self._body.controller.moving and time.monotonic() < until_s:
+            self._mover.over.wait(self._body.robot_type.period_ms / 1000)
+            self._check()
+
+    def _check(self) -> None:
+        if self._mover.over.is_set():
+            raise self._mover.tenure.why or Refused("ended", "the action ended")
+
+
+class _Stage:
+    """``Stage`` of one skill."""
+
+    def __init__(self, mover: Mover) -> None:
+        self._mover = mover
+
+    @property
+    def ended(self) -> bool:
+        """See ``Stage``."""
+        return self._mover.over.is_set()
+
+    def wait(self, timeout_s: float) -> bool:
+        """See ``Stage``."""
+        return self._mover.over.wait(timeout_s)
+
+    def move_joints(self, position_rad: dict[str, float], speed: float) -> None:
+        """See ``Stage``."""
+        try:
+            self._mover.move_joints(position_rad, speed)
+        except Refused as refused:
+            raise SkillError(refused.message) from refused
+
+
+def check_share(name: str, value: float, *, above_zero: bool = False) -> None:
+    """A share is 0 to 1.
+
+    Raises:
+        Refused: It is not, or is 0 where that is none.
+    """
+    if not (0 < value <= 1 if above_zero else 0 <= value <= 1):  # false for NaN
+        raise Refused(f"bad_{name}", f"{name} must be {'above ' if above_zero else ''}0 and at most 1, not {value}")
+
+
+def _skill(call: script_calls.Say | script_calls.Express | script_calls.Posture | script_calls.Behaviour) -> Skill:
+    match call:
+        case script_calls.Say(text=text, language=language):
+            return skills.Say(text, language)
+        case script_calls.Express(name=name, strength=strength):
+            check_share("strength", strength)
+            return skills.Express(name, strength)
+        case script_calls.Posture(name=name, speed=speed):
+            check_share("speed", speed, above_zero=True)
+            return skills.Pose(name, speed)
+    return skills.Behave(call.name)

@@ -1,0 +1,132 @@
+"""The keys whose orders the agent obeys: pinned when it was claimed, and followed when the cloud gets new ones."""
+
+import logging
+import threading
+from collections.abc import Callable, Iterable, Iterator, Mapping
+
+from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PublicKey
+from msgspec.structs import replace
+
+from device_agent.config.agent_config import HomeError, Pairing
+from device_agent.protocol import codec
+from device_agent.protocol.errors import ProtocolError, SignatureError
+from device_agent.protocol.security import key_rotation, signing
+from device_agent.protocol.security.key_rotation import NewKey
+from device_agent.runtime.authority.lease_gate import Refused
+
+_log = logging.getLogger(__name__)
+ADVICE = "run `python -m device_agent repin` on this machine, or un-pair the agent and claim it again"
+
+
+class Pins(Mapping[str, Ed25519PublicKey]):
+    """Pinned keys that count now, by key id. Thread-safe: every device and the link look here.
+
+    Args:
+        pairing: With the keys as they are on file.
+        save: Writes the pairing; a new key counts only after that.
+        now_ms: The cloud's time [ms], or ``None`` while it is not known. Then no key ends: all that is obeyed without
+            the time is a Stop.
+    """
+
+    def __init__(
+        self, pairing: Pairing, *, save: Callable[[Pairing], None], now_ms: Callable[[], float | None]
+    ) -> None:
+        self._lock = threading.Lock()
+        self._pairing = pairing
+        self._keys = pairing.public_keys()
+        self._save = save
+        self._now_ms = now_ms
+        self._complained = ""
+
+    def __getitem__(self, name: str) -> Ed25519PublicKey:
+        with self._lock:
+            key = self._keys[name]
+            if self._ended(self._pairing, name):
+                raise KeyError(name)
+            return key
+
+    def __iter__(self) -> Iterator[str]:
+        with self._lock:
+            names = [name for name in self._keys if not self._ended(self._pairing, name)]
+        return iter(names)
+
+    def __len__(self) -> int:
+        return sum(1 for _ in self)
+
+    @property
+    def serial(self) -> int:
+        """The newest key's."""
+        with self._lock:
+            return self._pairing.serial
+
+    def follow(self, statements: Iterable[str]) -> None:
+        """Pin what the statements lead to, oldest first; those of keys that are pinned already change nothing.
+
+        Raises:
+            Refused: Not signed with a pinned key that still counts, over, or leading back to an older key.
+        """
+        for statement in statements:
+            with self._lock:
+                self._follow(statement.encode())
+
+    def check(self, name: str) -> None:
+        """Complain, once, when the cloud signs orders with a key that is not pinned."""
+        if not name or name in self:
+            return
+        if self._complained != name:
+            self._complained = name
+            _log.error("the cloud signs its orders with key %s, which this agent has not learned: %s", name, ADVICE)
+
+    def _follow(self, statement: bytes) -> None:
+        before = self._pairing
+        now_ms = self._now_ms()
+        try:
+            signer = codec.decode(statement, signing.Signed).key
+            new = codec.decode(signing.verify(statement, self._keys, context=key_rotation.KEYS_CONTEXT), NewKey)
+            key = signing.public_key(new.key)
+        except SignatureError as error:
+            if self._known(statement):
+                return
+            raise Refused("bad_signature", f"the statement of a new key is refused: {error}; {ADVICE}") from error
+        except ProtocolError as error:
+            raise Refused("malformed", f"the statement of a new key cannot be read: {error}") from error
+        name = signing.key_id(key)
+        if name in self._keys and new.serial <= before.serial:
+            return
+        if new.serial <= before.serial:
+            raise Refused("rolled_back", f"key {new.serial} is not newer than key {before.serial}, which is pinned")
+        if before.until_ms.get(signer):
+            raise Refused("rolled_back", f"key {new.serial} is told of by a key that has a successor already; {ADVICE}")
+        if now_ms is None:
+            raise Refused("no_clock", "the device does not know the cloud's time yet; send it again")
+        if now_ms >= new.former_until_ms:
+            raise Refused("expired", f"the key that tells of a new one is over; {ADVICE}")
+        pairing = replace(
+            before,
+            keys={old: text for old, text in before.keys.items() if not self._ended(before, old)} | {name: new.key},
+            until_ms={
+                old: min(before.until_ms.get(old) or new.former_until_ms, new.former_until_ms)
+                for old in before.keys
+                if not self._ended(before, old)
+            },
+            serial=new.serial,
+        )
+        try:
+            self._save(pairing)
+        except HomeError as error:
+            raise Refused("journal", f"the new key could not be written down: {error}") from error
+        self._pairing, self._keys = pairing, pairing.public_keys()
+        _log.info("the cloud has a new key, %s (number %d)", name, new.serial)
+
+    def _known(self, statement: bytes) -> bool:
+        """Whether it tells of a key that is pinned already, and was signed by one that is so no longer."""
+        try:
+            body = codec.decode(bytes(codec.decode(statement, signing.Signed).body), NewKey)
+            name = signing.key_id(signing.public_key(body.key))
+        except ProtocolError:
+            return False
+        return name in self._keys and body.serial <= self._pairing.serial
+
+    def _ended(self, pairing: Pairing, name: str) -> bool:
+        until_ms, now_ms = pairing.until_ms.get(name, 0), self._now_ms()
+        return bool(until_ms) and now_ms is not None and now_ms >= until_ms

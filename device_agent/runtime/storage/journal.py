@@ -1,0 +1,241 @@
+"""What an agent must not forget: commands it has seen, epochs, Stop latches, movements that ran, its session number.
+
+SQLite, one file per agent. Epochs, latches, movements and the ends of commands are on the disk when their call returns.
+That a command has come, and what it has come to, is only written, which outlives the agent but not the machine's power:
+whoever is about to move something because of it calls ``settle`` before.
+"""
+
+import contextlib
+import os
+import sqlite3
+import threading
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from device_agent.protocol import Ack, AckStatus, Reason, StopLatch, codec
+
+_SCHEMA = """
+CREATE TABLE IF NOT EXISTS commands (
+    id TEXT PRIMARY KEY, device TEXT NOT NULL, last_ack BLOB NOT NULL,
+    terminal INTEGER NOT NULL, delivered INTEGER NOT NULL, at_ms INTEGER NOT NULL);
+CREATE INDEX IF NOT EXISTS undelivered ON commands (device) WHERE delivered = 0;
+CREATE TABLE IF NOT EXISTS devices (
+    device TEXT PRIMARY KEY, epoch INTEGER NOT NULL DEFAULT 0, burned INTEGER NOT NULL DEFAULT 0, latch BLOB);
+CREATE TABLE IF NOT EXISTS movements (
+    device TEXT NOT NULL, author TEXT NOT NULL, robot_type TEXT NOT NULL, name TEXT NOT NULL, version INTEGER NOT NULL,
+    PRIMARY KEY (device, author, robot_type, name)) WITHOUT ROWID;
+CREATE TABLE IF NOT EXISTS counters (name TEXT PRIMARY KEY, value INTEGER NOT NULL);
+"""
+_CACHE_KB = 256
+"""Rows are found one by one, by their key: more would only fill up over days, in the memory of a small computer."""
+_KEEP_MS = 7 * 24 * 3600 * 1000
+"""Commands are remembered a week: longer than any ``ttl_ms`` (a day at most), so that none can run twice."""
+
+
+class JournalError(Exception):
+    """The journal cannot be read or written; the text says what to do. The agent must not run without it."""
+
+
+@dataclass(frozen=True, slots=True)
+class DeviceRecord:
+    """What one device remembers across restarts: highest epoch seen, highest epoch no longer obeyed, Stop latch."""
+
+    epoch: int = 0
+    burned: int = 0
+    latch: StopLatch | None = None
+
+
+class Journal:
+    """The agent's memory. Thread-safe.
+
+    Args:
+        path: The database file; its folder must exist.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self._path = path
+        self._lock = threading.Lock()
+        self._database: sqlite3.Connection | None = None
+
+    def open(self, *, now_ms: int) -> None:
+        """Open or create the file, and forget commands older than a week.
+
+        Raises:
+            JournalError: Unreadable, or not a journal.
+        """
+        try:
+            self._database = sqlite3.connect(self._path, check_same_thread=False, isolation_level=None)
+            self._database.execute("PRAGMA journal_mode=WAL")
+            self._database.execute("PRAGMA synchronous=NORMAL")
+            self._database.execute(f"PRAGMA cache_size=-{_CACHE_KB}")
+            self._database.executescript(_SCHEMA)
+            self._database.execute("DELETE FROM commands WHERE terminal = 1 AND at_ms < ?", (now_ms - _KEEP_MS,))
+        except sqlite3.Error as error:
+            raise JournalError(
+                f"the journal {self._path} cannot be used ({error}). Move it away to start with an empty one; the "
+                "agent then needs a new lease for each device and will not know which commands it has already run."
+            ) from error
+
+    def close(self) -> None:
+        """Close the file. May be called twice."""
+        with self._lock:
+            if self._database is not None:
+                self._database.close()
+                self._database = None
+
+    def begin(self, device: str, ack: Ack) -> Ack | None:
+        """Remember a command before anything is done about it; see ``settle``.
+
+        Args:
+            device: Name of the device.
+            ack: The first answer to it, ``received`` or already a refusal.
+
+        Returns:
+            ``None`` for a new command; for one seen before, the last answer given to it, and nothing may be done again.
+        """
+        with self._lock:
+            rows = self._execute(
+                "INSERT INTO commands VALUES (?, ?, ?, ?, 0, ?) ON CONFLICT (id) DO NOTHING RETURNING id",
+                (ack.id, device, codec.encode(ack), ack.status.terminal, ack.at_ms),
+            )
+            if rows:
+                return None
+            return codec.decode(self._execute("SELECT last_ack FROM commands WHERE id = ?", (ack.id,))[0][0], Ack)
+
+    def record(self, ack: Ack) -> None:
+        """Remember the newest answer to a command begun before; on the disk when this returns if it is the last."""
+        with self._lock, self._on_disk() if ack.status.terminal else contextlib.nullcontext():
+            self._execute(
+                "UPDATE commands SET last_ack = ?, terminal = ?, delivered = 0, at_ms = ? "
+                "WHERE id = ? AND terminal = 0",
+                (codec.encode(ack), ack.status.terminal, ack.at_ms, ack.id),
+            )
+
+    def settle(self) -> None:
+        """All that was written is on the disk when this returns: with the next start, none of it is done again.
+
+        The disk takes most of a millisecond, for which nobody is kept from writing: what was written is in SQLite's
+        write-ahead log, or has been synced from there into the file, and a log may be synced by anybody.
+
+        Raises:
+            JournalError: It is closed, or the disk fails.
+        """
+        try:
+            log = os.open(f"{self._path}-wal", os.O_RDWR)
+            try:
+                os.fsync(log)
+            finally:
+                os.close(log)
+        except OSError as error:
+            raise JournalError(f"the journal {self._path} is not on the disk ({error}); look at the disk") from error
+
+    def delivered(self, ack: Ack) -> None:
+        """Note that the cloud has this answer, unless a newer one has been recorded since."""
+        with self._lock:
+            if self._database is not None:
+                self._execute(
+                    "UPDATE commands SET delivered = 1 WHERE id = ? AND last_ack = ?", (ack.id, codec.encode(ack))
+                )
+
+    def undelivered(self, device: str) -> tuple[Ack, ...]:
+        """The last answers to this device's commands that the cloud may not have."""
+        with self._lock:
+            rows = self._execute("SELECT last_ack FROM commands WHERE device = ? AND delivered = 0", (device,))
+        return tuple(codec.decode(row[0], Ack) for row in rows)
+
+    def end_open(self, *, now_ms: int, tick_ms: int) -> int:
+        """At start: give every command that a former run left without an end one, ``failed``.
+
+        Returns:
+            How many there were. None of them will be run again: the device may have moved already.
+        """
+        reason = Reason(code="agent_restarted", message="the agent restarted while this ran; it was not run again")
+        with self._lock:
+            rows = self._execute("SELECT last_ack FROM commands WHERE terminal = 0")
+        for row in rows:
+            last = codec.decode(row[0], Ack)
+            self.record(
+                Ack(
+                    id=last.id,
+                    status=AckStatus.FAILED,
+                    sequence=last.sequence + 1,
+                    at_ms=now_ms,
+                    tick_ms=tick_ms,
+                    reason=reason,
+                )
+            )
+        return len(rows)
+
+    def device(self, device: str) -> DeviceRecord:
+        """What is remembered of a device; all zero for a new one."""
+        with self._lock:
+            rows = self._execute("SELECT epoch, burned, latch FROM devices WHERE device = ?", (device,))
+        if not rows:
+            return DeviceRecord()
+        epoch, burned, latch = rows[0]
+        return DeviceRecord(epoch, burned, codec.decode(latch, StopLatch) if latch else None)
+
+    def save_epoch(self, device: str, *, epoch: int, burned: int) -> None:
+        """Remember a device's epochs; neither ever falls."""
+        with self._lock, self._on_disk():
+            self._execute(
+                "INSERT INTO devices (device, epoch, burned) VALUES (?, ?, ?) ON CONFLICT (device) DO UPDATE SET "
+                "epoch = max(epoch, excluded.epoch), burned = max(burned, excluded.burned)",
+                (device, epoch, burned),
+            )
+
+    def save_latch(self, device: str, latch: StopLatch | None) -> None:
+        """Remember a device's Stop latch."""
+        with self._lock, self._on_disk():
+            self._execute(
+                "INSERT INTO devices (device, latch) VALUES (?, ?) "
+                "ON CONFLICT (device) DO UPDATE SET latch = excluded.latch",
+                (device, codec.encode(latch) if latch else None),
+            )
+
+    def movement(self, device: str, author: str, robot_type: str, name: str) -> int:
+        """The highest version of a movement that has run on a device; 0 for none."""
+        with self._lock:
+            rows = self._execute(
+                "SELECT version FROM movements WHERE device = ? AND author = ? AND robot_type = ? AND name = ?",
+                (device, author, robot_type, name),
+            )
+        return int(rows[0][0]) if rows else 0
+
+    def save_movement(self, device: str, author: str, robot_type: str, name: str, version: int) -> None:
+        """Remember a version that runs; what is remembered never falls."""
+        with self._lock, self._on_disk():
+            self._execute(
+                "INSERT INTO movements VALUES (?, ?, ?, ?, ?) ON CONFLICT (device, author, robot_type, name) "
+                "DO UPDATE SET version = max(version, excluded.version)",
+                (device, author, robot_type, name, version),
+            )
+
+    def next_session(self) -> int:
+        """The next session number of this agent's link, rising for ever."""
+        with self._lock, self._on_disk():
+            rows = self._execute(
+                "INSERT INTO counters VALUES ('session', 1) ON CONFLICT (name) DO UPDATE SET value = value + 1 "
+                "RETURNING value"
+            )
+        return int(rows[0][0])
+
+    @contextlib.contextmanager
+    def _on_disk(self) -> Iterator[None]:
+        """What is written here, and all before it, is on the disk at the end."""
+        self._execute("PRAGMA synchronous=FULL")
+        try:
+            yield
+        finally:
+            with contextlib.suppress(JournalError):  # what went wrong is being told already
+                self._execute("PRAGMA synchronous=NORMAL")
+
+    def _execute(self, sql: str, values: tuple[object, ...] = ()) -> list[Any]:
+        if self._database is None:
+            raise JournalError("the journal is closed")
+        try:
+            return self._database.execute(sql, values).fetchall()
+        except sqlite3.Error as error:
+            raise JournalError(f"the journal {self._path} cannot be written ({error}): is the disk full?") from error

@@ -1,0 +1,377 @@
+"""Makes a robot type folder from somebody else's MuJoCo model, for example one of MuJoCo Menagerie.
+
+What the model says is taken; what it does not say is guessed on the safe side, and the manifest says so beside
+each guess.
+"""
+
+import math
+import shutil
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import mujoco
+import numpy as np
+
+from device_agent.protocol.topics import is_id
+from device_agent.simulation.mjcf.equality_joints import Ties
+
+GUESSED = "  # guessed"
+_SPEED_RAD_S, _SPEED_M_S = 0.5, 0.05
+"""Slow enough to be stopped by hand."""
+_RANGE_RAD = math.pi
+_ACCELERATION, _JERK, _BRAKING = 2.0, 20.0, 4.0
+_LEAST_EFFORT = 1.0
+_SAMPLES = 200
+_ROOM_M = 0.05
+_DIGITS = 1e4
+_FRAMES = 8
+_POSITION_KEY = "home"
+
+
+class AdoptError(Exception):
+    """The model cannot be made a robot type. Its text says why, and what to do."""
+
+
+@dataclass(frozen=True, slots=True)
+class _Servo:
+    """A joint and its motor. A ``guess`` names the fields that the model does not tell."""
+
+    name: str
+    slides: bool
+    lower: float
+    upper: float
+    effort: float
+    guessed: frozenset[str]
+
+
+def adopt(source: Path, name: str, into: Path, *, without: Sequence[str] = ()) -> Path:
+    """Write ``into/name``: manifest, model, scene, a movement, README.
+
+    Args:
+        source: MJCF file of the robot, alone or in a scene; only the robot is taken.
+        name: Id of the new type.
+        into: The folder of robot types.
+        without: Actuators to leave out.
+
+    Returns:
+        The new folder.
+
+    Raises:
+        AdoptError: There is such a folder, the model cannot be read, or is no robot of position servos.
+    """
+    if not is_id(name):
+        raise AdoptError(f"'{name}' is no name for a robot type: letters, digits, _ and -, 1 to 64 of them")
+    folder = into / name
+    if folder.exists():
+        raise AdoptError(f"{folder} is there already; choose another name, or delete it")
+    spec = _read(source)
+    home = _home(spec, _compile(spec, source))
+    _leave_out(spec, without)
+    model = _compile(spec, source)
+    _check_servos(model)
+    _keep_robot_only(spec, model.body(_root(model)).name)
+    _name_actuators(spec, model)
+    alone = _compile(spec, source)
+    servos = [_servo(alone, actuator) for actuator in range(alone.nu)]
+    for actuator, servo in zip(spec.actuators, servos, strict=True):
+        actuator.forcelimited, actuator.forcerange = True, (-servo.effort, servo.effort)
+        actuator.ctrllimited, actuator.ctrlrange = True, (servo.lower, servo.upper)
+    for joint in spec.joints:
+        found = next((servo for servo in servos if servo.name == joint.name), None)
+        if found is not None and "range" in found.guessed:
+            joint.limited, joint.range = True, (found.lower, found.upper)
+    home = {servo.name: min(max(home.get(servo.name, 0.0), servo.lower), servo.upper) for servo in servos}
+    folder.mkdir(parents=True)
+    try:
+        _write_model(spec, source, folder)
+        _write_texts(folder, source, alone, servos, home)
+    except (OSError, ValueError, AdoptError) as error:
+        shutil.rmtree(folder)
+        raise AdoptError(str(error)) from error
+    return folder
+
+
+# ------------------------------------------------------------ what it is
+
+
+def _read(source: Path) -> Any:
+    try:
+        return mujoco.MjSpec.from_file(str(source))
+    except (ValueError, OSError, mujoco.FatalError) as error:
+        raise AdoptError(f"{source}: MuJoCo cannot read this model: {error}") from error
+
+
+def _compile(spec: Any, source: Path) -> Any:
+    try:
+        return spec.compile()
+    except (ValueError, OSError, mujoco.FatalError) as error:
+        raise AdoptError(f"{source}: MuJoCo cannot build this model: {error}") from error
+
+
+def _leave_out(spec: Any, without: Sequence[str]) -> None:
+    known = {actuator.name: actuator for actuator in spec.actuators}
+    for name in without:
+        if name not in known:
+            raise AdoptError(f"no actuator '{name}' to leave out; there are: {', '.join(known)}")
+        spec.delete(known[name])
+
+
+def _check_servos(model: Any) -> None:
+    """All actuators are position servos of one joint each."""
+    if not model.nu:
+        raise AdoptError("the model has no actuators: nothing could move it")
+    wrong = {
+        model.actuator(index).name or f"actuator {index}": why
+        for index in range(model.nu)
+        if (why := _wrong(model, index))
+    }
+    if wrong:
+        told = "; ".join(f"{name} {why}" for name, why in wrong.items())
+        leave = " ".join(f"--without {name}" for name in wrong)
+        raise AdoptError(
+            f"only position servos of joints can be driven: {told}. Change the model, or leave out: {leave}"
+        )
+    joints = model.actuator_trnid[:, 0].tolist()
+    if len(set(joints)) != len(joints):
+        raise AdoptError("two actuators move the same joint; leave one of each pair out with --without")
+    if any(not model.joint(joint).name for joint in joints):
+        raise AdoptError("a joint with an actuator has no name; name it in the model")
+
+
+def _wrong(model: Any, index: int) -> str:
+    if model.actuator_trntype[index] != int(mujoco.mjtTrn.mjTRN_JOINT):
+        return "moves no joint by itself"
+    if model.jnt_type[model.actuator_trnid[index, 0]] not in (
+        int(mujoco.mjtJoint.mjJNT_HINGE),
+        int(mujoco.mjtJoint.mjJNT_SLIDE),
+    ):
+        return "moves a joint that is neither a hinge nor a slide"
+    if model.actuator_gear[index, 0] != 1:
+        return f"has a gear of {model.actuator_gear[index, 0]:g}"
+    gain = model.actuator_gainprm[index, 0]
+    affine = model.actuator_biastype[index] == int(mujoco.mjtBias.mjBIAS_AFFINE)
+    servo = affine and gain > 0 and model.actuator_biasprm[index, 1] == -gain and not model.actuator_dyntype[index]
+    return "" if servo else "is no position servo"
+
+
+def _root(model: Any) -> int:
+    """The one top-level body that all driven joints hang on."""
+    roots = {int(model.body_rootid[model.jnt_bodyid[joint]]) for joint in model.actuator_trnid[:, 0]}
+    if len(roots) != 1:
+        names = ", ".join(sorted(model.body(root).name for root in roots))
+        raise AdoptError(f"the motors belong to several robots ({names}); make a file of each")
+    return roots.pop()
+
+
+def _keep_robot_only(spec: Any, root: str) -> None:
+    """Take away what stands around the robot, and what names it."""
+    world = spec.worldbody
+    for thing in [*world.geoms, *world.lights, *world.cameras, *world.sites]:
+        spec.delete(thing)
+    for body in [body for body in world.bodies if body.name != root]:
+        spec.delete(body)
+    for body in world.bodies:
+        for light in [light for each in (body, *_below(body)) for light in each.lights]:
+            spec.delete(light)
+
+
+def _below(body: Any) -> Iterator[Any]:
+    for child in body.bodies:
+        yield child
+        yield from _below(child)
+
+
+def _home(spec: Any, model: Any) -> dict[str, float]:
+    """Where its joints are in the keyframe ``home``, or in the first; else where the model has them."""
+    found = model.qpos0
+    if model.nkey:
+        names = [model.key(index).name for index in range(model.nkey)]
+        found = model.key_qpos[names.index(_POSITION_KEY) if _POSITION_KEY in names else 0]
+    for key in list(spec.keys):  # they list joints that may be gone
+        spec.delete(key)
+    return {model.joint(joint).name: float(found[model.jnt_qposadr[joint]]) for joint in range(model.njnt)}
+
+
+def _name_actuators(spec: Any, model: Any) -> None:
+    """An actuator is called as its joint: so the driver finds both."""
+    names = [model.joint(joint).name for joint in model.actuator_trnid[:, 0]]
+    for index, actuator in enumerate(spec.actuators):
+        actuator.name = f"adopted {index}"
+    for actuator, name in zip(spec.actuators, names, strict=True):
+        actuator.name = name
+
+
+def _servo(model: Any, actuator: int) -> _Servo:
+    joint = int(model.actuator_trnid[actuator, 0])
+    guessed: set[str] = set()
+    lower, upper = -_RANGE_RAD, _RANGE_RAD
+    if model.jnt_limited[joint]:
+        lower, upper = model.jnt_range[joint].tolist()
+    else:
+        guessed.add("range")
+    if model.actuator_ctrllimited[actuator]:
+        least, most = model.actuator_ctrlrange[actuator].tolist()
+        lower, upper = max(lower, least), min(upper, most)
+    # A written model has six digits: rounded inwards, the manifest's range lies within it.
+    lower, upper = math.ceil(lower * _DIGITS) / _DIGITS, math.floor(upper * _DIGITS) / _DIGITS
+    if lower >= upper:
+        name = model.joint(joint).name
+        raise AdoptError(f"joint '{name}' and its actuator have no position in common; correct their ranges")
+    efforts = [
+        float(np.abs(ranges).min())
+        for limited, ranges in (
+            (model.actuator_forcelimited[actuator], model.actuator_forcerange[actuator]),
+            (model.jnt_actfrclimited[joint], model.jnt_actfrcrange[joint]),
+        )
+        if limited and np.abs(ranges).min() > 0
+    ]
+    if not efforts:
+        guessed.add("effort")
+        efforts = [max(_LEAST_EFFORT, 2 * _holding(model, joint))]
+    slides = int(model.jnt_type[joint]) == int(mujoco.mjtJoint.mjJNT_SLIDE)
+    return _Servo(
+        model.joint(joint).name, slides, float(lower), float(upper), round(min(efforts), 3), frozenset(guessed)
+    )
+
+
+def _holding(model: Any, joint: int) -> float:
+    """The most that a joint needs against gravity, in random positions [N m or N]."""
+    data, random = mujoco.MjData(model), np.random.default_rng(0)
+    ties, most = Ties(model), 0.0
+    dof = int(model.jnt_dofadr[joint])
+    scalar = model.jnt_type >= int(mujoco.mjtJoint.mjJNT_SLIDE)
+    addresses = model.jnt_qposadr[scalar]
+    limited = model.jnt_limited[scalar].astype(bool)[:, np.newaxis]
+    ranges = np.where(limited, model.jnt_range[scalar], (-_RANGE_RAD, _RANGE_RAD))
+    for _ in range(_SAMPLES):
+        data.qpos[addresses] = random.uniform(ranges[:, 0], ranges[:, 1])
+        ties.settle(data.qpos)
+        mujoco.mj_forward(model, data)
+        most = max(most, abs(float(data.qfrc_bias[dof] - data.qfrc_gravcomp[dof])))
+    return most
+
+
+# ------------------------------------------------------------ what is written
+
+
+def _write_model(spec: Any, source: Path, folder: Path) -> None:
+    """The model with the files that it needs beside it."""
+    spec.modelname = folder.name
+    places = {"meshdir": spec.meshdir, "texturedir": spec.texturedir}
+    needed = [(places["meshdir"], mesh) for mesh in spec.meshes] + [
+        (places["texturedir"], each) for each in spec.textures
+    ]
+    for where, asset in needed:
+        if asset.file:
+            found = source.parent / where / asset.file
+            if not found.is_file():
+                raise AdoptError(f"{found} is missing, which the model asks for")
+            kept = folder / "assets" / Path(asset.file).name
+            kept.parent.mkdir(exist_ok=True)
+            shutil.copyfile(found, kept)
+            asset.file = kept.name
+    spec.meshdir = spec.texturedir = "assets"
+    spec.modelfiledir = str(folder)
+    (folder / f"{folder.name}.xml").write_text(spec.to_xml(), encoding="utf-8")
+
+
+def _write_texts(folder: Path, source: Path, model: Any, servos: Sequence[_Servo], home: dict[str, float]) -> None:
+    name = folder.name
+    data = mujoco.MjData(model)
+    for joint, position in home.items():
+        data.joint(joint).qpos[0] = position
+    Ties(model).settle(data.qpos)
+    mujoco.mj_forward(model, data)
+    (folder / "scene.xml").write_text(_scene(name, model, data), encoding="utf-8")
+    (folder / "robot.toml").write_text(_manifest(name, model, servos, home), encoding="utf-8")
+    (folder / "movements").mkdir()
+    (folder / "movements" / "home.py").write_text('"""Go home, slowly."""\n\nrobot.home(speed=0.3)\n', encoding="utf-8")
+    (folder / "README.md").write_text(_readme(name, source, servos), encoding="utf-8")
+
+
+def _scene(name: str, model: Any, data: Any) -> str:
+    """A floor, and a camera that sees all of it.
+
+    The floor is where the robot stands on it at home; below what moves, where that would be too near.
+    """
+    reach = float(model.stat.extent)
+    fixed = model.body_weldid[model.geom_bodyid] == 0
+    stands = not fixed.any()  # on feet or wheels
+    low = [_bottom(model, data, geom) - (0.0 if fixed[geom] or stands else _ROOM_M) for geom in range(model.ngeom)]
+    lowest = min(low, default=0.0)
+    x, y, z = (float(value) for value in model.stat.center)
+    eye = f"{x + 1.6 * reach:.3f} {y - 1.6 * reach:.3f} {z + reach:.3f}"
+    return f"""<mujoco model="{name}_scene">
+  <include file="{name}.xml"/>
+  <worldbody>
+    <light pos="{x:.3f} {y - reach:.3f} {z + 2 * reach:.3f}" dir="0 0.4 -1" directional="true"/>
+    <camera name="picture" fovy="40" pos="{eye}" xyaxes="1 1 0 -0.35 0.35 1.2"/>
+    <geom name="floor" type="plane" size="5 5 0.1" pos="0 0 {lowest:.4f}" rgba="0.8 0.81 0.82 1"/>
+  </worldbody>
+</mujoco>
+"""
+
+
+def _bottom(model: Any, data: Any, geom: int) -> float:
+    centre, half = model.geom_aabb[geom, :3], model.geom_aabb[geom, 3:]
+    turn = data.geom_xmat[geom].reshape(3, 3)
+    return float(data.geom_xpos[geom, 2] + (turn @ centre)[2] - np.abs(turn[2]) @ half)
+
+
+def _manifest(name: str, model: Any, servos: Sequence[_Servo], home: dict[str, float]) -> str:
+    frames = [model.site(index).name for index in range(model.nsite) if model.site(index).name][:_FRAMES]
+    frames = frames or [model.body(model.jnt_bodyid[model.joint(servos[-1].name).id]).name]
+    lines = [
+        f'type = "{name}"',
+        "version = 1",
+        f'label = "{name}"',
+        'kind = "robot"',
+        'description = "Taken over from a MuJoCo model. Look at every guessed figure before you trust it."',
+        f'model = "{name}.xml"',
+        'scene = "scene.xml"',
+        'driver = "mujoco"',
+        "period_ms = 20",
+        f"braking_rad_s2 = {_BRAKING}{GUESSED}",
+        "frames = [" + ", ".join(f'"{frame}"' for frame in frames if frame) + "]",
+        'capabilities = ["joints", "movements"]',
+        "",
+        "[home_rad]",
+        *(f'"{joint}" = {position!r}' for joint, position in home.items()),
+        "",
+        "[[streams]]",
+        'name = "joints"',
+        "rate_hz = 20.0",
+    ]
+    for servo in servos:
+        guess = {field: GUESSED if field in servo.guessed else "" for field in ("range", "effort")}
+        lines += [
+            "",
+            "[[joints]]",
+            f'name = "{servo.name}"',
+            f'label = "{servo.name}"',
+            f"lower_rad = {servo.lower!r}{guess['range']}",
+            f"upper_rad = {servo.upper!r}{guess['range']}",
+            f"max_velocity_rad_s = {_SPEED_M_S if servo.slides else _SPEED_RAD_S}{GUESSED}",
+            f"max_acceleration_rad_s2 = {_ACCELERATION}{GUESSED}",
+            f"max_jerk_rad_s3 = {_JERK}{GUESSED}",
+            f"max_effort_nm = {servo.effort!r}{guess['effort']}",
+        ]
+    return "\n".join(lines) + "\n"
+
+
+def _readme(name: str, source: Path, servos: Sequence[_Servo]) -> str:
+    efforts = ", ".join(servo.name for servo in servos if "effort" in servo.guessed) or "none"
+    ranges = ", ".join(servo.name for servo in servos if "range" in servo.guessed) or "none"
+    return f"""# {name}
+
+Taken over from `{source.name}` by `python -m device_agent import-model`. **Source** of shapes, masses, ranges and
+servos: that model; its licence holds for this folder as well.
+
+## What is approximate
+
+- Speeds, accelerations, jerk and braking: guessed, slow.
+- Ranges that were guessed (±180°): {ranges}. Efforts that were guessed (twice what gravity asks for): {efforts}.
+- The scene is a floor and a camera.
+"""

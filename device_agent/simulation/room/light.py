@@ -1,0 +1,74 @@
+"""Light of a simulated room: what comes through the window and from the lamps, as a number and for the cameras.
+
+Illuminance adds up: E = E_day (b + (1 - b) opening of the blinds) + E_lamp level, in the middle of the room at table
+height; b is what closed blinds let through. E_day and E_lamp are the room's own figures. EN 12464-1 asks for 500 lx in
+a laboratory, which the usual one has with both. For cameras the model's ``window`` and ``lamp…`` lights are dimmed too.
+"""
+
+from typing import Any
+
+import mujoco
+import numpy as np
+
+from device_agent.protocol.manifests.room import Room
+from device_agent.simulation.room.openings import opening
+from device_agent.simulation.world import World
+
+PERIOD_S = 0.1
+_THROUGH_BLINDS = 0.08
+"""Share of daylight that light fabric lets through; approximate."""
+_LAMP, _BLINDS, _WINDOW = "lamp", "blinds", "window"
+_UNLIT = 0.45
+"""Colour of a lamp's panel when it is off, as a share of when it is on."""
+
+
+class Light:
+    """A ``Process`` of a ``World``; tells ``light_lux``, and dims the model's lights and lamp panels.
+
+    Args:
+        room: Its figures.
+        world: Whose quantities it tells.
+    """
+
+    def __init__(self, room: Room, world: World) -> None:
+        self._of = room.climate
+        self._world = world
+        self._model: Any = None
+        self._next_s = 0.0
+        self._lamps: list[int] = []
+        self._panels: list[int] = []
+        self._window = -1
+        self._full = np.zeros((0, 3))
+        self._lit = np.zeros((0, 4))
+        self._dimmed = (-1.0, -1.0)
+
+    def step(self, model: Any, data: Any, time_s: float) -> None:
+        """Look at lamp and blinds."""
+        if model is not self._model:
+            self._resolve(model)
+        if time_s < self._next_s:
+            return
+        self._next_s = time_s + PERIOD_S
+        level = min(1.0, max(0.0, self._world.settings.get(_LAMP, 0.0)))
+        day = _THROUGH_BLINDS + (1 - _THROUGH_BLINDS) * opening(model, data, _BLINDS, missing=1.0)
+        self._world.tell({"light_lux": self._of.daylight_lux * day + self._of.lamp_lux * level})
+        if self._dimmed != (level, day):
+            self._dim(model, level, day)
+
+    def _dim(self, model: Any, level: float, day: float) -> None:
+        self._dimmed = level, day
+        for lamp in self._lamps:
+            model.light_diffuse[lamp] = self._full[lamp] * level
+        if self._window >= 0:
+            model.light_diffuse[self._window] = self._full[self._window] * day
+        for panel in self._panels:
+            model.mat_rgba[panel, :3] = self._lit[panel, :3] * (_UNLIT + (1 - _UNLIT) * level)
+
+    def _resolve(self, model: Any) -> None:
+        self._model = model
+        names = [str(model.light(light).name) for light in range(model.nlight)]
+        self._lamps = [light for light, name in enumerate(names) if name.startswith(_LAMP)]
+        self._window = names.index(_WINDOW) if _WINDOW in names else -1
+        geoms = [int(mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_GEOM, names[lamp])) for lamp in self._lamps]
+        self._panels = sorted({int(model.geom_matid[geom]) for geom in geoms if geom >= 0} - {-1})
+        self._full, self._lit = model.light_diffuse.copy(), model.mat_rgba.copy()

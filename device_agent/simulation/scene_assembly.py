@@ -1,0 +1,90 @@
+"""A world from its parts: a scene, the robots placed in it, everybody at home."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import mujoco
+
+from device_agent.ports.driver import DriverError
+from device_agent.simulation.mjcf.equality_joints import Ties
+from device_agent.simulation.mjcf.options import agree
+
+TIMESTEP_S = 0.002
+SCALAR_JOINTS = frozenset({int(mujoco.mjtJoint.mjJNT_HINGE), int(mujoco.mjtJoint.mjJNT_SLIDE)})
+"""Joint types with one position. As ``int``: MuJoCo's enumerations do not equal the numbers in its arrays."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Placement:
+    """One robot put into a scene.
+
+    Attributes:
+        prefix: Put before every name of the robot's model, ``arm/`` for example; unique in its world.
+        model: MJCF file of the robot alone.
+        position_m: Of the robot's origin in the world [m]. A robot that stands on a free joint starts there.
+        quaternion: Of the robot in the world (w, x, y, z).
+    """
+
+    prefix: str
+    model: Path
+    position_m: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    quaternion: tuple[float, float, float, float] = (1.0, 0.0, 0.0, 0.0)
+
+
+def assemble(scene: Path, robots: Sequence[Placement]) -> Any:
+    """The compiled ``MjModel`` of a scene with robots in it.
+
+    Raises:
+        DriverError: A file is missing or MuJoCo refuses it.
+    """
+    try:
+        spec = mujoco.MjSpec.from_file(str(scene))
+        # One world has one time step and one integrator; the robots' servos are tuned for this pair.
+        spec.option.timestep = TIMESTEP_S
+        spec.option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
+        # A diverged world must stop and say so. MuJoCo's own answer is to jump back to the start.
+        spec.option.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_AUTORESET)
+        for robot in robots:
+            frame = spec.worldbody.add_frame(pos=robot.position_m, quat=robot.quaternion)
+            model = mujoco.MjSpec.from_file(str(robot.model))
+            agree(model.option, spec.option)
+            agree(model.visual, spec.visual)
+            spec.attach(model, prefix=robot.prefix, frame=frame)
+        return spec.compile()
+    except (ValueError, OSError, mujoco.FatalError) as error:
+        raise DriverError(f"{scene}: MuJoCo cannot build this world: {error}") from error
+
+
+def at_home(model: Any, home: Mapping[str, float], settings: Mapping[str, float], *, scene: Path) -> Any:
+    """A fresh state: joints at home, every position servo holding where its joint starts.
+
+    Args:
+        model: ``MjModel``.
+        home: Full joint name → position [rad or m]; others start at the model's reference.
+        settings: Actuator's name → where its joint starts [rad or m]; other names are left alone.
+        scene: For the error's text.
+
+    Raises:
+        DriverError: ``home`` names a joint that is not there.
+    """
+    data = mujoco.MjData(model)
+    for name, position in home.items():
+        joint = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_JOINT, name)
+        if joint < 0:
+            known = ", ".join(model.joint(index).name for index in range(model.njnt))
+            raise DriverError(f"{scene}: no joint '{name}'; the model has: {known}")
+        data.qpos[model.jnt_qposadr[joint]] = position
+    for name, position in settings.items():
+        actuator = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_ACTUATOR, name)
+        if actuator >= 0:
+            data.qpos[model.jnt_qposadr[model.actuator_trnid[actuator, 0]]] = position
+    Ties(model).settle(data.qpos)
+    for actuator in range(model.nu):
+        joint = model.actuator_trnid[actuator, 0]
+        by_joint = model.actuator_trntype[actuator] == int(mujoco.mjtTrn.mjTRN_JOINT)
+        if by_joint and model.actuator_biasprm[actuator, 1] < 0 and model.jnt_type[joint] in SCALAR_JOINTS:
+            data.ctrl[actuator] = data.qpos[model.jnt_qposadr[joint]]
+    mujoco.mj_forward(model, data)
+    return data

@@ -1,0 +1,384 @@
+"""One MuJoCo world, stepped in real time in a thread of its own, shared by any number of drivers and sensors.
+
+No lock is held while stepping. A driver hands in its newest command by swapping one reference, and reads an immutable
+``Snapshot`` that the thread puts in place after each group of steps. What goes on in it by itself (``Process``) is done
+in the thread before each group.
+"""
+
+import logging
+import math
+import threading
+import time
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import mujoco
+import numpy as np
+
+from device_agent.ports.driver import DriverError
+from device_agent.ports.simulation import Process
+from device_agent.simulation.actuator_ramps import Ramps, controls
+from device_agent.simulation.scene_assembly import SCALAR_JOINTS, TIMESTEP_S, Placement, assemble, at_home
+from device_agent.simulation.snapshot import Floats, Ints, Snapshot, take
+from device_agent.simulation.stepper import Stepper
+from device_agent.simulation.trace import Trace
+
+log = logging.getLogger(__name__)
+
+GROUP_STEPS = 2
+"""Steps between two snapshots: half of the shortest control period in use (8 ms)."""
+LATE_STEPS = 4
+"""The same while the world is behind real time by a group: what stands beside the steps is then paid half as often."""
+MAX_CATCH_UP_S = 0.1
+"""Furthest that simulated time may fall behind before it slips."""
+STALE_S = 2.0
+"""Age at which a snapshot of a running world means that its thread hangs."""
+WARN_EVERY_S = 10.0
+_STOP_TIMEOUT_S = 5.0
+_SET_S = 3.0
+"""Time in which something of the room goes through the whole of its range: a door, blinds, a camera that turns."""
+_DIVERGED = ("mjWARN_BADQPOS", "mjWARN_BADQVEL", "mjWARN_BADQACC", "mjWARN_BADCTRL")
+
+
+class World:
+    """A scene and the robots placed in it.
+
+    ``open`` and ``close`` count users: the first ``open`` compiles the model and starts real time, the last ``close``
+    stops it, and a later ``open`` goes on where it stopped. For tests, ``build`` then ``step`` drive it by hand; the
+    same commands then give the same numbers.
+    """
+
+    def __init__(
+        self,
+        scene: Path,
+        *,
+        robots: Sequence[Placement] = (),
+        home: Mapping[str, float] | None = None,
+        settings: Mapping[str, float] | None = None,
+        trace: Path | None = None,
+    ) -> None:
+        """Describe a world; nothing is read before ``build`` or ``open``.
+
+        Args:
+            scene: MJCF file. It may hold a robot already.
+            robots: Robots to put into it.
+            home: Full joint name → position [rad or m] at the start; others start at the model's reference.
+            settings: What the room is set to at the start.
+            trace: File to append the truth to, see ``Trace``.
+        """
+        self._scene = scene
+        self._robots = tuple(robots)
+        self._home = dict(home or {})
+        self._trace_files: dict[Path, str] = {} if trace is None else {trace: ""}
+        self._traces: tuple[Trace, ...] = ()
+        self._processes: tuple[Process, ...] = ()
+        self._quantities: Mapping[str, float] = {}
+        self._start = dict(settings or {})
+        self._settings = dict(self._start)
+        self._sounds: dict[str, tuple[float, float]] = {}
+        self._users = 0
+        self._life = threading.Lock()  # guards starting and stopping only
+        self._thread: threading.Thread | None = None
+        self._stopping = threading.Event()
+        self._model: Any = None
+        self._data: Any = None
+        self._stepper: Stepper
+        self._snapshot: Snapshot | None = None
+        self._ramps = Ramps()
+        self._addresses: dict[str, int] = {}
+        self._passive_gravity = np.zeros(0)
+        self._lag_s = 0.0
+        self._fault = ""
+
+    # ------------------------------------------------------------ life
+
+    def open(self) -> None:
+        """Take part; the first to do so starts real time.
+
+        Raises:
+            DriverError: The model cannot be read or compiled, or the trace file cannot be written.
+        """
+        with self._life:
+            self.build()
+            if self._thread is None:
+                self._begin()
+            self._users += 1
+
+    def close(self) -> None:
+        """Leave; the last to do so stops real time. One call for each ``open``."""
+        with self._life:
+            self._users = max(0, self._users - 1)
+            if not self._users:
+                self._end()
+
+    def build(self) -> None:
+        """Compile the model and put every robot at home. Does nothing when that has been done.
+
+        Raises:
+            DriverError: A file is missing or MuJoCo refuses it, or ``home`` names a joint that is not there.
+        """
+        if self._model is not None:
+            return
+        # Else MuJoCo writes its warnings into a file in whatever folder the agent was started.
+        mujoco.set_mju_user_warning(_warn)
+        model = assemble(self._scene, self._robots)
+        data = at_home(model, self._home, self._start, scene=self._scene)
+        self._addresses = {
+            model.joint(index).name: int(model.jnt_qposadr[index])
+            for index in range(model.njnt)
+            if model.jnt_type[index] in SCALAR_JOINTS
+        }
+        # Gravity compensation that the model does not already count as the motors' work.
+        self._passive_gravity = np.where(model.jnt_actgravcomp[model.dof_jntid], 0.0, 1.0)
+        self._model, self._data, self._stepper = model, data, Stepper(model)
+        self._publish()
+
+    def recover(self) -> None:
+        """Begin again after a fault, with every robot at home. Does nothing in a world that is well.
+
+        Raises:
+            DriverError: As for ``open``.
+        """
+        with self._life:
+            if not self._fault:
+                return
+            running = self._thread is not None
+            self._end()
+            time_s = self.snapshot().time_s
+            self._ramps.clear()
+            self._settings = dict(self._start)
+            self._data = at_home(self._model, self._home, self._start, scene=self._scene)
+            self._data.time = time_s  # time only ever rises
+            self._fault = ""
+            self._publish()
+            if running:
+                self._begin()
+
+    # ------------------------------------------------------------ for drivers and tests
+
+    @property
+    def model(self) -> Any:
+        """The compiled ``MjModel``, to look names up in. Do not write to it.
+
+        Raises:
+            DriverError: Not built yet.
+        """
+        if self._model is None:
+            raise DriverError("the world is not built; open it first")
+        return self._model
+
+    @property
+    def shared(self) -> bool:
+        """Whether robots were placed into the scene, rather than standing in a scene of their own."""
+        return bool(self._robots)
+
+    def snapshot(self) -> Snapshot:
+        """The newest snapshot. Costs one reference.
+
+        Raises:
+            DriverError: Not built yet.
+        """
+        if self._snapshot is None:
+            raise DriverError("the world is not built; open it first")
+        return self._snapshot
+
+    def command(self, who: str, actuators: Ints, target: Sequence[float] | Floats, *, ramp_s: float = 0.0) -> None:
+        """Hand in the newest target of one driver; the one before is dropped. Never blocks.
+
+        Args:
+            who: The driver; each has one command at a time.
+            actuators: Indices of its actuators, shape (n,).
+            target: Where they shall go, shape (n,) [rad or m].
+            ramp_s: Time in which to get there in a straight line, so that a target every control period gives an
+                even motion rather than steps [s].
+        """
+        self._ramps.command(who, actuators, target, ramp_s)
+
+    def trace(self, path: Path, *, prefix: str) -> None:
+        """Append the truth of one robot to a file while the world runs; its joints are those with this prefix.
+
+        Raises:
+            DriverError: The world runs already, and the file cannot be written.
+        """
+        with self._life:
+            if path in self._trace_files:
+                return
+            self._trace_files[path] = prefix
+            if self._thread is not None:
+                self._traces = (*self._traces, Trace(path, self._model, list(self._addresses), prefix=prefix))
+
+    # ------------------------------------------------------------ for the room
+
+    def add(self, process: Process) -> None:
+        """Have something go on in it, from the next group of steps."""
+        self._processes = (*self._processes, process)
+
+    def copy(self, into: Any) -> None:
+        """The newest snapshot as an ``MjData`` of the caller's own, with the poses of all that can be seen.
+
+        Contacts and sensors are not computed.
+
+        Raises:
+            DriverError: Not built yet, or the simulation has stopped; the text says why.
+        """
+        snapshot = self.snapshot()
+        if snapshot.fault:
+            raise DriverError(snapshot.fault)
+        into.time = snapshot.time_s
+        into.qpos[:], into.qvel[:], into.ctrl[:] = snapshot.qpos, snapshot.qvel, snapshot.ctrl
+        into.mocap_pos[:], into.mocap_quat[:] = snapshot.mocap_position_m, snapshot.mocap_quaternion
+        mujoco.mj_kinematics(self._model, into)
+        mujoco.mj_comPos(self._model, into)
+        mujoco.mj_camlight(self._model, into)
+
+    @property
+    def quantities(self) -> Mapping[str, float]:
+        """What has no place in MuJoCo's state, the newest of each."""
+        return self._quantities
+
+    def tell(self, quantities: Mapping[str, float]) -> None:
+        """Put new values of some quantities in place. For processes."""
+        self._quantities = {**self._quantities, **quantities}
+
+    @property
+    def settings(self) -> Mapping[str, float]:
+        """What was ``set`` last."""
+        return self._settings
+
+    def set(self, name: str, value: float) -> float:
+        """Set something of the room; an actuator of its model goes there at its own pace.
+
+        Raises:
+            DriverError: Not finite.
+        """
+        if not math.isfinite(value):
+            raise DriverError(f"'{name}' cannot be set to a number that is not finite")
+        actuator = int(mujoco.mj_name2id(self.model, mujoco.mjtObj.mjOBJ_ACTUATOR, name))
+        if actuator >= 0:
+            lower, upper = self._model.actuator_ctrlrange[actuator].tolist()
+            value = min(max(value, lower), upper)
+            share = abs(value - float(self.snapshot().ctrl[actuator])) / (upper - lower)
+            self.command(f"set {name}", np.array([actuator], dtype=np.intp), [value], ramp_s=share * _SET_S)
+        self._settings[name] = value
+        return value
+
+    @property
+    def sounds(self) -> Mapping[str, tuple[float, float]]:
+        """What is or was to be heard: level a metre away [dB], and until when [s of simulated time]."""
+        return self._sounds
+
+    def sound(self, name: str, level_db: float, *, for_s: float) -> None:
+        """Let something be heard from now on; the same name again takes its place."""
+        self._sounds[name] = (level_db, self.snapshot().time_s + for_s)
+
+    # ------------------------------------------------------------ by hand
+
+    def step(self, count: int) -> Snapshot:
+        """Advance by ``count`` steps of 2 ms, by hand.
+
+        Raises:
+            DriverError: Not built, running in real time, or diverged (see ``Snapshot.fault``).
+        """
+        if self._thread is not None:
+            raise DriverError("the world runs in real time; step is for a world driven by hand")
+        _ = self.model
+        while count > 0:
+            self._advance(min(count, GROUP_STEPS))
+            count -= GROUP_STEPS
+        self._publish()
+        if self._fault:
+            raise DriverError(self._fault)
+        return self.snapshot()
+
+    # ------------------------------------------------------------ stepping
+
+    def _begin(self) -> None:
+        traces: list[Trace] = []
+        try:
+            for path, prefix in self._trace_files.items():
+                traces.append(Trace(path, self._model, list(self._addresses), prefix=prefix))
+        except DriverError:
+            for trace in traces:
+                trace.close()
+            raise
+        self._traces = tuple(traces)
+        self._stopping.clear()
+        self._publish()
+        self._thread = threading.Thread(target=self._run, name="mujoco-world", daemon=True)
+        self._thread.start()
+
+    def _end(self) -> None:
+        if self._thread is None:
+            return
+        self._stopping.set()
+        self._thread.join(timeout=_STOP_TIMEOUT_S)
+        if self._thread.is_alive():
+            raise DriverError(f"the simulation did not stop within {_STOP_TIMEOUT_S:.0f} s")
+        self._thread = None
+
+    def _advance(self, count: int) -> None:
+        model, data = self._model, self._data
+        active = self._ramps.take(data.ctrl)
+        for process in self._processes:
+            process.step(model, data, data.time)
+        if active:
+            self._stepper.go(data, controls(active, data.ctrl, count))
+        else:
+            mujoco.mj_step(model, data, nstep=count)
+        mujoco.mj_kinematics(model, data)  # poses of the positions just reached, not of those a step ago
+        for name in _DIVERGED:
+            if not self._fault and data.warning[int(getattr(mujoco.mjtWarning, name))].number:
+                self._fault = f"the simulation became unstable at {data.time:.3f} s ({name}) and was stopped"
+
+    def _publish(self) -> None:
+        self._snapshot = take(
+            self._data,
+            passive_gravity=self._passive_gravity,
+            addresses=self._addresses,
+            lag_s=self._lag_s,
+            fault=self._fault,
+        )
+
+    def _write_traces(self) -> None:
+        snapshot, targets = self.snapshot(), self._ramps.targets(self._data.ctrl)
+        for trace in self._traces:
+            trace.write(snapshot, targets)
+
+    def _run(self) -> None:
+        try:
+            self._keep_time()
+        except Exception as error:  # nothing may end this thread unseen: drivers read the fault
+            log.exception("the simulation stopped")
+            self._fault = f"the simulation stopped: {error}"
+            self._publish()
+        finally:
+            for trace in self._traces:
+                trace.close()
+
+    def _keep_time(self) -> None:
+        due = time.monotonic()
+        count = GROUP_STEPS
+        warned = -WARN_EVERY_S
+        while not self._stopping.is_set():
+            self._advance(count)
+            self._publish()
+            if self._fault:
+                log.error(self._fault)
+                return
+            if self._traces:
+                self._write_traces()
+            due += count * TIMESTEP_S
+            now = time.monotonic()
+            count = LATE_STEPS if now - due >= GROUP_STEPS * TIMESTEP_S else GROUP_STEPS
+            if now - due > MAX_CATCH_UP_S:
+                self._lag_s += now - due
+                due = now
+                if now - warned >= WARN_EVERY_S:
+                    warned = now
+                    log.warning("the simulation cannot keep up: %.0f ms lost so far", self._lag_s * 1000)
+            self._stopping.wait(max(0.0, due - now))
+
+
+def _warn(text: str) -> None:
+    log.warning("MuJoCo: %s", text)

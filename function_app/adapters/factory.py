@@ -1,0 +1,241 @@
+"""The adapters that settings choose between: signing keys, stores, the broker's access, what goes there and comes.
+
+Of the stores, and of the clouds' adapters, only those in use are imported, and they their SDKs only when needed.
+"""
+
+import hashlib
+import ssl
+from collections.abc import Awaitable, Callable
+
+from function_app.adapters.local.blobs import FileBlobs
+from function_app.adapters.local.broker_access import MosquittoBrokerAccess, TokenBrokerAccess
+from function_app.adapters.local.certificates import FileCertificates, NoCertificates
+from function_app.adapters.local.clock import SystemClock
+from function_app.adapters.local.command_bus import MqttCommandBus
+from function_app.adapters.local.device_feed import MqttFeed, MqttLate, MqttTelemetry
+from function_app.adapters.local.signing_keys import FileKeys
+from function_app.adapters.mqtt.connection import Broker
+from function_app.adapters.mqtt.tls import client_context
+from function_app.adapters.shared.key_ring_keys import RingKeys
+from function_app.adapters.shared.vault_keys import VaultKeys
+from function_app.ports.blobs import Blobs
+from function_app.ports.broker_access import BrokerAccess, BrokerAccessError
+from function_app.ports.certificates import Certificates
+from function_app.ports.clock import Clock
+from function_app.ports.command_bus import CommandBus
+from function_app.ports.device_feed import Feed, Telemetry
+from function_app.ports.oidc_provider import OpenId
+from function_app.ports.tables import StoreError, Tables
+from function_app.settings import AwsStore, AzureStore, EventGridBus, IotBus, KeyVault, SecretsManager, Settings
+
+TABLES_FILE = "tables.sqlite"
+BLOBS_PATH = "/api/v1/blobs"
+"""Where the addresses of blobs in files lead to."""
+MOSQUITTO_SERVICE = "service"
+
+
+def keys(settings: Settings, now_ms: Callable[[], int]) -> RingKeys:
+    """The signing keys; files are read, a vault is not asked yet.
+
+    Raises:
+        StoreError: They cannot be used.
+    """
+    match settings.keys:
+        case KeyVault() as vault:
+            from function_app.adapters.azure.client import Place  # noqa: PLC0415 (only where it is in use)
+            from function_app.adapters.azure.signing_keys import KeyVaultKeys  # noqa: PLC0415
+
+            place = Place(url=vault.url, identity=vault.identity)
+            return KeyVaultKeys(secret=vault.secret, place=place, now_ms=now_ms)
+        case SecretsManager() as manager:
+            from function_app.adapters.aws.signing_keys import SecretsManagerKeys  # noqa: PLC0415
+
+            return SecretsManagerKeys(
+                secret=manager.secret,
+                region=manager.region,
+                endpoint=manager.endpoint,
+                kms_key=manager.kms_key,
+                now_ms=now_ms,
+            )
+        case None:
+            found = FileKeys(settings.home / "keys", now_ms=now_ms)
+            found.load()
+            return found
+
+
+def open_id(settings: Settings, clock: Clock) -> OpenId | None:
+    """Where people may sign in, beside here."""
+    if settings.open_id is None:
+        return None
+    from function_app.adapters.oidc.provider import HttpOpenId  # noqa: PLC0415 (only where it is in use)
+
+    known = settings.open_id
+    return HttpOpenId(issuer=known.issuer, client_id=known.client_id, client_secret=known.client_secret, clock=clock)
+
+
+def stores(settings: Settings, signing: RingKeys | None = None) -> tuple[Tables, Blobs]:
+    """Tables and blobs."""
+    match settings.store:
+        case AzureStore() as azure:
+            from function_app.adapters.azure.blobs import AzureBlobs  # noqa: PLC0415
+            from function_app.adapters.azure.client import Place  # noqa: PLC0415
+            from function_app.adapters.azure.tables import AzureTables  # noqa: PLC0415
+
+            tables_place = Place(azure.connection, azure.tables_url, azure.identity)
+            blobs_place = Place(azure.connection, azure.blobs_url, azure.identity)
+            return (
+                AzureTables(place=tables_place, prefix=azure.prefix),
+                AzureBlobs(place=blobs_place, container=azure.container),
+            )
+        case AwsStore() as aws:
+            from function_app.adapters.aws.blobs import S3Blobs  # noqa: PLC0415
+            from function_app.adapters.aws.tables import DynamoTables  # noqa: PLC0415
+
+            return (
+                DynamoTables(table=aws.table, region=aws.region, endpoint=aws.endpoint),
+                S3Blobs(bucket=aws.bucket, region=aws.region, endpoint=aws.endpoint),
+            )
+        case None:
+            from function_app.adapters.local.tables import SqliteTables  # noqa: PLC0415
+
+            return SqliteTables(settings.home / TABLES_FILE), _files(settings, signing)
+
+
+def access(
+    settings: Settings, signing: RingKeys, tables: Tables, publish: Callable[[str, bytes], Awaitable[None]]
+) -> BrokerAccess:
+    """What gives and takes the broker's rights. ``publish``: how the embedded broker is told."""
+    if settings.broker == "iot":
+        from function_app.adapters.aws.broker_access import IotBrokerAccess  # noqa: PLC0415 (only where it is in use)
+
+        iot = settings.bus
+        assert isinstance(iot, IotBus)  # noqa: S101 (the settings see to it)
+        return IotBrokerAccess(keys=signing, tables=tables, region=iot.region, endpoint=iot.endpoint)
+    if settings.broker == "eventgrid":
+        return _event_grid(settings, signing, tables)
+    if settings.broker == "amqtt":
+        return TokenBrokerAccess(signer=signing.signer, publish=publish)
+    return MosquittoBrokerAccess(
+        host=settings.mqtt_host,
+        port=settings.mqtt_port,
+        username=MOSQUITTO_SERVICE,
+        password_file=settings.home / "mosquitto" / "service.password",
+        tls=broker_tls(settings),
+    )
+
+
+def _event_grid(settings: Settings, signing: RingKeys, tables: Tables) -> BrokerAccess:
+    from function_app.adapters.azure.broker_access import EventGridBrokerAccess  # noqa: PLC0415 (only where in use)
+    from function_app.adapters.azure.session_takeover import SessionTaker  # noqa: PLC0415
+    from function_app.adapters.azure.webhook_auth import EntraCallers  # noqa: PLC0415
+
+    grid = settings.bus
+    assert isinstance(grid, EventGridBus)  # noqa: S101 (the settings see to it)
+    assert grid.webhook is not None  # noqa: S101
+    webhook = grid.webhook
+    callers = EntraCallers(tenant=webhook.tenant, audience=webhook.audience, identity=webhook.caller)
+    # Its certificate is of an authority that every machine knows, whoever made ours.
+    taker = SessionTaker(host=settings.mqtt_host, port=settings.mqtt_port, tls=client_context(None))
+    return EventGridBrokerAccess(keys=signing, tables=tables, take=taker, known=callers.knows)
+
+
+def bus(settings: Settings, granted: BrokerAccess) -> CommandBus:
+    """What publishes commands."""
+    match settings.bus:
+        case IotBus() as iot:
+            from function_app.adapters.aws.command_bus import IotCommandBus  # noqa: PLC0415 (only where it is in use)
+
+            return IotCommandBus(region=iot.region, endpoint=iot.endpoint)
+        case EventGridBus() as grid:
+            from function_app.adapters.azure.command_bus import EventGridCommandBus  # noqa: PLC0415
+
+            return EventGridCommandBus(endpoint=grid.endpoint, identity=grid.identity)
+        case None:
+            return MqttCommandBus(_broker(settings, granted))
+
+
+def feeds(settings: Settings, granted: BrokerAccess) -> tuple[Feed, Telemetry, Telemetry]:
+    """What brings what devices say, what they measure, and what they measured while their link was down."""
+    broker = _broker(settings, granted)
+    return MqttFeed(broker), MqttTelemetry(broker), MqttLate(broker)
+
+
+def certificates(settings: Settings) -> Certificates:
+    """The authority for agents."""
+    if settings.broker == "iot":
+        from function_app.adapters.aws.certificates import IotCertificates  # noqa: PLC0415 (only where it is in use)
+
+        iot = settings.bus
+        assert isinstance(iot, IotBus)  # noqa: S101 (the settings see to it)
+        return IotCertificates(region=iot.region, policy=iot.policy)
+    if settings.tls is None or settings.tls.agents is None:
+        return NoCertificates()
+    return FileCertificates(settings.tls.agents)
+
+
+def broker_tls(settings: Settings) -> ssl.SSLContext | None:
+    """How connections to the broker are kept from others.
+
+    Raises:
+        BrokerAccessError: The authority's certificate cannot be read.
+    """
+    return None if settings.tls is None else client_context(settings.tls.ca, settings.tls.agents)
+
+
+async def prepare(settings: Settings) -> None:
+    """Make what store and vault must have before their first use. Safe to repeat.
+
+    Of the stores only Amazon's needs it: a file, and Azure's tables and container, are made when first written to.
+
+    Raises:
+        StoreError: It cannot be made.
+    """
+    if settings.broker == "iot":
+        from function_app.adapters.aws.certificates import IotCertificates  # noqa: PLC0415
+
+        agents = certificates(settings)
+        assert isinstance(agents, IotCertificates)  # noqa: S101 (the settings say so)
+        try:
+            await agents.prepare()
+        except BrokerAccessError as error:
+            raise StoreError(str(error)) from error
+        finally:
+            await agents.close()
+    if settings.keys is not None:
+        held = keys(settings, SystemClock().now_ms)
+        assert isinstance(held, VaultKeys)  # noqa: S101 (the settings say so)
+        try:
+            await held.prepare()
+        finally:
+            await held.close()
+    if isinstance(settings.store, AwsStore):
+        from function_app.adapters.aws.blobs import S3Blobs  # noqa: PLC0415
+        from function_app.adapters.aws.tables import DynamoTables  # noqa: PLC0415
+
+        for store in stores(settings):
+            assert isinstance(store, DynamoTables | S3Blobs)  # noqa: S101 (the settings say so)
+            try:
+                await store.prepare()
+            finally:
+                await store.close()
+
+
+def _broker(settings: Settings, granted: BrokerAccess) -> Broker:
+    """The broker, as the functions themselves meet it."""
+    return Broker(
+        host=settings.mqtt_host,
+        port=settings.mqtt_port,
+        credentials=granted.service_credentials,
+        tls=broker_tls(settings),
+    )
+
+
+def _files(settings: Settings, signing: RingKeys | None) -> FileBlobs:
+    """Blobs in files, whose addresses any instance with the same signing keys makes and knows."""
+
+    def derived() -> list[bytes]:
+        secrets = () if signing is None else signing.secrets()
+        return [hashlib.sha256(b"telescope/v1/blobs" + secret).digest() for secret in secrets]
+
+    url = f"{settings.public_url}{BLOBS_PATH}"
+    return FileBlobs(settings.home / "blobs", keys=None if signing is None else derived, url=url)

@@ -1,0 +1,150 @@
+"""Signing keys in files: ``ring.json`` (mode 0600), and ``public.json``, which the embedded broker reads.
+
+Each call looks whether the file is still the one that was read, which costs microseconds: another process's rotation
+is followed at once.
+"""
+
+import contextlib
+import json
+import logging
+import os
+import stat
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
+
+from device_agent.protocol.errors import ProtocolError
+from device_agent.protocol.security import signing
+from function_app.adapters.local import atomic_files
+from function_app.adapters.shared import key_ring
+from function_app.adapters.shared.key_ring import Ring, RingError
+from function_app.adapters.shared.key_ring_keys import RingKeys, wall_ms
+from function_app.ports.tables import StoreError
+
+RING = "ring.json"
+PUBLIC = "public.json"
+FORMER = "signing.pem"
+"""Where the only key was before there were rings; taken over as the first."""
+_LOCK = "ring.lock"
+_OTHERS = stat.S_IRWXG | stat.S_IRWXO
+_OTHERS_WRITE = stat.S_IWGRP | stat.S_IWOTH
+_log = logging.getLogger(__name__)
+
+
+class FileKeys(RingKeys):
+    """``Keys`` in ``folder``; made at first use.
+
+    Args:
+        folder: Of the keys alone.
+        now_ms: The wall clock, by which overlaps end.
+    """
+
+    def __init__(self, folder: Path, *, now_ms: Callable[[], int] = wall_ms) -> None:
+        super().__init__(now_ms=now_ms)
+        self._folder = folder
+        self._seen: tuple[int, int, int] | None = None
+        self._read: Ring
+        self._changes_ms = 0
+
+    def load(self) -> Ed25519PrivateKey:
+        """Read the keys, and make them when there are none. Sees to it that nobody else can.
+
+        Raises:
+            StoreError: A file cannot be read or is not what it should be; the text names it.
+        """
+        key = self.signer()
+        with self._guarded():
+            self._close_to_others()
+        return key
+
+    async def _ring(self, *, fresh: bool = False) -> Ring:
+        del fresh  # it always is
+        return self._known()
+
+    async def _change(self, change: Callable[[Ring], Ring]) -> Ring:
+        self._known()
+        with self._guarded(), self._locked():
+            self._write(change(self._parse()))
+        return self._known()
+
+    def _known(self) -> Ring:
+        """The ring in the file. What has just ended is taken out of it, and out of what the broker reads."""
+        with self._guarded():
+            if self._seen is None and not (self._folder / RING).exists():
+                self._make()
+            if self._stamp() != self._seen or self._now_ms() >= self._changes_ms:
+                with self._locked():
+                    stored = self._parse()
+                    ring = stored.pruned(self._now_ms())
+                    if ring != stored:
+                        self._write(ring)
+                    self._publish(ring)
+                    self._read, self._seen = ring, self._stamp()
+                    self._changes_ms = ring.next_change_ms(self._now_ms())
+            return self._read
+
+    def _stamp(self) -> tuple[int, int, int]:
+        found = (self._folder / RING).stat()
+        return found.st_mtime_ns, found.st_size, found.st_ino
+
+    def _parse(self) -> Ring:
+        return Ring.read((self._folder / RING).read_bytes())
+
+    def _make(self) -> None:
+        """Of several processes that make a key at once, one wins: a link is made only where there is none."""
+        self._folder.mkdir(parents=True, exist_ok=True, mode=0o700)
+        former = self._folder / FORMER
+        key = key_ring.from_pem(former.read_bytes()) if former.exists() else signing.generate()
+        temporary = atomic_files.write_beside(self._folder / RING, Ring.first(key).text.encode(), mode=0o600)
+        with contextlib.suppress(FileExistsError):
+            os.link(temporary, self._folder / RING)
+        temporary.unlink()
+        former.unlink(missing_ok=True)
+
+    def _write(self, ring: Ring) -> None:
+        atomic_files.write(self._folder / RING, ring.text.encode(), mode=0o600)
+
+    def _publish(self, ring: Ring) -> None:
+        """Tell the embedded broker which keys' tokens count."""
+        path = self._folder / PUBLIC
+        wanted = {key.id: key.public for key in ring.live(self._now_ms())}
+        if not path.exists() or json.loads(path.read_bytes()) != wanted:
+            atomic_files.write(path, json.dumps(wanted, indent=1).encode(), mode=0o644)
+
+    def _close_to_others(self) -> None:
+        """Keep others of this machine from the keys. Windows has no such rights: there it is the folder's own."""
+        if os.name == "nt":
+            return
+        for path, forbidden in (
+            (self._folder, _OTHERS),
+            (self._folder / RING, _OTHERS),
+            (self._folder / PUBLIC, _OTHERS_WRITE),
+        ):
+            if path.exists() and (mode := stat.S_IMODE(path.stat().st_mode)) & forbidden:
+                path.chmod(mode & ~forbidden)
+                _log.warning(
+                    "%s was open to others of this machine (mode %03o) and is no longer; if one of them may have read "
+                    "it, run `python -m function_app rotate-keys --leaked`",
+                    path,
+                    mode,
+                )
+
+    @contextlib.contextmanager
+    def _guarded(self) -> Iterator[None]:
+        try:
+            yield
+        except (OSError, ValueError, TypeError, AttributeError, ProtocolError, RingError) as error:
+            raise StoreError(f"the signing keys in {self._folder} cannot be used: {error}. Put back a copy.") from error
+
+    @contextlib.contextmanager
+    def _locked(self) -> Iterator[None]:
+        """One process at a time changes the ring. SQLite's lock: the same on every system, gone with its holder."""
+        import sqlite3  # noqa: PLC0415 (only where something is written)
+
+        with contextlib.closing(sqlite3.connect(self._folder / _LOCK, timeout=10, isolation_level=None)) as lock:
+            try:
+                lock.execute("BEGIN EXCLUSIVE")
+            except sqlite3.Error as error:
+                raise OSError(f"{self._folder / _LOCK}: {error}") from error
+            yield

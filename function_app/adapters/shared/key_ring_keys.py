@@ -1,0 +1,104 @@
+"""``Keys`` of a ring, wherever it is stored: what all adapters have in common."""
+
+import time
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Mapping
+
+from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey, Ed25519PublicKey
+
+from device_agent.protocol.security import signing
+from function_app.adapters.shared import key_ring
+from function_app.adapters.shared.key_ring import Ring, RingKey
+from function_app.ports.signing_keys import LEARN_MS, OVERLAP_MS, News, Pin
+
+
+def wall_ms() -> int:
+    """The machine's wall clock [ms since 1970]."""
+    return time.time_ns() // 1_000_000
+
+
+class RingKeys(ABC):
+    """``Keys`` of a ring.
+
+    Args:
+        now_ms: The wall clock, by which overlaps end.
+    """
+
+    def __init__(self, *, now_ms: Callable[[], int] = wall_ms) -> None:
+        self._now_ms = now_ms
+        self._privates: dict[str, Ed25519PrivateKey] = {}
+
+    async def current(self) -> Ed25519PrivateKey:
+        """See ``Keys``."""
+        return self._private((await self._ring()).newest)
+
+    async def for_devices(self) -> Ed25519PrivateKey:
+        """See ``Keys``."""
+        return self._private((await self._ring()).for_devices(self._now_ms()))
+
+    async def public(self, wanted: str = "") -> Mapping[str, Ed25519PublicKey]:
+        """See ``Keys``."""
+        found = key_ring.public((await self._ring()).live(self._now_ms()))
+        if wanted and wanted not in found:
+            found = key_ring.public((await self._ring(fresh=True)).live(self._now_ms()))
+        return found
+
+    async def archive(self) -> Mapping[str, Ed25519PublicKey]:
+        """See ``Keys``."""
+        return key_ring.public(tuple(key for key in (await self._ring()).keys if not key.leaked))
+
+    async def news(self) -> News:
+        """See ``Keys``."""
+        return self._told(await self._ring())
+
+    async def rotate(self, *, learn_ms: int = LEARN_MS, overlap_ms: int = OVERLAP_MS, leaked: bool = False) -> News:
+        """See ``Keys``."""
+        new, now_ms = signing.generate(), self._now_ms()
+
+        def change(ring: Ring) -> Ring:
+            if leaked:
+                return ring.replaced(new, now_ms=now_ms)
+            return ring.rotated(new, now_ms=now_ms, learn_ms=learn_ms, overlap_ms=overlap_ms)
+
+        return self._told(await self._change(change))
+
+    async def close(self) -> None:  # noqa: B027 (who has nothing open need not say so)
+        """See ``Keys``."""
+
+    def signer(self) -> Ed25519PrivateKey:
+        """``current``, for who cannot wait.
+
+        Raises:
+            StoreError: The keys cannot be read, or have not been yet.
+        """
+        return self._private(self._known().newest)
+
+    def secrets(self) -> tuple[bytes, ...]:
+        """The private keys that are still kept, the newest first: what was made from one outlives a rotation.
+
+        Raises:
+            StoreError: See ``signer``.
+        """
+        return tuple(self._private(key).private_bytes_raw() for key in reversed(self._known().keys) if key.private)
+
+    @abstractmethod
+    def _known(self) -> Ring:
+        """The ring as this process knows it."""
+
+    @abstractmethod
+    async def _ring(self, *, fresh: bool = False) -> Ring:
+        """The ring as it is, or lately was; ``fresh``: looked at again as soon as that is no burden."""
+
+    @abstractmethod
+    async def _change(self, change: Callable[[Ring], Ring]) -> Ring:
+        """Write what ``change`` makes of the ring; what was written."""
+
+    def _told(self, ring: Ring) -> News:
+        now_ms = self._now_ms()
+        pins = tuple(Pin(key.id, signing.public_key(key.public), key.serial, key.until_ms) for key in ring.live(now_ms))
+        return News(pins, ring.statements(now_ms), ring.for_devices(now_ms).id)
+
+    def _private(self, key: RingKey) -> Ed25519PrivateKey:
+        if key.public not in self._privates:
+            self._privates[key.public] = key_ring.private(key)
+        return self._privates[key.public]

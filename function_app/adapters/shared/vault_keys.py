@@ -1,0 +1,125 @@
+"""``Keys`` of a ring that is one secret of a cloud's vault.
+
+Why a secret and no key of the vault's own: Azure's Key Vault has no Ed25519 among its key types (P-256, P-256K, P-384,
+P-521, RSA). Amazon's KMS has it since 2025, but signs at most 4,096 bytes, where an order with a script has 64 KB, and
+each order and token would wait for a call. The vault keeps the secret encrypted, says who may read it, and logs it.
+
+The functions only read. ``python -m function_app prepare`` makes the secret and ``rotate-keys`` changes it, by whoever
+deploys and with that person's rights; two of them at the same moment are told apart only as far as the vault can.
+"""
+
+import asyncio
+import logging
+from abc import abstractmethod
+from collections.abc import Callable
+from typing import NamedTuple
+
+from device_agent.protocol.security import signing
+from function_app.adapters.shared.key_ring import Ring, RingError
+from function_app.adapters.shared.key_ring_keys import RingKeys, wall_ms
+from function_app.ports.tables import StoreError
+
+LOOK_EVERY_MS = 60_000
+"""How long a process goes on with what it has read: less than what devices are given to learn a key."""
+AGAIN_MS = 5_000
+"""A key that is not known has the vault asked again, but no more often: anybody can name one."""
+_log = logging.getLogger(__name__)
+
+
+class Secret(NamedTuple):
+    """What the vault holds, and which version of it."""
+
+    text: str
+    version: str
+
+
+class VaultKeys(RingKeys):
+    """``Keys`` in a vault.
+
+    Args:
+        what: The secret, for errors.
+        now_ms: The wall clock, by which overlaps end.
+        look_every_ms: How long what was read is good [ms].
+        again_ms: Least time between two looks [ms].
+    """
+
+    def __init__(
+        self,
+        *,
+        what: str,
+        now_ms: Callable[[], int] = wall_ms,
+        look_every_ms: int = LOOK_EVERY_MS,
+        again_ms: int = AGAIN_MS,
+    ) -> None:
+        super().__init__(now_ms=now_ms)
+        self._what = what
+        self._look_every_ms = look_every_ms
+        self._again_ms = again_ms
+        self._read: Ring | None = None
+        self._read_ms = 0
+        self._turn = asyncio.Lock()
+
+    async def prepare(self) -> None:
+        """Make the secret, with a first key, where there is none. Safe to repeat.
+
+        Raises:
+            StoreError: It cannot be made.
+        """
+        if await self._fetch() is None:
+            await self._create(Ring.first(signing.generate()).text)
+
+    @abstractmethod
+    async def _fetch(self) -> Secret | None:
+        """What the vault holds now; ``None`` where there is no such secret.
+
+        Raises:
+            StoreError: It does not say.
+        """
+
+    @abstractmethod
+    async def _create(self, text: str) -> None:
+        """Make the secret; where somebody else has at the same moment, theirs may stay."""
+
+    @abstractmethod
+    async def _put(self, text: str) -> None:
+        """A new version of the secret."""
+
+    def _known(self) -> Ring:
+        if self._read is None:
+            raise StoreError(f"{self._what} has not been read yet")
+        return self._read
+
+    async def _ring(self, *, fresh: bool = False) -> Ring:
+        async with self._turn:
+            age_ms = self._now_ms() - self._read_ms
+            if self._read is None or not 0 <= age_ms < (self._again_ms if fresh else self._look_every_ms):
+                await self._look()
+            return self._known()
+
+    async def _look(self) -> None:
+        """Read it; what was read before stays in force while the vault does not answer."""
+        self._read_ms = self._now_ms()
+        try:
+            self._read = self._parse(await self._fetch())
+        except StoreError as error:
+            if self._read is None:
+                raise
+            _log.warning("%s; the keys from before stay in force", error)
+
+    async def _change(self, change: Callable[[Ring], Ring]) -> Ring:
+        before = await self._fetch()
+        ring = change(self._parse(before))
+        if await self._fetch() != before:
+            raise StoreError(f"{self._what} was changed by somebody else at this moment. Look at it, and try again.")
+        await self._put(ring.text)
+        async with self._turn:
+            self._read, self._read_ms = ring, self._now_ms()
+        return ring
+
+    def _parse(self, secret: Secret | None) -> Ring:
+        if secret is None:
+            raise StoreError(f"{self._what} does not exist. Make it: `python -m function_app prepare`.")
+        try:
+            return Ring.read(secret.text)
+        except RingError as error:
+            raise StoreError(f"{self._what} holds no signing keys: {error}. Restore an earlier version.") from error

@@ -1,0 +1,143 @@
+"""The chain that keeps what was done in an account: each record's hash covers the record and the hash before it.
+
+Whoever changes, deletes, swaps or inserts a record breaks the chain at that place. Only its end can be cut off without
+a trace in the chain itself; against that its head is signed, and noted elsewhere (``services/audit_chain.py``).
+"""
+
+import hashlib
+import json
+import re
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from enum import StrEnum
+from typing import Any, Final, Literal
+
+from function_app.domain.identity.accounts import Identity
+
+Outcome = Literal["done", "refused", "failed", "unknown"]
+"""``unknown``: whoever did it was killed in the middle; look at what it is about."""
+CLOUD: Final = "cloud"
+"""The chain of what belongs to no account."""
+FIRST: Final = 1
+"""The number of a chain's first record."""
+_GENESIS: Final = b"telescope/v1/audit\n"
+_HEAD: Final = b"telescope/v1/audit-head\n"
+_EXPECTED: Final = re.compile(r"\A([0-9]{1,12}):([0-9a-f]{64})\Z")
+
+
+class Deed(StrEnum):
+    """What is done to an account rather than to control over a device; for that see ``authority.Fact``."""
+
+    SIGNED_IN = "signed-in"
+    SIGN_IN_REFUSED = "sign-in-refused"
+    SIGNED_OUT = "signed-out"
+    ACCOUNT_MADE = "account-made"
+    PASSWORD_SET = "password-set"  # noqa: S105 (the name of a deed)
+    API_KEY_MADE = "api-key-made"
+    API_KEY_REVOKED = "api-key-revoked"
+    SIGNING_KEY_ROTATED = "signing-key-rotated"
+    SPACE_MADE = "space-made"
+    AGENT_CLAIMED = "agent-claimed"
+    CLAIM_REFUSED = "claim-refused"
+    AGENT_UNPAIRED = "agent-unpaired"
+    AGENT_MOVED = "agent-moved"
+    DEVICE_RENAMED = "device-renamed"
+    SHARED = "shared"
+    UNSHARED = "unshared"
+    INVITED = "invited"
+    INVITATION_REDEEMED = "invitation-redeemed"
+    INVITATION_REVOKED = "invitation-revoked"
+    TRANSFERRED = "transferred"
+    MOVEMENT_SAVED = "movement-saved"
+    MOVEMENT_DELETED = "movement-deleted"
+    ROBOT_TYPE_UPLOADED = "robot-type-uploaded"
+    ROBOT_TYPE_DELETED = "robot-type-deleted"
+
+
+@dataclass(frozen=True, slots=True)
+class Entry:
+    """What is to be recorded. ``on`` names a device, agent or whatever else it was done to; ``data`` is plain JSON."""
+
+    id: str
+    at_ms: int
+    what: str
+    outcome: Outcome = "done"
+    on: str = ""
+    who: str = ""
+    account: str = ""
+    session: str = ""
+    key: str = ""
+    data: Mapping[str, Any] = field(default_factory=dict)
+
+    def fields(self) -> dict[str, Any]:
+        """As it is kept."""
+        return {
+            "id": self.id,
+            "at_ms": self.at_ms,
+            "what": self.what,
+            "outcome": self.outcome,
+            "on": self.on,
+            "who": self.who,
+            "account": self.account,
+            "session": self.session,
+            "key": self.key,
+            "data": json.loads(json.dumps(dict(self.data), allow_nan=False)),
+        }
+
+
+@dataclass(frozen=True, slots=True)
+class Head:
+    """Where a chain ends: the number and the hash of its newest record."""
+
+    seq: int
+    hash: str
+
+    def __str__(self) -> str:
+        return f"{self.seq}:{self.hash}"
+
+
+def entry(
+    what: str, who: Identity | None, *, entry_id: str, at_ms: int, on: str = "", outcome: Outcome = "done", **data: Any
+) -> Entry:
+    """An entry of what ``who`` did (``None``: somebody unknown, or the cloud by itself)."""
+    by = {} if who is None else {"who": who.name, "account": who.account, "session": who.session}
+    return Entry(entry_id, at_ms, what, outcome, on, **by, key="" if who is None else who.key, data=data)
+
+
+def start(chain: str) -> Head:
+    """The head of a chain without records; it differs from account to account, so that none stands in for another."""
+    return Head(FIRST - 1, hashlib.sha256(_GENESIS + chain.encode()).hexdigest())
+
+
+def follow(head: Head, fields: Mapping[str, Any]) -> tuple[Head, dict[str, Any]]:
+    """The head once ``fields`` are recorded behind it, and the record as it is stored."""
+    numbered = {**fields, "seq": head.seq + 1}
+    after = Head(head.seq + 1, _hash(head.hash, numbered))
+    return after, {**numbered, "hash": after.hash}
+
+
+def fault(head: Head, record: Mapping[str, Any]) -> str:
+    """What is wrong with ``record`` as the one behind ``head``; empty where nothing is."""
+    if record.get("seq") != head.seq + 1 or isinstance(record["seq"], bool):
+        return f"it calls itself number {record.get('seq')!r}"
+    rest = {name: value for name, value in record.items() if name != "hash"}
+    if _hash(head.hash, rest) != record.get("hash"):
+        return "it, or its hash, is not what was recorded"
+    return ""
+
+
+def to_sign(chain: str, head: Head, at_ms: int) -> bytes:
+    """What the cloud signs of a head."""
+    return _HEAD + f"{chain}\n{head}\n{at_ms}".encode()
+
+
+def read_head(text: str) -> Head | None:
+    """A head as it was noted (``<number>:<hash>``); ``None`` where it is none."""
+    found = _EXPECTED.match(text.strip())
+    return Head(int(found[1]), found[2]) if found else None
+
+
+def _hash(before: str, fields: Mapping[str, Any]) -> str:
+    # Sorted, without spaces, in ASCII: the same record is the same bytes in every store.
+    text = json.dumps(fields, sort_keys=True, separators=(",", ":"), allow_nan=False)
+    return hashlib.sha256(bytes.fromhex(before) + text.encode()).hexdigest()

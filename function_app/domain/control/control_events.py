@@ -1,0 +1,144 @@
+"""What is told of control over a device: who took, gave, asked, stopped, and who was refused.
+
+These are the cloud's decisions; what became of them at the device the agent tells in events of its own. Facts follow
+from a lease before and after one write, and have ids that follow from it too: told twice, they are one.
+"""
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field
+from enum import StrEnum
+from typing import Any, Literal
+
+from function_app.domain.control.lease import Asked, Lease
+
+
+class Fact(StrEnum):
+    """Kinds of events, in the past tense."""
+
+    TAKEN = "control-taken"
+    TAKEN_OVER = "control-taken-over"
+    HANDED_OVER = "control-handed-over"
+    RELEASED = "control-released"
+    EXPIRED = "control-expired"
+    ENDED = "control-ended"
+    REQUESTED = "control-requested"
+    REQUEST_REFUSED = "control-request-refused"
+    REQUEST_WITHDRAWN = "control-request-withdrawn"
+    REQUEST_LAPSED = "control-request-lapsed"
+    STOP_ORDERED = "stop-ordered"
+    RESET_ORDERED = "stop-reset-ordered"
+    ORDER_REFUSED = "order-refused"
+    SHARED = "shared"
+    UNSHARED = "unshared"
+
+
+@dataclass(frozen=True, slots=True)
+class Happened:
+    """One fact. ``id`` is unique for the device; ``data`` is for programs, ``message`` for people."""
+
+    id: str
+    fact: Fact
+    at_ms: int
+    message: str
+    data: dict[str, Any] = field(default_factory=dict)
+    severity: Literal["info", "warning"] = "info"
+
+    def event(self, device_name: str) -> dict[str, Any]:
+        """As it is stored among the device's events."""
+        return {
+            "id": self.id,
+            "device": device_name,
+            "at_ms": self.at_ms,
+            "kind": self.fact.value,
+            "severity": self.severity,
+            "message": self.message,
+            "data": self.data,
+        }
+
+
+def overdue(lease: Lease | None, now_ms: int) -> Iterator[Happened]:
+    """What time alone has brought: a lease that ran out, a request that nobody answered."""
+    if lease is None:
+        return
+    asked = lease.asked
+    if asked is not None and asked.outcome == "open" and asked.how(lease, now_ms) == "lapsed":
+        yield _of_request(asked, Fact.REQUEST_LAPSED, asked.expires_ms, f"Nobody answered {asked.by} in time.")
+    if lease.account and not lease.action and not lease.live(now_ms):
+        message = f"The lease of {lease.holder} ran out."
+        yield _of_lease(lease, Fact.EXPIRED, lease.expires_ms, message, {"holder": lease.holder})
+
+
+def changed(before: Lease | None, after: Lease, *, by: str, now_ms: int) -> Iterator[Happened]:
+    """What one write has changed.
+
+    Args:
+        before: The lease that was read.
+        after: The lease that was written in its place.
+        by: Who did it, by name.
+        now_ms: When.
+    """
+    if before is not None and (after.epoch != before.epoch or not after.account):
+        yield from overdue(before, now_ms)
+    elif before is not None and before.asked is not None and (after.asked is None or after.asked.id != before.asked.id):
+        yield from (late for late in overdue(before, now_ms) if late.fact is Fact.REQUEST_LAPSED)
+    yield from _of_change(before, after, by=by, now_ms=now_ms)
+    yield from _of_asking(before, after, by=by, now_ms=now_ms)
+
+
+def ended(before: Lease, after: Lease, *, why: str, now_ms: int) -> Happened:
+    """Control has ended because the device was ``unpaired``, ``moved``, ``removed``, or is ``unshared``."""
+    how = "is shared with them no longer" if why == "unshared" else f"was {why}"
+    message = f"Control of {before.holder} ended: the device {how}."
+    return _of_lease(after, Fact.ENDED, now_ms, message, {"holder": before.holder, "why": why})
+
+
+def _of_change(before: Lease | None, after: Lease, *, by: str, now_ms: int) -> Iterator[Happened]:
+    had = before.holder if before is not None and before.live(now_ms) else ""
+    if before is not None and after.epoch == before.epoch:
+        if had and not after.account and not before.action:
+            yield _of_lease(after, Fact.RELEASED, now_ms, f"{by} gave control back.", {"holder": had})
+        return
+    data = {"holder": after.holder} | ({"from": had} if had else {})
+    asked = after.asked
+    if not after.account:
+        yield _of_lease(after, Fact.RESET_ORDERED, now_ms, f"{by} ordered the reset of Stop.", {"by": by, **data})
+    elif asked is not None and asked.outcome == "accepted" and asked.epoch == after.epoch - 1:
+        message = f"{by} handed control over to {after.holder}."
+        yield _of_lease(after, Fact.HANDED_OVER, now_ms, message, {"request": asked.id, **data})
+    elif after.reason:
+        message = f"{after.holder} took control from {had}: {after.reason}"
+        data = {"reason": after.reason, **data}
+        yield _of_lease(after, Fact.TAKEN_OVER, now_ms, message, data, severity="warning")
+    else:
+        data |= {"action": after.action} if after.action else {}
+        yield _of_lease(after, Fact.TAKEN, now_ms, f"{after.holder} took control.", data)
+
+
+def _of_asking(before: Lease | None, after: Lease, *, by: str, now_ms: int) -> Iterator[Happened]:
+    asked, known = after.asked, before.asked if before is not None else None
+    if asked is None or asked == known:
+        return
+    if asked.outcome == "open":
+        message = f"{asked.by} asked {after.holder} for control."
+        yield _of_request(asked, Fact.REQUESTED, now_ms, message)
+    elif asked.outcome == "refused":
+        yield _of_request(asked, Fact.REQUEST_REFUSED, now_ms, f"{by} kept control; {asked.by} had asked for it.")
+    elif asked.outcome == "withdrawn":
+        yield _of_request(asked, Fact.REQUEST_WITHDRAWN, now_ms, f"{asked.by} no longer asks for control.")
+
+
+def _of_lease(
+    lease: Lease,
+    fact: Fact,
+    at_ms: int,
+    message: str,
+    data: Mapping[str, str],
+    *,
+    severity: Literal["info", "warning"] = "info",
+) -> Happened:
+    return Happened(f"{fact}-{lease.epoch}", fact, at_ms, message, {"epoch": lease.epoch, **data}, severity)
+
+
+def _of_request(asked: Asked, fact: Fact, at_ms: int, message: str) -> Happened:
+    data = {"request": asked.id, "by": asked.by, "epoch": asked.epoch}
+    return Happened(f"{fact}-{asked.id}", fact, at_ms, message, data)

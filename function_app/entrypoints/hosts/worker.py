@@ -1,0 +1,89 @@
+"""The local worker: ingest from the broker, and the timer. One process; any number may run."""
+
+import asyncio
+import logging
+import signal
+from collections.abc import Sequence
+
+import function_app
+from function_app.bootstrap import Functions
+from function_app.entrypoints.ingest.router import ingest, ingest_telemetry
+from function_app.ports.model_compiler import CompilerMissingError
+
+SWEEP_EVERY_S = 1.0
+CHECK_EVERY_S = 0.2
+_log = logging.getLogger(__name__)
+
+
+async def work(functions: Functions) -> None:
+    """Run until SIGINT or SIGTERM.
+
+    Raises:
+        StoreError: The tables cannot be used, at the start.
+    """
+    ending = asyncio.Event()
+    loop = asyncio.get_running_loop()
+    for number in (signal.SIGINT, signal.SIGTERM):
+        loop.add_signal_handler(number, ending.set)
+    await functions.health.require_tables()
+
+    async def handle(topic: str, payload: bytes) -> None:
+        await ingest(functions, topic, payload)
+
+    async def handle_telemetry(messages: Sequence[tuple[str, bytes]]) -> None:
+        await ingest_telemetry(functions, messages)
+
+    function_app.run_for_long()
+    tasks = [
+        asyncio.create_task(functions.feed.run(handle)),
+        asyncio.create_task(functions.telemetry.run(handle_telemetry)),
+        asyncio.create_task(functions.late.run(handle_telemetry)),
+        asyncio.create_task(_sweep(functions)),
+        asyncio.create_task(_check_models(functions)),
+    ]
+    waiting = asyncio.create_task(ending.wait())
+    done, _ = await asyncio.wait([*tasks, waiting], return_when=asyncio.FIRST_COMPLETED)
+    for task in (*tasks, waiting):
+        task.cancel()
+    await asyncio.gather(*tasks, waiting, return_exceptions=True)
+    await functions.close()
+    for task in done - {waiting}:
+        task.result()
+
+
+async def check_models(functions: Functions, *, drain: bool) -> None:
+    """Check uploaded models, for ever or until none is left.
+
+    Raises:
+        CompilerMissingError: This machine cannot.
+    """
+    functions.model_checks.require()
+    while True:
+        try:
+            busy = await functions.model_checks.run()
+        except CompilerMissingError:
+            raise
+        except Exception:  # noqa: BLE001 (one bad upload must not end the checker; after some tries it is refused)
+            _log.exception("model checks")
+            busy = False
+        if drain and not busy:
+            return
+        await asyncio.sleep(0 if busy else CHECK_EVERY_S)
+
+
+async def _check_models(functions: Functions) -> None:
+    """A worker without MuJoCo does all the rest."""
+    try:
+        await check_models(functions, drain=False)
+    except CompilerMissingError as error:
+        _log.warning("uploaded models are not checked by this worker: %s", error)
+        await asyncio.Event().wait()
+
+
+async def _sweep(functions: Functions) -> None:
+    while True:
+        try:
+            await functions.sweep.run()
+        except Exception:  # noqa: BLE001 (one bad round must not end the timer)
+            _log.exception("timer")
+        await asyncio.sleep(SWEEP_EVERY_S)

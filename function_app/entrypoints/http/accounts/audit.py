@@ -1,0 +1,65 @@
+"""``accounts/me/audit``: who did what in one's own account."""
+
+from typing import Annotated
+
+from fastapi import Query, Request, Response
+
+from function_app.bootstrap import Functions
+from function_app.domain.common.timestamps import LAST_MS, rfc3339
+from function_app.entrypoints.http.accounts import schemas_audit as contract
+from function_app.entrypoints.http.framework.authentication import Caller
+from function_app.entrypoints.http.framework.responses import answer
+from function_app.entrypoints.http.framework.routing import Cursor, Limit, Routes
+from function_app.services.audit.audit_reader import Wanted
+
+On = Annotated[str | None, Query(max_length=200, description="Only on this device, agent, …, by its id.")]
+What = Annotated[str | None, Query(max_length=60, description="Only of this kind, such as `control-taken`.")]
+Since = Annotated[
+    int | None, Query(alias="from", ge=0, le=LAST_MS, description="From here [ms since 1970]; the beginning.")
+]
+Until = Annotated[
+    int | None, Query(alias="to", ge=0, le=LAST_MS, description="To before here [ms since 1970]; the end.")
+]
+
+
+def router(functions: Functions, caller: Caller) -> Routes:
+    """The routes."""
+    routes = Routes("accounts")
+
+    @routes.add(
+        "GET", "/accounts/me/audit", summary="Who did what", answers={200: contract.AuditList}, problems=(403, 422)
+    )
+    async def read_audit(  # noqa: PLR0917 (FastAPI names them)
+        request: Request,
+        on: On = None,
+        what: What = None,
+        since: Since = None,
+        until: Until = None,
+        cursor: Cursor = None,
+        limit: Limit = 100,
+    ) -> Response:
+        """In the account that asks, and on its devices, whoever did it: who took and lost control, what was refused,
+        every Stop, claim, share, key and sign-in. Each record's hash covers the one before it.
+        """  # noqa: D205
+        who = await caller.account(request)
+        wanted = Wanted(what=what, on=on, since_ms=since, until_ms=until)
+        records, following = await functions.trail.read(who, wanted, cursor=cursor, limit=limit)
+        items = tuple(
+            contract.AuditRecordOut(
+                seq=record["seq"],
+                at=rfc3339(record["at_ms"]),
+                what=record["what"],
+                on=record["on"],
+                outcome=record["outcome"],
+                who=record["who"],
+                by_account=record["account"],
+                session=record["session"],
+                key=record["key"],
+                data=record["data"],
+                hash=record["hash"],
+            )
+            for record in records
+        )
+        return answer(contract.AuditList(items=items, cursor=following))
+
+    return routes

@@ -1,0 +1,47 @@
+"""The page's cookie, and what is answered to somebody who has signed in."""
+
+from fastapi import Request, Response
+
+from function_app.entrypoints.http.accounts import schemas as contract
+from function_app.entrypoints.http.framework.authentication import COOKIE
+from function_app.entrypoints.http.framework.client_address import client_address
+from function_app.entrypoints.http.framework.responses import answer
+from function_app.services.identity.sessions import From, SignedIn
+from function_app.settings import Settings
+
+
+def set_session(settings: Settings, done: SignedIn) -> str:
+    """``Set-Cookie`` of a new session."""
+    return _session(settings, done.cookie, done.cookie_s)
+
+
+def clear_session(settings: Settings) -> str:
+    """``Set-Cookie`` of none."""
+    return _session(settings, "", 0)
+
+
+def secure(settings: Settings) -> str:
+    """What a cookie says where the page is at ``https``."""
+    return "; Secure" if settings.public_url.startswith("https:") else ""
+
+
+def signed_in(settings: Settings, done: SignedIn, status: int = 200) -> Response:
+    """An access token for programs, and a cookie for the page."""
+    body = contract.SignedIn(
+        access_token=done.access_token,
+        token_type="Bearer",  # noqa: S106 (a scheme's name)
+        expires_in_s=done.expires_in_s,
+        account=contract.AccountRef(id=done.account.id, name=done.account.name),
+        session=done.session,
+        csrf_token=done.csrf,
+    )
+    return answer(body, status, {"Set-Cookie": set_session(settings, done), "Cache-Control": "no-store"})
+
+
+def whence(request: Request, settings: Settings) -> From:
+    """Whence somebody signs in."""
+    return From(client_address(request, settings.trusted_proxies), request.headers.get("user-agent", ""))
+
+
+def _session(settings: Settings, value: str, lifetime_s: int) -> str:
+    return f"{COOKIE}={value}; Path=/api; Max-Age={lifetime_s}; HttpOnly; SameSite=Strict{secure(settings)}"

@@ -1,0 +1,56 @@
+"""``actions``: one action, many devices."""
+
+import asyncio
+
+from fastapi import Request, Response
+
+from function_app.bootstrap import Functions
+from function_app.domain.common.problems import Problem, invalid
+from function_app.entrypoints.http.actions import schemas_fleet as contract
+from function_app.entrypoints.http.actions.actions import Key, show_action, start_of
+from function_app.entrypoints.http.framework.authentication import Caller
+from function_app.entrypoints.http.framework.responses import answer, problem_type, read
+from function_app.entrypoints.http.framework.routing import Routes
+from function_app.entrypoints.http.framework.schemas import Problem as Refusal
+from function_app.services.actions.start_many import Answer
+
+
+def router(functions: Functions, caller: Caller) -> Routes:
+    """The routes."""
+    routes = Routes("actions")
+
+    @routes.add(
+        "POST",
+        "/actions",
+        summary="Start an action on many devices",
+        body=contract.FleetRequest,
+        answers={200: contract.FleetOut, 202: contract.FleetOut, 207: contract.FleetOut},
+    )
+    async def start_actions(request: Request, once: Key = None) -> Response:
+        """200: all have come as far as ``wait_for``, or have ended. 202: some are not there yet. 207: some are refused.
+
+        The key counts for each device by itself.
+        """
+        who = await caller.account(request)
+        asked: contract.FleetRequest = await read(request, contract.FleetRequest)
+        if len(set(asked.devices)) != len(asked.devices):
+            raise invalid("A device is named twice.")
+        if not asked.epochs.keys() <= set(asked.devices):
+            raise invalid("epochs names a device that devices does not.")
+        found = await functions.fleet.start(who, asked.devices, start_of(asked, once), epochs=asked.epochs)
+        items = await asyncio.gather(*(item(each) for each in found))
+        refused = any(isinstance(each.result, Problem) for each in found)
+        there = all(each.there for each in found)
+        return answer(contract.FleetOut(items=tuple(items)), 207 if refused else 200 if there else 202)
+
+    async def item(found: Answer) -> contract.FleetItem:
+        if isinstance(found.result, Problem):
+            why = found.result
+            told = Refusal(type=problem_type(why), title=why.title, status=why.status, detail=why.detail)
+            return contract.FleetItem(device=found.device, status=why.status, action=None, problem=told)
+        status = 200 if found.there else 202
+        return contract.FleetItem(
+            device=found.device, status=status, action=await show_action(functions, found.result), problem=None
+        )
+
+    return routes

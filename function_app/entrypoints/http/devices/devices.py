@@ -1,0 +1,87 @@
+"""``devices``: what they are, what their owner calls them, and who looks at them."""
+
+from fastapi import Request, Response
+
+from function_app.bootstrap import Functions
+from function_app.domain.common.timestamps import rfc3339
+from function_app.entrypoints.http import serializers
+from function_app.entrypoints.http.devices import schemas as contract
+from function_app.entrypoints.http.framework.authentication import Caller
+from function_app.entrypoints.http.framework.responses import answer, empty, read
+from function_app.entrypoints.http.framework.routing import Cursor, Limit, Routes
+
+_AGAIN_MS = 10_000
+"""How soon a page that looks at a device is to say so again."""
+
+
+def router(functions: Functions, caller: Caller) -> Routes:
+    """The routes."""
+    routes = Routes("devices")
+
+    @routes.add("GET", "/devices", summary="Devices one may see", answers={200: contract.DeviceList}, problems=(422,))
+    async def list_devices(request: Request, cursor: Cursor = None, limit: Limit = 100) -> Response:
+        """With presence, newest state and lease. A page holds the devices of up to ``limit`` agents."""
+        who = await caller.account(request)
+        views, following = await functions.devices.views(who, cursor=cursor, limit=limit)
+        items = tuple(serializers.device(view, who, functions.clock.now_ms()) for view in views)
+        return answer(contract.DeviceList(items=items, cursor=following))
+
+    @routes.add("GET", "/devices/{device}", summary="One device", answers={200: contract.DeviceOut}, problems=(404,))
+    async def get_device(request: Request, device: str) -> Response:
+        """With presence, newest state and lease."""
+        who = await caller.account(request)
+        return answer(serializers.device(await functions.devices.view(who, device), who, functions.clock.now_ms()))
+
+    _named_and_seen(routes, functions, caller)
+    return routes
+
+
+def _named_and_seen(routes: Routes, functions: Functions, caller: Caller) -> None:
+    @routes.add(
+        "PUT",
+        "/devices/{device}/label",
+        summary="Name a device",
+        body=contract.RenameRequest,
+        answers={200: contract.DeviceOut},
+        problems=(403, 404),
+    )
+    async def rename_device(request: Request, device: str) -> Response:
+        """For its owner. Whoever takes it over later finds it called as its agent calls it."""
+        who = await caller.account(request)
+        asked: contract.RenameRequest = await read(request, contract.RenameRequest)
+        label = None if asked.label is None else " ".join(asked.label.split())
+        await functions.rename.rename(who, device, label)
+        return answer(serializers.device(await functions.devices.view(who, device), who, functions.clock.now_ms()))
+
+    @routes.add(
+        "PUT",
+        "/devices/{device}/watchers",
+        summary="Say that one looks at it, and learn who else does",
+        answers={200: contract.WatchersOut},
+        problems=(404,),
+    )
+    async def watch_device(request: Request, device: str) -> Response:
+        """For whoever may see it. It counts for 25 s; what is said more often than every 5 s changes nothing."""
+        who = await caller.account(request)
+        others = tuple(
+            contract.WatcherOut(
+                name=other.name,
+                role=other.role.value,
+                mine=other.account == who.account,
+                since=rfc3339(other.since_ms),
+            )
+            for other in await functions.watchers.watch(who, device)
+        )
+        return answer(contract.WatchersOut(items=others, again_ms=_AGAIN_MS))
+
+    @routes.add(
+        "DELETE",
+        "/devices/{device}/watchers",
+        summary="Say that one looks no longer",
+        answers={204: None},
+        problems=(404,),
+    )
+    async def unwatch_device(request: Request, device: str) -> Response:
+        """Of this sign-in. Whoever says nothing is gone after 25 s too."""
+        await functions.watchers.leave(await caller.account(request), device)
+        return empty()

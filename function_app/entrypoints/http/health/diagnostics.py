@@ -1,0 +1,122 @@
+"""``devices/{id}/diagnostics``, ``spaces/{id}/diagnostics`` and ``diagnostics``."""
+
+from fastapi import Request, Response
+
+from function_app.bootstrap import Functions
+from function_app.domain.common.timestamps import rfc3339
+from function_app.domain.health.diagnosis import Health, band
+from function_app.domain.health.faults import Severity
+from function_app.entrypoints.http.framework.authentication import Caller
+from function_app.entrypoints.http.framework.responses import answer
+from function_app.entrypoints.http.framework.routing import Cursor, Limit, Routes
+from function_app.entrypoints.http.health import schemas as contract
+from function_app.entrypoints.http.health.faults import show as show_fault
+from function_app.services.health.diagnostics import FieldView, Summary
+
+
+def router(functions: Functions, caller: Caller) -> Routes:
+    """The routes."""
+    routes = Routes("diagnostics")
+
+    @routes.add(
+        "GET",
+        "/devices/{device}/diagnostics",
+        summary="How a device is",
+        answers={200: contract.DeviceDiagnostics},
+        problems=(404,),
+    )
+    async def get_diagnostics(request: Request, device: str) -> Response:
+        """Open faults, and each measurement beside what is usual, allowed and to be expected."""
+        who = await caller.account(request)
+        summary, fields = await functions.diagnostics.of_device(who, device)
+        body = contract.DeviceDiagnostics(
+            device=summary.view.device.id,
+            label=summary.view.device.label,
+            health=summary.health.value,
+            online=summary.view.online,
+            last_seen_at=_moment(summary.view.last_seen_ms),
+            counts=_counts(summary),
+            faults=tuple(show_fault(fault) for fault in summary.faults),
+            fields=tuple(_field(field) for field in fields),
+        )
+        return answer(body)
+
+    @routes.add(
+        "GET",
+        "/diagnostics",
+        summary="How all devices are",
+        answers={200: contract.DeviceHealthList},
+        problems=(422,),
+    )
+    async def list_diagnostics(request: Request, cursor: Cursor = None, limit: Limit = 1000) -> Response:
+        """Worst first, with counts."""
+        who = await caller.account(request)
+        found, following = await functions.diagnostics.summaries(who, space=None, cursor=cursor, limit=limit)
+        return answer(_list(found, following))
+
+    @routes.add(
+        "GET",
+        "/spaces/{space}/diagnostics",
+        summary="How a space's devices are",
+        answers={200: contract.DeviceHealthList},
+        problems=(404, 422),
+    )
+    async def list_space_diagnostics(
+        request: Request, space: str, cursor: Cursor = None, limit: Limit = 1000
+    ) -> Response:
+        """Worst first, with counts."""
+        who = await caller.account(request)
+        found, following = await functions.diagnostics.summaries(who, space=space, cursor=cursor, limit=limit)
+        return answer(_list(found, following))
+
+    return routes
+
+
+def _list(found: list[Summary], cursor: str | None) -> contract.DeviceHealthList:
+    counted = {health.value: sum(one.health is health for one in found) for health in Health}
+    items = tuple(
+        contract.DeviceHealthOut(
+            device=one.view.device.id,
+            label=one.view.device.label,
+            space=one.view.device.space,
+            health=one.health.value,
+            online=one.view.online,
+            last_seen_at=_moment(one.view.last_seen_ms),
+            counts=_counts(one),
+            worst=show_fault(one.faults[0]) if one.faults else None,
+        )
+        for one in found
+    )
+    return contract.DeviceHealthList(counts=contract.DeviceHealthCounts(**counted), items=items, cursor=cursor)
+
+
+def _counts(summary: Summary) -> contract.FaultCounts:
+    return contract.FaultCounts(**{severity.value: summary.count(severity) for severity in Severity})
+
+
+def _field(known: FieldView) -> contract.FieldOut:
+    limits, watch = known.rule.limits, known.watch
+    usual = band(watch, limits)
+    return contract.FieldOut(
+        stream=known.stream,
+        field=known.name,
+        label=known.rule.label,
+        unit=known.rule.unit,
+        advice=known.rule.advice,
+        value=watch.value,
+        baseline=watch.baseline.mean,
+        usual_low=usual[0] if usual else None,
+        usual_high=usual[1] if usual else None,
+        warning_low=limits.warning_low,
+        warning_high=limits.warning_high,
+        low=limits.low,
+        high=limits.high,
+        slope_per_s=watch.slope_per_s,
+        limit_in_s=watch.limit_in_s,
+        findings=watch.findings,
+        updated_at=rfc3339(watch.seen_ms),
+    )
+
+
+def _moment(at_ms: int | None) -> str | None:
+    return None if at_ms is None else rfc3339(at_ms)

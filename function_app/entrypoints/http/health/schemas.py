@@ -1,0 +1,87 @@
+"""Health of devices."""
+
+from typing import Literal
+
+from function_app.entrypoints.http.framework.schemas import Answer, Moment
+from function_app.entrypoints.http.health.schemas_faults import FaultOut
+
+Health = Literal["ok", "unknown", "warning", "fault"]
+
+
+class FieldOut(Answer, frozen=True, kw_only=True):
+    """One watched field, by means over ten seconds.
+
+    ``baseline`` is what is usual; values are usually from ``usual_low`` to ``usual_high``, null until that is known.
+    ``slope_per_s`` is the trend of the last ten minutes; ``limit_in_s`` the time until it meets a limit, null: it
+    does not. ``findings``: what is wrong now, of ``level``, ``trend``, ``change``, ``outlier``. ``advice``: what to do
+    then, by the robot type or the room; empty where nobody has listed the field.
+    """
+
+    stream: str
+    field: str
+    label: str
+    unit: str
+    advice: str
+    value: float
+    baseline: float
+    usual_low: float | None
+    usual_high: float | None
+    warning_low: float | None
+    warning_high: float | None
+    low: float | None
+    high: float | None
+    slope_per_s: float | None
+    limit_in_s: float | None
+    findings: tuple[str, ...]
+    updated_at: Moment
+
+
+class FaultCounts(Answer, frozen=True, kw_only=True):
+    """Open faults by severity."""
+
+    error: int
+    warning: int
+    info: int
+
+
+class DeviceDiagnostics(Answer, frozen=True, kw_only=True):
+    """How a device is, and all that is watched of it. ``unknown``: nothing is heard of it."""
+
+    device: str
+    label: str
+    health: Health
+    online: bool
+    last_seen_at: Moment | None
+    counts: FaultCounts
+    faults: tuple[FaultOut, ...]
+    fields: tuple[FieldOut, ...]
+
+
+class DeviceHealthOut(Answer, frozen=True, kw_only=True):
+    """How a device is, in short. ``worst`` is its worst open fault."""
+
+    device: str
+    label: str
+    space: str
+    health: Health
+    online: bool
+    last_seen_at: Moment | None
+    counts: FaultCounts
+    worst: FaultOut | None
+
+
+class DeviceHealthCounts(Answer, frozen=True, kw_only=True):
+    """Devices of this page by health."""
+
+    fault: int
+    warning: int
+    unknown: int
+    ok: int
+
+
+class DeviceHealthList(Answer, frozen=True, kw_only=True):
+    """Devices, worst first. A page holds those of up to ``limit`` agents, by default all."""
+
+    counts: DeviceHealthCounts
+    items: tuple[DeviceHealthOut, ...]
+    cursor: str | None

@@ -1,0 +1,14 @@
+"""``health``."""
+
+from typing import Literal
+
+from function_app.entrypoints.http.framework.schemas import Answer
+
+
+class HealthOut(Answer, frozen=True, kw_only=True):
+    """``ok``, or a sentence, for each thing the functions need."""
+
+    status: Literal["ok", "degraded"]
+    version: str
+    tables: str
+    broker: str

@@ -1,0 +1,90 @@
+"""``agents/{agent}/commands`` and ``agents/{agent}/messages``: for agents that cannot speak MQTT."""
+
+from typing import Annotated
+
+from fastapi import Query, Request, Response
+
+from function_app.bootstrap import Functions
+from function_app.domain.common.problems import not_found
+from function_app.domain.common.timestamps import rfc3339
+from function_app.domain.devices.devices import Agent
+from function_app.entrypoints.http.framework.authentication import Caller
+from function_app.entrypoints.http.framework.responses import answer, read
+from function_app.entrypoints.http.framework.routing import Routes
+from function_app.entrypoints.http.messaging import schemas as contract
+from function_app.entrypoints.ingest.agent_messages import tell
+from function_app.services.devices.device_access import require_claimed
+
+Wait = Annotated[int, Query(ge=0, le=30_000, description="Wait at most this long for a command [ms]; 0: plain poll.")]
+Limit = Annotated[int, Query(ge=1, le=32, description="At most so many.")]
+Have = Annotated[
+    list[str], Query(max_length=32, description="Ids of commands that came already and are not answered yet.")
+]
+
+
+def router(functions: Functions, caller: Caller) -> Routes:
+    """The routes."""
+    routes = Routes("agents")
+
+    @routes.add(
+        "GET",
+        "/agents/{agent}/commands",
+        summary="Commands that wait for this agent",
+        answers={200: contract.CommandList},
+        problems=(404, 409, 422),
+        caller="agent",
+    )
+    async def fetch_commands(
+        request: Request,
+        agent: str,
+        wait_ms: Wait = 0,
+        limit: Limit = 10,
+        have: Have = (),  # type: ignore[assignment]
+    ) -> Response:
+        """Called by an agent that said ``http`` when it enrolled. A command comes again until an ack of it was told."""
+        asking = await _asking(request, agent)
+        found = await functions.polling.commands(asking, wait_ms=wait_ms, limit=limit, have=frozenset(have))
+        items = tuple(
+            contract.CommandOut(
+                id=letter.command,
+                topic=letter.topic,
+                payload=letter.payload.decode(),
+                expires_at=rfc3339(letter.expires_ms),
+            )
+            for letter in found
+        )
+        return answer(contract.CommandList(items=items), headers={"Cache-Control": "no-store"})
+
+    @routes.add(
+        "POST",
+        "/agents/{agent}/messages",
+        summary="What this agent has to say",
+        body=contract.MessagesRequest,
+        answers={200: contract.MessagesTaken},
+        problems=(404, 409),
+        caller="agent",
+    )
+    async def tell_messages(request: Request, agent: str) -> Response:
+        """Acks, state, description, events, telemetry, as over MQTT; told to the broker's subscribers too.
+
+        Each message has its own result. All may be told again: what was taken already changes nothing.
+        """
+        asking = await _asking(request, agent)
+        require_claimed(asking)
+        asked: contract.MessagesRequest = await read(request, contract.MessagesRequest)
+        await functions.polling.seen(asking)  # first: what it says of itself counts more
+        told = [(each.topic, bytes(each.payload)) for each in asked.messages]
+        results = (
+            contract.ToldOut(status="stored" if why is None else "refused", detail=why and f"{why.rstrip('.')}.")
+            for why in await tell(functions, asking, told, by="http")
+        )
+        return answer(contract.MessagesTaken(results=tuple(results)))
+
+    async def _asking(request: Request, agent: str) -> Agent:
+        """The agent that asks, once it is seen that the path names it."""
+        found = await caller.agent(request)
+        if found.id != agent:
+            raise not_found("agent", agent)
+        return found
+
+    return routes

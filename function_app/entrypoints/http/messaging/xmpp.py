@@ -1,0 +1,81 @@
+"""``xmpp/credentials`` for who connects, and ``xmpp/verify`` for the XMPP server."""
+
+from typing import Any
+
+from fastapi import Request, Response
+
+from device_agent.protocol.xmpp import jids
+from function_app.bootstrap import Functions
+from function_app.domain.common.timestamps import rfc3339
+from function_app.entrypoints.http.control.schemas_broker import AgentRequest
+from function_app.entrypoints.http.framework.authentication import Caller
+from function_app.entrypoints.http.framework.responses import answer, read
+from function_app.entrypoints.http.framework.routing import Routes
+from function_app.entrypoints.http.messaging import schemas_xmpp as contract
+
+_NOT_KEPT = {"Cache-Control": "no-store"}
+
+
+def router(functions: Functions, caller: Caller) -> Routes:
+    """The routes."""
+    routes = Routes("broker")
+
+    @routes.add(
+        "POST",
+        "/xmpp/credentials",
+        summary="Credentials for the XMPP server",
+        body=contract.XmppRequest,
+        answers={200: contract.XmppCredentialsOut},
+        problems=(409,),
+        caller="account or agent",
+    )
+    async def xmpp_credentials(request: Request) -> Response:
+        """For an agent that said ``xmpp`` when it enrolled; or to watch one's agents with any XMPP client."""
+        asked: Any = await read(request, contract.XmppRequest)
+        space: str | None = None
+        if isinstance(asked, AgentRequest):
+            agent = await caller.agent(request)
+            given = await functions.xmpp_access.agent(agent)
+            space = agent.space
+        else:
+            given = await functions.xmpp_access.account(await caller.account(request))
+        settings = functions.settings
+        news = None if space is None else await functions.keys.news()
+        body = contract.XmppCredentialsOut(
+            jid=f"{given.user}@{settings.xmpp_domain}",
+            password=given.password,
+            expires_at=rfc3339(given.expires_ms),
+            lifetime_s=given.lifetime_s,
+            space=space,
+            cloud=f"{jids.CLOUD}@{settings.xmpp_domain}",
+            host=settings.xmpp_host,
+            port=settings.xmpp_port,
+            server_time_ms=functions.clock.now_ms(),
+            key_statements=() if news is None else news.statements,
+            signing_key="" if news is None else news.signing,
+        )
+        return answer(body, headers=_NOT_KEPT)
+
+    @routes.add(
+        "POST",
+        "/xmpp/verify",
+        summary="Whether somebody may log in at the XMPP server",
+        body=contract.VerifyRequest,
+        answers={200: contract.AdmittedOut},
+        problems=(401, 409),
+        caller="nobody",
+    )
+    async def xmpp_verify(request: Request) -> Response:
+        """Asked by the XMPP server; who has no valid password learns nothing here."""
+        asked: contract.VerifyRequest = await read(request, contract.VerifyRequest)
+        found = await functions.xmpp_access.verify(asked.user, asked.password)
+        body = contract.AdmittedOut(
+            user=found.user,
+            name=found.name,
+            kind=found.kind,
+            lifetime_s=found.lifetime_s,
+            contacts=tuple(contract.ContactOut(user=each.user, name=each.name) for each in found.contacts),
+        )
+        return answer(body, headers=_NOT_KEPT)
+
+    return routes

@@ -1,0 +1,84 @@
+"""``devices/{id}/robot-type`` and ``devices/{id}/movements``: what its owner has for a device, whoever asks."""
+
+from fastapi import Request, Response
+
+from device_agent.protocol.security import signing
+from function_app.bootstrap import Functions
+from function_app.domain.identity.accounts import Identity
+from function_app.entrypoints.http import serializers
+from function_app.entrypoints.http.framework.authentication import Caller
+from function_app.entrypoints.http.framework.responses import answer, content
+from function_app.entrypoints.http.framework.routing import Cursor, Limit, Routes
+from function_app.entrypoints.http.robot_types import schemas_movements as contract
+from function_app.entrypoints.http.robot_types.schemas import RobotTypeOut
+from function_app.services.devices.device_access import require_operator
+
+
+def router(functions: Functions, caller: Caller) -> Routes:
+    """The routes."""
+    routes = Routes("devices")
+
+    @routes.add(
+        "GET",
+        "/devices/{device}/robot-type",
+        summary="A device's robot type",
+        answers={200: RobotTypeOut},
+        problems=(404,),
+    )
+    async def get_device_robot_type(request: Request, device: str) -> Response:
+        """As its owner has it: one's own of the same name may be another."""
+        found = await functions.devices.get(await caller.account(request), device)
+        return answer(serializers.robot_type(await functions.robot_types.view(_owner(found.owner), found.robot_type)))
+
+    @routes.add(
+        "GET",
+        "/devices/{device}/robot-type/files/{name:path}",
+        summary="One file of a device's robot type",
+        answers={200: "application/octet-stream"},
+        problems=(404, 409),
+    )
+    async def get_device_robot_type_file(request: Request, device: str, name: str) -> Response:
+        """Of the version in use; ``robot.toml`` is the manifest."""
+        found = await functions.devices.get(await caller.account(request), device)
+        body = await functions.robot_types.file(_owner(found.owner), found.robot_type, name)
+        return content(body, "application/octet-stream", name.rpartition("/")[2])
+
+    @routes.add(
+        "GET",
+        "/devices/{device}/movements",
+        summary="Movements that can be run on a device",
+        answers={200: contract.MovementList},
+        problems=(403, 404, 409, 422),
+    )
+    async def list_device_movements(
+        request: Request, device: str, cursor: Cursor = None, limit: Limit = 100
+    ) -> Response:
+        """Built-in ones and its owner's, by name. For who may run them."""
+        found = require_operator(await functions.devices.get(await caller.account(request), device))
+        items, following = await functions.movements.list(
+            _owner(found.owner), found.robot_type, cursor=cursor, limit=limit
+        )
+        return answer(
+            contract.MovementList(items=tuple(serializers.movement(each) for each in items), cursor=following)
+        )
+
+    @routes.add(
+        "GET",
+        "/devices/{device}/movements/{name}",
+        summary="One movement that can be run on a device, with its source",
+        answers={200: contract.MovementSource},
+        problems=(403, 404, 409),
+    )
+    async def get_device_movement(request: Request, device: str, name: str) -> Response:
+        """Whoever may run it may read what it does. Its newest version."""
+        found = require_operator(await functions.devices.get(await caller.account(request), device))
+        movement, source = await functions.movements.get(_owner(found.owner), found.robot_type, name)
+        public = signing.public_text((await functions.keys.public())[movement.key])
+        return answer(serializers.movement_source(found.robot_type, movement, source, public))
+
+    return routes
+
+
+def _owner(account: str) -> Identity:
+    """In whose library it is looked. That the caller may is seen to before."""
+    return Identity(account, "", "")

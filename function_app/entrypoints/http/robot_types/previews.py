@@ -1,0 +1,83 @@
+"""``robot-type-looks``: a robot type before it is saved."""
+
+from fastapi import Request, Response
+
+from function_app.bootstrap import Functions
+from function_app.entrypoints.http import serializers
+from function_app.entrypoints.http.framework.authentication import Caller
+from function_app.entrypoints.http.framework.responses import answer, empty, read, read_or
+from function_app.entrypoints.http.framework.routing import PREFIX, Routes
+from function_app.entrypoints.http.robot_types import schemas as contract
+
+_ONE = "/robot-type-looks/{look}"
+
+
+def router(functions: Functions, caller: Caller) -> Routes:
+    """The routes."""
+    routes = Routes("robot types")
+
+    @routes.add(
+        "POST",
+        "/robot-type-looks",
+        summary="Look at a robot type before it is saved",
+        body=contract.TypeLookRequest,
+        answers={201: contract.TypeLookOut, 202: contract.TypeLookOut},
+        problems=(409,),
+    )
+    async def add_robot_type_look(request: Request) -> Response:
+        """Compiled and compared with its manifest as an upload is. 201: there is a verdict; 202: look at it again.
+
+        Four of an account are kept, each for half an hour.
+        """
+        who = await caller.account(request)
+        asked: contract.TypeLookRequest = await read(request, contract.TypeLookRequest, limit=contract.MAX_UPLOAD)
+        found = await functions.look_at_robot_type.begin(
+            who, asked.manifest, asked.files, asked.movements, wait_ms=asked.wait_ms
+        )
+        status = 202 if found.upload.open else 201
+        return answer(serializers.look(found), status, {"Location": f"{PREFIX}/robot-type-looks/{found.id}"})
+
+    @routes.add("GET", _ONE, summary="How a look fares", answers={200: contract.TypeLookOut}, problems=(404,))
+    async def get_robot_type_look(request: Request, look: str) -> Response:
+        """One's own."""
+        return answer(serializers.look(await functions.look_at_robot_type.get(await caller.account(request), look)))
+
+    @routes.add(
+        "GET",
+        _ONE + "/twin",
+        summary="The drawing of what is looked at",
+        answers={200: contract.RobotTypeTwin},
+        problems=(404, 409, 422),
+    )
+    async def get_robot_type_look_twin(request: Request, look: str) -> Response:
+        """As of a robot type."""
+        return answer(serializers.twin(await functions.look_at_robot_type.model(await caller.account(request), look)))
+
+    @routes.add(
+        "POST",
+        _ONE + "/save",
+        summary="Save what is looked at",
+        body=contract.SaveTypeLookRequest,
+        body_required=False,
+        answers={200: contract.RobotTypeOut, 201: contract.RobotTypeOut, 202: contract.RobotTypeOut},
+        problems=(404, 409),
+    )
+    async def save_robot_type_look(request: Request, look: str) -> Response:
+        """It becomes a robot type, or the next version of one, as if it were uploaded now; the look ends."""
+        who = await caller.account(request)
+        asked = await read_or(request, contract.SaveTypeLookRequest, contract.SaveTypeLookRequest())
+        found, new = await functions.look_at_robot_type.save(who, look, wait_ms=asked.wait_ms)
+        status = 201 if new else 200
+        if found.upload is not None and found.upload.open:
+            status = 202
+        return answer(
+            serializers.robot_type(found), status, {"Location": f"{PREFIX}/robot-types/{found.manifest.type}"}
+        )
+
+    @routes.add("DELETE", _ONE, summary="End a look", answers={204: None}, problems=(404,))
+    async def delete_robot_type_look(request: Request, look: str) -> Response:
+        """What it has stored goes."""
+        await functions.look_at_robot_type.drop(await caller.account(request), look)
+        return empty()
+
+    return routes

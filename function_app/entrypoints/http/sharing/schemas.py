@@ -1,0 +1,113 @@
+"""``devices/{id}/shares``, ``spaces/{id}/shares``: with whom something is shared."""
+
+from typing import Annotated, Literal
+
+from msgspec import Meta
+
+from device_agent.protocol import Id
+from function_app.entrypoints.http.accounts.schemas import AccountRef
+from function_app.entrypoints.http.framework.schemas import Answer, Moment, Name, Request
+
+SharedRole = Literal["operator", "viewer"]
+ForS = Annotated[int, Meta(ge=10, le=10 * 366 * 86_400, description="How long it lasts [s]; null: until it is ended.")]
+
+
+class ShareRequest(Request, frozen=True, kw_only=True):
+    """With which account (its name), as what, and for how long. Asked again, it is changed."""
+
+    account: Name
+    role: SharedRole
+    expires_in_s: ForS | None = None
+
+
+class ShareOut(Answer, frozen=True, kw_only=True):
+    """One account's part. ``by``: who shared it."""
+
+    account: AccountRef
+    role: SharedRole
+    by: str
+    created_at: Moment
+    expires_at: Moment | None
+
+
+class ShareEnding(Answer, frozen=True, kw_only=True):
+    """The share has ended and control with it; ``detail``: who could not be told yet, and what becomes of that."""
+
+    detail: str
+
+
+class ShareList(Answer, frozen=True, kw_only=True):
+    """Shares, oldest first: all of them."""
+
+    items: tuple[ShareOut, ...]
+    cursor: str | None
+
+
+Secret = Annotated[str, Meta(min_length=1, max_length=200)]
+LinkS = Annotated[int, Meta(ge=60, le=30 * 86_400, description="How long it can be redeemed [s].")]
+Uses = Annotated[int, Meta(ge=1, le=50, description="How many accounts may redeem it; each once.")]
+
+
+class InvitationRequest(Request, frozen=True, kw_only=True):
+    """As what, and for how long, whoever brings the secret gets a part.
+
+    ``account``: who alone may redeem it, by name; null: whoever has the secret.
+    """
+
+    role: SharedRole
+    expires_in_s: LinkS = 86_400
+    uses: Uses = 1
+    share_s: ForS | None = None
+    account: Name | None = None
+
+
+class TransferRequest(Request, frozen=True, kw_only=True):
+    """Until when it can be accepted, and by whom alone (an account's name); null: whoever has the secret."""
+
+    expires_in_s: LinkS = 86_400
+    account: Name | None = None
+
+
+class InvitationOut(Answer, frozen=True, kw_only=True):
+    """An open invitation. ``role`` ``owner``: a transfer. ``share_s``: how long the part will last; null: no end.
+
+    ``account``: who alone may redeem it, in lists, which are the owner's; null: whoever has the secret.
+    """
+
+    id: str
+    kind: Literal["device", "space", "agent"]
+    target: str
+    label: str
+    role: Literal["owner", "operator", "viewer"]
+    by: str
+    uses: int
+    share_s: int | None
+    expires_at: Moment
+    account: AccountRef | None = None
+
+
+class InvitationMade(InvitationOut, frozen=True, kw_only=True):
+    """With its secret, which is told this once, and a link to the console that carries it."""
+
+    secret: str
+    link: str
+
+
+class InvitationList(Answer, frozen=True, kw_only=True):
+    """Open invitations, oldest first: all of them."""
+
+    items: tuple[InvitationOut, ...]
+    cursor: str | None
+
+
+class LookRequest(Request, frozen=True, kw_only=True):
+    """The secret of an invitation."""
+
+    secret: Secret
+
+
+class RedeemRequest(Request, frozen=True, kw_only=True):
+    """The secret of an invitation; and for an agent that is handed over the space it shall be in (null: the first)."""
+
+    secret: Secret
+    space: Id | None = None

@@ -1,0 +1,43 @@
+"""``devices/{id}/events``."""
+
+from fastapi import Request, Response
+
+from function_app.bootstrap import Functions
+from function_app.domain.common.timestamps import rfc3339
+from function_app.entrypoints.http.framework.authentication import Caller
+from function_app.entrypoints.http.framework.responses import answer
+from function_app.entrypoints.http.framework.routing import Cursor, Limit, Routes
+from function_app.entrypoints.http.telemetry import schemas_events as contract
+
+
+def router(functions: Functions, caller: Caller) -> Routes:
+    """The routes."""
+    routes = Routes("diagnostics")
+
+    @routes.add(
+        "GET",
+        "/devices/{device}/events",
+        summary="What happened",
+        answers={200: contract.EventList},
+        problems=(404, 422),
+    )
+    async def list_events(request: Request, device: str, cursor: Cursor = None, limit: Limit = 100) -> Response:
+        """Since the device was paired: who got and lost control, what was refused and why, faults, the room."""
+        who = await caller.account(request)
+        found = await functions.devices.get(who, device)
+        events, following = await functions.events.read(found, cursor=cursor, limit=limit)
+        items = tuple(
+            contract.EventOut(
+                id=event["id"],
+                kind=event["kind"],
+                severity=event["severity"],
+                message=event["message"],
+                data=event["data"],
+                at=rfc3339(event["at_ms"]),
+                heard_at=rfc3339(event["seen_ms"]),
+            )
+            for event in events
+        )
+        return answer(contract.EventList(items=items, cursor=following))
+
+    return routes

@@ -1,0 +1,128 @@
+"""``devices/{id}/latency`` and ``agents/{id}/latency``."""
+
+from typing import Annotated, Any
+
+from fastapi import Header, Query, Request, Response
+
+from function_app.bootstrap import Functions
+from function_app.domain.common.problems import not_found
+from function_app.domain.common.timestamps import rfc3339
+from function_app.entrypoints.http.framework.authentication import Caller
+from function_app.entrypoints.http.framework.responses import answer, empty, read
+from function_app.entrypoints.http.framework.routing import Routes
+from function_app.entrypoints.http.telemetry import schemas_latency as contract
+from function_app.services.devices.device_access import devices_of, require_operator
+from function_app.services.telemetry.latency import Found, Path, Samples, Transport
+
+Key = Annotated[
+    str | None,
+    Header(
+        alias="Idempotency-Key",
+        min_length=1,
+        max_length=200,
+        description="The same key counts once. Without one the same samples of the same sender do.",
+    ),
+]
+OfTransport = Annotated[Transport | None, Query(description="Only this transport.")]
+OfPath = Annotated[Path | None, Query(description="Only this path.")]
+Since = Annotated[
+    int | None, Query(alias="from", ge=0, le=2**48, description="From here [ms since 1970]; a day before `to`.")
+]
+Until = Annotated[int | None, Query(alias="to", ge=0, le=2**48, description="To here [ms since 1970]; now.")]
+Recent = Annotated[int, Query(ge=0, le=1000, description="At most so many of the newest samples of each.")]
+
+
+def router(functions: Functions, caller: Caller) -> Routes:
+    """The routes."""
+    routes = Routes("latency")
+
+    @routes.add(
+        "POST",
+        "/devices/{device}/latency",
+        summary="Add an operator's samples",
+        body=contract.LatencyRequest,
+        answers={204: None},
+        problems=(404,),
+    )
+    async def add_latency(request: Request, device: str, once: Key = None) -> Response:
+        """Times that the operator's side has measured, on its own clock alone. Who only watches adds none."""
+        who = await caller.account(request)
+        asked: contract.LatencyRequest = await read(request, contract.LatencyRequest)
+        found = require_operator(await functions.devices.get(who, device))
+        await functions.latencies.add(found, _samples(asked), who=f"account:{who.account}", once=once or "")
+        return empty()
+
+    @routes.add(
+        "POST",
+        "/agents/{agent}/latency",
+        summary="Add an agent's samples",
+        body=contract.AgentLatencyRequest,
+        answers={204: None},
+        problems=(404,),
+        caller="agent",
+    )
+    async def add_agent_latency(request: Request, agent: str, once: Key = None) -> Response:
+        """Called by an agent: times that it has measured for one of its devices, on its own clock alone."""
+        known = await caller.agent(request)
+        asked: contract.AgentLatencyRequest = await read(request, contract.AgentLatencyRequest)
+        if known.id != agent or not known.claimed:
+            raise not_found("agent", agent)
+        device = next((found for found in devices_of(known) if found.name == asked.device), None)
+        if device is None:
+            raise not_found("device", asked.device)
+        await functions.latencies.add(device, _samples(asked), who=f"agent:{known.id}", once=once or "")
+        return empty()
+
+    @routes.add(
+        "GET",
+        "/devices/{device}/latency",
+        summary="How long things take",
+        answers={200: contract.LatencyList},
+        problems=(404, 422),
+    )
+    async def get_latency(  # noqa: PLR0917 (FastAPI names them)
+        request: Request,
+        device: str,
+        transport: OfTransport = None,
+        path: OfPath = None,
+        since: Since = None,
+        until: Until = None,
+        samples: Recent = 1000,
+    ) -> Response:
+        """Percentiles and histograms of each transport and path, side by side, since the device was paired."""
+        who = await caller.account(request)
+        found = await functions.devices.get(who, device)
+        span = functions.latencies.span(since, until)
+        items = await functions.latencies.find(found, span, transport=transport, path=path)
+        body = contract.LatencyList(
+            since=rfc3339(span.first_ms),
+            until=rfc3339(span.last_ms),
+            items=tuple(_show(item, samples) for item in items),
+        )
+        return answer(body)
+
+    return routes
+
+
+def _samples(asked: contract.LatencyRequest | contract.AgentLatencyRequest) -> Samples:
+    return Samples(asked.transport, asked.path, tuple((sample.at_ms, sample.ms) for sample in asked.samples))
+
+
+def _show(found: Found, samples: int) -> contract.LatencyOut:
+    known = found.histogram
+    recent = found.recent[len(found.recent) - min(samples, len(found.recent)) :]
+    measures: dict[str, Any] = dict.fromkeys(
+        ("mean_ms", "min_ms", "max_ms", "p50_ms", "p90_ms", "p95_ms", "p99_ms"), None
+    )
+    if known.count:
+        measures = {"mean_ms": known.mean_ms, "min_ms": known.min_ms, "max_ms": known.max_ms}
+        measures |= {f"p{percent}_ms": known.quantile(percent / 100) for percent in (50, 90, 95, 99)}
+    return contract.LatencyOut(
+        transport=found.transport,
+        path=found.path,
+        count=known.count,
+        bins=tuple(contract.Bin(above_ms=low, up_to_ms=high, count=count) for low, high, count in known.bins()),
+        at_ms=tuple(at_ms for at_ms, _ in recent),
+        ms=tuple(ms for _, ms in recent),
+        **measures,
+    )

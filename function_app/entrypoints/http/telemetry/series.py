@@ -1,0 +1,107 @@
+"""``devices/{id}/data``: what devices have measured."""
+
+from typing import Annotated, cast
+
+from fastapi import Query, Request, Response
+
+from function_app.bootstrap import Functions
+from function_app.domain.common.timestamps import LAST_MS, rfc3339
+from function_app.entrypoints.http.framework.authentication import Caller
+from function_app.entrypoints.http.framework.responses import answer
+from function_app.entrypoints.http.framework.routing import Routes
+from function_app.entrypoints.http.telemetry import schemas as contract
+from function_app.services.telemetry.series_reader import MAX_POINTS, Part, Range
+
+Since = Annotated[
+    int | None, Query(alias="from", ge=0, le=LAST_MS, description="From here [ms since 1970]; the beginning.")
+]
+Until = Annotated[
+    int | None, Query(alias="to", ge=0, le=LAST_MS, description="To before here [ms since 1970]; the end.")
+]
+Points = Annotated[int, Query(ge=1, le=MAX_POINTS, description="At most so many points in a page.")]
+Fields = Annotated[str | None, Query(max_length=4_000, description="Only these fields, with commas between.")]
+Cursor = Annotated[str | None, Query(max_length=40, description="Where the page before ended.")]
+Resolution = Annotated[
+    contract.Resolution | None, Query(description="How fine; without it, as fine as `points` allow on one page.")
+]
+
+
+def router(functions: Functions, caller: Caller) -> Routes:
+    """The routes."""
+    routes = Routes("data")
+
+    @routes.add(
+        "GET",
+        "/devices/{device}/data",
+        summary="What a device measures",
+        answers={200: contract.StreamList},
+        problems=(404,),
+    )
+    async def list_streams(request: Request, device: str) -> Response:
+        """Its streams since it was paired."""
+        views = await functions.series.streams(await caller.account(request), device)
+        items = tuple(
+            contract.StreamOut(
+                name=view.name,
+                samples=view.about.count,
+                first_at=rfc3339(view.about.first_ms),
+                last_at=rfc3339(view.about.last_ms),
+                fields=view.about.fields,
+            )
+            for view in views
+        )
+        return answer(contract.StreamList(items=items, cursor=None))
+
+    @routes.add(
+        "GET",
+        "/devices/{device}/data/{stream}",
+        summary="A stretch of a stream",
+        answers={200: contract.DataOut},
+        problems=(404, 422),
+    )
+    async def read_stream(  # noqa: PLR0917 (FastAPI names them)
+        request: Request,
+        device: str,
+        stream: str,
+        since: Since = None,
+        until: Until = None,
+        points: Points = 500,
+        fields: Fields = None,
+        resolution: Resolution = None,
+        cursor: Cursor = None,
+    ) -> Response:
+        """Samples as they came where these are few; else mean, least, greatest and last of even stretches of time."""
+        wanted = Range(
+            first_ms=since,
+            last_ms=until,
+            points=points,
+            level=resolution,
+            fields=None if fields is None else fields.split(","),
+            cursor=cursor,
+        )
+        part = await functions.series.read(await caller.account(request), device, stream, wanted)
+        return answer(_show(stream, part))
+
+    return routes
+
+
+def _show(stream: str, part: Part) -> contract.DataOut:
+    columns = {name: contract.ColumnOut(mean=tuple(values)) for name, values in part.values.items()}
+    for name, summaries in part.summaries.items():
+        columns[name] = contract.ColumnOut(
+            mean=tuple(each and each.mean for each in summaries),
+            min=tuple(each and each.low for each in summaries),
+            max=tuple(each and each.high for each in summaries),
+            last=tuple(each and each.last for each in summaries),
+            count=tuple(each.samples if each else 0 for each in summaries),
+        )
+    return contract.DataOut(
+        stream=stream,
+        resolution=cast("contract.Resolution", part.level.name),
+        span_ms=part.level.span_ms,
+        from_ms=part.first_ms,
+        to_ms=part.last_ms,
+        at_ms=tuple(part.at_ms),
+        fields=columns,
+        cursor=part.cursor,
+    )

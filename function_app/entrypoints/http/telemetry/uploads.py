@@ -1,0 +1,179 @@
+"""``devices/{id}/uploads`` and ``agents/{id}/uploads``: pictures, scans, bags."""
+
+from typing import Any
+
+from fastapi import Request, Response
+
+from function_app.bootstrap import Functions
+from function_app.domain.common.problems import not_found
+from function_app.domain.common.timestamps import rfc3339
+from function_app.domain.devices.devices import Agent, Device
+from function_app.entrypoints.http.framework.authentication import Caller
+from function_app.entrypoints.http.framework.responses import answer, empty, read
+from function_app.entrypoints.http.framework.routing import Cursor, Limit, Routes
+from function_app.entrypoints.http.telemetry import schemas_uploads as contract
+from function_app.services.devices.device_access import devices_of, require_operator, require_owner
+from function_app.services.telemetry.uploads import LIFETIME_S, Announced, Capture
+
+
+def router(functions: Functions, caller: Caller) -> Routes:
+    """The routes."""
+    routes = Routes("uploads")
+    _for_accounts(routes, functions, caller)
+    _for_agents(routes, functions, caller)
+    return routes
+
+
+def _for_accounts(routes: Routes, functions: Functions, caller: Caller) -> None:
+    async def operated(request: Request, device: str) -> tuple[Device, str]:
+        who = await caller.account(request)
+        return require_operator(await functions.devices.get(who, device)), who.name
+
+    @routes.add(
+        "POST",
+        "/devices/{device}/uploads",
+        summary="Begin an upload",
+        body=contract.UploadRequest,
+        answers={201: contract.UploadBegun},
+        problems=(404, 409),
+    )
+    async def begin_upload(request: Request, device: str) -> Response:
+        """Gives an address, to which the content goes past this API. Complete the upload after that."""
+        found, name = await operated(request, device)
+        asked: contract.UploadRequest = await read(request, contract.UploadRequest)
+        return await _begin(functions, found, asked, f"account:{name}")
+
+    @routes.add(
+        "POST",
+        "/devices/{device}/uploads/{upload}/complete",
+        summary="Register what was uploaded",
+        answers={200: contract.UploadOut},
+        problems=(404, 409),
+    )
+    async def complete_upload(request: Request, device: str, upload: str) -> Response:
+        """Checks that it is there, and is what was announced. Safe to repeat."""
+        found, _ = await operated(request, device)
+        return answer(contract.UploadOut(**_show(await functions.uploads.complete(found, upload))))
+
+    @routes.add(
+        "GET",
+        "/devices/{device}/uploads",
+        summary="Captures of a device",
+        answers={200: contract.UploadList},
+        problems=(404, 422),
+    )
+    async def list_uploads(request: Request, device: str, cursor: Cursor = None, limit: Limit = 100) -> Response:
+        """Registered ones, newest first."""
+        found = await functions.devices.get(await caller.account(request), device)
+        captures, following = await functions.uploads.list(found, cursor=cursor, limit=limit)
+        items = tuple(contract.UploadOut(**_show(capture)) for capture in captures)
+        return answer(contract.UploadList(items=items, cursor=following))
+
+    @routes.add(
+        "GET",
+        "/devices/{device}/uploads/{upload}",
+        summary="One capture",
+        answers={200: contract.UploadFound},
+        problems=(404,),
+    )
+    async def get_upload(request: Request, device: str, upload: str) -> Response:
+        """With an address from which it can be read."""
+        found = await functions.devices.get(await caller.account(request), device)
+        capture, url = await functions.uploads.get(found, upload)
+        return answer(contract.UploadFound(url=url, **_show(capture)), headers={"Cache-Control": "no-store"})
+
+    @routes.add(
+        "DELETE",
+        "/devices/{device}/uploads/{upload}",
+        summary="Delete a capture",
+        answers={204: None},
+        problems=(404,),
+    )
+    async def delete_upload(request: Request, device: str, upload: str) -> Response:
+        """With its content. For its owner: what an operator has captured stays until then."""
+        found = require_owner(await functions.devices.get(await caller.account(request), device))
+        await functions.uploads.delete(found, upload)
+        return empty()
+
+
+def _for_agents(routes: Routes, functions: Functions, caller: Caller) -> None:
+    @routes.add(
+        "POST",
+        "/agents/{agent}/uploads",
+        summary="Begin an agent's upload",
+        body=contract.AgentUploadRequest,
+        answers={201: contract.UploadBegun},
+        problems=(404, 409),
+        caller="agent",
+    )
+    async def begin_agent_upload(request: Request, agent: str) -> Response:
+        """Called by an agent, for one of its devices."""
+        known = await caller.agent(request)
+        asked: contract.AgentUploadRequest = await read(request, contract.AgentUploadRequest)
+        return await _begin(functions, _own(known, agent, asked.device), asked, f"agent:{known.id}")
+
+    @routes.add(
+        "POST",
+        "/agents/{agent}/uploads/{upload}/complete",
+        summary="Register what an agent has uploaded",
+        body=contract.AgentCompleteRequest,
+        answers={200: contract.UploadOut},
+        problems=(404, 409),
+        caller="agent",
+    )
+    async def complete_agent_upload(request: Request, agent: str, upload: str) -> Response:
+        """Called by an agent. Safe to repeat."""
+        known = await caller.agent(request)
+        asked: contract.AgentCompleteRequest = await read(request, contract.AgentCompleteRequest)
+        capture = await functions.uploads.complete(_own(known, agent, asked.device), upload)
+        return answer(contract.UploadOut(**_show(capture)))
+
+
+def _own(known: Agent, agent: str, name: str) -> Device:
+    """The device of this name of the agent that asks.
+
+    Raises:
+        Problem: ``agent-unknown``, ``device-unknown``.
+    """
+    if known.id != agent or not known.claimed:
+        raise not_found("agent", agent)
+    device = next((found for found in devices_of(known) if found.name == name), None)
+    if device is None:
+        raise not_found("device", name)
+    return device
+
+
+async def _begin(functions: Functions, device: Device, asked: contract.UploadRequest, by: str) -> Response:
+    wanted = Announced(
+        stream=asked.stream,
+        length=asked.length,
+        content_type=asked.content_type,
+        name=asked.name,
+        at_ms=asked.at_ms,
+        sha256=asked.sha256 or "",
+    )
+    capture, upload = await functions.uploads.begin(device, wanted, by=by)
+    body = contract.UploadBegun(
+        id=capture.id,
+        method=upload.method,
+        url=upload.url,
+        headers=dict(upload.headers),
+        expires_at=rfc3339(capture.created_ms + LIFETIME_S * 1000),
+    )
+    return answer(body, 201, headers={"Cache-Control": "no-store"})
+
+
+def _show(capture: Capture) -> dict[str, Any]:
+    return {
+        "id": capture.id,
+        "stream": capture.stream,
+        "name": capture.name,
+        "at": rfc3339(capture.at_ms),
+        "content_type": capture.content_type,
+        "length": capture.length,
+        "sha256": capture.sha256 or None,
+        "verified": capture.verified,
+        "by": capture.by,
+        "stored_at": rfc3339(capture.stored_ms),
+        "expires_at": rfc3339(capture.expires_ms),
+    }

@@ -1,0 +1,224 @@
+"""API keys of an account: made, listed, revoked, and recognised."""
+
+import contextlib
+import logging
+from collections import OrderedDict
+from dataclasses import dataclass, replace
+from typing import Final
+
+from function_app.domain.audit.hash_chain import Deed
+from function_app.domain.common.ids import split_device
+from function_app.domain.common.problems import Problem, invalid, not_found, unauthorized
+from function_app.domain.identity import api_keys as rules
+from function_app.domain.identity.accounts import Identity, Role
+from function_app.domain.identity.api_keys import ApiKey
+from function_app.ports.clock import Clock
+from function_app.ports.tables import Conflict, Row, StoreError, Tables
+from function_app.services.accounts.sign_out import SignOut
+from function_app.services.audit.audit_log import AuditChain
+from function_app.services.devices.device_access import Devices
+from function_app.services.identity.authenticator import RECHECK_MS, new_secret
+from function_app.services.identity.session_status import API_KEY
+from function_app.services.identity.sign_in import SignIn
+from function_app.services.storage import records
+from function_app.services.storage.reminders import Pending
+from function_app.services.storage.retention import DAY_MS, Forget
+
+MOST: Final = 50
+"""Of one account, more or less: two that are made at once may both be the last."""
+SHOWN_MS: Final = 30 * DAY_MS
+"""A key that has run out stays on the list so long: somebody will ask why their program stopped."""
+USED_EVERY_MS: Final = 3_600_000
+_KNOWN: Final = 4096
+_INDEX: Final = "api-key:"
+_EXPIRES: Final = "key-expires:"
+_REFUSED: Final = "This API key is unknown, revoked or expired. Make a new one."
+
+_log = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True, slots=True)
+class Wanted:
+    """A key to be made: as ``ApiKey``."""
+
+    label: str
+    most: Role
+    only: tuple[str, ...]
+    days: int
+
+
+@dataclass(slots=True)
+class _Checked:
+    key: ApiKey
+    at_ms: int
+
+
+class ApiKeys:
+    """The keys. A key that this process has seen is looked up again after a few seconds, as sessions are."""
+
+    def __init__(
+        self,
+        *,
+        tables: Tables,
+        devices: Devices,
+        sign_in: SignIn,
+        sign_out: SignOut,
+        chain: AuditChain,
+        forget: Forget,
+        pending: Pending,
+        clock: Clock,
+    ) -> None:
+        self._tables = tables
+        self._devices = devices
+        self._sign_in = sign_in
+        self._sign_out = sign_out
+        self._chain = chain
+        self._forget = forget
+        self._pending = pending
+        self._clock = clock
+        self._known: OrderedDict[str, _Checked] = OrderedDict()
+
+    async def make(self, who: Identity, wanted: Wanted) -> tuple[ApiKey, str]:
+        """A new key, and the token that is shown this once.
+
+        Raises:
+            Problem: ``too-many-keys``; ``device-unknown``, ``space-unknown``: it would be kept to what there is not.
+        """
+        if wanted.most is Role.OWNER:
+            raise invalid("A key is operator or viewer: owning is for people, who sign in.")
+        if not 1 <= wanted.days <= rules.MOST_DAYS:
+            raise invalid(f"A key is good for 1 to {rules.MOST_DAYS} days; make another one then.")
+        if len(await self._ids(who.account)) >= MOST:
+            detail = f"An account has at most {MOST} API keys. Revoke one that is not used."
+            raise Problem("too-many-keys", 409, "Too many API keys", detail)
+        only = tuple(dict.fromkeys(wanted.only))
+        await self._require_there(who, only)
+        now_ms, secret = self._clock.now_ms(), new_secret()
+        key = ApiKey(
+            id=rules.new_key_id(),
+            account=who.account,
+            owner=who.name,
+            label=wanted.label,
+            hash=rules.hashed(secret),
+            most=wanted.most,
+            only=only,
+            created_ms=now_ms,
+            expires_ms=now_ms + wanted.days * DAY_MS,
+        )
+        # Forgotten on time whatever becomes of this, and on the list before it is any use.
+        due_ms = key.expires_ms + SHOWN_MS
+        await self._forget.row(records.API_KEYS, key.id, API_KEY, due_ms=due_ms)
+        await self._forget.row(records.MEMBERS, who.account, _INDEX + key.id, due_ms=due_ms)
+        await self._pending.note(_EXPIRES + key.id, key.expires_ms)
+        about = {"name": key.label, "role": key.most.value, "only": list(only), "expires_ms": key.expires_ms}
+        async with self._chain.change(who.account, Deed.API_KEY_MADE, who, on=f"key:{key.id}", **about) as change:
+            await change.noted()
+            await self._tables.create(records.MEMBERS, Row(who.account, _INDEX + key.id, {}))
+            await self._tables.create(records.API_KEYS, Row(key.id, API_KEY, records.fields(key)))
+        return key, rules.token(key.id, secret)
+
+    async def of(self, account: str) -> tuple[ApiKey, ...]:
+        """Those of an account, the newest first."""
+        rows = [await self._tables.get(records.API_KEYS, key, API_KEY) for key in await self._ids(account)]
+        found = [records.read(row, ApiKey) for row in rows if row is not None]
+        return tuple(sorted((key for key in found if key.account == account), key=lambda key: -key.created_ms))
+
+    async def revoke(self, who: Identity, key_id: str) -> None:
+        """Refuse a key from now on, here at once and elsewhere within seconds, and end what is done with it.
+
+        Raises:
+            Problem: ``api-key-unknown``.
+        """
+        row = await self._tables.get(records.API_KEYS, key_id, API_KEY)
+        key = records.read(row, ApiKey) if row else None
+        if row is None or key is None or key.account != who.account:
+            raise not_found("api-key", key_id)
+        async with self._chain.change(who.account, Deed.API_KEY_REVOKED, who, on=f"key:{key_id}") as change:
+            await change.noted()
+            try:
+                await self._tables.delete(records.API_KEYS, row)
+            except Conflict:
+                change.came_to_nothing = True  # it was used just now, or somebody else revokes it too
+        if await self._tables.get(records.API_KEYS, key_id, API_KEY) is not None:
+            await self.revoke(who, key_id)
+            return
+        self._known.pop(key_id, None)
+        await self._sign_out.end(key.identity)
+        index = await self._tables.get(records.MEMBERS, who.account, _INDEX + key_id)
+        if index is not None:
+            with contextlib.suppress(Conflict):
+                await self._tables.delete(records.MEMBERS, index)
+
+    async def look(self, what: str, note: Row) -> None:
+        """The timer's look at a key whose time may be over: what is done with it ends, as when it is revoked."""
+        row = await self._tables.get(records.API_KEYS, what.removeprefix(_EXPIRES), API_KEY)
+        key = records.read(row, ApiKey) if row else None
+        if key is not None and self._clock.now_ms() >= key.expires_ms:
+            await self._sign_out.end(key.identity)
+        await self._pending.drop(note)
+
+    async def identify(self, token: str) -> Identity:
+        """Who asks by this token.
+
+        Raises:
+            Problem: ``unauthorized``: unknown, revoked or expired; the answer is the same.
+        """
+        parts = rules.split(token)
+        if parts is None:
+            raise unauthorized(_REFUSED)
+        now_ms = self._clock.now_ms()
+        known = self._known.get(parts[0])
+        if known is None or not 0 <= now_ms - known.at_ms < RECHECK_MS:
+            known = await self._look(parts[0], now_ms)
+        if known is None or not known.key.opened_by(parts[1]) or now_ms >= known.key.expires_ms:
+            raise unauthorized(_REFUSED)
+        if now_ms - known.key.used_ms >= USED_EVERY_MS:
+            known.key = await self._used(known.key, now_ms)
+        return known.key.identity
+
+    async def _look(self, key_id: str, now_ms: int) -> _Checked | None:
+        row = await self._tables.get(records.API_KEYS, key_id, API_KEY)
+        if row is None:
+            self._known.pop(key_id, None)
+            return None
+        checked = self._known[key_id] = _Checked(records.read(row, ApiKey), now_ms)
+        self._known.move_to_end(key_id)
+        if len(self._known) > _KNOWN:
+            self._known.popitem(last=False)
+        return checked
+
+    async def _used(self, key: ApiKey, now_ms: int) -> ApiKey:
+        """The key, once it is noted that it was used; at most once an hour, and without insisting."""
+        used = replace(key, used_ms=now_ms)
+        try:
+            row = await self._tables.get(records.API_KEYS, key.id, API_KEY)
+            if row is not None:
+                await self._tables.replace(
+                    records.API_KEYS, Row(row.partition, row.key, records.fields(used), row.etag)
+                )
+        except (Conflict, StoreError) as error:
+            _log.warning("the use of API key %s was not noted: %s", key.id, error)
+        return used
+
+    async def _require_there(self, who: Identity, only: tuple[str, ...]) -> None:
+        spaces: set[str] = set()
+        if any(each.startswith("space:") for each in only):
+            spaces = {space.id for space in await self._sign_in.spaces(who.account)}
+            spaces |= {device.space for device in await self._devices.all(who)}
+        for each in only:
+            if each.startswith("space:"):
+                if each.removeprefix("space:") not in spaces:
+                    raise not_found("space", each.removeprefix("space:"))
+            elif split_device(each) is None:
+                raise not_found("device", each)
+            else:
+                await self._devices.get(who, each)
+
+    async def _ids(self, account: str) -> list[str]:
+        page = await self._tables.query(records.MEMBERS, account, first=_INDEX, last="api-key;", limit=1000)
+        return [row.key.removeprefix(_INDEX) for row in page.rows]
+
+
+def about_key(note: str) -> bool:
+    """Whether a note of the timer is about an API key."""
+    return note.startswith(_EXPIRES)

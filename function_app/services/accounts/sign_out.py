@@ -1,0 +1,95 @@
+"""Signing out: tokens, broker connections and control end, at once and for good."""
+
+import asyncio
+import logging
+
+from function_app.domain.audit.hash_chain import Deed
+from function_app.domain.common.problems import Problem, not_found
+from function_app.domain.devices.devices import Device
+from function_app.domain.identity.accounts import Identity
+from function_app.ports.broker_access import BrokerAccess, BrokerAccessError
+from function_app.ports.clock import Clock
+from function_app.ports.tables import Tables
+from function_app.services.audit.audit_log import AuditChain
+from function_app.services.control.leases import Leases
+from function_app.services.devices.control_rows import read_lease
+from function_app.services.devices.device_access import Devices
+from function_app.services.identity.authenticator import Identify, principal
+from function_app.services.identity.sessions import Sessions
+
+AT_ONCE = 16
+"""Devices that are looked at in the same moment."""
+
+_log = logging.getLogger(__name__)
+
+
+class SignOut:
+    """Ends sign-in sessions, and whatever else acts for an account by a principal of its own."""
+
+    def __init__(
+        self,
+        *,
+        tables: Tables,
+        identify: Identify,
+        sessions: Sessions,
+        access: BrokerAccess,
+        devices: Devices,
+        leases: Leases,
+        chain: AuditChain,
+        clock: Clock,
+    ) -> None:
+        self._tables = tables
+        self._identify = identify
+        self._sessions = sessions
+        self._access = access
+        self._devices = devices
+        self._leases = leases
+        self._chain = chain
+        self._clock = clock
+
+    async def end(self, who: Identity) -> None:
+        """End the session of ``who``: its tokens first, then its connections to the broker, then its leases.
+
+        Whoever is not reached changes nothing: what the broker was told ends by itself within a quarter of an hour, a
+        lease when it runs out, and until then nobody can renew either.
+        """
+        async with self._chain.change(who.account, Deed.SIGNED_OUT, who) as change:
+            await change.noted()
+            await self._identify.sign_out(who)
+            await self._sessions.drop(who.account, who.session)
+        try:
+            await self._access.revoke(principal=principal(who))
+        except BrokerAccessError as error:
+            _log.warning("sign-out: %s", error)
+        await self._release(who)
+
+    async def one(self, who: Identity, session: str) -> None:
+        """End one session of the account.
+
+        Raises:
+            Problem: ``session-unknown``.
+        """
+        if session not in {known.id for known in await self._sessions.list(who.account)}:
+            raise not_found("session", session)
+        await self.end(Identity(who.account, who.name, session))
+
+    async def others(self, who: Identity) -> int:
+        """End every session of the account but the one that asks; how many there were."""
+        others = [known.id for known in await self._sessions.list(who.account) if known.id != who.session]
+        for session in others:
+            await self.end(Identity(who.account, who.name, session))
+        return len(others)
+
+    async def _release(self, who: Identity) -> None:
+        gate = asyncio.Semaphore(AT_ONCE)
+        await asyncio.gather(*(self._let_go(who, device, gate) for device in await self._devices.all(who)))
+
+    async def _let_go(self, who: Identity, device: Device, gate: asyncio.Semaphore) -> None:
+        async with gate:
+            lease = await read_lease(self._tables, device)
+            if lease is None or not lease.mine(who) or not lease.live(self._clock.now_ms()):
+                return
+            try:
+                await self._leases.release(who, device.id, epoch=lease.epoch)
+            except Problem as problem:
+                _log.warning("sign-out: control over %s: %s", device.id, problem.detail)

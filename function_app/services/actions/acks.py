@@ -1,0 +1,147 @@
+"""What devices report about actions, written down by whoever hears it first: the waiting call or the ingest."""
+
+import asyncio
+from collections.abc import AsyncIterator, Iterable
+
+import msgspec
+
+from device_agent.protocol import Ack, codec
+from device_agent.protocol.errors import ProtocolError
+from device_agent.protocol.topics import Topic
+from function_app.domain.actions.action import Action, Report, Status, apply_report, mark_published, reached
+from function_app.domain.common.ids import device_id, split_command
+from function_app.domain.common.json_depth import too_deep
+from function_app.domain.devices.devices import Transport
+from function_app.ports.clock import Clock
+from function_app.services.actions.action_store import ActionRows, Found
+from function_app.services.actions.queue import Queues
+from function_app.services.messaging.delivery import CONFIRMING
+from function_app.services.messaging.mailbox import Mailbox
+from function_app.services.telemetry.latency import Latencies
+
+_POLL_S = 0.02
+_SLOWEST_POLL_S = 0.2
+_FIRST_LOOK_S = 0.05
+_SLOWEST_LOOK_S = 0.5
+
+
+class ActionAcks:
+    """Applies acks to actions, and waits for them."""
+
+    def __init__(
+        self, *, rows: ActionRows, queues: Queues, mailbox: Mailbox, latencies: Latencies, clock: Clock
+    ) -> None:
+        self._rows = rows
+        self._queues = queues
+        self._mailbox = mailbox
+        self._latencies = latencies
+        self._clock = clock
+
+    async def ingest(self, topic: Topic, payload: bytes, *, by: Transport = "mqtt") -> None:
+        """Apply one ack that came by ``topic``. Doubled and late ones change nothing.
+
+        Raises:
+            ProtocolError: Not an ack, or to a command of another device.
+            Problem: ``busy``: not stored, to be delivered again.
+        """
+        ack = codec.decode(payload, Ack)
+        parts = split_command(ack.id)
+        if parts is None or parts[0] != device_id(topic.agent, topic.device):
+            raise ProtocolError(f"'{ack.id}' is no command to {topic.agent}/{topic.device}")
+        heard = report(ack, self._clock.now_ms())
+        found = await self._queues.change(ack.id, lambda action: apply_report(action, heard))
+        if found is None:
+            await self._answer(topic.agent, ack)
+        elif ack.status.terminal:
+            await self._latencies.measured(found.action, by)
+        if by != "mqtt":
+            # Last: until then the agent is given the command again, and answers again.
+            await self._mailbox.withdraw(topic.agent, ack.id)
+
+    async def _answer(self, agent: str, ack: Ack) -> None:
+        """To a command that is no action: somebody may wait for it."""
+        if ack.status.terminal or ack.status in CONFIRMING:
+            await self._mailbox.answer(agent, ack)
+
+    async def follow(
+        self, found: Found, acks: AsyncIterator[Ack] | None, *, wanted: Status, wait_ms: int, published: bool = False
+    ) -> Action:
+        """Wait until the action has reached ``wanted``, has ended, or ``wait_ms`` are over.
+
+        Acks are collected and written once, before this returns: who asks next reads what this answered.
+
+        Args:
+            found: The action as it was read or written last.
+            acks: Its acks from before it was published, or ``None``: then the row is read again and again.
+            wanted: The status to wait for.
+            wait_ms: At most this long.
+            published: Whether to note that the command was published.
+        """
+        published_ms = self._clock.now_ms() if published else None
+        end = asyncio.get_running_loop().time() + wait_ms / 1000
+        if acks is None:
+            if published:
+                found = await self._write(found, (), published_ms)
+            return await self._poll(found, wanted, end)
+        found, reports = await self._hear(found, acks, wanted, end)
+        return (await self._write(found, reports, published_ms)).action
+
+    async def _hear(
+        self, found: Found, acks: AsyncIterator[Ack], wanted: Status, end: float
+    ) -> tuple[Found, list[Report]]:
+        """Collect acks, and look into the tables now and then: the ingest may have heard what came before this call."""
+        loop = asyncio.get_running_loop()
+        reports: list[Report] = []
+        action = found.action
+        pause_s = _FIRST_LOOK_S
+        while not reached(action, wanted) and (left_s := end - loop.time()) > 0:
+            try:
+                async with asyncio.timeout(min(pause_s, left_s)):
+                    reports.append(report(await anext(acks), self._clock.now_ms()))
+                if action.status is Status.QUEUED:  # not any more, or nobody would report about it
+                    found = await self._rows.get(action.id) or found
+                    action = _applied(found.action, reports)
+                else:
+                    action = apply_report(action, reports[-1])
+            except TimeoutError:
+                pause_s = min(2 * pause_s, _SLOWEST_LOOK_S)
+                found = await self._rows.get(found.action.id) or found
+                action = _applied(found.action, reports)
+        return found, reports
+
+    async def _write(self, found: Found, reports: Iterable[Report], published_ms: int | None) -> Found:
+        def changed(action: Action) -> Action:
+            if published_ms is not None:
+                action = mark_published(action, published_ms)
+            return _applied(action, reports)
+
+        return await self._queues.change(found.action.id, changed, known=found) or found
+
+    async def _poll(self, found: Found, wanted: Status, end: float) -> Action:
+        loop = asyncio.get_running_loop()
+        pause_s = _POLL_S
+        while not reached(found.action, wanted) and (left_s := end - loop.time()) > 0:
+            await asyncio.sleep(min(pause_s, left_s))
+            pause_s = min(2 * pause_s, _SLOWEST_POLL_S)
+            found = await self._rows.get(found.action.id) or found
+        return found.action
+
+
+def _applied(action: Action, reports: Iterable[Report]) -> Action:
+    for heard in reports:
+        action = apply_report(action, heard)
+    return action
+
+
+def report(ack: Ack, heard_ms: int) -> Report:
+    """An ack as the domain reads it. A result that could not be read again is left out; the end still counts."""
+    return Report(
+        status=Status(ack.status.value),
+        sequence=ack.sequence,
+        at_ms=ack.at_ms,
+        heard_ms=heard_ms,
+        reason=None if ack.reason is None else msgspec.to_builtins(ack.reason),
+        progress=ack.progress,
+        output=ack.output,
+        result={} if too_deep(ack.result) else ack.result,
+    )

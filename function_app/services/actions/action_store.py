@@ -1,0 +1,129 @@
+"""Actions in their rows: the one place that changes them, so that slot, lease and place in the queue end with them."""
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+from function_app.domain.actions.action import Action, Status
+from function_app.domain.actions.queue import FAILED_BEFORE
+from function_app.domain.common.ids import split_command
+from function_app.domain.common.problems import invalid
+from function_app.domain.control.lease import release
+from function_app.domain.devices.devices import Device
+from function_app.domain.identity.accounts import Identity
+from function_app.ports.tables import Row, Tables, Write
+from function_app.services.control.control_events import lease_change
+from function_app.services.devices.control_rows import Control, read_control_rows
+from function_app.services.storage import records
+
+_PREFIX = "action:"
+_END = "action;"
+
+
+@dataclass(frozen=True, slots=True)
+class Found:
+    """An action and the row it was read from; ``waited_for``: its end, just now, was what others wait for."""
+
+    action: Action
+    row: Row
+    waited_for: bool = False
+
+
+def place(action: str) -> tuple[str, str] | None:
+    """Partition and key of an action, or ``None`` for what is no action's id."""
+    parts = split_command(action)
+    return None if parts is None else (parts[0], f"{_PREFIX}{parts[1]}")
+
+
+def new_row(action: Action) -> Row:
+    """The row of a new action."""
+    device, key = place(action.id) or (action.device, "")
+    return Row(device, key, records.fields(action))
+
+
+class ActionRows:
+    """Reads and changes actions."""
+
+    def __init__(self, *, tables: Tables) -> None:
+        self._tables = tables
+
+    async def get(self, action: str) -> Found | None:
+        """One action."""
+        where = place(action)
+        if where is None:
+            return None
+        row = await self._tables.get(records.CONTROL, *where)
+        return None if row is None else Found(records.read(row, Action), row)
+
+    async def list(self, device: Device, *, cursor: str | None, limit: int) -> tuple[list[Action], str | None]:
+        """Actions of a device since it was paired, newest first.
+
+        Raises:
+            Problem: ``cursor-invalid``.
+        """
+        try:
+            page = await self._tables.query(
+                records.CONTROL, device.id, first=_PREFIX, last=_END, limit=limit, cursor=cursor
+            )
+        except ValueError as error:
+            raise invalid("The cursor is not one of this list. Begin without one.", code="cursor-invalid") from error
+        actions = [action for row in page.rows if (action := records.read(row, Action)).pairing == device.pairing]
+        # Older than the pairing is all that follows a stranger's action: the list ends there.
+        return actions, page.cursor if len(actions) == len(page.rows) else None
+
+    async def change(
+        self, action: str, change: Callable[[Action], Action], *, known: Found | None = None
+    ) -> Found | None:
+        """Change an action by ETag; when that ends it, free its slot, lease and place in the queue in the same batch.
+
+        Who ends one that others wait for must see to the queue then: ``Queues.change`` does both.
+
+        Args:
+            action: Its id.
+            change: Gives the same object when there is nothing to change; may be called several times.
+            known: What the caller read or wrote last: saves a read, and costs one more when it is stale.
+
+        Returns:
+            The action as it is now, or ``None`` when there is none.
+
+        Raises:
+            Problem: ``busy``.
+        """
+        stale = False
+
+        async def once() -> Found | None:
+            nonlocal stale
+            found = await self.get(action) if known is None or stale else known
+            stale = True
+            if found is None:
+                return None
+            changed = change(found.action)
+            if changed is found.action:
+                return found
+            writes = [Write("replace", replace(found.row, data=records.fields(changed)))]
+            waited_for = False
+            if changed.status.terminal:
+                control = await read_control_rows(self._tables, changed.device)
+                writes += _freed(changed, control)
+                waited_for = not control.queue.without(action).empty
+            rows = await self._tables.batch(records.CONTROL, writes)
+            return Found(changed, rows[0], waited_for)
+
+        return await records.retry(once)
+
+
+def _freed(action: Action, control: Control) -> list[Write]:
+    """Give back what the action held: the slot, its place in the queue, and the lease that was given for it alone."""
+    writes = []
+    queue = control.queue.without(action.id)
+    if control.action == action.id:
+        writes.append(control.write_slot(action.device, "", action.pairing))
+        if action.status is Status.FAILED:
+            queue = queue.halted(FAILED_BEFORE)
+    if queue != control.queue:
+        writes.append(control.write_queue(action.device, queue))
+    if control.lease is not None and control.lease.action == action.id:
+        nobody = release(control.lease, now_ms=action.ended_ms)
+        writes.append(control.write_lease(action.device, nobody))
+        who = Identity(action.account, action.who, action.session)
+        writes += lease_change(action.device, control.lease, nobody, who=who, now_ms=action.ended_ms)
+    return writes

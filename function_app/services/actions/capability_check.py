@@ -1,0 +1,67 @@
+"""What a device says that it can do, asked before an action takes its slot."""
+
+from collections.abc import Iterable, Sequence
+
+from device_agent.protocol import (
+    CaptureRaw,
+    Description,
+    Express,
+    Gather,
+    MoveJoints,
+    MovePose,
+    RunBehaviour,
+    SetControl,
+    Shoot,
+    TakePosture,
+    Task,
+)
+from function_app.domain.common.problems import Problem
+from function_app.domain.devices.devices import Device
+from function_app.ports.tables import Tables
+from function_app.services.storage import records
+
+
+async def check(tables: Tables, device: Device, asked: Task) -> None:
+    """Refuse what the device's own description lacks. Who has not described itself, or not its actions, decides itself.
+
+    Raises:
+        Problem: ``unable``; the text lists what there is.
+    """
+    if isinstance(asked, MoveJoints):
+        return  # asked of nearly every device, many times: it costs no reading of the description
+    row = await tables.get(records.DESCRIPTIONS, device.agent, device.name)
+    if row is None:
+        return
+    described = records.read(row, Description)
+    if not described.actions:
+        return
+    kind = str(type(asked).__struct_config__.tag)
+    _among("kind of action", kind, described.actions)
+    for word, name, there in _named(asked, described):
+        _among(word, name, there)
+
+
+def _named(asked: Task, described: Description) -> Iterable[tuple[str, str, Sequence[str]]]:
+    """What is asked for by name: the word for it, the name, and the names there are."""
+    match asked:
+        case Express(name=name):
+            yield "expression", name, described.expressions
+        case MovePose(frame=frame) if frame:
+            yield "frame", frame, described.frames
+        case TakePosture(name=name):
+            yield "posture", name, described.postures
+        case RunBehaviour(name=name):
+            yield "behaviour", name, described.behaviours
+        case Gather(streams=streams) | Shoot(streams=streams):
+            for stream in streams:
+                yield "stream", stream, [each.name for each in described.streams]
+        case CaptureRaw(name=name):
+            yield "capture", name, described.captures
+        case SetControl(control=control):
+            yield "control", control, [each.name for each in described.controls]
+
+
+def _among(word: str, name: str, there: Sequence[str]) -> None:
+    if name not in there:
+        detail = f"This device has no {word} '{name}'; it has: {', '.join(there) or 'none'}."
+        raise Problem("unable", 422, "The device cannot do this", detail, extras={"names": list(there)})

@@ -1,0 +1,119 @@
+"""From an action's row to its device: the same row always makes the same command, so the device drops doubles."""
+
+import msgspec
+
+from device_agent.protocol import RunMovement, Task
+from function_app.domain.actions.action import Action, mark_published
+from function_app.domain.actions.queue import DROPPED, KEY_ENDED, SIGNED_OUT, UNPAIRED, UNSHARED
+from function_app.domain.common.ids import split_command, split_device
+from function_app.domain.devices.devices import Agent, Device
+from function_app.domain.identity.accounts import Identity
+from function_app.domain.identity.api_keys import key_of
+from function_app.ports.clock import Clock
+from function_app.ports.tables import Tables
+from function_app.services.actions.action_store import ActionRows, Found
+from function_app.services.devices.device_access import Devices, devices_of
+from function_app.services.messaging.command_sender import Commands
+from function_app.services.robot_types.movements import Movements
+from function_app.services.storage import records
+
+
+class MovementChanged(Exception):  # noqa: N818 (an outcome that callers expect)
+    """The script that the action pinned is gone."""
+
+
+class NoLonger(Exception):  # noqa: N818 (an outcome that callers expect)
+    """Who started the action may not have it carried out any more; ``why`` is one of ``DROPPED``."""
+
+    def __init__(self, why: str) -> None:
+        super().__init__(DROPPED[why][1])
+        self.why = why
+
+
+class SendAction:
+    """Publishes written actions: those whose turn has come, and those that nobody has answered."""
+
+    def __init__(
+        self,
+        *,
+        tables: Tables,
+        devices: Devices,
+        rows: ActionRows,
+        commands: Commands,
+        movements: Movements,
+        clock: Clock,
+    ) -> None:
+        self._tables = tables
+        self._devices = devices
+        self._rows = rows
+        self._commands = commands
+        self._movements = movements
+        self._clock = clock
+
+    async def device(self, action: Action) -> Device | None:
+        """The action's device, as long as its agent is still of the pairing that the action belongs to."""
+        parts = split_device((split_command(action.id) or ("", ""))[0])
+        row = await self._tables.get(records.AGENTS, parts[0], "agent") if parts else None
+        if row is None:
+            return None
+        agent = records.read(row, Agent)
+        if agent.pairing != action.pairing:
+            return None
+        return next((device for device in devices_of(agent) if device.id == action.device), None)
+
+    async def standing(self, action: Action) -> tuple[Identity, Device]:
+        """For whom the action would begin now, and on what. It is looked up anew: it may have waited for long.
+
+        Raises:
+            NoLonger: The device is another's or gone, the share has ended or is a viewer's, its key has ended or
+                may do less, or whoever started it has signed out.
+        """
+        who = await self._devices.acting(Identity(action.account, action.who, action.session))
+        device, _ = (None, None) if who is None else await self._devices.find(who, action.device)
+        if who is not None and device is not None and device.pairing == action.pairing and device.role.may_operate:
+            return who, device
+        if await self.device(action) is None:
+            raise NoLonger(UNPAIRED)
+        if key_of(action.session):
+            raise NoLonger(KEY_ENDED)
+        raise NoLonger(SIGNED_OUT if who is None else UNSHARED)
+
+    async def send(self, found: Found, device: Device) -> None:
+        """Publish it and write that down.
+
+        Raises:
+            MovementChanged: There is nothing to send.
+            NoLonger: Who started it may not have it carried out any more.
+            BusUnavailable: The broker did not confirm it.
+        """
+        action = found.action
+        await self.standing(action)
+        signed = await self._commands.signed(
+            device,
+            action.id,
+            await self._command(action),
+            who=action.who,
+            epoch=action.epoch,
+            issued_ms=action.issued_ms,
+            ttl_ms=action.ttl_ms,
+        )
+        await self._commands.publish(device, signed)
+        now_ms = self._clock.now_ms()
+        await self._rows.change(action.id, lambda known: mark_published(known, now_ms), known=found)
+
+    async def _command(self, action: Action) -> Task | RunMovement:
+        if action.request["kind"] != "run_movement":
+            task: Task = msgspec.convert(action.request, Task)
+            return task
+        # On a shared device its owner's movements run: whoever wrote it is whose store it is in.
+        owner = Identity(action.pinned["author"] or action.account, action.who, "")
+        source = await self._movements.pinned_source(owner, action.request["name"], action.pinned)
+        if source is None:
+            raise MovementChanged
+        return RunMovement(
+            **action.pinned,
+            name=action.request["name"],
+            source=source,
+            parameters=action.request["parameters"],
+            timeout_ms=action.timeout_ms,
+        )

@@ -1,0 +1,252 @@
+"""The queue of each device: whoever sees the slot free gives the next action its turn.
+
+At its turn an action starts or ends; it never waits for a lease. One that was started with an epoch needs that lease
+still to be held; one that was started without gets a lease for its own time, and fails when somebody holds another one:
+to begin in the very moment in which that person lets go would surprise whoever stands there.
+"""
+
+import logging
+from collections.abc import Callable, Collection
+from dataclasses import replace
+from typing import Final
+
+from function_app.domain.actions.action import REPEAT_MS, Action, Status, end, give_turn
+from function_app.domain.actions.queue import DROPPED, Queue
+from function_app.domain.common.problems import Problem
+from function_app.domain.control import lease as rules
+from function_app.domain.control.lease import Lease
+from function_app.domain.devices.devices import Device
+from function_app.domain.identity.accounts import Identity
+from function_app.ports.clock import Clock
+from function_app.ports.command_bus import BusUnavailable
+from function_app.ports.tables import Row, Tables, Write
+from function_app.services.actions.action_store import ActionRows, Found
+from function_app.services.actions.dispatcher import MovementChanged, NoLonger, SendAction
+from function_app.services.control.control_events import Audit, lease_change
+from function_app.services.devices.control_rows import heed_device, read_control, read_control_rows
+from function_app.services.devices.device_access import Devices
+from function_app.services.storage import records
+from function_app.services.storage.reminders import Pending
+
+LOOK_MS: Final = 2_000
+"""A queue is looked at so often, for the case that whoever freed the slot was killed before it saw to the queue."""
+_NOTE: Final = "queue:"
+TIMEOUT: Final = "Its turn did not come in the time it was given. Start it again, with a larger queue_ms if need be."
+
+_log = logging.getLogger(__name__)
+
+
+class Queues:
+    """Sees to the queues of devices."""
+
+    def __init__(
+        self,
+        *,
+        tables: Tables,
+        devices: Devices,
+        rows: ActionRows,
+        pending: Pending,
+        sending: SendAction,
+        audit: Audit,
+        clock: Clock,
+    ) -> None:
+        self._tables = tables
+        self._devices = devices
+        self._rows = rows
+        self._pending = pending
+        self._sending = sending
+        self._audit = audit
+        self._clock = clock
+
+    async def change(
+        self, action: str, change: Callable[[Action], Action], *, known: Found | None = None
+    ) -> Found | None:
+        """As ``ActionRows.change``; then, where others waited for its end, see to them.
+
+        Raises:
+            Problem: ``busy``.
+        """
+        found = await self._rows.change(action, change, known=known)
+        if found is not None and found.waited_for:
+            await self.advance(found.action.device)
+        return found
+
+    async def watch(self, device: str) -> None:
+        """Have the timer look at a device's queue; to be noted before something is put into it."""
+        await self._pending.note(f"{_NOTE}{device}", self._clock.now_ms() + LOOK_MS)
+
+    async def look(self, device: str) -> bool:
+        """See to a device's queue; whether there is one."""
+        await self.advance(device)
+        return not (await read_control_rows(self._tables, device)).queue.empty
+
+    async def advance(self, device: str) -> None:
+        """End those that lost their place, and give the next one its turn if the slot is free.
+
+        What fails is logged: the timer looks again.
+        """
+        try:
+            while await records.retry(lambda: self._step(device)):
+                pass
+        except (Problem, BusUnavailable) as error:
+            _log.warning("queue of %s: %s", device, error)
+
+    async def halt(self, device: str, why: str) -> None:
+        """Drop all that wait, and end them.
+
+        Raises:
+            Problem: ``busy``.
+        """
+        await self._lose(device, lambda queue: queue.halted(why))
+
+    async def drop(self, device: str, actions: Collection[str], why: str) -> None:
+        """Drop some of those that wait, and end them.
+
+        Raises:
+            Problem: ``busy``.
+        """
+        await self._lose(device, lambda queue: queue.dropping(actions, why))
+
+    async def _lose(self, device: str, change: Callable[[Queue], Queue]) -> None:
+        async def once() -> None:
+            control = await read_control_rows(self._tables, device)
+            changed = change(control.queue)
+            if changed is not control.queue:
+                await self._tables.batch(records.CONTROL, [control.write_queue(device, changed)])
+
+        await records.retry(once)
+        await self.advance(device)
+
+    async def positions(self, actions: list[Action]) -> dict[str, int]:
+        """The places of those that wait: 1 is the next. All of one device."""
+        waiting = [action for action in actions if action.status is Status.QUEUED]
+        if not waiting:
+            return {}
+        queue = (await read_control_rows(self._tables, waiting[0].device)).queue
+        return {action.id: place for action in waiting if (place := queue.position(action.id)) is not None}
+
+    async def _step(self, device: str) -> bool:
+        """One change of the queue; whether there may be another."""
+        control = await read_control_rows(self._tables, device)
+        queue = control.queue
+        if queue.dropped:
+            action, why = next(iter(queue.dropped.items()))
+            status, message = DROPPED[why]
+            await self._drop(device, action, status, why, message)
+            return True
+        if control.action or not queue.actions:
+            return False
+        found = await self._rows.get(queue.actions[0])
+        if found is None or found.action.status is not Status.QUEUED:
+            await self._tables.batch(records.CONTROL, [control.write_queue(device, queue.without(queue.actions[0]))])
+            return True
+        return await self._turn(found)
+
+    async def _drop(self, device: str, action: str, status: Status, code: str, message: str) -> None:
+        """End one that lost its place. That takes it out of the queue; what has no row or an end already goes so."""
+        now_ms = self._clock.now_ms()
+        await self._rows.change(action, lambda known: _if_queued(known, status, code, message, now_ms))
+        control = await read_control_rows(self._tables, device)
+        if control.queue.holds(action):
+            await self._tables.batch(records.CONTROL, [control.write_queue(device, control.queue.without(action))])
+
+    async def _turn(self, found: Found) -> bool:
+        """Give the first one its turn, or its end where it cannot start."""
+        action = found.action
+        now_ms = self._clock.now_ms()
+        if now_ms >= action.queued_until_ms:
+            await self._refuse(found, Status.EXPIRED, "queue-timeout", TIMEOUT)
+            return True
+        try:
+            who, device = await self._sending.standing(action)
+        except NoLonger as ended:
+            status, message = DROPPED[ended.why]
+            await self._refuse(found, status, ended.why, message)
+            return True
+        try:
+            started = await self._start(found, device, who)
+        except Problem as problem:
+            if problem.code not in {"lease-held", "lease-lost"}:
+                raise
+            await self._refuse(found, Status.FAILED, problem.code, problem.detail)
+            await self._audit.refused(device, who, "start an action that waited for its turn", problem)
+            return True
+        if started is None:
+            return False
+        try:
+            await self._sending.send(started, device)
+        except MovementChanged:
+            _log.warning("action %s: its script is gone; the timer ends it", action.id)
+        except NoLonger as ended:
+            _log.warning("action %s: %s; the timer ends it", action.id, ended.why)
+        return False
+
+    async def _start(self, found: Found, device: Device, who: Identity) -> Found | None:
+        """Slot, lease, place in the queue and the action itself in one batch; ``None``: somebody was faster.
+
+        The note is written before, as for every action that the timer has to see to.
+        """
+        await self._pending.note(found.action.id, self._clock.now_ms() + REPEAT_MS)
+        control = await read_control(self._tables, device)
+        if control.action or control.queue.position(found.action.id) != 1:
+            return None
+        now_ms = self._clock.now_ms()
+        control = await heed_device(self._tables, device, control, who, now_ms)
+        lease = run_lease(
+            control.lease,
+            who,
+            epoch=found.action.epoch or None,
+            action=found.action.id,
+            lease_ms=found.action.timeout_ms,
+            now_ms=now_ms,
+            pairing=device.pairing,
+        )
+        started = give_turn(found.action, lease.epoch, now_ms)
+        writes = [
+            Write("replace", replace(found.row, data=records.fields(started))),
+            control.write_slot(device.id, started.id, device.pairing),
+            control.write_queue(device.id, control.queue.without(started.id)),
+        ]
+        if lease is not control.lease:
+            writes.append(control.write_lease(device.id, lease))
+            writes += lease_change(device.id, control.lease, lease, who=who, now_ms=now_ms, owner=device.owner)
+        rows: tuple[Row, ...] = await self._tables.batch(records.CONTROL, writes)
+        return Found(started, rows[0])
+
+    async def _refuse(self, found: Found, status: Status, code: str, message: str) -> None:
+        now_ms = self._clock.now_ms()
+        await self._rows.change(
+            found.action.id, lambda known: _if_queued(known, status, code, message, now_ms), known=found
+        )
+
+
+def queue_of(note: str) -> str | None:
+    """The device whose queue a note of the timer is about; ``None`` where it is about something else."""
+    return note.removeprefix(_NOTE) if note.startswith(_NOTE) else None
+
+
+def run_lease(
+    lease: Lease | None,
+    who: Identity,
+    *,
+    epoch: int | None,
+    action: str,
+    lease_ms: int,
+    now_ms: int,
+    pairing: str,
+) -> Lease:
+    """The lease that an action runs under: the caller's own, or one for the time of this action.
+
+    Raises:
+        Problem: ``lease-lost``, ``lease-held``.
+    """
+    if epoch is not None:
+        return rules.hold(lease, who, epoch=epoch, now_ms=now_ms)
+    if lease is not None and lease.live(now_ms) and lease.mine(who):
+        return lease
+    return rules.take(lease, who, lease_ms=lease_ms, now_ms=now_ms, pairing=pairing, action=action)
+
+
+def _if_queued(action: Action, status: Status, code: str, message: str, now_ms: int) -> Action:
+    """Its end, unless it got its turn meanwhile."""
+    return end(action, status, code, message, now_ms) if action.status is Status.QUEUED else action

@@ -1,0 +1,380 @@
+"""Starting an action: decide in one batch, publish, and wait as long as the caller likes."""
+
+import hashlib
+from collections.abc import AsyncIterator
+from contextlib import AbstractAsyncContextManager, AsyncExitStack, nullcontext
+from dataclasses import dataclass, field
+from typing import Any, Literal
+
+import msgspec
+from msgspec import Struct
+
+from device_agent.protocol import Ack, Gather, Id, RunMovement, Task
+from function_app.domain.actions.action import REPEAT_MS, Action, Status, end, reached
+from function_app.domain.actions.queue import DROPPED, KEY_ENDED, UNSHARED
+from function_app.domain.common.ids import command_id
+from function_app.domain.common.problems import Problem, busy_store, invalid
+from function_app.domain.control import lease as rules
+from function_app.domain.control.lease import Lease
+from function_app.domain.devices.devices import Device, Link
+from function_app.domain.identity.accounts import Identity
+from function_app.ports.clock import Clock
+from function_app.ports.command_bus import BusUnavailable
+from function_app.ports.tables import Row, Tables, Write
+from function_app.services.actions import capability_check
+from function_app.services.actions.acks import ActionAcks
+from function_app.services.actions.action_store import ActionRows, Found, new_row
+from function_app.services.actions.queue import Queues, run_lease
+from function_app.services.control.control_events import Audit, lease_change
+from function_app.services.devices.control_rows import Control, heed_device, read_control
+from function_app.services.devices.device_access import Devices, require_online, require_operator
+from function_app.services.messaging.command_sender import Commands
+from function_app.services.messaging.delivery import Delivery, Signed
+from function_app.services.robot_types import parameter_schema as parameters
+from function_app.services.robot_types.movements import Movements
+from function_app.services.storage import records
+from function_app.services.storage.reminders import Pending
+
+ABANDON_MS = 30_000
+"""A start that has not been written after this time is given up: the timer may already have forgotten its note."""
+
+
+PINNED = ("robot_type", "version", "sha256", "author", "key", "signature")
+"""What an action keeps of its movement, so that a command that is sent again is the same one."""
+
+
+class AskMovement(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True, tag_field="kind", tag="run_movement"):
+    """Run a movement of the device's robot type, in its newest version."""
+
+    name: Id
+    parameters: dict[str, Any] = {}
+
+
+Asked = AskMovement | Task
+
+
+@dataclass(frozen=True, slots=True)
+class Start:
+    """What to start.
+
+    Attributes:
+        epoch: Of the lease that the caller holds; ``None`` asks for one for the time of this action.
+        policy: Whether it is refused while the device is busy, or waits for its turn,
+        queue_ms: at most so long. ``ttl_ms`` and ``timeout_ms`` count from its turn.
+        once: The caller's idempotency key, or empty.
+    """
+
+    asked: Asked
+    epoch: int | None = None
+    policy: Literal["reject", "queue"] = "reject"
+    queue_ms: int = 300_000
+    ttl_ms: int = 10_000
+    timeout_ms: int = 300_000
+    wait_ms: int = 0
+    wait_for: Literal["started", "done"] = "started"
+    once: str = ""
+
+    def fingerprint(self) -> str:
+        """The same for the same request."""
+        body = msgspec.json.encode(
+            [
+                self.asked,
+                self.epoch,
+                self.ttl_ms,
+                self.timeout_ms,
+                self.wait_ms,
+                self.wait_for,
+                *((self.policy, self.queue_ms) if self.policy == "queue" else ()),
+            ],
+            order="deterministic",
+        )
+        return hashlib.sha256(body).hexdigest()
+
+
+@dataclass(slots=True)
+class _Plan:
+    """An action on its way into the tables."""
+
+    device: Device
+    action: str
+    created_ms: int
+    request: dict[str, Any]
+    command: RunMovement | Task
+    pinned: dict[str, Any] = field(default_factory=dict)
+
+
+@dataclass(frozen=True, slots=True)
+class _Begun:
+    """An action that is written, and its acks from before it was sent."""
+
+    found: Found
+    acks: AsyncIterator[Ack] | None
+    published: bool = False
+    undelivered: bool = False
+
+
+class StartAction:
+    """One run of something on one device."""
+
+    def __init__(
+        self,
+        *,
+        tables: Tables,
+        devices: Devices,
+        movements: Movements,
+        commands: Commands,
+        rows: ActionRows,
+        acks: ActionAcks,
+        pending: Pending,
+        queues: Queues,
+        delivery: Delivery,
+        audit: Audit,
+        clock: Clock,
+    ) -> None:
+        self._tables = tables
+        self._devices = devices
+        self._movements = movements
+        self._commands = commands
+        self._rows = rows
+        self._acks = acks
+        self._pending = pending
+        self._queues = queues
+        self._delivery = delivery
+        self._audit = audit
+        self._clock = clock
+
+    async def start(
+        self, who: Identity, device_id: str, start: Start, *, gate: AbstractAsyncContextManager[object] | None = None
+    ) -> tuple[Action, bool]:
+        """Start it; and whether the wanted status (or an end) was reached in time.
+
+        A stop of this process after any write leaves an action that the timer publishes or ends.
+
+        Args:
+            who: Who asks.
+            device_id: On which device.
+            start: What to start.
+            gate: Held while it is written and sent, not while its start is waited for.
+
+        Raises:
+            Problem: ``device-unknown``, ``forbidden``, ``movement-unknown``, ``device-offline``, ``device-busy``,
+                ``queue-full``, ``lease-held``, ``lease-lost``, ``idempotency-key-reused``, ``busy``,
+                ``parameters-invalid``, ``unable``, ``invalid``.
+        """
+        wanted = Status(start.wait_for)
+        async with AsyncExitStack() as listening:
+            async with gate or nullcontext():
+                begun = await self._begin(who, device_id, start, listening)
+            if begun.undelivered:
+                return begun.found.action, False
+            action = await self._acks.follow(
+                begun.found, begun.acks, wanted=wanted, wait_ms=start.wait_ms, published=begun.published
+            )
+        return action, reached(action, wanted)
+
+    async def _begin(self, who: Identity, device_id: str, start: Start, listening: AsyncExitStack) -> "_Begun":
+        if isinstance(start.asked, AskMovement):
+            parameters.check(start.asked.parameters)
+        device, link = await self._devices.with_link(who, device_id)
+        async with self._audit.refusals(device, who, "start an action"):
+            return await self._at(who, device, link, start, listening)
+
+    async def _at(
+        self, who: Identity, device: Device, link: Link | None, start: Start, listening: AsyncExitStack
+    ) -> "_Begun":
+        require_operator(device)
+        earlier = await self._earlier(who, device, start)
+        if earlier is not None:
+            return await self._join(earlier, device, listening)
+        require_online(link, self._clock.now_ms())
+        plan = await self._plan(who, device, start)
+        ttl_ms = min(start.ttl_ms, start.timeout_ms)
+        await self._pending.note(plan.action, plan.created_ms + REPEAT_MS)
+        if start.policy == "queue":
+            await self._queues.watch(device.id)
+        found, fresh = await self._write(who, plan, start, ttl_ms)
+        if fresh and found.action.status is Status.QUEUED:
+            await self._queues.advance(device.id)
+        if not fresh or found.action.status is Status.QUEUED:
+            return await self._join(found, device, listening)
+        await self._require_still(who, device, found)
+        signed = await self._signed(plan, found.action)
+        acks = await listening.enter_async_context(self._delivery.acks(device, plan.action))
+        try:
+            await self._commands.publish(device, signed)
+        except BusUnavailable:
+            # It is written: the timer publishes it as soon as the broker is back, or ends it.
+            return _Begun(found, acks, undelivered=True)
+        return _Begun(found, acks, published=True)
+
+    async def _require_still(self, who: Identity, device: Device, found: Found) -> None:
+        """End an action of somebody with whom the device was un-shared, or whose key was ended, while it was written.
+
+        Raises:
+            Problem: ``device-unknown``, ``forbidden``.
+        """
+        try:
+            await self._devices.require_still(who, device)
+        except Problem:
+            why = KEY_ENDED if who.key else UNSHARED
+            status, message = DROPPED[why]
+            now_ms = self._clock.now_ms()
+            await self._queues.change(
+                found.action.id, lambda known: end(known, status, why, message, now_ms), known=found
+            )
+            raise
+
+    async def _join(self, found: Found, device: Device, listening: AsyncExitStack) -> "_Begun":
+        """Where nothing is to be sent: an earlier request started it, or it waits for its turn."""
+        acks = await listening.enter_async_context(self._delivery.acks(device, found.action.id))
+        return _Begun(await self._rows.get(found.action.id) or found, acks)
+
+    async def _plan(self, who: Identity, device: Device, start: Start) -> _Plan:
+        asked, now_ms = start.asked, self._clock.now_ms()
+        request: dict[str, Any] = msgspec.to_builtins(asked)
+        action = command_id(device.id, now_ms)
+        if isinstance(asked, Task):
+            if isinstance(asked, Gather) and asked.duration_s * 1000 > start.timeout_ms:
+                raise invalid("A gathering cannot last longer than the action: raise timeout_ms, or lower duration_s.")
+            await capability_check.check(self._tables, device, asked)
+            plan = _Plan(device, action, now_ms, request, asked)
+        else:
+            # Whoever starts it: on a device run the movements that its owner has for it, and no others.
+            owner = Identity(device.owner, "", "")
+            movement, source = await self._movements.get(owner, device.robot_type, asked.name)
+            command = RunMovement(
+                robot_type=device.robot_type,
+                name=movement.name,
+                version=movement.version,
+                sha256=movement.sha256,
+                source=source,
+                parameters=parameters.fit(movement.parameters_schema, asked.parameters),
+                author=movement.author or device.owner,
+                key=movement.key,
+                signature=movement.signature,
+                timeout_ms=start.timeout_ms,
+            )
+            # With the defaults: a command that is sent again must be the same one.
+            request["parameters"] = command.parameters
+            pinned = {name: getattr(command, name) for name in PINNED}
+            plan = _Plan(device, action, now_ms, request, command, pinned)
+        # Before anything is written: what cannot be sent must not take the slot.
+        self._commands.check(device, action, plan.command, who=who.name, ttl_ms=1)
+        return plan
+
+    async def _signed(self, plan: _Plan, action: Action) -> Signed:
+        return await self._commands.signed(
+            plan.device,
+            action.id,
+            plan.command,
+            who=action.who,
+            epoch=action.epoch,
+            issued_ms=action.created_ms,
+            ttl_ms=action.ttl_ms,
+        )
+
+    async def _write(self, who: Identity, plan: _Plan, start: Start, ttl_ms: int) -> tuple[Found, bool]:
+        """Action, slot, lease and idempotency row in one batch; not fresh: another request with the key was first."""
+
+        async def once() -> tuple[Found, bool]:
+            now_ms = self._clock.now_ms()
+            control = await read_control(self._tables, plan.device)
+            control = await heed_device(self._tables, plan.device, control, who, now_ms)
+            if now_ms - plan.created_ms > ABANDON_MS:
+                raise busy_store()
+            earlier = await self._earlier(who, plan.device, start)
+            if earlier is not None:
+                return earlier, False
+            before = control.action or next(iter((*control.queue.actions, *control.queue.dropped)), "")
+            lease = _lease(who, control, plan, start, before, now_ms)
+            waits = bool(before)
+            action = Action(
+                id=plan.action,
+                device=plan.device.id,
+                account=who.account,
+                who=who.name,
+                pairing=plan.device.pairing,
+                request=plan.request,
+                epoch=lease.epoch if lease is not None else 0,
+                created_ms=plan.created_ms,
+                ttl_ms=ttl_ms,
+                deadline_ms=plan.created_ms + start.timeout_ms + (start.queue_ms if waits else 0),
+                status=Status.QUEUED if waits else Status.CREATED,
+                pinned=plan.pinned,
+                once=_once_key(who, plan.device, start) if start.once else "",
+                session=who.session,
+                timeout_ms=start.timeout_ms,
+                queued_until_ms=plan.created_ms + start.queue_ms if waits else 0,
+            )
+            writes = [
+                Write("create", new_row(action)),
+                # Also where it waits: whoever frees the slot now must see the queue, or this must see the slot free.
+                control.write_slot(plan.device.id, control.action if waits else plan.action, plan.device.pairing),
+            ]
+            if waits:
+                writes.append(control.write_queue(plan.device.id, control.queue.joined(plan.action)))
+            elif lease is not None and lease is not control.lease:
+                writes.append(control.write_lease(plan.device.id, lease))
+                writes += lease_change(
+                    plan.device.id, control.lease, lease, who=who, now_ms=now_ms, owner=plan.device.owner
+                )
+            if start.once:
+                data = {"action": plan.action, "request": start.fingerprint()}
+                writes.append(Write("create", Row(plan.device.id, action.once, data)))
+            rows = await self._tables.batch(records.CONTROL, writes)
+            return Found(action, rows[0]), True
+
+        return await records.retry(once)
+
+    async def _earlier(self, who: Identity, device: Device, start: Start) -> Found | None:
+        """The action that an earlier request with the same idempotency key started."""
+        if not start.once:
+            return None
+        row = await self._tables.get(records.CONTROL, device.id, _once_key(who, device, start))
+        if row is None:
+            return None
+        if row.data["request"] != start.fingerprint():
+            detail = "This Idempotency-Key was used with another request. Use a new key for a new request."
+            raise Problem("idempotency-key-reused", 422, "The key was used before", detail)
+        return await self._rows.get(row.data["action"])
+
+
+def device_busy(action: str) -> Problem:
+    """The refusal that names the running action."""
+    detail = f"The device is running action {action}. Wait for its end or cancel it."
+    return Problem("device-busy", 409, "The device is busy", detail, extras={"action": action})
+
+
+def _lease(  # noqa: PLR0917 (what decides)
+    who: Identity, control: Control, plan: _Plan, start: Start, before: str, now_ms: int
+) -> Lease | None:
+    """The lease it runs under; ``None`` where it waits behind ``before`` without one, and gets its own at its turn.
+
+    One that waits may wait for the end of an action that has the lease for its own time, not for a person who took it.
+
+    Raises:
+        Problem: ``device-busy``, ``lease-lost``, ``lease-held``.
+    """
+    waits = bool(before) and start.policy == "queue"
+    if waits and start.epoch is None:
+        held = control.lease
+        if held is not None and held.live(now_ms) and not held.mine(who) and not held.action:
+            raise rules.held(held)
+        return None
+    lease = run_lease(
+        control.lease,
+        who,
+        epoch=start.epoch,
+        action=plan.action,
+        lease_ms=start.timeout_ms,
+        now_ms=now_ms,
+        pairing=plan.device.pairing,
+    )
+    if before and not waits:
+        raise device_busy(before)
+    return lease
+
+
+def _once_key(who: Identity, device: Device, start: Start) -> str:
+    """Of one account and one pairing: the actions of an earlier pairing are nobody's any more."""
+    return "once:" + hashlib.sha256(f"{who.account}\n{device.pairing}\n{start.once}".encode()).hexdigest()

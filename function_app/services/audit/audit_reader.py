@@ -1,0 +1,218 @@
+"""Reading the chains of ``services/audit_chain.py``, and seeing whether they are whole."""
+
+import base64
+import binascii
+import json
+from collections.abc import AsyncIterator, Mapping
+from dataclasses import dataclass
+from typing import Any, Final
+
+from cryptography.exceptions import InvalidSignature
+
+from function_app.domain.audit import hash_chain as rules
+from function_app.domain.audit.hash_chain import FIRST, Head
+from function_app.domain.common.problems import forbidden, invalid
+from function_app.domain.identity.accounts import Identity
+from function_app.ports.blobs import Blobs
+from function_app.ports.signing_keys import Keys
+from function_app.ports.tables import Row, Tables
+from function_app.services.audit.audit_log import anchors, record_key
+from function_app.services.storage import records
+
+LOOKED_AT: Final = 1_000
+"""Records that are looked at for one page: where a filter lets few through, the page is short and has a cursor."""
+_CURSOR_DIGITS: Final = 12
+_LETTERS: Final = "abcdefghijklmnopqrstuvwxyz234567"
+_MOST_NAMES: Final = 1_000
+
+
+@dataclass(frozen=True, slots=True)
+class Wanted:
+    """Which records: of one kind, on one thing, of a stretch of time (``None``: all of them)."""
+
+    what: str | None = None
+    on: str | None = None
+    since_ms: int | None = None
+    until_ms: int | None = None
+
+    def fits(self, record: Mapping[str, Any]) -> bool:
+        """Whether ``record`` is one of them."""
+        at_ms = record["at_ms"]
+        return (
+            self.what in {None, record["what"]}
+            and self.on in {None, record["on"]}
+            and (self.since_ms is None or at_ms >= self.since_ms)
+            and (self.until_ms is None or at_ms < self.until_ms)
+        )
+
+
+@dataclass(frozen=True, slots=True)
+class Verdict:
+    """How it stands with one chain. ``broken`` names the first place that is not as it was written; empty: whole."""
+
+    chain: str
+    head: Head
+    broken: str = ""
+    anchors: int = 0
+
+
+class AuditTrail:
+    """Reads and verifies."""
+
+    def __init__(self, *, tables: Tables, blobs: Blobs, keys: Keys) -> None:
+        self._tables = tables
+        self._blobs = blobs
+        self._keys = keys
+
+    async def read(
+        self, who: Identity, wanted: Wanted, *, cursor: str | None, limit: int
+    ) -> tuple[list[Mapping[str, Any]], str | None]:
+        """Records of one's own chain, newest first, and where the next page begins.
+
+        Raises:
+            Problem: ``cursor-invalid``; ``forbidden``: with a key that is kept to less than everything of its account.
+        """
+        if not who.most.may_own or who.only:
+            raise forbidden("Only who may do everything in this account reads who did what in it.")
+        if cursor is None:
+            row = await self._tables.get(records.AUDIT, who.account, "head")
+            newest = 0 if row is None else int(row.data["seq"])
+        elif cursor.isdecimal() and cursor.isascii() and len(cursor) <= _CURSOR_DIGITS:
+            newest = int(cursor)
+        else:
+            raise invalid("The cursor is not one of this list. Begin without one.", code="cursor-invalid")
+        oldest = max(FIRST, newest - LOOKED_AT + 1)
+        found: list[Mapping[str, Any]] = []
+        while newest >= oldest and len(found) < limit:
+            first = max(oldest, newest - limit + 1)
+            page = await self._tables.query(
+                records.AUDIT, who.account, first=record_key(first), last=record_key(newest + 1), limit=limit
+            )
+            for row in reversed(page.rows):
+                newest = int(row.key.rpartition(":")[2]) - 1
+                if wanted.fits(row.data):
+                    found.append(row.data)
+                    if len(found) == limit:
+                        break
+            else:
+                newest = first - 1
+        return found, str(newest) if newest >= FIRST else None
+
+    async def chains(self) -> list[str]:
+        """All chains there are, or that there have been: those noted elsewhere are named though their rows be gone."""
+        named = {row.key async for row in self._rows("chains", "", None)}
+        for prefix in ("cloud", *_LETTERS):
+            named |= {name.split("/")[1] for name in await self._noted(f"audit/{prefix}")}
+        return sorted(named)
+
+    async def head(self, chain: str) -> Head | None:
+        """Where a chain ends; ``None`` where there is none."""
+        row = await self._tables.get(records.AUDIT, chain, "head")
+        return None if row is None else Head(int(row.data["seq"]), str(row.data["hash"]))
+
+    async def verify(self, chain: str, *, expected: tuple[Head, ...] = ()) -> Verdict:
+        """Whether a chain is as it was written.
+
+        Args:
+            chain: An account's id, or ``cloud``.
+            expected: Heads that somebody has noted elsewhere; those in the blob store are looked at in any case.
+        """
+        noted = await self._anchors(chain)
+        if isinstance(noted, str):
+            return Verdict(chain, rules.start(chain), noted)
+        known = {head.seq: head for head in noted} | {head.seq: head for head in expected}
+        for head in (*noted, *expected):
+            if known[head.seq] != head:
+                return Verdict(chain, head, f"two different heads were noted for record {head.seq}")
+        end = await self._tables.get(records.AUDIT, chain, "head")
+        reached, broken = await self._walk(chain, end, known)
+        if not broken:
+            broken = await self._end(chain, end, reached)
+        if not broken and (missing := [seq for seq in known if seq > reached.seq]):
+            broken = f"record {reached.seq + 1}: it and all after it are gone; {max(missing)} were noted elsewhere"
+        return Verdict(chain, reached, broken, len(noted))
+
+    async def _walk(self, chain: str, end: Row | None, known: Mapping[int, Head]) -> tuple[Head, str]:
+        """How far the chain is whole up to ``end``, and what is wrong behind that."""
+        head = rules.start(chain)
+        last = _number(end.data.get("seq")) if end is not None else 0
+        async for row in self._rows(chain, record_key(0), record_key(last + 1)):
+            wrong = rules.fault(head, row.data)
+            if not wrong and row.key != record_key(head.seq + 1):
+                wrong = "it stands in another place"
+            if wrong:
+                return head, f"record {head.seq + 1}: {wrong}"
+            head = Head(head.seq + 1, str(row.data["hash"]))
+            if known.get(head.seq, head) != head:
+                return head, f"record {head.seq}: another one was noted elsewhere"
+        return head, ""
+
+    async def _end(self, chain: str, end: Row | None, reached: Head) -> str:
+        """What is wrong with the chain's own word for where it ends."""
+        after = await self._tables.query(
+            records.AUDIT, chain, first=record_key(reached.seq + 1), last="record;", limit=1
+        )
+        now = await self._tables.get(records.AUDIT, chain, "head")
+        if end is None:
+            return "the head is gone, its records are there" if after.rows and now is None else ""
+        if now is None:
+            return "the head is gone"
+        if reached.seq != _number(end.data.get("seq")):
+            return f"record {reached.seq + 1}: it is gone"
+        if reached.hash != end.data.get("hash"):
+            return "the head is not the hash of the newest record"
+        if after.rows and now.etag == end.etag:
+            return f"record {reached.seq + 1}: it stands behind the head"
+        return await self._signature(chain, end, reached)
+
+    async def _signature(self, chain: str, end: Row, head: Head) -> str:
+        if set(end.data) != {"seq", "hash", "at_ms", "key", "signature"}:
+            return "the head has other fields than it was written with"
+        key = (await self._keys.archive()).get(str(end.data["key"]))
+        if key is None:
+            name = str(end.data["key"])[:40]
+            return f"the head is signed with the key {name!r}, which is none of this cloud's, or has leaked"
+        try:
+            text = str(end.data["signature"])
+            signature = base64.b64decode(text, altchars=b"-_", validate=True)
+            if base64.urlsafe_b64encode(signature).decode() != text:
+                return "the head's signature is not as it was written"
+            key.verify(signature, rules.to_sign(chain, head, end.data["at_ms"]))
+        except (InvalidSignature, ValueError, binascii.Error):
+            return "the head's signature is wrong"
+        return ""
+
+    async def _anchors(self, chain: str) -> tuple[Head, ...] | str:
+        text = await self._blobs.get(anchors(chain)) or b""
+        found = []
+        for number, line in enumerate(text.splitlines(), 1):
+            try:
+                read = json.loads(line)
+                head = rules.read_head(f"{read['seq']}:{read['hash']}")
+            except (ValueError, TypeError, KeyError):
+                head = None
+            if head is None:
+                return f"line {number} of the heads noted in the blob store ({anchors(chain)}) cannot be read"
+            found.append(head)
+        return tuple(found)
+
+    async def _noted(self, prefix: str) -> set[str]:
+        names = set(await self._blobs.list(prefix, limit=_MOST_NAMES))
+        if len(names) == _MOST_NAMES:
+            for letter in _LETTERS:
+                names |= await self._noted(prefix + letter)
+        return names
+
+    async def _rows(self, partition: str, first: str, last: str | None) -> AsyncIterator[Row]:
+        cursor = None
+        while True:
+            page = await self._tables.query(records.AUDIT, partition, first=first, last=last, limit=1000, cursor=cursor)
+            for row in page.rows:
+                yield row
+            cursor = page.cursor
+            if cursor is None:
+                return
+
+
+def _number(value: Any) -> int:
+    return value if isinstance(value, int) and not isinstance(value, bool) and 0 <= value < 10**_CURSOR_DIGITS else 0

@@ -1,0 +1,236 @@
+"""What happened to the control over devices, into their events and their owner's chain: nothing of it is lost.
+
+A change of a lease and the events that tell of it are one batch in the device's partition of ``Control``. From there
+they are moved to ``Events`` and to the chain (``services/audit_chain.py``) at once, by whoever makes the next change,
+or by the timer, which looks at a device with a lease by a note in ``Pending``. A refusal changes nothing, so it is
+written straight there.
+"""
+
+import contextlib
+import logging
+from collections.abc import AsyncGenerator, Iterable, Mapping
+from typing import Any, Final
+
+from function_app.domain.audit.hash_chain import CLOUD, Entry, Outcome
+from function_app.domain.common.ids import new_id, split_device
+from function_app.domain.common.problems import Problem
+from function_app.domain.control import control_events
+from function_app.domain.control.control_events import Fact, Happened
+from function_app.domain.control.lease import Lease
+from function_app.domain.devices.devices import Agent, Device
+from function_app.domain.identity.accounts import Identity
+from function_app.ports.clock import Clock
+from function_app.ports.tables import Conflict, Row, StoreError, Tables, Write
+from function_app.services.audit.audit_log import AuditChain
+from function_app.services.devices.control_rows import read_control_rows
+from function_app.services.storage import records
+from function_app.services.storage.reminders import Pending
+from function_app.services.telemetry.event_log import Events
+
+LOOK_MS: Final = 15_000
+"""The timer looks at a device so long after a change of its lease, in case that whoever made it was killed."""
+QUIET_MS: Final = 10_000
+"""The same refusal of the same person is told once in this time by a process: who tries without end fills no table."""
+REFUSALS: Final = frozenset({"forbidden", "lease-held", "lease-lost", "lease-requested"})
+"""What is told: refused for want of a role or of the lease."""
+_NOTE: Final = "lease:"
+_EVENT: Final = "event:"
+_KNOWN: Final = 1_000
+
+_log = logging.getLogger(__name__)
+
+
+class Audit:
+    """Tells what happened."""
+
+    def __init__(self, *, tables: Tables, events: Events, chain: AuditChain, pending: Pending, clock: Clock) -> None:
+        self._tables = tables
+        self._events = events
+        self._chain = chain
+        self._pending = pending
+        self._clock = clock
+        self._refused: dict[tuple[str, ...], int] = {}
+
+    async def watch(self, device: str) -> None:
+        """Have the timer look at a device's lease; to be noted before the write that changes it."""
+        await self._pending.note(f"{_NOTE}{device}", self._clock.now_ms() + LOOK_MS)
+
+    async def look(self, device: str) -> None:
+        """The timer's look: tell what was left, and what time has brought; note when to look again.
+
+        Raises:
+            Problem: ``busy``.
+            StoreError: The tables cannot be used.
+        """
+        await self._move(device)
+        lease = (await read_control_rows(self._tables, device)).lease
+        now_ms = self._clock.now_ms()
+        pairing = lease.pairing if lease else ""
+        late = [happened.event(_name(device)) for happened in control_events.overdue(lease, now_ms)]
+        for event in late:
+            await self._events.add(device, pairing, event)
+        if late:
+            await self._chain.tell(await self._owner(device, pairing), [_entry(device, event, {}) for event in late])
+        if lease is not None:
+            ends = [lease.expires_ms] if lease.live(now_ms) else []
+            if lease.asked is not None and lease.asked.how(lease, now_ms) == "open":
+                ends.append(lease.asked.expires_ms)
+            if ends:
+                await self._pending.note(f"{_NOTE}{device}", min(ends))
+
+    async def tell(self, device: str) -> None:
+        """Move what is noted to the device's events and its owner's chain. Safe to repeat and to be done by several.
+
+        Where others are in the way for long, the timer does it.
+        """
+        try:
+            await self._move(device)
+        except Problem as problem:
+            _log.warning("events of %s: %s", device, problem.detail)
+
+    async def _move(self, device: str) -> None:
+        page = await self._tables.query(records.CONTROL, device, first=_EVENT, last="event;", limit=1000)
+        owned: dict[str, list[Entry]] = {}
+        for row in page.rows:
+            await self._events.add(device, row.data["pairing"], row.data["event"])
+            owner = row.data.get("owner") or await self._owner(device, row.data["pairing"])
+            owned.setdefault(owner, []).append(_entry(device, row.data["event"], row.data.get("by", {})))
+        for owner, entries in owned.items():
+            await self._chain.tell(owner, entries)
+        for row in page.rows:
+            with contextlib.suppress(Conflict):  # another process tells the same
+                await self._tables.delete(records.CONTROL, row)
+
+    async def _owner(self, device: str, pairing: str) -> str:
+        """Whose chain the events of a pairing stand in: told before the agent's row forgets whose it was."""
+        agent_id, _ = split_device(device) or (device, "")
+        row = await self._tables.get(records.AGENTS, agent_id, "agent")
+        agent = None if row is None else records.read(row, Agent)
+        if agent is None:
+            return CLOUD
+        if agent.account is not None and pairing in {"", agent.pairing}:
+            return agent.account
+        return next((each.account for each in agent.leaving if each.pairing == pairing), CLOUD)
+
+    async def happened(
+        self,
+        device: Device,
+        fact: Fact,
+        message: str,
+        *,
+        who: Identity | None = None,
+        severity: Any = "info",
+        outcome: Outcome = "done",
+        **data: Any,
+    ) -> None:
+        """Tell of something that is no change of a lease.
+
+        Raises:
+            StoreError: The tables cannot be used.
+        """
+        event = await self.event(device, fact, message, severity=severity, **data)
+        await self._chain.keep(device.owner or CLOUD, _entry(device.id, event, _by(who), outcome))
+
+    async def event(
+        self, device: Device, fact: Fact, message: str, *, severity: Any = "info", **data: Any
+    ) -> Mapping[str, Any]:
+        """The same among the device's events alone, for what has its record otherwise; gives the event.
+
+        Raises:
+            StoreError: The tables cannot be used.
+        """
+        event = Happened(new_id(), fact, self._clock.now_ms(), message, data, severity).event(device.name)
+        await self._events.add(device.id, device.pairing, event)
+        return event
+
+    @contextlib.asynccontextmanager
+    async def refusals(self, device: Device, who: Identity, what: str) -> AsyncGenerator[None]:
+        """Tell of it when what is done within is refused for want of a role or of the lease.
+
+        Args:
+            device: On which device.
+            who: Who is refused.
+            what: What they wanted, to go on after "was refused to".
+        """
+        try:
+            yield
+        except Problem as problem:
+            if problem.code in REFUSALS:
+                await self.refused(device, who, what, problem)
+            raise
+
+    async def refused(self, device: Device, who: Identity, what: str, problem: Problem) -> None:
+        """Tell of a refusal. Whatever goes wrong with that: the refusal stands."""
+        now_ms = self._clock.now_ms()
+        key = (device.id, who.session, what, problem.code)
+        if now_ms - self._refused.get(key, -QUIET_MS) < QUIET_MS:
+            return
+        self._refused.pop(key, None)
+        self._refused[key] = now_ms
+        if len(self._refused) > _KNOWN:
+            del self._refused[next(iter(self._refused))]
+        message = f"{who.name} was refused to {what}: {problem.detail}"
+        try:
+            await self.happened(
+                device,
+                Fact.ORDER_REFUSED,
+                message,
+                who=who,
+                severity="warning",
+                outcome="refused",
+                by=who.name,
+                wanted=what,
+                code=problem.code,
+            )
+        except (StoreError, Problem) as error:
+            _log.warning("refusal on %s: %s", device.id, error)
+
+
+def told(
+    device: str, pairing: str, facts: Iterable[Happened], *, owner: str = "", who: Identity | None = None
+) -> list[Write]:
+    """The writes that note facts, to go into one batch with the change that they tell of.
+
+    Args:
+        device: On which device.
+        pairing: In which.
+        facts: What happened.
+        owner: Whose device it is, where that is known.
+        who: Who did it, where somebody did.
+    """
+    more = ({"owner": owner} if owner else {}) | ({"by": _by(who)} if who else {})
+    return [
+        Write(
+            "create",
+            Row(device, f"{_EVENT}{fact.id}", {"pairing": pairing, "event": fact.event(_name(device)), **more}),
+        )
+        for fact in facts
+    ]
+
+
+def lease_of(note: str) -> str | None:
+    """The device whose lease a note of the timer is about; ``None`` where it is about something else."""
+    return note.removeprefix(_NOTE) if note.startswith(_NOTE) else None
+
+
+def lease_change(
+    device: str, before: Lease | None, after: Lease, *, who: Identity, now_ms: int, owner: str = ""
+) -> list[Write]:
+    """The events of a change of a lease, to go into its batch."""
+    facts = control_events.changed(before, after, by=who.name, now_ms=now_ms)
+    return told(device, after.pairing, facts, owner=owner, who=who)
+
+
+def _entry(device: str, event: Mapping[str, Any], by: Mapping[str, str], outcome: Outcome = "done") -> Entry:
+    data = {"message": event["message"], **event["data"]}
+    return Entry(f"{device}/{event['id']}", event["at_ms"], event["kind"], outcome, device, **by, data=data)
+
+
+def _by(who: Identity | None) -> dict[str, str]:
+    if who is None:
+        return {}
+    return {"who": who.name, "account": who.account, "session": who.session, "key": who.key}
+
+
+def _name(device: str) -> str:
+    return (split_device(device) or ("", device))[1]

@@ -1,0 +1,183 @@
+"""Asking the holder for control, and the holder's answer."""
+
+import asyncio
+import logging
+from collections.abc import Callable
+
+from device_agent.protocol import AskLease, DropRequest
+from function_app.domain.common.ids import new_id
+from function_app.domain.common.problems import Problem
+from function_app.domain.control import control_request as rules
+from function_app.domain.control.lease import Asked, Lease
+from function_app.domain.devices.devices import Device
+from function_app.domain.identity.accounts import Identity
+from function_app.domain.identity.api_keys import key_of
+from function_app.ports.clock import Clock
+from function_app.ports.command_bus import BusUnavailable
+from function_app.ports.tables import Tables
+from function_app.services.control.control_events import Audit
+from function_app.services.control.lease_store import LeaseRows
+from function_app.services.control.leases import Leases
+from function_app.services.devices.control_rows import read_lease
+from function_app.services.devices.device_access import Devices, require_operator
+from function_app.services.messaging.command_sender import Commands
+
+_log = logging.getLogger(__name__)
+
+
+class Handovers:
+    """Requests for control. The lease's row decides; the device shows it to everybody who watches."""
+
+    def __init__(
+        self,
+        *,
+        tables: Tables,
+        devices: Devices,
+        leases: Leases,
+        rows: LeaseRows,
+        commands: Commands,
+        audit: Audit,
+        clock: Clock,
+    ) -> None:
+        self._tables = tables
+        self._devices = devices
+        self._leases = leases
+        self._rows = rows
+        self._commands = commands
+        self._audit = audit
+        self._clock = clock
+
+    async def get(self, who: Identity, device_id: str, request: str) -> tuple[Lease, Asked]:
+        """A device's last request for control, and its lease.
+
+        Raises:
+            Problem: ``device-unknown``, ``request-unknown``.
+        """
+        device = await self._devices.get(who, device_id)
+        return rules.find(await read_lease(self._tables, device), request)
+
+    async def ask(
+        self, who: Identity, device_id: str, *, within_ms: int, lease_ms: int, wait_ms: int
+    ) -> tuple[Lease, Asked, bool, bool]:
+        """Ask the holder for control.
+
+        Args:
+            who: Who asks.
+            device_id: For which device.
+            within_ms: How long the holder has for an answer.
+            lease_ms: How long control is wanted for.
+            wait_ms: How long it is waited for the device to show it.
+
+        Returns:
+            The lease, the request, whether it is new (it is not when this session asks already), and whether the device
+            shows it.
+
+        Raises:
+            Problem: ``device-unknown``, ``forbidden``, ``lease-free``, ``lease-yours``, ``lease-requested``, ``busy``.
+        """
+        device = await self._devices.get(who, device_id)
+        fresh = new_id()
+
+        def changed(lease: Lease | None, now_ms: int) -> Lease:
+            return rules.ask(lease, who, request=fresh, within_ms=within_ms, lease_ms=lease_ms, now_ms=now_ms)
+
+        async with self._audit.refusals(device, who, "ask for control"):
+            require_operator(device)
+            _, lease = await self._rows.change(who, device, changed)
+        asked = lease.asked
+        assert asked is not None  # noqa: S101 (the rule has just written it)
+        left_ms = max(1, asked.expires_ms - self._clock.now_ms())
+        order = AskLease(request=asked.id, by=asked.by, answer_within_ms=left_ms)
+        try:
+            shown = await self._commands.confirmed(device, order, who=who.name, epoch=lease.epoch, wait_ms=wait_ms)
+        except Problem as problem:
+            _log.warning("request for %s: %s", device.id, problem.detail)
+            shown = False
+        return lease, asked, asked.id == fresh, shown
+
+    async def accept(self, who: Identity, device_id: str, request: str, *, wait_ms: int) -> tuple[Lease, Asked, bool]:
+        """Hand control over, in one write: the next epoch is the asker's, and what moves is held.
+
+        Returns:
+            The lease, the request, and whether the device has confirmed within ``wait_ms``.
+
+        Raises:
+            Problem: ``device-unknown``, ``forbidden``, ``request-unknown``, ``request-over``, ``asker-gone``, ``busy``.
+        """
+        device = await self._devices.get(who, device_id)
+        async with self._audit.refusals(device, who, "hand control over"):
+            require_operator(device)
+            await self._require_asker(device, request)
+            before, lease = await self._change(who, device, rules.accept, request)
+            if before is not lease:
+                await self._require_asker_still(device, lease)
+        _, asked = rules.find(lease, request)
+        if before is lease or before is None:
+            # Handed over already, by an earlier request of the same kind. The device hears of it with each renewal.
+            return lease, asked, False
+        confirmed, _ = await asyncio.gather(
+            self._leases.grant(device, lease, by=who.name, wait_ms=wait_ms), self._leases.revoke(device, before.epoch)
+        )
+        return lease, asked, confirmed
+
+    async def refuse(self, who: Identity, device_id: str, request: str) -> tuple[Lease, Asked]:
+        """Keep control.
+
+        Raises:
+            Problem: ``device-unknown``, ``forbidden``, ``request-unknown``, ``request-over``, ``busy``.
+        """
+        device = await self._devices.get(who, device_id)
+        async with self._audit.refusals(device, who, "refuse control"):
+            require_operator(device)
+            before, lease = await self._change(who, device, rules.refuse, request)
+        if before is not lease:
+            await self._drop(who, device, lease, request)
+        return rules.find(lease, request)
+
+    async def withdraw(self, who: Identity, device_id: str, request: str) -> None:
+        """Ask no longer.
+
+        Raises:
+            Problem: ``device-unknown``, ``forbidden``, ``request-unknown``, ``request-over``, ``busy``.
+        """
+        device = await self._devices.get(who, device_id)
+        async with self._audit.refusals(device, who, "withdraw a request for control"):
+            before, lease = await self._change(who, device, rules.withdraw, request)
+        if before is not lease:
+            await self._drop(who, device, lease, request)
+
+    async def _change(
+        self, who: Identity, device: Device, rule: Callable[..., Lease], request: str
+    ) -> tuple[Lease | None, Lease]:
+        return await self._rows.change(
+            who, device, lambda lease, now_ms: rule(lease, who, request=request, now_ms=now_ms)
+        )
+
+    async def _require_asker(self, device: Device, request: str) -> None:
+        """Whoever asked must still be there, and one who may operate. What is over already, the rule answers."""
+        lease, asked = rules.find(await read_lease(self._tables, device), request)
+        if asked.how(lease, self._clock.now_ms()) != "open":
+            return
+        asker = await self._devices.acting(Identity(asked.account, asked.by, asked.session))
+        found = (await self._devices.find(asker, device.id))[0] if asker is not None else None
+        if found is None or not found.role.may_operate:
+            raise _asker_gone(asked.by, "Control stays with you.")
+
+    async def _require_asker_still(self, device: Device, lease: Lease) -> None:
+        asker = Identity(lease.account, lease.holder, lease.session, key=key_of(lease.session))
+        try:
+            await self._leases.require_still(asker, device)
+        except Problem as problem:
+            raise _asker_gone(lease.holder, "Nobody has control now.") from problem
+
+    async def _drop(self, who: Identity, device: Device, lease: Lease, request: str) -> None:
+        """Have the device show it no longer. Where that does not arrive, its time is over there soon by itself."""
+        try:
+            await self._commands.send(device, DropRequest(request=request), who=who.name, epoch=lease.epoch)
+        except BusUnavailable as error:
+            _log.warning("request for %s: %s", device.id, error)
+
+
+def _asker_gone(by: str, then: str) -> Problem:
+    detail = f"{by} has signed out, or may not operate this device any more. {then}"
+    return Problem("asker-gone", 409, "Who asked is gone", detail)

@@ -1,0 +1,114 @@
+"""Ending control that somebody has lost the right to: the epoch is burned, and the device is brought to a hold."""
+
+import asyncio
+import logging
+
+from device_agent.protocol import ReleaseLease
+from function_app.domain.control.control_events import ended
+from function_app.domain.control.lease import Lease
+from function_app.domain.devices.devices import Device
+from function_app.ports.broker_access import BrokerAccess, BrokerAccessError
+from function_app.ports.clock import Clock
+from function_app.ports.command_bus import BusUnavailable
+from function_app.ports.tables import Tables
+from function_app.services.control.control_events import told
+from function_app.services.devices.control_rows import read_control_rows
+from function_app.services.identity.authenticator import everything
+from function_app.services.messaging.command_sender import Commands
+from function_app.services.storage import records
+
+_log = logging.getLogger(__name__)
+
+
+class Fence:
+    """Ends leases from outside."""
+
+    def __init__(self, *, tables: Tables, commands: Commands, access: BrokerAccess, clock: Clock) -> None:
+        self._tables = tables
+        self._commands = commands
+        self._access = access
+        self._clock = clock
+
+    async def end(self, device: Device, why: str, *, account: str | None = None, until_s: float | None = None) -> bool:
+        """Raise the epoch, so that the holder's setpoints and orders are old, and have the device hold.
+
+        A lease that has run out is fenced too: what was ordered under it may still be on its way.
+
+        Args:
+            device: Whose lease; of which pairing.
+            why: What has happened to the device.
+            account: Only if this account has it; ``None``: whoever has.
+            until_s: When to give up telling others, by the loop's clock [s]; ``None``: as soon as they do.
+
+        Returns:
+            Whether everybody who had to be told has been. The lease has ended in any case.
+
+        Raises:
+            Problem: ``busy``.
+        """
+
+        async def once() -> Lease | None:
+            control = await read_control_rows(self._tables, device.id)
+            known = control.lease
+            if known is None or not known.account or known.pairing != device.pairing:
+                return None
+            if account not in {None, known.account}:
+                return None
+            lease = Lease(epoch=known.epoch + 1, pairing=device.pairing)
+            fact = ended(known, lease, why=why, now_ms=self._clock.now_ms())
+            facts = told(device.id, device.pairing, [fact], owner=device.owner)
+            await self._tables.batch(records.CONTROL, [control.write_lease(device.id, lease), *facts])
+            return lease
+
+        lease = await records.retry(once)
+        return lease is None or await self._tell(device, lease, until_s)
+
+    async def repeat(self, device: Device, account: str, *, until_s: float) -> bool:
+        """Tell again of the end of a lease that ``account`` had; whether it could be told, until ``until_s``.
+
+        Where somebody else has control by now, the device is told of them; until it has heard that, what counts is that
+        nothing of the account reaches it. Which epochs it had nobody knows any more, so all of its connections are cut.
+        """
+        control = await read_control_rows(self._tables, device.id)
+        lease = control.lease
+        if lease is None or lease.pairing != device.pairing:
+            return True
+        if not lease.account:
+            return await self._tell(device, lease, until_s)
+        try:
+            async with asyncio.timeout_at(until_s):
+                await self._access.revoke(principal=everything(account))
+        except (BrokerAccessError, TimeoutError) as error:
+            _log.warning("sessions of %s: %s", account, str(error) or "the broker did not answer in time")
+            return False
+        return True
+
+    async def _tell(self, device: Device, lease: Lease, until_s: float | None) -> bool:
+        """Cut the connection that carries the setpoints of the epoch before, and tell the device, both at once."""
+        try:
+            async with asyncio.timeout_at(until_s):
+                return all(await asyncio.gather(self._cut(device, lease.epoch - 1), self._release(device, lease.epoch)))
+        except TimeoutError:
+            _log.warning("end of control of %s: the broker did not answer in time", device.id)
+            return False
+
+    async def _cut(self, device: Device, epoch: int) -> bool:
+        try:
+            await self._access.revoke(client_id=control_client(device.id, epoch))
+        except BrokerAccessError as error:
+            _log.warning("setpoints of lease %d of %s: %s", epoch, device.id, error)
+            return False
+        return True
+
+    async def _release(self, device: Device, epoch: int) -> bool:
+        try:
+            await self._commands.send(device, ReleaseLease(), who="telescope", epoch=epoch)
+        except BusUnavailable as error:
+            _log.warning("end of control of %s: %s", device.id, error)
+            return False
+        return True
+
+
+def control_client(device: str, epoch: int) -> str:
+    """The MQTT client id of the connection that carries one epoch's setpoints."""
+    return f"c-{device}-{epoch}"

@@ -1,0 +1,57 @@
+"""Leases in their rows: the one place that changes them on purpose, so that every change is told and none is lost."""
+
+from collections.abc import Callable
+
+from function_app.domain.control.lease import Lease
+from function_app.domain.devices.devices import Device
+from function_app.domain.identity.accounts import Identity
+from function_app.ports.clock import Clock
+from function_app.ports.tables import Tables
+from function_app.services.control.control_events import Audit, lease_change
+from function_app.services.devices.control_rows import heed_device, read_control
+from function_app.services.storage import records
+
+
+class LeaseRows:
+    """Changes leases. An action that gets a lease of its own writes it in its own batch."""
+
+    def __init__(self, *, tables: Tables, audit: Audit, clock: Clock) -> None:
+        self._tables = tables
+        self._audit = audit
+        self._clock = clock
+
+    async def change(
+        self, who: Identity, device: Device, change: Callable[[Lease | None, int], Lease]
+    ) -> tuple[Lease | None, Lease]:
+        """Put what ``change`` makes of the lease in its place, by ETag; the lease before and after.
+
+        Args:
+            who: Who changes it.
+            device: Whose lease.
+            change: Decides, from the lease and the time; gives the same object when there is nothing to change. May be
+                called several times.
+
+        Raises:
+            Problem: ``busy``, and whatever ``change`` raises.
+        """
+        watched = False
+
+        async def once() -> tuple[Lease | None, Lease]:
+            nonlocal watched
+            control = await read_control(self._tables, device)
+            now_ms = self._clock.now_ms()
+            control = await heed_device(self._tables, device, control, who, now_ms)
+            lease = change(control.lease, now_ms)
+            if lease is control.lease:
+                return lease, lease
+            facts = lease_change(device.id, control.lease, lease, who=who, now_ms=now_ms, owner=device.owner)
+            if facts and not watched:
+                await self._audit.watch(device.id)
+                watched = True
+            await self._tables.batch(records.CONTROL, [control.write_lease(device.id, lease), *facts])
+            return control.lease, lease
+
+        before, after = await records.retry(once)
+        if watched:
+            await self._audit.tell(device.id)
+        return before, after

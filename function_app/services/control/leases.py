@@ -1,0 +1,155 @@
+"""Taking, renewing and releasing control of a device."""
+
+import logging
+
+from device_agent.protocol import GrantLease, ReleaseLease
+from function_app.domain.actions.queue import UNSHARED
+from function_app.domain.common.problems import Problem
+from function_app.domain.control import lease as rules
+from function_app.domain.control.lease import Lease
+from function_app.domain.devices.devices import Device
+from function_app.domain.identity.accounts import Identity
+from function_app.ports.broker_access import BrokerAccess, BrokerAccessError
+from function_app.ports.clock import Clock
+from function_app.ports.command_bus import BusUnavailable
+from function_app.ports.tables import Tables
+from function_app.services.control.control_events import Audit
+from function_app.services.control.fencing import Fence, control_client
+from function_app.services.control.lease_store import LeaseRows
+from function_app.services.devices.control_rows import ended_at_device, read_lease
+from function_app.services.devices.device_access import Devices, require_operator, require_owner
+from function_app.services.messaging.command_sender import Commands
+
+_log = logging.getLogger(__name__)
+
+
+class Leases:
+    """Leases of devices. The row decides; the device is told by a signed command and also decides for itself."""
+
+    def __init__(
+        self,
+        *,
+        tables: Tables,
+        devices: Devices,
+        rows: LeaseRows,
+        fence: Fence,
+        commands: Commands,
+        access: BrokerAccess,
+        audit: Audit,
+        clock: Clock,
+    ) -> None:
+        self._tables = tables
+        self._devices = devices
+        self._rows = rows
+        self._fence = fence
+        self._commands = commands
+        self._access = access
+        self._audit = audit
+        self._clock = clock
+
+    async def get(self, who: Identity, device_id: str) -> Lease | None:
+        """The live lease of a device, unless the device has ended it.
+
+        Raises:
+            Problem: ``device-unknown``.
+        """
+        device = await self._devices.get(who, device_id)
+        lease = await read_lease(self._tables, device)
+        if lease is None or not lease.live(self._clock.now_ms()):
+            return None
+        return None if await ended_at_device(self._tables, device, lease) else lease
+
+    async def take(
+        self,
+        who: Identity,
+        device_id: str,
+        *,
+        epoch: int | None,
+        lease_ms: int,
+        wait_ms: int,
+        over: str = "",
+    ) -> tuple[Lease, bool]:
+        """Take the lease, or renew epoch ``epoch`` of it; and whether the device has confirmed within ``wait_ms``.
+
+        Args:
+            who: Who takes it.
+            device_id: Of which device.
+            epoch: What is renewed; ``None``: take.
+            lease_ms: For how long; not longer than the device is shared with them.
+            wait_ms: How long the device's answer is waited for.
+            over: Why it is taken even from somebody else. Only an owner may.
+
+        Raises:
+            Problem: ``device-unknown``, ``forbidden``, ``lease-held``, ``lease-lost``, ``busy``.
+        """
+        device = await self._devices.get(who, device_id)
+        what = "take control over" if over else "take control" if epoch is None else "go on in control"
+
+        def changed(lease: Lease | None, now_ms: int) -> Lease:
+            for_ms = rules.lasting(lease_ms, device.until_ms - now_ms)
+            if epoch is None:
+                return rules.take(lease, who, lease_ms=for_ms, now_ms=now_ms, pairing=device.pairing, over=over)
+            return rules.renew(lease, who, epoch=epoch, lease_ms=for_ms, now_ms=now_ms)
+
+        async with self._audit.refusals(device, who, what):
+            require_operator(device)
+            if over:
+                require_owner(device)
+            before, lease = await self._rows.change(who, device, changed)
+            await self.require_still(who, device)
+        confirmed = await self.grant(device, lease, by=who.name, wait_ms=wait_ms)
+        if before is not None and lease.reason and epoch is None:
+            await self.revoke(device, before.epoch)
+        return lease, confirmed
+
+    async def release(self, who: Identity, device_id: str, *, epoch: int) -> None:
+        """Give the lease back. The device holds, and credentials for this epoch's setpoints are taken back.
+
+        Raises:
+            Problem: ``device-unknown``, ``forbidden``, ``lease-lost``, ``busy``.
+        """
+        device = await self._devices.get(who, device_id)
+
+        def changed(lease: Lease | None, now_ms: int) -> Lease:
+            return rules.release(rules.hold(lease, who, epoch=epoch, now_ms=now_ms), now_ms=now_ms)
+
+        async with self._audit.refusals(device, who, "give control back"):
+            require_operator(device)
+            await self._rows.change(who, device, changed)
+        # Released it is, whoever can be told: what the device was granted ends with the time it was granted for.
+        try:
+            await self._commands.send(device, ReleaseLease(), who=who.name, epoch=epoch)
+        except BusUnavailable as error:
+            _log.warning("release of %s: %s", device.id, error)
+        await self.revoke(device, epoch)
+
+    async def require_still(self, who: Identity, device: Device) -> None:
+        """See that whoever has just got the lease may still have it; else it has ended before the device hears of it.
+
+        Raises:
+            Problem: ``device-unknown``, ``forbidden``.
+        """
+        try:
+            await self._devices.require_still(who, device)
+        except Problem:
+            await self._fence.end(device, UNSHARED, account=who.account)
+            raise
+
+    async def grant(self, device: Device, lease: Lease, *, by: str, wait_ms: int) -> bool:
+        """Tell the device whose lease it is; whether it has confirmed.
+
+        The lease is theirs in any case; that the device could not be told is what ``False`` says.
+        """
+        order = GrantLease(holder=lease.holder, lease_ms=lease.lease_ms, reason=lease.reason)
+        try:
+            return await self._commands.confirmed(device, order, who=by, epoch=lease.epoch, wait_ms=wait_ms)
+        except Problem as problem:
+            _log.warning("lease of %s: %s", device.id, problem.detail)
+            return False
+
+    async def revoke(self, device: Device, epoch: int) -> None:
+        """Take back the credentials that carry this epoch's setpoints: fencing that does not need the device."""
+        try:
+            await self._access.revoke(client_id=control_client(device.id, epoch))
+        except BrokerAccessError as error:
+            _log.warning("setpoints of lease %d of %s: %s", epoch, device.id, error)

@@ -1,0 +1,215 @@
+"""Short-lived broker credentials, for exactly what their holder may do."""
+
+from collections.abc import Awaitable
+from dataclasses import dataclass, field
+
+from device_agent.protocol import topics
+from device_agent.protocol.security import grants
+from device_agent.protocol.security.grants import Grant
+from function_app.domain.common.ids import new_id
+from function_app.domain.common.problems import Problem, broker_unavailable, busy_store
+from function_app.domain.control import lease as rules
+from function_app.domain.devices.devices import Agent, Device
+from function_app.domain.identity.accounts import Identity
+from function_app.ports.broker_access import BrokerAccess, BrokerAccessError, Credentials
+from function_app.ports.clock import Clock
+from function_app.ports.tables import Tables
+from function_app.services.control.control_events import Audit
+from function_app.services.control.fencing import control_client
+from function_app.services.devices.control_rows import read_lease
+from function_app.services.devices.device_access import Devices, require_claimed, require_operator
+from function_app.services.identity.authenticator import principal, watch_principal
+
+WATCH_S = 15 * 60
+AGENT_S = 3600
+CONTROL_MIN_S = 60
+TOPIC_BYTES = 10_000
+"""Filters in one grant [bytes]: signed and in base 64 they fit into the 16 KiB that a CONNECT may have."""
+
+
+@dataclass(frozen=True, slots=True)
+class Issued:
+    """Credentials, and the topics to use with them."""
+
+    client_id: str
+    credentials: Credentials
+    expires_ms: int
+    lifetime_s: int
+    publish: tuple[str, ...]
+    subscribe: tuple[str, ...]
+
+
+class MqttCredentials:
+    """Issues broker credentials."""
+
+    def __init__(self, *, tables: Tables, devices: Devices, access: BrokerAccess, audit: Audit, clock: Clock) -> None:
+        self._audit = audit
+        self._tables = tables
+        self._devices = devices
+        self._access = access
+        self._clock = clock
+
+    async def watch(self, who: Identity) -> Issued:
+        """To see every device that the account may see, and to stop those it may operate.
+
+        Where the account has a part in a whole space, what the broker is told is said by space and stays small however
+        many devices there are; a device that is shared by itself is named, topic by topic. The answer names each topic.
+        The credentials end with the first share that they rest on, and with the session or API key that asks.
+
+        Raises:
+            Problem: ``broker-unavailable``, ``busy``.
+        """
+        devices = await self._devices.all(who)
+        issued = await self._watch(who, devices)
+        if any(device.owner != who.account for device in devices) and _rights(await self._devices.all(who)) != _rights(
+            devices
+        ):
+            # Something was un-shared meanwhile: its sessions were cut before these credentials were there to be cut.
+            await self._take_back(issued)
+            raise busy_store()
+        await self._require(issued, self._devices.require_key(who))
+        return issued
+
+    async def _watch(self, who: Identity, devices: list[Device]) -> Issued:
+        watched = _watching(devices, self._access)
+        seen = watched.devices
+        now_ms = self._clock.now_ms()
+        ends_ms = min([now_ms + WATCH_S * 1000, who.until_ms, *(device.until_ms for device in seen)])
+        grant = Grant(
+            principal=watch_principal(who),
+            client_id=f"w-{who.session}-{new_id(10)}",
+            publish=tuple(watched.publish),
+            subscribe=tuple(watched.subscribe),
+            token_id=new_id(),
+            expires_at=max(now_ms // 1000 + 1, ends_ms // 1000),
+        )
+        subscribe = [topics.conn(space, agent) for space, agent in sorted({(one.space, one.agent) for one in seen})]
+        for device in seen:
+            subscribe += grants.heard(device.space, device.agent, device.name)
+        lifetime_s = max(1, (ends_ms - now_ms) // 1000)
+        return await self._issue(grant, lifetime_s, tuple(watched.stops), tuple(dict.fromkeys(subscribe)))
+
+    async def _take_back(self, issued: Issued) -> None:
+        try:
+            await self._access.revoke(client_id=issued.client_id)
+        except BrokerAccessError as error:
+            raise broker_unavailable(f"{error}.") from error
+
+    async def control(self, who: Identity, device_id: str, epoch: int) -> Issued:
+        """To send setpoints under one epoch of a lease.
+
+        Raises:
+            Problem: ``device-unknown``, ``forbidden``, ``lease-lost``, ``broker-unavailable``.
+        """
+        device = await self._devices.get(who, device_id)
+        now_ms = self._clock.now_ms()
+        async with self._audit.refusals(device, who, "steer"):
+            require_operator(device)
+            lease = rules.hold(await read_lease(self._tables, device), who, epoch=epoch, now_ms=now_ms)
+        # Longer than the lease, which may be renewed; not than the right to it.
+        lifetime_s = min(max(CONTROL_MIN_S, lease.lease_ms // 1000), max(1, (device.until_ms - now_ms) // 1000))
+        publish = (f"{device.topic}/{topics.CTL}/{epoch}",)
+        grant = Grant(
+            principal=principal(who),
+            client_id=control_client(device.id, epoch),
+            publish=publish,
+            subscribe=(),
+            token_id=new_id(),
+            expires_at=now_ms // 1000 + lifetime_s,
+        )
+        issued = await self._issue(grant, lifetime_s, publish, ())
+        await self._require(issued, self._devices.require_still(who, device))
+        return issued
+
+    async def _require(self, issued: Issued, still: Awaitable[object]) -> None:
+        """Take credentials back that were made while the right to them was ended: nobody found them to be cut then."""
+        try:
+            await still
+        except Problem:
+            await self._take_back(issued)
+            raise
+
+    async def agent(self, agent: Agent) -> Issued:
+        """To speak for an agent's own devices and hear what is addressed to them.
+
+        It may also hear what its space measures; which of that it does, its own configuration says.
+
+        Raises:
+            Problem: ``agent-unclaimed``, ``broker-unavailable``.
+        """
+        space = require_claimed(agent)
+        grant = grants.agent_grant(space, agent.id, token_id=new_id(), lifetime_s=AGENT_S)
+        return await self._issue(grant, AGENT_S, grant.publish, grants.agent_orders(space, agent.id))
+
+    async def _issue(
+        self, grant: Grant, lifetime_s: int, publish: tuple[str, ...], subscribe: tuple[str, ...]
+    ) -> Issued:
+        try:
+            credentials = await self._access.issue(grant)
+        except BrokerAccessError as error:
+            raise broker_unavailable(f"{error}.") from error
+        return Issued(grant.client_id, credentials, grant.expires_at * 1000, lifetime_s, publish, subscribe)
+
+
+@dataclass(slots=True)
+class _Watched:
+    """What one connection is given, and the devices that it reaches with that.
+
+    Attributes:
+        publish: Filters.
+        subscribe: Filters.
+        devices: Which are heard.
+        stops: Topics, one for each of them that may be stopped.
+    """
+
+    publish: list[str] = field(default_factory=list)
+    subscribe: list[str] = field(default_factory=list)
+    devices: list[Device] = field(default_factory=list)
+    stops: list[str] = field(default_factory=list)
+
+    def add(self, says: list[str], hears: tuple[str, ...], access: BrokerAccess) -> bool:
+        """Whether there was room for them."""
+        publish = list(dict.fromkeys([*self.publish, *says]))
+        subscribe = list(dict.fromkeys([*self.subscribe, *hears]))
+        size = sum(len(pattern) + 3 for pattern in (*publish, *subscribe))
+        if size > TOPIC_BYTES or not access.takes(publish, subscribe):
+            return False
+        self.publish, self.subscribe = publish, subscribe
+        return True
+
+
+def _watching(devices: list[Device], access: BrokerAccess) -> _Watched:
+    """What may be said and heard in order to watch these devices, and those of them that fit.
+
+    Whole spaces come first. All filters travel in one CONNECT, which brokers bound, some more than others: devices
+    beyond what the broker takes are left out. Whoever has so many in one room is better given the room.
+    """
+    found = _Watched()
+    whole: set[str] = set()
+    for space, role in sorted({(device.space, device.space_role) for device in devices if device.space_role}):
+        says = [topics.device(space, topics.ANY, topics.ANY, topics.STOP)] if role.may_operate else []
+        if not found.add(says, grants.heard(space, topics.ANY, topics.ANY), access):
+            break
+        inside = [device for device in devices if device.space == space and device.space_role]
+        found.devices += inside
+        whole |= {device.id for device in inside}
+        found.stops += [_stop(device) for device in inside if role.may_operate]
+    stoppable = set(found.stops)
+    for device in devices:
+        says = [_stop(device)] if device.role.may_operate and _stop(device) not in stoppable else []
+        hears = () if device.id in whole else grants.heard(device.space, device.agent, device.name)
+        if not says and not hears:
+            continue
+        if not found.add(says, hears, access):
+            break
+        found.stops += says
+        found.devices += [device] if hears else []
+    return found
+
+
+def _stop(device: Device) -> str:
+    return f"{device.topic}/{topics.STOP}"
+
+
+def _rights(devices: list[Device]) -> set[tuple[object, ...]]:
+    return {(device.id, device.topic, device.role, device.space_role, device.until_ms) for device in devices}

@@ -1,0 +1,114 @@
+"""The rows that decide who controls a device: lease, slot and queue, side by side in the device's partition."""
+
+from dataclasses import dataclass, field, replace
+
+from function_app.domain.actions.queue import Queue
+from function_app.domain.control.lease import Lease, release
+from function_app.domain.devices.devices import Device, LastState
+from function_app.domain.identity.accounts import Identity
+from function_app.ports.tables import Row, Tables, Write
+from function_app.services.storage import records
+
+LEASE = "now:lease"
+SLOT = "now:slot"
+QUEUE = "now:queue"
+
+
+@dataclass(frozen=True, slots=True)
+class Control:
+    """Lease, slot and queue as they were read, with their rows (none: not written yet)."""
+
+    lease: Lease | None = None
+    action: str = ""
+    slot_pairing: str = ""
+    queue: Queue = field(default_factory=lambda: Queue(""))
+    rows: dict[str, Row] = field(default_factory=dict)
+
+    def write_lease(self, device: str, lease: Lease) -> Write:
+        """The change that puts ``lease`` in place of what was read."""
+        return self._write(device, LEASE, records.fields(lease))
+
+    def write_slot(self, device: str, action: str, pairing: str) -> Write:
+        """The change that gives the slot to ``action`` (empty: to nobody)."""
+        return self._write(device, SLOT, {"action": action, "pairing": pairing})
+
+    def write_queue(self, device: str, queue: Queue) -> Write:
+        """The change that puts ``queue`` in place of what was read."""
+        return self._write(device, QUEUE, records.fields(queue))
+
+    def _write(self, device: str, key: str, data: dict[str, object]) -> Write:
+        row = self.rows.get(key)
+        return Write("replace" if row else "create", Row(device, key, data, row.etag if row else ""))
+
+
+async def read_control(tables: Tables, device: Device) -> Control:
+    """Lease, slot and queue in one read.
+
+    What an earlier owner's pairing left behind is nobody's: an un-pairing that stopped half way blocks nobody.
+    """
+    rows = await _rows(tables, device.id)
+    lease = _lease(rows, device)
+    slot = rows.get(SLOT)
+    action = slot.data["action"] if slot and slot.data["pairing"] == device.pairing else ""
+    queue = _queue(rows)
+    return Control(
+        lease=lease,
+        action=action,
+        slot_pairing=device.pairing,
+        queue=queue if queue.pairing == device.pairing else Queue(device.pairing),
+        rows=rows,
+    )
+
+
+async def read_control_rows(tables: Tables, device: str) -> Control:
+    """Lease, slot and queue, of whatever pairing."""
+    rows = await _rows(tables, device)
+    slot = rows.get(SLOT)
+    return Control(
+        lease=records.read(rows[LEASE], Lease) if LEASE in rows else None,
+        action=slot.data["action"] if slot else "",
+        slot_pairing=slot.data["pairing"] if slot else "",
+        queue=_queue(rows),
+        rows=rows,
+    )
+
+
+async def heed_device(tables: Tables, device: Device, control: Control, who: Identity, now_ms: int) -> Control:
+    """The same, without a lease of somebody else that the device itself has ended, as its ``state`` says.
+
+    A hold, a Stop or a restart ends leases at the device. Such an epoch is never obeyed again, so what the state says
+    of it stays true however old it is.
+    """
+    lease = control.lease
+    if lease is None or not lease.anothers(who, now_ms) or not await ended_at_device(tables, device, lease):
+        return control
+    return replace(control, lease=release(lease, now_ms=now_ms))
+
+
+async def ended_at_device(tables: Tables, device: Device, lease: Lease) -> bool:
+    """Whether the device has said that it will not obey this lease again."""
+    row = await tables.get(records.AGENTS, device.agent, f"state:{device.name}")
+    last = records.read(row, LastState) if row else None
+    return last is not None and last.pairing == device.pairing and last.ended_epoch >= lease.epoch
+
+
+async def read_lease(tables: Tables, device: Device) -> Lease | None:
+    """The lease row alone, live or not."""
+    row = await tables.get(records.CONTROL, device.id, LEASE)
+    return _lease({LEASE: row} if row else {}, device)
+
+
+async def _rows(tables: Tables, device: str) -> dict[str, Row]:
+    page = await tables.query(records.CONTROL, device, first="now:", last="now;")
+    return {row.key: row for row in page.rows}
+
+
+def _queue(rows: dict[str, Row]) -> Queue:
+    return records.read(rows[QUEUE], Queue) if QUEUE in rows else Queue("")
+
+
+def _lease(rows: dict[str, Row], device: Device) -> Lease | None:
+    if LEASE not in rows:
+        return None
+    lease = records.read(rows[LEASE], Lease)
+    return lease if lease.pairing in ("", device.pairing) else Lease(epoch=lease.epoch)

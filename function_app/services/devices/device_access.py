@@ -1,0 +1,385 @@
+"""Devices as an account may see them: the one place where it is looked up who may do what with which device."""
+
+import asyncio
+from collections.abc import Iterable
+from dataclasses import dataclass, replace
+from typing import Any, TypeVar
+
+from device_agent.protocol import topics
+from function_app.domain.common.ids import device_id, split_device
+from function_app.domain.common.problems import Problem, forbidden, invalid, not_found
+from function_app.domain.control.lease import Lease
+from function_app.domain.devices import access, devices
+from function_app.domain.devices.access import OWNERS, Share, Standing, device_target, space_target
+from function_app.domain.devices.devices import Agent, Device, DeviceSpec, LastState, Leaving, Link
+from function_app.domain.identity.accounts import Account, Identity
+from function_app.ports.clock import Clock
+from function_app.ports.tables import Row, Tables
+from function_app.services.devices.control_rows import read_lease
+from function_app.services.identity.session_status import acting
+from function_app.services.storage import records
+
+T = TypeVar("T")
+
+_SHARED = "~shared:"
+"""Begins the cursors of pages that hold what is shared, behind the account's own."""
+
+
+@dataclass(frozen=True, slots=True)
+class DeviceView:
+    """A device with what is known of it now, and the name of its owner."""
+
+    device: Device
+    owner_name: str
+    online: bool
+    last_seen_ms: int | None
+    state: dict[str, Any] | None
+    lease: Lease | None
+
+
+class Devices:
+    """Looks devices up. What neither belongs to the account nor is shared with it does not exist for it."""
+
+    def __init__(self, *, tables: Tables, clock: Clock) -> None:
+        self._tables = tables
+        self._clock = clock
+
+    async def get(self, who: Identity, device: str) -> Device:
+        """One device.
+
+        Raises:
+            Problem: ``device-unknown``.
+        """
+        found, _ = await self.with_link(who, device)
+        return found
+
+    async def with_link(self, who: Identity, device: str) -> tuple[Device, Link | None]:
+        """One device and the last word about its agent's connection, in one read.
+
+        Raises:
+            Problem: ``device-unknown``.
+        """
+        found, link = await self.find(who, device)
+        if found is None:
+            raise not_found("device", device)
+        return found, link
+
+    async def find(self, who: Identity, device: str) -> tuple[Device | None, Link | None]:
+        """As ``with_link``, with ``None`` for a device that does not exist for ``who``."""
+        parts = split_device(device)
+        if parts is None:
+            return None, None
+        page = await self._tables.query(records.AGENTS, parts[0], first="agent", last="link ", limit=2)
+        rows = {row.key: row for row in page.rows}
+        agent = records.read(rows["agent"], Agent) if "agent" in rows else None
+        spec = agent.device(parts[1]) if agent else None
+        if agent is None or spec is None:
+            return None, None
+        allowed = (await self._standings(who, agent, [spec.name])).get(spec.name)
+        if allowed is None:
+            return None, None
+        return _device(agent, spec, allowed), _of(agent, rows, "link", Link)
+
+    async def require_still(self, who: Identity, device: Device) -> None:
+        """See, after something was written for ``who``, that they may still operate the device.
+
+        Whoever un-shares deletes the share first and then ends what it finds; whoever uses a share writes first and
+        then looks here: of the two at least one sees the other. An owner is told apart by the pairing, and not read.
+        An API key is looked at in the same way, whoever's it is: whoever revokes it deletes its row first.
+
+        Raises:
+            Problem: ``device-unknown``, ``forbidden``.
+        """
+        if who.key:
+            who = await self.require_key(who)
+        if who.key or device.owner != who.account:
+            require_operator(await self.get(who, device.id))
+
+    async def require_key(self, who: Identity) -> Identity:
+        """``who`` as their API key stands now; a person as they are.
+
+        Raises:
+            Problem: ``forbidden``.
+        """
+        now = await self.acting(who) if who.key else who
+        if now is None:
+            raise forbidden("This API key was revoked or has run out. Make a new one.")
+        return now
+
+    async def acting(self, who: Identity) -> Identity | None:
+        """As ``acting``: what they may do now, and ``None`` once their key or session was ended."""
+        return await acting(self._tables, who, self._clock.now_ms())
+
+    async def view(self, who: Identity, device: str) -> DeviceView:
+        """One device with what is known of it now.
+
+        Raises:
+            Problem: ``device-unknown``.
+        """
+        parts = split_device(device)
+        if parts is not None:
+            for view in await self.of_agent(who, parts[0], only=parts[1]):
+                return view
+        raise not_found("device", device)
+
+    async def views(self, who: Identity, *, cursor: str | None, limit: int) -> tuple[list[DeviceView], str | None]:
+        """All devices that the account may see, agent by agent: a page holds those of up to ``limit`` agents.
+
+        Raises:
+            Problem: ``cursor-invalid``.
+        """
+        ids, following = await self._agent_ids(who, cursor, limit)
+        found = await asyncio.gather(*(self.of_agent(who, agent) for agent in ids))
+        return [view for views in found for view in views], following
+
+    async def all(self, who: Identity) -> list[Device]:
+        """Every device that the account may see, without what is known of it now."""
+        found: list[Device] = []
+        cursor: str | None = None
+        while True:
+            ids, cursor = await self._agent_ids(who, cursor, 1000)
+            for devices_ in await asyncio.gather(*(self._seen_of(who, agent) for agent in ids)):
+                found += devices_
+            if cursor is None:
+                return found
+
+    async def agents(self, who: Identity, *, cursor: str | None, limit: int) -> tuple[list[Agent], str | None]:
+        """The account's own agents, as far as ``who`` may see a device of theirs.
+
+        Raises:
+            Problem: ``cursor-invalid``.
+        """
+        ids, following = await self._own_agent_ids(who.account, cursor, limit)
+        rows = await asyncio.gather(*(self._tables.get(records.AGENTS, agent, "agent") for agent in ids))
+        agents = [records.read(row, Agent) for row in rows if row is not None]
+        own = [agent for agent in agents if agent.account == who.account]
+        return [agent for agent in own if not agent.devices or await self._standings(who, agent)], following
+
+    async def _seen_of(self, who: Identity, agent_id: str) -> list[Device]:
+        row = await self._tables.get(records.AGENTS, agent_id, "agent")
+        if row is None:
+            return []
+        agent = records.read(row, Agent)
+        allowed = await self._standings(who, agent)
+        return [_device(agent, spec, allowed[spec.name]) for spec in agent.devices if spec.name in allowed]
+
+    async def _agent_ids(self, who: Identity, cursor: str | None, limit: int) -> tuple[list[str], str | None]:
+        """The account's own agents, then those of which something is shared with it."""
+        own: list[str] = []
+        after = ""
+        if cursor is not None and cursor.startswith(_SHARED):
+            after = cursor.removeprefix(_SHARED)
+        else:
+            own, following = await self._own_agent_ids(who.account, cursor, limit)
+            if following is not None:
+                return own, following
+        shared = [agent for agent in await self._shared_agent_ids(who.account) if agent > after]
+        chosen = shared[: limit - len(own)]
+        last = chosen[-1] if chosen else after
+        return own + chosen, f"{_SHARED}{last}" if len(shared) > len(chosen) else None
+
+    async def _own_agent_ids(self, account: str, cursor: str | None, limit: int) -> tuple[list[str], str | None]:
+        try:
+            page = await self._tables.query(
+                records.MEMBERS, account, first="agent:", last="agent;", limit=limit, cursor=cursor
+            )
+        except ValueError as error:
+            raise invalid("The cursor is not one of this list. Begin without one.", code="cursor-invalid") from error
+        return [row.key.removeprefix("agent:") for row in page.rows], page.cursor
+
+    async def _shared_agent_ids(self, account: str) -> list[str]:
+        """Agents of which something may be shared with an account. The shares themselves decide."""
+        found: set[str] = set()
+        cursor: str | None = None
+        while True:
+            page = await self._tables.query(
+                records.MEMBERS, account, first="share:", last="share;", limit=1000, cursor=cursor
+            )
+            for row in page.rows:
+                kind, name = access.split_target(row.key.removeprefix("share:"))
+                if kind == "space":
+                    found |= set(await self._all_agent_ids(str(row.data["owner"])))
+                elif (parts := split_device(name)) is not None:
+                    found.add(parts[0])
+            cursor = page.cursor
+            if cursor is None:
+                return sorted(found)
+
+    async def _all_agent_ids(self, account: str) -> list[str]:
+        found: list[str] = []
+        cursor: str | None = None
+        while True:
+            ids, cursor = await self._own_agent_ids(account, cursor, 1000)
+            found += ids
+            if cursor is None:
+                return found
+
+    async def owned(self, device: str) -> Device | None:
+        """A device as its owner sees it, whoever that is."""
+        parts = split_device(device)
+        row = await self._tables.get(records.AGENTS, parts[0], "agent") if parts else None
+        if row is None:
+            return None
+        return next((found for found in devices_of(records.read(row, Agent)) if found.id == device), None)
+
+    async def in_space(self, account: str, space: str) -> list[Device]:
+        """The devices of an account's space, as their owner sees them."""
+        ids = await self._all_agent_ids(account)
+        rows = await asyncio.gather(*(self._tables.get(records.AGENTS, agent, "agent") for agent in ids))
+        agents = [records.read(row, Agent) for row in rows if row is not None]
+        return [
+            device
+            for agent in agents
+            if agent.account == account and agent.space == space
+            for device in devices_of(agent)
+        ]
+
+    async def _standings(self, who: Identity, agent: Agent, names: Iterable[str] | None = None) -> dict[str, Standing]:
+        """What ``who`` may do with the devices of an agent; those that do not exist for them are left out.
+
+        For the owner nothing is read.
+        """
+        wanted = [spec.name for spec in agent.devices] if names is None else list(names)
+        shares: list[Share] = []
+        if agent.account is not None and agent.account != who.account:
+            targets = [space_target(agent.space or ""), *(device_target(device_id(agent.id, name)) for name in wanted)]
+            key = share_key(who.account)
+            rows = await asyncio.gather(*(self._tables.get(records.SHARES, on, key) for on in targets))
+            shares = [records.read(row, Share) for row in rows if row is not None]
+        now_ms = self._clock.now_ms()
+        found = {name: access.standing(who, agent, name, shares, now_ms) for name in wanted}
+        return {name: allowed for name, allowed in found.items() if allowed is not None}
+
+    async def _owner_name(self, who: Identity, agent: Agent) -> str:
+        if agent.account == who.account and not who.key:
+            return who.name
+        row = await self._tables.get(records.ACCOUNTS, agent.account or "-", "account")
+        return records.read(row, Account).name if row else ""
+
+    async def of_agent(self, who: Identity, agent_id: str, only: str | None = None) -> list[DeviceView]:
+        """The devices of one agent that the account may see, or the one called ``only``."""
+        page = await self._tables.query(records.AGENTS, agent_id, limit=1000)
+        rows = {row.key: row for row in page.rows}
+        if "agent" not in rows:
+            return []
+        agent = records.read(rows["agent"], Agent)
+        chosen = [spec for spec in agent.devices if only in {None, spec.name}]
+        allowed = await self._standings(who, agent, [spec.name for spec in chosen])
+        if not allowed:
+            return []
+        owner_name = await self._owner_name(who, agent)
+        now_ms = self._clock.now_ms()
+        link = _of(agent, rows, "link", Link)
+        views = []
+        for spec in chosen:
+            if spec.name not in allowed:
+                continue
+            device = _device(agent, spec, allowed[spec.name])
+            last = _of(agent, rows, f"state:{spec.name}", LastState)
+            seen_ms = max(link.seen_ms if link else 0, last.seen_ms if last else 0)
+            lease = await read_lease(self._tables, device)
+            views.append(
+                DeviceView(
+                    device=device,
+                    owner_name=owner_name,
+                    online=devices.online(link, seen_ms, now_ms),
+                    last_seen_ms=seen_ms or None,
+                    state=last.state if last else None,
+                    lease=lease if lease and lease.live(now_ms) and not _ended(lease, last) else None,
+                )
+            )
+        return views
+
+
+def require_operator(device: Device) -> Device:
+    """The same device, once it is seen that its role may operate.
+
+    Raises:
+        Problem: ``forbidden``.
+    """
+    if not device.role.may_operate:
+        raise forbidden("You may watch this device, not operate it. Ask its owner.")
+    return device
+
+
+def require_owner(device: Device) -> Device:
+    """The same device, once it is seen that its role is the owner's.
+
+    Raises:
+        Problem: ``forbidden``.
+    """
+    if not device.role.may_own:
+        raise forbidden("Only the owner of this device may do that. For control, ask who has it, at lease/requests.")
+    return device
+
+
+def require_claimed(agent: Agent) -> str:
+    """The space of an agent, once it is seen that somebody has claimed it.
+
+    Raises:
+        Problem: ``agent-unclaimed``.
+    """
+    if agent.space is None:
+        detail = "Nobody has claimed this agent yet. Wait for GET /agents/enrollment to say so."
+        raise Problem("agent-unclaimed", 409, "The agent is not claimed", detail)
+    return agent.space
+
+
+def require_online(link: Link | None, now_ms: int) -> None:
+    """Refuse what cannot arrive.
+
+    Raises:
+        Problem: ``device-offline``: the agent's last word was "offline", or it polls and has stopped to.
+    """
+    if link is not None and not (devices.online(link, link.seen_ms, now_ms) if link.polled else link.online):
+        detail = "The device's agent is offline. Check that it runs and has network."
+        raise Problem("device-offline", 409, "The device is offline", detail)
+
+
+def share_key(account: str) -> str:
+    """Of the share that an account has in something."""
+    return f"account:{account}"
+
+
+def devices_of(agent: Agent) -> list[Device]:
+    """The devices of a claimed agent, as its owner sees them."""
+    return [_device(agent, spec) for spec in agent.devices]
+
+
+def left_devices(agent: Agent, leaving: Leaving) -> list[Device]:
+    """The devices that an agent has left behind, as their owner saw them."""
+    before = replace(agent, account=leaving.account, space=leaving.space, pairing=leaving.pairing)
+    gone = DeviceSpec("", "", "", "")
+    return [_device(before, replace(agent.device(name) or gone, name=name)) for name in leaving.devices]
+
+
+def _ended(lease: Lease, last: LastState | None) -> bool:
+    """Whether the device has said that it will not obey this lease again."""
+    return last is not None and last.ended_epoch >= lease.epoch
+
+
+def _of(agent: Agent, rows: dict[str, Row], key: str, kind: type[T]) -> T | None:
+    """What was said under the agent's present pairing."""
+    if key not in rows or rows[key].data.get("pairing", "") not in {"", agent.pairing}:
+        return None
+    return records.read(rows[key], kind)
+
+
+def _device(agent: Agent, spec: DeviceSpec, allowed: Standing = OWNERS) -> Device:
+    space = agent.space or ""
+    return Device(
+        id=device_id(agent.id, spec.name),
+        name=spec.name,
+        label=agent.labels.get(spec.name, spec.label),
+        kind=spec.kind,
+        robot_type=spec.robot_type,
+        agent=agent.id,
+        space=space,
+        pairing=agent.pairing,
+        role=allowed.role,
+        topic=f"{topics.ROOT}/{space}/{agent.id}/{spec.name}",
+        transport=agent.transport,
+        owner=agent.account or "",
+        until_ms=allowed.until_ms,
+        space_role=allowed.space,
+    )

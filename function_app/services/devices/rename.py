@@ -1,0 +1,40 @@
+"""What an owner calls a device: kept beside what its agent calls it, until it belongs to somebody else."""
+
+from function_app.domain.audit.hash_chain import Deed
+from function_app.domain.common.problems import not_found
+from function_app.domain.devices import devices as rules
+from function_app.domain.devices.devices import Agent
+from function_app.domain.identity.accounts import Identity
+from function_app.ports.tables import Row, Tables
+from function_app.services.audit.audit_log import AuditChain
+from function_app.services.devices.device_access import Devices, require_owner
+from function_app.services.storage import records
+
+
+class Rename:
+    """Names devices. The agent is not told: the name is the owner's, and the agent's own stays as it is."""
+
+    def __init__(self, *, tables: Tables, devices: Devices, chain: AuditChain) -> None:
+        self._tables = tables
+        self._devices = devices
+        self._chain = chain
+
+    async def rename(self, who: Identity, device_id: str, label: str | None) -> None:
+        """Call a device ``label``; ``None``: as its agent does.
+
+        Raises:
+            Problem: ``device-unknown``, ``forbidden``, ``busy``.
+        """
+        device = require_owner(await self._devices.get(who, device_id))
+        async with self._chain.change(who.account, Deed.DEVICE_RENAMED, who, on=device.id, label=label) as change:
+
+            async def once() -> None:
+                row = await self._tables.get(records.AGENTS, device.agent, "agent")
+                agent = records.read(row, Agent) if row else None
+                if row is None or agent is None or agent.pairing != device.pairing:
+                    raise not_found("device", device.id)
+                changed = rules.call(agent, device.name, label)
+                await change.noted()
+                await self._tables.replace(records.AGENTS, Row(agent.id, "agent", records.fields(changed), row.etag))
+
+            await records.retry(once)

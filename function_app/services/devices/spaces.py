@@ -1,0 +1,92 @@
+"""Spaces as an account may see them: its own, and those that are shared with it."""
+
+import asyncio
+from dataclasses import dataclass
+
+from function_app.domain.common.problems import forbidden, not_found
+from function_app.domain.devices import access
+from function_app.domain.devices.access import Share, space_target
+from function_app.domain.identity.accounts import Account, Identity, Role, Space
+from function_app.ports.clock import Clock
+from function_app.ports.tables import Tables
+from function_app.services.devices.device_access import share_key
+from function_app.services.storage import records
+
+
+@dataclass(frozen=True, slots=True)
+class SpaceView:
+    """A space, whose it is, and what the account may do in it."""
+
+    space: Space
+    role: Role
+    owner: Account
+
+
+class Spaces:
+    """Looks spaces up. What neither belongs to the account nor is shared with it does not exist for it."""
+
+    def __init__(self, *, tables: Tables, clock: Clock) -> None:
+        self._tables = tables
+        self._clock = clock
+
+    async def list(self, who: Identity) -> tuple[SpaceView, ...]:
+        """The account's own, oldest first; then those that are shared with it, by id."""
+        owner = Account(who.account, await self._name(who.account))
+        page = await self._tables.query(records.ACCOUNTS, who.account, first="space:", last="space;", limit=1000)
+        own = sorted((records.read(row, Space) for row in page.rows), key=lambda space: space.created_ms)
+        found = [SpaceView(space, Role.OWNER, owner) for space in own]
+        shared = await self._tables.query(
+            records.MEMBERS, who.account, first="share:space:", last="share:space;", limit=1000
+        )
+        ids = [row.key.removeprefix("share:space:") for row in shared.rows]
+        found += [view for view in await asyncio.gather(*(self._shared(who, name) for name in ids)) if view is not None]
+        return tuple(view for each in found if (view := _seen(who, each)) is not None)
+
+    async def get(self, who: Identity, space: str) -> SpaceView:
+        """One space.
+
+        Raises:
+            Problem: ``space-unknown``.
+        """
+        row = await self._tables.get(records.ACCOUNTS, who.account, f"space:{space}")
+        view: SpaceView | None
+        if row is not None:
+            owner = Account(who.account, await self._name(who.account))
+            view = SpaceView(records.read(row, Space), Role.OWNER, owner)
+        else:
+            view = await self._shared(who, space)
+        seen = None if view is None else _seen(who, view)
+        if seen is None:
+            raise not_found("space", space)
+        return seen
+
+    async def own(self, who: Identity, space: str) -> SpaceView:
+        """One space of the account's own.
+
+        Raises:
+            Problem: ``space-unknown``, ``forbidden``.
+        """
+        view = await self.get(who, space)
+        if not view.role.may_own:
+            raise forbidden("Only the owner of this space may do that.")
+        return view
+
+    async def _shared(self, who: Identity, space: str) -> SpaceView | None:
+        row = await self._tables.get(records.SHARES, space_target(space), share_key(who.account))
+        share = records.read(row, Share) if row else None
+        if share is None or not share.live(self._clock.now_ms()):
+            return None
+        found = await self._tables.get(records.ACCOUNTS, share.owner, f"space:{space}")
+        if found is None:
+            return None
+        return SpaceView(records.read(found, Space), share.role, Account(share.owner, await self._name(share.owner)))
+
+    async def _name(self, account: str) -> str:
+        row = await self._tables.get(records.ACCOUNTS, account, "account")
+        return records.read(row, Account).name if row else ""
+
+
+def _seen(who: Identity, view: SpaceView) -> SpaceView | None:
+    if who.only and space_target(view.space.id) not in who.only:
+        return None
+    return SpaceView(view.space, access.capped(who, view.role), view.owner)

@@ -1,0 +1,120 @@
+"""Who looks at a device at this moment: pages that are seen say so every few seconds, and are told who else does.
+
+A row for each sign-in session, good for a few seconds only: whoever says nothing more is gone by themselves, and so is
+whoever may not see the device any more, since they may not say so either. Nothing depends on it.
+"""
+
+import contextlib
+from dataclasses import dataclass
+from typing import Final
+
+from function_app.domain.devices.devices import Device
+from function_app.domain.identity.accounts import Identity, Role
+from function_app.ports.clock import Clock
+from function_app.ports.tables import MAX_BATCH, Conflict, Row, Tables, Write
+from function_app.services.devices.device_access import Devices
+from function_app.services.storage import records
+from function_app.services.storage.retention import Forget
+
+GOOD_MS: Final = 25_000
+"""How long one word counts: pages say it every ten seconds."""
+MOST: Final = 50
+"""As many are remembered of one device; whoever comes when there are more is told of the others, and not shown."""
+_AGAIN_MS: Final = 5_000
+"""So soon after one word another is not written down."""
+_FORGOTTEN_MS: Final = 3_600_000
+
+
+@dataclass(frozen=True, slots=True)
+class Watcher:
+    """One sign-in session that looks at a device.
+
+    Attributes:
+        since_ms: From when on, without a pause [ms since 1970].
+        said_ms: Its newest word.
+        pairing: Of the device's agent then.
+    """
+
+    account: str
+    session: str
+    name: str
+    role: Role
+    since_ms: int
+    said_ms: int
+    expires_ms: int
+    pairing: str
+
+
+class Watchers:
+    """Remembers and tells who watches."""
+
+    def __init__(self, *, tables: Tables, devices: Devices, forget: Forget, clock: Clock) -> None:
+        self._tables = tables
+        self._devices = devices
+        self._forget = forget
+        self._clock = clock
+
+    async def watch(self, who: Identity, device_id: str) -> list[Watcher]:
+        """Say that ``who`` looks at a device.
+
+        Returns:
+            Who else does, the longest first.
+
+        Raises:
+            Problem: ``device-unknown``.
+        """
+        device = await self._devices.get(who, device_id)
+        now_ms = self._clock.now_ms()
+        page = await self._tables.query(records.WATCHERS, device.id, limit=2 * MOST)
+        rows = {row.key: (row, records.read(row, Watcher)) for row in page.rows}
+        live = {
+            key: known
+            for key, (_, known) in rows.items()
+            if known.expires_ms > now_ms and known.pairing == device.pairing
+        }
+        mine = live.get(who.session)
+        if mine is None and len(live) < MOST:
+            await self._tidy([row for key, (row, _) in rows.items() if key not in live])
+        if (len(live) < MOST) if mine is None else now_ms - mine.said_ms >= _AGAIN_MS:
+            await self._note(device, who, now_ms)
+        others = [known for key, known in live.items() if key != who.session]
+        return sorted(others, key=lambda known: known.since_ms)
+
+    async def leave(self, who: Identity, device_id: str) -> None:
+        """Say that ``who`` looks no longer.
+
+        Raises:
+            Problem: ``device-unknown``.
+        """
+        device = await self._devices.get(who, device_id)
+        row = await self._tables.get(records.WATCHERS, device.id, who.session)
+        if row is not None:
+            with contextlib.suppress(Conflict):  # another tab has just said that it does
+                await self._tables.delete(records.WATCHERS, row)
+
+    async def _note(self, device: Device, who: Identity, now_ms: int) -> None:
+        # One note for all of an hour, and written first: nothing stays that nobody forgets.
+        due_ms = (now_ms // _FORGOTTEN_MS + 2) * _FORGOTTEN_MS
+        await self._forget.rows(records.WATCHERS, device.id, first="", last=None, due_ms=due_ms)
+
+        def said(known: Watcher | None) -> Watcher:
+            goes_on = known is not None and known.expires_ms > now_ms and known.pairing == device.pairing
+            since_ms = known.since_ms if known is not None and goes_on else now_ms
+            return Watcher(
+                account=who.account,
+                session=who.session,
+                name=who.name,
+                role=device.role,
+                since_ms=since_ms,
+                said_ms=now_ms,
+                expires_ms=now_ms + GOOD_MS,
+                pairing=device.pairing,
+            )
+
+        await records.upsert(self._tables, records.WATCHERS, device.id, who.session, said, Watcher)
+
+    async def _tidy(self, over: list[Row]) -> None:
+        """Delete what is over, so that a device's rows stay few."""
+        if over:
+            with contextlib.suppress(Conflict):  # somebody else tidies up
+                await self._tables.batch(records.WATCHERS, [Write("delete", row) for row in over[:MAX_BATCH]])

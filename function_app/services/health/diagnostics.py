@@ -1,0 +1,258 @@
+"""Health of devices: new measurements against what is usual and allowed, while they come in.
+
+Partition of ``Diagnostics``: device and pairing. Key: stream. A row keeps the watches of a stream's fields and the sums
+of the open window; it is written by ETag, after the faults that follow from it: a process killed in between leaves
+faults that the next one finds as they should be.
+"""
+
+import asyncio
+import fnmatch
+import logging
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+
+from device_agent.protocol import Description, Diagnostic, topics
+from function_app.domain.common.problems import Problem
+from function_app.domain.devices.devices import Agent, Device
+from function_app.domain.health import detectors, diagnosis
+from function_app.domain.health.detectors import MINUTE_MS, WINDOW_MS, Limits, Watch
+from function_app.domain.health.diagnosis import Health, Rule
+from function_app.domain.health.faults import Fault, Report, Severity
+from function_app.domain.identity.accounts import Identity
+from function_app.ports.clock import Clock
+from function_app.ports.tables import Row, Tables
+from function_app.services.devices.device_access import Devices, DeviceView
+from function_app.services.devices.spaces import Spaces
+from function_app.services.health.faults import Faults
+from function_app.services.robot_types.catalogue import RobotTypes
+from function_app.services.storage import records
+
+MAX_FIELDS = 100
+"""Fields of one stream that are watched: those listed by the robot type, then others by name; a row stays small."""
+RULES_MS = 60_000
+"""A device's rules are looked up again after this time."""
+_RULES_KEPT = 1_000
+_AT_ONCE = 20
+
+Values = Mapping[str, float]
+
+_log = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True, slots=True)
+class FieldView:
+    """One field and what is known of it."""
+
+    stream: str
+    name: str
+    rule: Rule
+    watch: Watch
+
+
+@dataclass(frozen=True, slots=True)
+class Summary:
+    """One device's health in short."""
+
+    view: DeviceView
+    health: Health
+    faults: tuple[Fault, ...]
+
+    def count(self, severity: Severity) -> int:
+        """Open faults of this severity."""
+        return sum(fault.severity is severity for fault in self.faults)
+
+
+@dataclass(frozen=True, slots=True)
+class _Kept:
+    """What a row keeps: the open window's start [ms], its sums and counts, and the watches."""
+
+    window_ms: int = 0
+    sums: dict[str, tuple[float, int]] = field(default_factory=dict)
+    watches: dict[str, Watch] = field(default_factory=dict)
+
+
+class Diagnostics:
+    """Watches what comes in, and says how devices are."""
+
+    def __init__(
+        self,
+        *,
+        tables: Tables,
+        devices: Devices,
+        faults: Faults,
+        robot_types: RobotTypes,
+        spaces: Spaces,
+        clock: Clock,
+    ) -> None:
+        self._tables = tables
+        self._devices = devices
+        self._faults = faults
+        self._robot_types = robot_types
+        self._spaces = spaces
+        self._clock = clock
+        self._rules: dict[tuple[str, str], tuple[int, tuple[Diagnostic, ...]]] = {}
+
+    async def observe(self, device: Device, stream: str, means: Sequence[tuple[int, Values]]) -> None:
+        """New measurements of a stream: when, and means over (a part of) ten seconds. Late ones are left out.
+
+        Raises:
+            Problem: ``busy``.
+        """
+        listed = await self._listed(device)
+        names = {name for _, values in means for name in values}
+        if not _rules(listed, stream, names):
+            return
+        tried: set[str] = set()
+
+        async def once() -> None:
+            row = await self._tables.get(records.DIAGNOSTICS, _partition(device), stream)
+            known = _Kept() if row is None else records.read(row, _Kept)
+            rules = _rules(listed, stream, names | set(known.sums) | set(known.watches))
+            after = known
+            for at_ms, values in sorted(means, key=lambda mean: mean[0]):
+                after = _take(after, rules, at_ms, values)
+            if after is known:
+                return
+            # Looked at when something has changed, and each minute: what a killed process left is put right then.
+            before = {name for name, watch in known.watches.items() if watch.findings}
+            now = {name for name, watch in after.watches.items() if watch.findings}
+            minute = known.window_ms // MINUTE_MS != after.window_ms // MINUTE_MS
+            if minute or now != before | tried or _worse(known, after):
+                await self._faults.settle(device, f"detector/{stream}", _reports(listed, stream, after))
+                tried.update(now)
+            data = records.fields(after)
+            if row is None:
+                await self._tables.create(records.DIAGNOSTICS, Row(_partition(device), stream, data))
+            else:
+                await self._tables.replace(records.DIAGNOSTICS, Row(row.partition, stream, data, row.etag))
+
+        await records.retry(once)
+
+    async def of_device(self, who: Identity, device_id: str) -> tuple[Summary, list[FieldView]]:
+        """A device's health, and each watched field.
+
+        Raises:
+            Problem: ``device-unknown``.
+        """
+        view = await self._devices.view(who, device_id)
+        summary = await self._summary(view)
+        listed = await self._listed(view.device)
+        page = await self._tables.query(records.DIAGNOSTICS, _partition(view.device), limit=1000)
+        fields = []
+        for row in page.rows:
+            watches = records.read(row, _Kept).watches
+            rules = _rules(listed, row.key, set(watches))
+            fields += [
+                FieldView(row.key, name, rules[name], watches[name]) for name in sorted(watches) if name in rules
+            ]
+        return summary, fields
+
+    async def summaries(
+        self, who: Identity, *, space: str | None, cursor: str | None, limit: int
+    ) -> tuple[list[Summary], str | None]:
+        """Devices with their health, worst first; a page holds those of up to ``limit`` agents.
+
+        Raises:
+            Problem: ``space-unknown``, ``cursor-invalid``.
+        """
+        if space is not None:
+            await self._spaces.get(who, space)
+        views, following = await self._devices.views(who, cursor=cursor, limit=limit)
+        chosen = [view for view in views if space in {None, view.device.space}]
+        found: list[Summary] = []
+        for first in range(0, len(chosen), _AT_ONCE):
+            found += await asyncio.gather(*(self._summary(view) for view in chosen[first : first + _AT_ONCE]))
+        return sorted(found, key=lambda summary: (-summary.health.rank, summary.view.device.id)), following
+
+    async def _summary(self, view: DeviceView) -> Summary:
+        faults = tuple(await self._faults.open(view.device))
+        return Summary(view, diagnosis.health(faults, online=view.online), faults)
+
+    async def _listed(self, device: Device) -> tuple[Diagnostic, ...]:
+        """What is said about its measurements: by itself, as a room's devices do, or else by its robot type."""
+        now_ms = self._clock.now_ms()
+        key = (device.id, device.pairing)
+        known = self._rules.get(key)
+        if known is not None and 0 <= now_ms - known[0] < RULES_MS:
+            return known[1]
+        row = await self._tables.get(records.DESCRIPTIONS, device.agent, device.name)
+        found = () if row is None else records.read(row, Description).diagnostics
+        found = found or await self._of_type(device)
+        if len(self._rules) >= _RULES_KEPT:
+            self._rules.clear()
+        self._rules[key] = (now_ms, found)
+        return found
+
+    async def _of_type(self, device: Device) -> tuple[Diagnostic, ...]:
+        row = await self._tables.get(records.AGENTS, device.agent, "agent")
+        agent = None if row is None else records.read(row, Agent)
+        if agent is None or agent.account is None:
+            return ()
+        try:
+            robot_type = await self._robot_types.get(Identity(agent.account, "", ""), device.robot_type)
+        except Problem as problem:
+            _log.debug("%s is watched without limits: %s", device.id, problem.detail)
+            return ()
+        return robot_type.diagnostics
+
+
+def _rules(listed: Sequence[Diagnostic], stream: str, names: set[str]) -> dict[str, Rule]:
+    """The rule of each field that is watched. Of the joints' own stream only those that are listed."""
+    found: dict[str, Rule] = {}
+    for name in sorted(names):
+        given = next((one for one in listed if one.stream == stream and fnmatch.fnmatchcase(name, one.fields)), None)
+        if given is not None:
+            limits = Limits(
+                low=given.low,
+                high=given.high,
+                warning_low=given.warning_low,
+                warning_high=given.warning_high,
+                change=given.change,
+                horizon_s=given.horizon_s,
+                kinds=given.questions,
+            )
+            found[name] = Rule(given.label, given.unit, given.advice, limits, listed=True)
+        elif stream != topics.JOINTS:
+            found[name] = Rule(name.partition(".")[0])
+    chosen = sorted(found, key=lambda name: (not found[name].listed, name))[:MAX_FIELDS]
+    return {name: found[name] for name in chosen}
+
+
+def _take(kept: _Kept, rules: Mapping[str, Rule], at_ms: int, values: Values) -> _Kept:
+    """One more mean; a later window closes the open one."""
+    window_ms = at_ms // WINDOW_MS * WINDOW_MS
+    if window_ms < kept.window_ms:
+        return kept
+    sums, watches = kept.sums, kept.watches
+    if window_ms > kept.window_ms:
+        watches = dict(watches)
+        for name, (total, count) in sums.items():
+            if name in rules:
+                watch = watches.get(name, Watch())
+                watches[name] = detectors.step(watch, rules[name].limits, kept.window_ms, total / count)
+        watches = {name: watch for name, watch in watches.items() if name in rules}
+        sums = {}
+    sums = dict(sums)
+    for name in rules:
+        if name in values:
+            total, count = sums.get(name, (0.0, 0))
+            sums[name] = (total + values[name], count + 1)
+    return _Kept(window_ms, sums, watches)
+
+
+def _worse(known: _Kept, after: _Kept) -> bool:
+    """Whether a field has passed a limit that had not."""
+    return any(
+        watch.breach.on and not (name in known.watches and known.watches[name].breach.on)
+        for name, watch in after.watches.items()
+    )
+
+
+def _reports(listed: Sequence[Diagnostic], stream: str, kept: _Kept) -> list[Report]:
+    rules = _rules(listed, stream, set(kept.watches))
+    reports = [diagnosis.judge(rule, stream, name, kept.watches[name]) for name, rule in rules.items()]
+    return [report for report in reports if report is not None]
+
+
+def _partition(device: Device) -> str:
+    return f"{device.id}/{device.pairing}"

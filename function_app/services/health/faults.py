@@ -1,0 +1,187 @@
+"""Faults of devices in their rows: one open fault for each code, however many processes see it at once.
+
+Partition of ``Faults``: device and pairing. Keys: ``open:<scope>:<code>``; ``past:<id>``, newest first; ``count:…``,
+how often a code was raised; ``event:<id>:<step>``, a step that is still to be told among the device's events: it is
+written together with the step, so that a process killed in between leaves it to the next.
+"""
+
+from collections.abc import Sequence
+from typing import Any
+
+import msgspec
+
+from function_app.domain.common.ids import new_suffix
+from function_app.domain.common.problems import Problem, invalid, not_found
+from function_app.domain.devices.devices import Device
+from function_app.domain.health import faults as rules
+from function_app.domain.health.faults import Fault, Report, Severity
+from function_app.ports.clock import Clock
+from function_app.ports.tables import Conflict, Row, Tables, Write
+from function_app.services.storage import records
+from function_app.services.storage.retention import DAY_MS, Forget
+from function_app.services.telemetry.event_log import Events
+
+KEEP_FAULTS_MS = 365 * DAY_MS
+"""Cleared faults are kept for so long, and so is the count of a code that is not raised any more."""
+MAX_OPEN = 64
+"""Open faults of one scope; what a device reports beyond is left out."""
+_OPEN, _PAST, _COUNT, _EVENT = "open:", "past:", "count:", "event:"
+_CODE_SHOWN = 200
+
+
+class Faults:
+    """Raises, acknowledges and clears."""
+
+    def __init__(self, *, tables: Tables, events: Events, forget: Forget, clock: Clock) -> None:
+        self._tables = tables
+        self._events = events
+        self._forget = forget
+        self._clock = clock
+
+    async def settle(self, device: Device, scope: str, reports: Sequence[Report]) -> None:
+        """Make the open faults of one scope those that are reported: raise what is new, clear what is gone.
+
+        Safe to repeat and to be done by several at once.
+
+        Args:
+            device: The device.
+            scope: Who reports: its reports say all that is wrong as it sees it.
+            reports: What is wrong now.
+
+        Raises:
+            Problem: ``busy``.
+        """
+        wanted = {_key(scope, report.code): report for report in list(reports)[:MAX_OPEN]}
+
+        async def once() -> bool:
+            rows = await self._read(device)
+            known = {row.key: row for row in rows if row.key.startswith(f"{_OPEN}{scope}:")}
+            news = any(row.key.startswith(_EVENT) for row in rows)
+            for key, row in known.items():
+                if key not in wanted:
+                    await self._clear(device, row)
+                    news = True
+            for key, report in wanted.items():
+                news |= await self._report(device, key, report, known.get(key))
+            return news
+
+        if await records.retry(once):
+            await self._tell(device)
+
+    async def open(self, device: Device) -> list[Fault]:
+        """What is wrong now, worst first, then newest first."""
+        rows = await self._read(device)
+        found = [records.read(row, Fault) for row in rows if row.key.startswith(_OPEN)]
+        return sorted(found, key=lambda fault: (-fault.severity.rank, fault.id))
+
+    async def past(self, device: Device, *, cursor: str | None, limit: int) -> tuple[list[Fault], str | None]:
+        """What was wrong, newest first.
+
+        Raises:
+            Problem: ``cursor-invalid``.
+        """
+        try:
+            page = await self._tables.query(
+                records.FAULTS, _partition(device), first=_PAST, last="past;", limit=limit, cursor=cursor
+            )
+        except ValueError as error:
+            raise invalid("The cursor is not one of this list. Begin without one.", code="cursor-invalid") from error
+        return [records.read(row, Fault) for row in page.rows], page.cursor
+
+    async def acknowledge(self, device: Device, fault: str, *, by: str) -> Fault:
+        """Somebody has seen it; it stays open until it is cleared.
+
+        Raises:
+            Problem: ``fault-unknown``, ``fault-cleared``, ``busy``.
+        """
+
+        async def once() -> Fault:
+            rows = [row for row in await self._read(device) if row.key.startswith(_OPEN)]
+            row = next((row for row in rows if row.data["id"] == fault), None)
+            if row is None:
+                if await self._tables.get(records.FAULTS, _partition(device), f"{_PAST}{fault[:64]}") is None:
+                    raise not_found("fault", fault)
+                raise Problem("fault-cleared", 409, "The fault is over", "It was cleared; there is nothing left to do.")
+            known = records.read(row, Fault)
+            seen = rules.acknowledged(known, by=by, now_ms=self._clock.now_ms())
+            if seen is not known:
+                write = Write("replace", Row(row.partition, row.key, records.fields(seen), row.etag))
+                await self._write(device, seen, "acknowledged", [write])
+            return seen
+
+        found = await records.retry(once)
+        await self._tell(device)
+        return found
+
+    async def _read(self, device: Device) -> list[Row]:
+        """What is open, and what is still to be told."""
+        page = await self._tables.query(records.FAULTS, _partition(device), first=_EVENT, last="open;", limit=1000)
+        return list(page.rows)
+
+    async def _report(self, device: Device, key: str, report: Report, row: Row | None) -> bool:
+        """Raise a fault or make it worse; whether that was news."""
+        partition = _partition(device)
+        if row is not None:
+            known = records.read(row, Fault)
+            worse = rules.reported(known, report)
+            if worse is not known:
+                write = Write("replace", Row(partition, key, records.fields(worse), row.etag))
+                await self._write(device, worse, f"worsened-{worse.worse}", [write])
+            return worse is not known
+        now_ms = self._clock.now_ms()
+        count_key = _COUNT + key.removeprefix(_OPEN)
+        counted = await self._tables.get(records.FAULTS, partition, count_key)
+        count = counted.data["count"] + 1 if counted else 1
+        fault = rules.raised(report, fault=new_suffix(now_ms), now_ms=now_ms, count=count)
+        expires_ms = now_ms + KEEP_FAULTS_MS
+        await self._forget.row(records.FAULTS, partition, count_key, due_ms=expires_ms)
+        number = Row(partition, count_key, {"count": count, "expires_ms": expires_ms}, counted.etag if counted else "")
+        writes = [
+            Write("create", Row(partition, key, records.fields(fault))),
+            Write("replace" if counted else "create", number),
+        ]
+        await self._write(device, fault, "raised", writes)
+        return True
+
+    async def _clear(self, device: Device, row: Row) -> None:
+        now_ms = self._clock.now_ms()
+        over = rules.cleared(records.read(row, Fault), now_ms=now_ms)
+        past = Row(row.partition, f"{_PAST}{over.id}", records.fields(over))
+        await self._forget.row(records.FAULTS, row.partition, past.key, due_ms=now_ms + KEEP_FAULTS_MS)
+        await self._write(device, over, "cleared", [Write("delete", row), Write("create", past)])
+
+    async def _write(self, device: Device, fault: Fault, step: str, writes: list[Write]) -> None:
+        """One step of a fault's life, with the event that tells of it."""
+        event = Row(_partition(device), f"{_EVENT}{fault.id}:{step}", _event(device, fault, step, self._clock.now_ms()))
+        await self._tables.batch(records.FAULTS, [*writes, Write("create", event)])
+
+    async def _tell(self, device: Device) -> None:
+        page = await self._tables.query(records.FAULTS, _partition(device), first=_EVENT, last="event;", limit=1000)
+        for row in page.rows:
+            await self._events.add(device.id, device.pairing, row.data)
+            try:
+                await self._tables.delete(records.FAULTS, row)
+            except Conflict:
+                continue  # another process tells the same
+
+
+def _event(device: Device, fault: Fault, step: str, now_ms: int) -> dict[str, Any]:
+    kind = step.partition("-")[0]
+    severity = fault.severity if kind in {"raised", "worsened"} else Severity.INFO
+    return {
+        "id": f"{fault.id}-{step}",
+        "device": device.name,
+        "at_ms": now_ms,
+        "kind": f"fault-{kind}",
+        "severity": severity.value,
+        "message": fault.message,
+        "data": msgspec.to_builtins(fault),
+    }
+
+
+def _key(scope: str, code: str) -> str:
+    return f"{_OPEN}{scope}:{code[:_CODE_SHOWN]}"
+
+
+def _partition(device: Device) -> str:
+    return f"{device.id}/{device.pairing}"

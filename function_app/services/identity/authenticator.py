@@ -1,0 +1,261 @@
+"""Who is asking: access tokens of people and apps, signed requests of agents."""
+
+import math
+import secrets
+from collections import OrderedDict
+from dataclasses import dataclass
+from typing import Any, Final, Literal
+
+import jwt
+from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PublicKey
+
+from device_agent.protocol.errors import ProtocolError
+from device_agent.protocol.security import signing
+from device_agent.protocol.topics import ANY
+from function_app.domain.common.ids import agent_id, new_id
+from function_app.domain.common.problems import unauthorized
+from function_app.domain.devices.devices import Agent
+from function_app.domain.identity.accounts import Identity
+from function_app.ports.clock import Clock
+from function_app.ports.signing_keys import Keys
+from function_app.ports.tables import Conflict, Row, Tables
+from function_app.services.identity.session_status import signed_out_key
+from function_app.services.storage import records
+from function_app.services.storage.retention import Forget
+
+ALGORITHM = "EdDSA"
+API: Final = "telescope/api"
+SESSION: Final = "telescope/session"
+XMPP: Final = "telescope/xmpp"
+ACCESS_S = 15 * 60
+"""One that leaks is of no use for long. Who has signed in gets the next one by the cookie."""
+SESSION_S = 12 * 3600
+AGENT_TOKEN_S = 60
+CLOCK_SKEW_S = 30
+"""How far an agent's clock may be off."""
+KNOWN_TOKENS = 4096
+RECHECK_MS = 5_000
+"""A token known to this process is checked against sign-outs again after this time."""
+
+Audience = Literal["telescope/api", "telescope/session", "telescope/xmpp"]
+
+
+@dataclass(slots=True)
+class _Known:
+    identity: Identity
+    expires_ms: int
+    checked_ms: int
+    csrf: str
+
+
+class Identify:
+    """Issues and checks tokens. Verifying a signature costs 0.1 ms: what was verified is remembered until it ends."""
+
+    def __init__(self, *, tables: Tables, keys: Keys, forget: Forget, clock: Clock) -> None:
+        self._tables = tables
+        self._forget = forget
+        self._keys = keys
+        self._clock = clock
+        self._known: OrderedDict[tuple[str, str], _Known] = OrderedDict()
+
+    async def issue(self, who: Identity, audience: Audience, lifetime_s: int, *, csrf: str | None = None) -> str:
+        """A token of one sign-in session, good no longer than that.
+
+        Args:
+            who: Account, session, and when that ends.
+            audience: What it is for.
+            lifetime_s: How long it is good for at most [s].
+            csrf: In a cookie, what a page has to show beside it.
+        """
+        key = await self._keys.current()
+        now_ms = self._clock.now_ms()
+        claims = {
+            "iss": "telescope",
+            "aud": audience,
+            "sub": who.account,
+            "name": who.name,
+            "sid": who.session,
+            "iat": now_ms // 1000,
+            "exp": now_ms // 1000 + who.lasting_s(lifetime_s, now_ms),
+            "until": who.until_ms // 1000,
+            "jti": new_id(),
+        }
+        if csrf is not None:
+            claims["csrf"] = csrf
+        return jwt.encode(claims, key, ALGORITHM, headers={"kid": signing.key_id(key.public_key())})
+
+    async def person(self, token: str, audience: Audience) -> Identity:
+        """The account and session behind a token.
+
+        Raises:
+            Problem: ``unauthorized``: forged, expired, for another purpose, or signed out.
+        """
+        return (await self._find(token, audience)).identity
+
+    async def page(self, cookie: str) -> tuple[Identity, str]:
+        """The account and session behind a page's cookie, and the CSRF token that belongs to it.
+
+        Raises:
+            Problem: ``unauthorized``, as ``person``.
+        """
+        known = await self._find(cookie, SESSION)
+        return known.identity, known.csrf
+
+    async def _find(self, token: str, audience: Audience) -> _Known:
+        now_ms = self._clock.now_ms()
+        known = self._known.get((audience, token))
+        if known is None or not self._fresh(known, now_ms):
+            # In full, and not for sign-outs alone: its key may have leaked, and counts no more.
+            known = await self._verify(token, audience)
+            self._remember((audience, token), known)
+        if now_ms >= known.expires_ms:
+            self._known.pop((audience, token), None)
+            raise unauthorized("The access token has expired. Sign in again.")
+        return known
+
+    def _remember(self, name: tuple[str, str], known: _Known) -> None:
+        """Keep what was checked just now, and nothing that would have to be checked again in any case."""
+        self._known[name] = known
+        self._known.move_to_end(name)
+        while len(self._known) > KNOWN_TOKENS or not self._fresh(next(iter(self._known.values())), known.checked_ms):
+            self._known.popitem(last=False)
+
+    @staticmethod
+    def _fresh(known: _Known, now_ms: int) -> bool:
+        return 0 <= now_ms - known.checked_ms < RECHECK_MS
+
+    async def sign_out(self, who: Identity) -> None:
+        """End the session: its tokens are refused from now on, by other instances within ``RECHECK_MS``."""
+        ends_ms = self._clock.now_ms() + SESSION_S * 1000
+        row = Row(who.account, signed_out_key(who.session), {"expires_ms": ends_ms})
+        await self._forget.row(records.ACCOUNTS, row.partition, row.key, due_ms=ends_ms)
+        try:
+            await self._tables.create(records.ACCOUNTS, row)
+        except Conflict:
+            return
+        finally:
+            for name in [name for name, known in self._known.items() if known.identity.session == who.session]:
+                del self._known[name]
+
+    async def enrolling(self, token: str, public_key: str) -> str:
+        """The id of the agent whose key is ``public_key`` and signed ``token``.
+
+        Raises:
+            Problem: ``unauthorized``.
+        """
+        try:
+            key = signing.public_key(public_key)
+        except ProtocolError as error:
+            raise unauthorized(f"public_key: {error}.") from error
+        self._check_agent(token, key)
+        return agent_id(signing.key_id(key))
+
+    async def agent(self, token: str) -> Agent:
+        """The enrolled agent that signed ``token``.
+
+        Raises:
+            Problem: ``unauthorized``: unknown key, forged, expired or too long-lived.
+        """
+        try:
+            kid = str(jwt.get_unverified_header(token).get("kid", ""))
+            agent = agent_id(kid)
+        except (jwt.PyJWTError, ValueError) as error:
+            raise unauthorized("The agent's token names no key (header kid).") from error
+        row = await self._tables.get(records.AGENTS, agent, "agent")
+        if row is None:
+            raise unauthorized("This agent is not enrolled. Enroll it first.")
+        record = records.read(row, Agent)
+        self._check_agent(token, signing.public_key(record.public_key))
+        return record
+
+    async def _verify(self, token: str, audience: Audience) -> _Known:
+        try:
+            kid = jwt.get_unverified_header(token).get("kid", "")
+            key = (await self._keys.public(str(kid))).get(str(kid))
+            if key is None:
+                raise unauthorized("The access token was not issued here. Sign in again.")
+            claims = decode(token, key, audience, now_s=self._now_s(), leeway_s=0)
+            identity = Identity(
+                account=str(claims["sub"]),
+                name=str(claims["name"]),
+                session=str(claims["sid"]),
+                # A token from before sessions told their end ends what it gives with itself.
+                until_ms=int(claims.get("until", claims["exp"])) * 1000,
+            )
+        except (jwt.PyJWTError, KeyError) as error:
+            raise unauthorized(f"The access token is refused: {error}. Sign in again.") from error
+        await self._check_signed_out(identity)
+        return _Known(identity, int(claims["exp"]) * 1000, self._clock.now_ms(), str(claims.get("csrf", "")))
+
+    async def _check_signed_out(self, who: Identity) -> None:
+        if await self._tables.get(records.ACCOUNTS, who.account, signed_out_key(who.session)) is not None:
+            raise unauthorized("This session was signed out. Sign in again.")
+
+    def _check_agent(self, token: str, key: Ed25519PublicKey) -> None:
+        try:
+            claims = decode(token, key, API, now_s=self._now_s(), leeway_s=CLOCK_SKEW_S)
+        except jwt.PyJWTError as error:
+            raise unauthorized(f"The agent's token is refused: {error}.") from error
+        if claims.get("iss") != "agent" or claims["exp"] - claims["iat"] > AGENT_TOKEN_S:
+            raise unauthorized(f"An agent's token has iss 'agent' and lives at most {AGENT_TOKEN_S} s.")
+
+    def _now_s(self) -> float:
+        return self._clock.now_ms() / 1000
+
+
+def new_session() -> str:
+    """The id of a new sign-in session."""
+    return new_id()
+
+
+def principal(who: Identity) -> str:
+    """A sign-in session, as the broker knows it: signing out ends its connections and nobody else's."""
+    return f"account:{who.account}:{who.session}"
+
+
+def watch_principal(who: Identity) -> str:
+    """The part of a sign-in session that watches: it is cut apart from what steers, and by account (``watchers``)."""
+    return f"{principal(who)}:watch"
+
+
+def watchers(account: str) -> str:
+    """All sessions of an account that watch, as a pattern for ``BrokerAccess.revoke``."""
+    return f"account:{account}:{ANY}:watch"
+
+
+def everything(account: str) -> str:
+    """All connections of an account, for ``BrokerAccess.revoke``."""
+    return f"account:{account}"
+
+
+def new_secret() -> str:
+    """A one-time token: 256 random bits."""
+    return secrets.token_urlsafe(32)
+
+
+def decode(token: str, key: Ed25519PublicKey, audience: str, *, now_s: float, leeway_s: float) -> dict[str, Any]:
+    """The claims of a signed token. Its times are judged here, by our own clock, once they are seen to be numbers.
+
+    Raises:
+        jwt.PyJWTError: Forged, for another purpose, not yet good, or expired.
+    """
+    claims: dict[str, Any] = jwt.decode(
+        token,
+        key,
+        algorithms=[ALGORITHM],
+        audience=audience,
+        options={
+            "require": ["exp", "iat", "aud", "jti"],
+            "verify_exp": False,
+            "verify_iat": False,
+            "verify_nbf": False,
+        },
+    )
+    times = (claims["iat"], claims["exp"])
+    if not all(isinstance(moment, int | float) and math.isfinite(moment) for moment in times):
+        raise jwt.DecodeError("exp and iat must be seconds since 1970")
+    if claims["iat"] > now_s + leeway_s:
+        raise jwt.ImmatureSignatureError("the token is from the future; set this machine's clock")
+    if claims["exp"] <= now_s - leeway_s:
+        raise jwt.ExpiredSignatureError("the token has expired")
+    return claims

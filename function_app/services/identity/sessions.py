@@ -1,0 +1,142 @@
+"""Sign-in sessions: begun in one place however somebody came in, and listed for the one whose they are."""
+
+from dataclasses import dataclass
+from typing import Final, Literal
+
+from function_app.domain.audit.hash_chain import Deed
+from function_app.domain.identity.accounts import Account, Identity
+from function_app.ports.clock import Clock
+from function_app.ports.tables import Conflict, Row, Tables
+from function_app.services.audit.audit_log import AuditChain
+from function_app.services.identity.authenticator import (
+    ACCESS_S,
+    API,
+    SESSION,
+    SESSION_S,
+    Identify,
+    new_secret,
+    new_session,
+)
+from function_app.services.storage import records
+from function_app.services.storage.retention import Forget
+
+How = Literal["link", "password", "open-id"]
+FRESH_MS: Final = 10 * 60 * 1000
+"""A session begun by a one-time link so lately may set a password without the old one."""
+_SHOWN: Final = 200
+_ROW: Final = "session:"
+
+
+@dataclass(frozen=True, slots=True)
+class From:
+    """Whence somebody signs in, as far as the request tells; shown to the account alone."""
+
+    address: str = ""
+    program: str = ""
+
+
+@dataclass(frozen=True, slots=True)
+class Session:
+    """One sign-in, as its account may see it.
+
+    Attributes:
+        how: By what.
+        program: What the browser or program calls itself.
+    """
+
+    id: str
+    how: How
+    since_ms: int
+    expires_ms: int
+    address: str = ""
+    program: str = ""
+
+    def fresh_by_link(self, now_ms: int) -> bool:
+        """Whether a one-time link was redeemed for it just now."""
+        return self.how == "link" and 0 <= now_ms - self.since_ms < FRESH_MS
+
+
+@dataclass(frozen=True, slots=True)
+class SignedIn:
+    """A new sign-in session.
+
+    Attributes:
+        cookie: For the page, which no script there can read.
+        csrf: What the page has to show beside its cookie.
+    """
+
+    account: Account
+    session: str
+    access_token: str
+    cookie: str
+    csrf: str
+    expires_in_s: int = ACCESS_S
+    cookie_s: int = SESSION_S
+
+
+class Sessions:
+    """Begins sessions, and knows those that an account has."""
+
+    def __init__(self, *, tables: Tables, identify: Identify, forget: Forget, chain: AuditChain, clock: Clock) -> None:
+        self._tables = tables
+        self._identify = identify
+        self._forget = forget
+        self._chain = chain
+        self._clock = clock
+
+    async def begin(self, account: Account, how: How, whence: From) -> SignedIn:
+        """A new session of somebody who has shown who they are."""
+        now_ms = self._clock.now_ms()
+        ends_ms = now_ms + SESSION_S * 1000
+        begun = Session(new_session(), how, now_ms, ends_ms, address=whence.address, program=whence.program[:_SHOWN])
+        row = Row(account.id, _ROW + begun.id, records.fields(begun))
+        await self._forget.row(records.ACCOUNTS, row.partition, row.key, due_ms=ends_ms)
+        who = Identity(account.id, account.name, begun.id, until_ms=ends_ms)
+        async with self._chain.change(account.id, Deed.SIGNED_IN, who, how=how, address=whence.address) as change:
+            await change.noted()
+            await self._tables.create(records.ACCOUNTS, row)
+        csrf = new_secret()
+        return SignedIn(
+            account=account,
+            session=begun.id,
+            access_token=await self._identify.issue(who, API, ACCESS_S),
+            cookie=await self._identify.issue(who, SESSION, SESSION_S, csrf=csrf),
+            csrf=csrf,
+        )
+
+    async def access_token(self, who: Identity) -> tuple[str, int]:
+        """The next access token of a session, and how long it is good [s]: not longer than the session."""
+        lifetime_s = who.lasting_s(ACCESS_S, self._clock.now_ms())
+        return await self._identify.issue(who, API, lifetime_s), lifetime_s
+
+    async def list(self, account: str) -> tuple[Session, ...]:
+        """The sessions of an account that have not ended, the newest first."""
+        now_ms = self._clock.now_ms()
+        found: list[Session] = []
+        cursor: str | None = None
+        while True:
+            page = await self._tables.query(
+                records.ACCOUNTS, account, first=_ROW, last="session;", limit=1000, cursor=cursor
+            )
+            found += [records.read(row, Session) for row in page.rows]
+            cursor = page.cursor
+            if cursor is None:
+                break
+        live = [session for session in found if now_ms < session.expires_ms]
+        return tuple(sorted(live, key=lambda session: -session.since_ms))
+
+    async def get(self, who: Identity) -> Session | None:
+        """The session that asks, as it was begun."""
+        row = await self._tables.get(records.ACCOUNTS, who.account, _ROW + who.session)
+        return records.read(row, Session) if row else None
+
+    async def drop(self, account: str, session: str) -> bool:
+        """Take one off the list; whether it was there."""
+        row = await self._tables.get(records.ACCOUNTS, account, _ROW + session)
+        if row is None:
+            return False
+        try:
+            await self._tables.delete(records.ACCOUNTS, row)
+        except Conflict:
+            return False
+        return True

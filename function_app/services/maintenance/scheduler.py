@@ -1,0 +1,255 @@
+"""What time brings: commands that nobody answered, actions without an end, codes and links that ran out.
+
+Run every second by one or more timers; every step is safe to repeat and to be run by two at once.
+"""
+
+import logging
+
+from device_agent.protocol import CancelAction
+from function_app.domain.actions.action import Action, Status, Verdict, end, judge, next_look_ms
+from function_app.domain.actions.queue import DROPPED
+from function_app.domain.common.ids import CLAIM_ALPHABET
+from function_app.domain.common.problems import Problem
+from function_app.ports.broker_access import BrokerAccess, BrokerAccessError
+from function_app.ports.clock import Clock
+from function_app.ports.command_bus import BusUnavailable
+from function_app.ports.tables import Conflict, Row, Tables
+from function_app.services.accounts.api_keys import ApiKeys, about_key
+from function_app.services.actions.action_store import ActionRows, Found, place
+from function_app.services.actions.dispatcher import MovementChanged, NoLonger, SendAction
+from function_app.services.actions.queue import TIMEOUT, Queues, queue_of
+from function_app.services.actions.start import ABANDON_MS
+from function_app.services.audit.audit_log import AuditChain, anchor_of, chain_of
+from function_app.services.control.control_events import Audit, lease_of
+from function_app.services.health.reported_faults import Conditions
+from function_app.services.messaging.command_sender import Commands
+from function_app.services.pairing.offboarding import Leave, leaver_of
+from function_app.services.robot_types.cleanup import TendRobotTypes
+from function_app.services.sharing.invitations import Invitations, about_transfer
+from function_app.services.sharing.shares import Sharing, about_share
+from function_app.services.storage import records
+from function_app.services.storage.reminders import SHARDS, Pending
+from function_app.services.storage.retention import DAY_MS, Forget
+from function_app.services.telemetry.ingest import Intake
+from function_app.services.telemetry.uploads import Uploads
+
+ORPHAN_MS = 2 * ABANDON_MS
+"""A note whose action was never written is kept this long: whoever writes it gives up before."""
+KEEP_ONCE_MS = DAY_MS
+"""An idempotency key is good for a day."""
+_ENDING = frozenset({Verdict.ENDED, Verdict.LOSE, Verdict.EXPIRE})
+_HEX = "0123456789abcdef"
+
+_log = logging.getLogger(__name__)
+
+
+class Sweep:
+    """The timer's work."""
+
+    def __init__(
+        self,
+        *,
+        tables: Tables,
+        rows: ActionRows,
+        pending: Pending,
+        commands: Commands,
+        sending: SendAction,
+        queues: Queues,
+        leave: Leave,
+        sharing: Sharing,
+        invitations: Invitations,
+        api_keys: ApiKeys,
+        audit: Audit,
+        chain: AuditChain,
+        access: BrokerAccess,
+        forget: Forget,
+        conditions: Conditions,
+        intake: Intake,
+        uploads: Uploads,
+        robot_types: TendRobotTypes,
+        keep_actions_ms: int,
+        clock: Clock,
+    ) -> None:
+        self._tables = tables
+        self._rows = rows
+        self._pending = pending
+        self._commands = commands
+        self._sending = sending
+        self._queues = queues
+        self._leave = leave
+        self._sharing = sharing
+        self._invitations = invitations
+        self._api_keys = api_keys
+        self._audit = audit
+        self._chain = chain
+        self._access = access
+        self._forget = forget
+        self._conditions = conditions
+        self._intake = intake
+        self._uploads = uploads
+        self._robot_types = robot_types
+        self._keep_actions_ms = keep_actions_ms
+        self._clock = clock
+        self._turn = 0
+
+    async def run(self) -> None:
+        """One round. What fails is logged and comes again in the next round.
+
+        Raises:
+            StoreError: The tables cannot be used.
+        """
+        for shard in range(SHARDS):
+            for action, note in await self._pending.due(shard, self._clock.now_ms()):
+                try:
+                    await self._look(action, note)
+                except (Problem, BusUnavailable) as error:
+                    _log.warning("action %s: %s", action, error)
+        await self._forget_expired()
+        await self._forget.run(self._clock.now_ms())
+        try:
+            await self._conditions.run(self._clock.now_ms())
+        except Problem as problem:
+            _log.warning("silent devices: %s", problem.detail)
+        await self._intake.distribute_left()
+        await self._uploads.forget_due()
+        await self._robot_types.run()
+        try:
+            await self._access.expire(self._clock.now_ms() / 1000)
+        except BrokerAccessError as error:
+            _log.warning("broker access: %s", error)
+
+    async def _look(self, what: str, note: Row) -> None:
+        if device := queue_of(what):
+            await self._look_at_queue(device, note)
+        elif agent := leaver_of(what):
+            await self._look_at_leaver(agent, note)
+        elif about_share(what):
+            await self._sharing.look(what, note)
+        elif about_key(what):
+            await self._api_keys.look(what, note)
+        elif about_transfer(what):
+            await self._invitations.go_on(what, note)
+        elif device := lease_of(what):
+            await self._audit.look(device)
+            await self._pending.drop(note)
+        elif owner := chain_of(what):
+            await self._chain.look(owner)
+            await self._pending.drop(note)
+        elif owner := anchor_of(what):
+            await self._chain.anchor(owner)
+            await self._pending.drop(note)
+        else:
+            await self._look_at_action(what, note)
+
+    async def _look_at_action(self, action_id: str, note: Row) -> None:
+        found = await self._rows.get(action_id)
+        now_ms = self._clock.now_ms()
+        if found is None:
+            if now_ms - int(note.key.partition(":")[0]) > ORPHAN_MS:
+                await self._pending.drop(note)
+            return
+        await self._audit.tell(found.action.device)
+        verdict = judge(found.action, now_ms)
+        if verdict in _ENDING:
+            after = await self._ended(found, verdict, now_ms)
+            if after is not None and after.status.terminal:
+                await self._keep_for_a_while(after)
+            elif after is not None:  # something was heard of it meanwhile
+                await self._pending.note(action_id, next_look_ms(after, now_ms))
+        else:
+            # The next note before this one goes: a stop in between leaves two, which is one too many, not too few.
+            await self._pending.note(action_id, next_look_ms(found.action, now_ms))
+            if verdict is Verdict.PUBLISH:
+                await self._publish(found, now_ms)
+            elif verdict is Verdict.CANCEL:
+                await self._cancel(found.action)
+        await self._pending.drop(note)
+
+    async def _ended(self, found: Found, verdict: Verdict, now_ms: int) -> Action | None:
+        """The action with its end, known or given now, unless it has come to deserve another verdict."""
+        if verdict is Verdict.ENDED:
+            return found.action
+        if verdict is Verdict.LOSE:
+            await self._cancel(found.action)
+            message = "The device did not say how it ended before its time was over. Look at the device."
+            return await self._end(found, Status.FAILED, "lost", message, now_ms)
+        if found.action.status is Status.QUEUED:
+            return await self._end(found, Status.EXPIRED, "queue-timeout", TIMEOUT, now_ms)
+        if found.action.cancel_id:
+            message = "Cancelled before the device took it."
+            return await self._end(found, Status.CANCELLED, "cancelled", message, now_ms)
+        message = "The device did not take the command in time. Check that it is online, then start it again."
+        return await self._end(found, Status.EXPIRED, "no-answer", message, now_ms)
+
+    async def _look_at_queue(self, device: str, note: Row) -> None:
+        """Whoever freed the slot may have been killed before it gave the next one its turn."""
+        if await self._queues.look(device):
+            await self._queues.watch(device)
+        elif self._clock.now_ms() - int(note.key.partition(":")[0]) <= ORPHAN_MS:
+            return  # somebody may be about to put an action into it
+        await self._pending.drop(note)
+
+    async def _look_at_leaver(self, agent: str, note: Row) -> None:
+        """Whoever un-paired or moved it may have been killed, or could not reach the broker."""
+        if not await self._leave.finish(agent):
+            await self._leave.watch(agent)
+        elif self._clock.now_ms() - int(note.key.partition(":")[0]) <= ORPHAN_MS:
+            return  # somebody may be about to write what this is about
+        await self._pending.drop(note)
+
+    async def _end(self, found: Found, status: Status, code: str, message: str, now_ms: int) -> Action | None:
+        verdict = judge(found.action, now_ms)
+
+        def ended(action: Action) -> Action:
+            # An ack, or its turn, may have come since it was read.
+            return end(action, status, code, message, now_ms) if judge(action, now_ms) is verdict else action
+
+        after = await self._queues.change(found.action.id, ended, known=found)
+        return None if after is None else after.action
+
+    async def _keep_for_a_while(self, action: Action) -> None:
+        """See that an action that has ended, and the key it was started with, will be forgotten."""
+        where = place(action.id)
+        if where is None:
+            return
+        await self._forget.row(records.CONTROL, *where, due_ms=action.ended_ms + self._keep_actions_ms)
+        if action.once:
+            await self._forget.row(records.CONTROL, where[0], action.once, due_ms=action.created_ms + KEEP_ONCE_MS)
+
+    async def _publish(self, found: Found, now_ms: int) -> None:
+        """Send the very same command again: same id, same time of issue, so the device runs it at most once."""
+        device = await self._sending.device(found.action)
+        if device is None:
+            message = "The device was un-paired before the command reached it."
+            await self._end(found, Status.FAILED, "unpaired", message, now_ms)
+            return
+        try:
+            await self._sending.send(found, device)
+        except MovementChanged:
+            message = "The movement's script was changed before the command could be sent. Start it again."
+            await self._end(found, Status.FAILED, "movement-changed", message, now_ms)
+        except NoLonger as ended:
+            status, message = DROPPED[ended.why]
+            await self._end(found, status, ended.why, message, now_ms)
+
+    async def _cancel(self, action: Action) -> None:
+        device = await self._sending.device(action)
+        if device is None:
+            return
+        try:
+            await self._commands.send(device, CancelAction(action=action.id), who=action.who, epoch=action.epoch)
+        except BusUnavailable as error:
+            _log.warning("cancel of %s: %s", action.id, error)
+
+    async def _forget_expired(self) -> None:
+        """Claim codes and sign-in links whose time is over, a part of them each round."""
+        self._turn += 1
+        now_ms = self._clock.now_ms()
+        for table, shards in ((records.CLAIMS, CLAIM_ALPHABET), (records.SIGN_INS, _HEX)):
+            page = await self._tables.query(table, shards[self._turn % len(shards)], limit=1000)
+            for row in page.rows:
+                if now_ms >= row.data["expires_ms"]:
+                    try:
+                        await self._tables.delete(table, row)
+                    except Conflict:
+                        continue

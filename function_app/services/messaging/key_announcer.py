@@ -1,0 +1,49 @@
+"""Tells agents of a new signing key while they still learn it: by an order that the key before has signed."""
+
+import logging
+
+from device_agent.protocol import FollowKey
+from function_app.domain.common.problems import Problem
+from function_app.domain.devices.devices import Agent
+from function_app.ports.command_bus import BusUnavailable
+from function_app.ports.signing_keys import Keys
+from function_app.services.devices.device_access import devices_of
+from function_app.services.messaging.command_sender import Commands
+
+_WHO = "telescope"
+_log = logging.getLogger(__name__)
+
+
+class TellKeys:
+    """The word of mouth. Agents also ask by themselves, with every request for credentials."""
+
+    def __init__(self, *, keys: Keys, commands: Commands) -> None:
+        self._keys = keys
+        self._commands = commands
+        self._serial = 0
+        self._told: set[str] = set()
+
+    async def heard(self, agent: Agent, device: str) -> None:
+        """A device has said something: so its agent is there to be told, once by each process.
+
+        Raises:
+            StoreError: The keys cannot be read.
+        """
+        news = await self._keys.news()
+        learning = news.signing != news.pins[-1].id
+        if not learning or not news.statements:
+            return
+        if news.serial != self._serial:
+            self._serial = news.serial
+            self._told.clear()
+        if agent.id in self._told:
+            return
+        found = next((each for each in devices_of(agent) if each.name == device), None)
+        if found is None:
+            return
+        try:
+            await self._commands.send(found, FollowKey(statements=news.statements), who=_WHO, epoch=0)
+        except (BusUnavailable, Problem) as error:
+            _log.warning("agent %s could not be told of a new key: %s", agent.id, error)
+            return
+        self._told.add(agent.id)

@@ -1,0 +1,61 @@
+"""An agent asks for its commands; that it asks shows that it is there."""
+
+import asyncio
+import contextlib
+from collections.abc import Collection
+
+from function_app.domain.devices.devices import Agent, Link, polled
+from function_app.ports.clock import Clock
+from function_app.ports.tables import Tables
+from function_app.services.devices.device_access import require_claimed
+from function_app.services.messaging.mailbox import Letter, Mailbox
+from function_app.services.storage import records
+
+_LOOK_S = 0.05
+_SLOWEST_LOOK_S = 0.25
+"""Another instance may have put a command into the mailbox: then nothing but looking tells."""
+
+
+class Polling:
+    """Polls, plain and long."""
+
+    def __init__(self, *, tables: Tables, mailbox: Mailbox, clock: Clock) -> None:
+        self._tables = tables
+        self._mailbox = mailbox
+        self._clock = clock
+
+    async def commands(self, agent: Agent, *, wait_ms: int, limit: int, have: Collection[str]) -> list[Letter]:
+        """Commands that wait for the agent, as soon as there is one, or none after ``wait_ms``.
+
+        Raises:
+            Problem: ``agent-unclaimed``, ``busy``.
+        """
+        require_claimed(agent)
+        await self.seen(agent)
+        loop = asyncio.get_running_loop()
+        end = loop.time() + wait_ms / 1000
+        pause_s = _LOOK_S
+        with self._mailbox.listen(agent.id) as bell:
+            while True:
+                bell.clear()
+                found = await self._mailbox.waiting(agent, limit=limit, have=have)
+                left_s = end - loop.time()
+                if found or left_s <= 0:
+                    return found
+                with contextlib.suppress(TimeoutError):
+                    async with asyncio.timeout(min(pause_s, left_s)):
+                        await bell.wait()
+                pause_s = min(2 * pause_s, _SLOWEST_LOOK_S)
+
+    async def seen(self, agent: Agent) -> None:
+        """Note that the agent is there; written only now and then. Of one on MQTT its connection tells.
+
+        Raises:
+            Problem: ``busy``.
+        """
+        if agent.transport == "mqtt":
+            return
+        now_ms = self._clock.now_ms()
+        await records.upsert(
+            self._tables, records.AGENTS, agent.id, "link", lambda known: polled(known, now_ms, agent.pairing), Link
+        )

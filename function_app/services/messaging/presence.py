@@ -1,0 +1,85 @@
+"""What agents say of themselves and their devices, into the tables: presence, description, state, events."""
+
+from typing import TypeVar
+
+import msgspec
+
+from device_agent.protocol import Description, Event, Presence, State, codec, topics
+from device_agent.protocol.errors import ProtocolError
+from device_agent.protocol.topics import Topic
+from function_app.domain.common.ids import device_id
+from function_app.domain.common.json_depth import MAX_LEVELS, too_deep
+from function_app.domain.common.timestamps import LAST_MS
+from function_app.domain.devices.devices import Agent, LastState, Link, Transport, newer_link
+from function_app.ports.clock import Clock
+from function_app.ports.tables import Tables
+from function_app.services.health.reported_faults import Conditions
+from function_app.services.messaging.key_announcer import TellKeys
+from function_app.services.storage import records
+from function_app.services.telemetry.event_log import Events
+
+T = TypeVar("T")
+
+
+class PresenceIngest:
+    """Writes down what arrives. Safe to repeat; what does not belong to a claimed agent is dropped."""
+
+    def __init__(self, *, tables: Tables, events: Events, conditions: Conditions, keys: TellKeys, clock: Clock) -> None:
+        self._tables = tables
+        self._events = events
+        self._conditions = conditions
+        self._keys = keys
+        self._clock = clock
+
+    async def ingest(self, topic: Topic, payload: bytes, *, by: Transport = "mqtt") -> None:
+        """Take one message in.
+
+        What an agent has said by another way is told to the broker too and comes back from there, perhaps late: then
+        it is not taken a second time.
+
+        Raises:
+            ProtocolError: It is not what its topic says.
+            Problem: ``busy``: not stored, to be delivered again.
+        """
+        row = await self._tables.get(records.AGENTS, topic.agent, "agent")
+        if row is None:
+            return
+        agent = records.read(row, Agent)
+        if agent.space != topic.space or (topic.device and agent.device(topic.device) is None):
+            return
+        if agent.transport == "mqtt" or by != "mqtt":
+            await self._store(agent, topic, payload, by)
+
+    async def _store(self, agent: Agent, topic: Topic, payload: bytes, by: Transport) -> None:
+        now_ms = self._clock.now_ms()
+        if topic.kind == topics.CONN:
+            presence = codec.decode(payload, Presence)
+            link = Link(presence.online, presence.session, now_ms, by == "http", agent.pairing)
+            if link.online:
+                await self._conditions.connected(agent, link.session)
+            await records.upsert(
+                self._tables, records.AGENTS, topic.agent, "link", lambda known: newer_link(known, link), Link
+            )
+        elif topic.kind == topics.STATE:
+            said = codec.decode(payload, State)
+            await self._conditions.said(agent, topic.device, said)
+            state = LastState(msgspec.to_builtins(said), now_ms, agent.pairing)
+            await records.upsert(
+                self._tables, records.AGENTS, topic.agent, f"state:{topic.device}", lambda _: state, LastState
+            )
+            await self._keys.heard(agent, topic.device)
+        elif topic.kind == topics.DESC and not topic.name:
+            description = codec.decode(payload, Description)
+            await records.upsert(
+                self._tables, records.DESCRIPTIONS, topic.agent, topic.device, lambda _: description, Description
+            )
+        elif topic.kind == topics.EVENT:
+            await self._event(agent, topic, codec.decode(payload, Event))
+
+    async def _event(self, agent: Agent, topic: Topic, event: Event) -> None:
+        """By its id, so that one that is delivered twice is stored once."""
+        if too_deep(event.data):
+            raise ProtocolError(f"the event's data are nested more than {MAX_LEVELS} levels deep")
+        if event.at_ms > LAST_MS:
+            raise ProtocolError("the event's `at_ms` is not a time of milliseconds since 1970")
+        await self._events.add(device_id(topic.agent, topic.device), agent.pairing, msgspec.to_builtins(event))

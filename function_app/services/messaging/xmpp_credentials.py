@@ -1,0 +1,207 @@
+"""Who may log in at the XMPP server, for how long, and whom they know there: passwords made, and looked at again.
+
+A password is a signed token for this purpose alone, so whoever sees it can do nothing else with it. The server asks at
+each login; nothing is written. A user is an agent, an account, or the cloud, and the first two know each other exactly
+while the one is paired with the other.
+"""
+
+from dataclasses import dataclass
+from typing import Final, Literal
+
+import jwt
+
+from device_agent.protocol.security import signing
+from device_agent.protocol.topics import is_id
+from device_agent.protocol.xmpp import jids
+from function_app.domain.common.ids import AGENT_LENGTH, new_id
+from function_app.domain.common.problems import Problem, unauthorized
+from function_app.domain.devices.devices import Agent
+from function_app.domain.identity.accounts import Identity
+from function_app.ports.clock import Clock
+from function_app.ports.signing_keys import Keys
+from function_app.ports.tables import Tables
+from function_app.services.devices.device_access import Devices, require_claimed
+from function_app.services.identity.authenticator import ALGORITHM, SESSION_S, XMPP, Identify, decode
+from function_app.services.identity.sign_in import SignIn
+from function_app.services.storage import records
+
+AGENT_S: Final = 3600
+LOGIN_S: Final = 3600
+"""A connection of a person ends after this time: who has signed out does not come back then."""
+CLOUD_NAME: Final = "Telescope"
+_SERVICE: Final = "service:xmpp"
+_PAGE = 1000
+
+
+@dataclass(frozen=True, slots=True)
+class Password:
+    """What to log in with."""
+
+    user: str
+    password: str
+    expires_ms: int
+    lifetime_s: int
+
+
+@dataclass(frozen=True, slots=True)
+class Contact:
+    """Somebody whom a user knows: the user part of a JID, and a name for people."""
+
+    user: str
+    name: str
+
+
+@dataclass(frozen=True, slots=True)
+class Admitted:
+    """Who has logged in, until when, and whom they know."""
+
+    user: str
+    name: str
+    kind: Literal["agent", "account", "cloud"]
+    lifetime_s: int
+    contacts: tuple[Contact, ...]
+
+
+class XmppAccess:
+    """Makes and checks passwords.
+
+    Args:
+        tables: Agents.
+        keys: Signs, and checks.
+        identify: Tokens of people.
+        sign_in: Names of accounts.
+        devices: The agents of an account.
+        clock: Of the cloud.
+        domain: The part of every JID after the ``@``; empty where there is no XMPP server.
+    """
+
+    def __init__(
+        self,
+        *,
+        tables: Tables,
+        keys: Keys,
+        identify: Identify,
+        sign_in: SignIn,
+        devices: Devices,
+        clock: Clock,
+        domain: str,
+    ) -> None:
+        self._tables = tables
+        self._keys = keys
+        self._identify = identify
+        self._sign_in = sign_in
+        self._devices = devices
+        self._clock = clock
+        self._domain = domain
+
+    async def agent(self, agent: Agent) -> Password:
+        """For an agent.
+
+        Raises:
+            Problem: ``xmpp-unavailable``, ``agent-unclaimed``.
+        """
+        self._require()
+        require_claimed(agent)
+        return await self._signed(agent.id, f"agent:{agent.id}", AGENT_S, pairing=agent.pairing)
+
+    async def account(self, who: Identity) -> Password:
+        """For a person's own XMPP client; good as long as the sign-in session.
+
+        Raises:
+            Problem: ``xmpp-unavailable``.
+        """
+        self._require()
+        now_ms = self._clock.now_ms()
+        lifetime_s = who.lasting_s(SESSION_S, now_ms)
+        token = await self._identify.issue(who, XMPP, lifetime_s)
+        return Password(who.account, token, now_ms + lifetime_s * 1000, lifetime_s)
+
+    async def cloud(self) -> Password:
+        """For the program that speaks for the cloud.
+
+        Raises:
+            Problem: ``xmpp-unavailable``.
+        """
+        self._require()
+        return await self._signed(jids.CLOUD, _SERVICE, AGENT_S)
+
+    async def verify(self, user: str, password: str) -> Admitted:
+        """Who this is.
+
+        Raises:
+            Problem: ``unauthorized``: not with this password, or not any more; ``xmpp-unavailable``.
+        """
+        self._require()
+        if user == jids.CLOUD:
+            claims = await self._claims(password)
+            if claims.get("sub") != _SERVICE:
+                raise _refused()
+            return Admitted(user, CLOUD_NAME, "cloud", self._left_s(claims), ())
+        if len(user) == AGENT_LENGTH and is_id(user):
+            return await self._verify_agent(user, password)
+        return await self._verify_account(user, password)
+
+    async def _verify_agent(self, user: str, password: str) -> Admitted:
+        claims = await self._claims(password)
+        row = await self._tables.get(records.AGENTS, user, "agent")
+        agent = None if row is None else records.read(row, Agent)
+        if claims.get("sub") != f"agent:{user}" or agent is None or agent.account is None:
+            raise _refused()
+        if claims.get("pairing") != agent.pairing:
+            raise _refused()
+        owner = await self._sign_in.named(agent.account)
+        contacts = (Contact(jids.CLOUD, CLOUD_NAME), Contact(agent.account, owner))
+        return Admitted(user, agent.name, "agent", self._left_s(claims), contacts)
+
+    async def _verify_account(self, user: str, password: str) -> Admitted:
+        who = await self._identify.person(password, XMPP)
+        if who.account != user:
+            raise _refused()
+        contacts = [Contact(jids.CLOUD, CLOUD_NAME)]
+        cursor: str | None = None
+        while True:
+            agents, cursor = await self._devices.agents(who, cursor=cursor, limit=_PAGE)
+            contacts += [Contact(agent.id, agent.name) for agent in agents if agent.transport == "xmpp"]
+            if cursor is None:
+                left_s = who.lasting_s(LOGIN_S, self._clock.now_ms())
+                return Admitted(user, who.name, "account", left_s, tuple(contacts))
+
+    def _require(self) -> None:
+        if not self._domain:
+            detail = "These functions have no XMPP server. Use another transport, or set TELESCOPE_XMPP_DOMAIN here."
+            raise Problem("xmpp-unavailable", 409, "No XMPP here", detail)
+
+    async def _signed(self, user: str, subject: str, lifetime_s: int, **more: str) -> Password:
+        key = await self._keys.current()
+        now_s = self._clock.now_ms() // 1000
+        expires_s = now_s + lifetime_s
+        claims = {
+            "iss": "telescope",
+            "aud": XMPP,
+            "sub": subject,
+            "iat": now_s,
+            "exp": expires_s,
+            "jti": new_id(),
+            **more,
+        }
+        token = jwt.encode(claims, key, ALGORITHM, headers={"kid": signing.key_id(key.public_key())})
+        return Password(user, token, expires_s * 1000, lifetime_s)
+
+    async def _claims(self, token: str) -> dict[str, object]:
+        try:
+            kid = str(jwt.get_unverified_header(token).get("kid", ""))
+            key = (await self._keys.public(kid)).get(kid)
+            if key is None:
+                raise _refused()
+            return decode(token, key, XMPP, now_s=self._clock.now_ms() / 1000, leeway_s=0)
+        except (jwt.PyJWTError, ValueError) as error:
+            raise _refused() from error
+
+    def _left_s(self, claims: dict[str, object]) -> int:
+        ends_s = claims["exp"]
+        assert isinstance(ends_s, int | float)  # noqa: S101 (`decode` has seen to it)
+        return max(1, int(ends_s - self._clock.now_ms() / 1000))
+
+
+def _refused() -> Problem:
+    return unauthorized("Nobody logs in with this name and password. Ask for new credentials.")

@@ -1,0 +1,33 @@
+"""Certificates of agents, where the broker wants to see them."""
+
+from function_app.domain.common.problems import Problem, broker_unavailable, invalid
+from function_app.domain.devices.devices import Agent
+from function_app.ports.broker_access import BrokerAccessError
+from function_app.ports.certificates import CertificateRefused, Certificates, Issued
+from function_app.services.devices.device_access import require_claimed
+
+
+class Certify:
+    """Gives an agent that is claimed a certificate of its own."""
+
+    def __init__(self, *, certificates: Certificates) -> None:
+        self._certificates = certificates
+
+    async def certify(self, agent: Agent, request: str) -> Issued:
+        """Sign a request of the agent's.
+
+        Raises:
+            Problem: ``agent-unclaimed``; ``certificates-unused``: the broker wants none; ``invalid``: it is no request;
+                ``broker-unavailable``.
+        """
+        space = require_claimed(agent)
+        if not self._certificates.wanted:
+            detail = "The broker here wants no certificates of agents."
+            raise Problem("certificates-unused", 409, "No certificates here", detail)
+        try:
+            await self._certificates.place(agent.id, space)
+            return await self._certificates.issue(agent.id, request)
+        except CertificateRefused as refused:
+            raise invalid(f"request: {refused}.") from refused
+        except BrokerAccessError as error:
+            raise broker_unavailable(f"{error}.") from error

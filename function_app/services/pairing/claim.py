@@ -1,0 +1,105 @@
+"""An account claims an agent with the code that the agent shows; and gives it up again."""
+
+import contextlib
+from dataclasses import dataclass
+
+from function_app.domain.audit.hash_chain import Deed
+from function_app.domain.common.ids import new_id, read_claim_code
+from function_app.domain.common.problems import Problem, not_found
+from function_app.domain.devices import devices
+from function_app.domain.devices.devices import Agent
+from function_app.domain.identity.accounts import Identity
+from function_app.ports.clock import Clock
+from function_app.ports.tables import Conflict, Row, Tables
+from function_app.services.audit.audit_log import AuditChain, Change
+from function_app.services.identity.guess_limiter import Attempts, Guess, by_address
+from function_app.services.identity.sign_in import SignIn
+from function_app.services.pairing.offboarding import Leave
+from function_app.services.storage import records
+
+WRONG_TRIES = 5
+GUESS = Guess("claim", 300_000, "Too many wrong claim codes.")
+
+
+@dataclass(frozen=True, slots=True)
+class _Member:
+    pairing: str = ""
+
+
+class Claim:
+    """Pairing by claim code. What decides is one ETag write on the agent's row."""
+
+    def __init__(
+        self, *, tables: Tables, sign_in: SignIn, attempts: Attempts, leave: Leave, chain: AuditChain, clock: Clock
+    ) -> None:
+        self._tables = tables
+        self._attempts = attempts
+        self._leave = leave
+        self._sign_in = sign_in
+        self._chain = chain
+        self._clock = clock
+
+    async def claim(self, who: Identity, text: str, space: str | None, *, address: str = "") -> Agent:
+        """Make the agent that shows this code an agent of ``who``.
+
+        Wrong codes are counted by the account and, where it is known, by the address that the request comes from; a
+        right code is not.
+
+        Raises:
+            Problem: ``claim-code-unknown`` for a wrong, used or expired code alike; ``too-many-tries``;
+                ``space-unknown``.
+        """
+        spaces = await self._sign_in.spaces(who.account)
+        chosen = next((known.id for known in spaces if space in (None, known.id)), None)
+        if chosen is None:
+            raise not_found("space", space or "")
+        counters = {who.account: WRONG_TRIES, **by_address(address, WRONG_TRIES)}
+        try:
+            await self._attempts.count(GUESS, counters)
+            agent = await self._redeem(who, read_claim_code(text), chosen)
+        except Problem as problem:
+            await self._refused(who, problem, address)
+            raise
+        if agent is None:
+            detail = "This code is wrong, used or expired. Codes live five minutes; the agent shows its newest."
+            unknown = Problem("claim-code-unknown", 404, "No such claim code", detail)
+            await self._refused(who, unknown, address)
+            raise unknown
+        await self._attempts.uncount(GUESS, counters)
+        return agent
+
+    async def _refused(self, who: Identity, problem: Problem, address: str) -> None:
+        await self._chain.refused(who.account, Deed.CLAIM_REFUSED, who, code=problem.code, address=address)
+
+    async def _redeem(self, who: Identity, code: str | None, space: str) -> Agent | None:
+        if code is None:
+            return None
+        found = await self._tables.get(records.CLAIMS, code[0], code)
+        if found is None:
+            return None
+        agent = str(found.data["agent"])
+        async with self._chain.change(who.account, Deed.AGENT_CLAIMED, who, on=agent, space=space) as change:
+            claimed = await records.retry(lambda: self._take(who, code, agent, space, change))
+            if claimed is None:
+                change.came_to_nothing = True
+        if claimed is not None:
+            with contextlib.suppress(Conflict):
+                await self._tables.delete(records.CLAIMS, found)
+        return claimed
+
+    async def _take(self, who: Identity, code: str, agent_id: str, space: str, change: Change) -> Agent | None:
+        row = await self._tables.get(records.AGENTS, agent_id, "agent")
+        if row is None:
+            return None
+        agent = records.read(row, Agent)
+        now_ms = self._clock.now_ms()
+        if agent.claimed or agent.claim_code != code or now_ms >= agent.claim_expires_ms:
+            return None
+        await self._leave.settle(agent)
+        await change.noted()
+        claimed = devices.claim(agent, account=who.account, space=space, pairing=new_id(), now_ms=now_ms)
+        # The index first: without the agent's row behind it it shows nothing, so a stop in between leaves no harm.
+        member = _Member(claimed.pairing)
+        await records.upsert(self._tables, records.MEMBERS, who.account, f"agent:{agent.id}", lambda _: member, _Member)
+        await self._tables.replace(records.AGENTS, Row(agent.id, "agent", records.fields(claimed), row.etag))
+        return claimed

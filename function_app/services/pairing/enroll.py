@@ -1,0 +1,105 @@
+"""An agent makes itself known with its own key, and waits to be claimed."""
+
+import asyncio
+from dataclasses import dataclass, replace
+
+from function_app.domain.common.ids import new_claim_code
+from function_app.domain.common.problems import Problem
+from function_app.domain.devices.devices import Agent, DeviceSpec, Transport, introduced
+from function_app.ports.clock import Clock
+from function_app.ports.tables import Conflict, Row, Tables, Write
+from function_app.services.pairing.offboarding import Leave
+from function_app.services.storage import records
+from function_app.services.storage.retention import DAY_MS, Forget
+
+CLAIM_MS = 300_000
+KEEP_UNCLAIMED_MS = 7 * DAY_MS
+"""An agent that waits shows a new code every few minutes: one that nobody has heard of for so long is gone."""
+_LOOK_S = 0.2
+
+
+@dataclass(frozen=True, slots=True)
+class Enrollment:
+    """What an agent says about itself."""
+
+    name: str
+    public_key: str
+    software: str
+    devices: tuple[DeviceSpec, ...]
+    transport: Transport = "mqtt"
+
+
+class Enroll:
+    """Enrolment of agents."""
+
+    def __init__(self, *, tables: Tables, leave: Leave, forget: Forget, clock: Clock) -> None:
+        self._tables = tables
+        self._leave = leave
+        self._forget = forget
+        self._clock = clock
+
+    async def enroll(self, agent: str, told: Enrollment) -> Agent:
+        """Make or refresh the agent's row; while nobody owns it, with a new claim code.
+
+        What a device that is no longer named was doing ends. The code's row is written first: a code without an agent's
+        row behind it claims nothing.
+
+        Raises:
+            Problem: ``agent-id-taken``: another key has the same id (one in 2⁵⁰).
+        """
+
+        async def once() -> Agent:
+            row = await self._tables.get(records.AGENTS, agent, "agent")
+            now_ms = self._clock.now_ms()
+            if row is None:
+                record = Agent(agent, told.name, told.public_key, told.software, told.devices, now_ms)
+            else:
+                record = records.read(row, Agent)
+                if record.public_key != told.public_key:
+                    detail = "Another agent's key has the same id. Make a new key."
+                    raise Problem("agent-id-taken", 409, "The id is taken", detail)
+                before = record.leaving
+                record = replace(introduced(record, told.devices), name=told.name, software=told.software)
+                if record.leaving != before:
+                    await self._leave.watch(agent)
+            record = replace(record, transport=told.transport)
+            if not record.claimed:
+                expires_ms = now_ms + CLAIM_MS
+                code = await self._new_code(agent, expires_ms)
+                forget_ms = now_ms + KEEP_UNCLAIMED_MS
+                await self._forget.row(records.AGENTS, agent, "agent", due_ms=(forget_ms // DAY_MS + 1) * DAY_MS)
+                record = replace(record, claim_code=code, claim_expires_ms=expires_ms, expires_ms=forget_ms)
+            new = Row(agent, "agent", records.fields(record), row.etag if row else "")
+            await self._tables.batch(records.AGENTS, [Write("replace" if row else "create", new)])
+            return record
+
+        record = await records.retry(once)
+        if record.claimed and record.leaving:
+            await self._leave.finish(agent)
+        return record
+
+    async def wait(self, agent: Agent, wait_ms: int) -> Agent:
+        """The agent's row, as soon as somebody has claimed it, or as it is when the time is over."""
+        loop = asyncio.get_running_loop()
+        end = loop.time() + wait_ms / 1000
+        while not agent.claimed:
+            left_s = end - loop.time()
+            if left_s <= 0:
+                break
+            await asyncio.sleep(min(_LOOK_S, left_s))
+            row = await self._tables.get(records.AGENTS, agent.id, "agent")
+            if row is None:
+                break
+            agent = records.read(row, Agent)
+        return agent
+
+    async def _new_code(self, agent: str, expires_ms: int) -> str:
+        """A code that no live row has."""
+        while True:
+            code = new_claim_code()
+            try:
+                data = {"agent": agent, "expires_ms": expires_ms}
+                await self._tables.create(records.CLAIMS, Row(code[0], code, data))
+            except Conflict:
+                continue
+            return code

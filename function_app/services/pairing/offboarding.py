@@ -1,0 +1,214 @@
+"""What a device leaves behind when its agent is un-paired or moved to another space, or no longer has it.
+
+The agent's row says it first, in the write that decides (``Agent.leaving``); all of this only tidies up, is safe to
+repeat, and is noted for the timer before that write. Everything here belongs to the pairing that is left: what a new
+owner has by then is not touched.
+"""
+
+import contextlib
+import logging
+from collections.abc import Iterable
+from dataclasses import replace
+from typing import Final
+
+from device_agent.protocol import topics
+from function_app.domain.actions.action import Status, end
+from function_app.domain.actions.queue import DROPPED
+from function_app.domain.common.ids import device_id
+from function_app.domain.devices.access import Share, device_target
+from function_app.domain.devices.devices import Agent, Device, Leaving
+from function_app.ports.broker_access import BrokerAccess, BrokerAccessError
+from function_app.ports.certificates import Certificates
+from function_app.ports.clock import Clock
+from function_app.ports.command_bus import BusUnavailable, CommandBus
+from function_app.ports.tables import Conflict, Row, Tables
+from function_app.services.actions.action_store import ActionRows
+from function_app.services.actions.queue import Queues
+from function_app.services.control.control_events import Audit
+from function_app.services.control.fencing import Fence
+from function_app.services.devices.control_rows import read_control_rows
+from function_app.services.devices.device_access import left_devices
+from function_app.services.identity.authenticator import watchers
+from function_app.services.storage import records
+from function_app.services.storage.reminders import Pending
+from function_app.services.storage.retention import Forget
+from function_app.services.telemetry.series_writer import MARGIN_MS, SeriesWriter
+
+LOOK_MS: Final = 5_000
+"""The timer looks again so often, as long as the broker cannot be told."""
+_NOTE: Final = "leave:"
+_RETAINED: Final = ((topics.STATE, ""), (topics.DESC, ""), (topics.DESC, topics.TWIN))
+
+_log = logging.getLogger(__name__)
+
+
+class Leave:
+    """Tidies up behind agents and devices."""
+
+    def __init__(
+        self,
+        *,
+        tables: Tables,
+        rows: ActionRows,
+        queues: Queues,
+        pending: Pending,
+        fence: Fence,
+        access: BrokerAccess,
+        certificates: Certificates,
+        bus: CommandBus,
+        series: SeriesWriter,
+        forget: Forget,
+        audit: Audit,
+        clock: Clock,
+    ) -> None:
+        self._tables = tables
+        self._rows = rows
+        self._queues = queues
+        self._pending = pending
+        self._fence = fence
+        self._access = access
+        self._certificates = certificates
+        self._bus = bus
+        self._series = series
+        self._forget = forget
+        self._audit = audit
+        self._clock = clock
+
+    async def watch(self, agent: str) -> None:
+        """Have the timer look at an agent; to be noted before the write that has it, or a device of it, leave."""
+        await self._pending.note(f"{_NOTE}{agent}", self._clock.now_ms() + LOOK_MS)
+
+    async def finish(self, agent_id: str) -> bool:
+        """Tidy up behind all that has left; whether everything is done.
+
+        Raises:
+            Problem: ``busy``.
+        """
+        row = await self._tables.get(records.AGENTS, agent_id, "agent")
+        agent = records.read(row, Agent) if row else None
+        if agent is None:
+            return True
+        done = set()
+        for leaving in agent.leaving:
+            await self._settle(agent, leaving)
+            try:
+                await self._tell_broker(agent_id, leaving)
+            except (BusUnavailable, BrokerAccessError) as error:
+                _log.warning("%s of %s: %s", leaving.why, agent_id, error)
+            else:
+                done.add(leaving)
+        if done:
+            await self._strike(agent_id, done)
+        return len(done) == len(agent.leaving)
+
+    async def settle(self, agent: Agent) -> None:
+        """The part of it that the tables alone decide: before somebody else claims the agent.
+
+        Raises:
+            Problem: ``busy``.
+        """
+        for leaving in agent.leaving:
+            await self._settle(agent, leaving)
+
+    async def _settle(self, agent: Agent, leaving: Leaving) -> None:
+        for device in left_devices(agent, leaving):
+            # Before its actions end: with them would go the lease that tells that somebody has moved it.
+            await self._fence.end(device, leaving.why)
+            await self._end_actions(device, leaving.why)
+            # While the agent's row still knows whose it was.
+            await self._audit.tell(device.id)
+            await self._delete(records.AGENTS, agent.id, f"state:{device.name}", leaving)
+            if leaving.why == "unpaired":
+                await self._series.forget(device.id, device.pairing)
+                await self._forget_measures(device)
+            if leaving.why != "moved":
+                await self._delete(records.DESCRIPTIONS, agent.id, device.name, leaving)
+        if leaving.why != "removed":
+            await self._delete(records.AGENTS, agent.id, "link", leaving)
+        if leaving.why == "unpaired":
+            await self._delete(records.MEMBERS, leaving.account, f"agent:{agent.id}", leaving)
+
+    async def _forget_measures(self, device: Device) -> None:
+        """Events, faults, what is watched, and times, once those who do not know yet have stopped to write."""
+        due_ms = self._clock.now_ms() + MARGIN_MS
+        for table in (records.EVENTS, records.FAULTS, records.DIAGNOSTICS, records.LATENCY):
+            partition = f"{device.id}/{device.pairing}"
+            await self._forget.rows(table, partition, first="", last=None, due_ms=due_ms)
+
+    async def _end_actions(self, device: Device, why: str) -> None:
+        _, message = DROPPED[why]
+        control = await read_control_rows(self._tables, device.id)
+        if control.queue.pairing == device.pairing:
+            await self._queues.halt(device.id, why)
+        if control.action and control.slot_pairing == device.pairing:
+            now_ms = self._clock.now_ms()
+            await self._rows.change(control.action, lambda action: end(action, Status.FAILED, why, message, now_ms))
+
+    async def _delete(self, table: str, partition: str, key: str, leaving: Leaving) -> None:
+        """Delete a row of the pairing that is left, not one that was written anew."""
+        row = await self._tables.get(table, partition, key)
+        if row is not None and row.data.get("pairing", "") in {"", leaving.pairing}:
+            with contextlib.suppress(Conflict):
+                await self._tables.delete(table, row)
+
+    async def _tell_broker(self, agent_id: str, leaving: Leaving) -> None:
+        """Cut the agent, then clear what is retained: its will may have spoken. Not what is said there anew."""
+        found = await self._tables.get(records.AGENTS, agent_id, "agent")
+        now = records.read(found, Agent) if found else None
+        if leaving.why != "removed":
+            if leaving.why == "unpaired":
+                await self._certificates.revoke(agent_id)
+            elif now is not None and now.space is not None:
+                await self._certificates.place(agent_id, now.space)
+            await self._access.revoke(principal=f"agent:{agent_id}")
+        if leaving.why == "unpaired":
+            for name in leaving.devices:
+                await self._end_shares(device_id(agent_id, name), leaving.pairing)
+        row = await self._tables.get(records.AGENTS, agent_id, "agent")
+        agent = records.read(row, Agent) if row else None
+        back = agent if agent is not None and agent.space == leaving.space else None
+        if back is None:
+            await self._bus.publish(topics.conn(leaving.space, agent_id), b"", retain=True)
+        for name in leaving.devices:
+            if back is not None and back.device(name) is not None:
+                continue
+            for kind, stream in _RETAINED:
+                topic = topics.device(leaving.space, agent_id, name, kind, stream)
+                await self._bus.publish(topic, b"", retain=True)
+
+    async def _end_shares(self, device: str, pairing: str) -> None:
+        """Cut who watched by a share that has ended with the pairing; then forget the share.
+
+        They hold topics of this device by name, and would hear it again if its owner claimed it anew.
+        """
+        on = device_target(device)
+        page = await self._tables.query(records.SHARES, on, first="account:", last="account;", limit=1000)
+        for row in page.rows:
+            share = records.read(row, Share)
+            if share.pairing != pairing:
+                continue
+            await self._access.revoke(principal=watchers(share.account))
+            with contextlib.suppress(Conflict):
+                await self._tables.delete(records.SHARES, row)
+                index = await self._tables.get(records.MEMBERS, share.account, f"share:{on}")
+                if index is not None:
+                    await self._tables.delete(records.MEMBERS, index)
+
+    async def _strike(self, agent_id: str, done: Iterable[Leaving]) -> None:
+        gone = set(done)
+
+        async def once() -> None:
+            row = await self._tables.get(records.AGENTS, agent_id, "agent")
+            if row is None:
+                return
+            agent = records.read(row, Agent)
+            left = tuple(leaving for leaving in agent.leaving if leaving not in gone)
+            fresh = records.fields(replace(agent, leaving=left))
+            await self._tables.replace(records.AGENTS, Row(agent_id, "agent", fresh, row.etag))
+
+        await records.retry(once)
+
+
+def leaver_of(note: str) -> str | None:
+    """The agent that a note of the timer is about; ``None`` where it is about something else."""
+    return note.removeprefix(_NOTE) if note.startswith(_NOTE) else None

@@ -1,0 +1,79 @@
+"""Giving an agent up: its devices are gone for the account, its rights on the broker are taken back."""
+
+from collections.abc import Callable
+
+from function_app.domain.audit.hash_chain import Deed
+from function_app.domain.common.problems import not_found
+from function_app.domain.devices import devices as rules
+from function_app.domain.devices.devices import Agent
+from function_app.domain.identity.accounts import Identity
+from function_app.ports.tables import Row, Tables
+from function_app.services.audit.audit_log import AuditChain, Change
+from function_app.services.identity.sign_in import SignIn
+from function_app.services.pairing.offboarding import Leave
+from function_app.services.storage import records
+
+
+class Unpair:
+    """Ends a pairing, or takes it to another space."""
+
+    def __init__(self, *, tables: Tables, sign_in: SignIn, leave: Leave, chain: AuditChain) -> None:
+        self._tables = tables
+        self._sign_in = sign_in
+        self._leave = leave
+        self._chain = chain
+
+    async def unpair(self, who: Identity, agent_id: str) -> None:
+        """End the pairing. The write on the agent's row decides; all that follows only tidies up.
+
+        Leases, slots and actions name the pairing they belong to: what a stop half way leaves is nobody's, and the
+        epochs go on from where they were.
+
+        Raises:
+            Problem: ``agent-unknown``, ``busy``.
+        """
+        async with self._chain.change(who.account, Deed.AGENT_UNPAIRED, who, on=agent_id) as change:
+            changed = await self._change(who, agent_id, rules.unpair, change)
+        await self._finish(changed)
+
+    async def move(self, who: Identity, agent_id: str, space: str) -> Agent:
+        """Take an agent to another space of its account. What is known of its devices stays; what they do ends.
+
+        Raises:
+            Problem: ``agent-unknown``, ``space-unknown``, ``busy``.
+        """
+        own = {known.id for known in await self._sign_in.spaces(who.account)}
+
+        def moved(agent: Agent) -> Agent:
+            if space not in own:
+                raise not_found("space", space)
+            return agent if agent.space == space else rules.move(agent, space)
+
+        async with self._chain.change(who.account, Deed.AGENT_MOVED, who, on=agent_id, space=space) as change:
+            changed = await self._change(who, agent_id, moved, change)
+        await self._finish(changed)
+        return changed
+
+    async def _change(self, who: Identity, agent_id: str, rule: Callable[[Agent], Agent], change: Change) -> Agent:
+        watched = False
+
+        async def once() -> Agent:
+            nonlocal watched
+            row = await self._tables.get(records.AGENTS, agent_id, "agent")
+            agent = records.read(row, Agent) if row else None
+            if row is None or agent is None or agent.account != who.account:
+                raise not_found("agent", agent_id)
+            changed = rule(agent)
+            if changed is not agent:
+                if not watched:
+                    await self._leave.watch(agent_id)
+                    watched = True
+                await change.noted()
+                await self._tables.replace(records.AGENTS, Row(agent_id, "agent", records.fields(changed), row.etag))
+            return changed
+
+        return await records.retry(once)
+
+    async def _finish(self, agent: Agent) -> None:
+        if agent.leaving:
+            await self._leave.finish(agent.id)

@@ -1,0 +1,225 @@
+"""Robot types: those that come with the installation, and an account's own. The one place where one is looked up."""
+
+import asyncio
+import io
+import zipfile
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import msgspec
+
+from device_agent.protocol import Twin
+from device_agent.protocol.manifests.robot_type import RobotType
+from function_app.domain.common.ids import ID
+from function_app.domain.common.problems import Problem, invalid, not_found
+from function_app.domain.identity.accounts import Identity
+from function_app.domain.robot_types.robot_types import TypeHead, TypeVersion
+from function_app.ports.blobs import Blobs
+from function_app.ports.model_compiler import Looked
+from function_app.ports.robot_catalogue import Catalogue
+from function_app.ports.tables import Tables
+from function_app.services.robot_types.integrity import Seals, require_whole
+from function_app.services.robot_types.rows import INDEX, LOOKED, Place, place, read_head, read_version
+from function_app.services.storage import records
+
+_ZIP_TIME = (1980, 1, 1, 0, 0, 0)
+
+
+@dataclass(frozen=True, slots=True)
+class KnownType:
+    """A robot type as its account sees it.
+
+    Attributes:
+        manifest: Of the version in use; of the newest upload where none is in use yet.
+        version: Whose manifest it is.
+        files: Name → bytes, of the same version.
+        usable: Whether devices and movements may have it.
+        upload: The newest upload, of an account's own type.
+    """
+
+    manifest: RobotType
+    version: int
+    files: dict[str, int]
+    usable: bool
+    upload: TypeVersion | None = None
+
+    @property
+    def built_in(self) -> bool:
+        """Whether it comes with the installation."""
+        return self.upload is None
+
+
+@dataclass(frozen=True, slots=True)
+class Model:
+    """The model of a robot type as a page can draw it, and what is in it."""
+
+    twin: Twin
+    actuators: tuple[str, ...]
+    cameras: tuple[str, ...]
+
+
+class RobotTypes:
+    """All robot types that an account may use."""
+
+    def __init__(self, *, tables: Tables, blobs: Blobs, catalogue: Catalogue, seals: Seals) -> None:
+        self._seals = seals
+        self._tables = tables
+        self._blobs = blobs
+        self._catalogue = catalogue
+
+    async def list(self, who: Identity, *, cursor: str | None, limit: int) -> tuple[tuple[KnownType, ...], str | None]:
+        """Robot types by id.
+
+        Raises:
+            Problem: ``cursor-invalid``.
+        """
+        if cursor is not None and not ID.match(cursor):
+            raise invalid("The cursor is not one of this list. Begin without one.", code="cursor-invalid")
+        after = "" if cursor is None else cursor + "\0"
+        page = await self._tables.query(
+            records.MEMBERS, who.account, first=INDEX + after, last=INDEX + "\x7f", limit=limit
+        )
+        own = [row.key.removeprefix(INDEX) for row in page.rows]
+        end = None if page.cursor is None else own[-1]
+        built_in = [name for name in await self._catalogue.types() if after <= name and (end is None or name <= end)]
+        names = sorted({*own, *built_in})
+        last = names[limit - 1] if len(names) > limit else end
+        found = await asyncio.gather(*(self._find(who, name) for name in names[:limit]))
+        return tuple(each for each in found if each is not None), last
+
+    async def get(self, who: Identity, robot_type: str) -> RobotType:
+        """A robot type that can be used.
+
+        Raises:
+            Problem: ``robot-type-unknown``, ``robot-type-not-ready``, ``robot-type-damaged``.
+        """
+        built_in = (await self._catalogue.types()).get(robot_type)
+        if built_in is not None:
+            return built_in
+        where, head = await self._head(who, robot_type)
+        if not head.ready:
+            detail = f"No version of '{robot_type}' is ready. Look at the robot type: it says why."
+            raise Problem("robot-type-not-ready", 409, "The robot type is not ready", detail)
+        await self._seals.check(where.account, robot_type, head)
+        return msgspec.convert(head.manifest, RobotType)
+
+    async def view(self, who: Identity, robot_type: str) -> KnownType:
+        """A robot type with what is known of it.
+
+        Raises:
+            Problem: ``robot-type-unknown``.
+        """
+        found = await self._find(who, robot_type)
+        if found is None:
+            raise not_found("robot-type", robot_type)
+        return found
+
+    async def file(self, who: Identity, robot_type: str, name: str) -> bytes:
+        """One file of the version in use; ``robot.toml`` is the manifest.
+
+        Raises:
+            Problem: ``robot-type-unknown``, ``robot-type-not-ready``, ``robot-type-damaged``, ``file-unknown``.
+        """
+        await self.get(who, robot_type)
+        files = await self._catalogue.files(robot_type)
+        if robot_type in await self._catalogue.types():
+            content = files.get(name)
+        else:
+            where, head = await self._head(who, robot_type)
+            _, version = await read_version(self._tables, where, head.ready)
+            known = version is not None and name in version.files
+            content = await self._blobs.get(where.prefix(head.ready) + name) if known else None
+            if content is not None:
+                require_whole(robot_type, head.seal, name, content)
+        if content is None:
+            raise not_found("file", name)
+        return content
+
+    async def model(self, who: Identity, robot_type: str) -> Model:
+        """The drawing of the version in use.
+
+        Raises:
+            Problem: ``robot-type-unknown``, ``robot-type-not-ready``, ``model-unknown``: it cannot be drawn, or was
+                checked before checkers drew.
+        """
+        if robot_type in await self._catalogue.types():
+            drawing = await self._catalogue.drawing(robot_type)
+            if drawing is None:
+                raise not_found("model", robot_type)
+            return _model(robot_type, msgspec.json.decode(drawing, type=Looked))
+        await self.get(who, robot_type)
+        where, head = await self._head(who, robot_type)
+        _, version = await read_version(self._tables, where, head.ready)
+        if version is None:
+            raise not_found("model", robot_type)
+        return await self.checked_model(where, version)
+
+    async def checked_model(self, where: Place, version: TypeVersion) -> Model:
+        """What a checker has drawn.
+
+        Raises:
+            Problem: ``model-unknown``.
+        """
+        content = await self._blobs.get(where.prefix(version.version) + LOOKED)
+        if content is None:
+            raise not_found("model", version.manifest["type"])
+        return _model(version.manifest["type"], msgspec.json.decode(content, type=Looked))
+
+    async def archive(self, who: Identity, robot_type: str) -> bytes:
+        """All files of the version in use as a zip, in a folder of the type's name.
+
+        Raises:
+            Problem: ``robot-type-unknown``, ``robot-type-not-ready``, ``file-unknown``.
+        """
+        await self.get(who, robot_type)
+        known = await self.view(who, robot_type)
+        files = {f"{robot_type}/{name}": await self.file(who, robot_type, name) for name in sorted(known.files)}
+        return await asyncio.to_thread(_zip, files)
+
+    async def _find(self, who: Identity, robot_type: str) -> KnownType | None:
+        built_in = (await self._catalogue.types()).get(robot_type)
+        if built_in is not None:
+            files = await self._catalogue.files(robot_type)
+            sizes = {name: len(content) for name, content in files.items()}
+            return KnownType(built_in, built_in.version, sizes, usable=True)
+        where = place(who, robot_type)
+        if where is None:
+            return None
+        _, head = await read_head(self._tables, where)
+        if head is None or head.deleted:
+            return None
+        _, newest = await read_version(self._tables, where, head.last)
+        if newest is None:
+            return None
+        used = newest
+        if head.ready not in {0, head.last}:
+            _, ready = await read_version(self._tables, where, head.ready)
+            used = ready or newest
+        return KnownType(_manifest(used.manifest), used.version, used.files, usable=head.ready > 0, upload=newest)
+
+    async def _head(self, who: Identity, robot_type: str) -> tuple[Place, TypeHead]:
+        where = place(who, robot_type)
+        _, head = (None, None) if where is None else await read_head(self._tables, where)
+        if where is None or head is None or head.deleted:
+            raise not_found("robot-type", robot_type)
+        return where, head
+
+
+def _model(robot_type: str, looked: Looked) -> Model:
+    if looked.twin is None:
+        raise not_found("model", robot_type)
+    return Model(looked.twin, looked.actuators, looked.cameras)
+
+
+def _zip(files: Mapping[str, bytes]) -> bytes:
+    held = io.BytesIO()
+    with zipfile.ZipFile(held, "w") as archive:
+        for name, content in files.items():
+            entry = zipfile.ZipInfo(name, _ZIP_TIME)  # a fixed time: the same files are the same archive
+            archive.writestr(entry, content, zipfile.ZIP_DEFLATED)
+    return held.getvalue()
+
+
+def _manifest(fields: dict[str, Any]) -> RobotType:
+    return msgspec.convert(fields, RobotType)

@@ -1,0 +1,138 @@
+"""What time brings for robot types: uploads without a verdict, versions and files that nobody needs any more."""
+
+import contextlib
+import logging
+from collections.abc import Sequence
+
+from function_app.domain.common.problems import Problem
+from function_app.domain.robot_types.robot_types import TypeHead, TypeVersion
+from function_app.ports.blobs import Blobs
+from function_app.ports.clock import Clock
+from function_app.ports.tables import Conflict, Row, Tables
+from function_app.services.robot_types.model_validation import drop_files, give_verdict
+from function_app.services.robot_types.rows import (
+    CHECKS,
+    LOOKS,
+    VERSIONS,
+    Place,
+    note_look,
+    place_of,
+    read_head,
+    trial_index,
+)
+from function_app.services.robot_types.versions import GIVE_UP_MS, KEEP_LOOK_MS
+from function_app.services.storage import records
+from function_app.services.storage.retention import DAY_MS
+
+AGAIN_MS = 30_000
+LONGEST_MS = 5 * GIVE_UP_MS
+"""While checkers are busy, an upload may wait for its turn so long."""
+NOTES = 25
+NO_CHECKER = (
+    "No checker has looked at the model in time. Run `python -m function_app work` or `check-models` on a machine that "
+    "has MuJoCo, then upload it again."
+)
+CUT_OFF = "The upload was cut off. Upload it again."
+
+_log = logging.getLogger(__name__)
+
+
+class TendRobotTypes:
+    """The timer's part."""
+
+    def __init__(self, *, tables: Tables, blobs: Blobs, clock: Clock) -> None:
+        self._tables = tables
+        self._blobs = blobs
+        self._clock = clock
+
+    async def run(self) -> None:
+        """One round. Safe to repeat and to be run by many at once: each note goes last.
+
+        Raises:
+            StoreError: The stores cannot be used.
+        """
+        last = f"{self._clock.now_ms() + 1:013d}"
+        page = await self._tables.query(records.MODEL_CHECKS, LOOKS, last=last, limit=NOTES)
+        for note in page.rows:
+            try:
+                await self._look(place_of(note.key))
+            except Problem as problem:
+                _log.warning("robot types: %s", problem.detail)
+                continue
+            with contextlib.suppress(Conflict):
+                await self._tables.delete(records.MODEL_CHECKS, note)
+
+    async def _look(self, where: Place) -> None:
+        _, head = await read_head(self._tables, where)
+        if head is None:
+            if where.trial:
+                await self._forget(where)
+            return
+        page = await self._tables.query(
+            records.ROBOT_TYPES, where.partition, first=VERSIONS, last=VERSIONS + "\x7f", limit=1000
+        )
+        if where.trial:
+            await self._look_at_trial(where, head, page.rows)
+            return
+        for row in page.rows:
+            await self._look_at(where, head, row)
+
+    async def _look_at_trial(self, where: Place, head: TypeHead, rows: Sequence[Row]) -> None:
+        """One version, for a while; then all of it goes, what leads to it last."""
+        now_ms = self._clock.now_ms()
+        versions = [records.read(row, TypeVersion) for row in rows]
+        if not head.deleted and any(now_ms < version.created_ms + KEEP_LOOK_MS for version in versions):
+            for version in versions:
+                if version.open:
+                    await self._judge(where, version, now_ms)
+            return
+        for row, version in zip(rows, versions, strict=True):
+            await self._drop(where, row, version)
+        last, _ = await read_head(self._tables, where)
+        if last is not None:
+            with contextlib.suppress(Conflict):
+                await self._tables.delete(records.ROBOT_TYPES, last)
+        await self._forget(where)
+
+    async def _forget(self, where: Place) -> None:
+        """Take a look off its account's list."""
+        row = await self._tables.get(records.MEMBERS, where.account, trial_index(where))
+        if row is not None:
+            with contextlib.suppress(Conflict):
+                await self._tables.delete(records.MEMBERS, row)
+
+    async def _look_at(self, where: Place, head: TypeHead, row: Row) -> None:
+        version = records.read(row, TypeVersion)
+        now_ms = self._clock.now_ms()
+        if version.state == "refused" and version.version < head.last:
+            await self._drop(where, row, version)
+        elif not head.needs(version.version):
+            # Superseded ones stay for a day, for who has begun to download.
+            due_ms = 0 if head.deleted or version.version < head.since else head.ready_ms + DAY_MS
+            if now_ms >= due_ms:
+                await self._drop(where, row, version)
+            else:
+                await note_look(self._tables, where, due_ms)
+        elif version.open:
+            await self._judge(where, version, now_ms)
+
+    async def _judge(self, where: Place, version: TypeVersion, now_ms: int) -> None:
+        age_ms = now_ms - version.created_ms
+        if age_ms < GIVE_UP_MS:
+            await note_look(self._tables, where, version.created_ms + GIVE_UP_MS)
+        elif version.state == "checking" and age_ms < LONGEST_MS and await self._busy(now_ms):
+            await note_look(self._tables, where, now_ms + AGAIN_MS)
+        else:
+            why = CUT_OFF if version.state == "uploading" else NO_CHECKER
+            await give_verdict(self._tables, where, version.version, (why,), now_ms)
+
+    async def _busy(self, now_ms: int) -> bool:
+        """Whether a checker is at work: then this one's turn will come."""
+        page = await self._tables.query(records.MODEL_CHECKS, CHECKS, limit=100)
+        return any(note.data["until_ms"] > now_ms for note in page.rows)
+
+    async def _drop(self, where: Place, row: Row, version: TypeVersion) -> None:
+        """Files first: a row without its files is dropped again, files without a row are never found."""
+        await drop_files(self._blobs, where, version.version)
+        with contextlib.suppress(Conflict):
+            await self._tables.delete(records.ROBOT_TYPES, row)

@@ -1,0 +1,82 @@
+"""Deleting a robot type that nothing needs any more."""
+
+import contextlib
+from dataclasses import replace
+
+from function_app.domain.audit.hash_chain import Deed
+from function_app.domain.common.problems import Problem, not_found
+from function_app.domain.identity.accounts import Identity
+from function_app.ports.clock import Clock
+from function_app.ports.robot_catalogue import Catalogue
+from function_app.ports.tables import Conflict, Row, Tables
+from function_app.services.audit.audit_log import AuditChain
+from function_app.services.devices.device_access import Devices
+from function_app.services.robot_types.movements import Movements
+from function_app.services.robot_types.rows import INDEX, note_look, place, read_head
+from function_app.services.storage import records
+
+AFTER_MS = 60_000
+"""The files of a deleted type stay so long: who has just begun to download them may go on."""
+_NAMED = 5
+
+
+class DeleteRobotType:
+    """Takes an account's own robot type out of use."""
+
+    def __init__(
+        self,
+        *,
+        tables: Tables,
+        catalogue: Catalogue,
+        devices: Devices,
+        movements: Movements,
+        chain: AuditChain,
+        clock: Clock,
+    ) -> None:
+        self._tables = tables
+        self._catalogue = catalogue
+        self._devices = devices
+        self._movements = movements
+        self._chain = chain
+        self._clock = clock
+
+    async def delete(self, who: Identity, robot_type: str) -> None:
+        """Delete it, all versions. The write on its row decides; the timer deletes versions and files.
+
+        Raises:
+            Problem: ``robot-type-unknown``, ``robot-type-built-in``, ``robot-type-in-use`` with who uses it.
+        """
+        if robot_type in await self._catalogue.types():
+            detail = f"'{robot_type}' comes with the installation and cannot be deleted."
+            raise Problem("robot-type-built-in", 409, "Built-in", detail)
+        where = place(who, robot_type)
+        if where is None:
+            raise not_found("robot-type", robot_type)
+        index = await self._tables.get(records.MEMBERS, who.account, INDEX + robot_type)
+
+        async def once() -> None:
+            row, head = await read_head(self._tables, where)
+            if row is None or head is None or head.deleted:
+                raise not_found("robot-type", robot_type)
+            await self._require_unused(who, robot_type)
+            await note_look(self._tables, where, self._clock.now_ms() + AFTER_MS)
+            await change.noted()
+            gone = replace(head, deleted=True, ready=0, manifest={})
+            await self._tables.replace(records.ROBOT_TYPES, Row(row.partition, row.key, records.fields(gone), row.etag))
+
+        async with self._chain.change(who.account, Deed.ROBOT_TYPE_DELETED, who, on=robot_type) as change:
+            await records.retry(once)
+        if index is not None:
+            with contextlib.suppress(Conflict):
+                await self._tables.delete(records.MEMBERS, index)
+
+    async def _require_unused(self, who: Identity, robot_type: str) -> None:
+        own = [device for device in await self._devices.all(who) if device.owner == who.account]
+        devices = [device.id for device in own if device.robot_type == robot_type]
+        movements = list(await self._movements.own(who, robot_type))
+        users = [f"device {name}" for name in devices] + [f"movement {name}" for name in movements]
+        if users:
+            more = f" and {len(users) - _NAMED} more" if len(users) > _NAMED else ""
+            detail = f"'{robot_type}' is used by {', '.join(users[:_NAMED])}{more}. Un-pair or delete these first."
+            extras = {"devices": devices[:_NAMED], "movements": movements[:_NAMED]}
+            raise Problem("robot-type-in-use", 409, "The robot type is in use", detail, extras=extras)

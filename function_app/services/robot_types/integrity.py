@@ -1,0 +1,70 @@
+"""The seal on an uploaded robot type: what was checked is what is used, whoever else can write to the stores."""
+
+import hashlib
+import json
+from collections.abc import Mapping
+from dataclasses import replace
+from typing import Any
+
+from device_agent.protocol.errors import SignatureError
+from device_agent.protocol.security import signing
+from function_app.domain.common.problems import Problem
+from function_app.domain.robot_types.robot_types import Seal, TypeHead, TypeVersion
+from function_app.ports.signing_keys import Keys
+
+_CONTEXT = b"telescope/v1/robot-type\n"
+
+
+class Seals:
+    """Signs uploads, and checks what is read again."""
+
+    def __init__(self, *, keys: Keys) -> None:
+        self._keys = keys
+
+    async def sealed(
+        self, account: str, robot_type: str, upload: TypeVersion, files: Mapping[str, bytes]
+    ) -> TypeVersion:
+        """The upload with a signature over its place, version, manifest, and each file's hash."""
+        key = await self._keys.current()
+        hashes = {name: hashlib.sha256(content).hexdigest() for name, content in files.items()}
+        text = _text(account, robot_type, upload.version, upload.manifest, hashes)
+        signature = signing.sign_text(text, key, context=_CONTEXT)
+        return replace(upload, seal=Seal(signing.key_id(key.public_key()), signature, hashes))
+
+    async def check(self, account: str, robot_type: str, used: TypeHead | TypeVersion) -> Seal:
+        """The seal, once it is seen to be ours, on this manifest.
+
+        Raises:
+            Problem: ``robot-type-damaged``.
+        """
+        version = used.ready if isinstance(used, TypeHead) else used.version
+        seal = used.seal
+        key = (await self._keys.archive()).get(seal.key)
+        if key is None:
+            raise _damaged(robot_type, "was sealed with a key that has leaked or is not ours")
+        text = _text(account, robot_type, version, used.manifest, seal.hashes)
+        try:
+            signing.verify_text(text, seal.signature, key, context=_CONTEXT)
+        except SignatureError as error:
+            raise _damaged(robot_type, "is not what was uploaded") from error
+        return seal
+
+
+def require_whole(robot_type: str, seal: Seal, name: str, content: bytes) -> None:
+    """A file is the one that was uploaded.
+
+    Raises:
+        Problem: ``robot-type-damaged``.
+    """
+    if seal.hashes.get(name) != hashlib.sha256(content).hexdigest():
+        raise _damaged(robot_type, f"has a file that was changed in the store, {name}")
+
+
+def _text(account: str, robot_type: str, version: int, manifest: Mapping[str, Any], hashes: Mapping[str, str]) -> str:
+    said = {"account": account, "type": robot_type, "version": version, "manifest": manifest, "files": hashes}
+    return json.dumps(said, sort_keys=True, separators=(",", ":"))
+
+
+def _damaged(robot_type: str, how: str) -> Problem:
+    detail = f"The robot type '{robot_type}' {how}. Upload it again."
+    return Problem("robot-type-damaged", 409, "The robot type cannot be used", detail)

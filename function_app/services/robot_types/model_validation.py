@@ -1,0 +1,164 @@
+"""Checking uploaded models: whoever has MuJoCo takes a note, compiles, and writes the verdict.
+
+A note is taken for a time by its ETag: two checkers never hold the same one, and a killed one's is taken up again.
+"""
+
+import asyncio
+import logging
+from collections.abc import Sequence
+from dataclasses import replace
+
+import msgspec
+
+from device_agent.protocol.manifests.robot_type import MANIFEST, RobotType
+from function_app.domain.robot_types.robot_types import State, TypeVersion, with_ready
+from function_app.ports.blobs import Blobs
+from function_app.ports.clock import Clock
+from function_app.ports.model_compiler import CompilerMissingError, Looked, ModelCompiler
+from function_app.ports.tables import Conflict, Row, Tables, Write
+from function_app.services.robot_types.package_reader import malformed, missing
+from function_app.services.robot_types.rows import CHECKS, HEAD, LOOKED, Place, note_look, read_head, read_version
+from function_app.services.storage import records
+from function_app.services.storage.retention import DAY_MS
+
+LEASE_MS = 60_000
+"""How long a checker may hold a note: longer than a compiler may take."""
+MAX_TRIES = 3
+"""So many checkers may end while they hold a note; then the model is to blame."""
+MAX_ERRORS = 20
+MAX_ERROR = 500
+
+_log = logging.getLogger(__name__)
+
+
+class ModelChecks:
+    """The checker's work."""
+
+    def __init__(self, *, tables: Tables, blobs: Blobs, compiler: ModelCompiler, clock: Clock) -> None:
+        self._tables = tables
+        self._blobs = blobs
+        self._compiler = compiler
+        self._clock = clock
+
+    def require(self) -> None:
+        """See that models can be compiled here.
+
+        Raises:
+            CompilerMissingError: They cannot.
+        """
+        self._compiler.require()
+
+    async def run(self) -> bool:
+        """Deal with one upload; whether there was one.
+
+        Raises:
+            CompilerMissingError: Models cannot be compiled here; the note is free again.
+            StoreError: The stores cannot be used.
+        """
+        page = await self._tables.query(records.MODEL_CHECKS, CHECKS, limit=100)
+        for note in page.rows:
+            if note.data["until_ms"] > self._clock.now_ms():
+                continue
+            try:
+                taken = await self._take(note)
+            except Conflict:
+                continue  # another checker has it
+            try:
+                await self._check(taken)
+                await self._tables.delete(records.MODEL_CHECKS, taken)
+            except CompilerMissingError:
+                await self._tables.replace(records.MODEL_CHECKS, replace(note, etag=taken.etag))
+                raise
+            except Conflict:
+                _log.warning("check %s took too long: another checker has taken it up", note.key)
+            return True
+        return False
+
+    async def _take(self, note: Row) -> Row:
+        until_ms = self._clock.now_ms() + LEASE_MS
+        data = {**note.data, "until_ms": until_ms, "tries": note.data["tries"] + 1}
+        return await self._tables.replace(records.MODEL_CHECKS, replace(note, data=data))
+
+    async def _check(self, note: Row) -> None:
+        where, number = _target(note)
+        _, upload = await read_version(self._tables, where, number)
+        if upload is not None and upload.state == "checking":
+            if note.data["tries"] > MAX_TRIES:
+                looked = Looked((f"The check was cut off {MAX_TRIES} times. Simplify the model.",))
+            else:
+                looked = await self._look(where, upload)
+            # The drawing first: a version that is ready has one.
+            await self._blobs.put(where.prefix(number) + LOOKED, msgspec.json.encode(looked))
+            warnings = _sentences(looked.warnings)
+            await give_verdict(self._tables, where, number, looked.errors, self._clock.now_ms(), warnings=warnings)
+            _, upload = await read_version(self._tables, where, number)
+        if upload is None:
+            await drop_files(self._blobs, where, number)  # the timer may have been here in between
+
+    async def _look(self, where: Place, upload: TypeVersion) -> Looked:
+        names = list(upload.files)
+        contents = await asyncio.gather(*(self._blobs.get(where.prefix(upload.version) + name) for name in names))
+        files = {name: content for name, content in zip(names, contents, strict=True) if content is not None}
+        if len(files) < len(names):
+            return Looked(("A file of the upload is gone. Upload it again.",))
+        manifest = msgspec.convert(upload.manifest, RobotType)
+        del files[MANIFEST]
+        lost = missing(files)
+        looked = await self._compiler.check(manifest, files, [name for _, name, _ in lost])
+        told = [error for error in looked.errors if not any(name in error for _, name, _ in lost)]
+        torn = [error for error in malformed(files) if not any(_file(one) == _file(error) for one in told)]
+        named = [f"{file}: '{name}' is not among the files (line {line})" for file, name, line in lost]
+        return replace(looked, errors=(*told, *named, *torn))
+
+
+async def drop_files(blobs: Blobs, where: Place, number: int) -> None:
+    """Delete all files of a version."""
+    for name in await blobs.list(where.prefix(number)):
+        await blobs.delete(name)
+
+
+async def give_verdict(
+    tables: Tables, where: Place, number: int, errors: Sequence[str], now_ms: int, *, warnings: tuple[str, ...] = ()
+) -> None:
+    """Write what was found, beside what was known before; what nobody waits for any more stays as it is.
+
+    A version that is ready takes the place of those before it in the same batch; these are looked at a day later.
+    """
+
+    async def once() -> None:
+        head_row, head = await read_head(tables, where)
+        row, upload = await read_version(tables, where, number)
+        if row is None or upload is None or head_row is None or head is None:
+            return
+        if not upload.open or not head.needs(number):
+            return
+        wrong = _sentences((*upload.errors, *errors))
+        state: State = "refused" if wrong else "ready"
+        done = replace(upload, state=state, errors=wrong, warnings=warnings, checked_ms=now_ms)
+        version_row = Row(row.partition, row.key, records.fields(done), row.etag)
+        writes = [Write("replace", version_row)]
+        if not wrong:
+            await note_look(tables, where, now_ms + DAY_MS)
+            head_data = records.fields(with_ready(head, done))
+            writes.append(Write("replace", Row(row.partition, HEAD, head_data, head_row.etag)))
+        await tables.batch(records.ROBOT_TYPES, writes)
+
+    await records.retry(once)
+
+
+def _sentences(texts: Sequence[str]) -> tuple[str, ...]:
+    return tuple(_sentence(text) for text in texts[:MAX_ERRORS])
+
+
+def _file(error: str) -> str:
+    return error.partition(":")[0]
+
+
+def _sentence(error: str) -> str:
+    return error[:MAX_ERROR] + " …" if len(error) > MAX_ERROR else error.rstrip(".") + "."
+
+
+def _target(note: Row) -> tuple[Place, int]:
+    place, _, version = note.key.partition(":")[2].rpartition(":")
+    account, _, robot_type = place.partition("/")
+    return Place(account, robot_type), int(version)

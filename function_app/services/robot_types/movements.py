@@ -1,0 +1,346 @@
+"""Movement scripts: those that come with a robot type, and an account's own, which may shadow them.
+
+One partition holds an account's movements of one robot type: a row for each name, which decides by its ETag which
+version is the newest, and a row for each version, written with it in one batch. The script is a blob of that version
+alone, so that deleting one version's never takes another's.
+"""
+
+import asyncio
+import hashlib
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from typing import Any
+
+from device_agent.protocol import SHIPPED
+from function_app.domain.audit.hash_chain import Deed
+from function_app.domain.common.ids import ID
+from function_app.domain.common.problems import Problem, invalid, not_found
+from function_app.domain.identity.accounts import Identity
+from function_app.domain.robot_types.movements import Movement
+from function_app.ports.blobs import Blobs
+from function_app.ports.clock import Clock
+from function_app.ports.robot_catalogue import BuiltIn, Catalogue
+from function_app.ports.signing_keys import Keys
+from function_app.ports.tables import Row, Tables, Write
+from function_app.services.audit.audit_log import AuditChain
+from function_app.services.robot_types.catalogue import RobotTypes
+from function_app.services.robot_types.script_metadata import Script, read_script
+from function_app.services.robot_types.script_store import ScriptStore, blob_name
+from function_app.services.storage import records
+from function_app.services.storage.retention import DAY_MS, Forget
+
+MAX_OWN = 1_000
+"""Movements an account may keep for one robot type."""
+KEPT_MS = 3 * DAY_MS
+"""The script of a deleted movement stays so long: an action that was started with it before may be sent again."""
+_VERSIONS = "~"
+"""Begins the keys of version rows: behind every name."""
+_LAST_VERSION = 10**8
+
+
+@dataclass(frozen=True, slots=True)
+class Draft:
+    """What somebody saves. Without description or schema the script's own count.
+
+    Attributes:
+        based_on: The version that it was made from, which has to be the newest still; 0: there has to be none.
+    """
+
+    source: str
+    description: str | None = None
+    parameters_schema: dict[str, Any] | None = None
+    based_on: int | None = None
+
+
+class Movements:
+    """The library of an account, robot type by robot type."""
+
+    def __init__(
+        self,
+        *,
+        tables: Tables,
+        blobs: Blobs,
+        catalogue: Catalogue,
+        robot_types: RobotTypes,
+        keys: Keys,
+        forget: Forget,
+        chain: AuditChain,
+        clock: Clock,
+    ) -> None:
+        self._tables = tables
+        self._scripts = ScriptStore(blobs=blobs, keys=keys)
+        self._catalogue = catalogue
+        self._types = robot_types
+        self._forget = forget
+        self._chain = chain
+        self._clock = clock
+        self._read: dict[str, Script] = {}
+
+    async def list(
+        self, who: Identity, robot_type: str, *, cursor: str | None, limit: int
+    ) -> tuple[tuple[Movement, ...], str | None]:
+        """Newest versions, by name; an account's own in place of a built-in one of the same name.
+
+        Raises:
+            Problem: ``robot-type-unknown``, ``cursor-invalid``.
+        """
+        await self._types.get(who, robot_type)
+        if cursor is not None and not ID.match(cursor):
+            raise _bad_cursor()
+        after = "" if cursor is None else cursor + "\0"
+        partition = _partition(who, robot_type)
+        page = await self._tables.query(records.MOVEMENTS, partition, first=after, last=_VERSIONS, limit=limit)
+        own = {row.key: records.read(row, Movement) for row in page.rows}
+        end = None if page.cursor is None else page.rows[-1].key
+        shown = {
+            name: await self._built_in(robot_type, item)
+            for name, item in (await self._catalogue.movements(robot_type)).items()
+            if after <= name and (end is None or name <= end)
+        }
+        shown |= {name: movement for name, movement in own.items() if not movement.deleted}
+        names = sorted(shown)
+        last = names[limit - 1] if len(names) > limit else end
+        return tuple(shown[name] for name in names[:limit]), last
+
+    async def versions(
+        self, who: Identity, robot_type: str, name: str, *, cursor: str | None, limit: int
+    ) -> tuple[tuple[Movement, ...], str | None]:
+        """Every version of one movement, newest first; at the end the built-in one that it shadows.
+
+        Raises:
+            Problem: ``robot-type-unknown``, ``movement-unknown``, ``cursor-invalid``.
+        """
+        newest = await self._newest(who, robot_type, name)
+        built_in = (await self._catalogue.movements(robot_type)).get(name)
+        found: list[Movement] = []
+        following = None
+        if not newest.built_in:
+            try:
+                page = await self._tables.query(
+                    records.MOVEMENTS,
+                    _partition(who, robot_type),
+                    first=_version_key(name, newest.version),
+                    last=_version_key(name, newest.since) + "\0",
+                    limit=limit,
+                    cursor=cursor,
+                )
+            except ValueError as error:
+                raise _bad_cursor() from error
+            found = [records.read(row, Movement) for row in page.rows]
+            following = page.cursor
+        if built_in is not None and following is None:
+            found.append(await self._built_in(robot_type, built_in))
+        return tuple(found), following
+
+    async def get(self, who: Identity, robot_type: str, name: str, version: int | None = None) -> tuple[Movement, str]:
+        """One movement and its source: the newest version, or the one that is asked for.
+
+        Raises:
+            Problem: ``robot-type-unknown``, ``movement-unknown``, ``movement-version-unknown``, ``movement-damaged``.
+        """
+        found = await self._newest(who, robot_type, name)
+        built_in = (await self._catalogue.movements(robot_type)).get(name)
+        if version is not None and version != found.version:
+            if built_in is not None and version == built_in.version:
+                found = await self._built_in(robot_type, built_in)
+            else:
+                found = await self._version(who, robot_type, found, version)
+        if found.built_in and built_in is not None:
+            return found, built_in.source
+        return found, await self._scripts.get(who, robot_type, found)
+
+    async def put(self, who: Identity, robot_type: str, name: str, draft: Draft) -> tuple[Movement, bool]:
+        """Store a new version; and whether the account had none of this name.
+
+        The script is stored before the rows that name it: a row without its script cannot be.
+
+        Raises:
+            Problem: ``robot-type-unknown``, ``movement-invalid`` with the line, ``schema-invalid``, ``movements-full``,
+                ``movement-changed`` with the newest version.
+        """
+        await self._types.get(who, robot_type)
+        if not ID.match(name):
+            raise invalid("A movement's name has letters, digits, _ and -, 1 to 64 of them.")
+        script = read_script(draft.source)
+        new = Movement(
+            name=name,
+            description=script.description if draft.description is None else draft.description,
+            version=0,
+            sha256=hashlib.sha256(draft.source.encode()).hexdigest(),
+            updated_ms=self._clock.now_ms(),
+            author=who.account,
+            parameters_schema=script.schema if draft.parameters_schema is None else draft.parameters_schema,
+        )
+        lost: list[Movement] = []
+
+        async def once() -> tuple[Movement, bool]:
+            row = await self._row(who, robot_type, name)
+            old = records.read(row, Movement) if row else None
+            await self._check_newest(robot_type, name, old, draft.based_on)
+            if row is None:
+                await self._check_room(who, robot_type)
+            elif old is not None and old.deleted:
+                await self._forget_versions(who, robot_type, old)
+            numbered = await self._scripts.sign(robot_type, await self._numbered(robot_type, new, old))
+            await self._scripts.put(who, robot_type, numbered, draft.source)
+            lost.append(numbered)
+            change.data["version"] = numbered.version
+            await change.noted()
+            await self._tables.batch(records.MOVEMENTS, _writes(_partition(who, robot_type), numbered, row))
+            lost.pop()
+            return numbered, old is None or old.deleted
+
+        on = f"{robot_type}/{name}"
+        async with self._chain.change(who.account, Deed.MOVEMENT_SAVED, who, on=on, sha256=new.sha256) as change:
+            done = await records.retry(once)
+        for tried in lost:
+            await self._drop_lost(who, robot_type, tried)
+        return done
+
+    async def delete(self, who: Identity, robot_type: str, name: str) -> None:
+        """Delete the account's own movement, all versions; a built-in one of the same name shows again.
+
+        An action that was started with it goes on to its end: its script stays for ``KEPT_MS``.
+
+        Raises:
+            Problem: ``robot-type-unknown``, ``movement-unknown``, ``movement-built-in``.
+        """
+        await self._types.get(who, robot_type)
+
+        async def once() -> Movement:
+            row = await self._row(who, robot_type, name)
+            old = records.read(row, Movement) if row else None
+            if row is None or old is None or old.deleted:
+                if old is not None:
+                    await self._forget_versions(who, robot_type, old)
+                if name in await self._catalogue.movements(robot_type):
+                    detail = f"'{name}' comes with the robot type and cannot be deleted."
+                    raise Problem("movement-built-in", 409, "Built-in", detail)
+                raise not_found("movement", name)
+            gone = replace(old, deleted=True, updated_ms=self._clock.now_ms())
+            await change.noted()
+            await self._tables.replace(records.MOVEMENTS, Row(row.partition, row.key, records.fields(gone), row.etag))
+            return gone
+
+        async with self._chain.change(who.account, Deed.MOVEMENT_DELETED, who, on=f"{robot_type}/{name}") as change:
+            gone = await records.retry(once)
+        await self._forget_versions(who, robot_type, gone)
+
+    async def own(self, who: Identity, robot_type: str) -> tuple[str, ...]:
+        """Names of the account's own movements of a robot type."""
+        partition = _partition(who, robot_type)
+        page = await self._tables.query(records.MOVEMENTS, partition, last=_VERSIONS, limit=MAX_OWN)
+        return tuple(row.key for row in page.rows if not records.read(row, Movement).deleted)
+
+    async def pinned_source(self, who: Identity, name: str, pinned: Mapping[str, Any]) -> str | None:
+        """The script of an action that is sent again, by what was pinned at its start; ``None`` when it is gone."""
+        found = (await self._catalogue.movements(pinned["robot_type"])).get(name)
+        if found is not None and found.sha256 == pinned["sha256"]:
+            return found.source
+        movement = Movement(name=name, description="", version=pinned["version"], sha256=pinned["sha256"], updated_ms=0)
+        return await self._scripts.find(who, pinned["robot_type"], movement)
+
+    async def _newest(self, who: Identity, robot_type: str, name: str) -> Movement:
+        await self._types.get(who, robot_type)
+        row = await self._row(who, robot_type, name)
+        own = records.read(row, Movement) if row else None
+        if own is not None and not own.deleted:
+            return own
+        found = (await self._catalogue.movements(robot_type)).get(name)
+        if found is None:
+            raise not_found("movement", name)
+        return await self._built_in(robot_type, found)
+
+    async def _version(self, who: Identity, robot_type: str, newest: Movement, version: int) -> Movement:
+        row = None
+        if not newest.built_in and newest.since <= version < newest.version:
+            key = _version_key(newest.name, version)
+            row = await self._tables.get(records.MOVEMENTS, _partition(who, robot_type), key)
+        if row is None:
+            raise not_found("movement-version", f"{newest.name}, version {version}")
+        return records.read(row, Movement)
+
+    async def _row(self, who: Identity, robot_type: str, name: str) -> Row | None:
+        if not ID.match(name):
+            return None
+        return await self._tables.get(records.MOVEMENTS, _partition(who, robot_type), name)
+
+    async def _check_newest(self, robot_type: str, name: str, old: Movement | None, based_on: int | None) -> None:
+        """Refuse to save over what somebody has saved meanwhile."""
+        built_in = (await self._catalogue.movements(robot_type)).get(name)
+        newest = old.version if old and not old.deleted else built_in.version if built_in else 0
+        if based_on is None or based_on == newest:
+            return
+        made = f"Version {newest} of '{name}' is the newest" if newest else f"'{name}' has been deleted meanwhile"
+        detail = f"{made}, and this was made from version {based_on}." if based_on else f"There is a '{name}' already."
+        raise Problem("movement-changed", 409, "Somebody has saved it meanwhile", detail, extras={"version": newest})
+
+    async def _check_room(self, who: Identity, robot_type: str) -> None:
+        partition = _partition(who, robot_type)
+        page = await self._tables.query(records.MOVEMENTS, partition, last=_VERSIONS, limit=MAX_OWN)
+        if len(page.rows) >= MAX_OWN:
+            detail = f"An account keeps at most {MAX_OWN} movements for one robot type."
+            raise Problem("movements-full", 409, "Too many movements", detail)
+
+    async def _numbered(self, robot_type: str, new: Movement, old: Movement | None) -> Movement:
+        """The next version, and since which version the name has been in use."""
+        built_in = (await self._catalogue.movements(robot_type)).get(new.name)
+        version = max(old.version if old else 0, built_in.version if built_in else 0) + 1
+        return replace(new, version=version, since=old.since if old and not old.deleted else version)
+
+    async def _drop_lost(self, who: Identity, robot_type: str, tried: Movement) -> None:
+        """Delete the script of a version that another writer got, unless it is that very script."""
+        key = _version_key(tried.name, tried.version)
+        row = await self._tables.get(records.MOVEMENTS, _partition(who, robot_type), key)
+        if row is None or row.data["sha256"] != tried.sha256:
+            await self._scripts.delete(who, robot_type, tried)
+
+    async def _forget_versions(self, who: Identity, robot_type: str, gone: Movement) -> None:
+        """Note scripts, then rows, of a deleted movement. Whoever meets one again notes the same again."""
+        due_ms = gone.updated_ms + KEPT_MS
+        partition = _partition(who, robot_type)
+        first, last = _version_key(gone.name, gone.version), _version_key(gone.name, gone.since) + "\0"
+        start: str | None = first
+        while start is not None:
+            page = await self._tables.query(records.MOVEMENTS, partition, first=start, last=last)
+            blobs = [blob_name(who, robot_type, records.read(row, Movement)) for row in page.rows]
+            await asyncio.gather(*(self._forget.blob(blob, due_ms=due_ms) for blob in blobs))
+            start = page.rows[-1].key + "\0" if page.cursor is not None else None
+        await self._forget.rows(records.MOVEMENTS, partition, first=first, last=last, due_ms=due_ms)
+
+    async def _built_in(self, robot_type: str, item: BuiltIn) -> Movement:
+        script = self._read.get(item.sha256)
+        if script is None:
+            script = self._read[item.sha256] = read_script(item.source)
+        shown = Movement(
+            name=item.name,
+            description=item.description,
+            version=item.version,
+            sha256=item.sha256,
+            updated_ms=item.updated_ms,
+            built_in=True,
+            author=SHIPPED,
+            parameters_schema=script.schema,
+        )
+        return await self._scripts.sign(robot_type, shown)
+
+
+def _writes(partition: str, movement: Movement, row: Row | None) -> list[Write]:
+    data = records.fields(movement)
+    return [
+        Write("replace" if row else "create", Row(partition, movement.name, data, row.etag if row else "")),
+        Write("create", Row(partition, _version_key(movement.name, movement.version), data)),
+    ]
+
+
+def _bad_cursor() -> Problem:
+    return invalid("The cursor is not one of this list. Begin without one.", code="cursor-invalid")
+
+
+def _partition(who: Identity, robot_type: str) -> str:
+    return f"{who.account}/{robot_type}"
+
+
+def _version_key(name: str, version: int) -> str:
+    """Newest first."""
+    return f"{_VERSIONS}{name}:{_LAST_VERSION - version:08d}"

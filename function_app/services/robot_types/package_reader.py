@@ -1,0 +1,197 @@
+"""The files of an uploaded robot type: what may be among them, and what its XML may refer to."""
+
+import base64
+import binascii
+import contextlib
+import re
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass
+from functools import partial
+from typing import TypeVar
+from xml.parsers import expat
+
+from device_agent.protocol.errors import ProtocolError
+from device_agent.protocol.manifests import robot_type as manifests
+from device_agent.protocol.manifests.robot_type import RobotType
+from function_app.domain.common.ids import ID
+from function_app.domain.common.problems import Problem, invalid
+
+MAX_FILES = 32
+MAX_BYTES = 6_000_000
+"""Of all files together."""
+MAX_MANIFEST = 48_000
+MAX_VERSION = 1_000_000
+MAX_TOLD = 20
+"""Of things that are wrong so many are told."""
+TEXT = ".xml"
+BINARY = (".stl", ".obj", ".png")
+_NAME = re.compile(r"\A(?=.{1,120}\Z)([A-Za-z0-9_-][A-Za-z0-9_.-]*/){0,3}[A-Za-z0-9_-][A-Za-z0-9_.-]*\.[a-z]{3}\Z")
+_FILE = re.compile(r"\Afile", re.IGNORECASE)
+_FOLDERS = frozenset({"meshdir", "texturedir", "assetdir"})
+T = TypeVar("T")
+_OUTSIDE = re.compile(r"\A[/~]|[\\:\x00]|(\A|/)\.\.(/|\Z)")
+
+
+@dataclass(frozen=True, slots=True)
+class Upload:
+    """A robot type as it was uploaded: its manifest as text is one of ``files``."""
+
+    robot_type: RobotType
+    files: dict[str, bytes]
+
+
+def read_upload(manifest: str, files: Mapping[str, str]) -> Upload:
+    """Check all that can be said without MuJoCo.
+
+    Args:
+        manifest: Text of ``robot.toml``.
+        files: Name → text of an ``.xml``; base64 of any other.
+
+    Raises:
+        Problem: ``manifest-invalid`` with the field, ``robot-type-invalid`` with the file; of several things that are
+            wrong the first, and all in ``errors``.
+    """
+    if not 1 <= len(files) <= MAX_FILES:
+        raise _bad(f"A robot type has 1 to {MAX_FILES} files, not {len(files)}.")
+    wrong: list[Problem] = []
+    robot_type = _or_note(wrong, partial(_manifest, manifest))
+    content: dict[str, bytes] = {}
+    for name, text in files.items():
+        read = _or_note(wrong, partial(_content, name, text))
+        if read is not None:
+            content[name] = read
+    wrong += _unfit(content)
+    if robot_type is not None:
+        wrong += _unnamed(robot_type, content)
+    for name, given in content.items():
+        if name.endswith(TEXT):
+            _or_note(wrong, partial(_check_references, name, given))
+    if wrong or robot_type is None:
+        errors = [problem.detail for problem in wrong][:MAX_TOLD]
+        raise invalid(errors[0], code=wrong[0].code, errors=errors)
+    return Upload(robot_type, {manifests.MANIFEST: manifest.encode(), **content})
+
+
+def missing(files: Mapping[str, bytes]) -> tuple[tuple[str, str, int], ...]:
+    """Files that the XML names and that are in no folder of the upload: who names it, what, and in which line."""
+    known = {name.rpartition("/")[2] for name in files}
+    found: list[tuple[str, str, int]] = []
+
+    def look(name: str, parser: expat.XMLParserType) -> None:
+        def element(_: str, attributes: dict[str, str]) -> None:
+            for attribute, value in attributes.items():
+                wanted = value.rpartition("/")[2]
+                if _FILE.match(attribute) and wanted and wanted not in known:
+                    found.append((name, wanted, parser.CurrentLineNumber))
+
+        parser.StartElementHandler = element
+
+    for name, text in files.items():
+        if name.endswith(TEXT):
+            parser = _parser()
+            look(name, parser)
+            with contextlib.suppress(expat.ExpatError):
+                parser.Parse(text, True)
+    return tuple(found)
+
+
+def malformed(files: Mapping[str, bytes]) -> tuple[str, ...]:
+    """Files that are not well-formed XML: their references could not be looked at, so they are never good."""
+    errors = []
+    for name, text in files.items():
+        if name.endswith(TEXT):
+            try:
+                _parser().Parse(text, True)
+            except expat.ExpatError as error:
+                errors.append(f"{name}: {error}.")
+    return tuple(errors)
+
+
+def _unfit(content: Mapping[str, bytes]) -> Iterator[Problem]:
+    if sum(map(len, content.values())) > MAX_BYTES:
+        yield _bad(f"The files have at most {MAX_BYTES} bytes together. Simplify the meshes.")
+    for name in content:
+        folder = next((other for other in content if name.startswith(other + "/")), None)
+        if folder is not None:
+            yield _bad(f"'{folder}' cannot be a file and a folder.")
+
+
+def _unnamed(robot_type: RobotType, content: Mapping[str, bytes]) -> Iterator[Problem]:
+    for field in ("model", "scene"):
+        named = getattr(robot_type, field)
+        if named not in content or not named.endswith(TEXT):
+            known = _xml_names(content)
+            yield _bad_manifest(f"{field} is '{named[:120]}'; it must be one of the .xml files: {known}.")
+
+
+def _or_note(wrong: list[Problem], read: Callable[[], T]) -> T | None:
+    """What ``read`` gives; ``None`` where it refuses, which is noted."""
+    try:
+        return read()
+    except Problem as problem:
+        wrong.append(problem)
+        return None
+
+
+def _manifest(text: str) -> RobotType:
+    if len(text.encode()) > MAX_MANIFEST:
+        raise _bad_manifest(f"It has at most {MAX_MANIFEST} bytes.")
+    try:
+        found = manifests.parse(text)
+    except (ProtocolError, RecursionError) as error:
+        raise _bad_manifest(f"{error}.") from error
+    if not ID.match(found.type):
+        raise _bad_manifest("type has letters, digits, _ and -, 1 to 64 of them.")
+    if not 1 <= found.version <= MAX_VERSION:
+        raise _bad_manifest(f"version is {found.version}; it must be 1 to {MAX_VERSION}.")
+    return found
+
+
+def _content(name: str, text: str) -> bytes:
+    if not _NAME.match(name) or not name.endswith((TEXT, *BINARY)):
+        endings = ", ".join((TEXT, *BINARY))
+        raise _bad(f"A file cannot be called '{name[:120]}': letters, digits, _, - and ., then one of {endings}.")
+    if name.endswith(TEXT):
+        return text.encode()
+    try:
+        return base64.b64decode(text, validate=True)
+    except (binascii.Error, ValueError) as error:
+        raise _bad(f"'{name}' is not base64: {error}.") from error
+
+
+def _check_references(name: str, text: bytes) -> None:
+    """Refuse what leads out of the folder. What is not well formed is left to MuJoCo, which says so best."""
+    outside: list[str] = []
+
+    def element(tag: str, attributes: dict[str, str]) -> None:
+        for attribute, value in attributes.items():
+            if (_FILE.match(attribute) or attribute.lower() in _FOLDERS) and _OUTSIDE.search(value):
+                outside.append(f'{name}: <{tag} {attribute}="{value[:120]}"> leads out of the robot type\'s folder.')
+
+    def doctype(*_: object) -> None:
+        outside.append(f"{name}: a DOCTYPE is not allowed.")
+
+    parser = _parser()
+    parser.StartElementHandler = element
+    parser.StartDoctypeDeclHandler = doctype
+    with contextlib.suppress(expat.ExpatError):
+        parser.Parse(text, True)
+    if outside:
+        raise _bad(" ".join(outside[:5]))
+
+
+def _parser() -> expat.XMLParserType:
+    """One that reads bytes as MuJoCo's does: UTF-8, whatever the file says."""
+    return expat.ParserCreate("utf-8")
+
+
+def _xml_names(files: Mapping[str, bytes]) -> str:
+    return ", ".join(sorted(name for name in files if name.endswith(TEXT))) or "there is none"
+
+
+def _bad(detail: str) -> Problem:
+    return invalid(detail, code="robot-type-invalid")
+
+
+def _bad_manifest(detail: str) -> Problem:
+    return invalid(f"robot.toml: {detail}", code="manifest-invalid")

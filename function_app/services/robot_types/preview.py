@@ -1,0 +1,208 @@
+"""Looking at a robot type before it is saved: stored and compiled as one, where nobody else finds it, for a while."""
+
+import asyncio
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+
+import msgspec
+
+from device_agent.protocol.manifests.robot_type import RobotType
+from function_app.domain.common.ids import ID, new_id
+from function_app.domain.common.problems import Problem, not_found
+from function_app.domain.identity.accounts import Identity
+from function_app.domain.robot_types.robot_types import TypeHead, TypeVersion
+from function_app.ports.blobs import Blobs
+from function_app.ports.clock import Clock
+from function_app.ports.robot_catalogue import Catalogue
+from function_app.ports.tables import Row, Tables, Write
+from function_app.services.robot_types.catalogue import KnownType, Model, RobotTypes
+from function_app.services.robot_types.integrity import Seals, require_whole
+from function_app.services.robot_types.package_reader import MAX_TOLD, Upload, read_upload
+from function_app.services.robot_types.rows import (
+    HEAD,
+    TRIALS,
+    Place,
+    note_look,
+    read_head,
+    read_version,
+    trial_index,
+    trial_place,
+    version_key,
+)
+from function_app.services.robot_types.script_metadata import read_script
+from function_app.services.robot_types.upload import UploadRobotType, require_own
+from function_app.services.robot_types.versions import GIVE_UP_MS, KEEP_LOOK_MS, TypeVersions, refused
+from function_app.services.storage import records
+
+MAX_LOOKS = 4
+"""Uploads of an account that are looked at and not saved; one more ends the oldest."""
+_ONLY = 1
+
+
+@dataclass(frozen=True, slots=True)
+class Look:
+    """An upload that is looked at."""
+
+    id: str
+    upload: TypeVersion
+    manifest: RobotType
+
+    @property
+    def expires_ms(self) -> int:
+        """When it goes by itself [ms since 1970]."""
+        return self.upload.created_ms + KEEP_LOOK_MS
+
+
+class LookAtRobotType:
+    """Every look is a place of its own with one version, which the checkers and the timer treat as any other."""
+
+    def __init__(
+        self,
+        *,
+        tables: Tables,
+        blobs: Blobs,
+        versions: TypeVersions,
+        catalogue: Catalogue,
+        robot_types: RobotTypes,
+        upload: UploadRobotType,
+        seals: Seals,
+        clock: Clock,
+    ) -> None:
+        self._tables = tables
+        self._blobs = blobs
+        self._versions = versions
+        self._catalogue = catalogue
+        self._types = robot_types
+        self._upload = upload
+        self._seals = seals
+        self._clock = clock
+
+    async def begin(
+        self, who: Identity, manifest: str, files: Mapping[str, str], scripts: Mapping[str, str], *, wait_ms: int
+    ) -> Look:
+        """Store an upload for a look. The notes for the timer come first: whatever a stop cuts off goes by itself.
+
+        Raises:
+            Problem: ``manifest-invalid``, ``robot-type-invalid`` with ``errors``, ``robot-type-built-in``.
+        """
+        wrong = _wrong_scripts(scripts)
+        try:
+            given = read_upload(manifest, files)
+        except Problem as problem:
+            problem.extras["errors"] = [*problem.extras.get("errors", [problem.detail]), *wrong][:MAX_TOLD]
+            raise
+        await require_own(self._catalogue, given.robot_type.type)
+        where = Place(who.account, f"~{new_id()}")
+        now_ms = self._clock.now_ms()
+        await note_look(self._tables, where, now_ms + KEEP_LOOK_MS)
+        await note_look(self._tables, where, now_ms + GIVE_UP_MS)
+        await self._list(where, now_ms)
+        sizes = {name: len(content) for name, content in given.files.items()}
+        fields = msgspec.to_builtins(given.robot_type)
+        plain = TypeVersion(_ONLY, "uploading", fields, sizes, now_ms, errors=wrong)
+        upload = await self._seals.sealed(where.account, where.type, plain, given.files)
+        head = Row(where.partition, HEAD, records.fields(TypeHead(where.type, last=_ONLY, since=_ONLY)))
+        version = Row(where.partition, version_key(_ONLY), records.fields(upload))
+        await self._tables.batch(records.ROBOT_TYPES, [Write("create", head), Write("create", version)])
+        await self._versions.store(where, _ONLY, given.files)
+        done = await self._versions.verdict(where, _ONLY, wait_ms)
+        return Look(where.type[1:], done or upload, given.robot_type)
+
+    async def get(self, who: Identity, look: str, *, wait_ms: int = 0) -> Look:
+        """How it fares.
+
+        Raises:
+            Problem: ``look-unknown``.
+        """
+        where, upload = await self._find(who, look)
+        if upload.open and wait_ms:
+            upload = await self._versions.verdict(where, _ONLY, wait_ms) or upload
+        return Look(look, upload, msgspec.convert(upload.manifest, RobotType))
+
+    async def model(self, who: Identity, look: str) -> Model:
+        """What it was found to be.
+
+        Raises:
+            Problem: ``look-unknown``, ``robot-type-not-ready``, ``model-unknown``.
+        """
+        where, upload = await self._find(who, look)
+        _require_good(upload)
+        return await self._types.checked_model(where, upload)
+
+    async def save(self, who: Identity, look: str, *, wait_ms: int) -> tuple[KnownType, bool]:
+        """Make what was looked at the next version of its robot type; it is checked as any upload is.
+
+        Raises:
+            Problem: ``look-unknown``, ``robot-type-not-ready``, ``robot-type-damaged``, and those of an upload.
+        """
+        where, upload = await self._find(who, look)
+        _require_good(upload)
+        seal = await self._seals.check(where.account, where.type, upload)
+        names = list(upload.files)
+        contents = await asyncio.gather(*(self._blobs.get(where.prefix(_ONLY) + name) for name in names))
+        files = {name: content or b"" for name, content in zip(names, contents, strict=True)}
+        for name, content in files.items():
+            require_whole(where.type, seal, name, content)
+        found = await self._upload.add(who, Upload(msgspec.convert(upload.manifest, RobotType), files), wait_ms=wait_ms)
+        await self.drop(who, look)
+        return found
+
+    async def drop(self, who: Identity, look: str) -> None:
+        """End it; the timer deletes what it has stored.
+
+        Raises:
+            Problem: ``look-unknown``.
+        """
+        where, _ = await self._find(who, look)
+        await self._end(where)
+
+    async def _end(self, where: Place) -> None:
+        async def once() -> None:
+            row, head = await read_head(self._tables, where)
+            await note_look(self._tables, where, self._clock.now_ms())
+            if row is not None and head is not None and not head.deleted:
+                gone = records.fields(replace(head, deleted=True))
+                await self._tables.replace(records.ROBOT_TYPES, Row(row.partition, row.key, gone, row.etag))
+
+        await records.retry(once)
+
+    async def _list(self, where: Place, now_ms: int) -> None:
+        """See that there are not too many: the oldest ones end."""
+        page = await self._tables.query(records.MEMBERS, where.account, first=TRIALS, last=TRIALS + "\x7f", limit=100)
+        there = sorted(page.rows, key=lambda row: row.data["created_ms"])
+        for row in there[: max(0, len(there) - MAX_LOOKS + 1)]:
+            await self._end(Place(where.account, "~" + row.key.removeprefix(TRIALS)))
+        row = Row(where.account, trial_index(where), {"created_ms": now_ms})
+        await self._tables.create(records.MEMBERS, row)
+
+    async def _find(self, who: Identity, look: str) -> tuple[Place, TypeVersion]:
+        where = trial_place(who, look)
+        if where is not None:
+            _, head = await read_head(self._tables, where)
+            _, upload = await read_version(self._tables, where, _ONLY)
+            live = upload is not None and self._clock.now_ms() < upload.created_ms + KEEP_LOOK_MS
+            if upload is not None and live and head is not None and not head.deleted:
+                return where, upload
+        raise not_found("look", look)
+
+
+def _require_good(upload: TypeVersion) -> None:
+    if upload.state == "refused":
+        raise refused(upload)
+    if upload.state != "ready":
+        raise Problem("robot-type-not-ready", 409, "Not checked yet", "The upload is still being checked.")
+
+
+def _wrong_scripts(scripts: Mapping[str, str]) -> tuple[str, ...]:
+    """What is wrong with movements, as far as one can say without running them."""
+    found = []
+    for name, source in scripts.items():
+        file = f"movements/{name[:80]}.py"
+        if not ID.match(name):
+            found.append(f"{file}: a movement's name has letters, digits, _ and -, 1 to 64 of them.")
+            continue
+        try:
+            read_script(source)
+        except Problem as problem:
+            found.append(f"{file}: {problem.detail}")
+    return tuple(found)

@@ -1,0 +1,92 @@
+"""The scripts of movements in the blob store, each signed when it is saved and checked before it is used."""
+
+import hashlib
+from collections import OrderedDict
+from dataclasses import replace
+
+from device_agent.protocol.errors import SignatureError
+from device_agent.protocol.security import signing
+from function_app.domain.common.problems import Problem
+from function_app.domain.identity.accounts import Identity
+from function_app.domain.robot_types.movements import Movement
+from function_app.ports.blobs import Blobs
+from function_app.ports.signing_keys import Keys
+
+_KEPT = 256
+
+
+class ScriptStore:
+    """Scripts by account, robot type, name, version and hash: one version's deletion never takes another's script."""
+
+    def __init__(self, *, blobs: Blobs, keys: Keys) -> None:
+        self._blobs = blobs
+        self._keys = keys
+        self._kept: OrderedDict[str, str] = OrderedDict()
+
+    async def sign(self, robot_type: str, movement: Movement) -> Movement:
+        """The movement with a signature over robot type, name, version and hash."""
+        key = await self._keys.current()
+        signature = signing.sign_text(signed_text(robot_type, movement), key, context=signing.MOVEMENT_CONTEXT)
+        return replace(movement, key=signing.key_id(key.public_key()), signature=signature)
+
+    async def put(self, who: Identity, robot_type: str, movement: Movement, source: str) -> None:
+        """Store a script; before the rows that name it, so that a row without its script cannot be."""
+        await self._blobs.put(blob_name(who, robot_type, movement), source.encode())
+
+    async def get(self, who: Identity, robot_type: str, movement: Movement) -> str:
+        """A script, once signature and hash are seen to be right.
+
+        From memory where this process has read it before: content under its own hash never changes.
+
+        Raises:
+            Problem: ``movement-damaged``.
+        """
+        await self._verify(robot_type, movement)
+        name = blob_name(who, robot_type, movement)
+        if name in self._kept:
+            self._kept.move_to_end(name)
+            return self._kept[name]
+        source = await self.find(who, robot_type, movement)
+        if source is None:
+            raise _damaged(movement, "is missing or was changed in the store")
+        self._kept[name] = source
+        if len(self._kept) > _KEPT:
+            self._kept.popitem(last=False)
+        return source
+
+    async def find(self, who: Identity, robot_type: str, movement: Movement) -> str | None:
+        """The script with the movement's hash; ``None`` when it is gone or was changed."""
+        content = await self._blobs.get(blob_name(who, robot_type, movement))
+        if content is None or hashlib.sha256(content).hexdigest() != movement.sha256:
+            return None
+        return content.decode()
+
+    async def delete(self, who: Identity, robot_type: str, movement: Movement) -> None:
+        """Delete a script that no row names."""
+        await self._blobs.delete(blob_name(who, robot_type, movement))
+
+    async def _verify(self, robot_type: str, movement: Movement) -> None:
+        key = (await self._keys.archive()).get(movement.key)
+        if key is None:
+            raise _damaged(movement, "was signed with a key that has leaked or is not ours")
+        try:
+            signing.verify_text(
+                signed_text(robot_type, movement), movement.signature, key, context=signing.MOVEMENT_CONTEXT
+            )
+        except SignatureError as error:
+            raise _damaged(movement, "is not the one that was signed") from error
+
+
+def signed_text(robot_type: str, movement: Movement) -> str:
+    """What the signature of a movement says."""
+    return signing.movement_text(robot_type, movement.name, movement.version, movement.sha256)
+
+
+def blob_name(who: Identity, robot_type: str, movement: Movement) -> str:
+    """Where a version's script is."""
+    return f"movements/{who.account}/{robot_type}/{movement.name}/{movement.version}-{movement.sha256}.py"
+
+
+def _damaged(movement: Movement, how: str) -> Problem:
+    detail = f"The script of '{movement.name}' {how}. Save it again."
+    return Problem("movement-damaged", 409, "The movement cannot be used", detail)

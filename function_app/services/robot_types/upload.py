@@ -1,0 +1,131 @@
+"""Adding a robot type: stored first, then compiled by a checker somewhere, then in use."""
+
+import contextlib
+from collections.abc import Mapping
+
+import msgspec
+
+from function_app.domain.audit.hash_chain import Deed
+from function_app.domain.common.problems import Problem
+from function_app.domain.identity.accounts import Identity
+from function_app.domain.robot_types.robot_types import TypeHead, TypeVersion, next_version
+from function_app.ports.clock import Clock
+from function_app.ports.robot_catalogue import Catalogue
+from function_app.ports.tables import Conflict, Row, Tables, Write
+from function_app.services.audit.audit_log import AuditChain, Change
+from function_app.services.robot_types.catalogue import KnownType, RobotTypes
+from function_app.services.robot_types.integrity import Seals
+from function_app.services.robot_types.package_reader import Upload, read_upload
+from function_app.services.robot_types.rows import HEAD, INDEX, Place, note_look, read_head, read_version, version_key
+from function_app.services.robot_types.versions import GIVE_UP_MS, TypeVersions, refused
+from function_app.services.storage import records
+
+MAX_OWN = 100
+"""Robot types an account may have."""
+
+
+class UploadRobotType:
+    """Stores an upload and waits for the checker's verdict."""
+
+    def __init__(
+        self,
+        *,
+        tables: Tables,
+        versions: TypeVersions,
+        catalogue: Catalogue,
+        robot_types: RobotTypes,
+        seals: Seals,
+        chain: AuditChain,
+        clock: Clock,
+    ) -> None:
+        self._tables = tables
+        self._versions = versions
+        self._catalogue = catalogue
+        self._types = robot_types
+        self._seals = seals
+        self._chain = chain
+        self._clock = clock
+
+    async def upload(
+        self, who: Identity, manifest: str, files: Mapping[str, str], *, wait_ms: int
+    ) -> tuple[KnownType, bool]:
+        """Add a robot type, or the next version of one; and whether the account had none of this id.
+
+        The note for a look comes first: an upload that a stop cuts off is refused by the timer. Until a version is
+        found good, the one before it stays in use.
+
+        Raises:
+            Problem: ``manifest-invalid``, ``robot-type-invalid``, ``robot-type-built-in``, ``robot-types-full``,
+                ``robot-type-checking``, ``robot-type-refused`` with ``errors``.
+        """
+        return await self.add(who, read_upload(manifest, files), wait_ms=wait_ms)
+
+    async def add(self, who: Identity, given: Upload, *, wait_ms: int) -> tuple[KnownType, bool]:
+        """As ``upload``, of files that have been read."""
+        where = Place(who.account, given.robot_type.type)
+        await require_own(self._catalogue, where.type)
+        await note_look(self._tables, where, self._clock.now_ms() + GIVE_UP_MS)
+        await self._index(where)
+        async with self._chain.change(who.account, Deed.ROBOT_TYPE_UPLOADED, who, on=where.type) as change:
+            version, new = await self._number(where, given, change)
+        await self._index(where)
+        await self._versions.store(where, version, given.files)
+        done = await self._versions.verdict(where, version, wait_ms)
+        if done is not None and done.state == "refused":
+            raise refused(done)
+        return await self._types.view(who, where.type), new
+
+    async def _index(self, where: Place) -> None:
+        """List the type. A new ETag each time keeps a deletion that began before from taking it off the list."""
+        key = INDEX + where.type
+        row = await self._tables.get(records.MEMBERS, where.account, key)
+        with contextlib.suppress(Conflict):
+            if row is not None:
+                await self._tables.replace(records.MEMBERS, row)
+                return
+            page = await self._tables.query(
+                records.MEMBERS, where.account, first=INDEX, last=INDEX + "\x7f", limit=MAX_OWN
+            )
+            if len(page.rows) >= MAX_OWN:
+                detail = f"An account keeps at most {MAX_OWN} robot types. Delete one that is not in use."
+                raise Problem("robot-types-full", 409, "Too many robot types", detail)
+            await self._tables.create(records.MEMBERS, Row(where.account, key, {}))
+
+    async def _number(self, where: Place, given: Upload, change: Change) -> tuple[int, bool]:
+        """Take the next version's number, and write that it is on its way."""
+        manifest = msgspec.to_builtins(given.robot_type)
+        sizes = {name: len(content) for name, content in given.files.items()}
+
+        async def once() -> tuple[int, bool]:
+            row, head = await read_head(self._tables, where)
+            if head is not None and not head.deleted:
+                await self._require_no_other(where, head)
+            following = next_version(head, given.robot_type.version, where.type)
+            plain = TypeVersion(following.last, "uploading", manifest, sizes, self._clock.now_ms())
+            upload = await self._seals.sealed(where.account, where.type, plain, given.files)
+            new_head = Row(where.partition, HEAD, records.fields(following), row.etag if row else "")
+            new_version = Row(where.partition, version_key(following.last), records.fields(upload))
+            writes = [Write("replace" if row else "create", new_head), Write("create", new_version)]
+            change.data["version"] = following.last
+            await change.noted()
+            await self._tables.batch(records.ROBOT_TYPES, writes)
+            return following.last, head is None or head.deleted
+
+        return await records.retry(once)
+
+    async def _require_no_other(self, where: Place, head: TypeHead) -> None:
+        _, newest = await read_version(self._tables, where, head.last)
+        if newest is not None and newest.open:
+            detail = f"Version {newest.version} of '{where.type}' is still being checked. Wait for its verdict."
+            raise Problem("robot-type-checking", 409, "Still being checked", detail)
+
+
+async def require_own(catalogue: Catalogue, robot_type: str) -> None:
+    """An id that an account's own robot type may have.
+
+    Raises:
+        Problem: ``robot-type-built-in``.
+    """
+    if robot_type in await catalogue.types():
+        detail = f"'{robot_type}' comes with the installation. Give your robot type another id."
+        raise Problem("robot-type-built-in", 409, "Built-in", detail)

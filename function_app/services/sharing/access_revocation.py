@@ -1,0 +1,163 @@
+"""Ending what was done under a role that somebody has lost.
+
+At once, and not only what comes next: the lease and its epoch, what waits and what runs in their name, and the broker
+sessions that hear or tell the device. Whoever takes a right away means that this person shall move nothing any more,
+and a script may go on for minutes: the device holds, and nothing that waits begins by itself then.
+
+Who acts under a share looks again after something was written (``Devices.require_still``), and here is looked after the
+share was deleted: of the two at least one sees the other. All of it is safe to repeat.
+
+What the tables decide is done in any case. The broker is waited for a moment: whoever asked is told that it did not
+answer, and the timer goes on telling it.
+"""
+
+import asyncio
+import contextlib
+import logging
+from typing import Final
+
+from device_agent.protocol import CancelAction
+from function_app.domain.actions.action import end
+from function_app.domain.actions.queue import DROPPED, UNSHARED
+from function_app.domain.devices.access import Share, split_target
+from function_app.domain.devices.devices import Device
+from function_app.domain.identity.accounts import Identity
+from function_app.ports.broker_access import BrokerAccess, BrokerAccessError
+from function_app.ports.clock import Clock
+from function_app.ports.command_bus import BusUnavailable
+from function_app.ports.tables import Conflict, Tables
+from function_app.services.actions.action_store import ActionRows
+from function_app.services.actions.queue import Queues
+from function_app.services.control.fencing import Fence
+from function_app.services.devices.control_rows import read_control_rows
+from function_app.services.devices.device_access import Devices, share_key
+from function_app.services.identity.authenticator import watchers
+from function_app.services.messaging.command_sender import Commands
+from function_app.services.storage import records
+
+TELL_S: Final = 1.5
+"""How long somebody who un-shares waits for the broker [s],"""
+TELL_AGAIN_S: Final = 10.0
+"""and how long the timer does."""
+INDEX: Final = "share:"
+"""Begins the keys of shares in an account's partition of ``Members``."""
+
+_log = logging.getLogger(__name__)
+
+
+class Unshare:
+    """Takes from an account what it may no longer have."""
+
+    def __init__(
+        self,
+        *,
+        tables: Tables,
+        devices: Devices,
+        rows: ActionRows,
+        queues: Queues,
+        commands: Commands,
+        fence: Fence,
+        access: BrokerAccess,
+        clock: Clock,
+    ) -> None:
+        self._tables = tables
+        self._devices = devices
+        self._rows = rows
+        self._queues = queues
+        self._commands = commands
+        self._fence = fence
+        self._access = access
+        self._clock = clock
+
+    async def settle(self, share: Share, *, again: bool = False) -> bool:
+        """End what the share's account may no longer do; whether everybody who had to be told has been.
+
+        Args:
+            share: As it was, or as it is now with less. What the account may do by another share stays.
+            again: Tell devices again: who was to do it was killed, or could not reach the broker.
+
+        Raises:
+            Problem: ``busy``.
+        """
+        devices = await self._devices_on(share)
+        until_s = asyncio.get_running_loop().time() + (TELL_AGAIN_S if again else TELL_S)
+        done = await asyncio.gather(
+            self._cut(share.account, until_s),
+            *(self._end_at(device, share.account, until_s, again=again) for device in devices),
+        )
+        if await self._tables.get(records.SHARES, share.on, share_key(share.account)) is None:
+            await self._unindex(share)
+        return all(done)
+
+    async def _cut(self, account: str, until_s: float) -> bool:
+        """End the account's watching sessions: who has lost one device watches the others with new credentials."""
+        try:
+            async with asyncio.timeout_at(until_s):
+                await self._access.revoke(principal=watchers(account))
+        except (BrokerAccessError, TimeoutError) as error:
+            _log.warning("sessions of %s: %s", account, str(error) or "the broker did not answer in time")
+            return False
+        return True
+
+    async def _end_at(self, device: Device, account: str, until_s: float, *, again: bool) -> bool:
+        who = Identity(account, "", "")
+        found, _ = await self._devices.find(who, device.id)
+        if found is not None and found.role.may_operate:
+            return True
+        done = await self._fence.end(device, UNSHARED, account=account, until_s=until_s)
+        if again:
+            done = await self._fence.repeat(device, account, until_s=until_s) and done
+        return await self._end_actions(device, account, until_s) and done
+
+    async def _end_actions(self, device: Device, account: str, until_s: float) -> bool:
+        control = await read_control_rows(self._tables, device.id)
+        waiting = []
+        for action in control.queue.actions:
+            found = await self._rows.get(action)
+            if found is not None and found.action.account == account:
+                waiting.append(action)
+        if waiting:
+            await self._queues.drop(device.id, waiting, UNSHARED)
+        found = await self._rows.get(control.action) if control.action else None
+        if found is None or found.action.account != account or found.action.pairing != device.pairing:
+            return True
+        # Written before it is told. Where this is not heard, the lease's release is told until it is: it holds, too.
+        status, message = DROPPED[UNSHARED]
+        now_ms = self._clock.now_ms()
+        await self._queues.change(found.action.id, lambda known: end(known, status, UNSHARED, message, now_ms))
+        epoch = max(control.lease.epoch if control.lease else 0, found.action.epoch)
+        try:
+            async with asyncio.timeout_at(until_s):
+                await self._commands.send(device, CancelAction(action=found.action.id), who="telescope", epoch=epoch)
+        except (BusUnavailable, TimeoutError) as error:
+            _log.warning("end of action %s: %s", found.action.id, str(error) or "the broker did not answer in time")
+            return False
+        return True
+
+    async def _devices_on(self, share: Share) -> list[Device]:
+        kind, name = split_target(share.on)
+        if kind == "device":
+            device = await self._devices.owned(name)
+            return [] if device is None else [device]
+        owner = share.owner or await self._owner_in_index(share)
+        return await self._devices.in_space(owner, name) if owner else []
+
+    async def _owner_in_index(self, share: Share) -> str:
+        """Of a space whose share is gone: the index is deleted last."""
+        row = await self._tables.get(records.MEMBERS, share.account, INDEX + share.on)
+        return str(row.data["owner"]) if row else ""
+
+    async def _unindex(self, share: Share) -> None:
+        row = await self._tables.get(records.MEMBERS, share.account, INDEX + share.on)
+        if row is not None:
+            with contextlib.suppress(Conflict):
+                await self._tables.delete(records.MEMBERS, row)
+        if await self._tables.get(records.SHARES, share.on, share_key(share.account)) is not None:
+            # Shared again at this very moment: the index follows the share.
+            await index(self._tables, share)
+
+
+async def index(tables: Tables, share: Share) -> None:
+    """Note with the account that something may be shared with it."""
+    data = {"owner": share.owner}
+    await records.upsert(tables, records.MEMBERS, share.account, INDEX + share.on, lambda _: data, dict)

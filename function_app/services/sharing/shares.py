@@ -1,0 +1,335 @@
+"""Sharing devices and spaces with other accounts, and ending that.
+
+A share's row decides from the moment in which it is written or deleted. What was done under a role that is lost ends
+then (``services/unshare.py``); a note for the timer, written first, has that done where this process is killed.
+"""
+
+import asyncio
+import logging
+from dataclasses import dataclass, replace
+from typing import Final, Literal
+
+from function_app.domain.audit.hash_chain import Deed
+from function_app.domain.common.problems import Problem, forbidden, invalid, not_found
+from function_app.domain.common.timestamps import NEVER_MS
+from function_app.domain.control.control_events import Fact
+from function_app.domain.devices.access import (
+    MOST_SHARES,
+    Share,
+    device_target,
+    lasting,
+    outranks,
+    shareable,
+    space_target,
+    split_target,
+)
+from function_app.domain.identity.accounts import Account, Identity, Role
+from function_app.ports.clock import Clock
+from function_app.ports.tables import Conflict, Row, Tables
+from function_app.services.audit.audit_log import AuditChain
+from function_app.services.control.control_events import Audit
+from function_app.services.devices.device_access import Devices, require_owner, share_key
+from function_app.services.devices.spaces import Spaces
+from function_app.services.identity.sign_in import SignIn
+from function_app.services.sharing.access_revocation import Unshare, index
+from function_app.services.storage import records
+from function_app.services.storage.reminders import Pending
+
+LOOK_MS: Final = 10_000
+"""The timer sees to what a change has left undone after so long, where whoever made it was killed."""
+AGAIN_MS: Final = 1_000
+"""And so often, as long as the broker cannot be told."""
+_CHANGED: Final = "share-changed:"
+_EXPIRES: Final = "share-expires:"
+
+_log = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True, slots=True)
+class Shared:
+    """What is shared or handed over, once it is seen that it is the caller's."""
+
+    on: str
+    owner: Account
+    label: str
+    pairing: str = ""
+
+
+class Sharing:
+    """Shares."""
+
+    def __init__(
+        self,
+        *,
+        tables: Tables,
+        devices: Devices,
+        spaces: Spaces,
+        sign_in: SignIn,
+        unshare: Unshare,
+        pending: Pending,
+        audit: Audit,
+        chain: AuditChain,
+        clock: Clock,
+    ) -> None:
+        self._tables = tables
+        self._devices = devices
+        self._spaces = spaces
+        self._sign_in = sign_in
+        self._unshare = unshare
+        self._pending = pending
+        self._audit = audit
+        self._chain = chain
+        self._clock = clock
+
+    # ------------------------------------------------------------ what people ask for
+
+    async def of(self, who: Identity, kind: Literal["device", "space"], name: str) -> Shared:
+        """A device or space of the caller's own, to share it.
+
+        Raises:
+            Problem: ``device-unknown``, ``space-unknown``, ``forbidden``; to an API key always: what it shares would
+                outlive it.
+        """
+        if kind == "space":
+            view = await self._spaces.own(who, name)
+            require_person(who)
+            return Shared(space_target(name), view.owner, view.space.name)
+        device = await self._devices.get(who, name)
+        async with self._audit.refusals(device, who, "share it"):
+            require_owner(device)
+        require_person(who)
+        owner = Account(device.owner, await self._sign_in.named(device.owner))
+        return Shared(device_target(name), owner, device.label, device.pairing)
+
+    async def shares(self, shared: Shared) -> list[tuple[Share, str]]:
+        """With whom it is shared now, each with the account's name."""
+        page = await self._tables.query(records.SHARES, shared.on, first="account:", last="account;", limit=1000)
+        now_ms = self._clock.now_ms()
+        found = [share for row in page.rows if _holds(share := records.read(row, Share), shared, now_ms)]
+        names = await asyncio.gather(*(self._sign_in.named(share.account) for share in found))
+        return sorted(zip(found, names, strict=True), key=lambda each: each[0].created_ms)
+
+    async def put(
+        self, who: Identity, shared: Shared, account: Account, role: Role, for_s: int | None
+    ) -> tuple[Share, bool, bool]:
+        """Share it with an account, or change that.
+
+        Returns:
+            The share, whether it is new, and whether everybody has been told of what was taken away, if anything was;
+            else the timer tells them.
+
+        Raises:
+            Problem: ``invalid``, ``too-many-shares``, ``busy``.
+        """
+        expires_ms = lasting(for_s, self._clock.now_ms())
+        share = self._share(shared, account.id, shareable(role), who.name, expires_ms)
+        return await self._write(who, shared, account, share, keep_more=False)
+
+    async def give(self, who: Identity, shared: Shared, account: Account, role: Role, expires_ms: int) -> Share:
+        """The same by an invitation, which takes nothing away from who has more already."""
+        share = self._share(shared, account.id, role, who.name, expires_ms)
+        return (await self._write(who, shared, account, share, keep_more=True))[0]
+
+    async def end(self, who: Identity, shared: Shared, account: str) -> bool:
+        """Un-share; whether everybody has been told. Else the timer tells them as soon as the broker answers.
+
+        Raises:
+            Problem: ``share-unknown``, ``busy``.
+        """
+        row = await self._tables.get(records.SHARES, shared.on, share_key(account))
+        if row is None or not _holds(records.read(row, Share), shared, self._clock.now_ms()):
+            raise not_found("share", account)
+        return await self._end(who, row)
+
+    async def end_all(self, on: str) -> None:
+        """End all shares of something that its owner has given away.
+
+        Raises:
+            Problem: ``busy``.
+        """
+        page = await self._tables.query(records.SHARES, on, first="account:", last="account;", limit=1000)
+        for row in page.rows:
+            await self._end(None, row)
+
+    async def leave(self, who: Identity, on: str) -> bool:
+        """Give one's own part in something of another's back; whether everybody has been told, as ``end``.
+
+        Raises:
+            Problem: ``share-unknown``, ``already-yours``, ``forbidden``, ``busy``.
+        """
+        require_person(who)
+        row = await self._tables.get(records.SHARES, on, share_key(who.account))
+        if row is None and await self._owns(who, on):
+            raise yours("It is this account's own, which has no share in it. To be rid of it, transfer or un-pair it.")
+        if row is None:
+            raise not_found("share", who.account)
+        return await self._end(who, row)
+
+    async def person(self, name: str) -> Account:
+        """The account of this name.
+
+        Raises:
+            Problem: ``account-unknown``.
+        """
+        found = await self._sign_in.known(name)
+        if found is None:
+            detail = f"There is no account '{name[:80]}'. Ask for the name they sign in with, or make an invitation."
+            raise Problem("account-unknown", 404, "No such account", detail)
+        return found
+
+    async def _owns(self, who: Identity, on: str) -> bool:
+        kind, name = split_target(on)
+        if kind == "space":
+            return name in {space.id for space in await self._sign_in.spaces(who.account)}
+        device, _ = await self._devices.find(who, name)
+        return device is not None and device.owner == who.account
+
+    # ------------------------------------------------------------ writing
+
+    def _share(self, shared: Shared, account: str, role: Role, by: str, expires_ms: int) -> Share:
+        if account == shared.owner.id:
+            raise invalid("It is this account's own: there is nothing to share with it. To give it away, transfer it.")
+        return Share(
+            on=shared.on,
+            account=account,
+            role=role,
+            owner=shared.owner.id,
+            by=by,
+            created_ms=self._clock.now_ms(),
+            expires_ms=expires_ms,
+            pairing=shared.pairing,
+        )
+
+    async def _write(
+        self, who: Identity, shared: Shared, account: Account, share: Share, *, keep_more: bool
+    ) -> tuple[Share, bool, bool]:
+        note = await self._pending.note(_note(_CHANGED, share), self._clock.now_ms() + LOOK_MS)
+        if share.expires_ms < NEVER_MS:
+            await self._pending.note(_note(_EXPIRES, share), share.expires_ms)
+        # The index first: without the share's row behind it it shows nothing.
+        await index(self._tables, share)
+        lowered = False
+
+        async def once() -> tuple[Share, bool]:
+            nonlocal lowered
+            row = await self._tables.get(records.SHARES, share.on, share_key(share.account))
+            known = records.read(row, Share) if row else None
+            before = known if known is not None and _holds(known, shared, self._clock.now_ms()) else None
+            if before is not None and keep_more and not _more(share, before):
+                return before, False
+            lowered = before is not None and (outranks(before.role, share.role) or share.expires_ms < before.expires_ms)
+            if row is None:
+                await self._check_room(share.on)
+            await change.noted()
+            if row is None:
+                await self._tables.create(
+                    records.SHARES, Row(share.on, share_key(share.account), records.fields(share))
+                )
+            else:
+                await self._tables.replace(records.SHARES, replace(row, data=records.fields(share)))
+            return share, before is None
+
+        terms = {"with": account.id, "name": account.name, "role": share.role.value, "expires_ms": share.expires_ms}
+        async with self._chain.change(share.owner, Deed.SHARED, who, on=share.on, **terms) as change:
+            written, fresh = await records.retry(once)
+        if written is share:
+            message = f"{who.name} shared it with {account.name} as {share.role}."
+            await self._tell(share, Fact.SHARED, message, by=who.name, account=account.id, role=share.role.value)
+        return written, fresh, not lowered or await self._settle(share, note)
+
+    async def _check_room(self, on: str) -> None:
+        page = await self._tables.query(records.SHARES, on, first="account:", last="account;", limit=MOST_SHARES)
+        now_ms = self._clock.now_ms()
+        dead = [row for row in page.rows if not records.read(row, Share).live(now_ms)]
+        if len(page.rows) - len(dead) >= MOST_SHARES:
+            detail = f"It is shared with {MOST_SHARES} accounts, the most there can be. End one of these shares."
+            raise Problem("too-many-shares", 409, "Too many shares", detail)
+
+    async def _end(self, who: Identity | None, row: Row) -> bool:
+        """Delete the share's row, which decides, and end what was done under it; whether everybody has been told."""
+        share = records.read(row, Share)
+        note = await self._pending.note(_note(_CHANGED, share), self._clock.now_ms() + LOOK_MS)
+        name = await self._sign_in.named(share.account)
+        on = {"on": share.on, "with": share.account, "name": name}
+        async with self._chain.change(share.owner, Deed.UNSHARED, who, **on) as change:
+            await change.noted()
+            try:
+                await self._tables.delete(records.SHARES, row)
+            except Conflict:
+                change.came_to_nothing = True
+        if change.came_to_nothing:
+            fresh = await self._tables.get(records.SHARES, row.partition, row.key)
+            # What time has ended, and somebody has shared anew at that moment, goes on.
+            if fresh is not None and (who is not None or not records.read(fresh, Share).live(self._clock.now_ms())):
+                return await self._end(who, fresh)
+            return True
+        done = await self._settle(share, note)
+        if who is None:
+            await self._tell(share, Fact.UNSHARED, f"{name}'s share is over.", account=share.account)
+        else:
+            message = f"{who.name} ended {name}'s share."
+            await self._tell(share, Fact.UNSHARED, message, by=who.name, account=share.account)
+        return done
+
+    async def _settle(self, share: Share, note: Row | None) -> bool:
+        """End what is over the role that is left; what could not be told the timer tells soon, until it is."""
+        done = await self._unshare.settle(share)
+        if not done:
+            await self._pending.note(_note(_CHANGED, share), self._clock.now_ms() + AGAIN_MS)
+        if note is not None:
+            await self._pending.drop(note)
+        return done
+
+    async def _tell(self, share: Share, fact: Fact, message: str, **data: str) -> None:
+        kind, name = split_target(share.on)
+        device = await self._devices.owned(name) if kind == "device" else None
+        if device is not None and device.pairing == share.pairing:
+            await self._audit.event(device, fact, message, **data)
+
+    async def look(self, what: str, note: Row) -> None:
+        """The timer's look at a share that was changed, or whose time may be over."""
+        expired = what.startswith(_EXPIRES)
+        on, _, account = what.removeprefix(_EXPIRES if expired else _CHANGED).rpartition("|")
+        row = await self._tables.get(records.SHARES, on, share_key(account))
+        share = records.read(row, Share) if row else None
+        if row is not None and share is not None and not share.live(self._clock.now_ms()):
+            await self._end(None, row)
+        elif not expired:
+            kept = share or Share(on, account, Role.VIEWER, "", "", 0)
+            if not await self._unshare.settle(kept, again=True):
+                await self._pending.note(what, self._clock.now_ms() + AGAIN_MS)
+        await self._pending.drop(note)
+
+
+def require_person(who: Identity) -> None:
+    """See that it is a person who shares, gives away or takes: an API key never does.
+
+    Raises:
+        Problem: ``forbidden``.
+    """
+    if who.key:
+        raise forbidden("An API key shares nothing, gives nothing away and takes nothing. Sign in for that.")
+
+
+def yours(detail: str) -> Problem:
+    """The refusal of what nobody can do with what is their own."""
+    return Problem("already-yours", 409, "It is yours", detail)
+
+
+def about_share(note: str) -> bool:
+    """Whether a note of the timer is about a share."""
+    return note.startswith((_CHANGED, _EXPIRES))
+
+
+def _note(kind: str, share: Share) -> str:
+    return f"{kind}{share.on}|{share.account}"
+
+
+def _holds(share: Share, shared: Shared, now_ms: int) -> bool:
+    return share.live(now_ms) and share.owner == shared.owner.id and share.pairing == shared.pairing
+
+
+def _more(share: Share, than: Share) -> bool:
+    if share.role is than.role:
+        return share.expires_ms > than.expires_ms
+    return outranks(share.role, than.role)

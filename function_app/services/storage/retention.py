@@ -1,0 +1,112 @@
+"""Forgetting on time: notes that name rows or a blob, by the moment from which nobody may need them.
+
+A note is written by whoever knows when that moment comes, and outlives a process that is killed while it deletes: it is
+dropped last. A row that was renewed since says so itself, by ``expires_ms`` in its data; its writer noted it again.
+"""
+
+import asyncio
+import hashlib
+import json
+import logging
+from typing import Any, Final
+
+from function_app.ports.blobs import Blobs
+from function_app.ports.tables import MAX_BATCH, Conflict, Row, Tables, Write
+from function_app.services.storage import records
+
+DAY_MS: Final = 86_400_000
+SHARDS = 8
+NOTES = 25
+"""Notes of one shard that are dealt with in one round."""
+ROWS = 500
+"""Rows of one note that are looked at in one round; the next round goes on behind them."""
+_BATCH_BYTES = 1_000_000
+"""Rows deleted in one batch hold at most this much: a transaction may count what it deletes."""
+
+_log = logging.getLogger(__name__)
+
+
+class Forget:
+    """The notes, and the deleting."""
+
+    def __init__(self, *, tables: Tables, blobs: Blobs) -> None:
+        self._tables = tables
+        self._blobs = blobs
+
+    async def rows(self, table: str, partition: str, *, first: str, last: str | None, due_ms: int) -> None:
+        """Delete the rows with ``first`` ≤ key < ``last`` once ``due_ms`` has come; the same note twice is one.
+
+        Args:
+            table: Their table.
+            partition: Their partition.
+            first: The first key.
+            last: Behind the last key; ``None``: to the end of the partition.
+            due_ms: When [ms since 1970]. Rows whose ``expires_ms`` is later then are kept.
+        """
+        await self._note({"table": table, "partition": partition, "first": first, "last": last}, due_ms)
+
+    async def row(self, table: str, partition: str, key: str, *, due_ms: int) -> None:
+        """Delete one row, as ``rows``."""
+        await self.rows(table, partition, first=key, last=key + "\0", due_ms=due_ms)
+
+    async def blob(self, name: str, *, due_ms: int) -> None:
+        """Delete a blob once ``due_ms`` has come; the same note twice is one."""
+        await self._note({"blob": name}, due_ms)
+
+    async def run(self, now_ms: int) -> None:
+        """One round: part of what is due. Safe to repeat and to be run by many at once.
+
+        Raises:
+            StoreError: The stores cannot be used.
+        """
+        await asyncio.gather(*(self._shard(shard, now_ms) for shard in range(SHARDS)))
+
+    async def _note(self, target: dict[str, Any], due_ms: int) -> None:
+        digest = hashlib.sha256(json.dumps(target, sort_keys=True).encode()).hexdigest()
+        row = Row(str(int(digest[:2], 16) % SHARDS), f"{due_ms:013d}:{digest[:32]}", target)
+        try:
+            await self._tables.create(records.FORGET, row)
+        except Conflict:
+            return
+
+    async def _shard(self, shard: int, now_ms: int) -> None:
+        due = await self._tables.query(records.FORGET, str(shard), last=f"{now_ms + 1:013d}", limit=NOTES)
+        for note in due.rows:
+            try:
+                if await self._done(note, now_ms):
+                    await self._tables.delete(records.FORGET, note)
+            except Conflict:
+                _log.debug("another timer deals with %s, or a row has changed: the next round looks again", note.key)
+
+    async def _done(self, note: Row, now_ms: int) -> bool:
+        """Delete what ``note`` names; whether that was all of it."""
+        target = note.data
+        if "blob" in target:
+            await self._blobs.delete(target["blob"])
+            return True
+        table, partition, last = target["table"], target["partition"], target["last"]
+        first, seen = target["first"], 0
+        while seen < ROWS:
+            page = await self._tables.query(table, partition, first=first, last=last, limit=MAX_BATCH)
+            if not page.rows:
+                return True
+            for batch in _batches([row for row in page.rows if row.data.get("expires_ms", 0) <= now_ms]):
+                await self._tables.batch(table, batch)
+            if page.cursor is None:
+                return True
+            first, seen = page.rows[-1].key + "\0", seen + len(page.rows)
+        await self._tables.replace(records.FORGET, Row(note.partition, note.key, {**target, "first": first}, note.etag))
+        return False
+
+
+def _batches(rows: list[Row]) -> list[list[Write]]:
+    batches: list[list[Write]] = []
+    left = 0
+    for row in rows:
+        size = len(json.dumps(dict(row.data)))
+        if not batches or size > left:
+            batches.append([])
+            left = _BATCH_BYTES
+        batches[-1].append(Write("delete", row))
+        left -= size
+    return batches

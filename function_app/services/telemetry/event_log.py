@@ -1,0 +1,77 @@
+"""What happened to devices, newest first: told by agents, or found here."""
+
+from collections.abc import Mapping
+from typing import Any
+
+from function_app.domain.common.ids import new_suffix
+from function_app.domain.common.problems import invalid
+from function_app.domain.devices.devices import Device
+from function_app.ports.clock import Clock
+from function_app.ports.tables import Conflict, Row, Tables
+from function_app.services.storage import records
+from function_app.services.storage.retention import DAY_MS, Forget
+
+KEEP_EVENTS_MS = 90 * DAY_MS
+_NOTED = 4096
+"""Days of devices whose end a process knows to be noted."""
+
+
+class Events:
+    """The events of all devices."""
+
+    def __init__(self, *, tables: Tables, forget: Forget, clock: Clock) -> None:
+        self._tables = tables
+        self._forget = forget
+        self._clock = clock
+        self._noted: dict[tuple[str, int, int], None] = {}
+
+    async def add(self, device: str, pairing: str, event: Mapping[str, Any]) -> None:
+        """Store an event by its ``id`` and ``at_ms``: one that comes twice is stored once.
+
+        Args:
+            device: The device's id.
+            pairing: In which it happened: a later owner is not shown it.
+            event: As ``messages.Event``.
+        """
+        partition = _partition(device, pairing)
+        now_ms = self._clock.now_ms()
+        data = {**event, "seen_ms": now_ms, "expires_ms": now_ms + KEEP_EVENTS_MS}
+        when = new_suffix(event["at_ms"])[:9]
+        await self._note(partition, event["at_ms"] // DAY_MS, now_ms // DAY_MS)
+        try:
+            await self._tables.create(records.EVENTS, Row(partition, f"{when}:{event['id']}", data))
+        except Conflict:
+            return
+
+    async def read(
+        self, device: Device, *, cursor: str | None, limit: int
+    ) -> tuple[list[Mapping[str, Any]], str | None]:
+        """What happened since the device was paired, newest first, and where the next page begins.
+
+        Raises:
+            Problem: ``cursor-invalid``.
+        """
+        try:
+            page = await self._tables.query(
+                records.EVENTS, _partition(device.id, device.pairing), limit=limit, cursor=cursor
+            )
+        except ValueError as error:
+            raise invalid("The cursor is not one of this list. Begin without one.", code="cursor-invalid") from error
+        return [row.data for row in page.rows], page.cursor
+
+    async def _note(self, partition: str, day: int, seen_day: int) -> None:
+        """See that the events of one day that were seen on another will be forgotten: one note for all of them."""
+        known = (partition, day, seen_day)
+        if known in self._noted:
+            return
+        # Keys count down with time: the day's last moment comes first.
+        first, last = (new_suffix((day + 1) * DAY_MS - 1)[:9], new_suffix(day * DAY_MS)[:9] + ";")
+        due_ms = (seen_day + 1) * DAY_MS + KEEP_EVENTS_MS
+        await self._forget.rows(records.EVENTS, partition, first=first, last=last, due_ms=due_ms)
+        self._noted[known] = None
+        if len(self._noted) > _NOTED:
+            del self._noted[next(iter(self._noted))]
+
+
+def _partition(device: str, pairing: str) -> str:
+    return f"{device}/{pairing}"

@@ -1,0 +1,265 @@
+"""Telemetry of all devices into one joined queue, and from there to each device's series.
+
+What arrives together is written down as one row (the paper's data buffer), then distributed to the series of the
+devices (its device-related data buffers), then dropped. A process that is killed in between leaves the row, which a
+timer distributes; a sample counts once however often it comes.
+"""
+
+import asyncio
+import logging
+import re
+from collections import defaultdict
+from collections.abc import Awaitable, Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from typing import NamedTuple
+
+from device_agent.protocol import Description, JointTelemetry, Measurements, Mode, codec, topics
+from device_agent.protocol.errors import ProtocolError
+from device_agent.protocol.topics import Topic
+from function_app.domain.common.ids import new_id, split_device
+from function_app.domain.common.problems import Problem
+from function_app.domain.devices.devices import Agent, Device
+from function_app.domain.telemetry import series
+from function_app.domain.telemetry.series import MAX_FIELDS, MAX_MAGNITUDE, Samples
+from function_app.ports.clock import Clock
+from function_app.ports.tables import Conflict, Row, Tables
+from function_app.services.devices.device_access import devices_of
+from function_app.services.storage import records
+from function_app.services.telemetry.series_writer import Place, SeriesWriter
+
+SHARDS = 8
+KNOWN_MS = 3_000
+"""An agent's row is read again after this time: until then an un-paired agent's data still go to its former pairing."""
+MAX_KNOWN = 1_000
+LEFT_MS = 30_000
+"""What has lain in the queue for so long was left by a process that has ended."""
+GIVE_UP_MS = 3_600_000
+"""What could not be distributed for so long never can be."""
+MAX_ROW_BYTES = 200_000
+"""A row of the queue holds at most about so much."""
+_BYTES_PER_VALUE = 11
+"""Eight bytes that do not compress, in base64."""
+_JOINT = re.compile(r"\A[A-Za-z0-9_-]{1,60}\Z")
+_LEFT = 20
+_AT_ONCE = 20
+"""Messages that are read before others get their turn: an ack must not wait for telemetry."""
+
+Values = Mapping[str, float]
+Observer = Callable[[Device, str, Sequence[tuple[int, Values]]], Awaitable[None]]
+"""Told of new samples of a device's stream: the time of the last one in each (part of a) window of 10 s, and means."""
+
+_log = logging.getLogger(__name__)
+
+
+class Arrived(NamedTuple):
+    """One message, as it came."""
+
+    topic: Topic
+    payload: bytes
+
+
+@dataclass(frozen=True, slots=True)
+class _Agent:
+    """What is known of an agent for a moment."""
+
+    space: str | None
+    devices: Mapping[str, Device]
+    joints: Mapping[str, Sequence[str]]
+    read_ms: int
+
+
+class Intake:
+    """Takes telemetry in. Safe to repeat; what does not belong to a claimed agent's device is dropped."""
+
+    def __init__(
+        self, *, tables: Tables, writer: SeriesWriter, clock: Clock, observers: Sequence[Observer] = ()
+    ) -> None:
+        self._tables = tables
+        self._writer = writer
+        self._clock = clock
+        self._observers = tuple(observers)
+        self._agents: dict[str, _Agent] = {}
+        self._turn = 0
+
+    async def take(self, messages: Iterable[Arrived]) -> dict[int, str]:
+        """Take messages in: once this returns they are in their series.
+
+        Returns:
+            What cannot be read and is dropped: its place among ``messages``, and why.
+
+        Raises:
+            Problem: ``busy``: what is not in its series yet is in the queue, or is to be delivered again.
+            StoreError: As above.
+        """
+        dropped: dict[int, str] = {}
+        parts: dict[tuple[str, str], list[tuple[int, Values]]] = defaultdict(list)
+        devices: dict[str, Device] = {}
+        for number, message in enumerate(messages):
+            if number % _AT_ONCE == 0:
+                await asyncio.sleep(0)
+            known = await self._agent(message.topic.agent)
+            device = known.devices.get(message.topic.device)
+            if device is None or known.space != message.topic.space:
+                continue
+            try:
+                sample = _sample(message, known.joints.get(message.topic.device, ()))
+            except ProtocolError as error:
+                _log.warning("%s of %s dropped: %s", message.topic.name, device.id, error)
+                dropped[number] = str(error)
+                continue
+            devices[device.id] = device
+            parts[device.id, message.topic.name].append(sample)
+        gathered = [_Part(devices[id_], stream, series.gather(rows)) for (id_, stream), rows in parts.items()]
+        for batch in _batches(gathered):
+            await self._distribute(await self._queue(batch), batch)
+        return dropped
+
+    async def distribute_left(self) -> None:
+        """Distribute what others have left behind: a part of the queue each time.
+
+        Raises:
+            StoreError: The tables cannot be used.
+        """
+        self._turn += 1
+        now_ms = self._clock.now_ms()
+        shard = str(self._turn % SHARDS)
+        page = await self._tables.query(records.DATA, shard, last=f"{now_ms - LEFT_MS:013d}", limit=_LEFT)
+        for row in page.rows:
+            try:
+                await self._distribute(row, await self._parts(row))
+            except Problem as problem:
+                _log.warning("data of %s: %s", row.key, problem.detail)
+                if now_ms - int(row.key.partition(":")[0]) > GIVE_UP_MS:
+                    await self._drop(row)
+
+    async def _queue(self, batch: Sequence["_Part"]) -> Row:
+        now_ms = self._clock.now_ms()
+        data = {
+            "parts": [
+                {"device": device.id, "pairing": device.pairing, "stream": stream, "samples": series.pack(samples)}
+                for device, stream, samples in batch
+            ]
+        }
+        shard = str(now_ms // 1000 % SHARDS)
+        return await self._tables.create(records.DATA, Row(shard, f"{now_ms:013d}:{new_id(8)}", data))
+
+    async def _distribute(self, row: Row, batch: Sequence["_Part"]) -> None:
+        for device, stream, samples in batch:
+            await asyncio.sleep(0)
+            new = await self._writer.add(Place(device.id, device.pairing, stream), samples)
+            if new:
+                await self._tell(device, stream, new)
+        await self._drop(row)
+
+    async def _parts(self, row: Row) -> list["_Part"]:
+        """What is in a row of the queue. A device that was un-paired since has no place for it any more."""
+        parts: list[_Part] = []
+        for part in row.data["parts"]:
+            agent, name = split_device(part["device"]) or ("", "")
+            known = await self._agent(agent)
+            device = known.devices.get(name)
+            if device is not None and device.pairing == part["pairing"]:
+                parts.append(_Part(device, part["stream"], series.unpack(part["samples"])))
+        return parts
+
+    async def _tell(self, device: Device, stream: str, new: Samples) -> None:
+        means = []
+        for _, window in new.windows():
+            fields = series.summarize(window).fields
+            means.append((window.at_ms[-1], {name: summary.mean for name, summary in fields.items()}))
+        for observer in self._observers:
+            try:
+                await observer(device, stream, means)
+            except Exception:  # noqa: BLE001 (who only watches must not hold up what is watched)
+                _log.exception("observer of %s of %s", stream, device.id)
+
+    async def _drop(self, row: Row) -> None:
+        try:
+            await self._tables.delete(records.DATA, row)
+        except Conflict:
+            _log.debug("%s was distributed twice, and counted once", row.key)
+
+    async def _agent(self, agent_id: str) -> _Agent:
+        now_ms = self._clock.now_ms()
+        known = self._agents.get(agent_id)
+        if known is not None and 0 <= now_ms - known.read_ms < KNOWN_MS:
+            return known
+        if len(self._agents) >= MAX_KNOWN:
+            self._agents.clear()
+        row = await self._tables.get(records.AGENTS, agent_id, "agent") if agent_id else None
+        agent = None if row is None else records.read(row, Agent)
+        if agent is None or not agent.claimed:
+            known = _Agent(None, {}, {}, now_ms)
+        else:
+            page = await self._tables.query(records.DESCRIPTIONS, agent_id, limit=1000)
+            joints = {row.key: _joints(records.read(row, Description)) for row in page.rows}
+            known = _Agent(agent.space, {device.name: device for device in devices_of(agent)}, joints, now_ms)
+        self._agents[agent_id] = known
+        return known
+
+
+class _Part(NamedTuple):
+    """Samples of one stream of one device."""
+
+    device: Device
+    stream: str
+    samples: Samples
+
+
+def _batches(parts: Iterable[_Part]) -> Iterator[list[_Part]]:
+    """Parts that fit into one row of the queue each."""
+    batch: list[_Part] = []
+    left = MAX_ROW_BYTES
+    for device, stream, samples in parts:
+        fields = len(samples.columns)
+        step = max(1, MAX_ROW_BYTES * 3 // 4 // (_BYTES_PER_VALUE * (fields + 2)))
+        for begin in range(0, len(samples), step):
+            piece = samples.part(begin, begin + step)
+            size = _BYTES_PER_VALUE * len(piece) * (fields + 2) + sum(len(name) + 4 for name in samples.columns) + 400
+            if batch and size > left:
+                yield batch
+                batch, left = [], MAX_ROW_BYTES
+            batch.append(_Part(device, stream, piece))
+            left -= size
+    if batch:
+        yield batch
+
+
+def _joints(description: Description) -> Sequence[str]:
+    """The joints' names as fields take them; the number of a joint whose name they do not take."""
+    return [joint.name if _JOINT.match(joint.name) else str(index) for index, joint in enumerate(description.joints)]
+
+
+def _sample(message: Arrived, joints: Sequence[str]) -> tuple[int, Values]:
+    """Time and values of a message.
+
+    Raises:
+        ProtocolError: It is not what its stream carries.
+    """
+    values: dict[str, float]
+    if message.topic.name == topics.JOINTS:
+        telemetry = codec.decode(message.payload, JointTelemetry)
+        at_ms, values = telemetry.at_ms, _joint_values(telemetry, joints)
+    else:
+        measured = codec.decode(message.payload, Measurements)
+        at_ms, values = measured.at_ms, {name: float(value) for name, value in measured.values.items()}
+    if not 1 <= len(values) <= MAX_FIELDS:
+        raise ProtocolError(f"{len(values)} values; it must be 1 to {MAX_FIELDS}")
+    if max(values.values()) > MAX_MAGNITUDE or min(values.values()) < -MAX_MAGNITUDE:
+        raise ProtocolError(f"a value is beyond {MAX_MAGNITUDE:g}")
+    return at_ms, values
+
+
+def _joint_values(telemetry: JointTelemetry, joints: Sequence[str]) -> dict[str, float]:
+    """Position, velocity and effort of each joint; and while an operator streams setpoints, how old these are."""
+    values: dict[str, float] = {}
+    for quantity, measured in (
+        ("position_rad", telemetry.position_rad),
+        ("velocity_rad_s", telemetry.velocity_rad_s),
+        ("effort_nm", telemetry.effort_nm),
+    ):
+        for index, value in enumerate(measured):
+            values[f"{quantity}.{joints[index] if index < len(joints) else index}"] = value
+    if telemetry.mode is Mode.STREAMING:
+        values["loop_age_ms"] = telemetry.loop_age_ms
+    return values

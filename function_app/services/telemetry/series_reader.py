@@ -1,0 +1,224 @@
+"""Reading series: which streams a device has, and a range of one, as fine as the caller has room for."""
+
+import asyncio
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import NamedTuple
+
+from device_agent.protocol import topics
+from function_app.domain.common.problems import invalid, not_found
+from function_app.domain.identity.accounts import Identity
+from function_app.domain.telemetry import series
+from function_app.domain.telemetry.series import FINEST, LEVELS, RAW, WINDOW_MS, Keep, Level, Samples, Summary
+from function_app.ports.clock import Clock
+from function_app.ports.tables import Tables
+from function_app.services.devices.device_access import Devices
+from function_app.services.storage import records
+from function_app.services.telemetry.series_writer import ABOUT, MAX_STREAMS, About, Place
+
+MAX_POINTS = 1_000
+_DIGITS = 13
+"""Of a time in a key [ms]."""
+RAW_ROWS = 100
+"""Windows that are looked through for raw samples in one query."""
+RAW_QUERIES = 10
+"""Queries in one page of raw samples: where windows are nearly empty the page ends early, with a cursor."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Range:
+    """What to read: ``first_ms`` ≤ time < ``last_ms``.
+
+    Attributes:
+        first_ms: ``None``: from the beginning.
+        last_ms: ``None``: to the end.
+        points: At most so many points in a page.
+        level: Which buckets; ``None``: the finest of which ``points`` are enough.
+        fields: Which fields; ``None``: all.
+        cursor: Where the page before ended.
+    """
+
+    first_ms: int | None = None
+    last_ms: int | None = None
+    points: int = 500
+    level: str | None = None
+    fields: Sequence[str] | None = None
+    cursor: str | None = None
+
+
+@dataclass(slots=True)
+class Part:
+    """One page: times, and for each field a value or summary for each of them; ``None`` where there is none."""
+
+    level: Level
+    first_ms: int
+    last_ms: int
+    at_ms: list[int] = field(default_factory=list)
+    values: dict[str, list[float | None]] = field(default_factory=dict)
+    summaries: dict[str, list[Summary | None]] = field(default_factory=dict)
+    cursor: str | None = None
+
+
+class _Question(NamedTuple):
+    """A range, once it is settled."""
+
+    place: Place
+    first_ms: int
+    last_ms: int
+    points: int
+    names: Sequence[str]
+
+
+class StreamView(NamedTuple):
+    """A stream and what is known of all of it."""
+
+    name: str
+    about: About
+
+
+class SeriesReader:
+    """Reads what ``SeriesWriter`` has written."""
+
+    def __init__(self, *, tables: Tables, devices: Devices, keep: Keep, clock: Clock) -> None:
+        self._tables = tables
+        self._devices = devices
+        self._keep = keep
+        self._clock = clock
+
+    async def streams(self, who: Identity, device: str) -> list[StreamView]:
+        """The streams of a device, by name.
+
+        Raises:
+            Problem: ``device-unknown``.
+        """
+        found = await self._devices.get(who, device)
+        place = Place(found.id, found.pairing, "")
+        listed = await self._tables.query(records.SERIES, place.streams, limit=MAX_STREAMS)
+        views = await asyncio.gather(*(self._about(place._replace(stream=row.key)) for row in listed.rows))
+        return [StreamView(row.key, about) for row, about in zip(listed.rows, views, strict=True) if about is not None]
+
+    async def read(self, who: Identity, device: str, stream: str, wanted: Range) -> Part:
+        """A page of one stream.
+
+        Raises:
+            Problem: ``device-unknown``, ``stream-unknown``, ``invalid``, ``cursor-invalid``.
+        """
+        found = await self._devices.get(who, device)
+        place = Place(found.id, found.pairing, stream)
+        about = await self._about(place)
+        if about is None:
+            raise not_found("stream", stream)
+        level = None if wanted.level is None else _level(wanted.level)
+        first_ms = max(wanted.first_ms or 0, about.first_ms)
+        last_ms = about.last_ms + 1
+        if wanted.last_ms is not None:
+            last_ms = min(wanted.last_ms, last_ms)
+        if wanted.cursor is not None:
+            level, first_ms = _read_cursor(wanted.cursor)
+        if first_ms >= last_ms:
+            return Part(level or FINEST, first_ms, max(first_ms, last_ms))
+        asked = _Question(place, first_ms, last_ms, wanted.points, _wanted(wanted.fields, about))
+        if level == RAW:
+            return await self._raw(asked)
+        if level is not None:
+            part, _ = await self._buckets(level, asked)
+            return part
+        now_ms = self._clock.now_ms()
+        level = series.finest(first_ms, last_ms, points=wanted.points, now_ms=now_ms, keep=self._keep)
+        part, samples = await self._buckets(level, asked)
+        if level == FINEST and samples <= wanted.points and first_ms > now_ms - self._keep.raw_ms:
+            return await self._raw(asked)
+        return part
+
+    async def _about(self, place: Place) -> About | None:
+        row = await self._tables.get(records.SERIES, place.partition, ABOUT) if topics.is_id(place.stream) else None
+        return None if row is None else records.read(row, About)
+
+    async def _buckets(self, level: Level, asked: _Question) -> tuple[Part, int]:
+        """A page of buckets, and how many samples are in them."""
+        page = await self._tables.query(
+            records.SERIES,
+            asked.place.partition,
+            first=series.key(level, series.floor(asked.first_ms, level.span_ms)),
+            last=series.key(level, asked.last_ms),
+            limit=asked.points,
+        )
+        part = Part(level, asked.first_ms, asked.last_ms, summaries={name: [] for name in asked.names})
+        samples = 0
+        for row in page.rows:
+            bucket = series.bucket(row.data)
+            samples += bucket.count
+            part.at_ms.append(series.start_of(row.key))
+            for name, summaries in part.summaries.items():
+                summaries.append(bucket.fields.get(name))
+        if page.cursor is not None:
+            part.cursor = _write_cursor(level, part.at_ms[-1] + level.span_ms)
+        return part, samples
+
+    async def _raw(self, asked: _Question) -> Part:
+        """A page of samples as they came."""
+        part = Part(RAW, asked.first_ms, asked.last_ms, values={name: [] for name in asked.names})
+        begin_ms = series.floor(asked.first_ms, WINDOW_MS)
+        rows = min(RAW_ROWS, asked.points)
+        for _ in range(RAW_QUERIES):
+            page = await self._tables.query(
+                records.SERIES,
+                asked.place.partition,
+                first=series.key(RAW, begin_ms),
+                last=series.key(RAW, asked.last_ms),
+                limit=rows,
+            )
+            for row in page.rows:
+                inside = series.unpack(row.data).between(asked.first_ms, asked.last_ms)
+                left = asked.points - len(part.at_ms)
+                if len(inside) > left:
+                    part.cursor = _write_cursor(RAW, inside.at_ms[left])
+                    inside = inside.part(0, left)
+                _extend(part, inside)
+                if part.cursor is not None:
+                    return part
+            if page.cursor is None:
+                return part
+            begin_ms = series.start_of(page.rows[-1].key) + WINDOW_MS
+        part.cursor = _write_cursor(RAW, begin_ms)
+        return part
+
+
+def _extend(part: Part, samples: Samples) -> None:
+    part.at_ms.extend(samples.at_ms)
+    for name, values in part.values.items():
+        column = samples.columns.get(name)
+        if column is None:
+            values.extend([None] * len(samples))
+        else:
+            values.extend(None if math.isnan(value) else value for value in column)
+
+
+def _wanted(fields: Sequence[str] | None, about: About) -> Sequence[str]:
+    if fields is None:
+        return about.fields
+    unknown = [name for name in fields if name not in about.fields]
+    if unknown:
+        there = ", ".join(about.fields[:20])
+        raise invalid(f"The stream has no field '{unknown[0][:80]}'. It has: {there}.", code="field-unknown")
+    return list(dict.fromkeys(fields))
+
+
+def _level(name: str) -> Level:
+    for level in (RAW, *LEVELS):
+        if level.name == name:
+            return level
+    raise invalid(f"The resolution is one of {', '.join(level.name for level in (RAW, *LEVELS))}.")
+
+
+def _write_cursor(level: Level, at_ms: int) -> str:
+    return f"{level.name}.{at_ms}"
+
+
+def _read_cursor(cursor: str) -> tuple[Level, int]:
+    name, _, at = cursor.partition(".")
+    level = next((level for level in (RAW, *LEVELS) if level.name == name), None)
+    if level is None or not at.isascii() or not at.isdecimal() or len(at) > _DIGITS:
+        raise invalid("The cursor is not one of this list. Begin without one.", code="cursor-invalid")
+    return level, int(at)

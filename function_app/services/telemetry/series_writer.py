@@ -1,0 +1,287 @@
+"""Samples into their series, each of them once.
+
+The raw window knows which times it has, and all buckets that a sample belongs to change in the same batch as it.
+"""
+
+import asyncio
+import logging
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field
+from typing import Any, NamedTuple
+
+from function_app.domain.telemetry import series
+from function_app.domain.telemetry.series import DAY, LEVELS, RAW, Bucket, Keep, Level, Samples
+from function_app.ports.clock import Clock
+from function_app.ports.tables import MAX_BATCH, MAX_BATCH_BYTES, Conflict, Row, Tables, Write
+from function_app.services.storage import records
+from function_app.services.storage.records import retry
+from function_app.services.storage.retention import Forget
+
+ABOUT = "about"
+"""Key of what is known of a whole stream."""
+MAX_STREAMS = 64
+"""Streams of one device."""
+AHEAD_MS = 300_000
+"""A device's clock may be wrong by so much towards the future; what is from later than that is not taken in."""
+MARGIN_MS = 3_600_000
+"""Rows stay so much longer than late samples are taken in: a writer may be slow, and clocks differ."""
+MAX_WRITTEN = 100
+"""Streams whose newest rows are kept in memory."""
+_MAX_BYTES = MAX_BATCH_BYTES * 3 // 4
+"""Of a batch; what is known of the stream, and the rows' other fields, need some of it."""
+_BYTES_PER_SUMMARY = 240
+_BYTES_PER_NAME = 84
+
+_log = logging.getLogger(__name__)
+
+
+class Place(NamedTuple):
+    """Where samples belong: a device in one pairing, so that a new owner sees nothing of the former one's."""
+
+    device: str
+    pairing: str
+    stream: str
+
+    @property
+    def streams(self) -> str:
+        """The partition that lists the device's streams."""
+        return f"{self.device}/{self.pairing}"
+
+    @property
+    def partition(self) -> str:
+        """The partition of this stream."""
+        return f"{self.device}/{self.pairing}/{self.stream}"
+
+
+@dataclass(frozen=True, slots=True)
+class About:
+    """What is known of a whole stream: ``count`` samples ever, the first and the last time, names of its fields."""
+
+    count: int = 0
+    first_ms: int = 0
+    last_ms: int = 0
+    fields: tuple[str, ...] = ()
+
+
+@dataclass(slots=True)
+class _Known:
+    """Rows of one stream as they were read."""
+
+    about: Row | None
+    rows: dict[str, Row] = field(default_factory=dict)
+    last_ms: int = 0
+    """Start of the newest window among them."""
+
+    def write(self, partition: str, key: str, data: dict[str, Any]) -> Write:
+        """The write that puts ``data`` where the row was, or was not."""
+        row = self.about if key == ABOUT else self.rows.get(key)
+        if row is None:
+            return Write("create", Row(partition, key, data))
+        return Write("replace", Row(partition, key, data, row.etag))
+
+
+_Windows = Sequence[tuple[int, Samples]]
+
+
+class SeriesWriter:
+    """Adds samples. Safe to repeat, by any number at once, in any order."""
+
+    def __init__(self, *, tables: Tables, forget: Forget, keep: Keep, clock: Clock) -> None:
+        self._tables = tables
+        self._forget = forget
+        self._keep = keep
+        self._clock = clock
+        self._written: dict[str, _Known] = {}
+
+    async def add(self, place: Place, samples: Samples) -> Samples:
+        """Add what is not there yet; gives what was new.
+
+        Samples from before raw data are forgotten, from more than five minutes ahead, and what no longer fits into its
+        window are left out, with a line in the log.
+
+        Raises:
+            Problem: ``busy``: part of it may be written. Safe to repeat.
+            StoreError: As above.
+        """
+        now_ms = self._clock.now_ms()
+        taken = samples.between(now_ms - self._keep.raw_ms, now_ms + AHEAD_MS)
+        if len(taken) < len(samples):
+            _log.warning("%s: %d samples are too old or ahead of time", place, len(samples) - len(taken))
+        new = Samples()
+        for windows in _chunks(taken):
+            new = series.merge(new, await self._add(place, windows))
+        return new
+
+    async def forget(self, device: str, pairing: str) -> None:
+        """Forget all streams of a pairing that has ended, once those who do not know yet have stopped to write."""
+        due_ms = self._clock.now_ms() + MARGIN_MS
+        place = Place(device, pairing, "")
+        listed = await self._tables.query(records.SERIES, place.streams, limit=MAX_STREAMS)
+        for row in listed.rows:
+            partition = place._replace(stream=row.key).partition
+            await self._forget.rows(records.SERIES, partition, first="", last=None, due_ms=due_ms)
+        await self._forget.rows(records.SERIES, place.streams, first="", last=None, due_ms=due_ms)
+
+    async def _add(self, place: Place, windows: _Windows) -> Samples:
+        """A part that fits into one batch, or, where what is known already makes it too large, into several."""
+        first_ms, last_ms = windows[0][0], windows[-1][0]
+
+        async def once() -> Samples | None:
+            # What this instance wrote last, as long as nobody else has: if so, the ETags say it, and it is read.
+            known = self._written.pop(place.partition, None)
+            if known is None or first_ms < known.last_ms:
+                known = await self._read(place.partition, first_ms, last_ms)
+            return await self._write(place, windows, known)
+
+        written = await retry(once)
+        if written is not None:
+            return written
+        half = len(windows) // 2
+        return series.merge(await self._add(place, windows[:half]), await self._add(place, windows[half:]))
+
+    async def _write(self, place: Place, windows: _Windows, known: _Known) -> Samples | None:
+        """Decide and write; ``None``: too much for one batch.
+
+        Raises:
+            Conflict: Somebody else has written meanwhile.
+        """
+        partition = place.partition
+        about = records.read(known.about, About) if known.about else About()
+        if known.about is None and not await self._announce(place):
+            return Samples()
+        names = _names(about, windows)
+        new = Samples()
+        buckets: dict[str, Bucket] = {}
+        writes: list[Write] = []
+        for start_ms, window in windows:
+            key = series.key(RAW, start_ms)
+            row = known.rows.get(key)
+            there = series.unpack(row.data) if row else Samples()
+            fresh = series.unseen(_only(window, names), there)
+            fitting = series.room(fresh, there)
+            if len(fitting) < len(fresh):
+                _log.warning("%s: %d samples are more than a window holds", place, len(fresh) - len(fitting))
+            if not fitting:
+                continue
+            new = series.merge(new, fitting)
+            writes.append(known.write(partition, key, series.pack(series.merge(there, fitting))))
+            _into(buckets, known, start_ms, series.summarize(fitting))
+        if not new:
+            return new
+        size = sum(
+            len(row["data"]) + _BYTES_PER_NAME * len(row["fields"]) for row in (each.row.data for each in writes)
+        )
+        size += _BYTES_PER_SUMMARY * sum(len(each.fields) for each in buckets.values())
+        if size > _MAX_BYTES and len(windows) > 1:
+            return None
+        writes += (known.write(partition, key, each.data()) for key, each in buckets.items())
+        writes.append(known.write(partition, ABOUT, records.fields(_grown(about, new, names))))
+        await self._note(partition, known, buckets)
+        self._remember(partition, windows[-1][0], await self._tables.batch(records.SERIES, writes))
+        return new
+
+    def _remember(self, partition: str, start_ms: int, written: Sequence[Row]) -> None:
+        """Keep the rows that samples from the same window on will change: a live stream needs no reading then."""
+        rows = {row.key: row for row in written}
+        about = rows.pop(ABOUT)
+        keys = {series.key(level, _start(level, start_ms)) for level in (RAW, *LEVELS)}
+        if keys <= rows.keys():
+            while len(self._written) >= MAX_WRITTEN:
+                self._written.pop(next(iter(self._written)))
+            self._written[partition] = _Known(about, {key: rows[key] for key in keys}, start_ms)
+
+    async def _read(self, partition: str, first_ms: int, last_ms: int) -> _Known:
+        """All rows that samples between the two windows can change."""
+        ranges = [(level, _start(level, first_ms), _start(level, last_ms)) for level in (RAW, *LEVELS)]
+        keys = [(ABOUT, ABOUT), *((series.key(level, first), series.key(level, last)) for level, first, last in ranges)]
+        pages = await asyncio.gather(*(self._rows(partition, first, last) for first, last in keys))
+        rows = {row.key: row for page in pages for row in page}
+        return _Known(rows.pop(ABOUT, None), rows)
+
+    async def _rows(self, partition: str, first: str, last: str) -> tuple[Row, ...]:
+        if first == last:
+            row = await self._tables.get(records.SERIES, partition, first)
+            return (row,) if row else ()
+        page = await self._tables.query(records.SERIES, partition, first=first, last=last + "\0", limit=MAX_BATCH)
+        return page.rows
+
+    async def _announce(self, place: Place) -> bool:
+        """List a new stream; ``False``: the device has too many already."""
+        listed = await self._tables.query(records.SERIES, place.streams, limit=MAX_STREAMS)
+        if any(row.key == place.stream for row in listed.rows):
+            return True
+        if len(listed.rows) == MAX_STREAMS:
+            _log.warning("%s: the device has %d streams already; this one is not stored", place, MAX_STREAMS)
+            return False
+        try:
+            await self._tables.create(records.SERIES, Row(place.streams, place.stream, {}))
+        except Conflict:
+            _log.debug("%s is listed already", place)
+        return True
+
+    async def _note(self, partition: str, known: _Known, buckets: dict[str, Bucket]) -> None:
+        """See that each new day's rows will be forgotten, before there are any."""
+        for key in buckets:
+            if not key.startswith(f"{DAY.name}:") or key in known.rows:
+                continue
+            begin_ms = series.start_of(key)
+            end_ms = begin_ms + DAY.span_ms
+            for level in (RAW, *LEVELS):
+                kept_ms = self._keep.of(level)
+                if kept_ms is not None:
+                    first, last = series.key(level, begin_ms), series.key(level, end_ms)
+                    due_ms = end_ms + kept_ms + MARGIN_MS
+                    await self._forget.rows(records.SERIES, partition, first=first, last=last, due_ms=due_ms)
+
+
+def _chunks(samples: Samples) -> Iterator[_Windows]:
+    """Stretches whose rows fit into one batch."""
+    chunk: list[tuple[int, Samples]] = []
+    keys: set[str] = {ABOUT}
+    for start_ms, window in samples.windows():
+        touched = {series.key(level, _start(level, start_ms)) for level in (RAW, *LEVELS)}
+        if len(keys | touched) > MAX_BATCH:
+            yield chunk
+            chunk, keys = [], {ABOUT}
+        chunk.append((start_ms, window))
+        keys |= touched
+    if chunk:
+        yield chunk
+
+
+def _start(level: Level, at_ms: int) -> int:
+    return series.floor(at_ms, level.span_ms or series.WINDOW_MS)
+
+
+def _into(buckets: dict[str, Bucket], known: _Known, start_ms: int, summary: Bucket) -> None:
+    """Add a summary to every bucket that the window is in."""
+    for level in LEVELS:
+        key = series.key(level, _start(level, start_ms))
+        if key not in buckets:
+            buckets[key] = series.bucket(known.rows[key].data) if key in known.rows else Bucket()
+        buckets[key].add(summary)
+
+
+def _names(about: About, windows: _Windows) -> dict[str, None]:
+    """The stream's fields: those it has, and new ones up to the limit."""
+    names = dict.fromkeys(about.fields)
+    for _, window in windows:
+        for name in window.columns:
+            if len(names) < series.MAX_FIELDS:
+                names.setdefault(name)
+    return names
+
+
+def _only(samples: Samples, names: dict[str, None]) -> Samples:
+    if all(name in names for name in samples.columns):
+        return samples
+    return Samples(samples.at_ms, {name: values for name, values in samples.columns.items() if name in names})
+
+
+def _grown(about: About, new: Samples, names: dict[str, None]) -> About:
+    return About(
+        count=about.count + len(new),
+        first_ms=min(about.first_ms, new.at_ms[0]) if about.count else new.at_ms[0],
+        last_ms=max(about.last_ms, new.at_ms[-1]),
+        fields=tuple(names),
+    )

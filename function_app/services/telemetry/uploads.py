@@ -1,0 +1,282 @@
+"""Captures of devices (pictures, scans, bags): straight into the blob store by a presigned upload, registered after.
+
+A row and a note that it ends are written before anybody has the address. A capture that is not registered in time is
+forgotten with its blob; one that is registered is kept for its time.
+"""
+
+import hashlib
+import logging
+from dataclasses import dataclass, replace
+from typing import Literal, NoReturn
+
+from function_app.domain.common.ids import new_suffix
+from function_app.domain.common.problems import Problem, busy_store, invalid, not_found
+from function_app.domain.devices.devices import Device
+from function_app.ports import blobs as port
+from function_app.ports.blobs import Blobs
+from function_app.ports.clock import Clock
+from function_app.ports.tables import Conflict, Row, Tables, Write
+from function_app.services.storage import records
+
+LIFETIME_S = 3_600
+"""An address for an upload or a download is good for so long [s]."""
+UNREGISTERED_MS = 24 * 3_600_000
+"""Longer than an upload can last that was begun within the address's lifetime."""
+MAX_UNREGISTERED = 100
+"""Uploads of one device that may be under way."""
+SHARDS = 8
+_NOTES = 25
+_DUE = "due"
+_SLACK_MS = 600_000
+"""Registering ends so long before forgetting begins: clocks differ."""
+_ID = 64
+
+_log = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True, slots=True)
+class Capture:
+    """What was, or is to be, uploaded.
+
+    Attributes:
+        stream: What it is of: ``camera``, ``lidar``.
+        at_ms: When it was taken [ms since 1970].
+        length: Bytes.
+        sha256: Of the content, in hex; empty when nobody has said it.
+        verified: The content was seen to have that hash.
+        blob: Name of the blob.
+        by: Account or agent that uploaded it.
+        expires_ms: It and its blob are gone from here on [ms since 1970].
+    """
+
+    id: str
+    stream: str
+    name: str
+    at_ms: int
+    content_type: str
+    length: int
+    sha256: str
+    blob: str
+    by: str
+    created_ms: int
+    expires_ms: int
+    state: Literal["waiting", "stored"] = "waiting"
+    verified: bool = False
+    stored_ms: int = 0
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Announced:
+    """What somebody wants to upload."""
+
+    stream: str
+    length: int
+    content_type: str
+    name: str = ""
+    at_ms: int | None = None
+    sha256: str = ""
+
+
+@dataclass(frozen=True, slots=True)
+class Found:
+    """A capture with its row."""
+
+    capture: Capture
+    row: Row
+
+
+class Uploads:
+    """The captures of devices. ``device`` is one that the caller may see."""
+
+    def __init__(self, *, tables: Tables, blobs: Blobs, keep_ms: int, clock: Clock) -> None:
+        self._tables = tables
+        self._blobs = blobs
+        self._keep_ms = keep_ms
+        self._clock = clock
+        self._turn = 0
+
+    async def begin(self, device: Device, wanted: Announced, *, by: str) -> tuple[Capture, port.Upload]:
+        """A place for a capture, and the request that uploads it.
+
+        Raises:
+            Problem: ``invalid``, ``too-many-uploads``.
+        """
+        if not 0 <= wanted.length <= port.MAX_UPLOAD_BYTES:
+            raise invalid(f"An upload has 0 to {port.MAX_UPLOAD_BYTES} bytes.")
+        now_ms = self._clock.now_ms()
+        await self._refuse_too_many(device)
+        id_ = new_suffix(now_ms)
+        capture = Capture(
+            id=id_,
+            stream=wanted.stream,
+            name=wanted.name,
+            at_ms=now_ms if wanted.at_ms is None else wanted.at_ms,
+            content_type=wanted.content_type,
+            length=wanted.length,
+            sha256=wanted.sha256,
+            blob=f"uploads/{device.id}/{device.pairing}/{id_}",
+            by=by,
+            created_ms=now_ms,
+            expires_ms=now_ms + UNREGISTERED_MS,
+        )
+        await self._note(device, capture.id, capture.expires_ms)
+        await self._tables.create(records.UPLOADS, Row(_partition(device), _waiting(id_), records.fields(capture)))
+        request = await self._blobs.presign_upload(
+            capture.blob, length=capture.length, content_type=capture.content_type, lifetime_s=LIFETIME_S
+        )
+        return capture, request
+
+    async def complete(self, device: Device, upload: str) -> Capture:
+        """Register what was uploaded. Safe to repeat.
+
+        Raises:
+            Problem: ``upload-unknown``, ``upload-missing``, ``upload-wrong``, ``busy``.
+        """
+        waiting = await self._tables.get(records.UPLOADS, _partition(device), _waiting(upload[:_ID]))
+        if waiting is None:
+            return (await self._stored(device, upload)).capture
+        capture = records.read(waiting, Capture)
+        now_ms = self._clock.now_ms()
+        if now_ms >= capture.expires_ms - _SLACK_MS:
+            raise not_found("upload", upload)
+        verified = await self._check(capture)
+        kept = replace(capture, state="stored", verified=verified, stored_ms=now_ms, expires_ms=now_ms + self._keep_ms)
+        await self._note(device, capture.id, kept.expires_ms)
+        writes = [
+            Write("delete", waiting),
+            Write("create", Row(waiting.partition, _registered(capture.id), records.fields(kept))),
+        ]
+        try:
+            await self._tables.batch(records.UPLOADS, writes)
+        except Conflict:
+            return (await self._stored(device, upload)).capture
+        return kept
+
+    async def list(self, device: Device, *, cursor: str | None, limit: int) -> tuple[list[Capture], str | None]:
+        """Registered captures, newest first.
+
+        Raises:
+            Problem: ``cursor-invalid``.
+        """
+        first, last = _registered(""), _registered("~")
+        try:
+            page = await self._tables.query(
+                records.UPLOADS, _partition(device), first=first, last=last, limit=limit, cursor=cursor
+            )
+        except ValueError as error:
+            raise invalid("The cursor is not one of this list. Begin without one.", code="cursor-invalid") from error
+        found = [records.read(row, Capture) for row in page.rows]
+        now_ms = self._clock.now_ms()
+        return [capture for capture in found if capture.expires_ms > now_ms], page.cursor
+
+    async def get(self, device: Device, upload: str) -> tuple[Capture, str]:
+        """One registered capture, and an address from which it can be read.
+
+        Raises:
+            Problem: ``upload-unknown``.
+        """
+        capture = (await self._stored(device, upload)).capture
+        address = await self._blobs.presign_download(
+            capture.blob, content_type=capture.content_type, lifetime_s=LIFETIME_S
+        )
+        return capture, address
+
+    async def delete(self, device: Device, upload: str) -> None:
+        """Forget a registered capture, with its content.
+
+        Raises:
+            Problem: ``upload-unknown``, ``busy``.
+        """
+        found = await self._stored(device, upload)
+        now_ms = self._clock.now_ms()
+        await self._note(device, found.capture.id, now_ms)
+        # From here on it is not there, whether or not this process comes to delete it.
+        ended = replace(found.capture, expires_ms=now_ms)
+        row = Row(found.row.partition, found.row.key, records.fields(ended), found.row.etag)
+        try:
+            row = await self._tables.replace(records.UPLOADS, row)
+            await self._blobs.delete(ended.blob)
+            await self._tables.delete(records.UPLOADS, row)
+        except Conflict as error:
+            raise busy_store() from error
+
+    async def forget_due(self) -> None:
+        """Forget what was not registered in time, and what was kept for its time: a part of it each round.
+
+        Raises:
+            StoreError: The stores cannot be used.
+        """
+        self._turn += 1
+        now_ms = self._clock.now_ms()
+        shard = f"{_DUE}:{self._turn % SHARDS}"
+        page = await self._tables.query(records.UPLOADS, shard, last=f"{now_ms + 1:013d}", limit=_NOTES)
+        for note in page.rows:
+            try:
+                for key in (_waiting(note.data["id"]), _registered(note.data["id"])):
+                    row = await self._tables.get(records.UPLOADS, note.data["partition"], key)
+                    # One that ends later has another note.
+                    if row is not None and row.data["expires_ms"] <= now_ms:
+                        await self._blobs.delete(row.data["blob"])
+                        await self._tables.delete(records.UPLOADS, row)
+                await self._tables.delete(records.UPLOADS, note)
+            except Conflict:
+                _log.debug("another timer forgets %s", note.key)
+
+    async def _stored(self, device: Device, upload: str) -> Found:
+        row = await self._tables.get(records.UPLOADS, _partition(device), _registered(upload[:_ID]))
+        if row is None or row.data["expires_ms"] <= self._clock.now_ms():
+            raise not_found("upload", upload)
+        return Found(records.read(row, Capture), row)
+
+    async def _check(self, capture: Capture) -> bool:
+        """Whether its content has the hash it was said to have; what is too large to read here is not looked at.
+
+        Raises:
+            Problem: ``upload-missing``, ``upload-wrong``.
+        """
+        length = await self._blobs.size(capture.blob)
+        if length is None:
+            detail = "There is no content yet. Send it to the address first, then complete the upload."
+            raise Problem("upload-missing", 409, "Nothing was uploaded", detail)
+        if length != capture.length:
+            await self._refuse(capture, f"The content has {length} bytes; {capture.length} were announced")
+        if not capture.sha256 or length > port.MAX_BYTES:
+            return False
+        content = await self._blobs.get(capture.blob) or b""
+        if hashlib.sha256(content).hexdigest() != capture.sha256:
+            await self._refuse(capture, "The content has not the hash that was announced")
+        return True
+
+    async def _refuse(self, capture: Capture, why: str) -> NoReturn:
+        await self._blobs.delete(capture.blob)
+        raise Problem("upload-wrong", 409, "Something else was uploaded", f"{why}. It was deleted; upload it again.")
+
+    async def _refuse_too_many(self, device: Device) -> None:
+        page = await self._tables.query(
+            records.UPLOADS, _partition(device), first=_waiting(""), last=_waiting("~"), limit=MAX_UNREGISTERED
+        )
+        if len(page.rows) == MAX_UNREGISTERED:
+            detail = f"{MAX_UNREGISTERED} uploads of this device are not completed. Complete them, or wait a day."
+            raise Problem("too-many-uploads", 409, "Too many uploads", detail)
+
+    async def _note(self, device: Device, upload: str, due_ms: int) -> None:
+        """See that somebody looks at it then. Written before what it is about."""
+        partition = _partition(device)
+        shard = hashlib.sha256(upload.encode()).digest()[0] % SHARDS
+        row = Row(f"{_DUE}:{shard}", f"{due_ms:013d}:{partition}/{upload}", {"partition": partition, "id": upload})
+        try:
+            await self._tables.create(records.UPLOADS, row)
+        except Conflict:
+            return
+
+
+def _partition(device: Device) -> str:
+    return f"{device.id}/{device.pairing}"
+
+
+def _waiting(upload: str) -> str:
+    return f"waiting:{upload}"
+
+
+def _registered(upload: str) -> str:
+    return f"stored:{upload}"

@@ -1,4 +1,0 @@
-"""The embedded broker: amqtt, hardened, for one machine. A site takes mosquitto, a cloud its own.
-
-``python -m infra.amqtt --keys FILE`` runs it; ``tests/contract/brokers`` is what it promises.
-"""

@@ -1,0 +1,216 @@
+"""A toy robot: an agent as the protocol says, of which a test decides what it answers."""
+
+import json
+import time
+from collections.abc import Callable, Iterable
+from typing import TYPE_CHECKING, Any, Self, TypeVar
+
+import httpx
+import jwt
+
+from device_agent.protocol import (
+    Ack,
+    AckStatus,
+    Command,
+    Presence,
+    Reason,
+    RunMovement,
+    State,
+    Stop,
+    Task,
+    codec,
+    topics,
+)
+from device_agent.protocol.security import signing
+from function_app.domain.common.ids import agent_id
+from function_app.entrypoints.http.framework.routing import PREFIX
+from function_app.ports.broker_access import Credentials
+from tests.harness.network.brokers import Client, Message
+
+if TYPE_CHECKING:
+    from tests.harness.cloud.cloud import Cloud, Person
+
+T = TypeVar("T")
+Answers = Iterable[AckStatus | Ack]
+
+
+class Robot:
+    """An agent as the protocol says: own key, broker credentials from the API, acks for each signed command.
+
+    A command that comes a second time is answered with the last ack, and not obeyed.
+
+    Attributes:
+        reports: What it answers to a new action; a test may put another function here.
+        silent: Answers nothing at all.
+    """
+
+    def __init__(self, cloud: "Cloud", names: tuple[str, ...]) -> None:
+        self.cloud = cloud
+        self.names = names
+        self.key = signing.generate()
+        self.public = signing.public_text(self.key.public_key())
+        self.id = agent_id(signing.key_id(self.key.public_key()))
+        self.devices = [f"{self.id}-{name}" for name in names]
+        self.space = ""
+        self.session = 0
+        self.silent = False
+        self.reports: Callable[[Command], Answers] = lambda _: (
+            AckStatus.RECEIVED,
+            AckStatus.ACCEPTED,
+            AckStatus.STARTED,
+        )
+        self.commands: list[Command] = []
+        self.payloads: dict[str, list[bytes]] = {}
+        self.stops: list[Stop] = []
+        self.link: Client | None = None
+        self._keys: dict[str, Any] = {}
+        self._sequences: dict[str, int] = {}
+        self._said: dict[str, bytes] = {}
+
+    @property
+    def device(self) -> str:
+        return self.devices[0]
+
+    # ------------------------------------------------------------ HTTP
+
+    def token(self, **changes: Any) -> str:
+        """A request token, signed by the agent's own key."""
+        key = changes.pop("key", self.key)
+        now_s = self.cloud.clock.now_ms() // 1000
+        claims = {"iss": "agent", "aud": "telescope/api", "iat": now_s, "exp": now_s + 60, "jti": str(time.time_ns())}
+        return jwt.encode(
+            {name: value for name, value in {**claims, **changes}.items() if value is not None},
+            key,
+            "EdDSA",
+            headers={"kid": signing.key_id(key.public_key())},
+        )
+
+    def ask(self, method: str, path: str, *, token: str = "", **options: Any) -> httpx.Response:
+        headers = {"Authorization": f"Bearer {token or self.token()}"}
+        return self.cloud.ask(method, PREFIX + path, headers=headers, **options)
+
+    def introduction(self, **changes: Any) -> dict[str, Any]:
+        devices = [{"name": name, "kind": "arm", "robot_type": "ur5", "label": name.title()} for name in self.names]
+        return {"name": "lab", "public_key": self.public, "software": "toy 1", "devices": devices, **changes}
+
+    def enroll(self, **changes: Any) -> httpx.Response:
+        return self.ask("POST", "/agents/enroll", json=self.introduction(**changes))
+
+    def code(self) -> str:
+        answer = self.enroll()
+        assert answer.status_code == 201, answer.text
+        code: str = answer.json()["claim_code"]
+        return code
+
+    def enrollment(self, wait_ms: int = 0) -> dict[str, Any]:
+        answer = self.ask("GET", "/agents/enrollment", params={"wait_ms": wait_ms})
+        assert answer.status_code == 200, answer.text
+        found: dict[str, Any] = answer.json()
+        return found
+
+    def pair(self, owner: "Person") -> str:
+        """Enroll and be claimed; gives the first device's id."""
+        answer = owner.post("/agents/claim", {"code": self.code()})
+        assert answer.status_code == 200, answer.text
+        state = self.enrollment()
+        self.space = state["space"]
+        self._keys = {key["id"]: signing.public_key(key["public"]) for key in state["keys"]}
+        return self.device
+
+    # ------------------------------------------------------------ MQTT
+
+    def connect(self) -> Self:
+        """Connect with credentials from the API, hear what is addressed to it, and say that it is there."""
+        issued = self.ask("POST", "/mqtt/credentials", json={"purpose": "agent"}).json()
+        self.session += 1
+        self.link = _Link(self, issued).open()
+        assert self.link.connected.is_set(), f"refused: {self.link.answer}"
+        assert self.link.subscribe(*issued["subscribe"]) == [1] * len(issued["subscribe"])
+        self.say_presence(online=True)
+        return self
+
+    def topic(self, kind: str, name: str = "") -> str:
+        return topics.device(self.space, self.id, name or self.names[0], kind)
+
+    def say(self, topic: str, message: Any, *, retain: bool = False) -> None:
+        assert self.link is not None
+        self.link.publish_acknowledged(topic, codec.encode(message), retain=retain)
+
+    def say_presence(self, *, online: bool, session: int | None = None) -> None:
+        number = self.session if session is None else session
+        message = Presence(online=online, session=number, at_ms=self.cloud.clock.now_ms())
+        self.say(topics.conn(self.space, self.id), message, retain=True)
+
+    def say_state(self, state: State) -> None:
+        self.say(self.topic(topics.STATE), state, retain=True)
+
+    def ack(self, command: str, status: AckStatus, **more: Any) -> Ack:
+        sequence = self._sequences[command] = self._sequences.get(command, 0) + 1
+        at_ms = self.cloud.clock.now_ms()
+        return replace_ack(Ack(id=command, status=status, sequence=sequence, at_ms=at_ms, tick_ms=at_ms), more)
+
+    def report(self, command: str, status: AckStatus, **more: Any) -> Ack:
+        """Report about an action, when the test wants it."""
+        ack = self.ack(command, status, **more)
+        self.say(self.topic(topics.ACK), ack)
+        return ack
+
+    def fail(self, command: str, code: str, message: str) -> None:
+        self.report(command, AckStatus.FAILED, reason=Reason(code=code, message=message))
+
+    def heard(self, kind: type[T]) -> list[Command]:
+        """Signed commands of this kind, in order."""
+        return [command for command in self.commands if isinstance(command.request, kind)]
+
+    def obey(self, message: Message) -> None:
+        """Called on the connection's own thread."""
+        topic = topics.parse(message.topic)
+        if topic.kind == topics.STOP:
+            self.stops.append(codec.decode(message.payload, Stop))
+        if topic.kind != topics.CMD:
+            return
+        command = codec.decode(signing.verify(message.payload, self._keys), Command)
+        seen = self.payloads.setdefault(command.id, [])
+        seen.append(message.payload)
+        topic_of_acks = topics.device(topic.space, topic.agent, topic.device, topics.ACK)
+        if len(seen) > 1:
+            if command.id in self._said and not self.silent and self.link is not None:
+                self.link.publish(topic_of_acks, self._said[command.id])
+            return
+        self.commands.append(command)
+        if self.silent or self.link is None:
+            return
+        action = isinstance(command.request, Task | RunMovement)
+        for each in self.reports(command) if action else (AckStatus.RECEIVED, AckStatus.DONE):
+            ack = each if isinstance(each, Ack) else self.ack(command.id, each)
+            self._said[command.id] = codec.encode(ack)
+            self.link.publish(topic_of_acks, self._said[command.id])
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        if self.link is not None:
+            self.link.close()
+
+
+class _Link(Client):
+    """The toy robot's connection: hands each message on at once."""
+
+    def __init__(self, robot: Robot, issued: dict[str, Any]) -> None:
+        super().__init__(
+            issued["client_id"], Credentials(issued["username"], issued["password"]), port=issued["tcp"]["port"]
+        )
+        self._robot = robot
+
+    def _on_message(self, *arguments: Any) -> None:
+        super()._on_message(*arguments)
+        self._robot.obey(self.messages.queue[-1])
+
+
+def replace_ack(ack: Ack, changes: dict[str, Any]) -> Ack:
+    return codec.decode(json.dumps({**json.loads(codec.encode(ack)), **_plain(changes)}).encode(), Ack)
+
+
+def _plain(changes: dict[str, Any]) -> dict[str, Any]:
+    return {name: json.loads(codec.encode(value)) for name, value in changes.items()}

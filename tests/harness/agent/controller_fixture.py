@@ -1,0 +1,138 @@
+"""A controller, an operator and a clock, and what may come between them; no thread, no wait."""
+
+from collections.abc import Callable, Mapping, Sequence
+from itertools import pairwise
+
+import pytest
+
+from device_agent.ports.geometry import Clearance, Geometry, Sweep, never
+from device_agent.protocol import JointTarget, Mode, Pose, Setpoint, StopLatch
+from device_agent.protocol.manifests.robot_type import Base
+from device_agent.runtime.authority.lease_gate import LeaseGate, Refused
+from device_agent.runtime.control.controller import Controller
+from tests.fakes.drivers import PERIOD_S, robot_type
+
+WALL_RAD = 1.0
+
+
+class Rig:
+    """A controller with a clock of its own and an operator who answers the newest telemetry."""
+
+    def __init__(self, *, geometry: Geometry | None = None, base: Base | None = None, **gate: int) -> None:
+        self.controller = Controller(robot_type(base), LeaseGate(**gate), geometry=geometry)
+        self.controller.start_at([0.0, 0.0])
+        self.limited: set[str] = set()
+        self.now_s = 100.0
+        self.sequence = 0
+        self.velocities: list[float] = []
+
+    @property
+    def tick_ms(self) -> int:
+        return round(self.now_s * 1000)
+
+    def take(self, epoch: int, lease_s: float = 30.0) -> None:
+        self.controller.grant(epoch=epoch, holder="ann", lease_s=lease_s, now_s=self.now_s)
+        self.sequence = 0
+
+    def offer(self, epoch: int, elbow: float = 2.0, *, age_ms: int = 20, sequence: int | None = None) -> None:
+        self.sequence += 1
+        setpoint = Setpoint(
+            epoch=epoch,
+            sequence=self.sequence if sequence is None else sequence,
+            echo_tick_ms=self.tick_ms - age_ms,
+            sent_ms=1.0,
+            target=JointTarget(position_rad={"elbow": elbow}),
+        )
+        self.controller.offer(setpoint, now_s=self.now_s, tick_ms=self.tick_ms)
+
+    def run(self, seconds: float) -> Mode:
+        before = self.elbow
+        for _ in range(round(seconds / PERIOD_S)):
+            self.now_s += PERIOD_S
+            tick = self.controller.step(self.now_s)
+            self.limited |= set(tick.limited)
+            self.elbow = tick.position_rad[1]
+            self.velocities.append((self.elbow - before) / PERIOD_S)
+            before = self.elbow
+        return self.controller.mode
+
+    elbow = 0.0
+
+    def stream(self, epoch: int, seconds: float, elbow: float = 2.0, *, age_ms: int = 20) -> Mode:
+        mode = self.controller.mode
+        for _ in range(round(seconds / 0.024)):
+            self.offer(epoch, elbow, age_ms=age_ms)
+            mode = self.run(0.024)
+        return mode
+
+    def at_rest_after(self, limit_s: float) -> float:
+        start = self.now_s
+        while self.now_s - start < limit_s:
+            self.run(PERIOD_S)
+            if not self.controller.moving:
+                return self.now_s - start
+        pytest.fail(f"still moving after {limit_s} s")
+
+
+def lost(_: Refused) -> None:
+    pass
+
+
+def interruptions() -> dict[str, object]:
+    return {
+        "stop": lambda rig: rig.controller.stop(StopLatch(by="bob", reason="", at_ms=1)),
+        "link": lambda rig: rig.controller.lost(Refused("link_lost", "the link is gone")),
+        "takeover": lambda rig: rig.take(2),
+        "release": lambda rig: rig.controller.release(epoch=1),
+        "expiry": lambda rig: rig.run(6.0),
+        "fault": lambda rig: rig.controller.fail("no answer"),
+    }
+
+
+class Wall:
+    """An elbow, one metre long, before a wall; whoever is beyond it may only come back."""
+
+    frames: tuple[str, ...] = ()
+
+    def __init__(self, at_rad: float = WALL_RAD) -> None:
+        self.at_rad = at_rad
+
+    def poses(self, position_rad: Sequence[float]) -> Mapping[str, Pose]:
+        raise NotImplementedError
+
+    def clearance(self, position_rad: Sequence[float]) -> Clearance:
+        return Clearance(self.at_rad - position_rad[1], ("hand", "wall"))
+
+    def sweep(self, path_rad: Sequence[Sequence[float]]) -> Sweep:
+        rooms = [self.clearance(position).room_m for position in path_rad]
+        least = min(0.0, rooms[0]) - 1e-7
+        for leg, (begin, end) in enumerate(pairwise(rooms)):
+            if end < least:
+                share = (leg + (begin - least) / (begin - end)) / (len(rooms) - 1)
+                return Sweep(share, Clearance(end, ("hand", "wall")))
+        return Sweep(1.0)
+
+    def glance(self, start_rad: Sequence[float], end_rad: Sequence[float]) -> float:
+        return self.sweep([start_rad, end_rad]).share
+
+    def speed_m_s(self, velocity_rad_s: Sequence[float]) -> float:
+        return abs(velocity_rad_s[1])
+
+    def solve(self, frame: str, pose: Pose, start_rad: Sequence[float]) -> tuple[float, ...]:
+        raise NotImplementedError
+
+    def rates(
+        self, frame: str, twist: Sequence[float], position_rad: Sequence[float], *, tool: bool
+    ) -> tuple[float, ...]:
+        raise NotImplementedError
+
+    def plan(
+        self,
+        start_rad: Sequence[float],
+        goal_rad: Sequence[float],
+        *,
+        seed: int = 0,
+        within_s: float = 5.0,
+        ended: Callable[[], bool] = never,
+    ) -> tuple[tuple[float, ...], ...]:
+        raise NotImplementedError

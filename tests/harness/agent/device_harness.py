@@ -1,0 +1,190 @@
+"""A whole device with a toy driver and a broker that is a list: commands in, acks out."""
+
+import hashlib
+import time
+import uuid
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+import pytest
+from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
+
+from device_agent.ports.clock import CloudClock, tick_ms, wall_ms
+from device_agent.ports.geometry import Geometry
+from device_agent.ports.sandbox import Jail
+from device_agent.ports.speech import Speech
+from device_agent.ports.uploads import Uploads
+from device_agent.protocol import (
+    SHIPPED,
+    Ack,
+    Command,
+    JointTarget,
+    JointTelemetry,
+    RunMovement,
+    Setpoint,
+    State,
+    codec,
+    topics,
+)
+from device_agent.protocol.manifests.robot_type import RobotType
+from device_agent.protocol.security import signing
+from device_agent.runtime.authority.interlocks import Interlock
+from device_agent.runtime.device import Device
+from device_agent.runtime.readings import Room
+from device_agent.runtime.storage.journal import Journal
+from device_agent.runtime.storage.outbox_store import Shelf
+from device_agent.runtime.telemetry.outbox import Outbox
+from tests.fakes.drivers import ToyDriver, robot_type
+from tests.harness.agent.pinned_keys import pins_of
+from tests.harness.agent.sandbox import warm_jail
+
+WITHIN_S = 120.0
+OWNER = "accountaaaaaaaaa"
+
+
+class Bench:
+    """A device, the cloud's key, and everything the device has said."""
+
+    def __init__(
+        self,
+        folder: Path,
+        *,
+        interlocks: Sequence[Interlock] = (),
+        driver: ToyDriver | None = None,
+        kind: RobotType | None = None,
+        geometry: Geometry | None = None,
+        jail: Jail | None = None,
+        speech: Speech | None = None,
+        uploads: Uploads | None = None,
+    ) -> None:
+        self.key = signing.generate()
+        self.kind = kind or robot_type()
+        self.said: list[tuple[str, bytes]] = []
+        self.driver = driver or ToyDriver()
+        self.journal = Journal(folder / "journal.db")
+        self.journal.open(now_ms=wall_ms())
+        self.journal.end_open(now_ms=wall_ms(), tick_ms=tick_ms())
+        self.clock = CloudClock()
+        self.clock.observe(server_ms=wall_ms(), sent_tick_ms=tick_ms(), received_tick_ms=tick_ms())
+        self.number = 0
+        shelf = Shelf(folder / "outbox.db", own="ts/v1/s/a/", max_bytes=10**6, max_age_ms=3_600_000)
+        self.outbox = Outbox(shelf, publish=self.publish, teller="ts/v1/s/a/arm")
+        self.outbox.link_changed(True)
+        self.outbox.start()
+        self.device = Device(
+            name="arm",
+            label="Arm",
+            space="s",
+            agent="a",
+            robot_type=self.kind,
+            driver=self.driver,
+            journal=self.journal,
+            cloud_clock=self.clock,
+            keys=pins_of(self.key),
+            publish=self.publish,
+            outbox=self.outbox,
+            room=Room(space="s", agent="a", own=["arm"], named=[(rule.device, rule.stream) for rule in interlocks]),
+            interlocks=interlocks,
+            geometry=geometry,
+            jail=jail or warm_jail(),
+            owner=OWNER,
+            speech=speech,
+            uploads=uploads,
+        )
+
+    def stop(self) -> None:
+        self.device.stop()
+        self.outbox.stop()
+        self.journal.close()
+
+    def publish(
+        self,
+        topic: str,
+        payload: bytes,
+        *,
+        qos: int,
+        retain: bool = False,
+        delivered: Callable[[], None] | None = None,
+    ) -> bool:
+        assert qos in {0, 1}
+        assert retain == (topics.parse(topic).kind in {topics.DESC, topics.STATE})
+        self.said.append((topic, payload))
+        if delivered is not None:
+            delivered()
+        return True
+
+    def command(self, request: Any, *, epoch: int = 0, command_id: str | None = None, **changes: Any) -> str:
+        self.number += 1
+        fields: dict[str, Any] = {
+            "id": command_id or f"c{self.number}-{uuid.uuid4().hex[:8]}",
+            "space": "s",
+            "agent": "a",
+            "device": "arm",
+            "issued_at_ms": wall_ms(),
+            "ttl_ms": 10_000,
+            "who": "ann",
+            "epoch": epoch,
+            "request": request,
+        }
+        command = Command(**(fields | changes))
+        self.receive(topics.CMD, signing.sign(codec.encode(command), self.key))
+        return command.id
+
+    def script(self, source: str, version: int = 1, author: str = SHIPPED) -> RunMovement:
+        return signed_movement(source, self.key, version=version, author=author, robot_type=self.kind.type)
+
+    def receive(self, kind: str, payload: bytes, name: str = "") -> None:
+        self.device.receive(topics.Topic("s", "a", "arm", kind, name), payload)
+
+    def setpoint(self, epoch: int, sequence: int, elbow: float = 2.0) -> None:
+        target = JointTarget(position_rad={"elbow": elbow})
+        setpoint = Setpoint(epoch=epoch, sequence=sequence, echo_tick_ms=tick_ms(), sent_ms=0.5, target=target)
+        self.receive(topics.CTL, codec.encode(setpoint), str(epoch))
+
+    def heard(self, kind: str, message: type[Any], name: str = "") -> list[Any]:
+        wanted = topics.device("s", "a", "arm", kind, name)
+        return [codec.decode(payload, message) for topic, payload in list(self.said) if topic == wanted]
+
+    def acks(self, command: str) -> list[Ack]:
+        return [ack for ack in self.heard(topics.ACK, Ack) if ack.id == command]
+
+    def end(self, command: str) -> Ack:
+        ended: Ack = eventually(lambda: next((ack for ack in self.acks(command) if ack.status.terminal), None))
+        return ended
+
+    def telemetry(self) -> JointTelemetry:
+        seen: JointTelemetry = eventually(lambda: self.heard(topics.TELE, JointTelemetry, "joints")[-1:])[0]
+        return seen
+
+
+def signed_movement(
+    source: str, key: Ed25519PrivateKey, *, version: int = 1, author: str = SHIPPED, robot_type: str = "toy"
+) -> RunMovement:
+    """As the cloud sends it."""
+    digest = hashlib.sha256(source.encode()).hexdigest()
+    text = signing.movement_text(robot_type, "dance", version, digest)
+    return RunMovement(
+        robot_type=robot_type,
+        name="dance",
+        version=version,
+        sha256=digest,
+        source=source,
+        author=author,
+        key=signing.key_id(key.public_key()),
+        signature=signing.sign_text(text, key, context=signing.MOVEMENT_CONTEXT),
+    )
+
+
+def eventually(probe: Callable[[], Any]) -> Any:
+    deadline_s = time.monotonic() + WITHIN_S
+    while time.monotonic() < deadline_s:
+        if found := probe():
+            return found
+        time.sleep(0.01)
+    pytest.fail("it never happened")
+
+
+def shown(bench: Bench, wanted: Callable[[State], Any]) -> State:
+    found: State = eventually(lambda: [s for s in bench.heard(topics.STATE, State)[-1:] if wanted(s)])[0]
+    return found

@@ -1,0 +1,70 @@
+"""A person at the console: a real Chromium, signed in. A script error, or a breach of the policy, fails the test."""
+
+import contextlib
+from collections.abc import Iterator
+
+from playwright.sync_api import Browser, Page, Playwright, expect
+
+from tests.harness.browser.product import Machine
+
+PATIENCE_MS = 90_000
+"""How long a person waits for what has to appear [ms]: the machine may be slow, and busy."""
+expect.set_options(timeout=PATIENCE_MS)
+_COMMON = [
+    "--no-sandbox",
+    "--disable-gpu",
+    "--disable-quic",
+    "--no-first-run",
+    "--disable-background-networking",
+    "--disable-component-update",
+    "--disable-sync",
+]
+FLAGS = [*_COMMON, "--enable-unsafe-swiftshader"]
+FLAT = [*_COMMON, "--disable-3d-apis"]
+"""Without the twin: drawn without a graphics card it costs more than much of what is asked of a page."""
+
+
+@contextlib.contextmanager
+def chromium(playwright: Playwright, flags: list[str] = FLAGS) -> Iterator[Browser]:
+    """The browser of this machine, closed at the end."""
+    browser = playwright.chromium.launch(executable_path="/usr/bin/chromium", args=flags)
+    try:
+        yield browser
+    finally:
+        browser.close()
+
+
+@contextlib.contextmanager
+def person(browser: Browser, address: str) -> Iterator[Page]:
+    """Somebody with a browser of their own. Fails on any script error, and on what the page's policy has stopped."""
+    context = browser.new_context(viewport={"width": 1440, "height": 900})
+    context.set_default_timeout(PATIENCE_MS)
+    page = context.new_page()
+    errors: list[str] = []
+    page.on("pageerror", lambda error: errors.append(str(error)))
+    page.on("console", lambda message: errors.append(message.text) if "Content Security" in message.text else None)
+    page.goto(address)
+    try:
+        yield page
+    finally:
+        context.close()
+    assert errors == []
+
+
+@contextlib.contextmanager
+def pages(browser: Browser, machine: Machine, count: int = 1) -> Iterator[list[Page]]:
+    """Tabs of one sign-in, on the list of devices."""
+    context = browser.new_context(viewport={"width": 1440, "height": 900})
+    context.set_default_timeout(PATIENCE_MS)
+    errors: list[str] = []
+    opened = [context.new_page() for _ in range(count)]
+    for page in opened:
+        page.on("pageerror", lambda error: errors.append(str(error)))
+        page.on("console", lambda message: errors.append(message.text) if "Content Security" in message.text else None)
+        page.goto(machine.sign_in_link() if page is opened[0] else machine.url)
+        expect(page.get_by_test_id("signed-in")).to_be_visible(timeout=PATIENCE_MS)
+    try:
+        yield opened
+    finally:
+        context.close()
+    assert errors == [], errors

@@ -1,0 +1,67 @@
+"""What is asked of every page of the console: nothing that keeps people out, nothing cut off, and a picture of it."""
+
+import os
+from pathlib import Path
+from typing import Final
+
+from playwright.sync_api import Page, ViewportSize
+
+from tests.harness.network.brokers import ROOT
+
+_AXE: Final = ROOT / "web" / "node_modules" / "axe-core" / "axe.min.js"
+_PICTURES: Final = ROOT / "docs" / "pictures"
+_SIZES: Final[tuple[ViewportSize, ...]] = ({"width": 390, "height": 844}, {"width": 1440, "height": 900})
+_GRAVE: Final = """async (part) => {
+    const found = await axe.run(part, {resultTypes: ["violations"]});
+    return found.violations
+        .filter((each) => ["serious", "critical"].includes(each.impact))
+        .flatMap((each) => each.nodes.map((node) => `${each.id}: ${node.target.join(" ")}: ${node.failureSummary}`));
+}"""
+_DRAWN_WITHIN_MS: Final = 1_000
+_LOOKS: Final = 20
+_BETWEEN_LOOKS_MS: Final = 100
+_OUTSIDE: Final = """() => {
+    const width = document.documentElement.clientWidth;
+    if (document.documentElement.scrollWidth <= width) return [];
+    return [...document.body.querySelectorAll("*")]
+        .filter((each) => each.getBoundingClientRect().right > width + 0.5)
+        .map((each) => `${each.tagName.toLowerCase()}.${each.className} to ${each.getBoundingClientRect().right}`);
+}"""
+
+
+def assert_good_page(page: Page, name: str, *, part: str | None = None) -> None:
+    """See that axe finds nothing serious in dark and in light, and that nothing stands out at the side of a phone.
+
+    With ``TELESCOPE_PICTURES`` set pictures of it are kept for the documentation.
+
+    Args:
+        page: What is looked at.
+        name: Of the pictures.
+        part: The test id of the part that is meant, where the rest of the page is looked at elsewhere.
+    """
+    chosen = "html" if part is None else f"[data-testid={part}]"
+    if page.evaluate("() => typeof axe") == "undefined":
+        page.evaluate(_AXE.read_text())  # past the page's policy, as a debugger may
+    found = []
+    for scheme in ("dark", "light"):
+        page.emulate_media(color_scheme=scheme, reduced_motion="reduce")
+        found += [f"{scheme}: {each}" for each in page.evaluate(_GRAVE, chosen)]
+    assert found == [], f"{name}: " + "\n".join(found)
+    for size in _SIZES:
+        page.set_viewport_size(size)
+        for _ in range(_LOOKS):
+            outside = page.evaluate(_OUTSIDE)
+            if not outside:
+                break
+            page.wait_for_timeout(_BETWEEN_LOOKS_MS)  # what is drawn to size is drawn anew a moment later
+        assert outside == [], f"{name} is wider than {size['width']} pixels: " + "; ".join(outside)
+        if os.environ.get("TELESCOPE_PICTURES"):
+            _picture(page, _PICTURES / f"console-{name}-{size['width']}.png", chosen)
+
+
+def _picture(page: Page, path: Path, chosen: str) -> None:
+    page.locator(chosen).evaluate("e => e.scrollIntoView({block: 'start'})")
+    page.evaluate("() => document.activeElement.matches(':read-only') || document.activeElement.blur()")
+    if page.locator("canvas").count():
+        page.wait_for_timeout(_DRAWN_WITHIN_MS)  # a canvas of another size is empty until it is drawn again
+    page.screenshot(path=path)

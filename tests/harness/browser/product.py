@@ -1,0 +1,233 @@
+"""The whole product as ``make up`` starts it, for tests that look at it from outside."""
+
+import contextlib
+import json
+import os
+import re
+import signal
+import socket
+import ssl
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Self
+
+import httpx
+
+from tests.harness.cloud.people import sign_in_link
+from tests.harness.network.brokers import ROOT, wait_until
+
+START_WITHIN_S = 90.0
+_ROW_BYTES = 500
+_COLUMNS = (("qpos", "joints"), ("qvel", "joints"), ("target", "actuators"), ("ctrl", "actuators"))
+
+
+def free_ports() -> int:
+    """The first of four free ports in a row."""
+    for _ in range(100):
+        with contextlib.ExitStack() as stack:
+            first = stack.enter_context(socket.socket())
+            first.bind(("127.0.0.1", 0))
+            port: int = first.getsockname()[1]
+            try:
+                for offset in (1, 2, 3):
+                    stack.enter_context(socket.socket()).bind(("127.0.0.1", port + offset))
+            except (OSError, OverflowError):
+                continue
+            return port
+    raise AssertionError("no four free ports in a row")
+
+
+@dataclass
+class Machine:
+    """A started product."""
+
+    process: "subprocess.Popen[str]"
+    home: Path
+    port: int
+    lines: list[str]
+    tls: bool = False
+
+    @property
+    def url(self) -> str:
+        return f"http{'s' if self.tls else ''}://127.0.0.1:{self.port}"
+
+    @property
+    def trusted(self) -> ssl.SSLContext:
+        """Trusts the authority that the product has made for itself, where it speaks TLS."""
+        return ssl.create_default_context(cafile=str(self.home / "tls" / "ca.crt") if self.tls else None)
+
+    @property
+    def ready(self) -> str:
+        return next(line for line in self.lines if line.startswith("ready"))
+
+    def sign_in_link(self, account: str = "demo") -> str:
+        """A new one-time link, as an administrator makes one."""
+        return f"{self.url}/#sign-in={sign_in_link({'TELESCOPE_HOME': str(self.home)}, account)}"
+
+    def api(self, account: str = "demo") -> "Api":
+        """The HTTP API, signed in."""
+        return Api(self, account)
+
+    def trace(self, device: str = "ur5") -> "Trace":
+        """What the simulation of a device has written down."""
+        return Trace(self.home / "trace" / f"{device}.ndjson")
+
+    def pid(self, words: str) -> int:
+        """The process of ours whose command line has these words."""
+        listed = subprocess.run(["ps", "-eo", "pid,ppid,args"], capture_output=True, text=True, check=True).stdout
+        found = [line for line in listed.splitlines() if words in line and int(line.split()[1]) == self.process.pid]
+        assert len(found) == 1, f"{words}: {found}"
+        return int(found[0].split()[0])
+
+    def kill(self, words: str) -> None:
+        os.kill(self.pid(words), signal.SIGKILL)
+
+    def interrupt(self) -> int:
+        """Ctrl-C; the exit code."""
+        self.process.send_signal(signal.SIGINT)
+        return self.process.wait(60)
+
+    def log(self, name: str) -> str:
+        return (self.home / "logs" / f"{name}.log").read_text()
+
+
+class Api:
+    """One sign-in's view of the HTTP API. ``with`` closes it."""
+
+    def __init__(self, machine: Machine, account: str = "demo") -> None:
+        self.http = httpx.Client(base_url=f"{machine.url}/api/v1", timeout=30, verify=machine.trusted)
+        link = machine.sign_in_link(account).partition("#sign-in=")[2]
+        signed_in = self.http.post("/auth/sign-in", json={"link": link})
+        assert signed_in.status_code == httpx.codes.OK, signed_in.text
+        self.http.headers["X-CSRF-Token"] = signed_in.json()["csrf_token"]  # with the cookie, which it keeps
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.http.close()
+
+    def get(self, path: str, **query: Any) -> Any:
+        return self._ok(self.http.get(path, params=query))
+
+    def post(self, path: str, body: Any = None) -> Any:
+        return self._ok(self.http.post(path, json={} if body is None else body))
+
+    def device(self, name: str = "ur5") -> dict[str, Any]:
+        """The device with this name at its agent, once it is online."""
+        found: list[dict[str, Any]] = []
+
+        def online() -> bool:
+            found[:] = [each for each in self.get("/devices")["items"] if each["name"] == name and each["online"]]
+            return bool(found)
+
+        wait_until(online, f"{name} to be online")
+        return found[0]
+
+    @staticmethod
+    def _ok(answer: httpx.Response) -> Any:
+        assert answer.is_success, f"{answer.request.method} {answer.request.url}: {answer.status_code} {answer.text}"
+        return answer.json() if answer.content else None
+
+
+def moves(api: Api, device: str) -> bool:
+    """Whether a little of the arm's wrist can be moved now."""
+    move = {"kind": "move_joints", "position_rad": {"wrist_3": 0.2}}
+    try:
+        answer = api.http.post(
+            f"/devices/{device}/actions", json={"request": move, "wait_ms": 20_000, "wait_for": "done"}
+        )
+        return bool(answer.json().get("status") == "done")
+    except httpx.HTTPError:
+        return False
+
+
+class Trace:
+    """The simulation's own record, line by line: what really moved."""
+
+    def __init__(self, path: Path) -> None:
+        self._path = path
+
+    def rows(self, newest: int = 800) -> list[dict[str, Any]]:
+        """The newest rows; what the file has as lists is given by name."""
+        rows = []
+        with self._path.open("rb") as file:
+            names: dict[str, list[str]] = json.loads(file.readline())
+            file.seek(max(file.tell(), self._path.stat().st_size - newest * _ROW_BYTES))
+            for line in file.read().splitlines():
+                with contextlib.suppress(ValueError):  # the first and the last line may be torn
+                    row = json.loads(line)
+                    if "qpos" in row:
+                        rows.append(row | {key: dict(zip(names[of], row[key], strict=True)) for key, of in _COLUMNS})
+        return rows
+
+    def now(self) -> dict[str, Any]:
+        return self.rows(20)[-1]  # a row of a robot with many joints is longer than most
+
+
+@contextlib.contextmanager
+def start_machine(home: Path, *, port: int = 0, **settings: str) -> Iterator[Machine]:
+    """``make up``'s program, until the end of the ``with``; ``settings`` are environment variables.
+
+    Waits for the ready line, or for the end of the process.
+    """
+    with start_program("infra.local", home, port or free_ports(), settings) as machine:
+        yield machine
+
+
+@contextlib.contextmanager
+def start_program(program: str, home: Path, port: int, settings: Mapping[str, str]) -> Iterator[Machine]:
+    """As ``start_machine``, by a module that stands in place of ``make up``'s."""
+    environment = os.environ | {
+        "TELESCOPE_HOME": str(home),
+        "TELESCOPE_PORT": str(port),
+        "TELESCOPE_TRACE": str(home / "trace"),
+        "TELESCOPE_ROOM": "none",  # most of what is asked of the whole product needs one arm
+        **settings,
+    }
+    process = subprocess.Popen(
+        [sys.executable, "-m", *program.split()],
+        cwd=ROOT,
+        env=environment,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.STDOUT,
+        text=True,
+    )
+    lines: list[str] = []
+    assert process.stdout is not None
+    output = process.stdout
+
+    def read() -> None:
+        for line in output:
+            lines.append(line)  # noqa: PERF402 (as they come)
+
+    reader = threading.Thread(target=read)
+    reader.start()
+    try:
+        deadline_s = time.monotonic() + START_WITHIN_S
+        while process.poll() is None and not any(line.startswith("ready") for line in lines):
+            assert time.monotonic() < deadline_s, "".join(lines)
+            time.sleep(0.05)
+        yield Machine(process, home, port, lines, settings.get("TELESCOPE_TLS") == "1")
+    finally:
+        if process.poll() is None:
+            process.send_signal(signal.SIGINT)
+            try:
+                process.wait(40)
+            except subprocess.TimeoutExpired:
+                process.kill()
+        reader.join(10)
+        process.wait()
+        output.close()
+
+
+def ready_link(line: str) -> str:
+    """The sign-in link in a ready line."""
+    found = re.search(r"http\S+#sign-in=\S+", line)
+    assert found, line
+    return found[0]

@@ -1,0 +1,243 @@
+"""The functions over real SQLite and a real broker, for tests that are not async; people who use them, and a toy robot.
+
+with Cloud(settings(home, broker)) as cloud:
+    anna = cloud.sign_in("anna")
+    with cloud.robot() as robot:
+        device = robot.pair(anna)
+        robot.connect()
+"""
+
+import asyncio
+import contextlib
+import threading
+import time
+from collections.abc import Callable, Coroutine, Iterator, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any, Self, TypeVar
+
+import httpx
+
+from function_app import bootstrap
+from function_app.domain.identity.accounts import Identity
+from function_app.entrypoints.http import create_app
+from function_app.entrypoints.ingest.router import ingest, ingest_telemetry
+from function_app.services.identity.authenticator import ACCESS_S, SESSION_S
+from function_app.settings import Settings
+from tests.fakes.agent import Robot
+from tests.harness.network.brokers import PATIENCE_S, RunningBroker, wait_until
+
+BASE = "http://telescope.test"
+API = "/api/v1"
+MOVE = {"kind": "move_joints", "position_rad": {"elbow": 1.0}}
+"""An action that every robot takes."""
+
+TOKEN_MS = ACCESS_S * 1000
+
+T = TypeVar("T")
+
+
+class MovingClock:
+    """The machine's clock, which a test can put forward."""
+
+    def __init__(self) -> None:
+        self.ahead_ms = 0
+
+    def now_ms(self) -> int:
+        return time.time_ns() // 1_000_000 + self.ahead_ms
+
+    def advance(self, seconds: float) -> None:
+        self.ahead_ms += round(seconds * 1000)
+
+
+class Cloud:
+    """One instance of the functions on an event loop of its own, with the ingest beside it."""
+
+    def __init__(self, settings: Settings, *, clock: MovingClock | None = None) -> None:
+        self.clock = clock or MovingClock()
+        self.loop = asyncio.new_event_loop()
+        self._thread = threading.Thread(target=self.loop.run_forever)
+        self._thread.start()
+        self.functions = bootstrap.build(settings, clock=self.clock)
+        self.app = create_app(self.functions)
+        self._feeds: list[asyncio.Future[None]] = []
+        self._clients: list[httpx.AsyncClient] = []
+
+    def run(self, call: Coroutine[Any, Any, T]) -> T:
+        """Run something on the functions' own loop."""
+        return asyncio.run_coroutine_threadsafe(call, self.loop).result(4 * PATIENCE_S)
+
+    def client(self, *, address: str = "127.0.0.1", **options: Any) -> httpx.AsyncClient:
+        """A new HTTP client with a cookie jar of its own, that asks from ``address``."""
+        transport = httpx.ASGITransport(self.app, raise_app_exceptions=False, client=(address, 50_000))
+        client = httpx.AsyncClient(transport=transport, base_url=BASE, timeout=PATIENCE_S, **options)
+        self._clients.append(client)
+        return client
+
+    def ask(self, method: str, path: str, **options: Any) -> httpx.Response:
+        """A request of nobody."""
+        client = self.client()
+        return self.run(client.request(method, path, **options))
+
+    def link(self, name: str) -> str:
+        """A one-time sign-in token."""
+
+        async def made() -> str:
+            return await self.functions.sign_in.link(await self.functions.sign_in.account(name))
+
+        return self.run(made())
+
+    def sign_in(self, name: str, *, address: str = "127.0.0.1") -> "Person":
+        """Somebody in a new sign-in session, who asks from ``address``."""
+        answer = self.ask("POST", f"{API}/auth/sign-in", json={"link": self.link(name)})
+        assert answer.status_code == 200, answer.text
+        return Person(self, answer.json(), address=address)
+
+    def robot(self, *names: str) -> Robot:
+        """An agent that nobody has claimed, with devices of these names (default: ``arm``)."""
+        return Robot(self, names or ("arm",))
+
+    def start_ingest(self) -> None:
+        """Take in what agents say, until the end; returns once it hears them."""
+
+        async def handle(topic: str, payload: bytes) -> None:
+            await ingest(self.functions, topic, payload)
+
+        self._listen(self.functions.feed, handle)
+
+    def start_telemetry(self) -> None:
+        """Take in what robots measure, until the end; returns once it hears them."""
+        self._listen(self.functions.telemetry, self._store)
+
+    def start_late(self) -> None:
+        """Take in what robots measured while their link was down, until the end; returns once it hears them."""
+        self._listen(self.functions.late, self._store)
+
+    async def _store(self, messages: Sequence[tuple[str, bytes]]) -> None:
+        await ingest_telemetry(self.functions, messages)
+
+    def _listen(self, feed: Any, handle: Callable[..., Coroutine[Any, Any, None]]) -> None:
+        async def start() -> None:
+            self._feeds.append(asyncio.ensure_future(feed.run(handle)))
+            assert await feed._link.ready(PATIENCE_S), feed._link.trouble
+
+        self.run(start())
+
+    def sweep(self) -> None:
+        """One round of the timer."""
+        self.run(self.functions.sweep.run())
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        async def end() -> None:
+            for feed in self._feeds:
+                feed.cancel()
+                await asyncio.gather(feed, return_exceptions=True)
+            for client in self._clients:
+                await client.aclose()
+            await self.functions.close()
+
+        self.run(end())
+        self.loop.call_soon_threadsafe(self.loop.stop)
+        self._thread.join()
+        self.loop.run_until_complete(self.loop.shutdown_default_executor())
+        self.loop.close()
+
+
+class Person:
+    """An account in one sign-in session, by access token, for which it gets the next one in time."""
+
+    def __init__(self, cloud: Cloud, signed_in: dict[str, Any], *, address: str = "127.0.0.1") -> None:
+        self.cloud = cloud
+        self.token: str = signed_in["access_token"]
+        self.account: str = signed_in["account"]["id"]
+        self.name: str = signed_in["account"]["name"]
+        self.session: str = signed_in["session"]
+        self._given_ms = cloud.clock.now_ms()
+        self._client = cloud.client(address=address, headers={"Authorization": f"Bearer {self.token}"})
+
+    def _stay(self) -> None:
+        """As a program does that has kept the cookie of its session."""
+        now_ms = self.cloud.clock.now_ms()
+        if TOKEN_MS // 2 < now_ms - self._given_ms < SESSION_S * 1000:
+            who = Identity(self.account, self.name, self.session)
+            self.token, _ = self.cloud.run(self.cloud.functions.sessions.access_token(who))
+            self._given_ms = now_ms
+            self._client.headers["Authorization"] = f"Bearer {self.token}"
+
+    def ask(self, method: str, path: str, **options: Any) -> httpx.Response:
+        self._stay()
+        return self.cloud.run(self._client.request(method, API + path, **options))
+
+    def begin(self, method: str, path: str, **options: Any) -> Callable[[], httpx.Response]:
+        """Ask without waiting; call what this gives for the answer."""
+        self._stay()
+        call = self._client.request(method, API + path, **options)
+        future = asyncio.run_coroutine_threadsafe(call, self.cloud.loop)
+        return lambda: future.result(4 * PATIENCE_S)
+
+    def get(self, path: str, **options: Any) -> httpx.Response:
+        return self.ask("GET", path, **options)
+
+    def post(self, path: str, body: Any = None, **options: Any) -> httpx.Response:
+        return self.ask("POST", path, json=body, **options) if body is not None else self.ask("POST", path, **options)
+
+    def put(self, path: str, body: Any) -> httpx.Response:
+        return self.ask("PUT", path, json=body)
+
+    def delete(self, path: str) -> httpx.Response:
+        return self.ask("DELETE", path)
+
+    def start(self, device: str, **options: Any) -> httpx.Response:
+        """Start an action; ``MOVE`` where no ``request`` is given. ``once`` is the idempotency key."""
+        headers = {"Idempotency-Key": options.pop("once")} if "once" in options else {}
+        return self.post(f"/devices/{device}/actions", {"request": MOVE, **options}, headers=headers)
+
+    def take(self, device: str, **options: Any) -> httpx.Response:
+        return self.post(f"/devices/{device}/lease", options)
+
+    def action(self, action: str, **query: Any) -> dict[str, Any]:
+        answer = self.get(f"/actions/{action}", params=query)
+        assert answer.status_code == 200, answer.text
+        found: dict[str, Any] = answer.json()
+        return found
+
+
+def settings(home: Path, broker: RunningBroker | None = None, **changes: Any) -> Settings:
+    """Settings of functions with this home, at this broker (``None``: at no broker).
+
+    Requests are counted only where a test asks for it: all of a test's people share one address.
+    """
+    rates = dict.fromkeys(("rate_address", "rate_account", "rate_key", "rate_agent"), 0)
+    known = Settings(home=home, public_url=BASE, mqtt_port=1, **{**rates, **changes})
+    if broker is None:
+        return known
+    return replace(
+        known, broker=broker.kind, mqtt_port=broker.tcp_port, websocket_url=f"ws://127.0.0.1:{broker.websocket_port}"
+    )
+
+
+def problem(answer: httpx.Response, status: int, code: str) -> dict[str, Any]:
+    """The body of a refusal, once it is seen to be a proper one."""
+    assert answer.status_code == status, f"{answer.status_code} {answer.text}"
+    assert answer.headers["content-type"] == "application/problem+json"
+    body: dict[str, Any] = answer.json()
+    assert body["type"] == f"/problems/{code}", body
+    assert body["status"] == status
+    assert body["title"]
+    assert body["detail"].endswith((".", "…"))
+    assert "Traceback" not in answer.text
+    return body
+
+
+@contextlib.contextmanager
+def paired(cloud: Cloud, owner: str = "anna", *names: str) -> Iterator[tuple[Person, Robot]]:
+    """Somebody with a robot that is connected and known to be online."""
+    person = cloud.sign_in(owner)
+    with cloud.robot(*names) as robot:
+        robot.pair(person)
+        robot.connect()
+        wait_until(lambda: person.get(f"/devices/{robot.device}").json()["online"], "the robot to be online")
+        yield person, robot

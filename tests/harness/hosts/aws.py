@@ -1,0 +1,310 @@
+"""AWS Lambda: Amazon's own runtime client in processes, before it the runtime's API and a gateway as API Gateway is.
+
+Any number of instances, as many as there are requests at once; each serves one request at a time and is frozen between
+two, by ``SIGSTOP``, as Amazon does.
+"""
+
+import base64
+import contextlib
+import http.client
+import json
+import os
+import queue
+import re
+import signal
+import threading
+import time
+import uuid
+from collections.abc import Iterator, Mapping
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from pathlib import Path
+from typing import Any, ClassVar
+from urllib.parse import unquote_to_bytes
+
+from tests.harness.hosts.host import (
+    LOOPBACK,
+    PATIENCE_S,
+    ROOT,
+    HostFailed,
+    Program,
+    environment_of,
+    only,
+    start_program,
+)
+
+MAX_INSTANCES = 8
+MAX_EVENT_BYTES = 6 * 1024 * 1024
+"""Most that Lambda takes and gives in one invocation."""
+_RUNTIME = "/2018-06-01/runtime"
+_TEXT = re.compile(r"text/|application/(json|javascript|xml|[\w.+-]+\+json)")
+_HANDLER = "function_app.entrypoints.hosts.aws.handler"
+_ARN = "arn:aws:lambda:eu-west-1:123456789012:function:telescope"
+
+
+@contextlib.contextmanager
+def start_lambda(
+    environment: Mapping[str, str], *, freeze: bool = True, package: Path | None = None
+) -> Iterator["Lambda"]:
+    """The functions behind a gateway on a free port; with ``package``, the code and libraries in it alone."""
+    with contextlib.ExitStack() as stack:
+        instances = stack.enter_context(contextlib.ExitStack())
+        host = Lambda(environment, instances, freeze=freeze, package=package)
+        host.url = stack.enter_context(_serve(_gateway(host)))
+        stack.callback(host.thaw)
+        yield host
+
+
+class Lambda:
+    """The service: starts instances, gives each an event at a time."""
+
+    def __init__(
+        self, environment: Mapping[str, str], stack: contextlib.ExitStack, *, freeze: bool, package: Path | None
+    ) -> None:
+        self.url = ""
+        self.instances: list[_Instance] = []
+        self._environment = environment
+        self._stack = stack
+        self._freeze = freeze
+        self._folder, self._arguments = ROOT, ["-m", "awslambdaric", _HANDLER]
+        self._libraries: dict[str, str] = {}
+        if package is not None:
+            self._folder, self._arguments = package, ["-S", *self._arguments]
+            self._libraries = only(package, "awslambdaric", "runtime_client*", "simplejson", "snapshot_restore_py")
+        self._lock = threading.Lock()
+        self._idle: list[_Instance] = []
+
+    def tick(self) -> None:
+        self.invoke(
+            {
+                "version": "0",
+                "id": str(uuid.uuid4()),
+                "source": "aws.events",
+                "detail-type": "Scheduled Event",
+                "resources": ["arn:aws:events:eu-west-1:123456789012:rule/sweep"],
+                "detail": {},
+            }
+        )
+
+    def deliver(self, topic: str, payload: bytes) -> None:
+        at_ms = time.time_ns() // 1_000_000
+        self.invoke({"topic": topic, "payload": base64.b64encode(payload).decode(), "at_ms": at_ms})
+
+    def invoke(self, event: dict[str, Any]) -> Any:
+        """One invocation's answer.
+
+        Raises:
+            HostFailed: It ended with an error.
+        """
+        with self._lock:
+            instance = self._idle.pop() if self._idle else self._start()
+        try:
+            outcome = instance.run(event)
+        finally:
+            with self._lock:
+                self._idle.append(instance)
+        if "error" in outcome:
+            raise HostFailed(json.dumps(outcome["error"]))
+        return outcome["answer"]
+
+    def thaw(self) -> None:
+        """Let all instances run from now on, so that they can end."""
+        for instance in self.instances:
+            instance.thaw()
+
+    def _start(self) -> "_Instance":
+        assert len(self.instances) < MAX_INSTANCES, "more requests at once than instances may run"
+        instance = _Instance(freeze=self._freeze)
+        address = self._stack.enter_context(_serve(_runtime_api(instance))).removeprefix("http://")
+        given = environment_of(
+            {
+                "AWS_REGION": "eu-west-1",
+                **self._environment,
+                "AWS_LAMBDA_RUNTIME_API": address,
+                "AWS_LAMBDA_FUNCTION_NAME": "telescope",
+                "AWS_LAMBDA_FUNCTION_MEMORY_SIZE": "512",
+                "AWS_EXECUTION_ENV": "AWS_Lambda_python3.11",
+                "_HANDLER": _HANDLER,
+                **self._libraries,
+            }
+        )
+        instance.program = self._stack.enter_context(start_program(self._arguments, given, folder=self._folder))
+        self.instances.append(instance)
+        return instance
+
+
+class _Instance:
+    """One process that asks for an event, answers, and asks again."""
+
+    def __init__(self, *, freeze: bool) -> None:
+        self.program: Program | None = None
+        self.events: queue.Queue[dict[str, Any]] = queue.Queue()
+        self.outcomes: queue.Queue[dict[str, Any]] = queue.Queue()
+        self._freeze = freeze
+        self._freezing = threading.Lock()
+
+    def run(self, event: dict[str, Any]) -> dict[str, Any]:
+        self.events.put(event)
+        deadline = time.monotonic() + PATIENCE_S
+        while True:
+            with contextlib.suppress(queue.Empty):
+                return self.outcomes.get(timeout=0.2)
+            assert self.program is not None
+            assert self.program.process.poll() is None, f"the instance ended: {self.program.said()}"
+            assert time.monotonic() < deadline, f"the instance does not answer: {self.program.said()}"
+
+    def next(self) -> dict[str, Any]:
+        """Its next event; frozen until there is one."""
+        with contextlib.suppress(queue.Empty):
+            return self.events.get_nowait()
+        self._signal(signal.SIGSTOP)
+        event = self.events.get()
+        self._signal(signal.SIGCONT)
+        return event
+
+    def thaw(self) -> None:
+        """Let it run from now on."""
+        self._signal(signal.SIGCONT, last=True)
+
+    def _signal(self, number: signal.Signals, *, last: bool = False) -> None:
+        with self._freezing:
+            freeze, self._freeze = self._freeze, self._freeze and not last
+            if freeze and self.program is not None and self.program.process.poll() is None:
+                os.kill(self.program.process.pid, number)
+
+
+class _Handler(BaseHTTPRequestHandler):
+    protocol_version = "HTTP/1.1"
+    disable_nagle_algorithm = True
+
+    def read(self) -> bytes:
+        if self.headers.get("transfer-encoding", "").lower() != "chunked":
+            return self.rfile.read(int(self.headers.get("content-length", 0)))
+        parts = []
+        while length := int(self.rfile.readline(), 16):
+            parts.append(self.rfile.read(length))
+            self.rfile.readline()
+        self.rfile.readline()
+        return b"".join(parts)
+
+    def answer(self, status: int, headers: list[tuple[str, str]], content: bytes) -> None:
+        self.send_response_only(status)
+        for name, value in headers:
+            self.send_header(name, value)
+        if status not in {http.client.NO_CONTENT, http.client.NOT_MODIFIED}:
+            self.send_header("content-length", str(len(content)))
+        self.end_headers()
+        if self.command != "HEAD":
+            self.wfile.write(content)
+
+    def log_message(self, *_: object) -> None:
+        """Nothing."""
+
+
+def _runtime_api(instance: _Instance) -> type[_Handler]:
+    class RuntimeApi(_Handler):
+        def do_GET(self) -> None:
+            assert self.path == f"{_RUNTIME}/invocation/next", self.path
+            event = instance.next()
+            deadline_ms = time.time_ns() // 1_000_000 + 30_000
+            headers = {
+                "Lambda-Runtime-Aws-Request-Id": str(uuid.uuid4()),
+                "Lambda-Runtime-Deadline-Ms": str(deadline_ms),
+                "Lambda-Runtime-Invoked-Function-Arn": _ARN,
+                "Content-Type": "application/json",
+            }
+            self.answer(200, list(headers.items()), json.dumps(event).encode())
+
+        def do_POST(self) -> None:
+            body = json.loads(self.read())
+            if self.path.endswith("/response"):
+                instance.outcomes.put({"answer": body})
+            else:
+                instance.outcomes.put({"error": body})
+            self.answer(202, [], b"{}")
+
+    return RuntimeApi
+
+
+def _gateway(service: Lambda) -> type[_Handler]:
+    class Gateway(_Handler):
+        """An HTTP API with a ``$default`` route, payload format 2.0."""
+
+        hop_by_hop: ClassVar = {"connection", "transfer-encoding", "content-length", "keep-alive"}
+
+        def handle_any(self) -> None:
+            event = self._event(self.read())
+            if len(json.dumps(event)) > MAX_EVENT_BYTES:
+                self.answer(413, [("content-type", "application/json")], b'{"message":"Request Too Long"}')
+                return
+            try:
+                answer = service.invoke(event)
+            except HostFailed:
+                self.answer(500, [("content-type", "application/json")], b'{"message":"Internal Server Error"}')
+                return
+            assert len(json.dumps(answer)) <= MAX_EVENT_BYTES
+            content = answer.get("body", "")
+            body = base64.b64decode(content) if answer.get("isBase64Encoded") else content.encode()
+            headers = [(name, value) for name, value in answer["headers"].items() if name not in self.hop_by_hop]
+            headers += [("set-cookie", cookie) for cookie in answer.get("cookies", ())]
+            self.answer(answer["statusCode"], headers, body)
+
+        do_GET = do_PUT = do_POST = do_PATCH = do_DELETE = do_HEAD = do_OPTIONS = handle_any  # noqa: N815
+
+        def _event(self, body: bytes) -> dict[str, Any]:
+            path, _, query = self.path.partition("?")
+            headers: dict[str, str] = {}
+            for name, value in self.headers.items():
+                known = name.lower()
+                if known not in {*self.hop_by_hop, "cookie"} or known == "content-length":
+                    headers[known] = f"{headers[known]},{value}" if known in headers else value
+            cookies = [part.strip() for line in self.headers.get_all("cookie", ()) for part in line.split(";")]
+            decoded = unquote_to_bytes(path).decode(errors="replace")
+            return {
+                "version": "2.0",
+                "routeKey": "$default",
+                "rawPath": decoded,
+                "rawQueryString": query,
+                **({"cookies": cookies} if cookies else {}),
+                "headers": {"x-forwarded-proto": "https", "x-forwarded-port": "443", **headers},
+                "requestContext": {
+                    "accountId": "123456789012",
+                    "apiId": "api",
+                    "http": {
+                        "method": self.command,
+                        "path": decoded,
+                        "protocol": "HTTP/1.1",
+                        "sourceIp": self.client_address[0],
+                        "userAgent": headers.get("user-agent", ""),
+                    },
+                    "requestId": uuid.uuid4().hex,
+                    "routeKey": "$default",
+                    "stage": "$default",
+                    "timeEpoch": time.time_ns() // 1_000_000,
+                },
+                **_body(body, headers.get("content-type", "")),
+            }
+
+    return Gateway
+
+
+def _body(body: bytes, kind: str) -> dict[str, Any]:
+    if not body:
+        return {"isBase64Encoded": False}
+    if _TEXT.match(kind):
+        with contextlib.suppress(UnicodeDecodeError):
+            return {"body": body.decode(), "isBase64Encoded": False}
+    return {"body": base64.b64encode(body).decode(), "isBase64Encoded": True}
+
+
+@contextlib.contextmanager
+def _serve(handler: type[BaseHTTPRequestHandler]) -> Iterator[str]:
+    server = ThreadingHTTPServer((LOOPBACK, 0), handler)
+    server.daemon_threads = True
+    thread = threading.Thread(target=server.serve_forever, args=(0.02,))
+    thread.start()
+    try:
+        yield f"http://{LOOPBACK}:{server.server_port}"
+    finally:
+        server.shutdown()
+        thread.join()
+        server.server_close()

@@ -1,0 +1,62 @@
+"""Azure Functions: Microsoft's own worker code in a process, behind a front as the Functions host is one."""
+
+import base64
+import contextlib
+import http.client
+import json
+import secrets
+import sys
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Any
+from urllib.parse import urlsplit
+
+from tests.harness.hosts.host import PATIENCE_S, Host, HostFailed, environment_of, only, start_program
+
+WORKER = Path(sys.prefix) / "azure-worker"
+"""Where ``make`` installs the worker: not among the project's packages, because it asks for a newer Python."""
+
+
+@contextlib.contextmanager
+def start_azure(environment: Mapping[str, str], *, package: Path | None = None) -> Iterator[Host]:
+    """The worker on a free port, with the functions indexed and loaded; with ``package``, on its libraries alone."""
+    assert any(WORKER.glob("azure_functions_runtime")), f"the Functions worker is not in {WORKER}; run `make test`"
+    arguments, more = ["-m", "tests.harness.hosts.functions_host", str(WORKER)], {}
+    if package is not None:
+        arguments, more = ["-S", *arguments], only(package, "uvicorn", "h11", "click")
+    with start_program(arguments, environment_of({**environment, **more})) as program:
+        yield _Azure(program.line())
+
+
+class _Azure:
+    """The non-HTTP functions are fired through the host's own addresses for that."""
+
+    def __init__(self, url: str) -> None:
+        self.url = url
+
+    def tick(self) -> None:
+        self._post("/admin/functions/sweep", {"input": ""}, {})
+
+    def deliver(self, topic: str, payload: bytes) -> None:
+        event = {
+            "specversion": "1.0",
+            "id": secrets.token_hex(8),
+            "source": "telescope-namespace",
+            "type": "MQTT.EventPublished",
+            "subject": topic,
+            "time": "2026-01-01T00:00:00Z",
+            "data_base64": base64.b64encode(payload).decode(),
+        }
+        self._post("/runtime/webhooks/eventgrid?functionName=ingest", [event], {"aeg-event-type": "Notification"})
+
+    def _post(self, path: str, body: Any, headers: dict[str, str]) -> None:
+        where = urlsplit(self.url)
+        connection = http.client.HTTPConnection(where.hostname or "", where.port, timeout=PATIENCE_S)
+        try:
+            connection.request("POST", path, json.dumps(body), {"content-type": "application/json", **headers})
+            answer = connection.getresponse()
+            said = answer.read().decode()
+            if answer.status != 202:
+                raise HostFailed(f"{answer.status} {said}")
+        finally:
+            connection.close()

@@ -1,0 +1,53 @@
+"""People and robots who reach the functions through a host."""
+
+import asyncio
+from collections.abc import Mapping
+from typing import Any, cast
+
+import httpx
+
+from device_agent.protocol.security import signing
+from function_app import bootstrap, settings
+from tests.fakes.agent import Robot
+from tests.harness.cloud.cloud import API, Cloud, MovingClock
+from tests.harness.hosts.host import PATIENCE_S, Host
+
+
+class Reached:
+    """A host, as the toy robot speaks to the functions."""
+
+    def __init__(self, host: Host, environment: Mapping[str, str]) -> None:
+        self.host = host
+        self.clock = MovingClock()
+        self._environment = environment
+
+    def ask(self, method: str, path: str, **options: Any) -> httpx.Response:
+        return httpx.request(method, self.host.url + path, timeout=PATIENCE_S, **options)
+
+    def link(self, name: str) -> str:
+        """A one-time sign-in token, made beside the host."""
+
+        async def made() -> str:
+            functions = bootstrap.build(settings.read(self._environment))
+            link = await functions.sign_in.link(await functions.sign_in.account(name))
+            await functions.close()
+            return link
+
+        return asyncio.run(made())
+
+    def sign_in(self, name: str) -> httpx.Client:
+        answer = self.ask("POST", f"{API}/auth/sign-in", json={"link": self.link(name)})
+        assert answer.status_code == 200, answer.text
+        token = {"Authorization": f"Bearer {answer.json()['access_token']}"}
+        return httpx.Client(base_url=self.host.url + API, headers=token, timeout=PATIENCE_S)
+
+    def robot(self) -> Robot:
+        """A toy robot; it asks for nothing of a cloud but what is here."""
+        return Robot(cast("Cloud", self), ("arm",))
+
+    def pair(self, owner: httpx.Client, robot: Robot) -> None:
+        claimed = owner.post("/agents/claim", json={"code": robot.code()})
+        assert claimed.status_code == 200, claimed.text
+        state = robot.enrollment()
+        robot.space = state["space"]
+        robot._keys = {key["id"]: signing.public_key(key["public"]) for key in state["keys"]}

@@ -1,0 +1,54 @@
+"""One machine: ``python -m function_app serve``, and beside it what ``work`` does, one step at a time."""
+
+import base64
+import contextlib
+import json
+import socket
+from collections.abc import Iterator, Mapping
+
+from tests.harness.hosts.host import LOOPBACK, PATIENCE_S, Host, HostFailed, Program, environment_of, start_program
+from tests.harness.network.brokers import wait_until
+
+
+@contextlib.contextmanager
+def start_uvicorn(environment: Mapping[str, str]) -> Iterator[Host]:
+    """The server on a free port, and a worker that is told each step."""
+    port = _free_port()
+    given = environment_of({"TELESCOPE_HOST": LOOPBACK, **environment, "TELESCOPE_PORT": str(port)})
+    with (
+        start_program(["-m", "function_app", "serve"], given) as server,
+        start_program(["-m", "tests.harness.hosts.stepwise_worker"], given) as worker,
+    ):
+        wait_until(lambda: _answers(port) or server.process.poll() is not None, "the server", PATIENCE_S)
+        assert server.process.poll() is None, server.said()
+        yield _Uvicorn(f"http://{LOOPBACK}:{port}", worker)
+
+
+class _Uvicorn:
+    def __init__(self, url: str, worker: Program) -> None:
+        self.url = url
+        self._worker = worker
+
+    def tick(self) -> None:
+        self._do({"do": "sweep"})
+
+    def deliver(self, topic: str, payload: bytes) -> None:
+        self._do({"do": "ingest", "topic": topic, "payload": base64.b64encode(payload).decode()})
+
+    def _do(self, step: dict[str, str]) -> None:
+        self._worker.tell(json.dumps(step))
+        answer = json.loads(self._worker.line())
+        if answer:
+            raise HostFailed(answer)
+
+
+def _free_port() -> int:
+    with socket.socket() as found:
+        found.bind((LOOPBACK, 0))
+        port: int = found.getsockname()[1]
+        return port
+
+
+def _answers(port: int) -> bool:
+    with socket.socket() as caller:
+        return caller.connect_ex((LOOPBACK, port)) == 0

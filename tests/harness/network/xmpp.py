@@ -1,0 +1,343 @@
+"""A real Prosody, who speaks for the cloud beside the functions, and a toy robot that speaks nothing but XMPP.
+
+with open_site(...) as site:                        # functions, their HTTP, Prosody, and one speaker
+    with site.robot() as robot:
+        robot.pair(anna)
+        robot.connect()
+"""
+
+import asyncio
+import contextlib
+import socket
+import subprocess
+import sys
+import threading
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Self
+
+import uvicorn
+
+from device_agent.protocol.xmpp.stream import Login, Stream
+from device_agent.transports.xmpp import XmppAccess, XmppTransport
+from function_app import bootstrap
+from function_app.entrypoints.xmpp.gateway import Speaker
+from function_app.ports.broker_access import Credentials
+from function_app.settings import Settings
+from tests.fakes.agent import Robot
+from tests.harness.cloud.cloud import Cloud, Person
+from tests.harness.cloud.cloud_processes import Ground, start_ground
+from tests.harness.hosts.host import environment_of, start_program
+from tests.harness.network.brokers import HOST, PATIENCE_S, ROOT, Client, Message, RunningBroker, wait_until
+
+if TYPE_CHECKING:
+    from xml.etree.ElementTree import Element
+
+DOMAIN = "telescope.localhost"
+
+
+def free_port() -> int:
+    with socket.socket() as probe:
+        probe.bind((HOST, 0))
+        port: int = probe.getsockname()[1]
+        return port
+
+
+@dataclass
+class Prosody:
+    """An XMPP server's process."""
+
+    process: "subprocess.Popen[str]"
+    home: Path
+    port: int
+
+    def kill(self) -> None:
+        """End it as a crash does, both the program that runs it and Prosody itself."""
+        self.process.kill()
+        self.process.wait(PATIENCE_S)
+        wait_until(self._gone, "the end of Prosody")
+
+    def _gone(self) -> bool:
+        with socket.socket() as probe:
+            return probe.connect_ex((HOST, self.port)) != 0
+
+    def stderr(self) -> str:
+        return (self.home / "stderr").read_text()
+
+
+@contextlib.contextmanager
+def start_prosody(home: Path, verify_url: str, *, port: int = 0, more: tuple[str, ...] = ()) -> Iterator[Prosody]:
+    home.mkdir(parents=True, exist_ok=True)
+    named = ("--domain", DOMAIN, "--verify-url", verify_url, *more)
+    with (home / "stderr").open("a") as stderr:
+        process = subprocess.Popen(
+            [sys.executable, "-m", "infra.prosody", "--home", str(home), "--port", str(port), *named],
+            cwd=ROOT,
+            stdout=subprocess.PIPE,
+            stderr=stderr,
+            text=True,
+        )
+        with process:
+            try:
+                assert process.stdout is not None
+                line = process.stdout.readline()
+                assert line.startswith("ready xmpp="), f"{line!r} {(home / 'stderr').read_text()}"
+                yield Prosody(process, home, int(line.partition("=")[2]))
+            finally:
+                if process.poll() is None:
+                    process.terminate()
+                    process.wait(PATIENCE_S)
+
+
+class ProsodyEnd:
+    """Prosody, as what a transport's connection ends at."""
+
+    def __init__(self, home: Path, verify_url: str, port: int, stack: contextlib.ExitStack) -> None:
+        self.port = port
+        self._begin = lambda: stack.enter_context(start_prosody(home, verify_url, port=port))
+        self._now = self._begin()
+
+    def kill(self) -> None:
+        self._now.kill()
+
+    def revive(self) -> None:
+        self._now = self._begin()
+
+
+@contextlib.contextmanager
+def served(cloud: Cloud, listener: socket.socket) -> Iterator[None]:
+    """The functions' HTTP at a socket that listens already."""
+    server = uvicorn.Server(uvicorn.Config(cloud.app, log_level="warning", lifespan="off"))
+    running = asyncio.run_coroutine_threadsafe(server.serve(sockets=[listener]), cloud.loop)
+    try:
+        yield
+    finally:
+        server.should_exit = True
+        running.result(PATIENCE_S)
+
+
+class Speaking:
+    """One who speaks for the cloud, in the loop of the functions."""
+
+    def __init__(self, cloud: Cloud) -> None:
+        self.cloud = cloud
+
+        async def start() -> "tuple[Speaker, asyncio.Task[None]]":
+            speaker = Speaker(cloud.functions, bootstrap.xmpp_line(cloud.functions), bootstrap.orders(cloud.functions))
+            return speaker, asyncio.create_task(speaker.run())
+
+        self.speaker, self._task = cloud.run(start())
+
+    def serves(self, agent: str) -> bool:
+        return agent in self.speaker._served
+
+    def end(self) -> None:
+        async def stop() -> None:
+            self._task.cancel()
+            await asyncio.gather(self._task, return_exceptions=True)
+
+        self.cloud.run(stop())
+
+
+@dataclass
+class XmppSite:
+    """Functions, an XMPP server, and who speaks for the cloud there."""
+
+    cloud: Cloud
+    prosody: Prosody
+    url: str
+    speaking: list[Speaking] = field(default_factory=list)
+
+    def speak(self) -> Speaking:
+        self.speaking.append(Speaking(self.cloud))
+        return self.speaking[-1]
+
+    def robot(self, *names: str) -> "XmppRobot":
+        return XmppRobot(self.cloud, names or ("arm",))
+
+    def client(self, user: str, password: str, **options: Any) -> "XmppClient":
+        return XmppClient(self.prosody.port, user, password, **options)
+
+    def watcher(self, broker: RunningBroker) -> Client:
+        """A connection to the broker with the functions' own rights."""
+        service = self.cloud.functions.access.service_credentials()
+        client = broker.connect(service.client_id, Credentials(service.username, service.password))
+        assert client.connected.is_set(), client.answer
+        return client
+
+    def person(self, who: Person) -> "XmppClient":
+        """A person's own XMPP client."""
+        given = who.post("/xmpp/credentials", {"purpose": "watch"}).json()
+        return self.client(who.account, given["password"])
+
+
+@contextlib.contextmanager
+def open_site(
+    open_cloud: Callable[[Settings], Cloud], settings: Settings, folder: Path, *, speak: bool = True
+) -> Iterator[XmppSite]:
+    """All of it.
+
+    Args:
+        open_cloud: Makes the functions.
+        settings: Theirs, without XMPP.
+        folder: For Prosody's files.
+        speak: Whether to start who speaks for the cloud.
+    """
+    with contextlib.ExitStack() as stack:
+        listener = stack.enter_context(socket.create_server((HOST, 0)))
+        url = f"http://{HOST}:{listener.getsockname()[1]}"
+        prosody = stack.enter_context(start_prosody(folder, f"{url}/api/v1/xmpp/verify"))
+        cloud = open_cloud(replace(settings, xmpp_domain=DOMAIN, xmpp_host=HOST, xmpp_port=prosody.port))
+        stack.enter_context(served(cloud, listener))
+        site = XmppSite(cloud, prosody, url)
+        if speak:
+            site.speak()
+        try:
+            yield site
+        finally:
+            for each in site.speaking:
+                each.end()
+
+
+class XmppRobot(Robot):
+    """As ``Robot``, over XMPP, with the agent's own transport.
+
+    Attributes:
+        setpoints: What came on ``ctl``, as it came.
+        changes: What the transport has told of its link.
+        listen: Topics of others that it wants to hear, and
+        overheard: what came of them.
+    """
+
+    def __init__(self, place: Any, names: tuple[str, ...]) -> None:
+        super().__init__(place, names)
+        self.setpoints: list[tuple[str, bytes]] = []
+        self.changes: list[bool] = []
+        self.refused: list[str] = []
+        self.listen: tuple[str, ...] = ()
+        self.overheard: list[tuple[str, bytes]] = []
+
+    def introduction(self, **changes: Any) -> dict[str, Any]:
+        return super().introduction(**{"transport": "xmpp", **changes})
+
+    def access(self) -> XmppAccess:
+        answer = self.ask("POST", "/xmpp/credentials", json={"purpose": "agent"})
+        if answer.status_code != 200:
+            self.refused.append(answer.text)
+            raise ValueError(answer.text)
+        given = answer.json()
+        login = Login(given["host"], given["port"], given["jid"], given["password"])
+        return XmppAccess(login, given["cloud"], given["lifetime_s"])
+
+    def next_session(self) -> int:
+        self.session += 1
+        return self.session
+
+    def connect(self) -> Self:
+        """Connect, and wait until it has been heard."""
+        line: Any = _Line(self)
+        self.link = line
+        wait_until(lambda: self.changes[-1:] == [True], "the link over XMPP")
+        return self
+
+    def obey(self, message: Message) -> None:
+        if "/ctl/" in message.topic:
+            self.setpoints.append((message.topic, message.payload))
+        if "/tele/" in message.topic:
+            self.overheard.append((message.topic, message.payload))
+        super().obey(message)
+
+
+class _Line:
+    """In the place of the toy robot's MQTT connection."""
+
+    def __init__(self, robot: XmppRobot) -> None:
+        self.transport = XmppTransport(
+            access=robot.access,
+            presence_topic=f"ts/v1/{robot.space}/{robot.id}/conn",
+            next_session=robot.next_session,
+            software="toy 1",
+            listen=robot.listen,
+        )
+        self.transport.start(
+            lambda topic, payload: robot.obey(Message(topic, payload, 1, retain=False)), robot.changes.append
+        )
+
+    def publish(self, topic: str, payload: bytes) -> None:
+        self.transport.publish(topic, payload, qos=1)
+
+    def publish_acknowledged(self, topic: str, payload: bytes, *, retain: bool = False) -> None:
+        done = threading.Event()
+        assert self.transport.publish(topic, payload, qos=1, retain=retain, delivered=done.set)
+        assert done.wait(PATIENCE_S), f"no receipt for {topic}"
+
+    def close(self) -> None:
+        self.transport.stop()
+
+
+class XmppClient:
+    """Any XMPP client: logs in, hears, and may say what it likes. ``with`` ends it."""
+
+    def __init__(self, port: int, user: str, password: str, *, resource: str = "test") -> None:
+        self.messages: list[Element] = []
+        self.presences: list[Element] = []
+        self.trouble: OSError | None = None
+        self._login = Login(HOST, port, f"{user}@{DOMAIN}/{resource}", password)
+        self._loop = asyncio.new_event_loop()
+        self._thread = threading.Thread(target=self._loop.run_forever)
+        self._thread.start()
+        self.opened = self._run(self._open())
+
+    async def _open(self) -> bool:
+        self.stream = Stream(self._login, message=self.messages.append, presence=self.presences.append)
+        try:
+            await self.stream.open()
+        except OSError as error:
+            self.trouble = error
+            return False
+        self._staying = asyncio.create_task(self.stream.stay())
+        return True
+
+    @property
+    def ended(self) -> bool:
+        return not self.opened or self._staying.done()
+
+    def say(self, stanza: str) -> None:
+        self._loop.call_soon_threadsafe(self.stream.send, stanza)
+
+    def there(self, user: str) -> bool:
+        """Whether this user's newest presence says that they are there."""
+        heard = [each for each in self.presences if each.get("from", "").startswith(f"{user}@")]
+        return bool(heard) and heard[-1].get("type") is None
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        async def close() -> None:
+            if self.opened:
+                self._staying.cancel()
+                await asyncio.gather(self._staying, return_exceptions=True)
+            await self.stream.close()
+
+        self._run(close())
+        self._loop.call_soon_threadsafe(self._loop.stop)
+        self._thread.join()
+        self._loop.close()
+
+    def _run(self, work: Any) -> Any:
+        return asyncio.run_coroutine_threadsafe(work, self._loop).result(PATIENCE_S)
+
+
+@contextlib.contextmanager
+def start_xmpp_ground(folder: Path) -> Iterator[Ground]:
+    """A ground with Prosody, and a program beside it that speaks for the cloud."""
+    port = free_port()
+    settings = {"TELESCOPE_XMPP_DOMAIN": DOMAIN, "TELESCOPE_XMPP_HOST": HOST, "TELESCOPE_XMPP_PORT": str(port)}
+    with start_ground("mosquitto", folder, settings) as ground:
+        end = ProsodyEnd(folder / "prosody", f"{ground.url}/api/v1/xmpp/verify", port, ground.stack)
+        ground.endpoints["xmpp"] = end
+        environment = environment_of({**ground.environment, "TELESCOPE_PORT": str(ground.endpoints["server"].port)})
+        ground.stack.enter_context(start_program(["-m", "function_app", "xmpp"], environment))
+        yield ground

@@ -1,0 +1,13 @@
+"""``python -m tests.security.fuzz [SECONDS] [TARGET …]``: each target so long, and a table of what that has reached."""
+
+import sys
+
+from tests.security.fuzz import instrumented
+from tests.security.fuzz.session import HEAD, fuzz
+
+if __name__ == "__main__":
+    seconds, *names = sys.argv[1:] or ["60"]
+    print(HEAD)
+    for name in names or instrumented.MODULES:
+        for session in fuzz([name], f"-max_total_time={seconds}"):
+            print(session.row, flush=True)

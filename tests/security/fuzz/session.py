@@ -1,0 +1,61 @@
+"""One target under the fuzzer, in a process of its own, and what libFuzzer says of it."""
+
+import re
+import subprocess
+import sys
+import tempfile
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from tests.harness.network.brokers import ROOT
+
+HEAD = """| parser | inputs tried | edges: an empty input | the examples | in the end |
+| --- | ---: | ---: | ---: | ---: |"""
+_REACHED = re.compile(r"^#[0-9]+\s+(INITED|DONE)\s+cov: ([0-9]+)", re.MULTILINE)
+_DONE = re.compile(r"^Done ([0-9]+) runs", re.MULTILINE)
+
+
+class Crashed(Exception):  # noqa: N818 (what a fuzzer is for)
+    """Something got out of a parser that must not; the text is the fuzzer's own, with the input."""
+
+
+@dataclass(frozen=True, slots=True)
+class Session:
+    """What one run has reached: branches of the parser's code ("edges")."""
+
+    name: str
+    runs: int
+    empty: int
+    examples: int
+    end: int
+
+    @property
+    def row(self) -> str:
+        return f"| {self.name} | {self.runs:,} | {self.empty} | {self.examples} | {self.end} |"
+
+
+def fuzz(names: Sequence[str], *options: str) -> Iterator[Session]:
+    """Run targets with libFuzzer's own options, one after another in one process.
+
+    Raises:
+        Crashed: One found something.
+    """
+    with tempfile.TemporaryDirectory(prefix="ts-fuzz-") as folder:
+        done = subprocess.run(
+            [sys.executable, "-m", "tests.security.fuzz.run", folder, ",".join(names), *options],
+            cwd=ROOT, capture_output=True, text=True, errors="replace", check=False,
+        )  # fmt: skip
+        for name in names:
+            said = [_said(Path(folder) / file) for file in (f"{name}-empty", name)]
+            if any(_DONE.search(text) is None for text in said):
+                raise Crashed(f"{name}: {done.stderr[-2000:]}{''.join(said)[-4000:]}")
+            empty, reached = (dict(_REACHED.findall(text)) for text in said)
+            runs = re.findall(_DONE, said[1])[-1]
+            yield Session(name, int(runs), int(empty["INITED"]), int(reached["INITED"]), int(reached["DONE"]))
+        if done.returncode:
+            raise Crashed(done.stderr[-2000:])
+
+
+def _said(path: Path) -> str:
+    return path.read_text(errors="replace") if path.exists() else ""

@@ -1,0 +1,50 @@
+"""Every parser of what others wrote, under a fuzzer for a moment; ``make fuzz`` gives each of them its time."""
+
+import sys
+
+import pytest
+
+from tests.security.fuzz import instrumented
+from tests.security.fuzz.session import Crashed, fuzz
+from tests.security.fuzz.targets import TARGETS, Found, _check_finite
+
+SLOW = ("home", "robot_type")
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="atheris, the fuzzer, is installed on Linux alone")
+@pytest.mark.parametrize(("slow", "runs"), [(False, 2000), (True, 300)], ids=["quick", "slow"])
+def test_nothing_but_what_is_documented_gets_out_of_any_parser(slow: bool, runs: int) -> None:
+    assert set(TARGETS) == set(instrumented.MODULES)
+    sessions = list(fuzz([name for name in TARGETS if (name in SLOW) == slow], f"-runs={runs}", "-seed=1"))
+    print(*(session.row for session in sessions), sep="\n")
+    assert all(session.runs >= runs for session in sessions)
+    assert all(session.end > session.empty for session in sessions), "the fuzzer is blind"
+
+
+@pytest.mark.parametrize(
+    ("name", "found"),
+    [
+        ("http", b'\0\0{"ageexpires_in_s": 600.0, "state": "a", "keys": []}'),
+        ("http", b'\0\0{"agent": "a", "expires_in_s": "soon"}'),
+        ("http", b'\0\2{"lifetime_s": NaN}'),
+        ("home", b'{"agent": "a", "space": "s", "account": "s", "keys": {"k": "A\xc0A"}, "owner": ""}'),
+    ],
+)
+def test_what_was_found_once_is_not_found_again(name: str, found: bytes) -> None:
+    TARGETS[name].try_out(found)
+
+
+def test_every_example_passes() -> None:
+    for target in TARGETS.values():
+        for seed in target.seeds:
+            target.try_out(seed)
+
+
+def test_a_number_that_is_not_finite_is_found_wherever_it_is() -> None:
+    with pytest.raises(Found):
+        _check_finite({"a": [1, ({"b": float("nan")},)]})
+
+
+def test_a_crash_is_told_with_its_input() -> None:
+    with pytest.raises(Crashed, match="no-such-parser"):
+        list(fuzz(["no-such-parser"]))

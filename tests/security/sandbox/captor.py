@@ -1,0 +1,287 @@
+"""The agent's side of an attack: a process with secrets, victims and open doors, which runs hostile scripts.
+
+``python -m tests.security.sandbox.captor LAYERS``: each line that it reads is a JSON ``[name, source, stranger]``, each
+line that it writes what came of it (``Result``). LAYERS are the jail's, comma-separated; none: no jail at all.
+"""
+
+import contextlib
+import json
+import os
+import platform
+import shutil
+import signal
+import socket
+import subprocess
+import sys
+import tempfile
+import threading
+import time
+from collections.abc import Iterator
+from ctypes import addressof, create_string_buffer
+from pathlib import Path
+from typing import Any
+
+import msgspec
+
+from device_agent.ports import script_calls
+from device_agent.ports.sandbox import Inmate, Limits
+from device_agent.protocol import RunMovement
+from device_agent.runtime.actions.script_action import Cell, Script, ScriptFailed
+from device_agent.runtime.authority.lease_gate import Refused
+from device_agent.sandbox.host import WarmJail
+from tests.security.sandbox.attacks import ATTACKS
+
+SECRET = "the-agents-secret-7e1e5c09e"
+PATIENCE_S = 0.2
+"""What has not ended by itself after this time is killed, as Stop does."""
+LIMITS = Limits(cpu_s=2)
+_NAMES = {word.split("'")[1] for source in ATTACKS.values() for word in source.split("call(")[1:] if word[0] == "'"}
+
+
+class Result(msgspec.Struct):
+    """What came of one attack.
+
+    Attributes:
+        tried: Whether it got as far as trying.
+        breaches: What succeeded, inside as the attack says and outside as it was seen.
+        said: The script's end, as the operator would read it.
+        moves: What reached the robot.
+        killed_ms: From the kill to the dead process [ms]; 0 where it ended by itself.
+        messages: How many of its messages were answered.
+        cpu_s: Processor time of this process meanwhile [s].
+        wall_s: Time meanwhile [s].
+    """
+
+    tried: bool
+    breaches: list[str]
+    said: str
+    moves: list[Any]
+    killed_ms: float
+    messages: int
+    cpu_s: float
+    wall_s: float
+
+
+class Puppet:
+    """A robot that takes notes."""
+
+    joints = ("shoulder", "elbow")
+    frames = ("tool",)
+    can = ("move_joints", "home", "state")
+
+    def __init__(self) -> None:
+        self.moves: list[Any] = []
+        self.messages = 0
+
+    def do(self, call: script_calls.Call) -> Any:
+        self.messages += 1
+        if isinstance(call, script_calls.AskState):
+            return {"position_rad": dict.fromkeys(self.joints, 0.0)}
+        self.moves.append(msgspec.to_builtins(call))
+        raise Refused("busy", "it does not move")
+
+
+class Surroundings:
+    """What an attack may reach for, and what can be seen of it afterwards."""
+
+    def __init__(self) -> None:
+        self.home = Path(tempfile.mkdtemp(prefix="telescope-captor-"))
+        self.outside = Path(tempfile.gettempdir()) / f"telescope-attack-{os.getpid()}"
+        self.key = self.home / "identity.pem"
+        self.key.write_text(f"PRIVATE KEY {SECRET}", encoding="ascii")
+        self.key.chmod(0o600)
+        self.memory = create_string_buffer(SECRET.encode())
+        self.victim = subprocess.Popen(["sleep", "1000"], stdin=subprocess.DEVNULL)
+        self.contacts: list[str] = []
+        self.port = self._listen(socket.AF_INET, ("127.0.0.1", 0)).getsockname()[1]
+        self.abstract = f"telescope-captor-{os.getpid()}"
+        self._listen(socket.AF_UNIX, b"\0" + self.abstract.encode())
+        self._listen(socket.AF_UNIX, str(self.home / "socket"))
+        self._udp = socket.socket(type=socket.SOCK_DGRAM)
+        self._udp.bind(("127.0.0.1", self.port))
+        self._udp.setblocking(False)
+        self._before = self._look()
+
+    def _listen(self, family: int, address: Any) -> socket.socket:
+        listener = socket.socket(family)
+        listener.bind(address)
+        listener.listen()
+
+        def welcome() -> None:
+            while True:
+                link, _ = listener.accept()
+                self.contacts.append(str(address))
+                link.close()
+
+        threading.Thread(target=welcome, daemon=True).start()
+        return listener
+
+    def parameters(self, parents: list[int]) -> dict[str, Any]:
+        import pyseccomp
+
+        numbers = {name: pyseccomp.resolve_syscall(pyseccomp.system_arch(), name) for name in _NAMES}
+        return {
+            "numbers": {name: number if number >= 0 else 9999 for name, number in numbers.items()},
+            "key": str(self.key),
+            "home": str(self.home),
+            "outside": str(self.outside),
+            "agent": os.getpid(),
+            "victim": self.victim.pid,
+            "parents": parents,
+            "port": self.port,
+            "abstract": self.abstract,
+            "secret_address": addressof(self.memory),
+            "secret_reversed": list(reversed(SECRET)),
+            "machine": platform.machine(),
+        }
+
+    def breaches(self) -> Iterator[str]:
+        """What was done outside, since this was asked last; mended as far as that goes."""
+        now = self._look()
+        for name, before in self._before.items():
+            if now[name] != before:
+                yield f"{name}: {before} became {now[name]}"
+        self._mend()
+
+    def _look(self) -> dict[str, Any]:
+        with contextlib.suppress(BlockingIOError):
+            self._udp.recv(10)
+            self.contacts.append("udp")
+        stat = Path(f"/proc/{self.victim.pid}/stat").read_text(encoding="ascii").rsplit(")", 1)[1].split()
+        return {
+            "the agent's folder": sorted(path.name for path in self.home.iterdir()),
+            "the agent's key": self.key.read_text(encoding="ascii") if self.key.exists() else None,
+            "its rights": self.key.stat().st_mode if self.key.exists() else None,
+            "outside": os.path.lexists(self.outside),
+            "shared memory": Path("/dev/shm/telescope-attack").exists(),
+            "contacts": len(self.contacts),
+            "the victim": stat[0] in "SR",
+            "the agent's memory": self.memory.value.decode(),
+            "the agent's importance": os.getpriority(os.PRIO_PROCESS, os.getpid()),
+            "the machine's name": platform.node(),
+        }
+
+    def _mend(self) -> None:
+        for path in (self.outside, Path("/dev/shm/telescope-attack"), self.home / "new"):
+            if path.is_dir() and not path.is_symlink():
+                path.rmdir()
+            path.unlink(missing_ok=True)
+        self.key.unlink(missing_ok=True)
+        self.key.write_text(f"PRIVATE KEY {SECRET}", encoding="ascii")
+        self.key.chmod(0o600)
+        with contextlib.suppress(ProcessLookupError):
+            self.victim.send_signal(signal.SIGCONT)
+        if self.victim.poll() is not None:
+            self.victim = subprocess.Popen(["sleep", "1000"], stdin=subprocess.DEVNULL)
+        self.memory.value = SECRET.encode()
+        self._before = self._look()
+
+    def clear(self) -> None:
+        self.victim.kill()
+        self.victim.wait()
+        shutil.rmtree(self.home, ignore_errors=True)
+
+
+def strays(jail: WarmJail, session: int) -> int:
+    """What is alive of a script: of its session, or a child of a warm parent of this process but for the ready ones."""
+    count = 0
+    with jail._lock:  # so that meanwhile none is made ready
+        parents = warm_parents()
+        waiting = {process_of(parent.ready[1]) for parent in (jail._own, jail._walled) if parent.ready}
+        for stat in Path("/proc").glob("[0-9]*/stat"):
+            with contextlib.suppress(OSError):
+                state, parent, _, its_session, *_ = stat.read_text(encoding="utf-8").rsplit(")", 1)[1].split()
+                child = int(parent) in parents and int(stat.parent.name) not in waiting
+                count += state not in "ZX" and (int(its_session) == session or child)
+    return count
+
+
+def process_of(inmate: Inmate) -> int:
+    """Its process id in this world; behind bubblewrap it has another."""
+    known = Path(f"/proc/self/fdinfo/{inmate._descriptor}").read_text(encoding="ascii")  # type: ignore[attr-defined]
+    return next(int(line.split()[1]) for line in known.splitlines() if line.startswith("Pid:"))
+
+
+def warm_parents() -> list[int]:
+    """Process ids of this process's children that are warm parents, and of theirs behind bubblewrap."""
+    found: list[int] = []
+    seen = [os.getpid()]
+    while seen:
+        with contextlib.suppress(OSError):
+            children = Path(f"/proc/{seen[0]}/task/{seen[0]}/children").read_text(encoding="ascii").split()
+            for child in map(int, children):
+                command = Path(f"/proc/{child}/cmdline").read_bytes()
+                if b"device_agent/sandbox/__main__.py" in command:
+                    (seen if command.startswith(b"bwrap") else found).append(child)
+                    if command.startswith(b"bwrap"):
+                        continue
+        seen.pop(0)
+    return found
+
+
+def attack(jail: WarmJail, around: Surroundings, name: str, source: str, *, stranger: bool) -> Result:
+    """Run one script, kill it in time, and see what it has done."""
+    puppet, printed = Puppet(), [""]
+
+    def told(text: str, share: float | None) -> None:
+        del share
+        if not printed[0]:
+            alarm.start()
+        printed[0] = (printed[0] + text)[:20_000]
+
+    order = RunMovement(
+        robot_type="toy", name=name, version=1, sha256="0" * 64, source=source,
+        parameters=around.parameters(warm_parents()),
+    )  # fmt: skip
+    script = Script(order, puppet, told, cell=Cell(jail, stranger, LIMITS), died=lambda: None)
+    killed_at_s = 0.0
+
+    def stop() -> None:
+        nonlocal killed_at_s
+        killed_at_s = time.perf_counter()
+        script.kill()
+
+    alarm = threading.Timer(PATIENCE_S, stop)  # from its first word on
+    said = ""
+    cpu_s, wall_s = time.process_time(), time.perf_counter()
+    try:
+        script.run()
+    except ScriptFailed as failed:
+        said = str(failed)
+    ended_s = time.perf_counter()
+    alarm.cancel()
+    breaches = [line for line in printed[0].splitlines() if line.startswith("BREACH")]
+    breaches += around.breaches()
+    inmate = script._inmate
+    if inmate is not None and strays(jail, inmate.pid):  # type: ignore[attr-defined]
+        breaches.append("something of it is still alive")
+    return Result(
+        tried=printed[0].startswith("TRIED\n"),
+        breaches=breaches,
+        said=said,
+        moves=puppet.moves,
+        killed_ms=(ended_s - killed_at_s) * 1000 if killed_at_s else 0.0,
+        messages=puppet.messages,
+        cpu_s=time.process_time() - cpu_s,
+        wall_s=ended_s - wall_s,
+    )
+
+
+def main(layers: str) -> None:
+    os.environ["TELESCOPE_SECRET"] = SECRET
+    jail = WarmJail(layers=[layer for layer in layers.split(",") if layer])
+    jail.start()
+    around = Surroundings()
+    try:
+        for line in sys.stdin:
+            name, source, stranger = json.loads(line)
+            result = attack(jail, around, name, source, stranger=stranger)
+            sys.stdout.buffer.write(msgspec.json.encode(result) + b"\n")
+            sys.stdout.buffer.flush()
+    finally:
+        jail.close()
+        around.clear()
+
+
+if __name__ == "__main__":
+    main(*sys.argv[1:])

@@ -1,0 +1,89 @@
+"""Starts a captor as root, or as a user that may do nothing."""
+
+import json
+import os
+import subprocess
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+
+import msgspec
+
+from device_agent.sandbox.constants import LAYERS
+from tests.security.sandbox.attacks import ATTACKS, PRELUDE
+from tests.security.sandbox.captor import Result
+
+REPOSITORY = Path(__file__).resolve().parents[3]
+NOBODY = 65534
+
+
+class Half:
+    """A captor and the pipe to it."""
+
+    def __init__(self, *, root: bool, layers: Sequence[str] = LAYERS) -> None:
+        self._results: dict[str, Result] = {}
+        command = [] if root == (os.geteuid() == 0) else as_nobody()
+        self._process = subprocess.Popen(
+            [*command, sys.executable, "-m", "tests.security.sandbox.captor", ",".join(layers)],
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            cwd=REPOSITORY,
+            env={"PATH": os.environ["PATH"], "OPENBLAS_NUM_THREADS": "1"},
+        )
+
+    def attack(self, name: str, *, stranger: bool = False) -> Result:
+        """One of the attacks."""
+        result = self.run(name, ATTACKS[name], stranger=stranger)
+        if not stranger:
+            self._results[name] = result
+        return result
+
+    def attacked(self, name: str) -> Result:
+        """What came of an attack that was tried before."""
+        if name not in self._results:
+            self._results[name] = self.attack(name)
+        return self._results[name]
+
+    def run(self, name: str, source: str, *, stranger: bool = False) -> Result:
+        """Any script."""
+        assert self._process.stdin is not None
+        assert self._process.stdout is not None
+        self._process.stdin.write(json.dumps([name, source, stranger]).encode() + b"\n")
+        self._process.stdin.flush()
+        line = self._process.stdout.readline()
+        assert line, "the agent's side has ended: the attack reached it"
+        return msgspec.json.decode(line, type=Result)
+
+    def close(self) -> None:
+        """End it."""
+        assert self._process.stdin is not None
+        assert self._process.stdout is not None
+        self._process.stdin.close()
+        self._process.wait(timeout=30)
+        self._process.stdout.close()
+
+
+def inside(source: str) -> str:
+    """A script with the attacks' own tools."""
+    return PRELUDE + source
+
+
+def as_nobody() -> list[str]:
+    """The command that runs another as nobody, where root started this.
+
+    Nobody may not pass through root's own folder; where Python or this repository is in there, a view is made in which
+    nothing of it is but these.
+    """
+    needed = [Path(sys.prefix).resolve(), Path(sys.base_prefix), Path(sys.prefix), REPOSITORY]
+    closed = {folder for path in needed for folder in path.parents if not folder.stat().st_mode & 0o001}
+    user = ["setpriv", f"--reuid={NOBODY}", f"--regid={NOBODY}", "--clear-groups", "--inh-caps=-all"]
+    if not closed:
+        return user
+    view = ["bwrap", "--dev-bind", "/", "/"]
+    view += [part for folder in sorted(closed) for part in ("--perms", "0755", "--tmpfs", str(folder))]
+    for path in dict.fromkeys(needed):
+        if any(folder in path.parents for folder in closed):
+            for folder in reversed(path.parents):
+                view += ["--perms", "0755", "--dir", str(folder)] if closed & set(folder.parents) else []
+            view += ["--ro-bind", str(path), str(path)]
+    return [*view, "--cap-add", "CAP_SETUID", "--cap-add", "CAP_SETGID", "--", *user]

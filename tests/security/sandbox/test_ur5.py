@@ -1,0 +1,80 @@
+"""A script in the jail moves the simulated UR5: by joints, to poses, and not where it may not go."""
+
+import json
+import math
+from collections.abc import Iterator
+from pathlib import Path
+
+import msgspec
+import pytest
+
+from device_agent import drivers, geometry
+from device_agent.config.catalogue import ROBOTS, TYPES
+from device_agent.protocol import AckStatus
+from function_app.services.robot_types.script_linter import check_script
+from tests.harness.agent.device_harness import Bench
+from tests.harness.network.brokers import ROOT
+
+UR5 = ROBOTS / "ur5"
+WRITTEN = ROOT / "web" / "tests" / "fixtures" / "keyframes.py"
+"""What the page's tests hold it to."""
+TELLS = "\nimport json\nprint(json.dumps(robot.state()['position_rad']))\n"
+
+
+@pytest.fixture
+def arm(tmp_path: Path) -> Iterator[Bench]:
+    kind = TYPES.load("ur5")
+    driver = drivers.load(kind.driver)(kind, UR5, {}, "arm")
+    bench = Bench(tmp_path, driver=driver, kind=kind, geometry=geometry.load(kind, UR5))  # type: ignore[arg-type]
+    bench.device.start()
+    bench.device.link_changed(True)
+    yield bench
+    bench.stop()
+
+
+def test_a_frame_goes_where_it_is_sent(arm: Bench) -> None:
+    source = (
+        "import json\n"
+        "robot.home(speed=1)\n"
+        "down = robot.state()['frames']['flange']\n"
+        "robot.move_to((down[0], down[1] + 0.1, down[2] + 0.05), speed=1)\n"
+        "wait(0.5)\n"
+        "there = robot.state()['frames']['flange']\n"
+        "robot.move_to(down[:3], quaternion=down[3:], frame='flange', speed=1)\n"
+        "wait(0.5)\n"
+        "print(json.dumps([down, there, robot.state()['frames']['flange']]))\n"
+    )
+    ack = arm.end(arm.command(arm.script(source), epoch=1))
+    assert ack.status is AckStatus.DONE, ack.reason
+    down, there, again = json.loads(ack.output)
+    wanted = (down[0], down[1] + 0.1, down[2] + 0.05)
+    assert math.dist(there[:3], wanted) < 2e-3
+    assert math.dist(again[:3], down[:3]) < 2e-3
+    assert abs(sum(a * b for a, b in zip(there[3:], down[3:], strict=True))) > 0.9999, "it keeps its orientation"
+
+
+@pytest.mark.parametrize(
+    ("call", "says"),
+    [
+        ("robot.move_to((5, 0, 0))", "line 1: RobotError"),
+        ("robot.move_to((-0.4, 0.0, -0.2))", "line 1: RobotError"),
+        ("robot.say('hello')", "this robot has no say; it has move_joints, play, home, move_to, state, latest"),
+        ("robot.drive(1)", "this robot has no drive"),
+        ("robot.look((1, 0, 0))", "this robot has no look"),
+    ],
+)
+def test_what_the_arm_cannot_or_may_not_do_is_refused(arm: Bench, call: str, says: str) -> None:
+    reason = arm.end(arm.command(arm.script(call), epoch=1)).reason
+    assert reason is not None
+    assert says in reason.message
+
+
+def test_what_the_keyframe_editor_writes_is_good_and_is_played(arm: Bench) -> None:
+    source = WRITTEN.read_text()
+    assert check_script(source, TYPES.load("ur5")).marks == ()
+    order = msgspec.structs.replace(arm.script(source + TELLS), parameters={"speed": 2})
+    ack = arm.end(arm.command(order, epoch=1))
+    assert ack.status is AckStatus.DONE, ack.reason
+    there = json.loads(ack.output)
+    assert there["shoulder_pan"] == pytest.approx(0.5, abs=0.02)
+    assert there["elbow"] == pytest.approx(1.57, abs=0.02)

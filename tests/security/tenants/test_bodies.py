@@ -1,0 +1,98 @@
+"""No route takes more of a body than it says, and none takes it in before it has found that out."""
+
+from collections.abc import AsyncIterator, Iterator
+from typing import Any
+
+import httpx
+import pytest
+
+from function_app.entrypoints.http.framework.responses import MAX_BODY
+from function_app.entrypoints.http.robot_types.schemas import MAX_UPLOAD
+from tests.harness.cloud.cloud import API, problem
+from tests.security.tenants.test_routes import ask
+from tests.security.tenants.world import World, make
+
+PART = 65_536
+LARGER = {"add_robot_type": MAX_UPLOAD, "add_robot_type_look": MAX_UPLOAD}
+"""Everything else has the same limit."""
+
+
+@pytest.fixture(scope="module")
+def world(tmp_path_factory: pytest.TempPathFactory) -> Iterator[World]:
+    world = make(tmp_path_factory.mktemp("home"))
+    with world.cloud:
+        yield world
+
+
+class Endless:
+    """A body without a declared length that goes on until nobody asks for more."""
+
+    def __init__(self, most: int) -> None:
+        self.taken = 0
+        self._most = most
+
+    async def parts(self) -> AsyncIterator[bytes]:
+        while True:
+            self.taken += PART
+            assert self.taken < self._most + 10 * PART, "the body is taken in whole"
+            yield b" " * PART
+
+
+def operations(world: World) -> list[tuple[str, str, str, dict[str, Any]]]:
+    return [
+        (str(operation["operationId"]), method.upper(), path.removeprefix("/api/v1"), operation)
+        for path, methods in world.cloud.app.openapi()["paths"].items()
+        for method, operation in methods.items()
+    ]
+
+
+def caller(operation: dict[str, Any]) -> str:
+    """Who may ask."""
+    names = {name for need in operation["security"] for name in need}
+    if not names:
+        return "nobody"
+    return "owner" if "accessToken" in names else "agent"
+
+
+def asked(world: World, name: str, method: str, path: str, who: str, **body: Any) -> Any:
+    """Its answer to this body, in the place of the one that the world has for it."""
+    robot: Any = getattr(world.callers["agent"], "__self__", None)
+    if who == "agent":
+        body["headers"] = {"Authorization": f"Bearer {robot.token()}", **body.get("headers", {})}
+
+    def send(method: str, path: str, **_: Any) -> httpx.Response:
+        return (
+            world.cloud.ask(method, API + path, **body) if who == "agent" else world.callers[who](method, path, **body)
+        )
+
+    return ask(World(world.cloud, {who: send}, world.ids, {}), who, name, method, path)[1]
+
+
+def test_every_route_with_a_body_refuses_one_that_is_too_large_and_reads_no_more_of_it(world: World) -> None:
+    seen = 0
+    for name, method, path, operation in operations(world):
+        if "requestBody" not in operation:
+            continue
+        assert "413" in operation["responses"], name
+        limit, who = LARGER.get(name, MAX_BODY), caller(operation)
+        body = Endless(limit)
+        problem(asked(world, name, method, path, who, content=body.parts()), 413, "too-large")
+        assert limit < body.taken <= limit + 2 * PART, f"{name} took {body.taken} bytes"
+        body = Endless(limit)
+        declared = {"headers": {"Content-Length": str(limit + 1)}}
+        problem(asked(world, name, method, path, who, content=body.parts(), **declared), 413, "too-large")
+        assert body.taken == 0, f"{name} took {body.taken} bytes of what it was told is too many"
+        world.put_back()
+        seen += 1
+    print(f"{seen} routes that take a body")  # noqa: T201
+    assert seen > 30
+
+
+def test_no_route_without_a_body_takes_any(world: World) -> None:
+    for name, method, path, operation in operations(world):
+        if "requestBody" in operation:
+            continue
+        body = Endless(0)
+        asked(world, name, method, path, caller(operation), content=body.parts())
+        assert body.taken == 0, f"{name} took {body.taken} bytes"
+        world.put_back()

@@ -1,0 +1,29 @@
+"""The headers of every answer."""
+
+from tests.security.tenants.test_routes import ask, operations
+from tests.security.tenants.world import World
+
+HEADERS = {
+    "content-security-policy",
+    "x-content-type-options",
+    "referrer-policy",
+    "x-frame-options",
+    "cross-origin-opener-policy",
+    "cross-origin-resource-policy",
+    "permissions-policy",
+}
+
+
+def test_every_answer_of_every_route_has_the_headers(world: World) -> None:
+    """Refused and served ones alike; what holds a secret is kept by nobody."""
+    for name, method, path in operations(world):
+        for caller in ("nobody", "owner", "agent"):
+            _, answer = ask(world, caller, name, method, path)
+            missing = HEADERS - set(answer.headers)
+            assert not missing, f"{name} by {caller}: {missing}"
+            assert answer.headers["x-content-type-options"] == "nosniff"
+            assert "access-control-allow-origin" not in answer.headers
+            assert "server" not in answer.headers
+            if any(word in answer.text for word in ('"secret":"', '"access_token":"', '"token":"', '"password":"')):
+                assert answer.headers.get("cache-control") == "no-store", f"{name} by {caller} may be kept"
+            world.put_back()

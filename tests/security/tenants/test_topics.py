@@ -1,0 +1,231 @@
+"""Every topic, by everybody, at real brokers: what is heard and said is what ``topics.txt`` says, and nothing else.
+
+A cell holds ``s`` where somebody may hear a channel of Anneliese's device, ``p`` where they may speak on it.
+"""
+
+import json
+import shutil
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any, Literal, NamedTuple
+
+import pytest
+
+from device_agent.protocol.security.grants import Grant
+from function_app.adapters.local.signing_keys import FileKeys
+from function_app.ports.broker_access import Credentials
+from tests.fakes.agent import Robot
+from tests.fakes.event_grid import event_grid_cloud
+from tests.harness.cloud.cloud import Cloud, settings
+from tests.harness.network.brokers import (
+    BROKERS,
+    ROOT,
+    BrokerKind,
+    Client,
+    Message,
+    RunningBroker,
+    start_broker,
+    wait_until,
+)
+
+TABLE = Path(__file__).with_name("topics.txt")
+RETAINED = ("presence", "description", "twin", "state")
+
+
+class Stage(NamedTuple):
+    """Who takes part, each by the credentials that the functions gave; and one who may say and hear everything."""
+
+    broker: RunningBroker
+    roles: dict[str, dict[str, Any]]
+    topics: dict[str, str]
+    wildcards: tuple[str, ...]
+    ear: Client
+
+
+def expected() -> dict[str, dict[str, str]]:
+    """Channel → role → cell."""
+    lines = [line for line in TABLE.read_text().splitlines() if line and not line.startswith("#")]
+    columns = [name.strip() for name in lines[0].split("|")[1:]]
+    rows = [[part.strip() for part in line.split("|")] for line in lines[1:]]
+    return {name: dict(zip(columns, cells, strict=True)) for name, *cells in rows}
+
+
+def channels() -> dict[str, str]:
+    """Name → address, as the document of the protocol says."""
+    document = json.loads((ROOT / "docs" / "asyncapi.json").read_text())
+    return {name: channel["address"] for name, channel in document["channels"].items()}
+
+
+@pytest.fixture(params=(*BROKERS, "eventgrid"), scope="module")
+def stage(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Stage]:
+    kind: BrokerKind | Literal["eventgrid"] = request.param
+    home = tmp_path_factory.mktemp(f"{kind}-home")
+    if kind == "eventgrid":
+        with event_grid_cloud(home) as (cloud, broker, grid):
+            grid.everything = "ear"
+            with broker.connect("ear", None) as ear:
+                yield _stage(broker, cloud, ear)
+        return
+    FileKeys(home / "keys").load()
+    with start_broker(kind, tmp_path_factory.mktemp(kind), keys=home / "keys" / "public.json") as broker:
+        if kind == "mosquitto":
+            (home / "mosquitto").mkdir()
+            shutil.copy(broker.home / "service.password", home / "mosquitto")
+        with Cloud(settings(home, broker)) as cloud, _ear(cloud, broker) as ear:
+            yield _stage(broker, cloud, ear)
+
+
+def _stage(broker: RunningBroker, cloud: Cloud, ear: Client) -> Stage:
+    robot, roles = _people(cloud)
+    topics = {name: address.format(**_names(robot)) for name, address in channels().items()}
+    wide = (
+        "#",
+        "ts/#",
+        "+/+/+/+/+/+",
+        f"ts/v1/{robot.space}/#",
+        f"ts/v1/+/{robot.id}/#",
+        "ts/v1/+/+/conn",
+        *(f"ts/v1/+/+/+/{kind}" for kind in ("state", "desc", "event", "ack", "cmd", "stop")),
+        *(f"ts/v1/+/+/+/{kind}/+" for kind in ("tele", "cam", "ctl", "late", "desc")),
+    )
+    return Stage(broker, roles, topics, wide, ear)
+
+
+def _names(robot: Robot) -> dict[str, str]:
+    return {"space": robot.space, "agent": robot.id, "device": "arm", "stream": "x", "camera": "x", "epoch": "1"}
+
+
+def _people(cloud: Cloud) -> tuple[Robot, dict[str, dict[str, Any]]]:
+    anna, stranger = cloud.sign_in("anna"), cloud.sign_in("stranger")
+    robot, foreign = cloud.robot(), cloud.robot()
+    robot.pair(anna)
+    foreign.pair(stranger)
+    people = {"owner": anna, "stranger": stranger}
+    for role in ("viewer", "operator"):
+        people[role] = cloud.sign_in(role)
+        assert anna.post(f"/devices/{robot.device}/shares", {"account": role, "role": role}).status_code == 201
+        people[f"space {role}"] = cloud.sign_in(f"space {role}")
+        body = {"account": f"space {role}", "role": role}
+        assert anna.post(f"/spaces/{robot.space}/shares", body).status_code == 201
+    epoch = anna.take(robot.device, wait_ms=0).json()["epoch"]
+    steer = {"purpose": "control", "device": robot.device, "epoch": epoch}
+    roles = {name: person.post("/mqtt/credentials", {"purpose": "watch"}).json() for name, person in people.items()}
+    roles["holder"] = anna.post("/mqtt/credentials", steer).json()
+    for name, agent in (("agent", robot), ("foreign agent", foreign)):
+        roles[name] = agent.ask("POST", "/mqtt/credentials", json={"purpose": "agent"}).json()
+    assert epoch == 1
+    return robot, roles
+
+
+def _ear(cloud: Cloud, broker: RunningBroker) -> Client:
+    now_s = cloud.clock.now_ms() // 1000
+    topics = tuple(address.format_map(_Any()) for address in channels().values())
+    grant = Grant(
+        principal="service:ear",
+        client_id="ear",
+        publish=topics,
+        subscribe=topics,
+        token_id="ear",
+        expires_at=now_s + 600,
+    )
+    credentials = cloud.run(cloud.functions.access.issue(grant))
+    ear = broker.connect("ear", credentials)
+    assert ear.connected.is_set(), ear.answer
+    return ear
+
+
+class _Any(dict[str, str]):
+    def __missing__(self, name: str) -> str:
+        return "+"
+
+
+def join(stage: Stage, role: str, **options: Any) -> Client:
+    issued = stage.roles[role]
+    return stage.broker.connect(issued["client_id"], Credentials(issued["username"], issued["password"]), **options)
+
+
+def barrier(client: Client, topic: str) -> None:
+    """A round trip: what the broker had for this client before it has come."""
+    client.paho.unsubscribe(topic)
+    client.subscribe(topic)
+
+
+def test_every_channel_has_a_row_and_every_row_a_channel(stage: Stage) -> None:
+    table = expected()
+    assert set(table) == set(channels())
+    for cells in table.values():
+        assert set(cells) == set(stage.roles)
+        assert set(cells.values()) <= {"-", "s", "p", "sp"}
+
+
+def test_nobody_hears_what_they_may_not_by_any_filter(stage: Stage) -> None:
+    table, leaks, heard_all = expected(), [], 0
+    for name in RETAINED:
+        stage.ear.publish_acknowledged(stage.topics[name], f"{name} kept", retain=True)
+    for role in stage.roles:
+        with join(stage, role) as client:
+            assert client.connected.is_set(), f"{role}: {client.answer}"
+            for pattern in (*stage.topics.values(), *stage.wildcards):
+                client.subscribe(pattern)
+            for name, topic in stage.topics.items():
+                stage.ear.publish_acknowledged(topic, name)
+            client.subscribe(stage.topics["state"])
+            heard = {message.topic for message in client.heard()}
+        for name, topic in stage.topics.items():
+            if (topic in heard) != ("s" in table[name][role]):
+                leaks.append(f"{role} {'hears' if topic in heard else 'does not hear'} {name}")
+            heard_all += 1
+        leaks += [f"{role} hears {topic}" for topic in heard - set(stage.topics.values())]
+    filters = len(stage.topics) + len(stage.wildcards)
+    print(f"{stage.broker.kind}: {heard_all} cells of hearing, {filters} filters each; {len(leaks)} leaks")  # noqa: T201
+    assert not leaks, "\n".join(leaks)
+
+
+def test_nobody_says_what_they_may_not(stage: Stage) -> None:
+    table, leaks, said = expected(), [], 0
+    for topic in stage.topics.values():
+        stage.ear.subscribe(topic)
+    stage.ear.heard()
+    for role in stage.roles:
+        for name, topic in stage.topics.items():
+            with join(stage, role) as client:
+                mid = client.publish(topic, role)
+                wait_until(lambda: client.acknowledged(mid) or client.disconnected.is_set(), "an end of it")  # noqa: B023
+            stage.ear.publish_acknowledged(stage.topics["ack"], "mark")
+            through = False
+            while (message := stage.ear.receive()).payload != b"mark":
+                through = through or (message.topic == topic and message.payload == role.encode())
+            if through != ("p" in table[name][role]):
+                leaks.append(f"{role} {'says' if through else 'cannot say'} {name}")
+            said += 1
+    print(f"{stage.broker.kind}: {said} cells of saying; {len(leaks)} leaks")  # noqa: T201
+    assert not leaks, "\n".join(leaks)
+
+
+def test_nobodys_will_is_said_where_they_may_not_speak(stage: Stage) -> None:
+    table = expected()
+    wills = [
+        ("presence", stage.topics["presence"]),
+        ("stop", stage.topics["stop"]),
+        ("command", stage.topics["command"]),
+    ]
+    for _, topic in wills:
+        stage.ear.subscribe(topic)
+    stage.ear.heard()
+    for role in stage.roles:
+        for name, topic in wills:
+            if "p" in table[name][role]:
+                continue
+            client = join(stage, role, will=Message(topic, b"evil", 1, retain=True))
+            if client.connected.is_set():
+                client.vanish()
+                wait_until(client.disconnected.is_set, "the end of the connection")
+            client.close()
+    # Whoever goes after them is heard after them.
+    last = join(stage, "agent", will=Message(stage.topics["presence"], b"last", 1, retain=False))
+    last.vanish()
+    said = []
+    while (message := stage.ear.receive()).payload != b"last":
+        said.append(message)
+    last.close()
+    assert not [message for message in said if message.payload == b"evil"]

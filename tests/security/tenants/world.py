@@ -1,0 +1,260 @@
+"""Two tenants over one store, everybody who may or may not ask, and everything that there is to be found.
+
+No broker: agents poll, and what they say is handed to the ingest as it would come. After each request the tables are
+put back, so that no cell of the matrix depends on another.
+"""
+
+import json
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import httpx
+
+from device_agent.protocol import Fault, Measurements, Mode, Presence, State, codec
+from function_app.services.storage import records
+from tests.fakes.agent import Robot
+from tests.harness.cloud.cloud import API, BASE, Cloud, Person, settings
+from tests.harness.network.brokers import ROOT
+
+OWNER = "Anneliese Musterfrau"
+LABEL = "Kronjuwel"
+MOVEMENT = "secretdance"
+SOURCE = "'only for whoever may see it'"
+TYPE_TOLD_OF_REFUSALS = {records.ATTEMPTS, records.AUDIT, records.FORGET, records.EVENTS}
+"""Who tried is counted, recorded and told to the owner; nothing else may change when somebody is refused."""
+
+Ask = Callable[..., httpx.Response]
+Rows = dict[tuple[str, str, str], str]
+
+
+@dataclass
+class World:
+    """Who asks, and for what."""
+
+    cloud: Cloud
+    callers: dict[str, Ask]
+    ids: dict[str, str]
+    """Path parameter → Anneliese's; ``<operation>.<parameter>`` where one operation needs another."""
+    bodies: dict[str, dict[str, Any]]
+    marks: set[str] = field(default_factory=set)
+    """What nobody may read who may not read it."""
+    foreign: tuple[str, ...] = ()
+    """What the partitions of Anneliese's rows hold."""
+
+    def rows(self) -> Rows:
+        db: Any = self.cloud.functions.tables
+        found = db._run("SELECT tab, part, key, etag FROM rows", ())
+        return {(table, partition, key): etag for table, partition, key, etag in found}
+
+    def keep(self) -> None:
+        db: Any = self.cloud.functions.tables
+        db._run("CREATE TEMP TABLE kept AS SELECT * FROM rows", ())
+
+    def put_back(self) -> None:
+        """The tables as they were when they were kept."""
+        db: Any = self.cloud.functions.tables
+        db._run("DELETE FROM rows", ())
+        db._run("INSERT INTO rows SELECT * FROM kept", ())
+
+
+def make(home: Path) -> World:
+    """The world, with a mark in everything of Anneliese's that has a text."""
+    cloud = Cloud(settings(home))
+    for silent, name in ((cloud.functions.bus, "publish"), (cloud.functions.access, "revoke")):
+        setattr(silent, name, _nothing)
+    anna, other = cloud.sign_in(OWNER), cloud.sign_in(OWNER)
+    people = {
+        name: cloud.sign_in(name) for name in ("stranger", "viewer", "operator", "space viewer", "space operator")
+    }
+    robot, foreign = _paired(cloud, anna), _paired(cloud, people["stranger"])
+    device, space = robot.device, robot.space
+    anna.put(f"/robot-types/ur5/movements/{MOVEMENT}", {"source": SOURCE, "description": "geheim"})
+    _made(anna.post("/spaces", {"name": "Speicher"}))  # one's only space cannot be handed over
+    invitations = {
+        "withdraw_device_invitation": _made(anna.post(f"/devices/{device}/invitations", {"role": "viewer"})),
+        "withdraw_space_invitation": _made(anna.post(f"/spaces/{space}/invitations", {"role": "viewer"})),
+        "withdraw_space_transfer": _made(anna.post(f"/spaces/{space}/transfers", {})),
+        "withdraw_agent_transfer": _made(anna.post(f"/agents/{robot.id}/transfers", {})),
+    }
+    for name, on in (("viewer", f"devices/{device}"), ("operator", f"devices/{device}")):
+        _made(anna.post(f"/{on}/shares", {"account": name, "role": name}))
+    for role in ("viewer", "operator"):
+        _made(anna.post(f"/spaces/{space}/shares", {"account": f"space {role}", "role": role}))
+    app = {"name": "app", "days": 1}
+    keys = {role: _made(anna.post("/api-keys", {**app, "role": role})) for role in ("viewer", "operator")}
+    epoch = anna.take(device, lease_ms=600_000, wait_ms=0).json()["epoch"]
+    action = anna.start(device, epoch=epoch).json()["id"]
+    request = _made(other.post(f"/devices/{device}/lease/requests", {"wait_ms": 0}))["request"]["id"]
+    _say(cloud, robot, epoch)
+    upload = _upload(cloud, anna, device)
+    fault = anna.get(f"/devices/{device}/faults").json()["items"][0]["id"]
+    ids = {
+        "device": device,
+        "agent": robot.id,
+        "space": space,
+        "action": action,
+        "request_id": request,
+        "fault": fault,
+        "upload": upload,
+        "stream": "hidden",
+        "look": _look(anna),
+        "robot_type": "ur5",
+        "name": MOVEMENT,
+        "get_robot_type_file.name": "ur5.xml",
+        "get_device_robot_type_file.name": "ur5.xml",
+        "account": people["viewer"].account,
+        "unshare_space.account": people["space viewer"].account,
+        "session": other.session,
+        "key": keys["viewer"]["api_key"]["id"],
+        **{f"{name}.invitation": made["id"] for name, made in invitations.items()},
+    }
+    world = World(
+        cloud,
+        callers={
+            "nobody": lambda method, path, **more: cloud.ask(method, API + path, **more),
+            **{name: person.ask for name, person in people.items()},
+            "owner": anna.ask,
+            **{f"{role} key": _by_key(cloud, key["token"]) for role, key in keys.items()},
+            "agent": robot.ask,
+            "foreign agent": foreign.ask,
+        },
+        ids=ids,
+        bodies=_bodies(device, space, epoch, robot.introduction(transport="http")),
+        marks={OWNER, LABEL, MOVEMENT, SOURCE, anna.account, anna.session, other.session, "geheim", "Kurzschluss"},
+        foreign=(anna.account, robot.id, space),
+    )
+    world.marks |= {made["secret"] for made in invitations.values()} | {
+        action,
+        request,
+        fault,
+        upload,
+        robot.id,
+        space,
+        ids["look"],
+    }
+    for caller in ("viewer key", "operator key"):
+        assert world.callers[caller]("GET", "/accounts/me").status_code == 200, (
+            "that a key is used is noted once an hour"
+        )
+    world.keep()
+    return world
+
+
+async def _nothing(*_: object, **__: object) -> None:
+    """There is no broker to wait for."""
+
+
+def _made(answer: httpx.Response) -> dict[str, Any]:
+    assert answer.status_code in {200, 201, 202}, answer.text
+    found: dict[str, Any] = answer.json()
+    return found
+
+
+def _by_key(cloud: Cloud, token: str) -> Ask:
+    return lambda method, path, **more: cloud.ask(
+        method, API + path, headers={"Authorization": f"Bearer {token}"}, **more
+    )
+
+
+def _paired(cloud: Cloud, owner: Person) -> Robot:
+    robot = cloud.robot()
+    devices = [{"name": "arm", "kind": "arm", "robot_type": "ur5", "label": LABEL if owner.name == OWNER else "x"}]
+    code = robot.enroll(transport="http", devices=devices).json()["claim_code"]
+    assert owner.post("/agents/claim", {"code": code}).status_code == 200
+    robot.space = robot.enrollment()["space"]
+    return robot
+
+
+def _say(cloud: Cloud, robot: Robot, epoch: int) -> None:
+    """Online, with a fault, and with something measured."""
+    at_ms = cloud.clock.now_ms()
+    short = Fault(code="short", message="Kurzschluss", since_ms=1)
+    state = State(device="arm", at_ms=at_ms, tick_ms=1, mode=Mode.FAULT, epoch=epoch, faults=(short,))
+    measured = Measurements(at_ms=at_ms, tick_ms=1, sequence=1, values={"geheim": 1.0})
+    top = f"ts/v1/{robot.space}/{robot.id}"
+    told = {
+        f"{top}/conn": Presence(online=True, session=1, at_ms=at_ms),
+        f"{top}/arm/state": state,
+        f"{top}/arm/tele/hidden": measured,
+    }
+    messages = [{"topic": topic, "payload": json.loads(codec.encode(message))} for topic, message in told.items()]
+    answer = robot.ask("POST", f"/agents/{robot.id}/messages", json={"messages": messages})
+    assert answer.status_code == 200, answer.text
+    assert '"refused"' not in answer.text, answer.text
+
+
+def _look(anna: Person) -> str:
+    """A robot type that is looked at before it is saved, and that no checker has seen."""
+    folder = ROOT / "robots" / "ur5"
+    manifest = (folder / "robot.toml").read_text().replace('type = "ur5"', 'type = "mine"')
+    files = {name: (folder / name).read_text() for name in ("ur5.xml", "scene.xml")}
+    return str(_made(anna.post("/robot-type-looks", {"manifest": manifest, "files": files, "wait_ms": 0}))["id"])
+
+
+def _upload(cloud: Cloud, anna: Person, device: str) -> str:
+    begun = _made(
+        anna.post(
+            f"/devices/{device}/uploads",
+            {"stream": "camera", "length": 3, "content_type": "image/png", "name": "geheim.png"},
+        )
+    )
+    put = cloud.ask(begun["method"], begun["url"].removeprefix(BASE), headers=begun["headers"], content=b"abc")
+    assert put.status_code == 201, put.text
+    _made(anna.post(f"/devices/{device}/uploads/{begun['id']}/complete"))
+    return str(begun["id"])
+
+
+def _bodies(device: str, space: str, epoch: int, introduction: dict[str, Any]) -> dict[str, dict[str, Any]]:
+    move = {"kind": "move_joints", "position_rad": {"elbow": 1.0}}
+    times = {"transport": "http", "path": "device-cloud", "samples": [{"at_ms": 1, "ms": 1}]}
+    capture = {"stream": "camera", "length": 3, "content_type": "image/png"}
+    return {
+        "sign_in": {"link": "x" * 43},
+        "sign_in_by_password": {"name": OWNER, "password": "wrong wrong wrong"},
+        "put_password": {"password": "correct horse battery"},
+        "make_space": {"name": "Attic"},
+        "make_api_key": {"name": "app", "role": "viewer", "days": 1},
+        "enroll_agent": introduction,
+        "make_account": {"name": "new", "password": "correct horse battery", "invitation": "x" * 43},
+        "start_open_id_invited": {"invitation": "x" * 43},
+        "certify": {"request": "x"},
+        "claim_agent": {"code": "BCDF-GHJK"},
+        "rename_device": {"label": "Elbow grease"},
+        "move_agent": {"space": space},
+        "tell_messages": {"messages": [{"topic": "t", "payload": {}}]},
+        "share_device": {"account": "stranger", "role": "operator"},
+        "share_space": {"account": "stranger", "role": "operator"},
+        "invite_to_device": {"role": "operator"},
+        "invite_to_space": {"role": "operator"},
+        "transfer_agent": {},
+        "transfer_space": {},
+        "look_at_invitation": {"secret": "x" * 43},
+        "redeem_invitation": {"secret": "x" * 43},
+        "take_lease": {"wait_ms": 0},
+        "ask_for_control": {"wait_ms": 0},
+        "accept_control_request": {"wait_ms": 0},
+        "stop_device": {"reason": "x"},
+        "stop_space": {"reason": "x"},
+        "stop_all": {"reason": "x"},
+        "start_action": {"request": move, "epoch": epoch},
+        "start_actions": {"devices": [device], "request": move},
+        "add_robot_type": {"manifest": "x", "files": {}},
+        "add_robot_type_look": {"manifest": "x", "files": {}},
+        "put_movement": {"source": "1"},
+        "check_movement": {"source": "1"},
+        "mqtt_credentials": {"purpose": "control", "device": device, "epoch": epoch},
+        "xmpp_credentials": {},
+        "xmpp_verify": {"username": "x", "password": "x"},
+        "add_latency": times,
+        "add_agent_latency": {"device": "arm", **times},
+        "begin_upload": capture,
+        "begin_agent_upload": {"device": "arm", **capture},
+        "complete_agent_upload": {"device": "arm"},
+    }
+
+
+def texts(answer: httpx.Response) -> str:
+    """All that somebody is told by an answer."""
+    return json.dumps(dict(answer.headers)) + answer.text

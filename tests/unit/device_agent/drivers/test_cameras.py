@@ -1,0 +1,42 @@
+"""What a simulated robot sees through the cameras of its model."""
+
+import msgspec
+import numpy as np
+import pytest
+import simplejpeg
+
+from device_agent.drivers import mujoco as simulation
+from device_agent.ports.driver import DriverError, Filming
+from device_agent.protocol import Stream
+from device_agent.protocol.manifests import robot_type
+from device_agent.simulation import renderer
+from tests.harness.network.brokers import PATIENCE_S, ROOT
+
+QBO = ROOT / "robots" / "qbo"
+TYPE = robot_type.load(QBO)
+
+
+def test_the_eyes_see_the_world_that_the_robot_stands_in(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(renderer, "WITHIN_S", PATIENCE_S)
+    driver = simulation.create(TYPE, QBO, {}, "qbo")
+    assert isinstance(driver, Filming)
+    assert driver.frame("eyes") is None
+    driver.connect()
+    try:
+        taken = driver.frame("eyes")
+        assert taken is not None
+        pixels = simplejpeg.decode_jpeg(taken.content)
+        assert pixels.shape == (taken.height, taken.width, 3)
+        assert float(np.std(pixels)) > 5, "it sees nothing but one colour"
+        with pytest.raises(DriverError, match="no camera 'ears'; there are: eyes"):
+            driver.frame("ears")
+    finally:
+        driver.close()
+        driver.close()
+    assert driver.frame("eyes") is None
+
+
+def test_a_camera_that_the_model_lacks_is_named() -> None:
+    kind = msgspec.structs.replace(TYPE, cameras=(Stream(name="third", rate_hz=1.0),))
+    with pytest.raises(DriverError, match="no camera 'third'"):
+        simulation.create(kind, QBO, {}, "qbo").connect()

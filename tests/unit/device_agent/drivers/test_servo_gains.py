@@ -1,0 +1,64 @@
+"""Servos that hold less: a limp arm hangs, holds others still, and is caught where it is."""
+
+from pathlib import Path
+
+import mujoco
+import numpy as np
+import pytest
+
+from device_agent.drivers.mujoco import MujocoDriver, World
+from device_agent.ports import skills
+from device_agent.ports.skills import SkillError, Stage
+from device_agent.protocol.manifests import robot_type
+
+ROBOT = Path(__file__).parents[3] / "robots" / "ur5"
+KIND = robot_type.load(ROBOT)
+STAGE: Stage = None  # type: ignore[assignment]
+
+
+class Arm:
+    """A simulated arm, stepped by hand."""
+
+    def __init__(self) -> None:
+        self.world = World(ROBOT / KIND.scene, home=KIND.home_rad)
+        self.world.build()
+        self.driver = MujocoDriver(robot_type=KIND, world=self.world, device="arm")
+        self.driver._resolve(self.world.model)
+        self.names = [joint.name for joint in KIND.joints]
+
+    def stiffen(self, value: float, *joints: str) -> None:
+        self.driver.perform(skills.Stiffen(value, joints), STAGE)
+
+    def run(self, seconds: float) -> dict[str, float]:
+        snapshot = self.world.step(round(seconds / 0.002))
+        return dict(zip(self.names, snapshot.qpos[self.driver._qpos].tolist(), strict=True))
+
+
+def test_a_limp_joint_falls_and_the_others_hold() -> None:
+    arm = Arm()
+    before = arm.run(0.2)
+    arm.stiffen(0.0, "wrist_1")
+    after = arm.run(1.0)
+    assert abs(after["wrist_1"] - before["wrist_1"]) > 0.3
+    assert abs(after["shoulder_pan"] - before["shoulder_pan"]) < 0.02
+    assert abs(after["elbow"] - before["elbow"]) < 0.1
+
+
+def test_with_all_of_its_stiffness_back_it_is_as_it_was_made() -> None:
+    arm = Arm()
+    model = arm.world.model
+    made = [model.actuator_gainprm.copy(), model.actuator_biasprm.copy(), model.body_gravcomp.copy()]
+    arm.stiffen(0.3)
+    arm.run(0.1)
+    assert not np.array_equal(made[0], model.actuator_gainprm)
+    elbow = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_ACTUATOR, "elbow")
+    assert model.actuator_gainprm[elbow, 0] == pytest.approx(made[0][elbow, 0] * 0.3)
+    arm.stiffen(1.0)
+    arm.run(0.1)
+    now = [model.actuator_gainprm, model.actuator_biasprm, model.body_gravcomp]
+    assert all(np.array_equal(one, other) for one, other in zip(made, now, strict=True))
+
+
+def test_other_skills_are_not_the_simulations() -> None:
+    with pytest.raises(SkillError, match="cannot do this"):
+        Arm().driver.perform(skills.Say("hello"), STAGE)

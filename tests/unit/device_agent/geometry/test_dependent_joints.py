@@ -1,0 +1,97 @@
+"""Poses and jogs of frames that hang on rods, or on joints of one motor: what the motors can do, or a clear no."""
+
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from device_agent import geometry
+from device_agent.geometry.mujoco_geometry import MujocoGeometry
+from device_agent.ports.geometry import GeometryError
+from device_agent.protocol.manifests import robot_type
+from device_agent.protocol.manifests.robot_type import RobotType
+
+ROBOTS = Path(__file__).parents[3] / "robots"
+STEP_S = 1e-4
+
+
+def loaded(name: str) -> tuple[RobotType, MujocoGeometry, np.ndarray]:
+    kind = robot_type.load(ROBOTS / name)
+    shape = geometry.load(kind, ROBOTS / name)
+    assert isinstance(shape, MujocoGeometry)
+    return kind, shape, np.array([kind.home_rad[joint.name] for joint in kind.joints])
+
+
+@pytest.fixture(scope="module")
+def head() -> tuple[RobotType, MujocoGeometry, np.ndarray]:
+    """Its motors move it by rods alone, but for the neck's turning."""
+    return loaded("hanson")
+
+
+@pytest.fixture(scope="module")
+def walker() -> tuple[RobotType, MujocoGeometry, np.ndarray]:
+    """One motor turns a joint of both of its legs."""
+    return loaded("nao")
+
+
+def test_a_pose_of_what_hangs_on_rods_is_found_for_its_motors(
+    head: tuple[RobotType, MujocoGeometry, np.ndarray],
+) -> None:
+    kind, shape, home = head
+    random = np.random.default_rng(3)
+    moved = [index for index, joint in enumerate(kind.joints) if "Gimbal" in joint.name or "Neck" in joint.name]
+    for _ in range(4):
+        there = home.copy()
+        there[moved] += random.uniform(-0.3, 0.3, len(moved))
+        wanted = shape.poses(there.tolist())["head"]
+        found = shape.poses(shape.solve("head", wanted, home.tolist()))["head"]
+        assert found[:3] == pytest.approx(wanted[:3], abs=2e-4)
+        assert abs(np.dot(found[3:], wanted[3:])) == pytest.approx(1.0, abs=1e-6)
+
+
+def test_a_pose_that_only_rods_without_their_motors_could_reach_is_refused(
+    head: tuple[RobotType, MujocoGeometry, np.ndarray],
+) -> None:
+    _, shape, home = head
+    x, y, z, *turn = shape.poses(home.tolist())["head"]
+    with pytest.raises(GeometryError, match="found no way to bring head there: the nearest it comes is"):
+        shape.solve("head", (x, y, z + 0.05, *turn), home.tolist())  # type: ignore[arg-type]
+
+
+def test_a_pose_of_a_leg_is_found_with_both_joints_of_the_one_motor(
+    walker: tuple[RobotType, MujocoGeometry, np.ndarray],
+) -> None:
+    kind, shape, home = walker
+    names = [joint.name for joint in kind.joints]
+    there = home.copy()
+    for name in ("LHipYawPitch", "RHipYawPitch"):
+        there[names.index(name)] -= 0.12
+    wanted = shape.poses(there.tolist())["RLeg"]
+    found = shape.solve("RLeg", wanted, home.tolist())
+    assert found[names.index("RHipYawPitch")] == pytest.approx(found[names.index("LHipYawPitch")], abs=1e-12)
+    assert shape.poses(found)["RLeg"][:3] == pytest.approx(wanted[:3], abs=2e-4)
+
+
+@pytest.mark.parametrize(
+    ("robot", "frame", "twist"),
+    [
+        ("hanson", "head", (0.0, 0.0, 0.0, 0.0, 0.05, 0.0)),  # a nod, which rods make
+        ("nao", "RLeg", (0.02, 0.0, 0.0, 0.0, 0.0, 0.0)),
+    ],
+)
+def test_a_jog_moves_the_frame_as_it_is_asked_by_what_motors_can_do(
+    robot: str, frame: str, twist: tuple[float, ...], request: pytest.FixtureRequest
+) -> None:
+    kind, shape, home = request.getfixturevalue({"hanson": "head", "nao": "walker"}[robot])
+    rates = np.array(shape.rates(frame, twist, home.tolist(), tool=False))
+    names = [joint.name for joint in kind.joints]
+    for mirror in kind.mirrors:
+        assert rates[names.index(mirror.joint)] == mirror.factor * rates[names.index(mirror.of)]
+    before, after = (np.array(shape.poses((home + rates * at).tolist())[frame]) for at in (0.0, STEP_S))
+    linear = (after[:3] - before[:3]) / STEP_S
+    turned = 2 * math.acos(min(1.0, abs(float(before[3:] @ after[3:])))) / STEP_S
+    asked, does = (
+        (np.array(twist[:3]), linear) if any(twist[:3]) else (np.array([np.linalg.norm(twist)]), np.array([turned]))
+    )
+    assert np.linalg.norm(does - asked) < 0.4 * np.linalg.norm(asked), "most of it; near its ends it is damped"

@@ -1,0 +1,383 @@
+"""The shape of a robot: against MuJoCo's own contacts, and against looking at very many places."""
+
+import builtins
+import math
+import shutil
+import sys
+from pathlib import Path
+from typing import Any
+
+import mink
+import msgspec
+import mujoco
+import numpy as np
+import pytest
+
+from device_agent import geometry
+from device_agent.geometry.mujoco_geometry import MujocoGeometry
+from device_agent.ports.geometry import GeometryError
+from device_agent.protocol.manifests import robot_type
+from device_agent.protocol.manifests.robot_type import Base, RobotType
+
+UR5 = Path(__file__).parents[3] / "robots" / "ur5"
+KIND = robot_type.load(UR5)
+HOME = [KIND.home_rad[joint.name] for joint in KIND.joints]
+LOWER = np.array([joint.lower_rad for joint in KIND.joints])
+UPPER = np.array([joint.upper_rad for joint in KIND.joints])
+
+
+@pytest.fixture(scope="module")
+def shape() -> MujocoGeometry:
+    return MujocoGeometry(KIND, UR5 / KIND.scene)
+
+
+def places(count: int, seed: int) -> Any:
+    return np.random.default_rng(seed).uniform(LOWER, UPPER, (count, len(LOWER)))
+
+
+def free(shape: MujocoGeometry, count: int, seed: int) -> list[Any]:
+    found = [place for place in places(20 * count, seed) if shape.clearance(place.tolist()).room_m > 0]
+    assert len(found) >= count
+    return found[:count]
+
+
+def test_the_home_position_has_room(shape: MujocoGeometry) -> None:
+    assert shape.clearance(HOME).room_m > 0.02
+
+
+def test_wherever_mujoco_finds_a_contact_there_is_no_room(shape: MujocoGeometry) -> None:
+    model = mujoco.MjModel.from_xml_path(str(UR5 / KIND.scene))
+    data = mujoco.MjData(model)
+    touching = 0
+    for place in places(400, 1):
+        data.qpos[:] = place
+        mujoco.mj_kinematics(model, data)
+        mujoco.mj_collision(model, data)
+        if any(data.contact[index].dist < 0 for index in range(data.ncon)):
+            touching += 1
+            assert shape.clearance(place.tolist()).room_m < 0
+    assert touching > 50
+
+
+def test_a_clear_way_is_clear_everywhere_and_a_blocked_one_is_not(shape: MujocoGeometry) -> None:
+    random = np.random.default_rng(3)
+    blocked = 0
+    for start in free(shape, 120, 2):
+        end = start + random.uniform(-0.5, 0.5, len(start))
+        swept = shape.sweep([start, (start + end) / 2, end])
+        share = swept.share
+        for part in np.linspace(0, share, 40):
+            assert shape.clearance((start + part * (end - start)).tolist()).room_m > -0.01
+        if swept.clearance is not None:
+            blocked += 1
+            assert swept.clearance.room_m < 0
+            beyond = [start + part * (end - start) for part in np.linspace(share, 1, 60)]
+            assert min(shape.clearance(place.tolist()).room_m for place in beyond) < 0
+        else:
+            assert share == 1.0
+    assert 20 < blocked < 100
+
+
+def test_what_was_measured_before_lets_no_step_pass_that_measuring_would_stop(
+    shape: MujocoGeometry, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    random = np.random.default_rng(8)
+    measuring = MujocoGeometry(KIND, UR5 / KIND.scene)
+    monkeypatch.setattr(measuring._probe, "_surely_clear", lambda _: False)
+    counts = {True: 0, False: 0}
+    for start in free(shape, 25, 4):
+        heading = random.uniform(-0.06, 0.06, len(start))
+        for _ in range(20):
+            path = [start, start + heading, start + 4 * heading]
+            found = shape.sweep(path)
+            assert found == measuring.sweep(path)
+            counts[found.clearance is None] += 1
+            start = start + heading  # noqa: PLW2901 (a walk)
+    assert min(counts.values()) > 50
+
+
+def test_who_is_too_near_may_leave_but_not_go_on(shape: MujocoGeometry) -> None:
+    low = [0.0, -0.86, *HOME[2:]]
+    assert shape.clearance(low).room_m < 0
+    away, on = ([0.0, lift, *HOME[2:]] for lift in (-1.0, -0.80))
+    assert shape.sweep([low, away]).share == 1.0
+    stopped = shape.sweep([low, on])
+    assert stopped.share == 0.0
+    assert stopped.clearance is not None
+    assert stopped.clearance.text == "clearance: table_top \u2013 wrist_3_link"
+
+
+def test_a_glance_sees_how_far_a_way_is_clear(shape: MujocoGeometry) -> None:
+    assert shape.glance(HOME, [1.0, *HOME[1:]]) == 1.0
+    for lift in (-0.8, -0.5, 0.3):
+        down = [0.0, lift, *HOME[2:]]
+        assert shape.glance(HOME, down) == pytest.approx(shape.sweep([HOME, down]).share, abs=0.04)
+    low = [0.0, -0.86, *HOME[2:]]
+    assert shape.glance(low, HOME) == 1.0
+    assert shape.glance(low, [0.0, 0.3, *HOME[2:]]) < 1.0, "something else comes too near on that way"
+
+
+def test_no_point_is_faster_than_the_bound(shape: MujocoGeometry) -> None:
+    model = mujoco.MjModel.from_xml_path(str(UR5 / KIND.scene))
+    data = mujoco.MjData(model)
+    random = np.random.default_rng(5)
+    solid = [g for g in range(model.ngeom) if model.geom_contype[g] and model.geom_bodyid[g]]
+
+    def corners(place: Any) -> Any:
+        data.qpos[:] = place
+        mujoco.mj_kinematics(model, data)
+        signs = np.array([(x, y, z) for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)])
+        return np.concatenate(
+            [
+                data.geom_xpos[g]
+                + (model.geom_aabb[g, :3] + signs * model.geom_aabb[g, 3:]) @ data.geom_xmat[g].reshape(3, 3).T
+                for g in solid
+            ]
+        )
+
+    tightest = math.inf
+    for place in places(200, 4):
+        velocity = random.uniform(-1, 1, len(place)) * random.integers(0, 2, len(place))
+        step = 1e-5
+        speed = np.linalg.norm(corners(place + step * velocity) - corners(place), axis=1).max() / step
+        bound = shape.speed_m_s(velocity.tolist())
+        assert speed <= bound + 1e-6
+        tightest = min(tightest, bound - speed)
+    assert shape.speed_m_s([0.0] * len(HOME)) == 0.0
+
+
+def test_the_workspace_keeps_frames_inside(shape: MujocoGeometry) -> None:
+    beside = [1.2, -0.05, 0.3, HOME[3], HOME[4], 0.0]  # beside the table, and below its top
+    found = shape.clearance(beside)
+    assert found.room_m < 0
+    narrow = msgspec.structs.replace(
+        KIND, workspace=robot_type.Workspace(lower_m=(-0.6, -0.6, 0.0), upper_m=(0.6, 0.6, 0.5), frames=("flange",))
+    )
+    small = MujocoGeometry(narrow, UR5 / KIND.scene)
+    up = [*HOME]
+    up[2] = 0.6
+    found = small.clearance(up)
+    assert (found.kind, found.between) == ("workspace", ("flange", "upper z"))
+    assert found.text == "workspace: flange \u2013 upper z"
+    swept = small.sweep([HOME, up])
+    assert 0.1 < swept.share < 1.0
+    assert swept.clearance is not None
+    assert swept.clearance.kind == "workspace"
+    assert small.sweep([up, HOME]).share == 1.0
+
+
+def test_poses_are_those_of_the_model(shape: MujocoGeometry) -> None:
+    model = mujoco.MjModel.from_xml_path(str(UR5 / KIND.scene))
+    data = mujoco.MjData(model)
+    for place in places(20, 6):
+        data.qpos[:] = place
+        mujoco.mj_kinematics(model, data)
+        poses: dict[str, Any] = dict(shape.poses(place.tolist()))
+        assert set(poses) == set(shape.frames) == set(KIND.frames)
+        for name, pose in poses.items():
+            assert pose[:3] == pytest.approx(data.site(name).xpos, abs=1e-9)
+            matrix = np.empty(9)
+            mujoco.mju_quat2Mat(matrix, np.array(pose[3:]))
+            assert matrix == pytest.approx(data.site(name).xmat, abs=1e-9)
+            assert pose[3] >= 0
+
+
+def test_inverse_kinematics_reaches_what_can_be_reached(shape: MujocoGeometry) -> None:
+    for place in free(shape, 12, 7):
+        wanted = shape.poses(place.tolist())["flange"]
+        found = shape.solve("flange", wanted, HOME)
+        assert shape.poses(found)["flange"][:3] == pytest.approx(wanted[:3], abs=2e-4)
+        assert abs(np.dot(shape.poses(found)["flange"][3:], wanted[3:])) == pytest.approx(1.0, abs=1e-6)
+        assert all(np.array(found) >= LOWER) and all(np.array(found) <= UPPER)  # noqa: PT018
+        assert shape.clearance(found).room_m >= 0
+
+
+def test_a_step_that_cannot_be_solved_ends_the_try(shape: MujocoGeometry, monkeypatch: pytest.MonkeyPatch) -> None:
+    def unsolved(*_: Any, **__: Any) -> Any:
+        raise mink.NoSolutionFound("daqp")
+
+    monkeypatch.setattr(mink, "solve_ik", unsolved)
+    x, y, z, *turn = shape.poses(HOME)["flange"]
+    with pytest.raises(GeometryError, match="found no way"):
+        shape.solve("flange", (x, y + 0.05, z, *turn), HOME)  # type: ignore[arg-type]
+
+
+def test_near_the_start_it_stays_near_the_start(shape: MujocoGeometry) -> None:
+    x, y, z, *turn = shape.poses(HOME)["flange"]
+    found = shape.solve("flange", (x, y + 0.05, z - 0.05, *turn), HOME)  # type: ignore[arg-type]
+    assert np.abs(np.subtract(found, HOME)).max() < 0.3
+
+
+@pytest.mark.parametrize(
+    ("frame", "pose", "says"),
+    [
+        ("hand", (0.3, 0.0, 0.3, 1.0, 0.0, 0.0, 0.0), "there are: shoulder_pan"),
+        ("flange", (2.0, 0.0, 0.3, 1.0, 0.0, 0.0, 0.0), "found no way to bring flange there: the nearest it comes is"),
+        ("flange", (-0.5, -0.1, 0.005, 0.0, 0.7071068, 0.7071068, 0.0), "flange cannot go there: "),
+        ("flange", (0.3, math.nan, 0.3, 1.0, 0.0, 0.0, 0.0), "finite"),
+        ("flange", (0.3, 0.0, 0.3, 0.0, 0.0, 0.0, 0.0), "quaternion"),
+    ],
+)
+def test_what_cannot_be_reached_is_said_with_what_to_do(
+    shape: MujocoGeometry, frame: str, pose: Any, says: str
+) -> None:
+    with pytest.raises(GeometryError, match=says):
+        shape.solve(frame, pose, HOME)
+
+
+def test_a_type_without_a_model_has_no_shape() -> None:
+    assert geometry.load(msgspec.structs.replace(KIND, model="", workspace=None), UR5) is None
+    assert geometry.load(KIND, UR5) is not None
+
+
+def test_without_mujoco_the_agent_says_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
+    real = builtins.__import__
+
+    def without(name: str, *arguments: Any, **options: Any) -> Any:
+        if name == "device_agent.geometry.mujoco_geometry":
+            raise ImportError("No module named 'mujoco'")
+        return real(name, *arguments, **options)
+
+    monkeypatch.delitem(sys.modules, "device_agent.geometry.mujoco_geometry")
+    monkeypatch.setattr(builtins, "__import__", without)
+    with pytest.raises(GeometryError, match="install mujoco-core"):
+        geometry.load(KIND, UR5)
+
+
+def broken() -> dict[str, tuple[RobotType, str, str]]:
+    return {
+        "no file": (KIND, "nowhere.xml", "cannot build"),
+        "no joint": (
+            msgspec.structs.replace(KIND, joints=(msgspec.structs.replace(KIND.joints[0], name="knee"),)),
+            KIND.scene,
+            "no joint 'knee'",
+        ),
+        "no frame": (
+            msgspec.structs.replace(KIND, frames=("nose",), workspace=None),
+            KIND.scene,
+            "no site or body 'nose'",
+        ),
+        "home below the table": (
+            msgspec.structs.replace(KIND, home_rad={**KIND.home_rad, "shoulder_lift": 0.0}),
+            KIND.scene,
+            "the home position has no room",
+        ),
+    }
+
+
+@pytest.mark.parametrize("case", broken())
+def test_a_model_that_does_not_fit_is_refused(case: str) -> None:
+    kind, scene, says = broken()[case]
+    if case == "no joint":
+        kind = msgspec.structs.replace(kind, home_rad={"knee": 0.0})
+    with pytest.raises(GeometryError, match=says):
+        MujocoGeometry(kind, UR5 / scene)
+
+
+CART = """
+<mujoco><worldbody>
+  <geom name="floor" type="plane" size="5 5 0.1"/>
+  <body name="cart" pos="0 0 0.1"><freejoint/>
+    <geom type="box" size="0.2 0.2 0.1"/>
+    <body name="mast" pos="0 0 0.1"><joint name="lift" type="slide" axis="0 0 1" range="0 0.3"/>
+      <geom type="capsule" fromto="0 0 0.1 0 0 0.4" size="0.03"/>
+      <body name="arm" pos="0.02 0 0.4"><joint name="swing" pos="0.01 0 0" axis="0 1 0" range="-3 3"/>
+        <geom type="capsule" fromto="0.1 0 0 0.4 0 0" size="0.03"/>
+        <site name="tip" pos="0.4 0 0"/>
+        <geom name="ghost" type="sphere" size="0.5" contype="2" conaffinity="2"/>
+      </body>
+    </body>
+  </body>
+</worldbody></mujoco>
+"""
+
+
+def test_a_robot_that_drives_is_held_against_itself_and_not_against_a_place_it_has_left(tmp_path: Path) -> None:
+    (tmp_path / "cart.xml").write_text(CART)
+    joint = KIND.joints[0]
+    kind = msgspec.structs.replace(
+        KIND,
+        joints=(
+            msgspec.structs.replace(joint, name="lift", lower_rad=0.0, upper_rad=0.3),
+            msgspec.structs.replace(joint, name="swing", lower_rad=-3.0, upper_rad=3.0),
+        ),
+        home_rad={"lift": 0.1, "swing": 0.0},
+        frames=("tip", "arm"),
+        workspace=None,
+        base=Base(
+            max_linear_m_s=1,
+            max_angular_rad_s=1,
+            max_linear_acceleration_m_s2=1,
+            max_angular_acceleration_rad_s2=1,
+            braking_linear_m_s2=1,
+            braking_angular_rad_s2=1,
+        ),
+    )
+    cart = MujocoGeometry(kind, tmp_path / "cart.xml")
+    assert cart.clearance([0.0, 1.4]).between == ("cart", "arm")
+    assert cart.clearance([0.3, 0.0]).room_m > 0.2
+    assert "arm" in cart.poses([0.1, 0.0])
+    assert cart.speed_m_s([1.0, 0.0]) == pytest.approx(1.0)
+    with pytest.raises(GeometryError, match="floor"):
+        MujocoGeometry(msgspec.structs.replace(kind, base=None), tmp_path / "cart.xml")
+
+
+def test_another_scene_can_be_named(tmp_path: Path) -> None:
+    shutil.copytree(UR5, tmp_path / "ur5")
+    scene = (tmp_path / "ur5" / "scene.xml").read_text()
+    post = '<geom name="post" type="cylinder" size="0.05 0.5" pos="-0.48 0.25 0.5"/>'
+    (tmp_path / "ur5" / "post.xml").write_text(scene.replace("</worldbody>", f"{post}</worldbody>"))
+    shape = geometry.load(KIND, tmp_path / "ur5", scene="post.xml")
+    assert shape is not None
+    turned = [-0.7, *HOME[1:]]
+    swept = shape.sweep([HOME, turned])
+    assert swept.clearance is not None
+    assert "post" in swept.clearance.text
+
+
+def room_with(tmp_path: Path, *things: str) -> Path:
+    room = tmp_path / "room.xml"
+    room.write_text(
+        '<mujoco><compiler angle="radian"/><option timestep="0.01" integrator="RK4"/><visual><map zfar="9"/></visual>'
+        f'<worldbody><geom name="floor" type="plane" size="5 5 1"/>{"".join(things)}</worldbody></mujoco>'
+    )
+    return room
+
+
+def standing(room: Path, yaw_rad: float = 0.7) -> MujocoGeometry:
+    there = geometry.Standing(room=room, position_m=(2.0, -1.0, 0.75), yaw_rad=yaw_rad)
+    return MujocoGeometry(KIND, UR5 / KIND.model, standing=there)
+
+
+def test_in_a_room_poses_stay_in_the_robots_base(shape: MujocoGeometry, tmp_path: Path):
+    there = standing(room_with(tmp_path))
+    for name, pose in shape.poses(HOME).items():
+        assert there.poses(HOME)[name] == pytest.approx(pose, abs=1e-9)
+    target = shape.poses(HOME)["flange"]
+    assert there.solve("flange", target, HOME) == pytest.approx(HOME, abs=1e-2)
+
+
+@pytest.mark.parametrize("yaw_rad", [0.0, 0.7, -2.2])
+def test_in_a_room_a_thing_is_where_the_robots_place_and_turn_have_it(tmp_path: Path, yaw_rad: float):
+    # As far from the base as the flange; the arm turns there about its base.
+    x, y = -0.36, -0.36
+    place = (2.0 + x * math.cos(yaw_rad) - y * math.sin(yaw_rad), -1.0 + x * math.sin(yaw_rad) + y * math.cos(yaw_rad))
+    post = f'<geom name="post" type="cylinder" size="0.05 0.6" pos="{place[0]} {place[1]} 1.3"/>'
+    there = standing(room_with(tmp_path, post), yaw_rad=yaw_rad)
+    towards = [HOME[0] + 1.0, *HOME[1:]]
+    swept = there.sweep([HOME, towards])
+    assert swept.clearance is not None
+    assert swept.clearance.between[0] == "post"
+    assert swept.share == pytest.approx(0.4, abs=0.1)
+    assert there.sweep([HOME, [HOME[0] - 1.0, *HOME[1:]]]).share == 1.0
+
+
+def test_what_moves_in_a_room_or_is_out_of_reach_is_left_out(tmp_path: Path):
+    gate = '<geom name="gate" type="box" size="0.05 0.4 0.4"/>'
+    swinging = f'<body pos="1.5 -1 1"><joint name="swing" type="hinge"/>{gate}</body>'
+    far = '<geom name="far" type="box" size="0.1 0.1 0.1" pos="-3 3 1"/>'
+    with_both = standing(room_with(tmp_path, swinging, far))
+    names = {name for pair in with_both._pairs._names for name in pair}
+    assert "gate" not in names
+    assert "far" not in names
+    assert "floor" in names

@@ -1,0 +1,268 @@
+"""Plans in a process of their own: the same ways, a clear end whatever becomes of that process, and never an orphan."""
+
+import math
+import os
+import signal
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from device_agent import geometry
+from device_agent.geometry.joint_bounds import Bounds
+from device_agent.geometry.mujoco_geometry import MujocoGeometry
+from device_agent.ports import script_calls
+from device_agent.ports.geometry import GeometryError, PlannerLostError
+from device_agent.protocol import StopLatch
+from device_agent.protocol.manifests import robot_type
+from device_agent.runtime.actions.device_context import Body
+from device_agent.runtime.actions.robot_api import ScriptRobot
+from device_agent.runtime.authority.lease_gate import LeaseGate, Refused
+from device_agent.runtime.control.controller import Controller
+from device_agent.runtime.control.goals import Outcome
+from device_agent.runtime.planning.joint_couplings import Couplings
+from device_agent.runtime.planning.motion_planner import Routes
+from device_agent.runtime.readings import Room
+
+ROBOTS = Path(__file__).parents[3] / "robots"
+UR5, NAO = ROBOTS / "ur5", ROBOTS / "nao"
+KIND = robot_type.load(UR5)
+HOME = [KIND.home_rad[joint.name] for joint in KIND.joints]
+BEYOND = [1.6, *HOME[1:]]
+PATIENCE_S = 60.0
+ANGLE = math.atan2(-0.414, -0.249)
+"""Half way between the two, seen from the arm."""
+WALL = '<geom name="{}" type="box" size="0.9 0.02 1.5" pos="{} {} 1.5" euler="0 0 {}"/>'
+
+
+def walls() -> str:
+    """Two, that leave the arm no way from one side to the other."""
+    return "".join(
+        WALL.format(name, 1.1 * math.cos(at), 1.1 * math.sin(at), at)
+        for name, at in (("before", ANGLE), ("behind", ANGLE + math.pi))
+    )
+
+
+@pytest.fixture(scope="module")
+def divided(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The arm's table, divided: whoever looks for a way across looks until the end of the time."""
+    folder = tmp_path_factory.mktemp("ur5")
+    (folder / "ur5.xml").write_bytes((UR5 / "ur5.xml").read_bytes())
+    text = (UR5 / KIND.scene).read_text(encoding="utf-8").replace("<worldbody>", f"<worldbody>{walls()}", 1)
+    (folder / KIND.scene).write_text(text, encoding="utf-8")
+    return folder / KIND.scene
+
+
+@pytest.fixture
+def shape(divided: Path) -> Iterator[MujocoGeometry]:
+    shape = MujocoGeometry(KIND, divided)
+    yield shape
+    shape._planning._process.end()
+
+
+def until(happened: Callable[[], bool]) -> None:
+    deadline_s = time.monotonic() + PATIENCE_S
+    while not happened():
+        assert time.monotonic() < deadline_s, "it did not happen"
+        time.sleep(0.01)
+
+
+def pid_of(shape: MujocoGeometry) -> int:
+    running = shape._planning._process.running
+    return 0 if running is None else running.pid
+
+
+def alive(pid: int) -> bool:
+    try:
+        return Path(f"/proc/{pid}/stat").read_text(encoding="ascii").rpartition(")")[2].split()[0] != "Z"
+    except OSError:
+        return False
+
+
+def test_the_process_finds_what_would_be_found_here() -> None:
+    shape = MujocoGeometry(KIND, UR5 / KIND.scene)
+    low = shape.solve("flange", (*shape.poses(HOME)["flange"][:2], 0.1, *shape.poses(HOME)["flange"][3:]), HOME)
+    goal = [low[0] + 2.5, *low[1:]]
+    there = shape.plan(low, goal, seed=4)
+    assert there == shape.plan_here(low, goal, seed=4, within_s=5.0)
+    first = pid_of(shape)
+    shape.plan(goal, low, seed=4)
+    assert pid_of(shape) == first, "it is kept"
+    del shape
+    until(lambda: not alive(first))
+
+
+def test_what_is_no_way_says_so_from_there_too(shape: MujocoGeometry) -> None:
+    with pytest.raises(GeometryError, match="found no way there in 0 s"):
+        shape.plan(HOME, BEYOND, within_s=0.2)
+
+
+def test_who_no_longer_wants_a_way_has_it_killed_at_once(shape: MujocoGeometry) -> None:
+    shape.plan(HOME, HOME)
+    pid, enough = pid_of(shape), threading.Event()
+    threading.Timer(0.3, enough.set).start()
+    with pytest.raises(GeometryError, match="nobody waits"):
+        shape.plan(HOME, BEYOND, within_s=PATIENCE_S, ended=enough.is_set)
+    assert not alive(pid)
+
+
+class Arm:
+    """An action on the arm."""
+
+    def __init__(self, shape: MujocoGeometry) -> None:
+        self.controller = Controller(KIND, LeaseGate(), geometry=shape)
+        self.controller.start_at(HOME)
+        body = Body(
+            robot_type=KIND,
+            controller=self.controller,
+            observe=lambda: None,
+            geometry=shape,
+            skills=None,
+            room=Room(space="s", agent="a", own=[]),
+        )
+        self.robot = ScriptRobot(body)
+        self.robot.begin(1, lambda _: self.robot.end())
+
+    def cross(self) -> Refused:
+        """Ask for what there is no way to; gives why it did not go."""
+        with pytest.raises(Refused) as refused:
+            self.robot.do(script_calls.MoveJoints(position_rad={KIND.joints[0].name: BEYOND[0]}, speed=0.5, plan=True))
+        return refused.value
+
+
+def test_an_action_whose_planner_is_killed_fails_with_a_reason_and_the_arm_holds(shape: MujocoGeometry) -> None:
+    arm = Arm(shape)
+
+    def kill() -> None:
+        until(lambda: pid_of(shape) > 0)
+        os.kill(pid_of(shape), signal.SIGKILL)
+
+    killer = threading.Thread(target=kill)
+    killer.start()
+    refused = arm.cross()
+    killer.join()
+    assert refused.code == "planner_lost"
+    assert "SIGKILL" in refused.message
+    assert not arm.controller.moving
+    assert arm.controller.commanded_rad == HOME
+    assert shape.plan(HOME, HOME), "asked again, another one does it"
+
+
+def test_a_planner_that_hangs_is_given_up(shape: MujocoGeometry, monkeypatch: pytest.MonkeyPatch) -> None:
+    shape.plan(HOME, HOME)
+    pid = pid_of(shape)
+    os.kill(pid, signal.SIGSTOP)
+    monkeypatch.setattr("device_agent.geometry.planner_process._SLOW_S", 0.2)
+    with pytest.raises(PlannerLostError, match="does not answer"):
+        shape.plan(HOME, BEYOND, within_s=0.1)
+    assert not alive(pid)
+
+
+def test_a_stop_ends_the_search(shape: MujocoGeometry) -> None:
+    arm = Arm(shape)
+
+    def stop() -> None:
+        until(lambda: pid_of(shape) > 0)
+        arm.controller.stop(StopLatch(by="ann", reason="", at_ms=0))
+
+    stopper = threading.Thread(target=stop)
+    stopper.start()
+    assert "nobody waits" in arm.cross().message
+    stopper.join()
+    assert pid_of(shape) == 0
+
+
+def test_a_model_that_cannot_be_used_there_says_so(shape: MujocoGeometry, monkeypatch: pytest.MonkeyPatch) -> None:
+    site = shape._planning._site
+    monkeypatch.setattr(shape._planning, "_site", type(site)(robot_type=KIND, scene="/nowhere/scene.xml"))
+    with pytest.raises(GeometryError, match=r"/nowhere/scene\.xml"):
+        shape.plan(HOME, HOME)
+
+
+def test_a_python_that_is_gone_is_told(shape: MujocoGeometry, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(sys, "executable", "/nowhere/python")
+    with pytest.raises(PlannerLostError, match="does not start"):
+        shape.plan(HOME, HOME)
+
+
+AGENT = """
+import sys, threading
+from pathlib import Path
+from device_agent.geometry.mujoco_geometry import MujocoGeometry
+from device_agent.protocol import robot_type
+from device_agent.protocol import StopLatch
+from tests.unit.geometry import test_planning as t
+shape = MujocoGeometry(t.KIND, Path(sys.argv[1]))
+shape.plan(t.HOME, t.HOME)
+print(t.pid_of(shape), flush=True)
+shape.plan(t.HOME, t.BEYOND, within_s=600.0)
+"""
+
+
+def test_it_ends_with_an_agent_that_is_killed_in_the_middle_of_a_search(divided: Path) -> None:
+    root = Path(__file__).parents[3]
+    with subprocess.Popen(
+        [sys.executable, "-c", AGENT, str(divided)],
+        stdout=subprocess.PIPE,
+        text=True,
+        cwd=root,
+        env=os.environ | {"PYTHONPATH": str(root)},
+    ) as agent:
+        assert agent.stdout is not None
+        pid = int(agent.stdout.readline())
+        assert alive(pid)
+        time.sleep(0.5)
+        agent.kill()
+    until(lambda: not alive(pid))
+
+
+# ------------------------------------------------------------ joints that hang together
+
+
+def test_a_planned_way_keeps_to_what_a_yaw_leaves_the_head_and_moves_both_hips_as_one() -> None:
+    kind = robot_type.load(NAO)
+    shape = geometry.load(kind, NAO)
+    assert shape is not None
+    names = [joint.name for joint in kind.joints]
+    couplings = Couplings(kind)
+    controller = Controller(kind, LeaseGate(), geometry=shape)
+    home = [kind.home_rad[name] for name in names]
+    controller.start_at(home)
+    tenure = controller.begin_action(epoch=1, on_lost=lambda _: None)
+    now_s, orders = 0.0, ({"HeadPitch": 0.45}, {"HeadYaw": 2.05, "HeadPitch": 0.25, "LHipYawPitch": -0.1})
+    for order in orders:
+        start, goal = controller.commanded_rad, controller.target(tenure, order)
+        way = Routes(kind, shape).around(start, goal, speed=1.0, ended=lambda: False)
+        passage = controller.go_along(tenure, way)
+        for _ in range(round(way.duration_s / (kind.period_ms / 1000)) + 50):
+            now_s += kind.period_ms / 1000
+            tick = controller.step(now_s)
+            assert couplings.parted(np.array([tick.position_rad])) == ""
+        assert passage.outcome is Outcome.REACHED, passage.why
+        assert controller.commanded_rad == pytest.approx(goal, abs=1e-4)
+    assert couplings.parted(np.linspace(start, goal, 50)) != "", "straight there it would not"
+    assert goal[names.index("RHipYawPitch")] == pytest.approx(-0.1)
+
+
+def test_between_rows_of_its_table_a_straight_way_is_looked_at_where_it_is_narrowest() -> None:
+    kind = robot_type.load(NAO)
+    bounds, couplings = Bounds(kind), Couplings(kind)
+    home = np.array([kind.home_rad[joint.name] for joint in kind.joints])
+    names = [joint.name for joint in kind.joints]
+    yaw, pitch = names.index("HeadYaw"), names.index("HeadPitch")
+    chance = np.random.default_rng(3)
+    kept = 0
+    for _ in range(400):
+        start, end = home.copy(), home.copy()
+        start[[yaw, pitch]] = chance.uniform((-2, -0.5), (2, 0.4))
+        end[[yaw, pitch]] = chance.uniform((-2, -0.5), (2, 0.4))
+        keeps = bounds.keeps(start, end, np.zeros(1))
+        assert keeps == (couplings.parted(np.linspace(start, end, 2000)) == "")
+        kept += keeps
+    assert 50 < kept < 350
+    assert bounds.spare(home, home)[0] == pytest.approx(0.03)

@@ -1,0 +1,226 @@
+"""A room of primitives in MuJoCo with a person, a walking and a driving robot, and an arm on a table; a lidar and a
+depth camera that cast rays, and err as real ones do. The truth is known here, and nowhere else."""
+
+import math
+import random
+from dataclasses import dataclass, field
+
+import mujoco
+import numpy as np
+
+from device_agent.perception.background_model import Survey
+from device_agent.perception.object_classes import Kind, Mount
+from device_agent.perception.occupancy_grid import OccupancyGrid
+from device_agent.perception.sensor_fusion import Sight, Zone
+from device_agent.ports.sensor import Image, Scan
+
+LOWER_M, UPPER_M = (-3.0, -2.5), (3.0, 2.5)
+KINDS = (
+    Kind(name="person", lowest_m=1.3, highest_m=2.1, radius_m=0.1, several=True),
+    Kind(name="nao", lowest_m=0.51, highest_m=0.64, radius_m=0.07, fastest_m_s=0.3),
+    Kind(name="qbo", lowest_m=0.38, highest_m=0.51, radius_m=0.13, fastest_m_s=0.6),
+)
+MOUNTS = (Mount(name="arm", lowest_m=0.78, highest_m=0.95, radius_m=0.05, near_m=(1.9, 1.6), reach_m=1.0),)
+ARM_M = (1.95, 1.5)
+WIDTH, HEIGHT, FOVY_RAD = 320, 240, math.radians(62)
+FURNITURE = {  # name: middle and half size
+    "shelf": ((-2.8, 0.8, 0.9), (0.18, 0.5, 0.9)),
+    "desk": ((-1.4, 2.2, 0.72), (0.7, 0.3, 0.02)),
+    "cupboard": ((0.9, -2.3, 0.5), (0.5, 0.2, 0.5)),
+    "bin": ((-2.6, -2.2, 0.2), (0.15, 0.15, 0.2)),
+    "table": ((1.95, 1.6, 0.73), (0.6, 0.5, 0.02)),
+}
+_LEG = """<body name="{0}" pos="0 {1} 0.9"><joint name="{0}" axis="0 1 0"/>
+  <geom type="capsule" fromto="0 0 0 0 0 -0.82" size="0.065"/></body>"""
+_PERSON = (
+    """<geom type="capsule" fromto="0 0 0.95 0 0 1.35" size="0.15" mass="1"/>
+  <geom type="sphere" pos="0 0 1.62" size="0.11"/>"""
+    + _LEG.format("left", 0.1)
+    + _LEG.format("right", -0.1)
+)
+_NAO = """<geom type="box" pos="0 0 0.38" size="0.05 0.07 0.09"/><geom type="sphere" pos="0 0 0.52" size="0.055"/>
+  <geom type="box" pos="0 0.05 0.15" size="0.04 0.03 0.15"/>
+  <geom type="box" pos="0 -0.05 0.15" size="0.04 0.03 0.15"/>"""
+_QBO = """<geom type="cylinder" pos="0 0 0.14" size="0.15 0.13"/><geom type="sphere" pos="0 0 0.34" size="0.12"/>"""
+
+
+def _body(name: str, inside: str) -> str:
+    return f'<body name="{name}" mocap="false"><freejoint name="{name}"/>{inside}</body>'
+
+
+def xml() -> str:
+    walls = [((3.05, 0), (0.05, 2.6)), ((-3.05, 0), (0.05, 2.6)), ((0, 2.55), (3.1, 0.05)), ((0, -2.55), (3.1, 0.05))]
+    still = "".join(f'<geom type="box" pos="{x} {y} 1.35" size="{a} {b} 1.35"/>' for (x, y), (a, b) in walls) + "".join(
+        f'<geom name="{name}" type="box" pos="{" ".join(map(str, at))}" size="{" ".join(map(str, half))}"/>'
+        for name, (at, half) in FURNITURE.items()
+    )
+    arm = """<body name="arm" pos="1.95 1.5 0.75"><geom type="cylinder" pos="0 0 0.08" size="0.075 0.08"/>
+      <body pos="0 0 0.16"><joint name="turn" axis="0 0 1"/>
+      <geom type="capsule" fromto="0 0 0 -0.4 0 0.25" size="0.06"/>
+      <geom type="capsule" fromto="-0.4 0 0.25 -0.75 0 0.1" size="0.05"/></body></body>"""
+    return f"""<mujoco><compiler angle="radian"/><option gravity="0 0 0"/><worldbody>
+      <geom type="plane" size="3.2 2.7 0.1"/>{still}
+      <body name="lidar" pos="0 -2.4 0.3"><geom type="cylinder" size="0.04 0.03"/></body>
+      {_body("person", _PERSON)}{_body("nao", _NAO)}{_body("qbo", _QBO)}{arm}
+    </worldbody></mujoco>"""
+
+
+@dataclass
+class Walker:
+    """Goes from one random place to the next, straight, and rests there."""
+
+    chance: random.Random
+    speed_m_s: float
+    room_m: tuple[float, float, float, float]
+    rest_s: float
+    x_m: float = 0.0
+    y_m: float = 0.0
+    yaw_rad: float = 0.0
+    walked_m: float = 0.0
+    _goal: tuple[float, float] | None = None
+    _rest_s: float = 0.0
+
+    def step(self, elapsed_s: float) -> None:
+        if self._rest_s > 0:
+            self._rest_s -= elapsed_s
+            return
+        if self._goal is None:
+            low_x, low_y, high_x, high_y = self.room_m
+            self._goal = self.chance.uniform(low_x, high_x), self.chance.uniform(low_y, high_y)
+        x, y = self._goal[0] - self.x_m, self._goal[1] - self.y_m
+        left = math.hypot(x, y)
+        way = min(left, self.speed_m_s * elapsed_s)
+        self.yaw_rad = math.atan2(y, x)
+        self.x_m += x / max(left, 1e-9) * way
+        self.y_m += y / max(left, 1e-9) * way
+        self.walked_m += way
+        if left < 0.02:
+            self._goal, self._rest_s = None, self.chance.uniform(0, self.rest_s)
+
+
+@dataclass
+class Playground:
+    """The room, its walkers and its sensors, in simulated time."""
+
+    seed: int = 1
+    time_s: float = 0.0
+    walkers: dict[str, Walker] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        chance = random.Random(self.seed)
+        self.noise = np.random.default_rng(self.seed)
+        self.model = mujoco.MjModel.from_xml_string(xml())
+        self.data = mujoco.MjData(self.model)
+        self.walkers = {
+            "person": Walker(chance, 0.9, (-2.2, -1.9, 2.4, 0.7), 3.0, x_m=-1.0),
+            "nao": Walker(chance, 0.1, (-2.0, -0.2, -0.6, 1.4), 6.0, x_m=-1.5, y_m=0.6),
+            "qbo": Walker(chance, 0.35, (0.3, -1.6, 2.2, 0.4), 4.0, x_m=1.4, y_m=-0.5),
+        }
+        across, up = np.meshgrid(
+            (np.arange(0, WIDTH, 2) + 0.5 - WIDTH / 2), (HEIGHT / 2 - np.arange(0, HEIGHT, 2) - 0.5)
+        )
+        per_pixel = 2 * math.tan(FOVY_RAD / 2) / HEIGHT
+        self.sight_lines = np.column_stack((across.ravel() * per_pixel, up.ravel() * per_pixel, -np.ones(across.size)))
+        back = np.array([-2.9, -2.3, 2.4]) - np.array([0.3, 0.2, 0.4])  # from where it looks to
+        back /= np.linalg.norm(back)
+        right = np.cross([0, 0, 1], back)
+        right /= np.linalg.norm(right)
+        self.camera_m = np.array([-2.9, -2.3, 2.4])
+        self.camera = np.column_stack((right, np.cross(back, right), back))
+        self.place()
+
+    def place(self) -> None:
+        for name, walker in self.walkers.items():
+            at = self.model.joint(name).qposadr[0]
+            half = walker.yaw_rad / 2
+            self.data.qpos[at : at + 7] = [walker.x_m, walker.y_m, 0, math.cos(half), 0, 0, math.sin(half)]
+        swing = 0.45 * math.sin(self.walkers["person"].walked_m / 0.65 * math.pi)
+        self.data.joint("left").qpos[0] = swing
+        self.data.joint("right").qpos[0] = -swing
+        self.data.joint("turn").qpos[0] = 1.3 * math.sin(self.time_s * 0.4)
+        mujoco.mj_kinematics(self.model, self.data)
+
+    def step(self, elapsed_s: float) -> None:
+        self.time_s += elapsed_s
+        for walker in self.walkers.values():
+            walker.step(elapsed_s)
+        self.place()
+
+    def clear(self) -> None:
+        """All who may move leave the room."""
+        for name in self.walkers:
+            self.data.joint(name).qpos[2] = 50.0
+        self.model.body("arm").pos[2] = 50.0
+        mujoco.mj_kinematics(self.model, self.data)
+
+    def _cast(self, origin: np.ndarray, ways: np.ndarray, without: int) -> np.ndarray:
+        distance, geoms = np.empty(len(ways)), np.empty(len(ways), dtype=np.int32)
+        mujoco.mj_multiRay(
+            self.model, self.data, origin, np.ascontiguousarray(ways).ravel(), None, True, without, geoms, distance,
+            None, len(ways), 30.0,
+        )  # fmt: skip
+        return np.where(geoms >= 0, distance, np.inf)
+
+    def scan(self) -> Scan:
+        angle = np.linspace(0, 2 * math.pi, 360, endpoint=False)
+        body = self.model.body("lidar").id
+        origin = np.array([0.0, -2.4, 0.3])
+        distance = self._cast(origin, np.column_stack((np.cos(angle), np.sin(angle), np.zeros(360))), body)
+        distance += self.noise.normal(0, 1, 360) * np.maximum(
+            0.005, 0.01 * np.where(np.isfinite(distance), distance, 0)
+        )
+        return Scan(taken_s=self.time_s, position_m=origin, rotation=np.eye(3), angle_rad=angle, range_m=distance,
+                    nearest_m=0.15, furthest_m=12.0)  # fmt: skip
+
+    def depth(self) -> Image:
+        ways = self.sight_lines @ self.camera.T
+        length = np.linalg.norm(ways, axis=1)
+        z = self._cast(self.camera_m, ways / length[:, None], -1) / length
+        z += self.noise.normal(0, 1, len(z)) * (0.0012 + 0.0019 * (np.where(np.isfinite(z), z, 0) - 0.4) ** 2)
+        depth = np.full((HEIGHT, WIDTH), np.inf, dtype=np.float32)
+        depth[::2, ::2] = np.where(z < 8.0, z, np.inf).reshape(HEIGHT // 2, WIDTH // 2)
+        return Image(
+            taken_s=self.time_s, position_m=self.camera_m, rotation=self.camera, fovy_rad=FOVY_RAD, depth_m=depth
+        )
+
+    def in_view(self, name: str) -> bool:
+        """Whether the middle of somebody is in the depth camera's picture."""
+        walker = self.walkers[name]
+        seen = (np.array([walker.x_m, walker.y_m, 0.3]) - self.camera_m) @ self.camera
+        per_pixel = 2 * math.tan(FOVY_RAD / 2) / HEIGHT
+        across, up = (abs(seen[:2]) / -seen[2] / per_pixel).tolist()
+        return bool(across < WIDTH / 2 and up < HEIGHT / 2)
+
+
+def survey(seed: int = 7) -> Survey:
+    """The empty room, as its own sensors see it."""
+    empty, found = Playground(seed), Survey()
+    empty.clear()
+    for _ in range(10):
+        found.look("lidar", empty.scan())
+        found.look("depth", empty.depth())
+    found.settle()
+    return found
+
+
+def sight(found: Survey) -> Sight:
+    return Sight(
+        grid=OccupancyGrid((-3.2, -2.7), (3.2, 2.7)),
+        survey=found,
+        kinds=KINDS,
+        mounts=MOUNTS,
+        inside=(*LOWER_M, *UPPER_M),
+        zones=(Zone("west", (-3.0, -2.5, 0.0, 2.5)), Zone("east", (0.0, -2.5, 3.0, 2.5))),
+    )
+
+
+def watch(ground: Playground, eyes: Sight, seconds: float, *, period_s: float = 0.2, each=None) -> None:
+    """Let it go on, and look at it every ``period_s``; ``each(ground, eyes)`` is asked half a period later."""
+    for _ in range(round(seconds / period_s)):
+        ground.step(period_s / 2)
+        eyes.see("lidar", ground.scan())
+        eyes.see("depth", ground.depth())
+        eyes.settle(ground.time_s)
+        ground.step(period_s / 2)
+        if each is not None:
+            each(ground, eyes)

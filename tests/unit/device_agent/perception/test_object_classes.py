@@ -1,0 +1,138 @@
+"""Who is who, by height, place and what was last seen: on the floor, and of those that are fixed to a table."""
+
+import math
+
+import numpy as np
+import pytest
+
+from device_agent.perception.fixed_robots import Mounted
+from device_agent.perception.object_classes import Kind, Mount
+from device_agent.perception.tracker import Tracks
+
+NAO = Kind(name="nao", lowest_m=0.42, highest_m=0.68, radius_m=0.07, fastest_m_s=0.3, start_m=(0.0, 0.0))
+QBO = Kind(name="qbo", lowest_m=0.3, highest_m=0.56, radius_m=0.12, fastest_m_s=0.6, start_m=(-0.9, 0.4))
+LOW_M = 0.49
+"""As high is Qbo, and NAO that sits."""
+CAMERA_M = np.array([3.0, 0.0])
+PERIOD_S = 0.2
+NEAR_M = 0.15
+
+
+def somebody(x_m: float, y_m: float, height_m: float = LOW_M) -> np.ndarray:
+    """What a depth camera sees of something round."""
+    turn, up = np.meshgrid(np.linspace(-1.3, 1.3, 12), np.linspace(0.1, height_m, 12))
+    return np.column_stack((x_m + 0.1 * np.cos(turn.ravel()), y_m + 0.1 * np.sin(turn.ravel()), up.ravel()))
+
+
+class Floor:
+    """Those on the floor, watched."""
+
+    def __init__(self, *kinds: Kind) -> None:
+        self.tracks = Tracks(kinds or (NAO, QBO))
+        self.now_s = 0.0
+
+    def watch(self, *seen: tuple[float, float], for_s: float = 2.0, height_m: float = LOW_M) -> None:
+        points = np.concatenate([np.zeros((0, 3)), *(somebody(x, y, height_m) for x, y in seen)])
+        for _ in range(round(for_s / PERIOD_S)):
+            self.now_s += PERIOD_S
+            self.tracks.see("depth", points, CAMERA_M, self.now_s)
+
+    def holds(self, **expected: tuple[float, float]) -> bool:
+        """Whether those are known, nobody else, and each about there."""
+        places = self.tracks.places(self.now_s)
+        off = {name: math.dist(at, (places[name].x_m, places[name].y_m)) for name, at in expected.items()}
+        return set(places) == set(expected) and max(off.values()) < NEAR_M
+
+
+@pytest.mark.parametrize("kinds", [(NAO, QBO), (QBO, NAO)])
+def test_two_of_one_height_are_told_apart_by_where_they_began(kinds: tuple[Kind, Kind]) -> None:
+    floor = Floor(*kinds)
+    floor.watch((0.2, 0.1), (-0.8, 0.2))
+    assert floor.holds(nao=(0.2, 0.1), qbo=(-0.8, 0.2))
+
+
+def test_who_sits_where_nao_began_is_nao_while_qbo_is_hidden() -> None:
+    floor = Floor()
+    floor.watch((0.1, 0.0), for_s=20.0)
+    assert floor.holds(nao=(0.1, 0.0))
+    floor.watch((0.1, 0.0), (-1.2, 1.0))
+    assert floor.holds(nao=(0.1, 0.0), qbo=(-1.2, 1.0))
+
+
+def test_both_are_found_again_where_they_were_last_and_not_where_they_began() -> None:
+    floor = Floor()
+    floor.watch((0.0, 0.0), (-0.9, 0.4))
+    for share in np.linspace(0, 1, 30):  # round each other, and each to where the other began
+        angle = math.pi * share
+        middle, half = np.array([-0.45, 0.2]), np.array([0.45, -0.2])
+        across = np.array([0.2, 0.45]) * math.sin(angle)
+        one, other = middle + half * math.cos(angle) + across, middle - half * math.cos(angle) - across
+        floor.watch((one[0], one[1]), (other[0], other[1]), for_s=0.4)
+    assert floor.holds(nao=(-0.9, 0.4), qbo=(0.0, 0.0))
+    floor.watch(for_s=5.0)
+    assert floor.holds(nao=(-0.9, 0.4), qbo=(0.0, 0.0)), "nobody saw them leave"
+    floor.watch((0.1, 0.1), (-0.9, 0.5), for_s=3.0)
+    assert floor.holds(nao=(-0.9, 0.5), qbo=(0.1, 0.1))
+
+
+def test_who_stands_as_high_as_only_nao_does_is_nao_wherever_it_was_carried() -> None:
+    floor = Floor()
+    floor.watch((-0.9, 0.4), for_s=2.0, height_m=0.58)
+    assert floor.holds(nao=(-0.9, 0.4))
+
+
+# ---------------------------------------------------------------- fixed to a table
+
+ARM = Mount(name="arm", lowest_m=0.77, highest_m=0.95, radius_m=0.05, near_m=(1.0, 1.0), reach_m=0.9)
+
+
+def on_table(x_m: float, y_m: float, low_m: float = 0.8) -> np.ndarray:
+    """What a camera from above sees of a base."""
+    across, up = np.meshgrid(np.arange(-0.09, 0.1, 0.03), np.arange(-0.09, 0.1, 0.03))
+    return np.column_stack((x_m + across.ravel(), y_m + up.ravel(), np.full(across.size, low_m)))
+
+
+def look(robot: Mounted, points_m: np.ndarray, *, from_s: float, for_s: float = 4.0, camera: str = "one") -> float:
+    now_s = from_s
+    for _ in range(round(for_s / PERIOD_S)):
+        now_s += PERIOD_S
+        mine = points_m[robot.own(points_m)]
+        robot.see(camera, mine, CAMERA_M, now_s)
+    return now_s
+
+
+def test_a_robot_on_a_table_is_told_of_only_when_something_stands_where_it_belongs() -> None:
+    robot = Mounted(ARM)
+    now_s = look(robot, on_table(3.0, -1.0), from_s=0.0)
+    now_s = look(robot, on_table(1.7, 1.0), from_s=now_s)  # within reach of its arm, but no place for its base
+    assert robot.place(now_s) is None
+    now_s = look(robot, on_table(1.05, 0.95), from_s=now_s)
+    place = robot.place(now_s)
+    assert place is not None
+    assert math.dist((place.x_m, place.y_m), (1.05, 0.95)) < 0.1
+    assert place.age_s == pytest.approx(0.0)
+
+
+def test_one_that_is_hidden_or_gone_is_told_with_when_it_was_seen_last() -> None:
+    robot = Mounted(ARM)
+    now_s = look(robot, on_table(1.0, 1.0), from_s=0.0)
+    before = robot.place(now_s)
+    # Somebody's hand within its reach is not its base.
+    now_s = look(robot, on_table(1.3, 1.0), from_s=now_s, for_s=6.0)
+    place = robot.place(now_s)
+    assert before is not None
+    assert place is not None
+    assert place.age_s == pytest.approx(6.0, abs=0.01)
+    assert (place.x_m, place.y_m) == pytest.approx((before.x_m, before.y_m), abs=0.01)
+
+
+def test_one_of_two_cameras_is_enough_to_see_it() -> None:
+    robot = Mounted(ARM)
+    now_s = 0.0
+    for _ in range(4):
+        look(robot, on_table(1.0, 1.0), from_s=now_s, for_s=1.0)
+        now_s = look(robot, np.zeros((0, 3)), from_s=now_s, for_s=1.0, camera="two")
+    place = robot.place(now_s)
+    assert place is not None
+    assert place.age_s == pytest.approx(0.0, abs=0.01)
+    assert math.dist((place.x_m, place.y_m), (1.0, 1.0)) < 0.1

@@ -1,0 +1,189 @@
+"""The occupancy grid: what it learns from looks, and what it forgets."""
+
+import math
+
+import numpy as np
+import pytest
+
+from device_agent.perception.grid_rows import rows
+from device_agent.perception.occupancy_grid import OccupancyGrid
+from device_agent.protocol import MAX_VALUES, Measurements, codec
+from device_agent.sandbox import api
+
+EMPTY = np.zeros((0, 2))
+
+
+def room(*boxes):
+    """Rays from the middle of a room of 4 by 3 m with boxes (x0, y0, x1, y1) in it: ends, hits."""
+    angles = np.linspace(-math.pi, math.pi, 360, endpoint=False)
+    ends = []
+    for angle in angles:
+        along = np.arange(0, 5, 0.005)[:, None] * [math.cos(angle), math.sin(angle)] + [2.0, 1.5]
+        hit = (along <= 0).any(axis=1) | (along[:, 0] >= 4) | (along[:, 1] >= 3)
+        for x0, y0, x1, y1 in boxes:
+            hit |= (along[:, 0] >= x0) & (along[:, 0] <= x1) & (along[:, 1] >= y0) & (along[:, 1] <= y1)
+        ends.append(along[int(np.argmax(hit))])
+    return np.array(ends)
+
+
+def look(grid, ends, times=1, elapsed_s=0.1):
+    for _ in range(times):
+        grid.see_rays("lidar", (2.0, 1.5), ends, np.ones(len(ends), dtype=bool))
+        grid.settle(elapsed_s)
+
+
+def cell(grid, x, y):
+    return grid.blocked(0.0).cell(x, y)
+
+
+def test_walls_are_found_within_a_cell():
+    grid = OccupancyGrid((-0.5, -0.5), (4.5, 3.5))
+    look(grid, room(), times=50)
+    rows, columns = np.nonzero(grid.static())
+    x = -0.5 + (columns + 0.5) * 0.05
+    y = -0.5 + (rows + 0.5) * 0.05
+    off = np.minimum.reduce([abs(x), abs(x - 4), abs(y), abs(y - 3)])
+    assert len(off) > 150
+    assert off.max() <= 0.05
+
+
+def test_who_has_left_disappears_and_is_never_furniture():
+    grid = OccupancyGrid((-0.5, -0.5), (4.5, 3.5))
+    look(grid, room(), times=100)
+    person = (3.0, 1.3, 3.3, 1.6)
+    look(grid, room(person), times=10)
+    at = cell(grid, 3.02, 1.45)
+    assert grid.moving()[at]
+    assert not grid.static()[at]
+    look(grid, room(), times=15)
+    assert not grid.taken()[at]
+
+
+def test_what_stays_becomes_furniture():
+    grid = OccupancyGrid((-0.5, -0.5), (4.5, 3.5))
+    look(grid, room(), times=100)
+    look(grid, room((3.0, 1.3, 3.3, 1.6)), times=90, elapsed_s=1.0)
+    assert grid.static()[cell(grid, 3.02, 1.45)]
+
+
+def test_a_wall_behind_somebody_stays():
+    grid = OccupancyGrid((-0.5, -0.5), (4.5, 3.5))
+    look(grid, room(), times=100)
+    look(grid, room((3.0, 1.0, 3.3, 2.0)), times=40, elapsed_s=0.5)
+    assert grid.static()[cell(grid, 4.02, 1.5)]
+
+
+def test_somebody_who_went_where_nobody_looks_is_forgotten():
+    grid = OccupancyGrid((0, 0), (4, 3))
+    grid.see_places("depth", taken_m=EMPTY, clear_m=np.array([[1.0, 1.0]]))
+    for _ in range(50):
+        grid.settle(0.1)
+    for _ in range(5):
+        grid.see_places("depth", taken_m=np.array([[1.0, 1.0]]), clear_m=EMPTY)
+        grid.settle(0.1)
+    assert grid.taken()[cell(grid, 1.0, 1.0)]
+    for _ in range(300):
+        grid.settle(0.1)
+    assert not grid.taken()[cell(grid, 1.0, 1.0)]
+
+
+def test_a_table_that_the_lidar_looks_through_is_taken():
+    grid = OccupancyGrid((0, 0), (4, 3))
+    table = np.array([[3.0, 1.5]])
+    for _ in range(10):
+        look(grid, room(), times=1)
+        grid.see_places("depth", taken_m=table, clear_m=EMPTY)
+    assert grid.taken()[cell(grid, 3.0, 1.5)]
+
+
+def test_blocked_keeps_the_radius_from_walls():
+    grid = OccupancyGrid((-0.5, -0.5), (4.5, 3.5))
+    look(grid, room(), times=10)
+    floor = grid.blocked(0.25)
+    assert floor.at(3.8, 1.5)
+    assert not floor.at(3.65, 1.5)
+    assert not floor.at(1.0, 1.0)
+    assert floor.at(9.0, 1.0), "outside of the grid"
+    assert floor.at(-0.4, 1.0), "behind the wall nobody has looked"
+    assert not grid.blocked(0.1, unknown=False).at(-0.4, 1.0)
+
+
+def test_a_robot_does_not_block_itself():
+    grid = OccupancyGrid((-0.5, -0.5), (4.5, 3.5))
+    look(grid, room((2.8, 1.4, 3.0, 1.6)), times=10)
+    assert grid.blocked(0.2).at(2.7, 1.5)
+    assert not grid.blocked(0.2, apart=[(2.9, 1.5, 0.3)]).at(2.7, 1.5)
+
+
+def test_what_is_no_number_is_let_go():
+    grid = OccupancyGrid((0, 0), (4, 3))
+    grid.see_places("depth", taken_m=np.array([[math.nan, 1.0], [math.inf, 1.0], [1.0, 1.0]]), clear_m=EMPTY)
+    assert grid.taken().sum() == 1
+
+
+def test_a_grid_without_size_is_refused():
+    with pytest.raises(ValueError, match="upper corner"):
+        OccupancyGrid((0, 0), (0, 3))
+
+
+def test_somebody_seen_again_and_again_where_the_floor_is_hidden_is_no_furniture():
+    grid = OccupancyGrid((0, 0), (4, 3))
+    for _ in range(10):
+        for _ in range(10):  # two seconds there, eighteen not
+            grid.see_places("depth", taken_m=np.array([[1.0, 1.0]]), clear_m=EMPTY)
+            grid.settle(0.2)
+        for _ in range(90):
+            grid.settle(0.2)
+        assert not grid.taken()[cell(grid, 1.0, 1.0)]
+        assert not grid.static()[cell(grid, 1.0, 1.0)]
+
+
+def test_nobody_plans_a_way_through_the_walls_of_the_plan():
+    grid = OccupancyGrid((-0.5, -0.5), (4.5, 3.5), plan=(0.0, 0.0, 4.0, 3.0))
+    for unknown in (True, False):
+        grid.see_places("depth", taken_m=EMPTY, clear_m=np.array([[0.3, 1.0], [0.15, 1.0], [-0.2, 1.0]]))
+        floor = grid.blocked(0.2, unknown=unknown)
+        assert not floor.at(0.3, 1.0)
+        assert floor.at(0.15, 1.0)
+        assert floor.at(-0.2, 1.0)
+
+
+def floor_of(values: dict[str, float]) -> api.Room:
+    """A script's room in which the floor was measured just now."""
+    return api.Room(lambda kind, device, stream: {"values": values, "age_s": 0.5})  # noqa: ARG005
+
+
+def test_a_script_reads_the_grid_from_its_rows():
+    grid = OccupancyGrid((-3.2, -2.7), (3.2, 2.7), plan=(-3.0, -2.5, 3.0, 2.5))
+    across, up = np.meshgrid(np.arange(-2.9, 2.9, 0.05), np.arange(-2.4, 1.0, 0.05))
+    clear = np.column_stack((across.ravel(), up.ravel()))
+    for _ in range(5):
+        grid.see_places("depth", taken_m=np.array([[1.01, -1.0], [-2.5, 0.6]]), clear_m=clear)
+    found = rows(grid)
+    assert (found["columns"], found["rows"], found["side_m"]) == (32.0, 27.0, 0.2)
+    assert len(found) <= MAX_VALUES
+    room = floor_of(found)
+    for x_m, y_m, taken in (
+        (1.01, -1.0, True),
+        (-2.5, 0.6, True),
+        (0.0, 0.0, False),
+        (1.5, -1.0, False),
+        (0.0, 2.0, None),  # nobody looked there
+        (3.1, 0.0, None),  # behind the wall
+        (50.0, 0.0, None),
+    ):
+        assert room.taken(x_m, y_m) is taken, (x_m, y_m)
+    with pytest.raises(api.RobotError, match="finite"):
+        room.taken(math.nan, 0.0)
+    assert api.Room(lambda *_, **__: None).taken(0.0, 0.0) is None
+    assert api.Room(lambda *_, **__: {"values": found, "age_s": 60.0}).taken(0.0, 0.0) is None
+
+
+@pytest.mark.parametrize("size_m", [6.0, 40.0, 80.0])
+def test_a_floor_fits_into_a_message_however_large_it_is(size_m):
+    grid = OccupancyGrid((0.0, 0.0), (size_m, size_m * 0.9))
+    last = np.array([[size_m - 0.03, size_m * 0.9 - 0.03]])
+    grid.see_places("depth", taken_m=last, clear_m=np.zeros((0, 2)))
+    found = rows(grid)
+    codec.encode(Measurements(tick_ms=1, at_ms=1, sequence=1, values=found))
+    assert floor_of(found).taken(*last[0]) is True

@@ -1,0 +1,46 @@
+"""What a manifest says about measurements is checked when it is read."""
+
+from pathlib import Path
+
+import pytest
+
+from device_agent.protocol.errors import ProtocolError
+from device_agent.protocol.manifests import robot_type
+
+UR5 = Path(__file__).parents[3] / "robots" / "ur5" / "robot.toml"
+
+
+def given(lines: str) -> str:
+    return f'{UR5.read_text(encoding="utf-8")}\n[[diagnostics]]\nfields = "x"\nlabel = "X"\n{lines}\n'
+
+
+def test_limits_that_rise_are_read() -> None:
+    known = robot_type.parse(given("low = -1\nwarning_high = 2\nhigh = 3\nquestions = ['level']"))
+    last = known.diagnostics[-1]
+    assert (last.low, last.warning_low, last.warning_high, last.high) == (-1.0, None, 2.0, 3.0)
+    assert (last.stream, last.questions) == ("health", ("level",))
+
+
+@pytest.mark.parametrize(
+    "lines",
+    [
+        "low = 2\nhigh = 1",
+        "warning_high = 5\nhigh = 4",
+        "high = nan",
+        "high = inf",
+        "change = 0",
+        "horizon_s = 1",
+        "questions = ['why']",
+        "limit = 3",
+        "fields = ''",
+    ],
+)
+def test_what_contradicts_itself_is_refused(lines: str) -> None:
+    with pytest.raises(ProtocolError):
+        robot_type.parse(given(lines))
+
+
+def test_a_ur5_says_what_its_joints_may_be() -> None:
+    known = robot_type.load(UR5.parent)
+    assert {one.stream for one in known.diagnostics} == {"health", "joints"}
+    assert all(one.advice for one in known.diagnostics)

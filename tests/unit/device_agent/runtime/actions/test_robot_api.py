@@ -1,0 +1,544 @@
+"""Every call of a script's API, from the script in its jail to a toy robot that can do all of it."""
+
+import math
+import threading
+import time
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Literal
+
+import msgspec
+import pytest
+
+from device_agent.ports import script_calls, skills
+from device_agent.ports.driver import Observation, Twist
+from device_agent.ports.geometry import Clearance, GeometryError, Sweep, never
+from device_agent.ports.skills import Skill, SkillError, Stage
+from device_agent.protocol import (
+    AckStatus,
+    BaseLimits,
+    CancelAction,
+    Description,
+    Drive,
+    Event,
+    Express,
+    LookAt,
+    Measurements,
+    MoveJoints,
+    Pose,
+    RunBehaviour,
+    Say,
+    SetStiffness,
+    Stop,
+    TakePosture,
+    Task,
+    codec,
+    topics,
+)
+from device_agent.protocol.manifests.robot_type import Base, Gaze, RobotType
+from device_agent.runtime.actions.device_context import Body
+from device_agent.runtime.actions.robot_api import ScriptRobot
+from device_agent.runtime.authority.lease_gate import LeaseGate, Refused
+from device_agent.runtime.control.controller import Controller
+from device_agent.runtime.planning import gaze
+from device_agent.runtime.readings import Room
+from tests.fakes.drivers import ToyDriver, robot_type
+from tests.harness.agent.device_harness import Bench, eventually
+from tests.harness.agent.sandbox import LACK, NoJail
+
+
+class AbleDriver(ToyDriver):
+    """Does at once whatever it is asked, and remembers it."""
+
+    performs = ("speech", "stiffness", "gaze", "expressions", "behaviours", "postures")
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.performed: list[Skill] = []
+        self.twists: list[Twist] = []
+        self.interrupted = threading.Event()
+
+    def drive(self, twist: Twist) -> Twist:
+        self.twists.append(twist)
+        return twist
+
+    def perform(self, skill: Skill, stage: Stage) -> None:
+        self.performed.append(skill)
+        match skill:
+            case skills.Behave(name="nod"):
+                stage.move_joints({"elbow": 0.1}, 1.0)
+            case skills.Behave(name="too far"):
+                stage.move_joints({"elbow": 99.0}, 1.0)
+            case skills.Behave(name="dance"):
+                while not stage.ended:
+                    stage.wait(0.01)
+                self.interrupted.set()
+            case skills.Behave(name="sulk"):
+                stage.wait(60)
+                raise SkillError("it broke off")
+            case skills.Express(name="frown"):
+                raise SkillError("no expression 'frown'; there are smile")
+
+
+class Head:
+    """A geometry: the shoulder turns it left, the elbow turns it up; it looks along its x axis, from 1 m above."""
+
+    frames = ("face",)
+
+    def poses(self, position_rad: Sequence[float]) -> Mapping[str, Pose]:
+        yaw, pitch = position_rad[0] / 2, -position_rad[1] / 2
+        cy, sy, cp, sp = math.cos(yaw), math.sin(yaw), math.cos(pitch), math.sin(pitch)
+        return {"face": (0.0, 0.0, 1.0, cy * cp, -sy * sp, cy * sp, sy * cp)}
+
+    def clearance(self, position_rad: Sequence[float]) -> Clearance:
+        del position_rad
+        return Clearance(10.0, ("face", "floor"))
+
+    def sweep(self, path_rad: Sequence[Sequence[float]]) -> Sweep:
+        del path_rad
+        return Sweep(1.0)
+
+    def glance(self, start_rad: Sequence[float], end_rad: Sequence[float]) -> float:
+        raise NotImplementedError
+
+    def speed_m_s(self, velocity_rad_s: Sequence[float]) -> float:
+        return max(map(abs, velocity_rad_s))
+
+    def solve(self, frame: str, pose: Pose, start_rad: Sequence[float]) -> tuple[float, ...]:
+        del frame, start_rad
+        if pose[0] > 1:
+            raise GeometryError("face cannot come nearer than 0.5 m")
+        return (pose[0], pose[6])
+
+    def rates(
+        self, frame: str, twist: Sequence[float], position_rad: Sequence[float], *, tool: bool
+    ) -> tuple[float, ...]:
+        raise NotImplementedError
+
+    def plan(
+        self,
+        start_rad: Sequence[float],
+        goal_rad: Sequence[float],
+        *,
+        seed: int = 0,
+        within_s: float = 5.0,
+        ended: Callable[[], bool] = never,
+    ) -> tuple[tuple[float, ...], ...]:
+        del seed, within_s, ended
+        if goal_rad[1] > 1:
+            raise GeometryError("found no way there")
+        return (tuple(start_rad), (0.0, 0.2), tuple(goal_rad))
+
+
+def able_type() -> RobotType:
+    base = Base(
+        max_linear_m_s=0.5,
+        max_angular_rad_s=1.0,
+        max_linear_acceleration_m_s2=5.0,
+        max_angular_acceleration_rad_s2=5.0,
+        braking_linear_m_s2=5.0,
+        braking_angular_rad_s2=5.0,
+    )
+    return msgspec.structs.replace(
+        robot_type(),
+        capabilities=("cartesian", "speech", "stiffness", "expressions", "behaviours", "postures"),
+        frames=("face",),
+        model="toy.xml",
+        base=base,
+        gaze=Gaze(frame="face", joints=("shoulder", "elbow")),
+    )
+
+
+@pytest.fixture
+def bench(tmp_path: Path) -> Iterator[Bench]:
+    bench = Bench(tmp_path, driver=AbleDriver(), kind=able_type(), geometry=Head())
+    bench.device.start()
+    bench.device.link_changed(True)
+    yield bench
+    bench.stop()
+
+
+def driver_of(bench: Bench) -> AbleDriver:
+    assert isinstance(bench.driver, AbleDriver)
+    return bench.driver
+
+
+def play(bench: Bench, source: str) -> str:
+    """What it printed; it must end well."""
+    ack = bench.end(bench.command(bench.script(source), epoch=1))
+    assert ack.status is AckStatus.DONE, ack.reason
+    return ack.output
+
+
+def test_a_robot_that_can_all_of_it_does_all_of_it(bench: Bench) -> None:
+    printed = play(
+        bench,
+        "robot.say('hello', language='en')\n"
+        "robot.stiffness(0.4, ['elbow'])\n"
+        "robot.express('smile', 0.7)\n"
+        "robot.posture('Sit', 0.9)\n"
+        "robot.behaviour('nod')\n"
+        "robot.drive(0.1, turn_rad_s=0.2, duration_s=0.05)\n"
+        "robot.move_joints({'elbow': 0.2}, speed=1)\n"
+        "robot.move_to((0.1, 0, 0), rpy_rad=(0, 0, 0.6), speed=1)\n"
+        "robot.move_joints({'elbow': 0.1}, speed=1, plan=True)\n"
+        "robot.look((1, 1, 1), speed=1)\n"
+        "state = robot.state()\n"
+        "print(round(state['position_rad']['shoulder'], 2), state['mode'], robot.can)\n",
+    )
+    assert driver_of(bench).performed == [
+        skills.Say("hello", "en"),
+        skills.Stiffen(0.4, ("elbow",)),
+        skills.Express("smile", 0.7),
+        skills.Pose("Sit", 0.9),
+        skills.Behave("nod"),
+    ]
+    assert max(twist.forward_m_s for twist in driver_of(bench).twists) > 0
+    assert printed.startswith(f"{math.pi / 4:.2f} action (")
+    assert all(call in printed for call in ("move_to", "look", "say", "drive", "behaviour"))
+
+
+def test_a_frame_goes_straight_to_a_pose_and_says_where_it_cannot(bench: Bench) -> None:
+    printed = play(
+        bench,
+        "robot.move_to((0.1, 0, 0), rpy_rad=(0, 0, 0.6), speed=1, straight=True)\n"
+        "print(round(robot.state()['position_rad']['shoulder'], 2))\n"
+        "try: robot.move_to((2, 0, 0), straight=True)\n"
+        "except RobotError as error: print(error)\n",
+    ).splitlines()
+    assert printed[0] == "0.1"
+    assert "of the way there: face cannot come nearer than 0.5 m" in printed[1]
+
+
+def test_keyframes_are_played_in_their_time_and_what_takes_longer_is_said(bench: Bench) -> None:
+    keyframes = "{'time_s': 0, 'position_rad': {'elbow': 0.1}}, {'time_s': %s, 'position_rad': {'elbow': 0.3}}"
+    begun_s = time.monotonic()
+    play(bench, f"robot.play([{keyframes % 0.8}])")
+    assert time.monotonic() - begun_s >= 0.8
+    assert bench.driver.position[1] == pytest.approx(0.3, abs=1e-3)
+    ack = bench.end(bench.command(bench.script(f"robot.play([{keyframes % 0.001}])"), epoch=1))
+    assert ack.result["limited"] == ["keyframes: later"]
+
+
+def test_what_a_robot_cannot_do_is_refused_with_what_it_can(tmp_path: Path) -> None:
+    bench = Bench(tmp_path)
+    bench.device.start()
+    asked = (
+        "robot.say('x')",
+        "robot.express('x')",
+        "robot.behaviour('x')",
+        "robot.posture('x')",
+        "robot.stiffness(1)",
+        "robot.drive(1)",
+        "robot.look((1, 0, 0))",
+        "robot.move_to((1, 0, 0))",
+    )
+    lines = "".join(f"try: {call}\nexcept RobotError as error: print(error)\n" for call in asked)
+    printed = play(bench, lines).splitlines()
+    assert [line.split(";")[0] for line in printed] == [
+        f"this robot has no {call.removeprefix('robot.').split('(')[0]}" for call in asked
+    ]
+    assert all(line.endswith("it has move_joints, play, home, state, latest") for line in printed)
+    bench.stop()
+
+
+@pytest.mark.parametrize(
+    ("call", "says"),
+    [
+        ("robot.express('frown')", "no expression 'frown'; there are smile"),
+        ("robot.express('smile', 2)", "strength must be 0 and at most 1, not 2.0"),
+        ("robot.stiffness(-1)", "stiffness must be 0"),
+        ("robot.behaviour('too far')", "elbow can go from"),
+        ("robot.home(speed=0)", "speed must be above 0 and at most 1, not 0.0"),
+        ("robot.move_to((0, 0, 0), frame='foot')", "no frame 'foot'; there are face"),
+        ("robot.move_to((2, 0, 0))", "face cannot come nearer than 0.5 m"),
+        ("robot.move_to((0, 0, 0), quaternion=(0, 0, 0, 0))", "has no direction"),
+        ("robot.move_to((0, 0, 0), straight=True, plan=True)", "straight or planned, not both"),
+        ("robot.move_joints({'elbow': 1.5}, plan=True)", "found no way there"),
+        ("robot.move_joints({'elbow': 99}, plan=True)", "elbow can go from"),
+        ("robot.look((0, 0, 1))", "inside of what it looks with"),
+        ("robot.look((-1, -0.1, 0.9), speed=9)", "speed must be above 0"),
+        ("robot.drive(99)", "forward_m_s can be up to 0.500"),
+        ("room.latest('x', 'y')", "is not listened to"),
+        ("robot.play([{'time_s': 0}, {'time_s': 1, 'position_rad': {'elbow': 9}}])", "keyframe 2: elbow can go from"),
+        ("robot.play([{'time_s': 0}, {'time_s': 1, 'position_rad': {'nose': 9}}])", "keyframe 2: no joint 'nose'"),
+        ("robot.play([{'time_s': float('nan')}, {'time_s': 1}])", "the time of keyframe 1 is not a finite number"),
+        ("robot.play([{'time_s': 0}, {'time_s': 1}], speed=3)", "speed must be above 0 and at most 2, not 3.0"),
+    ],
+)
+def test_what_is_not_done_says_why_and_in_which_line(bench: Bench, call: str, says: str) -> None:
+    ack = bench.end(bench.command(bench.script(f"\n{call}"), epoch=1))
+    assert ack.reason is not None
+    assert ack.reason.message.startswith("line 2: RobotError: ")
+    assert says in ack.reason.message
+
+
+def test_stop_ends_a_skill_and_nothing_more_is_performed(bench: Bench) -> None:
+    running = bench.command(bench.script("robot.behaviour('dance')\nrobot.say('still here')"), epoch=1)
+    eventually(lambda: driver_of(bench).performed)
+    bench.receive(topics.STOP, msgspec.json.encode(Stop(id="s1", by="bob", reason="smoke")))
+    reason = bench.end(running).reason
+    assert reason is not None
+    assert reason.code == "stopped"
+    assert driver_of(bench).interrupted.wait(10)
+    assert driver_of(bench).performed == [skills.Behave("dance")]
+
+
+def test_stop_ends_a_move_of_a_script_and_the_script(bench: Bench) -> None:
+    running = bench.command(bench.script("print('off')\nrobot.move_joints({'elbow': 2.5}, speed=0.05)"), epoch=1)
+    eventually(lambda: bench.driver.position[1] > 1e-4)
+    bench.receive(topics.STOP, msgspec.json.encode(Stop(id="s1", by="bob", reason="smoke")))
+    reason = bench.end(running).reason
+    assert reason is not None
+    assert reason.code == "stopped"
+
+
+@pytest.mark.parametrize("name", ["dance", "sulk"])
+def test_a_cancel_ends_a_skill(bench: Bench, name: str) -> None:
+    running = bench.command(bench.script(f"robot.behaviour('{name}')"), epoch=1)
+    eventually(lambda: driver_of(bench).performed)
+    bench.command(CancelAction(action=running))
+    assert bench.end(running).status is AckStatus.CANCELLED
+
+
+def test_a_script_is_ended_when_its_time_is_over(bench: Bench) -> None:
+    order = msgspec.structs.replace(bench.script("print('begun')\nwait(600)"), timeout_ms=300)
+    ack = bench.end(bench.command(order, epoch=1))
+    assert ack.reason is not None
+    assert (ack.status, ack.reason.code) == (AckStatus.FAILED, "too_long")
+    assert "after its 0.3 s" in ack.reason.message
+
+
+def test_progress_and_prints_are_told_while_it_runs(bench: Bench) -> None:
+    source = "for i in range(4):\n    progress(i / 4)\n    print('part', i)\n    wait(0.25)\n"
+    running = bench.command(bench.script(source), epoch=1)
+    bench.end(running)
+    told = [ack for ack in bench.acks(running) if ack.status is AckStatus.STARTED]
+    assert len({ack.progress for ack in told}) > 2
+    assert any("part 0" in ack.output and "part 3" not in ack.output for ack in told)
+
+
+def test_an_older_version_does_not_run_again(bench: Bench) -> None:
+    assert bench.end(bench.command(bench.script("print(2)", version=2), epoch=1)).status is AckStatus.DONE
+    reason = bench.end(bench.command(bench.script("print(1)", version=1), epoch=1)).reason
+    assert reason is not None
+    assert reason.code == "rolled_back"
+
+
+def test_a_script_of_another_account_runs_behind_bubblewrap(bench: Bench) -> None:
+    source = "import os\nprint(os.getpid())"
+    own = int(bench.end(bench.command(bench.script(source), epoch=1)).output)
+    strange = int(bench.end(bench.command(bench.script(source, author="accountbbbbbbbbb"), epoch=1)).output)
+    parents = [
+        int(process) for task in Path("/proc/self/task").glob("*/children") for process in task.read_text().split()
+    ]
+    # The machine's numbers come round again, so they say nothing about each other.
+    assert strange < min(own, *parents), "it does not see process ids of its own"
+
+
+def test_a_move_says_what_limited_it(bench: Bench) -> None:
+    bench.device._controller.restrict("room", 0.2, "somebody is near")
+    ack = bench.end(bench.command(MoveJoints(position_rad={"elbow": 0.05}, speed=1.0), epoch=1))
+    assert ack.status is AckStatus.DONE
+    assert ack.result["limited"] == ["interlock: somebody is near"]
+
+
+@pytest.mark.parametrize("how", ["refused", "trusted"])
+def test_where_scripts_cannot_be_locked_in_it_is_said_at_once(
+    tmp_path: Path, how: Literal["refused", "trusted"]
+) -> None:
+    bench = Bench(tmp_path, jail=NoJail(how))
+    bench.device.start()
+    bench.device.link_changed(True)
+    described: Description = eventually(lambda: bench.heard(topics.DESC, Description))[0]
+    assert (described.scripts, described.scripts_note) == (how, LACK)
+    eventually(lambda: [event for event in bench.heard(topics.EVENT, Event) if event.kind == f"scripts-{how}"])
+    reason = bench.end(bench.command(bench.script("print(1)"), epoch=1)).reason
+    assert reason is not None
+    assert (reason.code, reason.message) == ("no_jail", LACK)
+    bench.stop()
+
+
+def test_where_the_jail_holds_desc_says_so(bench: Bench) -> None:
+    described: Description = eventually(lambda: bench.heard(topics.DESC, Description))[0]
+    assert (described.scripts, described.scripts_note) == ("jailed", "")
+
+
+def test_an_agent_that_is_shut_down_ends_the_script(bench: Bench) -> None:
+    running = bench.command(bench.script("print('here')\nwait(600)"), epoch=1)
+    eventually(lambda: [ack for ack in bench.acks(running) if "here" in ack.output])
+    bench.device._executor.close()
+    reason = bench.end(running).reason
+    assert reason is not None
+    assert reason.code == "agent_stopping"
+
+
+def test_a_script_reads_what_the_room_measured() -> None:
+    room = Room(space="s", agent="a", own=["arm"], named=[("b-pir", "presence")])
+    body = replace(body_of(robot_type()), room=room)
+    robot = ScriptRobot(body)
+    asked = script_calls.AskLatest(device="b-pir", stream="presence")
+    assert robot.do(asked) is None
+    measured = Measurements(tick_ms=1, at_ms=1, sequence=1, values={"present": True, "distance_m": 1.5})
+    room.receive(topics.parse("ts/v1/s/b/pir/tele/presence"), codec.encode(measured))
+    answer = robot.do(asked)
+    assert answer["values"] == {"present": True, "distance_m": 1.5}
+    assert 0 <= answer["age_s"] < 60
+
+
+# ---------------------------------------------------------------- without a device around it
+
+
+def body_of(kind: RobotType, *, seen: bool = True, able: AbleDriver | None = None, head: Head | None = None) -> Body:
+    observation = Observation((0.0, 0.0), (0.0, 0.0), (0.0, 0.0), ())
+    controller = Controller(kind, LeaseGate())
+    controller.start_at((0.0, 0.0))
+    return Body(
+        robot_type=kind,
+        controller=controller,
+        observe=lambda: observation if seen else None,
+        geometry=head,
+        skills=able,
+        room=Room(space="s", agent="a", own=["arm"]),
+    )
+
+
+def test_before_the_first_measurement_there_is_no_state() -> None:
+    body = body_of(robot_type(), seen=False)
+    assert body.measured() == {}
+    with pytest.raises(Refused, match="not been measured"):
+        body.seen()
+
+
+def test_a_robot_that_has_ended_performs_nothing_more() -> None:
+    able = AbleDriver()
+    kind = msgspec.structs.replace(able_type(), gaze=None, capabilities=("gaze", "speech"))
+    robot = ScriptRobot(body_of(kind, able=able))
+    robot._look((1.0, 0.0, 0.0), 0.5)
+    assert able.performed == [skills.LookAt((1.0, 0.0, 0.0), 0.5)]
+    robot.end()
+    with pytest.raises(Refused, match="the action ended"):
+        robot.performer.perform(skills.Say("x"))
+    assert len(able.performed) == 1
+
+
+def test_without_model_or_skills_nothing_is_guessed() -> None:
+    robot = ScriptRobot(body_of(robot_type()))
+    with pytest.raises(Refused, match="no model"):
+        robot._shape()
+    with pytest.raises(Refused, match="no skills"):
+        robot.performer.perform(skills.Say("x"))
+    with pytest.raises(Refused, match="no gaze"):
+        gaze.aim(robot_type(), Head(), (0.0, 0.0), (1.0, 0.0, 0.0))
+
+
+@pytest.mark.parametrize("point", [(1.0, 1.0, 1.0), (2.0, -1.0, 0.2), (0.3, 0.1, 1.8), (-0.5, 0.8, 1.0)])
+def test_a_gaze_meets_its_point(point: tuple[float, float, float]) -> None:
+    found = gaze.aim(able_type(), Head(), (0.1, -0.1), point)
+    left, up = math.atan2(point[1], point[0]), math.atan2(point[2] - 1, math.hypot(point[0], point[1]))
+    assert found["shoulder"] == pytest.approx(left, abs=5e-3)
+    assert found["elbow"] == pytest.approx(up, abs=5e-3)
+
+
+def test_a_gaze_that_cannot_turn_far_enough_says_so() -> None:
+    kind = able_type()
+    narrow = tuple(msgspec.structs.replace(joint, lower_rad=-0.2, upper_rad=0.2) for joint in kind.joints)
+    with pytest.raises(Refused, match="shoulder, elbow cannot turn far enough"):
+        gaze.aim(msgspec.structs.replace(kind, joints=narrow), Head(), (0.0, 0.0), (0.0, 1.0, 1.0))
+
+
+def test_nothing_is_left_of_a_tenure_that_nobody_has() -> None:
+    robot = ScriptRobot(body_of(robot_type()))
+    robot.tenure.on_lost(Refused("x", "y"))
+    robot.give_back()
+    assert robot.over.is_set()
+
+
+def showing_type() -> RobotType:
+    return msgspec.structs.replace(
+        robot_type(),
+        home_rad={"shoulder": 0.0, "elbow": 0.1},
+        expressions={"glad": {"elbow": 0.3}, "shy": {"shoulder": -0.2}},
+        postures={"Bow": {"elbow": 0.25}},
+    )
+
+
+@pytest.mark.parametrize(
+    ("request_", "there"),
+    [
+        (Express(name="glad"), {"shoulder": 0.0, "elbow": 0.3}),
+        (Express(name="glad", strength=0.5), {"shoulder": 0.0, "elbow": 0.2}),
+        (Express(name="shy", strength=0.25), {"shoulder": -0.05, "elbow": 0.1}),
+        (TakePosture(name="Bow", speed=1.0), {"shoulder": 0.0, "elbow": 0.25}),
+    ],
+)
+def test_what_the_manifest_says_is_shown_without_a_driver_that_could(
+    tmp_path: Path, request_: Express | TakePosture, there: dict[str, float]
+) -> None:
+    bench = Bench(tmp_path, kind=showing_type())
+    bench.device.start()
+    ack = bench.end(bench.command(request_, epoch=1))
+    assert ack.status is AckStatus.DONE, ack.reason
+    assert bench.driver.position == pytest.approx([there["shoulder"], there["elbow"]], abs=2e-4)
+    bench.stop()
+
+
+@pytest.mark.parametrize(
+    ("request_", "says"),
+    [
+        (Express(name="sad"), "no expression 'sad'; there are glad, shy"),
+        (TakePosture(name="Sit"), "no posture 'Sit'; there are Bow"),
+        (
+            RunBehaviour(name="dance"),
+            "this robot has no behaviour; it has move_joints, play, home, express, posture, state",
+        ),
+        (SetStiffness(value=0.0), "this robot has no stiffness"),
+        (LookAt(position_m=(1.0, 0.0, 0.0)), "this robot has no look"),
+        (Drive(forward_m_s=0.1), "this robot has no drive"),
+        (Say(text="hello"), "this robot has no say"),
+    ],
+)
+def test_an_order_that_the_robot_cannot_do_fails_with_what_it_can(tmp_path: Path, request_: Task, says: str) -> None:
+    bench = Bench(tmp_path, kind=showing_type())
+    bench.device.start()
+    reason = bench.end(bench.command(request_, epoch=1)).reason
+    assert reason is not None
+    assert says in reason.message
+    bench.stop()
+
+
+def test_orders_reach_the_skills_that_scripts_reach(bench: Bench) -> None:
+    orders: tuple[Task, ...] = (
+        Say(text="ahoj", language="sk"),
+        SetStiffness(value=0.5, joints=("elbow",)),
+        Express(name="smile", strength=0.7),
+        TakePosture(name="Sit"),
+        RunBehaviour(name="nod"),
+        LookAt(position_m=(1.0, 1.0, 1.0), speed=1.0),
+        Drive(forward_m_s=0.1, duration_s=0.05),
+    )
+    for order in orders:
+        ack = bench.end(bench.command(order, epoch=1))
+        assert ack.status is AckStatus.DONE, ack.reason
+    assert driver_of(bench).performed == [
+        skills.Say("ahoj", "sk"),
+        skills.Stiffen(0.5, ("elbow",)),
+        skills.Express("smile", 0.7),
+        skills.Pose("Sit", 0.5),
+        skills.Behave("nod"),
+    ]
+    assert max(twist.forward_m_s for twist in driver_of(bench).twists) > 0
+    described: Description = eventually(lambda: bench.heard(topics.DESC, Description))[0]
+    assert described.actions == (
+        "move_joints",
+        "move_pose",
+        "say",
+        "express",
+        "take_posture",
+        "run_behaviour",
+        "set_stiffness",
+        "look_at",
+        "drive",
+    )
+    assert described.base == BaseLimits(forward_m_s=0.5, left_m_s=0.0, turn_rad_s=1.0)

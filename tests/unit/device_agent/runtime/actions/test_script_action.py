@@ -1,0 +1,403 @@
+"""Movement scripts in the real jail, with a robot that only takes notes."""
+
+import contextlib
+import hashlib
+import json
+import socket
+import threading
+import time
+from collections.abc import Iterator
+from typing import Any
+
+import pytest
+
+from device_agent.ports import script_calls
+from device_agent.ports.sandbox import JailError, Limits, Standing
+from device_agent.protocol import RunMovement
+from device_agent.runtime.actions import script_action
+from device_agent.runtime.actions.script_action import Cell, Script, ScriptFailed
+from device_agent.runtime.authority.lease_gate import Refused
+from tests.harness.agent.sandbox import warm_jail
+
+
+class Notes:
+    joints = ("shoulder", "elbow")
+    frames = ("tool",)
+    can = ("move_joints", "home", "state")
+
+    def __init__(self) -> None:
+        self.calls: list[Any] = []
+
+    def do(self, call: script_calls.Call) -> Any:
+        match call:
+            case script_calls.MoveJoints(position_rad=position_rad, speed=speed):
+                if "knee" in position_rad:
+                    raise Refused("unknown_joint", "no joint 'knee'")
+                self.calls.append((position_rad, speed))
+            case script_calls.AskState():
+                return {"position_rad": {"shoulder": 0.1, "elbow": 0.2}, "mode": "action"}
+            case _:
+                self.calls.append(call)
+        return None
+
+
+def nothing() -> None:
+    """Nobody needs to know that the process is dead."""
+
+
+class Told:
+    def __init__(self) -> None:
+        self.printed = ""
+        self.progress: list[float] = []
+
+    def __call__(self, text: str, share: float | None) -> None:
+        self.printed += text
+        if share is not None:
+            self.progress.append(share)
+
+
+class FakeInmate:
+    """A process that says what it is told to."""
+
+    def __init__(self, *, dies: bool = True) -> None:
+        self.link, self.theirs = socket.socketpair()
+        self.dies = dies
+        self.killed = False
+
+    def say(self, *lines: bytes) -> None:
+        self.theirs.sendall(b"".join(line + b"\n" for line in lines))
+
+    def kill(self) -> None:
+        self.killed = True
+
+    def wait(self, timeout_s: float) -> bool:
+        del timeout_s
+        return self.dies
+
+    def ending(self) -> str:
+        return "it crashed"
+
+    def close(self) -> None:
+        self.link.close()
+        self.theirs.close()
+
+
+class FakeJail:
+    def __init__(self, inmate: FakeInmate | None) -> None:
+        self.inmate = inmate
+
+    def start(self) -> None:
+        pass
+
+    def standing(self) -> Standing:
+        return Standing("jailed")
+
+    def refusal(self, *, stranger: bool) -> str | None:
+        del stranger
+        return None
+
+    def open(self, limits: Limits, *, stranger: bool) -> FakeInmate:
+        del limits, stranger
+        if self.inmate is None:
+            raise JailError("no process can be started for the script")
+        return self.inmate
+
+    def close(self) -> None:
+        pass
+
+
+def order(source: str, parameters: dict[str, Any] | None = None) -> RunMovement:
+    digest = hashlib.sha256(source.encode()).hexdigest()
+    return RunMovement(
+        robot_type="toy", name="wave", version=1, sha256=digest, source=source, parameters=parameters or {}
+    )
+
+
+def run(source: str, parameters: dict[str, Any] | None = None) -> tuple[Notes, Told]:
+    notes, told = Notes(), Told()
+    Script(order(source, parameters), notes, told, cell=Cell(warm_jail(), stranger=False), died=nothing).run()
+    return notes, told
+
+
+def run_fake(inmate: FakeInmate) -> Told:
+    told = Told()
+    Script(order(""), Notes(), told, cell=Cell(FakeJail(inmate), stranger=False), died=nothing).run()
+    return told
+
+
+def test_a_script_moves_prints_and_reads_its_parameters() -> None:
+    notes, told = run(
+        "for angle in parameters['angles']:\n"
+        "    robot.move_joints({'elbow': angle}, speed=0.3)\n"
+        "robot.move_joints([1, 2])\n"
+        "robot.home()\n"
+        "wait(0.01)\n"
+        "progress(0.5)\n"
+        "print('elbow', robot.state()['position_rad']['elbow'], robot.joints, robot.frames, robot.can[0])\n",
+        {"angles": [0.5, 1]},
+    )
+    assert notes.calls == [
+        ({"elbow": 0.5}, 0.3),
+        ({"elbow": 1.0}, 0.3),
+        ({"shoulder": 1.0, "elbow": 2.0}, 0.5),
+        script_calls.Home(speed=0.5),
+    ]
+    assert told.printed == "elbow 0.2 ('shoulder', 'elbow') ('tool',) move_joints\n"
+    assert told.progress == [0.5]
+
+
+def test_every_call_of_the_api_arrives_as_it_was_meant() -> None:
+    notes, _ = run(
+        "robot.move_to([0.1, 0, 0.3], rpy_rad=(0, 0, 1), speed=0.2)\n"
+        "robot.move_to((0.1, 0, 0.3), quaternion=(1, 0, 0, 0), frame='camera')\n"
+        "robot.drive(0.1, turn_rad_s=0.5, duration_s=2)\n"
+        "robot.look((1, 0, 0))\n"
+        "robot.say('ahoj', language='sk')\n"
+        "robot.stiffness(0.5, ['elbow'])\n"
+        "robot.express('smile', 0.7)\n"
+        "robot.behaviour('wave')\n"
+        "room.latest('agent-pir', 'presence')\n"
+    )
+    assert notes.calls == [
+        script_calls.MoveTo(frame="tool", position_m=(0.1, 0, 0.3), rpy_rad=(0, 0, 1), speed=0.2),
+        script_calls.MoveTo(frame="camera", position_m=(0.1, 0, 0.3), quaternion=(1, 0, 0, 0), speed=0.5),
+        script_calls.Drive(forward_m_s=0.1, left_m_s=0, turn_rad_s=0.5, duration_s=2),
+        script_calls.Look(position_m=(1, 0, 0), speed=0.5),
+        script_calls.Say(text="ahoj", language="sk"),
+        script_calls.Stiffness(value=0.5, joints=("elbow",)),
+        script_calls.Express(name="smile", strength=0.7),
+        script_calls.Behaviour(name="wave"),
+        script_calls.AskLatest(device="agent-pir", stream="presence"),
+    ]
+
+
+def test_keyframes_are_played_up_to_each_at_which_something_is_done() -> None:
+    notes, _ = run(
+        "robot.play([\n"
+        "    {'time_s': 1, 'position_rad': {'elbow': 0.1}, 'say': 'off'},\n"
+        "    {'time_s': 2, 'position_rad': {'elbow': 0.2}},\n"
+        "    {'time_s': 3, 'express': 'smile', 'posture': 'Sit', 'drive': {'forward_m_s': 0.1, 'duration_s': 2}},\n"
+        "    {'time_s': 5},\n"
+        "    {'time_s': 5.5, 'position_rad': {'shoulder': 0.3}, 'go_to': {'x_m': 1, 'y_m': 2}, 'behaviour': 'nod'},\n"
+        "], speed=0.5)\n"
+        "robot.play([{'time_s': 0, 'say': 'end'}])\n"
+        "robot.play([])\n"
+    )
+    there = script_calls.Moment(time_s=1, position_rad={"elbow": 0.2})
+    assert notes.calls == [
+        ({"elbow": 0.1}, 0.25),
+        script_calls.Say(text="off", language=""),
+        script_calls.Play(keyframes=(there, script_calls.Moment(time_s=2)), first=2, speed=0.5),
+        script_calls.Posture(name="Sit", speed=0.5),
+        script_calls.Express(name="smile", strength=1),
+        script_calls.Drive(forward_m_s=0.1, left_m_s=0, turn_rad_s=0, duration_s=2),
+        script_calls.Play(
+            keyframes=(script_calls.Moment(time_s=2), script_calls.Moment(time_s=2.5, position_rad={"shoulder": 0.3})),
+            first=4,
+            speed=0.5,
+        ),
+        script_calls.Behaviour(name="nod"),
+        script_calls.GoTo(x_m=1, y_m=2),
+        script_calls.Say(text="end", language=""),
+    ]
+
+
+@pytest.mark.parametrize(
+    ("source", "says"),
+    [
+        ("x = 1\ny = x / 0\n", "line 2: ZeroDivisionError"),
+        ("def f():\n    raise ValueError('no')\n\n\nf()\n", "line 2: ValueError: no"),
+        ("robot.move_joints({'elbow': float('nan')})", "line 1: ValueError"),
+        ("robot.move_joints({'elbow': 10**400})", "line 1: OverflowError"),
+        ("robot.move_joints([1])", "line 1: RobotError: 1 positions for 2 joints"),
+        ("robot.move_joints({})", "line 1: RobotError: not a valid"),
+        ("\nrobot.move_joints({'knee': 1})", "line 2: RobotError: no joint 'knee'"),
+        ("robot.move_to([1, 2])", "line 1: RobotError: position_m needs 3 numbers, not 2"),
+        ("robot.move_to([1, 2, 3], quaternion=[1, 0, 0, 0], rpy_rad=[0, 0, 0])", "line 1: RobotError: give a"),
+        ("\n\nrobot.fly()", "line 3: AttributeError: there is no robot.fly; there are behaviour, drive"),
+        ("if True print", "line 1: SyntaxError"),
+        ("raise SystemExit(3)", "line 1: SystemExit: 3"),
+        ("import asyncio", "line 1: ModuleNotFoundError: a script cannot import 'asyncio'; it can import abc"),
+        ("x = bytearray(2**30)", "line 1: MemoryError"),
+        ("import os\nos._exit(1)", "ended before the script did"),
+        ("import os\nos._exit(7)", "ended before the script did: it ended with 7"),
+        ("import ctypes\nctypes.string_at(0)", "ended before the script did: it crashed"),
+        ("import ctypes\nctypes.CDLL(None).ptrace(0, 0, 0, 0)", "did: it tried something that no script may"),
+    ],
+)
+def test_a_script_that_fails_says_where(source: str, says: str) -> None:
+    with pytest.raises(ScriptFailed) as failed:
+        run(source)
+    assert says in str(failed.value)
+
+
+def test_a_script_may_catch_what_the_robot_refuses() -> None:
+    _, told = run("try:\n    robot.move_joints({'knee': 1})\nexcept RobotError as e:\n    print(e)\n")
+    assert told.printed == "no joint 'knee'\n"
+
+
+@pytest.mark.parametrize(
+    "source",
+    [
+        "import numpy as np; print(round(float(np.linalg.det(np.linalg.inv(np.diag([2.0, 4.0])))), 6))",
+        "import datetime as d; print(d.datetime.strptime('2026', '%Y').year)",
+        "import statistics, itertools, dataclasses, re, heapq, decimal; print(decimal.Decimal('0.1'))",
+        "import random, secrets, uuid, hashlib; print(len(uuid.uuid4().hex))",
+        "import time; print(time.localtime().tm_year > 2000, 'é'.encode('cp1252'))",
+    ],
+)
+def test_what_a_script_usually_imports_works(source: str) -> None:
+    _, told = run(source)
+    assert told.printed
+
+
+def test_two_scripts_draw_different_random_numbers() -> None:
+    source = "import random, numpy\nprint(random.random(), numpy.random.rand())"
+    first, second = run(source)[1].printed, run(source)[1].printed
+    assert len({*first.split(), *second.split()}) == 4
+
+
+@contextlib.contextmanager
+def running(script: Script) -> Iterator[list[ScriptFailed]]:
+    failures: list[ScriptFailed] = []
+
+    def body() -> None:
+        try:
+            script.run()
+        except ScriptFailed as failed:
+            failures.append(failed)
+
+    thread = threading.Thread(target=body)
+    thread.start()
+    yield failures
+    thread.join(10)
+    assert not thread.is_alive()
+
+
+def test_a_script_is_killed_at_once() -> None:
+    told = Told()
+    source = "import signal\nsignal.signal(signal.SIGTERM, signal.SIG_IGN)\nprint('here')\nwhile True: pass"
+    script = Script(order(source), Notes(), told, cell=Cell(warm_jail(), stranger=False), died=nothing)
+    with running(script) as failures:
+        while not told.printed:
+            time.sleep(0.01)
+        script.kill()
+        script.kill()
+    assert [str(failure) for failure in failures] == ["the script's process ended before the script did"]
+
+
+def test_a_script_that_dies_in_the_middle_of_a_call_lets_go_of_the_robot_at_once() -> None:
+    let_go = threading.Event()
+
+    class Busy(Notes):
+        def do(self, call: script_calls.Call) -> Any:
+            del call
+            inmate = script._inmate
+            assert inmate is not None
+            inmate.kill()
+            assert let_go.wait(10), "the call went on for as long as it liked"
+            raise Refused("ended", "the action ended")
+
+    script = Script(order("robot.home()"), Busy(), Told(), cell=Cell(warm_jail(), stranger=False), died=let_go.set)
+    with pytest.raises(ScriptFailed, match="ended before the script did"):
+        script.run()
+
+
+def test_a_process_that_cannot_be_killed_does_not_hold_up_the_action() -> None:
+    inmate = FakeInmate(dies=False)
+    inmate.say(b'{"kind":"ready"}', b'{"kind":"ended"}')
+    died = threading.Event()
+    Script(order(""), Notes(), Told(), cell=Cell(FakeJail(inmate), stranger=False), died=died.set).run()
+    assert not died.is_set()
+
+
+def test_a_script_killed_before_it_began_does_not_run() -> None:
+    notes = Notes()
+    script = Script(order("robot.home()"), notes, Told(), cell=Cell(warm_jail(), stranger=False), died=nothing)
+    script.kill()
+    with pytest.raises(ScriptFailed):
+        script.run()
+    assert notes.calls == []
+
+
+def test_without_a_process_it_says_why() -> None:
+    script = Script(order(""), Notes(), Told(), cell=Cell(FakeJail(None), stranger=False), died=nothing)
+    with pytest.raises(ScriptFailed, match="no process can be started"):
+        script.run()
+
+
+def test_a_jail_that_does_not_hold_gets_no_script() -> None:
+    inmate = FakeInmate()
+    inmate.say(b'{"kind": "unfit", "why": "landlock: no"}')
+    with pytest.raises(ScriptFailed, match="the jail does not hold: landlock: no"):
+        run_fake(inmate)
+
+
+@pytest.mark.parametrize("first", [b'{"kind": "nonsense"}', b"", b"\xff\xfe"])
+def test_a_process_that_does_not_begin_as_it_should_gets_no_script(first: bytes) -> None:
+    inmate = FakeInmate()
+    inmate.say(first)
+    with pytest.raises(ScriptFailed, match="ended before the script did: it crashed"):
+        run_fake(inmate)
+
+
+def test_a_process_that_says_nothing_is_given_up(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(script_action, "_READY_S", 0.05)
+    with pytest.raises(ScriptFailed, match="it stopped making sense"):
+        run_fake(FakeInmate(dies=False))
+
+
+def test_a_line_without_end_is_the_end() -> None:
+    inmate = FakeInmate()
+    inmate.say(b'{"kind": "ready"}')
+    flood = threading.Thread(target=_flood, args=(inmate.theirs,))
+    flood.start()
+    with pytest.raises(ScriptFailed, match="ended before"):
+        run_fake(inmate)
+    flood.join(10)
+
+
+def _flood(link: socket.socket) -> None:
+    with contextlib.suppress(OSError):
+        link.sendall(b" " * (4 * script_calls.MAX_LINE))
+
+
+def test_a_line_that_is_too_long_is_the_end() -> None:
+    with socket.socket() as unread:
+        lines = script_action._Lines(unread, threading.Event())
+        lines._rest = b" " * script_calls.MAX_LINE + b"\n"
+        with pytest.raises(EOFError):
+            lines.read()
+
+
+def test_what_is_said_twice_or_is_no_message_is_answered_with_an_error() -> None:
+    inmate = FakeInmate()
+    inmate.say(
+        b'{"kind": "ready"}',
+        b'{"kind": "ready"}',
+        b'{"kind": "progress", "share": 7}',
+        b'{"kind": "output", "text": "x"}',
+        b'{"kind": "ended", "error": ""}',
+    )
+    answers = inmate.theirs.dup()
+    told = run_fake(inmate)
+    assert (told.printed, told.progress) == ("x", [])
+    got = [json.loads(line) for line in answers.makefile("rb").read().splitlines()]
+    assert got[0]["name"] == "wave"
+    assert got[1] == {"error": "this is said once"}
+    assert "share" in got[2]["error"]
+    answers.close()
+
+
+def test_a_script_that_floods_is_read_slowly(monkeypatch: pytest.MonkeyPatch) -> None:
+    ours, theirs = socket.socketpair()
+    with ours, theirs:
+        killed = threading.Event()
+        waited: list[float] = []
+        monkeypatch.setattr(killed, "wait", waited.append)
+        lines = script_action._Lines(ours, killed)
+        theirs.sendall(b"{}\n" * 700)
+        for _ in range(700):
+            assert lines.read() == b"{}"
+    assert len(waited) > 100
+    assert 0 < max(waited) < 10

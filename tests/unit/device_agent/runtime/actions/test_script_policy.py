@@ -1,0 +1,123 @@
+"""Which scripts a device runs at all."""
+
+from collections.abc import Iterator
+from pathlib import Path
+
+import msgspec
+import pytest
+
+from device_agent.protocol import SHIPPED, RunMovement
+from device_agent.protocol.security import signing
+from device_agent.runtime.actions.script_policy import Trust
+from device_agent.runtime.authority.lease_gate import Refused
+from device_agent.runtime.storage.journal import Journal
+from tests.harness.agent.device_harness import signed_movement
+
+OWNER, OTHER = "accountaaaaaaaaa", "accountbbbbbbbbb"
+KEY = signing.generate()
+
+
+@pytest.fixture
+def journal(tmp_path: Path) -> Iterator[Journal]:
+    journal = Journal(tmp_path / "journal.db")
+    journal.open(now_ms=0)
+    yield journal
+    journal.close()
+
+
+def trust_of(journal: Journal, *, device: str = "arm", owner: str = OWNER) -> Trust:
+    keys = {signing.key_id(KEY.public_key()): KEY.public_key()}
+    return Trust(device=device, robot_type="toy", owner=owner, keys=keys, journal=journal)
+
+
+def movement(version: int = 1, author: str = OWNER) -> RunMovement:
+    return signed_movement("print(1)", KEY, version=version, author=author)
+
+
+def refusal(trust: Trust, order: RunMovement) -> str:
+    with pytest.raises(Refused) as refused:
+        trust.check(order)
+    return refused.value.code
+
+
+def test_a_script_that_the_cloud_signed_is_run(journal: Journal) -> None:
+    trust_of(journal).check(movement())
+
+
+@pytest.mark.parametrize(
+    ("changes", "code"),
+    [
+        ({"source": "print(2)"}, "wrong_hash"),
+        ({"sha256": "0" * 64}, "wrong_hash"),
+        ({"robot_type": "nao"}, "wrong_type"),
+        ({"name": "wave"}, "bad_signature"),
+        ({"version": 2}, "bad_signature"),
+        ({"signature": ""}, "bad_signature"),
+        ({"signature": "x" * 86}, "bad_signature"),
+        ({"key": ""}, "bad_signature"),
+        ({"key": "another"}, "bad_signature"),
+    ],
+)
+def test_a_script_of_which_anything_was_changed_is_not_run(journal: Journal, changes: object, code: str) -> None:
+    changed = msgspec.structs.replace(movement(), **changes)  # type: ignore[arg-type]
+    assert refusal(trust_of(journal), changed) == code
+
+
+def test_every_character_of_the_signature_counts(journal: Journal) -> None:
+    good = movement()
+    trust = trust_of(journal)
+    for place in (*range(0, len(good.signature), 5), len(good.signature) - 1):
+        other = "A" if good.signature[place] != "A" else "B"
+        flipped = good.signature[:place] + other + good.signature[place + 1 :]
+        assert refusal(trust, msgspec.structs.replace(good, signature=flipped)) == "bad_signature"
+
+
+def test_a_signature_made_for_a_command_is_none_for_a_movement(journal: Journal) -> None:
+    good = movement()
+    text = signing.movement_text(good.robot_type, good.name, good.version, good.sha256)
+    stolen = signing.sign_text(text, KEY, context=signing.COMMAND_CONTEXT)
+    assert refusal(trust_of(journal), msgspec.structs.replace(good, signature=stolen)) == "bad_signature"
+
+
+def test_an_older_version_than_one_that_ran_is_refused_also_after_a_restart(journal: Journal, tmp_path: Path) -> None:
+    trust = trust_of(journal)
+    trust.check(movement(3))
+    trust.remember(movement(3))
+    trust.remember(movement(2))
+    journal.close()
+    journal.open(now_ms=0)
+    again = trust_of(journal)
+    assert refusal(again, movement(2)) == "rolled_back"
+    again.check(movement(3))
+    again.check(movement(4))
+    assert (tmp_path / "journal.db").exists()
+
+
+def test_what_only_asked_to_run_locks_nothing_out(journal: Journal) -> None:
+    trust = trust_of(journal)
+    trust.check(movement(9))
+    trust.check(movement(3))
+
+
+@pytest.mark.parametrize(
+    ("device", "author"), [("other", OWNER), ("arm", SHIPPED), ("arm", OTHER)], ids=["device", "shipped", "account"]
+)
+def test_each_device_and_author_counts_by_itself(journal: Journal, device: str, author: str) -> None:
+    trust_of(journal).remember(movement(9))
+    trust_of(journal, device=device).check(movement(1, author))
+
+
+@pytest.mark.parametrize(
+    ("author", "owner", "stranger"),
+    [
+        (SHIPPED, OWNER, False),
+        (OWNER, OWNER, False),
+        (OTHER, OWNER, True),
+        ("", OWNER, True),
+        ("", "", True),
+        (OTHER, "", True),
+        (SHIPPED, "", False),
+    ],
+)
+def test_who_is_a_stranger(journal: Journal, author: str, owner: str, stranger: bool) -> None:
+    assert trust_of(journal, owner=owner).stranger(movement(author=author)) is stranger

@@ -1,0 +1,370 @@
+"""What a robot shows: by its manifest through the controller, with words that everybody can read and hear."""
+
+import threading
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import pytest
+
+from device_agent.ports import skills
+from device_agent.ports.driver import Observation
+from device_agent.ports.skills import Skill, SkillError, Stage
+from device_agent.ports.speech import SpeechError, Spoken
+from device_agent.ports.uploads import UploadError
+from device_agent.protocol import (
+    AckStatus,
+    Event,
+    GrantLease,
+    MoveJoints,
+    RunBehaviour,
+    Say,
+    SetStiffness,
+    State,
+    Stop,
+    topics,
+)
+from device_agent.protocol.manifests.capabilities import Keyframe
+from device_agent.protocol.manifests.robot_type import RobotType
+from device_agent.runtime.actions.device_context import Body
+from device_agent.runtime.actions.skill_runner import Performer
+from device_agent.runtime.actions.speech_output import Speaker
+from device_agent.runtime.authority.lease_gate import Refused
+from device_agent.runtime.control.joint_stiffness import Slack
+from tests.fakes.drivers import ToyDriver, robot_type
+from tests.harness.agent.device_harness import Bench, eventually
+
+WAIT_S = 0.3
+
+
+class Servos(ToyDriver):
+    """Holds as firmly as it is told; what is limp hangs where somebody puts it."""
+
+    performs = ("stiffness",)
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.stiffness = 1.0
+        self.fails = False
+        self.jumped = 0.0
+        self.elbows: list[float] = []
+
+    def send(self, position_rad: Any) -> tuple[float, ...]:
+        self.elbows.append(position_rad[1])
+        if self.stiffness > 0:
+            self.jumped = max(self.jumped, abs(position_rad[1] - self.position[1]))
+            self.position = tuple(position_rad)
+        return tuple(position_rad)
+
+    def observe(self) -> Observation:
+        return Observation(self.position, (0.0, 0.0), (0.0, 0.0), ())
+
+    def perform(self, skill: Skill, stage: Stage) -> None:
+        assert isinstance(skill, skills.Stiffen)
+        assert not stage.ended
+        if self.fails:
+            raise SkillError("the servos do not answer")
+        self.stiffness = skill.value
+
+
+class Voice:
+    """A machine's voice that takes 0.2 s for whatever it says."""
+
+    def __init__(self, *, broken: bool = False) -> None:
+        self.broken = broken
+        self.said: list[tuple[str, str]] = []
+
+    def speak(self, text: str, language: str) -> Spoken | None:
+        if self.broken:
+            raise SpeechError("no voice today")
+        self.said.append((text, language))
+        return Spoken(b"RIFF", 0.2)
+
+
+class Store:
+    """Keeps what is uploaded, or fails to, or never ends."""
+
+    def __init__(self, how: str = "") -> None:
+        self.how = how
+        self.kept: list[dict[str, Any]] = []
+        self.ended = threading.Event()
+
+    def store(self, device: str, **file: Any) -> str:
+        if self.how == "fails":
+            raise UploadError("no network")
+        if self.how == "hangs":
+            self.ended.wait(30)
+        self.kept.append({"device": device, **file})
+        return "u1"
+
+
+def actor() -> RobotType:
+    kind = robot_type()
+    return msgspec.structs.replace(
+        kind,
+        capabilities=("speech", "stiffness", "behaviours"),
+        visemes={"aa": {"elbow": 0.2}, "PP": {"elbow": 0.0}},
+        behaviours={
+            "bow": (
+                Keyframe(time_s=0.3, position_rad={"shoulder": 0.1}),
+                Keyframe(time_s=0.6, position_rad={"shoulder": 0.0}, say="Good day"),
+            ),
+            "speech": (
+                Keyframe(time_s=0.0, say="so much to say"),
+                Keyframe(time_s=60.0),
+                Keyframe(time_s=61.0, say="more"),
+            ),
+        },
+    )
+
+
+def make(folder: Path, **more: Any) -> Bench:
+    bench = Bench(folder, driver=more.pop("driver", None) or Servos(), kind=more.pop("kind", None) or actor(), **more)
+    bench.device.start()
+    bench.device.link_changed(True)
+    return bench
+
+
+@pytest.fixture
+def bench(tmp_path: Path) -> Iterator[Bench]:
+    bench = make(tmp_path)
+    yield bench
+    bench.stop()
+
+
+def servos(bench: Bench) -> Servos:
+    assert isinstance(bench.driver, Servos)
+    return bench.driver
+
+
+def said(bench: Bench) -> list[Event]:
+    return [event for event in bench.heard(topics.EVENT, Event) if event.kind == "said"]
+
+
+def ends(bench: Bench, request: Any, epoch: int = 1) -> AckStatus:
+    ack = bench.end(bench.command(request, epoch=epoch))
+    assert ack.status is AckStatus.DONE, ack.reason
+    return ack.status
+
+
+def why(bench: Bench, request: Any, epoch: int = 1) -> str:
+    reason = bench.end(bench.command(request, epoch=epoch)).reason
+    assert reason is not None
+    return reason.message
+
+
+# ---------------------------------------------------------------- speech
+
+
+def test_what_is_said_is_told_as_text_and_the_mouth_moves(bench: Bench) -> None:
+    ends(bench, Say(text="Aha, mama!", language="sk"))
+    (event,) = eventually(lambda: said(bench))
+    assert (event.message, event.data["language"]) == ("Aha, mama!", "sk")
+    assert event.data["duration_s"] == pytest.approx(10 / 14, abs=0.01)
+    assert "upload" not in event.data
+    assert max(servos(bench).elbows) > 0.02
+    assert servos(bench).elbows[-1] == pytest.approx(0.0, abs=1e-4)
+
+
+@pytest.mark.parametrize(("how", "upload"), [("", "u1"), ("fails", None), ("hangs", None)])
+def test_with_a_voice_the_sound_is_stored_and_named_if_that_is_done_in_time(
+    tmp_path: Path, how: str, upload: str | None
+) -> None:
+    voice, store = Voice(), Store(how)
+    bench = make(tmp_path, speech=voice, uploads=store)
+    ends(bench, Say(text="hello"))
+    (event,) = eventually(lambda: said(bench))
+    assert event.data.get("upload") == upload
+    assert event.data["duration_s"] == 0.2
+    assert voice.said == [("hello", "")]
+    if upload:
+        wanted = {"device": "arm", "stream": "speech", "media_type": "audio/wav", "content": b"RIFF"}
+        assert wanted.items() <= store.kept[0].items()
+    store.ended.set()
+    bench.stop()
+
+
+def test_a_voice_that_fails_leaves_the_text(tmp_path: Path) -> None:
+    bench = make(tmp_path, speech=Voice(broken=True), kind=msgspec.structs.replace(actor(), visemes={}))
+    ends(bench, Say(text="hi"))
+    assert [event.message for event in eventually(lambda: said(bench))] == ["hi"]
+    bench.stop()
+
+
+def test_a_voice_without_a_place_for_its_sounds_speaks_all_the_same(tmp_path: Path) -> None:
+    bench = make(tmp_path, speech=Voice())
+    ends(bench, Say(text="hi"))
+    assert [event.message for event in eventually(lambda: said(bench))] == ["hi"]
+    bench.stop()
+
+
+def test_stop_ends_speech_without_a_mouth(tmp_path: Path) -> None:
+    bench = make(tmp_path, kind=msgspec.structs.replace(actor(), visemes={}))
+    running = bench.command(Say(text="a" * 1000), epoch=1)
+    eventually(lambda: said(bench))
+    bench.receive(topics.STOP, msgspec.json.encode(Stop(id="s1", by="bob", reason="enough")))
+    reason = bench.end(running).reason
+    assert reason is not None
+    assert reason.code == "stopped"
+    bench.stop()
+
+
+@pytest.mark.parametrize(("text", "language", "says"), [("  ", "", "nothing to say"), ("a", "-v x", "no language")])
+def test_what_cannot_be_said_is_refused(text: str, language: str, says: str) -> None:
+    with pytest.raises(Refused, match=says):
+        Speaker().prepare(text, language)
+
+
+def test_a_speaker_whom_nobody_hears_begins_all_the_same() -> None:
+    speaker = Speaker()
+    speaker.begin(speaker.prepare("hello", ""))
+
+
+def test_who_stands_around_hears_for_how_long_something_is_said() -> None:
+    heard: list[float] = []
+    speaker = Speaker(heard=heard.append)
+    said = speaker.prepare("hello, how are you today", "")
+    assert heard == []
+    speaker.begin(said)
+    assert heard == [said.duration_s]
+
+
+# ---------------------------------------------------------------- behaviours
+
+
+def test_a_behaviour_moves_and_speaks_in_its_time(bench: Bench) -> None:
+    begun_s = time.monotonic()
+    ends(bench, RunBehaviour(name="bow"))
+    assert time.monotonic() - begun_s >= 0.6
+    assert [event.message for event in eventually(lambda: said(bench))] == ["Good day"]
+    assert bench.driver.position == pytest.approx([0.0, 0.0], abs=1e-3)
+
+
+def test_an_unknown_behaviour_is_refused_with_those_there_are(bench: Bench) -> None:
+    assert "no behaviour 'dance'; there are bow, speech" in why(bench, RunBehaviour(name="dance"))
+
+
+def test_stop_ends_a_behaviour_before_its_next_words(bench: Bench) -> None:
+    running = bench.command(RunBehaviour(name="speech"), epoch=1)
+    eventually(lambda: said(bench))
+    bench.receive(topics.STOP, msgspec.json.encode(Stop(id="s1", by="bob", reason="enough")))
+    reason = bench.end(running).reason
+    assert reason is not None
+    assert reason.code == "stopped"
+    assert [event.message for event in said(bench)] == ["so much to say"]
+
+
+class Speaking(Servos):
+    """A robot that has a voice of its own."""
+
+    performs = ("speech",)
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.heard: list[str] = []
+
+    def perform(self, skill: Skill, stage: Stage) -> None:
+        del stage
+        assert isinstance(skill, skills.Say)
+        self.heard.append(skill.text)
+
+
+def test_a_robot_with_a_voice_of_its_own_says_the_words_of_a_behaviour(tmp_path: Path) -> None:
+    driver = Speaking()
+    bench = make(tmp_path, driver=driver)
+    ends(bench, RunBehaviour(name="bow"))
+    assert eventually(lambda: driver.heard) == ["Good day"]
+    bench.stop()
+
+
+# ---------------------------------------------------------------- stiffness
+
+
+def test_a_limp_joint_is_followed_and_does_not_jump_when_it_holds_again(bench: Bench) -> None:
+    ends(bench, SetStiffness(value=0.0))
+    assert servos(bench).stiffness == 0.0
+    state: State = eventually(lambda: [one for one in bench.heard(topics.STATE, State) if one.stiffness])[-1]
+    assert state.stiffness == {"shoulder": 0.0, "elbow": 0.0}
+    bench.driver.position = (0.0, 1.2)
+    eventually(lambda: abs(bench.telemetry().commanded_rad[1] - 1.2) < 1e-6)
+    assert "elbow: limp" in bench.telemetry().limited
+    assert "elbow: limp; set a stiffness above 0" in why(bench, MoveJoints(position_rad={"elbow": 0.0}))
+    assert "limp" in why(bench, RunBehaviour(name="bow"))
+    ends(bench, SetStiffness(value=0.6, joints=("elbow",)))
+    time.sleep(WAIT_S)
+    assert bench.driver.position[1] == pytest.approx(1.2)
+    assert servos(bench).jumped < 0.01
+    shown = {"shoulder": 0.0, "elbow": 0.6}
+    assert eventually(lambda: bench.heard(topics.STATE, State)[-1].stiffness == shown)
+    ends(bench, SetStiffness(value=1.0))
+    assert eventually(lambda: bench.heard(topics.STATE, State)[-1].stiffness == {})
+    ends(bench, MoveJoints(position_rad={"elbow": 1.0}, speed=1.0))
+
+
+def test_after_an_action_a_setpoint_leaves_the_other_joints_where_they_are(bench: Bench) -> None:
+    bench.end(bench.command(GrantLease(holder="ann", lease_ms=30_000), epoch=1))
+    bench.setpoint(1, 1, elbow=0.2)
+    ends(bench, MoveJoints(position_rad={"shoulder": 0.3}, speed=1.0))
+    for sequence in range(2, 20):
+        bench.setpoint(1, sequence, elbow=0.1)
+        time.sleep(0.02)
+    assert bench.driver.position[0] == pytest.approx(0.3, abs=1e-3)
+
+
+def test_servos_that_do_not_change_are_not_taken_for_limp(bench: Bench) -> None:
+    servos(bench).fails = True
+    assert "the servos do not answer" in why(bench, SetStiffness(value=0.0))
+    assert eventually(lambda: bench.telemetry().limited == ())
+    ends(bench, MoveJoints(position_rad={"elbow": 0.1}, speed=1.0))
+
+
+@pytest.mark.parametrize(
+    ("request_", "says"),
+    [
+        (SetStiffness(value=0.5, joints=("nose",)), "no joint 'nose'; there are shoulder, elbow"),
+        ("robot.stiffness(2)", "stiffness must be 0 and at most 1, not 2.0"),
+    ],
+)
+def test_a_stiffness_that_is_none_is_refused(bench: Bench, request_: Any, says: str) -> None:
+    assert says in why(bench, bench.script(request_) if isinstance(request_, str) else request_)
+
+
+def test_a_limp_joint_beyond_its_range_is_commanded_to_its_end() -> None:
+    slack = Slack(robot_type())
+    slack.set({"elbow": 0.0})
+    assert slack.feel((0.5, 3.3)) == {1: 3.0}
+
+
+# ---------------------------------------------------------------- before it begins
+
+
+class Late:
+    """An action that is over at once."""
+
+    def __init__(self) -> None:
+        self.over = threading.Event()
+        self.tenure: Any = type("Tenure", (), {"why": None})()
+
+
+class Restless:
+    """A controller of something that moves for ever."""
+
+    moving = True
+
+
+def test_what_still_moves_is_waited_for_and_a_lost_action_does_not_wait() -> None:
+    mover: Any = Late()
+    controller: Any = Restless()
+    body = Body(
+        robot_type=actor(),
+        controller=controller,
+        observe=lambda: None,
+        geometry=None,
+        skills=None,
+        room=None,  # type: ignore[arg-type]
+    )
+    threading.Timer(0.1, mover.over.set).start()
+    with pytest.raises(Refused, match="the action ended"):
+        Performer(body, mover).come_to_rest()

@@ -1,0 +1,55 @@
+"""Who asks for control, as the device shows it: until the answer, its time, or the end of the lease."""
+
+import pytest
+
+from device_agent.protocol import AskLease
+from device_agent.runtime.authority.control_request import Handover
+from device_agent.runtime.authority.lease_gate import Lease, Refused
+
+LEASE = Lease("ann", 5, 1_000.0)
+ASKED = AskLease(request="r1", by="bob", answer_within_ms=30_000)
+
+
+def asked(handover: Handover, lease: Lease | None = LEASE, now_s: float = 100.0) -> str | None:
+    found = handover.current(lease, now_s)
+    return None if found is None else found.id
+
+
+def test_a_request_is_shown_until_its_time_is_over() -> None:
+    handover = Handover()
+    assert asked(handover) is None
+    handover.ask(ASKED, epoch=5, lease=LEASE, now_s=100.0)
+    shown = handover.current(LEASE, 129.9)
+    assert shown is not None
+    assert (shown.by, shown.epoch, shown.expires_s) == ("bob", 5, 130.0)
+    assert asked(handover, now_s=130.0) is None
+    assert asked(handover, now_s=100.0) is None, "what has lapsed stays so"
+
+
+@pytest.mark.parametrize("lease", [None, Lease("ann", 6, 1_000.0)])
+def test_it_ends_with_the_lease_that_it_asks_for(lease: Lease | None) -> None:
+    handover = Handover()
+    handover.ask(ASKED, epoch=5, lease=LEASE, now_s=100.0)
+    assert asked(handover, lease) is None
+    assert asked(handover) is None
+
+
+@pytest.mark.parametrize(("epoch", "lease"), [(4, LEASE), (6, LEASE), (5, None)])
+def test_a_lease_that_is_not_in_force_cannot_be_asked_for(epoch: int, lease: Lease | None) -> None:
+    handover = Handover()
+    with pytest.raises(Refused) as refused:
+        handover.ask(ASKED, epoch=epoch, lease=lease, now_s=100.0)
+    assert refused.value.code == "no_lease"
+    assert asked(handover) is None
+
+
+def test_the_end_of_a_request_counts_even_before_the_request_itself_and_for_no_other() -> None:
+    handover = Handover()
+    handover.drop("r1")
+    handover.ask(ASKED, epoch=5, lease=LEASE, now_s=100.0)
+    assert asked(handover) is None
+    handover.ask(AskLease(request="r2", by="cid", answer_within_ms=1_000), epoch=5, lease=LEASE, now_s=100.0)
+    handover.drop("r1")
+    assert asked(handover) == "r2"
+    handover.drop("r2")
+    assert asked(handover) is None

@@ -1,0 +1,157 @@
+"""The room slows or holds a robot, and every doubt does."""
+
+from typing import Any
+
+import msgspec
+import pytest
+
+from device_agent.protocol import Measurements
+from device_agent.protocol.events import EventKind
+from device_agent.runtime.authority.interlocks import Interlock, Interlocks
+from device_agent.runtime.readings import Reading, Room
+
+
+def rule(**fields: Any) -> Interlock:
+    return msgspec.convert({"device": "pir", "stream": "presence", "field": "present"} | fields, Interlock)
+
+
+class TestRule:
+    @pytest.mark.parametrize(
+        ("fields", "acting", "free"),
+        [
+            ({"equals": True}, [True, 1.0], [False, 0.0, 2.0]),
+            ({"equals": 3}, [3.0], [2.9, True]),
+            ({"above": 0.5}, [0.51, True], [0.5, 0.0, False]),
+            ({"below": 1}, [0.99, False], [1.0, True]),
+        ],
+    )
+    def test_it_acts_on_its_condition(self, fields: dict[str, Any], acting: list[float], free: list[float]) -> None:
+        for value in acting:
+            assert rule(**fields).acts(Reading({"present": value}, 0.0)) == rule(**fields).condition
+        for value in free:
+            assert rule(**fields).acts(Reading({"present": value}, 0.0)) is None
+
+    @pytest.mark.parametrize(
+        "reading",
+        [
+            None,
+            Reading({"present": False}, 2.01),
+            Reading({"present": False}, float("nan")),
+            Reading({}, 0.0),
+            Reading({"absent": True}, 0.0),
+            Reading({"present": float("nan")}, 0.0),
+            Reading({"present": float("-inf")}, 0.0),
+        ],
+    )
+    def test_it_acts_when_in_doubt(self, reading: Reading | None) -> None:
+        for condition in ({"equals": True}, {"above": 0.5}, {"below": -0.5}):
+            assert rule(**condition).acts(reading)
+
+    @pytest.mark.parametrize(
+        ("fields", "text"),
+        [
+            ({}, "exactly one of above, below, equals"),
+            ({"above": 1, "equals": True}, "exactly one of above, below, equals"),
+            ({"above": float("nan")}, "finite"),
+            ({"equals": float("inf")}, "finite"),
+            ({"equals": True, "speed": 0}, "speed"),
+            ({"equals": True, "speed": 1}, "speed"),
+            ({"equals": True, "speed": float("nan")}, "speed"),
+            ({"equals": True, "stale_s": float("nan")}, "stale_s"),
+            ({"equals": True, "stale_s": 61}, "stale_s"),
+            ({"equals": True, "action": "shout"}, "action"),
+            ({"equals": True, "colour": "red"}, "colour"),
+            ({"equals": True, "device": "a b"}, "device"),
+        ],
+    )
+    def test_what_says_nothing_or_nonsense_is_refused(self, fields: dict[str, Any], text: str) -> None:
+        with pytest.raises(msgspec.ValidationError, match=text):
+            rule(**fields)
+
+    def test_its_name_says_what_it_watches(self) -> None:
+        assert rule(equals=True).name == "pir/presence present = true"
+        assert rule(above=0.5).name == "pir/presence present > 0.5"
+        assert rule(below=2).name == "pir/presence present < 2"
+
+
+class Bench:
+    """Interlocks, the room they watch, and what they did."""
+
+    def __init__(self, *rules: Interlock) -> None:
+        self.now_s = 10.0
+        self.done: list[tuple[Any, ...]] = []
+        self.told: list[Any] = []
+        self.sequence = 0
+        named = [(each.device, each.stream) for each in rules]
+        self.room = Room(space="lab", agent="own", own=["pir"], named=named, clock_s=lambda: self.now_s)
+        self.interlocks = Interlocks(
+            rules,
+            self.room,
+            restrict=lambda *what: self.done.append(what),
+            lift=lambda name: self.done.append((name,)),
+            note=lambda happened, *_: self.told.append(happened),
+        )
+
+    def measure(self, **values: float | bool) -> None:
+        self.sequence += 1
+        message = Measurements(tick_ms=self.sequence, at_ms=1, sequence=self.sequence, values=values)
+        self.room.note("pir", "presence", message)
+
+    def step(self, wait_s: float = 0.0) -> list[tuple[Any, ...]]:
+        """What one period did, after a while."""
+        self.now_s += wait_s
+        self.done.clear()
+        self.interlocks.step(self.now_s)
+        return list(self.done)
+
+
+NAME = "pir/presence present = true"
+
+
+def test_a_room_that_is_not_known_yet_holds() -> None:
+    bench = Bench(rule(equals=True))
+    assert bench.step() == [(NAME, 0.0, "nothing was heard yet of pir/presence")]
+    assert bench.step(1.0) == [], "once"
+    assert [happened.kind for happened in bench.told] == [EventKind.INTERLOCK_ACTED]
+
+
+def test_presence_slows_absence_frees_and_silence_slows_again() -> None:
+    bench = Bench(rule(equals=True, action="slow", speed=0.25))
+    bench.measure(present=False)
+    assert bench.step() == [(NAME,)]
+    assert bench.told == [], "nothing changed for anybody"
+    bench.measure(present=True)
+    assert bench.step() == [(NAME, 0.25, "present = true")]
+    bench.measure(present=False)
+    assert bench.step() == [(NAME,)]
+    assert bench.step(2.0) == []
+    assert bench.step(0.01) == [(NAME, 0.25, "pir/presence is silent")]
+    bench.measure(present=False)
+    assert bench.step() == [(NAME,)]
+    kinds = [happened.kind for happened in bench.told]
+    assert kinds == [EventKind.INTERLOCK_ACTED, EventKind.INTERLOCK_CLEARED] * 2
+    assert bench.told[0].data == {"interlock": NAME, "action": "slow", "why": "present = true"}
+
+
+def test_each_rule_acts_by_itself() -> None:
+    bench = Bench(rule(field="distance_m", below=2, action="slow"), rule(field="distance_m", below=1))
+    bench.measure(distance_m=1.5)
+    assert bench.step() == [
+        ("pir/presence distance_m < 2", 0.2, "distance_m < 2"),
+        ("pir/presence distance_m < 1",),
+    ]
+    bench.measure(distance_m=0.5)
+    assert bench.step() == [("pir/presence distance_m < 1", 0.0, "distance_m < 1")]
+
+
+def test_what_could_not_be_done_is_done_in_the_next_period() -> None:
+    bench = Bench(rule(equals=True))
+
+    def fail(*_: object) -> None:
+        raise RuntimeError
+
+    restrict, bench.interlocks._restrict = bench.interlocks._restrict, fail
+    with pytest.raises(RuntimeError):
+        bench.step()
+    bench.interlocks._restrict = restrict
+    assert bench.step() != []

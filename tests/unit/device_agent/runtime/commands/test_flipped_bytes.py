@@ -1,0 +1,71 @@
+"""Whatever bit of an order is another, the device obeys it not: of a lease, and of a movement."""
+
+import msgspec
+import pytest
+
+from device_agent.protocol import Command, GrantLease, Request, RunMovement, codec
+from device_agent.protocol.errors import ProtocolError, SignatureError
+from device_agent.protocol.security import signing
+from device_agent.runtime.actions.script_policy import Trust
+from device_agent.runtime.authority.lease_gate import Refused
+from tests.harness.agent.device_harness import signed_movement
+from tests.harness.agent.pinned_keys import pins_of
+
+KEY = signing.generate()
+PINS = pins_of(KEY)
+
+
+def envelope(request: Request) -> bytes:
+    order = Command(
+        id="a-arm-1",
+        space="s",
+        agent="a",
+        device="arm",
+        issued_at_ms=1000,
+        ttl_ms=5000,
+        who="ann",
+        epoch=5,
+        request=request,
+    )
+    return signing.sign(codec.encode(order), KEY)
+
+
+@pytest.mark.parametrize(
+    "request_",
+    [GrantLease(holder="ann", lease_ms=30_000), signed_movement("print(1)\n", KEY)],
+    ids=["lease", "movement"],
+)
+def test_no_bit_of_a_signed_order_may_differ(request_: Request) -> None:
+    good = envelope(request_)
+    codec.decode(signing.verify(good, PINS), Command)
+    for place in range(len(good)):
+        for bit in (0x01, 0x20, 0x80):
+            bad = bytearray(good)
+            bad[place] ^= bit
+            with pytest.raises((SignatureError, ProtocolError)):
+                codec.decode(signing.verify(bytes(bad), PINS), Command)
+
+
+class _NoJournal:
+    def movement(self, *_: object) -> int:
+        return 0
+
+
+def trust() -> Trust:
+    return Trust(device="arm", robot_type="toy", owner="", keys=PINS, journal=_NoJournal())  # type: ignore[arg-type]
+
+
+def test_no_byte_of_a_movement_may_differ_though_the_order_around_it_is_signed_anew() -> None:
+    """Who changes what the cloud has stored has the cloud itself sign the order."""
+    good = signed_movement('"""Wave."""\nrobot.home()\n', KEY)
+    trust().check(good)
+    for field in ("source", "sha256", "name", "robot_type", "signature", "key"):
+        text: str = getattr(good, field)
+        for place in range(len(text)):
+            other = "b" if text[place] != "b" else "c"
+            bad: RunMovement = msgspec.structs.replace(good, **{field: text[:place] + other + text[place + 1 :]})
+            with pytest.raises(Refused):
+                trust().check(bad)
+    for version in (good.version - 1, good.version + 1):
+        with pytest.raises(Refused):
+            trust().check(msgspec.structs.replace(good, version=version))

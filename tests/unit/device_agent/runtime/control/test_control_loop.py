@@ -1,0 +1,320 @@
+"""A setpoint for a device at rest does not wait for the next period, and telemetry tells of it when it is applied."""
+
+import threading
+import time
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from device_agent.ports.driver import Observation
+from device_agent.protocol import (
+    JointTarget,
+    JointTelemetry,
+    Mode,
+    Setpoint,
+    Stop,
+    StopDevice,
+    StopLatch,
+    codec,
+    topics,
+)
+from device_agent.runtime.authority.lease_gate import LeaseGate
+from device_agent.runtime.control.control_loop import ControlLoop
+from device_agent.runtime.control.controller import Controller
+from tests.fakes.drivers import ToyDriver, robot_type
+from tests.harness.agent.device_harness import Bench
+from tests.harness.network.brokers import SILENCE_S, wait_until
+
+LONG_MS = 600_000
+"""No test waits for a period of this length: it is longer than any patience."""
+
+
+class Desk:
+    """A toy arm whose control loop runs, and its operator."""
+
+    def __init__(self, driver: ToyDriver | None = None, *, period_ms: int = LONG_MS) -> None:
+        kind = robot_type(period_ms=period_ms)
+        self.driver = driver or ToyDriver()
+        self.controller = Controller(kind, LeaseGate())
+        self.told: list[JointTelemetry] = []
+        self.loop = ControlLoop(
+            kind, self.driver, self.controller, name="arm", tell=self.told.append, watch=lambda _now_s: None
+        )
+        self._sequence = 0
+
+    def start(self) -> None:
+        self.loop.start()
+        wait_until(lambda: len(self.told) == 1, "the first period")
+        self.controller.grant(epoch=1, holder="ann", lease_s=1000, now_s=time.monotonic())
+
+    def ask(self, elbow_rad: float) -> None:
+        self._sequence += 1
+        target = JointTarget(position_rad={"elbow": elbow_rad})
+        setpoint = Setpoint(epoch=1, sequence=self._sequence, echo_tick_ms=5, sent_ms=0.0, target=target)
+        self.controller.offer(setpoint, now_s=time.monotonic(), tick_ms=10)
+        self.loop.hurry()
+
+
+@pytest.fixture
+def desk() -> Iterator[Desk]:
+    desk = Desk()
+    desk.start()
+    yield desk
+    desk.loop.stop()
+
+
+def test_a_device_at_rest_follows_a_setpoint_at_once(desk: Desk) -> None:
+    desk.ask(0.5)
+    wait_until(lambda: desk.driver.position[1] == pytest.approx(0.5), "the setpoint at the driver")
+    wait_until(lambda: desk.told[-1].setpoint_sequence == 1, "telemetry of it")
+
+
+def test_a_flood_of_setpoints_makes_one_more_period_and_not_one_each(desk: Desk) -> None:
+    desk.ask(0.5)
+    wait_until(lambda: desk.driver.position[1] == pytest.approx(0.5), "the setpoint at the driver")
+    desk.ask(0.7)
+    time.sleep(SILENCE_S)
+    assert desk.driver.position[1] == pytest.approx(0.5)
+
+
+class PromptDriver(ToyDriver):
+    """Its loop's thread is not needed: ``threads`` are those that have commanded it."""
+
+    prompt = True
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.threads: list[str] = []
+
+    def send(self, position_rad: Sequence[float]) -> tuple[float, ...]:
+        self.threads.append(threading.current_thread().name)
+        return super().send(position_rad)
+
+
+def test_a_prompt_driver_is_commanded_by_the_thread_that_brings_the_setpoint() -> None:
+    desk = Desk(PromptDriver())
+    desk.start()
+    try:
+        desk.ask(0.5)
+        assert desk.driver.position[1] == pytest.approx(0.5)
+        assert desk.told[-1].setpoint_sequence == 1
+        desk.ask(0.7)  # the second waits for its period, which here takes ten minutes
+        assert desk.driver.position[1] == pytest.approx(0.5)
+        assert isinstance(desk.driver, PromptDriver)
+        assert desk.driver.threads[1:] == [threading.current_thread().name]
+    finally:
+        desk.loop.stop()
+    desk.loop._early = False
+    desk.ask(0.9)
+    assert len(desk.driver.threads) == 2, "who has stopped commands nothing more"
+
+
+def test_the_period_after_a_setpoints_own_comes_a_whole_period_later() -> None:
+    driver = PromptDriver()
+    desk = Desk(driver, period_ms=300)
+    desk.start()
+    try:
+        before = len(driver.threads)
+        wait_until(lambda: len(driver.threads) > before, "a period")
+        desk.loop._early = False
+        desk.ask(0.5)
+        asked_s, commanded = time.monotonic(), len(driver.threads)
+        wait_until(lambda: len(driver.threads) > commanded, "the next period")
+        assert time.monotonic() - asked_s >= 0.29
+    finally:
+        desk.loop.stop()
+
+
+def test_a_period_that_does_not_end_keeps_nobody_from_stopping() -> None:
+    desk = Desk()
+    desk.start()
+    with desk.loop._turn:
+        desk.loop.stop()
+    assert desk.loop._stopping.is_set()
+
+
+def test_of_two_that_hurry_at_once_one_begins_a_period() -> None:
+    """The other finds out when it has the turn, not before; so does the loop's own thread."""
+    driver = PromptDriver()
+    desk = Desk(driver)
+    desk.start()
+    real = desk.loop._turn
+
+    class Turn:
+        """Whoever takes it finds that somebody else was quicker."""
+
+        def acquire(self, **how: Any) -> bool:
+            taken = real.acquire(**how)
+            desk.loop._early = True
+            return taken
+
+        def release(self) -> None:
+            real.release()
+
+        def __enter__(self) -> None:
+            self.acquire()
+
+        def __exit__(self, *_: object) -> None:
+            self.release()
+
+    try:
+        wait_until(lambda: desk.loop._next_s > time.monotonic() + LONG_MS / 2000, "the first period")
+        desk.loop._turn = Turn()  # type: ignore[assignment]
+        commanded = len(driver.threads)
+        desk.ask(0.5)
+        time.sleep(SILENCE_S)
+        assert len(driver.threads) == commanded
+    finally:
+        desk.loop._turn = real
+        desk.loop.stop()
+
+
+def test_what_goes_wrong_in_a_setpoints_own_period_is_a_fault_until_the_driver_answers() -> None:
+    desk = Desk(PromptDriver(), period_ms=8)
+    desk.start()
+    try:
+        with desk.loop._turn:  # its loop's thread waits meanwhile
+            desk.driver.broken = True
+            desk.controller.step(time.monotonic())
+        wait_until(lambda: desk.controller.fault is not None, "the fault")
+        desk.driver.broken = False
+        wait_until(lambda: desk.controller.fault is None, "the driver's return")
+    finally:
+        desk.loop.stop()
+    desk = Desk(PromptDriver())
+    desk.start()
+    try:
+        desk.driver.refuses = True
+        desk.ask(0.5)
+        wait_until(lambda: desk.controller.fault == "no", "the fault")
+    finally:
+        desk.loop.stop()
+
+
+def plainly(bench: Bench) -> None:
+    bench.receive(topics.STOP, codec.encode(Stop(id="s", by="ann", reason="")))
+
+
+def signed(bench: Bench) -> None:
+    bench.command(StopDevice(reason=""))
+
+
+@pytest.mark.parametrize("stop", [plainly, signed])
+@pytest.mark.parametrize("driver", [ToyDriver, PromptDriver])
+def test_a_stop_of_a_device_at_rest_waits_for_no_period(
+    tmp_path: Path, driver: type[ToyDriver], stop: Callable[[Bench], object]
+) -> None:
+    bench = Bench(tmp_path, driver=driver(), kind=robot_type(period_ms=LONG_MS))
+    bench.device.start()
+    try:
+        loop = bench.device._loop
+        assert isinstance(loop, ControlLoop)
+        wait_until(lambda: loop._next_s > time.monotonic() + LONG_MS / 2000, "the first period")
+        stop(bench)
+        wait_until(lambda: bench.device._controller.mode is Mode.STOPPED, "the period that obeys")
+    finally:
+        bench.stop()
+
+
+def test_in_motion_periods_keep_their_length() -> None:
+    desk = Desk(PromptDriver(), period_ms=8)
+    desk.controller.start_at((0.0, 0.0))
+    now_s = time.monotonic()
+    desk.controller.grant(epoch=1, holder="ann", lease_s=1000, now_s=now_s)
+    desk.ask(0.5)
+    assert desk.loop._wait()
+    desk.controller.step(now_s)
+    assert desk.controller.moving
+    desk.ask(0.6)
+    assert not desk.loop._wait()
+    assert desk.driver.position[1] == 0.0, "no period has been run"
+
+
+def moving(period_ms: int, periods: int = 20) -> Desk:
+    """A desk whose arm moves and whose loop's thread is held back, as between two periods."""
+    desk = Desk(PromptDriver(), period_ms=period_ms)
+    desk.controller.start_at((0.0, 0.0))
+    desk.loop._thread = threading.current_thread()
+    now_s = time.monotonic()
+    desk.controller.grant(epoch=1, holder="ann", lease_s=1000, now_s=now_s)
+    desk.loop._early = True
+    desk.ask(2.5)
+    for _ in range(periods):
+        desk.loop._period(early=False)
+    assert desk.controller.mode is Mode.STREAMING
+    assert desk.controller.moving
+    return desk
+
+
+def test_a_stop_in_motion_brakes_at_once_and_by_no_more_than_has_passed() -> None:
+    desk = moving(period_ms=4)
+    assert isinstance(desk.driver, PromptDriver)
+    before_rad, speed_rad_s = desk.driver.position[1], desk.controller._motion.velocity_rad_s[1]
+    commanded = len(desk.driver.threads)
+    desk.loop._next_s = time.monotonic() + 0.004 - 0.001  # a quarter of the period has passed, or more
+    desk.controller.stop(StopLatch(by="bob", reason="", at_ms=1))
+    desk.loop.hurry()
+    assert desk.controller.mode is Mode.STOPPED
+    assert len(desk.driver.threads) == commanded + 1
+    assert 0 < desk.driver.position[1] - before_rad <= speed_rad_s * 0.004 + 1e-9
+    assert desk.controller.moving, "it brakes, it does not jump"
+    assert desk.loop._next_s > time.monotonic() - 1
+    desk.loop.hurry()
+    assert len(desk.driver.threads) == commanded + 1, "only once: then periods keep their length again"
+
+
+def test_a_stop_waits_for_no_period_after_a_setpoints_own_either() -> None:
+    desk = moving(period_ms=4)
+    desk.loop._early = True
+    desk.controller.stop(StopLatch(by="bob", reason="", at_ms=1))
+    desk.loop.hurry()
+    assert desk.controller.mode is Mode.STOPPED
+
+
+def test_what_has_passed_is_never_more_than_a_period_and_never_nothing() -> None:
+    desk = moving(period_ms=4)
+    desk.loop._next_s = 10.0
+    assert [desk.loop._passed_s(now_s) for now_s in (9.0, 9.996, 9.998, 10.0, 11.0)] == pytest.approx(
+        [0.0001, 0.0001, 0.002, 0.004, 0.004]
+    )
+
+
+def test_a_stop_waits_for_the_end_of_a_period_that_may_not_know_of_it() -> None:
+    desk = moving(period_ms=100, periods=3)
+    desk.controller.stop(StopLatch(by="bob", reason="", at_ms=1))
+    desk.loop._turn.acquire()
+    threading.Timer(0.05, desk.loop._turn.release).start()
+    desk.loop.hurry()
+    assert desk.controller.mode is Mode.STOPPED
+
+
+def test_telemetry_tells_of_a_new_setpoint_but_not_more_often_than_in_motion() -> None:
+    desk = Desk()
+    desk.controller.start_at((0.0, 0.0))
+    seen, tick = Observation((0.0, 0.0), (0.0, 0.0), (0.0, 0.0), ()), desk.controller.step(0.0)
+
+    def told(now_s: float, sequence: int) -> bool:
+        before = len(desk.told)
+        desk.loop._measure(now_s, seen, replace(tick, setpoint_sequence=sequence), (0.0, 0.0))
+        return len(desk.told) > before
+
+    asked = ((0.0, 0), (0.03, 0), (0.03, 1), (0.04, 2), (0.045, 3), (0.0501, 3))
+    assert [told(now_s, sequence) for now_s, sequence in asked] == [True, False, True, True, False, True]
+
+
+def test_while_setpoints_come_telemetry_goes_with_them_and_else_33_times_a_second() -> None:
+    desk = Desk()
+    desk.controller.start_at((0.0, 0.0))
+    seen = Observation((0.0, 0.0), (0.0, 0.0), (0.0, 0.0), ())
+    tick = replace(desk.controller.step(0.0), mode=Mode.STREAMING)
+    for period in range(1001):
+        now_s = period / 1000
+        desk.loop._measure(now_s, seen, replace(tick, setpoint_sequence=period // 25), (0.0, 0.0))
+    assert [each.setpoint_sequence for each in desk.told] == list(range(41))
+    desk.told.clear()
+    for period in range(1001, 2002):
+        desk.loop._measure(period / 1000, seen, replace(tick, setpoint_sequence=40), (0.0, 0.0))
+    assert 32 <= len(desk.told) <= 34

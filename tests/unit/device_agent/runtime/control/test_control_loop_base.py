@@ -1,0 +1,87 @@
+"""The control loop of a robot that drives: its driver is told how at every period, or the device does not start."""
+
+import threading
+
+import pytest
+
+from device_agent.ports.driver import REST, DriverError, Twist
+from device_agent.protocol import JointTelemetry
+from device_agent.runtime.authority.lease_gate import LeaseGate
+from device_agent.runtime.control.control_loop import ControlLoop
+from device_agent.runtime.control.controller import Controller
+from device_agent.runtime.control.goals import Outcome
+from tests.fakes.drivers import BASE, ToyDriver, robot_type
+from tests.harness.agent.controller_fixture import lost
+
+WITHIN_S = 60.0
+
+
+class Cart(ToyDriver):
+    """A toy that drives."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.twists: list[Twist] = []
+        self.drove = threading.Event()
+
+    def drive(self, twist: Twist) -> Twist:
+        self.twists.append(twist)
+        if twist.forward_m_s > 0:
+            self.drove.set()
+        return twist
+
+
+class Sitting(Cart):
+    """A toy that could drive, but sits."""
+
+    def drive(self, twist: Twist) -> Twist:
+        super().drive(twist)
+        return REST
+
+
+def ignore(_telemetry: JointTelemetry) -> None:
+    pass
+
+
+def unwatched(_now_s: float) -> None:
+    pass
+
+
+def test_the_driver_is_told_the_twist_until_the_drive_has_ended() -> None:
+    kind, cart = robot_type(BASE), Cart()
+    controller = Controller(kind, LeaseGate())
+    loop = ControlLoop(kind, cart, controller, name="cart", tell=ignore, watch=unwatched)
+    loop.start()
+    try:
+        tenure = controller.begin_action(epoch=1, on_lost=lost)
+        drive = controller.drive(tenure, Twist(0.2), duration_s=0.3)
+        assert cart.drove.wait(WITHIN_S)
+        assert drive.finished.wait(WITHIN_S)
+        assert drive.outcome is Outcome.REACHED
+    finally:
+        loop.stop()
+    assert 0 < max(twist.forward_m_s for twist in cart.twists) <= 0.2 + 1e-9
+    assert cart.twists[-1] == pytest.approx(Twist(), abs=1e-6)
+
+
+@pytest.mark.parametrize(("cart", "limited"), [(Cart(), ()), (Sitting(), ("base: driver",))])
+def test_a_drive_that_the_driver_does_not_follow_says_so(cart: Cart, limited: tuple[str, ...]) -> None:
+    kind = robot_type(BASE)
+    controller = Controller(kind, LeaseGate())
+    loop = ControlLoop(kind, cart, controller, name="cart", tell=ignore, watch=unwatched)
+    loop.start()
+    try:
+        tenure = controller.begin_action(epoch=1, on_lost=lost)
+        drive = controller.drive(tenure, Twist(0.2), duration_s=0.5)
+        assert drive.finished.wait(WITHIN_S)
+        assert drive.limited == limited
+    finally:
+        loop.stop()
+
+
+def test_a_driver_that_cannot_drive_does_not_start_with_a_type_that_has_a_base() -> None:
+    kind = robot_type(BASE)
+    loop = ControlLoop(kind, ToyDriver(), Controller(kind, LeaseGate()), name="cart", tell=ignore, watch=unwatched)
+    with pytest.raises(DriverError, match="'cart' has a base, but its driver cannot drive"):
+        loop.start()
+    loop.stop()

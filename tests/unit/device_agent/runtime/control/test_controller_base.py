@@ -1,0 +1,169 @@
+"""Driving: for a time, inside limits, braked by whatever brakes the joints."""
+
+import math
+from itertools import pairwise
+
+import pytest
+
+from device_agent.ports.driver import REST, Twist
+from device_agent.protocol import StopLatch
+from device_agent.runtime.authority.lease_gate import Refused
+from device_agent.runtime.control.base_motion import BaseMotion
+from device_agent.runtime.control.goals import Drive, Outcome
+from device_agent.runtime.control.joint_motion import MotionError
+from tests.fakes.drivers import BASE, PERIOD_S
+from tests.harness.agent.controller_fixture import Rig, interruptions, lost
+
+
+def twists(rig: Rig, seconds: float) -> list[Twist]:
+    found = []
+    for _ in range(round(seconds / PERIOD_S)):
+        rig.now_s += PERIOD_S
+        found.append(rig.controller.step(rig.now_s).twist)
+    return found
+
+
+def driving(rig: Rig, duration_s: float = 2.0) -> Drive:
+    tenure = rig.controller.begin_action(epoch=1, on_lost=lost)
+    return rig.controller.drive(tenure, Twist(0.4, 0.0, -0.5), duration_s=duration_s)
+
+
+def test_a_drive_speeds_up_keeps_its_twist_and_ends_by_itself() -> None:
+    rig = Rig(base=BASE)
+    drive = driving(rig)
+    found = twists(rig, 2.0)
+    assert not drive.finished.is_set()
+    assert found[-1] == pytest.approx(Twist(0.4, 0.0, -0.5))
+    gains = [(b.forward_m_s - a.forward_m_s) / PERIOD_S for a, b in pairwise(found)]
+    assert max(gains) <= BASE.max_linear_acceleration_m_s2 + 1e-6
+    assert twists(rig, 0.3)[-1] == pytest.approx(REST, abs=1e-6)
+    assert drive.outcome is Outcome.REACHED
+    assert rig.elbow == 0.0
+
+
+@pytest.mark.parametrize("cause", interruptions())
+def test_whatever_takes_the_device_away_brakes_the_base(cause: str) -> None:
+    rig = Rig(base=BASE)
+    rig.take(1, lease_s=5.0)
+    drive = driving(rig, duration_s=50.0)
+    twists(rig, 1.0)
+    assert rig.controller.moving
+    interruptions()[cause](rig)  # type: ignore[operator]
+    assert twists(rig, 0.3)[-1] == pytest.approx(REST, abs=1e-6)
+    assert drive.outcome is Outcome.INTERRUPTED
+    assert not rig.controller.moving
+
+
+def test_a_base_that_is_told_to_go_on_while_it_brakes_does_not_run_backwards() -> None:
+    motion = BaseMotion(BASE, PERIOD_S)
+    motion.follow(Twist(-0.2))
+    for _ in range(100):
+        motion.update()
+    motion.brake()
+    for _ in range(2):
+        motion.update()
+    for _ in range(200):
+        motion.follow(Twist(-0.2))
+        assert motion.update().forward_m_s <= 1e-6
+    assert motion.twist == pytest.approx(Twist(-0.2))
+
+
+def test_a_drive_is_slowed_by_the_room() -> None:
+    rig = Rig(base=BASE)
+    drive = driving(rig)
+    twists(rig, 1.0)
+    rig.controller.restrict("zone", 0.5, "somebody is near")
+    assert twists(rig, 0.8)[-1] == pytest.approx(Twist(0.2, 0.0, -0.25))
+    assert drive.limited == ("interlock: somebody is near",)
+
+
+def test_a_drive_takes_the_place_of_a_move_and_the_other_way_round() -> None:
+    rig = Rig(base=BASE)
+    tenure = rig.controller.begin_action(epoch=1, on_lost=lost)
+    move = rig.controller.move(tenure, {"elbow": 2.0}, speed=1.0)
+    rig.run(0.3)
+    drive = rig.controller.drive(tenure, Twist(0.4), duration_s=5.0)
+    rig.run(0.5)
+    assert (move.outcome, move.why and move.why.code) == (Outcome.INTERRUPTED, "replaced")
+    rig.controller.move(tenure, {"elbow": 0.0}, speed=1.0)
+    rig.run(2.0)
+    assert drive.outcome is Outcome.INTERRUPTED
+    assert not rig.controller.moving
+
+
+def refusals() -> dict[str, tuple[Twist, float]]:
+    return {
+        "out_of_range": (Twist(0.6), 1.0),
+        "out_of_range sideways": (Twist(0.0, 0.1), 1.0),
+        "out_of_range nan": (Twist(math.nan), 1.0),
+        "bad_duration": (Twist(0.1), 0.0),
+        "bad_duration long": (Twist(0.1), 61.0),
+        "bad_duration nan": (Twist(0.1), math.nan),
+    }
+
+
+@pytest.mark.parametrize("case", refusals())
+def test_what_cannot_be_driven_is_refused(case: str) -> None:
+    rig = Rig(base=BASE)
+    tenure = rig.controller.begin_action(epoch=1, on_lost=lost)
+    twist, duration_s = refusals()[case]
+    with pytest.raises(Refused) as refused:
+        rig.controller.drive(tenure, twist, duration_s=duration_s)
+    assert refused.value.code == case.split(maxsplit=1)[0]
+    assert twists(rig, 0.1)[-1] == REST
+
+
+def test_a_robot_without_a_base_does_not_drive() -> None:
+    rig = Rig()
+    tenure = rig.controller.begin_action(epoch=1, on_lost=lost)
+    with pytest.raises(Refused) as refused:
+        rig.controller.drive(tenure, Twist(0.1), duration_s=1.0)
+    assert refused.value.code == "no_base"
+
+
+def test_a_driver_that_comes_back_finds_the_base_at_rest() -> None:
+    rig = Rig(base=BASE)
+    driving(rig)
+    twists(rig, 0.5)
+    rig.controller.fail("no answer")
+    rig.controller.recover([0.0, 0.0])
+    assert twists(rig, 0.1)[0] == REST
+
+
+def test_a_stop_while_nothing_moves_leaves_the_base_at_rest() -> None:
+    rig = Rig(base=BASE)
+    rig.controller.stop(StopLatch(by="bob", reason="", at_ms=1))
+    assert twists(rig, 0.1)[-1] == REST
+
+
+def test_a_base_without_a_way_to_go_on_says_so() -> None:
+    motion = BaseMotion(BASE, PERIOD_S)
+    motion.follow(Twist(math.nan))
+    with pytest.raises(MotionError):
+        motion.update()
+
+
+def test_an_action_may_end_while_it_drives() -> None:
+    rig = Rig(base=BASE)
+    tenure = rig.controller.begin_action(epoch=1, on_lost=lost)
+    drive = rig.controller.drive(tenure, Twist(0.4), duration_s=5.0)
+    twists(rig, 0.5)
+    rig.controller.end_action(tenure)
+    rig.controller.end_action(tenure)
+    assert twists(rig, 0.3)[-1] == pytest.approx(REST, abs=1e-6)
+    assert drive.outcome is Outcome.INTERRUPTED
+
+
+def test_two_parts_of_a_period_brake_a_base_as_much_as_a_whole_one() -> None:
+    ends = []
+    for parts in ((None,), (PERIOD_S / 4, 3 * PERIOD_S / 4)):
+        motion = BaseMotion(BASE, PERIOD_S)
+        for _ in range(100):
+            motion.follow(Twist(0.3, 0.0, 0.0))
+            motion.update()
+        motion.brake()
+        for part in parts:
+            motion.update(part)
+        ends.append(tuple(motion.twist))
+    assert ends[0] == pytest.approx(ends[1])
+    assert 0 < ends[0][0] < 0.3

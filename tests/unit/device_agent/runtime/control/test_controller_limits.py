@@ -1,0 +1,264 @@
+"""Limits for every source: nothing comes nearer than it may, and whoever is too near can still leave."""
+
+import math
+from collections.abc import Sequence
+
+import msgspec
+import pytest
+from ruckig import InputParameter, Result, Ruckig, RuckigError, Trajectory
+
+from device_agent.ports.geometry import Sweep
+from device_agent.protocol import Mode
+from device_agent.protocol.manifests.robot_type import Workspace
+from device_agent.runtime.authority.lease_gate import Refused
+from device_agent.runtime.control.goals import Outcome
+from device_agent.runtime.control.joint_motion import Motion, MotionError, plan
+from device_agent.runtime.control.latency_limiter import Pace
+from device_agent.runtime.control.limits import Envelope
+from tests.fakes.drivers import PERIOD_S, robot_type
+from tests.harness.agent.controller_fixture import WALL_RAD, Rig, Wall, lost
+
+
+def test_a_streamed_arm_stops_before_the_wall_and_says_so() -> None:
+    rig = Rig(geometry=Wall())
+    rig.take(1)
+    assert rig.stream(1, 4.0) is Mode.STREAMING
+    assert WALL_RAD - 0.02 < rig.elbow <= WALL_RAD + 1e-6
+    assert not rig.controller.moving
+    assert "clearance: hand \u2013 wall" in rig.limited
+    rig.stream(1, 1.0, elbow=0.2)
+    assert rig.elbow == pytest.approx(0.2, abs=1e-3)
+    assert rig.controller.step(rig.now_s + PERIOD_S).limited == ()
+
+
+def test_an_operator_who_pushes_against_the_wall_moves_nothing() -> None:
+    rig = Rig(geometry=Wall())
+    rig.take(1)
+    rig.stream(1, 4.0)
+    rest = rig.elbow
+    for push in range(50):
+        rig.stream(1, 0.05, elbow=1.5 + push * 0.01)
+    assert rig.elbow - rest < 0.01
+    assert rig.elbow <= WALL_RAD + 1e-6
+
+
+def test_a_wall_that_is_met_at_full_speed_is_not_touched() -> None:
+    rig = Rig(geometry=Wall(2.0))
+    tenure = rig.controller.begin_action(epoch=1, on_lost=lost)
+    wall = Wall(2.0)
+    rig.controller._envelope._geometry = None  # the target is not looked at: only the way is
+    move = rig.controller.move(tenure, {"elbow": 2.9}, speed=1.0)
+    rig.controller._envelope._geometry = wall
+    rig.run(3.0)
+    assert 1.9 < rig.elbow <= 2.0
+    assert move.outcome is Outcome.INTERRUPTED
+    assert move.why is not None
+    assert (move.why.code, "hand \u2013 wall" in move.why.message) == ("no_room", True)
+    assert move.limited == ("clearance: hand \u2013 wall",)
+    assert rig.controller.mode is Mode.ACTION
+    rig.controller.move(tenure, {"elbow": 0.0}, speed=1.0)
+    rig.run(2.5)
+    assert rig.elbow == pytest.approx(0.0, abs=1e-4)
+
+
+def test_a_move_to_where_there_is_no_room_is_refused_and_says_what_is_there() -> None:
+    rig = Rig(geometry=Wall())
+    tenure = rig.controller.begin_action(epoch=1, on_lost=lost)
+    with pytest.raises(Refused) as refused:
+        rig.controller.move(tenure, {"elbow": 1.25}, speed=1.0)
+    assert refused.value.code == "no_room"
+    assert "hand \u2013 wall, 250 mm" in refused.value.message
+    rig.run(0.5)
+    assert rig.elbow == 0.0
+
+
+def test_who_is_too_near_already_may_leave_but_not_go_on() -> None:
+    rig = Rig(geometry=Wall())
+    rig.controller.start_at([0.0, 1.3])
+    tenure = rig.controller.begin_action(epoch=1, on_lost=lost)
+    with pytest.raises(Refused):
+        rig.controller.move(tenure, {"elbow": 1.4}, speed=1.0)
+    assert rig.controller.move(tenure, {"elbow": 1.2}, speed=1.0)
+    rig.run(1.0)
+    rig.controller.move(tenure, {"elbow": 0.5}, speed=1.0)
+    rig.run(1.0)
+    assert rig.elbow == pytest.approx(0.5, abs=1e-4)
+
+
+@pytest.mark.parametrize("speed", [0.0, -1.0, 1.1, math.nan, math.inf])
+def test_a_speed_that_is_none_is_refused(speed: float) -> None:
+    rig = Rig()
+    tenure = rig.controller.begin_action(epoch=1, on_lost=lost)
+    with pytest.raises(Refused) as refused:
+        rig.controller.move(tenure, {"elbow": 1.0}, speed=speed)
+    assert refused.value.code == "bad_speed"
+
+
+@pytest.mark.parametrize("value", [math.nan, math.inf, -math.inf])
+def test_a_position_that_is_no_number_is_refused_for_every_source(value: float) -> None:
+    rig = Rig()
+    rig.take(1)
+    with pytest.raises(Refused) as refused:
+        rig.offer(1, elbow=value)
+    assert refused.value.code == "not_finite"
+    tenure = rig.controller.begin_action(epoch=1, on_lost=lost)
+    with pytest.raises(Refused) as refused:
+        rig.controller.move(tenure, {"elbow": value}, speed=1.0)
+    assert refused.value.code == "not_finite"
+
+
+def test_speed_falls_before_the_wall_by_how_old_the_picture_is() -> None:
+    """v <= clearance / (loop age + watchdog + braking time), all the way."""
+    fastest = {}
+    for age_ms in (20, 190):
+        rig = Rig(geometry=Wall(1.5))
+        rig.take(1)
+        for _ in range(200):
+            rig.stream(1, 0.024, age_ms=age_ms)
+            velocity = rig.velocities[-1]
+            blind_s = age_ms / 1000 + 0.3 + abs(velocity) / 20.0
+            assert velocity <= max(0.02, (1.5 - rig.elbow) / blind_s) + 1e-3
+        fastest[age_ms] = rig.now_s
+        assert "speed: loop age" in rig.limited
+        assert rig.elbow == pytest.approx(1.5, abs=0.02)
+
+
+def test_with_a_young_picture_and_room_the_stream_has_its_full_speed() -> None:
+    rig = Rig(geometry=Wall(2.9))
+    rig.take(1)
+    rig.stream(1, 1.2, age_ms=40)
+    assert max(rig.velocities) == pytest.approx(0.35 * 3.0, rel=1e-6)
+    assert rig.limited == set()
+
+
+def test_where_nobody_knows_the_shape_age_alone_slows() -> None:
+    rig = Rig()
+    rig.take(1)
+    rig.stream(1, 1.0, age_ms=90)
+    assert max(rig.velocities) == pytest.approx(0.35 * 3.0, rel=1e-6)
+    assert rig.limited == set()
+    rig = Rig()
+    rig.take(1)
+    rig.stream(1, 1.5, age_ms=150)
+    assert rig.velocities[-1] == pytest.approx(0.5 * 0.35 * 3.0, rel=1e-3)
+    assert rig.limited == {"speed: loop age"}
+    rig = Rig()
+    rig.take(1)
+    rig.stream(1, 1.0, age_ms=200)
+    assert 0 < rig.velocities[-1] <= 0.1 * 0.35 * 3.0 + 1e-6
+
+
+def test_one_late_answer_is_no_slow_link() -> None:
+    pace = Pace(None, watchdog_s=0.3, oldest_s=0.2)
+    assert pace.age_s == 0.0
+    for _ in range(50):
+        pace.heard(0.03)
+    pace.heard(0.19)
+    assert pace.age_s < 0.07
+    assert pace.share() == 1.0
+    pace.begin()
+    assert pace.age_s == 0.0
+
+
+def test_what_the_driver_changes_is_told() -> None:
+    rig = Rig()
+    tenure = rig.controller.begin_action(epoch=1, on_lost=lost)
+    move = rig.controller.move(tenure, {"elbow": 1.0}, speed=1.0)
+    rig.run(0.1)
+    rig.controller.applied([0.0, rig.elbow - 0.01])
+    assert rig.controller.step(rig.now_s + PERIOD_S).limited == ("elbow: driver",)
+    assert move.limited == ("elbow: driver",)
+    rig.controller.applied(rig.controller._motion.position_rad)
+    assert rig.controller.step(rig.now_s + 2 * PERIOD_S).limited == ()
+
+
+def test_a_shape_that_fails_under_way_is_no_permission() -> None:
+    """The loop that calls ``step`` takes any error for a fault, and holds."""
+
+    class Broken(Wall):
+        def sweep(self, path_rad: Sequence[Sequence[float]]) -> Sweep:  # noqa: ARG002
+            raise RuntimeError("no shape")
+
+    rig = Rig(geometry=Broken())
+    tenure = rig.controller.begin_action(epoch=1, on_lost=lost)
+    rig.controller.move(tenure, {"elbow": 0.5}, speed=1.0)
+    with pytest.raises(RuntimeError):
+        rig.run(0.1)
+    rig.controller.fail("internal error")
+    rig.run(0.2)
+    assert rig.elbow == pytest.approx(0.0, abs=1e-4)
+
+
+def test_a_new_order_in_the_middle_of_hard_braking_does_not_turn_the_arm_round() -> None:
+    rig = Rig()
+    rig.take(1)
+    rig.stream(1, 1.5, elbow=2.9)
+    rig.take(2)
+    rig.run(2 * PERIOD_S)
+    rig.velocities.clear()
+    rig.stream(2, 1.0, elbow=2.9)
+    assert min(rig.velocities) > -1e-3
+    assert rig.elbow > 1.0
+
+
+def test_a_motion_without_a_way_to_brake_is_an_error() -> None:
+    motion = Motion(robot_type())
+    motion.follow([1.0, 1.0])
+    motion._braking = math.nan
+    with pytest.raises(MotionError):
+        motion.propose()
+
+
+def test_a_planner_that_finds_nothing_is_an_error() -> None:
+    with pytest.raises(MotionError):
+        plan(lambda _order, _answer: Result.ErrorExecutionTimeCalculation, None, None)
+
+
+def test_a_way_that_rounding_hides_from_the_planner_is_found_with_a_little_less_speed() -> None:
+    order = InputParameter(1)
+    # A joint that would meet both limits, and leave them again, at one moment.
+    order.current_position, order.target_position = [0.8000000000000002], [0.5]
+    order.max_velocity, order.max_acceleration, order.max_jerk = [3.0], [60.0], [1200.0]
+    with pytest.raises(RuckigError):
+        Ruckig(1).calculate(order, Trajectory(1))
+    found = Trajectory(1)
+    plan(Ruckig(1).calculate, order, found)
+    assert found.at_time(found.duration)[0] == pytest.approx([0.5])
+    assert order.max_velocity == [3.0]
+
+
+def test_a_motion_that_cannot_be_planned_holds_and_ends_the_lease() -> None:
+    rig = Rig()
+    rig.take(1)
+    rig.stream(1, 0.5)
+    rig.controller._motion._jerk_limits = [math.nan, math.nan]
+    assert rig.stream(1, 0.024) is Mode.HOLDING
+    assert rig.controller.moving, "it brakes, and does not stand still with a jerk"
+    assert rig.at_rest_after(0.3) < 0.1
+    assert rig.controller.lease(rig.now_s) is None
+
+
+def test_where_not_even_braking_can_be_planned_the_command_stands_still_at_once() -> None:
+    rig = Rig()
+    rig.take(1)
+    rig.stream(1, 0.5)
+    rig.controller._motion._jerk_limits = [math.nan, math.nan]
+    rig.controller._motion._braking = math.nan
+    rest = rig.elbow
+    assert rig.stream(1, 0.024) is Mode.HOLDING
+    assert rig.elbow == rest
+
+
+def test_it_says_what_it_holds_and_what_it_cannot_know() -> None:
+    known = ("position", "velocity", "acceleration", "jerk")
+    assert Rig().controller.limits == known
+    assert Rig(geometry=Wall()).controller.limits == (*known, "clearance")
+    box = Workspace(lower_m=(-1, -1, 0), upper_m=(1, 1, 1), frames=("hand",))
+    kind = msgspec.structs.replace(robot_type(), workspace=box)
+    assert Envelope(kind, Wall()).limits == (*known, "clearance", "workspace")
+
+
+def test_a_path_that_leads_nowhere_is_not_looked_at() -> None:
+    envelope = Envelope(robot_type(), Wall(-1.0))
+    assert envelope.blocked([[0.0, 0.0], [0.0, 0.0]]) is None
+    assert envelope.blocked([[0.0, 0.0], [0.0, 0.1]]) is not None

@@ -1,0 +1,316 @@
+"""The controller under chance: whatever comes in whatever order, limits hold and nobody moves it without authority."""
+
+from __future__ import annotations
+
+import math
+import random
+from contextlib import suppress
+from functools import partial
+from itertools import pairwise
+from typing import TYPE_CHECKING
+
+import pytest
+
+from device_agent.ports.driver import REST, Twist
+from device_agent.ports.geometry import Clearance, Sweep
+from device_agent.protocol import DriveTarget, JogTarget, JointTarget, Mode, Setpoint, StopLatch
+from device_agent.runtime.authority.lease_gate import Refused
+from tests.fakes.drivers import BASE, PERIOD_S
+from tests.harness.agent.controller_fixture import Rig, Wall
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Sequence
+
+    from device_agent.runtime.authority.authority import Tenure
+
+    Target = JointTarget | JogTarget | DriveTarget
+
+MAX_SPEED, MAX_ACCELERATION, BRAKING, RANGE = 3.0, 8.0, 20.0, 3.0
+LIMITS = (BASE.max_linear_m_s, 0.0, BASE.max_angular_rad_s)
+EASY = (BASE.max_linear_acceleration_m_s2, BASE.max_linear_acceleration_m_s2, BASE.max_angular_acceleration_rad_s2)
+HARD = (BASE.braking_linear_m_s2, BASE.braking_linear_m_s2, BASE.braking_angular_rad_s2)
+"""Of the base, part by part of its twist: it goes nowhere sideways."""
+WALL_RAD = 1.4
+REST_WITHIN_S = 0.3
+EVENTS = 120
+CLIPPED = BRAKING * 0.04**2 / 8
+"""A braking way is looked at by straight lines between knots 40 ms apart (``Motion.propose``): the way itself bends by
+so much at most, and may cut a corner of something by it. Real margins are wider."""
+JERK_PERIODS = 20
+"""What speeds up when the room slows it needs a tenth of a second to turn."""
+
+
+class Board(Wall):
+    """A wall, with a hand whose x the elbow moves and whose y the shoulder."""
+
+    frames = ("hand",)
+
+    def rates(
+        self, frame: str, twist: Sequence[float], position_rad: Sequence[float], *, tool: bool
+    ) -> tuple[float, ...]:
+        del frame, position_rad
+        return (twist[1], -twist[0] if tool else twist[0])
+
+
+class Post(Board):
+    """A post: whoever reaches out far enough, in its direction, touches it."""
+
+    def clearance(self, position_rad: Sequence[float]) -> Clearance:
+        shoulder, elbow = position_rad
+        return Clearance(max(self.at_rad - elbow, abs(shoulder - 0.8) - 0.2), ("hand", "post"))
+
+    def sweep(self, path_rad: Sequence[Sequence[float]]) -> Sweep:
+        fine = [
+            [a + (b - a) * part / 10 for a, b in zip(begin, end, strict=True)]
+            for begin, end in pairwise(path_rad)
+            for part in range(10)
+        ]
+        return super().sweep([*fine, path_rad[-1]])
+
+
+class Chance:
+    """One seeded life of a controller, watched at every tick by somebody who only knows what was asked and answered."""
+
+    def __init__(self, seed: int) -> None:
+        self.random = random.Random(seed)  # noqa: S311
+        shape = self.random.random()
+        self.shape = Board(WALL_RAD) if shape < 0.4 else Post(WALL_RAD) if shape < 0.8 else None
+        self.rig = Rig(geometry=self.shape, base=BASE)
+        self.controller = self.rig.controller
+        self.now_s = 100.0
+        self.epoch = 0
+        self.sequence = 0
+        self.tenure: Tenure | None = None
+        self.may_move_until_s = -1.0
+        self.position = [0.0, 0.0]
+        self.velocity, self.passed_s = [0.0, 0.0], PERIOD_S
+        self.twist = REST
+        self.unmoved_since_s = 0.0
+        self.rest_from_s = 0.0
+        self.unasked_s = 0.0
+        self.burned = 0
+        self.slowed_for, self.share = 0, 1.0
+        self.restrictions: dict[str, float] = {}
+
+    def live(self) -> None:
+        acts: dict[Callable[[], None], float] = {
+            self.grant: 3,
+            self.setpoint: 3,
+            self.act: 3,
+            self.move: 8,
+            self.drive: 1,
+            self.end: 1,
+            self.stop: 0.4,
+            self.reset: 2,
+            self.lose: 0.4,
+            self.fail: 0.3,
+            self.restrict: 0.7,
+            self.lift: 1.5,
+            self.release: 0.5,
+        }
+        for _ in range(EVENTS):
+            with suppress(Refused):
+                self.random.choices(list(acts), list(acts.values()))[0]()
+            for _ in range(self.random.choice((1, 2, 20, 50, 150))):
+                self.tick()
+
+    # ------------------------------------------------------------ what is asked
+
+    def grant(self) -> None:
+        self.epoch += self.random.choice((0, 1, 1))
+        epoch, lease_s = self.epoch, self.random.uniform(0.05, 20.0)
+        self.controller.grant(epoch=epoch, holder="ann", lease_s=lease_s, now_s=self.now_s)
+        self.sequence = 0
+
+    def likely(self) -> bool:
+        """Mostly somebody clears the way first; sometimes they just try."""
+        if self.random.random() < 0.2:
+            return False
+        if self.controller.latch is not None:
+            self.reset()
+        for source in list(self.restrictions):
+            if self.restrictions[source] <= 0:
+                self.controller.lift(source)
+                del self.restrictions[source]
+        self.epoch = max(self.epoch, *self.controller.epochs) + 1
+        return True
+
+    def setpoint(self) -> None:
+        if self.tenure is None and self.likely():
+            self.grant()
+        target = self.target()
+        for _ in range(self.random.choice((1, 5, 20, 60, 120))):
+            self.sequence += 1
+            tick_ms = round(self.now_s * 1000)
+            setpoint = Setpoint(
+                epoch=self.epoch,
+                sequence=self.sequence,
+                echo_tick_ms=tick_ms - self.random.randint(0, 210),
+                sent_ms=0.0,
+                target=target() if callable(target) else target,
+            )
+            self.controller.offer(setpoint, now_s=self.now_s, tick_ms=tick_ms)
+            assert self.epoch > self.burned, "a lease that has ended"
+            assert self.speed() > 0, "the room holds it"
+            self.may_move_until_s = self.now_s + REST_WITHIN_S
+            self.rest_from_s = self.now_s + REST_WITHIN_S
+            for _ in range(3):
+                self.tick()
+
+    def target(self) -> Target | Callable[[], Target]:
+        """What a hand on a slider, a joystick or a pad asks for, beyond every limit as well; sometimes each in turn."""
+        push = partial(self.random.uniform, -6, 6)
+        elbow = push()
+        kinds: list[Callable[[], Target]] = [
+            lambda: JointTarget(position_rad={"elbow": elbow, "shoulder": self.random.choice((0.0, 1.5))}),
+            lambda: DriveTarget(forward_m_s=push(), left_m_s=push(), turn_rad_s=push()),
+        ]
+        if self.shape is not None:
+            kinds.append(lambda: JogTarget(linear_m_s=(push(), push(), 0.0), tool=self.random.random() < 0.5))
+
+        def any_of_them() -> Target:
+            return self.random.choice(kinds)()
+
+        return any_of_them if self.random.random() < 0.2 else any_of_them()
+
+    def act(self) -> None:
+        if self.tenure is None and not self.likely():
+            self.epoch += self.random.choice((0, 1))
+        self.tenure = self.controller.begin_action(epoch=self.epoch, on_lost=self.lost)
+        assert self.epoch > self.burned, "a lease that has ended"
+        assert self.speed() > 0, "the room holds it"
+
+    def lost(self, _why: Refused) -> None:
+        self.tenure = None
+
+    def move(self) -> None:
+        if self.tenure is None:
+            self.act()
+        if self.tenure is not None:
+            target = {"elbow": self.random.uniform(-3, 3), "shoulder": self.random.uniform(-1, 2)}
+            self.controller.move(self.tenure, target, speed=self.random.uniform(0.05, 1.0))
+
+    def drive(self) -> None:
+        if self.tenure is not None:
+            twist = Twist(self.random.uniform(-0.5, 0.5), 0.0, self.random.uniform(-1, 1))
+            self.controller.drive(self.tenure, twist, duration_s=self.random.uniform(0.05, 3))
+
+    def end(self) -> None:
+        if self.tenure is not None:
+            self.controller.end_action(self.tenure)
+            self.tenure = None
+
+    def stop(self) -> None:
+        self.controller.stop(StopLatch(by="bob", reason="", at_ms=1))
+        self.taken_away()
+        if self.random.random() < 0.7:
+            self.tick(self.random.uniform(0.02, 1.0) * PERIOD_S)
+
+    def reset(self) -> None:
+        self.epoch += 1
+        self.controller.reset_stop(epoch=self.epoch)
+        self.taken_away()
+
+    def lose(self) -> None:
+        self.controller.lost(Refused("link_lost", "the link is gone"))
+
+    def fail(self) -> None:
+        self.controller.fail("no answer")
+        self.taken_away()
+        for _ in range(30):
+            self.tick()
+        self.controller.recover(self.position)
+
+    def restrict(self) -> None:
+        speed, source = self.random.choice((0.0, 0.2, 0.7, 0.7, math.nan)), self.random.choice("ab")
+        moved = self.controller.moving or self.tenure is not None
+        self.controller.restrict(source, speed, "somebody is near")
+        self.restrictions[source] = speed if speed > 0 else 0.0
+        if self.speed() <= 0:
+            assert self.tenure is None, "the action was not told"
+            self.may_move_until_s = -1.0
+            assert not moved or self.controller.epochs[0] == self.controller.epochs[1]
+
+    def lift(self) -> None:
+        source = self.random.choice("ab")
+        self.controller.lift(source)
+        self.restrictions.pop(source, None)
+
+    def speed(self) -> float:
+        return min(self.restrictions.values(), default=1.0)
+
+    def release(self) -> None:
+        self.controller.release(epoch=self.epoch)
+        self.taken_away()
+
+    def taken_away(self) -> None:
+        assert self.tenure is None, "the action was not told"
+        self.may_move_until_s = -1.0
+        self.burned = max(self.burned, self.controller.epochs[0])
+        assert self.controller.epochs[1] == self.controller.epochs[0]
+
+    # ------------------------------------------------------------ what must hold
+
+    def tick(self, passed_s: float = PERIOD_S) -> None:
+        self.now_s += passed_s
+        tick = self.controller.step(self.now_s, passed_s=None if passed_s == PERIOD_S else passed_s)
+        between_s, self.passed_s = (self.passed_s + passed_s) / 2, passed_s
+        faster = False
+        self.slowed_for = self.slowed_for + 1 if self.speed() == self.share else 0
+        self.share = self.speed()
+        for index, (was, now) in enumerate(zip(self.position, tick.position_rad, strict=True)):
+            velocity = (now - was) / passed_s
+            gain = abs(velocity) - abs(self.velocity[index])
+            turned = velocity * self.velocity[index] < 0
+            assert -RANGE - 1e-9 <= now <= RANGE + 1e-9
+            assert abs(velocity) <= MAX_SPEED + 1e-6
+            limit = MAX_ACCELERATION if gain > 0 and not turned else BRAKING
+            assert abs(velocity - self.velocity[index]) / between_s <= limit + 1e-3
+            faster |= gain > 1e-6
+            if gain > 1e-6 and self.slowed_for > JERK_PERIODS:
+                assert abs(velocity) <= self.speed() * MAX_SPEED + 1e-6, "faster than the room allows"
+            self.velocity[index] = velocity
+        self.position = tick.position_rad
+        if self.shape is not None:
+            assert self.shape.clearance(self.position).room_m >= -CLIPPED
+        faster |= self.base(tick.twist, passed_s)
+        allowed = self.tenure is not None or self.now_s <= self.may_move_until_s + 1e-9
+        # What speeds up when the hold begins does so for four milliseconds more: the brakes have a ramp.
+        asked = allowed and tick.mode in {Mode.STREAMING, Mode.ACTION}
+        self.unasked_s = 0.0 if asked else self.unasked_s + passed_s
+        assert self.unasked_s <= 2 * PERIOD_S + 1e-9 or not faster, "it moves by itself"
+        moving = max(map(abs, self.velocity)) > 1e-6 or any(abs(part) > 1e-6 for part in tick.twist)
+        if asked:
+            self.unmoved_since_s = self.now_s
+        if self.tenure is not None:
+            self.rest_from_s = self.now_s + REST_WITHIN_S
+        assert not moving or self.now_s <= self.rest_from_s + PERIOD_S, "zero 300 ms after the last setpoint"
+        if self.now_s - self.unmoved_since_s > 0.2:
+            assert not moving, "a hold is complete within 200 ms"
+        if self.tenure is None and self.now_s > self.may_move_until_s + PERIOD_S and tick.mode is Mode.STREAMING:
+            pytest.fail("setpoints that stopped coming are followed no more after 300 ms")
+
+    def base(self, twist: Twist, passed_s: float) -> bool:
+        """What holds for the base; whether any part of its twist grows."""
+        faster = False
+        for was, now, limit, easy, hard in zip(self.twist, twist, LIMITS, EASY, HARD, strict=True):
+            gain = abs(now) - abs(was)
+            assert abs(now) <= limit + 1e-6
+            assert abs(now - was) / passed_s <= (easy if gain > 0 and now * was >= 0 else hard) + 1e-3
+            faster |= gain > 1e-6
+            if gain > 1e-6 and self.slowed_for > JERK_PERIODS:
+                assert abs(now) <= self.speed() * limit + 1e-6, "faster than the room allows"
+        self.twist = twist
+        return faster
+
+
+@pytest.mark.parametrize("seed", range(40))
+def test_limits_and_authority_hold_whatever_comes(seed: int) -> None:
+    Chance(seed).live()
+
+
+@pytest.mark.long
+@pytest.mark.timeout(1800)
+def test_limits_and_authority_hold_over_many_lives() -> None:
+    for seed in range(1000, 3000):
+        Chance(seed).live()

@@ -1,0 +1,111 @@
+"""A move is done when the joints are there, not when they were told to be; what does not come says so."""
+
+import math
+from collections.abc import Callable, Sequence
+
+import pytest
+
+from device_agent.protocol import Mode
+from device_agent.runtime.control.goal_tolerance import NEAR_RAD, PATIENCE_S
+from device_agent.runtime.control.goals import Course, Outcome
+from device_agent.runtime.planning.motion_planner import Routes
+from tests.fakes.drivers import PERIOD_S, robot_type
+from tests.harness.agent.controller_fixture import Rig, Wall, lost
+
+Servo = Callable[[Sequence[float]], Sequence[float]]
+
+
+class Loaded(Rig):
+    """A rig whose joints are measured: each time where a servo has them, by where they are told to be."""
+
+    def __init__(self, servo: Servo) -> None:
+        super().__init__()
+        self.servo = servo
+        self.tenure = self.controller.begin_action(epoch=1, on_lost=lost)
+
+    def go(self, course: Course, *, most_s: float = 10.0) -> float:
+        """Until its end; gives how long the command had rested by then [s]."""
+        rested_s, until_s = 0.0, self.now_s + most_s
+        while not course.finished.is_set():
+            assert self.now_s < until_s, "it never ends"
+            self.now_s += PERIOD_S
+            measured = self.servo(self.controller.commanded_rad)
+            self.controller.step(self.now_s, measured)
+            rested_s = 0.0 if self.controller.moving else rested_s + PERIOD_S
+        return rested_s
+
+    def move(self, **position_rad: float) -> Course:
+        return self.controller.move(self.tenure, position_rad, speed=1.0)
+
+
+def late(periods: int) -> Servo:
+    """A servo that follows so much later."""
+    told: list[Sequence[float]] = []
+
+    def follow(commanded_rad: Sequence[float]) -> Sequence[float]:
+        told.append(commanded_rad)
+        return told[max(0, len(told) - 1 - periods)]
+
+    return follow
+
+
+@pytest.mark.parametrize("periods", [0, 30])
+def test_a_move_ends_when_the_joints_have_followed(periods: int) -> None:
+    rig = Loaded(late(periods))
+    move = rig.move(elbow=1.0)
+    rested_s = rig.go(move)
+    assert move.outcome is Outcome.REACHED
+    assert rig.servo(rig.controller.commanded_rad)[1] == pytest.approx(1.0, abs=NEAR_RAD)
+    assert rested_s >= 0.04 or periods == 0
+    assert rested_s < 0.4
+
+
+def test_who_only_comes_through_has_not_arrived() -> None:
+    swing = iter(range(10_000))
+    rig = Loaded(lambda told: (told[0], told[1] + 0.2 * math.cos(next(swing) * PERIOD_S * 20)))
+    move = rig.move(elbow=1.0)
+    rig.go(move)
+    assert move.why is not None
+    assert move.why.code == "not_arrived"
+
+
+@pytest.mark.parametrize("off_rad", [0.12, -0.12, math.nan])
+def test_what_never_comes_fails_names_the_joint_and_is_held_there(off_rad: float) -> None:
+    rig = Loaded(lambda told: (told[0] - 0.2, told[1] - off_rad))
+    move = rig.move(elbow=1.0)
+    rested_s = rig.go(move)
+    assert move.outcome is Outcome.INTERRUPTED
+    assert move.why is not None
+    assert move.why.code == "not_arrived"
+    assert f"elbow is {abs(off_rad):.2f} rad short" in move.why.message
+    assert "shoulder" not in move.why.message, "it was not to move"
+    assert rested_s == pytest.approx(PATIENCE_S, abs=0.1)
+    assert rig.controller.mode is Mode.ACTION
+    assert rig.controller.commanded_rad[1] == pytest.approx(1.0, abs=1e-4)
+    again = rig.move(elbow=0.9)
+    rig.servo = late(0)
+    rig.go(again)
+    assert again.outcome is Outcome.REACHED
+
+
+def test_a_joint_that_holds_softly_is_where_it_sags_to() -> None:
+    rig = Loaded(lambda told: (told[0], told[1] - 0.3))
+    rig.controller.stiffen(rig.tenure, {"elbow": 0.4})
+    move = rig.move(elbow=1.0)
+    rig.go(move)
+    assert move.outcome is Outcome.REACHED
+
+
+def test_the_end_of_a_planned_way_is_looked_at_too() -> None:
+    class Open(Wall):
+        def plan(
+            self, start_rad: Sequence[float], goal_rad: Sequence[float], **_: object
+        ) -> tuple[tuple[float, ...], ...]:
+            return tuple(start_rad), tuple(goal_rad)
+
+    rig = Loaded(lambda told: (told[0], told[1] - 0.12))
+    way = Routes(robot_type(), Open(9.0)).around([0.0, 0.0], [0.0, 1.0], speed=1.0, ended=lambda: False)
+    passage = rig.controller.go_along(rig.tenure, way)
+    rig.go(passage)
+    assert passage.why is not None
+    assert "elbow is 0.12 rad short" in passage.why.message

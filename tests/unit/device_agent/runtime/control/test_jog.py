@@ -1,0 +1,286 @@
+"""Setpoints for a frame and for a base: while they are fresh, inside every limit, and nothing goes on after them."""
+
+import json
+import math
+from contextlib import suppress
+from pathlib import Path
+
+import msgspec
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from device_agent import geometry
+from device_agent.protocol import DriveTarget, JogTarget, JointTarget, Mode, Setpoint, StopLatch, codec
+from device_agent.protocol.errors import ProtocolError
+from device_agent.protocol.manifests import robot_type
+from device_agent.runtime.authority.lease_gate import LeaseGate, Refused
+from device_agent.runtime.control.controller import Controller
+from tests.fakes.drivers import BASE
+from tests.harness.agent.controller_fixture import Rig, lost
+
+UR5 = Path(__file__).parents[3] / "robots" / "ur5"
+KIND = robot_type.load(UR5)
+SHAPE = geometry.load(KIND, UR5)
+HOME = [KIND.home_rad[joint.name] for joint in KIND.joints]
+Target = JointTarget | JogTarget | DriveTarget
+
+
+class Jogger(Rig):
+    """An operator with a joystick at a UR5, or at the toy with a base."""
+
+    def __init__(self, *, base: bool = False) -> None:
+        super().__init__(base=BASE if base else None)
+        self.period_s = 0.008
+        if not base:
+            self.controller = Controller(KIND, LeaseGate(), geometry=SHAPE)
+            self.controller.start_at(HOME)
+        self.position = self.controller.commanded_rad
+        self.gone: list[list[float]] = []
+        self.twists: list[tuple[float, ...]] = []
+
+    def hold(self, target: Target, seconds: float, *, age_ms: int = 20) -> Mode:
+        for _ in range(round(seconds / 0.024)):
+            self.sequence += 1
+            setpoint = Setpoint(
+                epoch=1, sequence=self.sequence, echo_tick_ms=self.tick_ms - age_ms, sent_ms=1.0, target=target
+            )
+            self.controller.offer(setpoint, now_s=self.now_s, tick_ms=self.tick_ms)
+            self.rest(0.024)
+        return self.controller.mode
+
+    def rest(self, seconds: float) -> Mode:
+        for _ in range(round(seconds / self.period_s)):
+            self.now_s += self.period_s
+            tick = self.controller.step(self.now_s)
+            self.limited |= set(tick.limited)
+            self.gone.append(tick.position_rad)
+            self.twists.append(tuple(tick.twist))
+        return self.controller.mode
+
+    def flange(self) -> tuple[float, ...]:
+        assert SHAPE is not None
+        return SHAPE.poses(self.controller.commanded_rad)["flange"]
+
+
+def jogger(*, base: bool = False) -> Jogger:
+    found = Jogger(base=base)
+    found.take(1)
+    return found
+
+
+def test_a_frame_goes_where_it_is_pushed_and_keeps_its_orientation() -> None:
+    rig = jogger()
+    begin = rig.flange()
+    rig.hold(JogTarget(linear_m_s=(0.0, 0.1, 0.0)), 1.2)
+    rig.hold(JogTarget(), 0.3)
+    end = rig.flange()
+    assert end[1] - begin[1] == pytest.approx(0.11, abs=0.02)
+    assert math.dist((begin[0], begin[2]), (end[0], end[2])) < 0.004
+    assert abs(sum(a * b for a, b in zip(begin[3:], end[3:], strict=True))) > math.cos(0.01)
+    assert not rig.controller.moving
+    assert rig.controller.lease(rig.now_s) is not None, "letting go is no loss"
+
+
+def test_a_tool_goes_along_its_own_axes() -> None:
+    rig = jogger()
+    begin = rig.flange()
+    rig.hold(JogTarget(linear_m_s=(0.0, 0.0, 0.05), tool=True, frame="flange"), 0.8)
+    rig.hold(JogTarget(), 0.3)
+    assert rig.flange()[2] < begin[2] - 0.02, "the flange looks down"
+    rig.hold(JogTarget(angular_rad_s=(0.0, 0.0, 0.4)), 0.8)
+    assert abs(sum(a * b for a, b in zip(begin[3:], rig.flange()[3:], strict=True))) < math.cos(0.1)
+
+
+def test_a_jog_that_ends_in_motion_is_an_operator_lost() -> None:
+    rig = jogger()
+    rig.hold(JogTarget(linear_m_s=(0.0, 0.1, 0.0)), 0.8)
+    assert rig.controller.moving
+    rig.rest(0.31)
+    assert not np.any(np.abs(np.subtract(rig.gone[-1], rig.gone[-2])) > 1e-9)
+    with pytest.raises(Refused):
+        rig.hold(JogTarget(linear_m_s=(0.0, 0.1, 0.0)), 0.1)
+
+
+def test_a_jog_is_held_before_the_table_and_can_leave_it() -> None:
+    rig = jogger()
+    assert SHAPE is not None
+    rig.hold(JogTarget(linear_m_s=(0.0, 0.0, -0.4)), 4.0)
+    assert any(one.startswith(("clearance", "workspace")) for one in rig.limited)
+    low = rig.flange()[2]
+    assert SHAPE.clearance(rig.controller.commanded_rad).room_m >= 0
+    rig.hold(JogTarget(linear_m_s=(0.0, 0.0, 0.2)), 0.8)
+    assert rig.flange()[2] > low + 0.03
+
+
+def test_near_a_singularity_it_is_slow_instead_of_jumping() -> None:
+    rig = jogger()
+    rig.hold(JogTarget(linear_m_s=(-0.5, 0.0, 0.2)), 5.0)
+    steps = np.abs(np.diff(rig.gone, axis=0)) / 0.008
+    assert steps.max() <= 0.35 * 3.1416 * 1.001
+    assert "speed: joints" in rig.limited
+
+
+@settings(max_examples=12, deadline=None)
+@given(
+    twists=st.lists(
+        st.tuples(*[st.floats(-2, 2)] * 6, st.booleans()),
+        min_size=1,
+        max_size=4,
+    )
+)
+def test_whatever_is_pushed_every_limit_holds(
+    twists: list[tuple[float, ...]],
+) -> None:
+    rig = jogger()
+    assert SHAPE is not None
+    for x, y, z, a, b, c, tool in twists:
+        rig.hold(JogTarget(linear_m_s=(x, y, z), angular_rad_s=(a, b, c), tool=bool(tool)), 0.5)
+    rig.rest(0.35)
+    gone = np.array(rig.gone)
+    velocity = np.diff(gone, axis=0) / 0.008
+    assert np.abs(velocity).max() <= 0.35 * 3.1416 * 1.01
+    assert np.abs(np.diff(velocity, axis=0) / 0.008).max() <= 21.0 + 0.1
+    assert not rig.controller.moving
+    assert all(SHAPE.clearance(place).room_m > -0.004 for place in gone[::10].tolist())
+
+
+def test_joints_go_on_from_where_a_jog_has_left_them() -> None:
+    rig = jogger()
+    rig.hold(JogTarget(linear_m_s=(0.0, 0.1, 0.0)), 0.8)
+    rig.hold(JointTarget(position_rad={"wrist_3": 0.3}), 1.5)
+    assert rig.controller.commanded_rad[5] == pytest.approx(0.3, abs=1e-3)
+    assert abs(rig.controller.commanded_rad[0] - HOME[0]) > 0.02
+
+
+def test_a_base_drives_while_setpoints_are_fresh_and_no_longer() -> None:
+    rig = jogger(base=True)
+    rig.hold(DriveTarget(forward_m_s=0.3, turn_rad_s=-0.4), 1.5)
+    assert rig.twists[-1] == pytest.approx((0.3, 0.0, -0.4), abs=1e-6)
+    rig.rest(0.31)
+    assert rig.twists[-1] == pytest.approx((0.0, 0.0, 0.0), abs=1e-6)
+    assert rig.controller.mode is Mode.HOLDING
+    with pytest.raises(Refused):
+        rig.hold(DriveTarget(forward_m_s=0.3), 0.1)
+
+
+def test_a_base_that_is_let_go_brakes_at_once_and_its_operator_keeps_control() -> None:
+    rig = jogger(base=True)
+    rig.hold(DriveTarget(forward_m_s=0.5, turn_rad_s=0.4), 1.5)
+    rig.hold(DriveTarget(), 0.25)  # half of the time that it would take at the acceleration of a start
+    assert rig.twists[-1] == pytest.approx((0.0, 0.0, 0.0), abs=1e-6)
+    rig.rest(0.5)
+    rig.hold(DriveTarget(forward_m_s=0.3), 1.0)
+    assert rig.twists[-1] == pytest.approx((0.3, 0.0, 0.0), abs=1e-6)
+
+
+def test_a_drive_beyond_the_limits_is_bounded_and_says_so() -> None:
+    rig = jogger(base=True)
+    rig.hold(DriveTarget(forward_m_s=9.0, left_m_s=1.0), 1.5)
+    assert rig.twists[-1] == pytest.approx((0.5, 0.0, 0.0), abs=1e-6)
+    assert {"forward_m_s: range", "left_m_s: range"} <= rig.limited
+    rig.hold(DriveTarget(forward_m_s=0.5), 2.0, age_ms=160)
+    assert rig.twists[-1][0] < 0.4, "an old picture slows it"
+
+
+def test_joints_that_are_still_asked_let_the_base_stand() -> None:
+    rig = jogger(base=True)
+    rig.hold(DriveTarget(forward_m_s=0.3), 1.0)
+    rig.hold(JointTarget(position_rad={"elbow": 1.0}), 0.6)
+    assert rig.twists[-1] == pytest.approx((0.0, 0.0, 0.0), abs=1e-6)
+    assert rig.controller.mode is Mode.STREAMING
+
+
+def test_an_action_that_begins_takes_the_base_from_the_joystick() -> None:
+    rig = jogger(base=True)
+    rig.hold(DriveTarget(forward_m_s=0.3), 1.0)
+    rig.controller.begin_action(epoch=1, on_lost=lost)
+    rig.rest(0.3)
+    assert rig.twists[-1] == pytest.approx((0.0, 0.0, 0.0), abs=1e-6)
+
+
+def test_stop_brakes_a_base_that_is_driven_and_nothing_resumes() -> None:
+    rig = jogger(base=True)
+    rig.hold(DriveTarget(forward_m_s=0.3), 1.0)
+    rig.controller.stop(StopLatch(by="ann", reason="", at_ms=0))
+    rig.rest(0.3)
+    assert rig.twists[-1] == pytest.approx((0.0, 0.0, 0.0), abs=1e-6)
+    rig.controller.reset_stop(epoch=2)
+    rig.rest(0.5)
+    assert rig.twists[-1] == pytest.approx((0.0, 0.0, 0.0), abs=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("target", "code"),
+    [
+        (DriveTarget(forward_m_s=0.1), "no_base"),
+        (JogTarget(frame="foot"), "unknown_frame"),
+        (JogTarget(linear_m_s=(math.nan, 0.0, 0.0)), "not_finite"),
+        (JogTarget(angular_rad_s=(0.0, math.inf, 0.0)), "not_finite"),
+    ],
+)
+def test_what_makes_no_sense_is_refused(target: Target, code: str) -> None:
+    with pytest.raises(Refused) as refused:
+        jogger().hold(target, 0.03)
+    assert refused.value.code == code
+
+
+def test_without_a_model_there_is_no_jog() -> None:
+    with pytest.raises(Refused) as refused:
+        jogger(base=True).hold(JogTarget(linear_m_s=(0.1, 0.0, 0.0)), 0.03)
+    assert refused.value.code == "no_model"
+    with pytest.raises(Refused, match="finite"):
+        jogger(base=True).hold(DriveTarget(forward_m_s=-math.inf), 0.03)
+
+
+_ODD: st.SearchStrategy[object] = st.one_of(
+    st.floats(),
+    st.floats(-3, 3),
+    st.integers(),
+    st.sampled_from([None, True, "1", "NaN", [], [0.1], {}, 1e308, -1e308, 5e-324, -0.0]),
+)
+
+
+@settings(max_examples=100, deadline=None)
+@given(st.dictionaries(st.sampled_from([*DriveTarget.__struct_fields__, "up_m_s", ""]), _ODD), st.integers(0, 220))
+def test_whatever_is_sent_to_drive_a_base_is_refused_or_driven_inside_its_limits(
+    sent: dict[str, object], age_ms: int
+) -> None:
+    text = json.dumps(
+        {"epoch": 1, "sequence": 1, "echo_tick_ms": 1, "sent_ms": 1.0, "target": {"kind": "drive"} | sent}
+    )
+    try:
+        target = codec.decode(text.encode(), Setpoint).target
+    except ProtocolError:
+        assert any(name not in DriveTarget.__struct_fields__ or not _number(value) for name, value in sent.items())
+        return
+    assert isinstance(target, DriveTarget)
+    assert all(math.isfinite(part) for part in (target.forward_m_s, target.left_m_s, target.turn_rad_s))
+    rig = jogger(base=True)
+    with suppress(Refused):
+        rig.hold(target, 0.4, age_ms=age_ms)
+    rig.rest(0.31)
+    limits = (BASE.max_linear_m_s, 0.0, BASE.max_angular_rad_s)
+    assert all(abs(part) <= most + 1e-9 for twist in rig.twists for part, most in zip(twist, limits, strict=True))
+    assert rig.twists[-1] == pytest.approx((0.0, 0.0, 0.0), abs=1e-6)
+    assert age_ms <= 200 or not any(map(any, rig.twists))
+
+
+def _number(value: object) -> bool:
+    """What JSON has as a number that fits."""
+    if isinstance(value, bool) or not isinstance(value, int | float):
+        return False
+    try:
+        return math.isfinite(float(value))
+    except OverflowError:
+        return False
+
+
+@pytest.mark.parametrize("wrong", [b'{"kind":"jog","linear_m_s":[1,2]}', b'{"kind":"drive","forward_m_s":1e999}'])
+def test_a_malformed_setpoint_does_not_pass_the_parser(wrong: bytes) -> None:
+    good = Setpoint(epoch=1, sequence=1, echo_tick_ms=1, sent_ms=1.0, target=JogTarget())
+    text = msgspec.json.encode(good)
+    assert codec.decode(text, Setpoint) == good
+    with pytest.raises(ProtocolError):
+        codec.decode(text.replace(msgspec.json.encode(good.target), wrong), Setpoint)

@@ -1,0 +1,77 @@
+"""Motion by itself: what it does when asked for what cannot be."""
+
+import msgspec
+import pytest
+
+from device_agent.runtime.control.joint_motion import Motion
+from device_agent.runtime.planning.behaviour_trajectory import Score
+from device_agent.runtime.planning.trajectory import Way
+from tests.fakes.drivers import robot_type
+from tests.fakes.head_driver import head
+
+
+def way_to(yaw: float) -> Way:
+    score = Score(head(), (0.0,) * 4)
+    score._reach(0, 0.0, 2.0, yaw)
+    score._end_s = 2.0
+    return score.way()
+
+
+def test_a_way_that_begins_elsewhere_is_not_taken() -> None:
+    motion, one, other = Motion(head()), way_to(1.0), way_to(-1.0)
+    for _ in range(50):
+        motion.ride(one, share=1.0)
+        motion.propose()
+        motion.update()
+    assert motion.fastest_rad_s > 0.1
+    for _ in range(50):
+        motion.ride(other, share=1.0)
+        motion.update()
+    assert not motion.moving
+    assert 0.4 < motion.position_rad[0] < 0.7, "it came to rest on the way that it was on"
+
+
+def test_without_joints_there_is_nothing_to_plan() -> None:
+    motion = Motion(msgspec.structs.replace(head(), joints=(), mirrors=(), narrowing=(), home_rad={}))
+    assert motion.propose() == [[], []]
+    assert motion.update() == []
+    assert motion.reached
+    assert motion.fastest_rad_s == pytest.approx(0.0)
+
+
+def test_two_parts_of_a_period_brake_as_much_as_a_whole_one() -> None:
+    for ridden in (False, True):
+        ends = []
+        for parts in ((None,), (0.25, 0.75)):
+            motion = Motion(head())
+            way, period_s = way_to(1.0), motion._period_s
+            for _ in range(45 if ridden else 15):
+                if ridden:
+                    motion.ride(way, share=1.0)
+                else:
+                    motion.follow(way.position_rad[-1].tolist())
+                motion.propose()
+                motion.update()
+            before_rad, before_rad_s = motion.position_rad[0], motion.velocity_rad_s[0]
+            motion.brake()
+            for part in parts:
+                motion.update(part and part * period_s)
+            ends.append((motion.position_rad[0], motion.velocity_rad_s[0]))
+        assert ends[0] == pytest.approx(ends[1], abs=0.02)
+        assert ends[0] != pytest.approx((before_rad, before_rad_s), abs=0.02)
+        assert abs(ends[0][1]) > 0.1
+        assert motion._generator.delta_time == pytest.approx(motion._period_s)
+
+
+def test_who_brakes_for_a_moment_and_goes_on_does_not_run_backwards_meanwhile() -> None:
+    for periods in range(1, 12):
+        motion = Motion(robot_type())
+        motion.start_at([3.0, 3.0])
+        for braking in [False] * periods + [True] + [False] * 30:
+            if braking:
+                motion.brake()
+            else:
+                motion.follow([0.0, 0.0])
+            motion.update()
+            assert max(motion.position_rad) <= 3.0 + 1e-9, "out of its range"
+        assert motion.velocity_rad_s[0] < -0.1, "it goes on"

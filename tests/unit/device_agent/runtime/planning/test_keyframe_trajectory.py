@@ -1,0 +1,169 @@
+"""Keyframes as one way: on time where limits allow it, later where not, never back, and never beyond a place."""
+
+import json
+import sys
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from device_agent.ports.script_calls import Moment, Play
+from device_agent.protocol.manifests.robot_type import RobotType
+from device_agent.runtime.authority.lease_gate import Refused
+from device_agent.runtime.control.limits import Envelope
+from device_agent.runtime.planning.keyframe_trajectory import Timeline
+from device_agent.runtime.planning.trajectory import Way
+from tests.fakes.head_driver import RANGES, head
+
+START = (0.0, 0.0, 0.0, 0.0)
+SHARED = Path(__file__).with_name("timelines.json")
+"""Movements with what becomes of them, also for the page's own reckoning (``web/tests/timeline.test.ts``)."""
+
+
+def frame(time_s: float, **position_rad: float) -> Moment:
+    return Moment(time_s=time_s, position_rad=position_rad)
+
+
+def timeline(*keyframes: Moment, speed: float = 1.0) -> Timeline:
+    return Timeline(head(), START, Play(keyframes=keyframes, speed=speed))
+
+
+def at(way: Way, time_s: float) -> list[float]:
+    place: list[float] = way.at(time_s)[0].tolist()
+    return place
+
+
+def check_limits(way: Way, kind: RobotType, joints: tuple[int, ...]) -> None:
+    for index in joints:
+        joint = kind.joints[index]
+        assert np.abs(way.velocity_rad_s[:, index]).max() <= joint.max_velocity_rad_s * 1.001
+        assert np.abs(way.acceleration_rad_s2[:, index]).max() <= joint.max_acceleration_rad_s2 * 1.002
+        jerk = np.diff(way.acceleration_rad_s2[:, index]) / way.step_s
+        assert np.abs(jerk).max() <= joint.max_jerk_rad_s3 * 1.01
+
+
+def test_joints_are_where_a_keyframe_says_when_it_says_and_pass_where_they_go_on() -> None:
+    made = timeline(frame(1.0, yaw=0.5), frame(2.0, yaw=1.0, left=0.3), frame(4.0, yaw=0.0))
+    way = made.way()
+    assert made.limited == ()
+    assert way.duration_s == pytest.approx(4.0, abs=0.021)
+    assert at(way, 1.0) == pytest.approx([0.5, 0.0, at(way, 1.0)[2], at(way, 1.0)[3]], abs=1e-6)
+    assert at(way, 2.0) == pytest.approx([1.0, 0.0, 0.3, -0.15], abs=1e-6)
+    assert at(way, 4.0) == pytest.approx([0.0, 0.0, 0.3, -0.15], abs=1e-6)
+    assert way.at(1.0)[1][0] == pytest.approx(0.5, abs=1e-3), "it goes on there, and does not stop"
+    assert way.at(2.0)[1][0] == pytest.approx(0.0, abs=1e-3), "it turns there"
+    assert 0 < at(way, 1.0)[2] < 0.3, "a joint that a keyframe does not name is on its way to the next that does"
+    check_limits(way, head(), (0, 2))
+
+
+def test_what_cannot_be_there_in_time_comes_later_and_the_rest_with_it() -> None:
+    made = timeline(frame(0.01, yaw=1.0), frame(1.0, left=0.3))
+    way = made.way()
+    assert made.limited == ("keyframes: later",)
+    assert way.duration_s > 1.3
+    assert at(way, 9.0) == pytest.approx([1.0, 0.0, 0.3, -0.15], abs=1e-6)
+    check_limits(way, head(), (0, 2))
+
+
+def test_speed_stretches_time_and_limits_hold_all_the_same() -> None:
+    keyframes = (frame(1.0, yaw=0.8), frame(2.0, yaw=0.0))
+    assert timeline(*keyframes, speed=0.5).way().duration_s == pytest.approx(4.0, abs=0.021)
+    fast = timeline(*keyframes, speed=2.0)
+    assert fast.limited
+    check_limits(fast.way(), head(), (0,))
+
+
+def test_keyframes_without_joints_only_take_their_time() -> None:
+    way = timeline(frame(0.5)).way()
+    assert way.duration_s == pytest.approx(0.5, abs=0.021)
+    assert np.ptp(way.position_rad) == 0
+
+
+def test_poses_are_those_at_the_keyframes_by_the_joints_that_count() -> None:
+    first, second = timeline(frame(1.0, yaw=0.5, right=0.1), frame(2.0, pitch=-0.2)).poses()
+    assert first == pytest.approx({"yaw": 0.5, "left": -0.2})
+    assert second == pytest.approx({"yaw": 0.5, "left": -0.2, "pitch": -0.2})
+
+
+@pytest.mark.parametrize(
+    ("keyframes", "says"),
+    [
+        ([frame(0.0, yaw=0.1)], "keyframe 1: time_s is 0.0; times must rise"),
+        ([frame(1.0), frame(1.0)], "keyframe 2: time_s is 1.0; times must rise"),
+        ([frame(601.0)], "to 600 at most"),
+        ([frame(1.0), frame(2.0, nose=0.1)], "keyframe 2: no joint 'nose'; there are yaw, pitch, left, right"),
+        ([frame(1.0, left=0.1, right=0.1)], "keyframe 1: one motor moves right and another joint"),
+    ],
+)
+def test_what_is_no_timeline_is_refused_by_the_number_of_its_keyframe(keyframes: list[Moment], says: str) -> None:
+    with pytest.raises(Refused) as refused:
+        timeline(*keyframes)
+    assert says in refused.value.message
+
+
+def test_where_again_and_again_does_not_do_all_of_it_becomes_slower(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("device_agent.runtime.planning.keyframe_trajectory._TRIES", 1)
+    way = timeline(frame(0.1, yaw=1.5), frame(0.12, yaw=1.6), frame(0.5, yaw=-1.0)).way()
+    assert np.abs(way.velocity_rad_s).max() <= 4.0
+
+
+@st.composite
+def movements(draw: st.DrawFn) -> list[Moment]:
+    reached_s, made = 0.0, []
+    for _ in range(draw(st.integers(1, 6))):
+        reached_s += draw(st.floats(0.01, 1.5))
+        named = draw(st.sets(st.sampled_from((0, 1, 2))))
+        places = {("yaw", "pitch", "left")[one]: draw(st.floats(*RANGES[one])) for one in named}
+        made.append(Moment(time_s=reached_s, position_rad=places))
+    return made
+
+
+@settings(max_examples=150, deadline=None)
+@given(movements())
+def test_any_movement_stays_in_its_limits_and_between_its_places(keyframes: list[Moment]) -> None:
+    kind = head()
+    way = Timeline(kind, START, Play(keyframes=tuple(keyframes), speed=1.0)).way()
+    Envelope(kind, None).check_way(way.position_rad)
+    check_limits(way, kind, (0, 2))
+    for index, name in ((0, "yaw"), (2, "left")):
+        places = [0.0, *(one.position_rad[name] for one in keyframes if name in one.position_rad)]
+        turns = sum((b - a) * (c - b) < 0 for (a, b), (_, c) in pairwise(pairwise(places)))
+        way_of = way.position_rad[:, index]
+        assert min(places) - 1e-9 <= way_of.min() <= way_of.max() <= max(places) + 1e-9
+        steps = np.diff(way_of)
+        steps = steps[np.abs(steps) > 1e-9]
+        assert np.sum(steps[1:] * steps[:-1] < 0) <= max(turns, 0) + 1
+
+
+def reckoned(case: dict[str, Any]) -> dict[str, Any]:
+    """A shared movement with when its keyframes are reached and where its joints are at ten moments."""
+    keyframes = msgspec.convert(case["keyframes"], tuple[Moment, ...])
+    made = Timeline(head(), case["start_rad"], Play(keyframes=keyframes, speed=1.0))
+    moments = made._moments()
+    looks = np.linspace(0, moments[-1], 10)
+    way = [[float(value) for value in at(made.way(), one)] for one in looks]
+    return {"reached_s": moments[1:].tolist(), "position_rad": way}
+
+
+def test_the_page_reckons_the_same() -> None:
+    cases = json.loads(SHARED.read_text())
+    assert cases
+    for case in cases:
+        now, kept = reckoned(case), case["reckoned"]
+        assert now["reached_s"] == pytest.approx(kept["reached_s"], rel=1e-6), case["name"]
+        assert np.array(now["position_rad"]) == pytest.approx(np.array(kept["position_rad"]), abs=1e-6), case["name"]
+
+
+def _write() -> None:
+    cases = json.loads(SHARED.read_text())
+    SHARED.write_text(json.dumps([case | {"reckoned": reckoned(case)} for case in cases], indent=1) + "\n")
+
+
+if __name__ == "__main__":
+    _write()
+    sys.exit(0)

@@ -1,0 +1,156 @@
+"""Ways around things: found, gone along in physics without a touch, and refused clearly where there are none."""
+
+import math
+from pathlib import Path
+
+import mujoco
+import numpy as np
+import pytest
+
+from device_agent.geometry.mujoco_geometry import MujocoGeometry
+from device_agent.ports.geometry import GeometryError, PlannerLostError
+from device_agent.protocol.manifests import robot_type
+from device_agent.runtime.authority.lease_gate import LeaseGate, Refused
+from device_agent.runtime.control.controller import Controller
+from device_agent.runtime.control.goals import Outcome
+from device_agent.runtime.planning.motion_planner import Routes
+
+UR5 = Path(__file__).parents[3] / "robots" / "ur5"
+KIND = robot_type.load(UR5)
+HOME = [KIND.home_rad[joint.name] for joint in KIND.joints]
+BEYOND = [1.6, *HOME[1:]]
+PERIOD_S = KIND.period_ms / 1000
+POST = '<geom name="post" type="cylinder" size="0.04 0.35" pos="-0.249 -0.414 0.35"/>'
+
+
+@pytest.fixture(scope="module")
+def scene(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The table with a post on it, half way between the arm at home and where it shall go."""
+    folder = tmp_path_factory.mktemp("ur5")
+    (folder / "ur5.xml").write_bytes((UR5 / "ur5.xml").read_bytes())
+    text = (UR5 / KIND.scene).read_text().replace("<worldbody>", f"<worldbody>{POST}", 1)
+    (folder / KIND.scene).write_text(text)
+    return folder / KIND.scene
+
+
+@pytest.fixture(scope="module")
+def shape(scene: Path) -> MujocoGeometry:
+    return MujocoGeometry(KIND, scene)
+
+
+class Physics:
+    """The arm in MuJoCo, moved by the agent's own controller."""
+
+    def __init__(self, scene: Path, shape: MujocoGeometry) -> None:
+        self.model = mujoco.MjModel.from_xml_path(str(scene))
+        self.model.opt.timestep = 0.002
+        self.data = mujoco.MjData(self.model)
+        self.data.qpos[:] = self.data.ctrl[:] = HOME
+        self.controller = Controller(KIND, LeaseGate(), geometry=shape)
+        self.controller.start_at(HOME)
+        self.tenure = self.controller.begin_action(epoch=1, on_lost=lambda _: None)
+        self.now_s = 0.0
+        self.touched = 0
+
+    def run(self, seconds: float) -> None:
+        for _ in range(round(seconds / PERIOD_S)):
+            self.now_s += PERIOD_S
+            self.data.ctrl[:] = self.controller.step(self.now_s).position_rad
+            mujoco.mj_step(self.model, self.data, nstep=round(PERIOD_S / 0.002))
+            self.touched += self.data.ncon
+
+    def flange_m(self) -> list[float]:
+        place: list[float] = self.data.site("flange").xpos.tolist()
+        return place
+
+
+def check_around(scene: Path, shape: MujocoGeometry, seed: int) -> float:
+    """Plan with this seed, go, and give how far the flange then is from where it should be [m]."""
+    physics, routes = Physics(scene, shape), Routes(KIND, shape, seed=seed)
+    way = routes.around(HOME, BEYOND, speed=1.0, ended=lambda: False)
+    passage = physics.controller.go_along(physics.tenure, way)
+    physics.run(way.duration_s + 1.5)
+    assert passage.outcome is Outcome.REACHED, passage.why
+    assert passage.limited == ()
+    assert physics.touched == 0
+    return math.dist(physics.flange_m(), shape.poses(BEYOND)["flange"][:3])
+
+
+def test_the_straight_way_leads_through_the_post(shape: MujocoGeometry) -> None:
+    swept = shape.sweep([HOME, BEYOND])
+    assert swept.clearance is not None
+    assert "post" in swept.clearance.text
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_the_arm_goes_around_a_post_and_rests_where_it_should(scene: Path, shape: MujocoGeometry, seed: int) -> None:
+    assert check_around(scene, shape, seed) <= 0.001
+
+
+@pytest.mark.long
+def test_it_does_so_with_twenty_seeds_of_twenty(scene: Path, shape: MujocoGeometry) -> None:
+    errors_m = [check_around(scene, shape, 100 + seed) for seed in range(20)]
+    assert max(errors_m) <= 0.001
+
+
+def test_a_straight_way_is_straight_in_physics_too(scene: Path, shape: MujocoGeometry) -> None:
+    physics = Physics(scene, shape)
+    begin = shape.poses(HOME)["flange"]
+    pose = (begin[0], begin[1] + 0.25, begin[2] - 0.05, *begin[3:])
+    way = Routes(KIND, shape).straight(HOME, "flange", pose, speed=0.5)
+    physics.controller.go_along(physics.tenure, way)
+    line, off_m = np.subtract(pose[:3], begin[:3]), []
+    for _ in range(round(way.duration_s / PERIOD_S) + 100):
+        physics.run(PERIOD_S)
+        away = np.subtract(physics.flange_m(), begin[:3])
+        off_m.append(float(np.linalg.norm(away - line * (away @ line) / (line @ line))))
+    assert math.dist(physics.flange_m(), pose[:3]) <= 0.001
+    assert max(off_m) <= 0.004
+    commanded = [shape.poses(place.tolist())["flange"] for place in way.position_rad[::5]]
+    ways = [np.subtract(place[:3], begin[:3]) for place in commanded]
+    assert max(float(np.linalg.norm(one - line * (one @ line) / (line @ line))) for one in ways) <= 0.0005
+
+
+def test_where_there_is_no_room_the_end_is_refused_and_named(shape: MujocoGeometry) -> None:
+    with pytest.raises(GeometryError, match="no room there: clearance: post"):
+        shape.plan(HOME, [0.8, *HOME[1:]])
+
+
+def test_a_search_ends_when_its_time_is_over(shape: MujocoGeometry) -> None:
+    with pytest.raises(GeometryError, match="found no way there in 0 s"):
+        shape.plan(HOME, BEYOND, within_s=0.0)
+
+
+def test_who_no_longer_wants_a_way_does_not_wait_for_it(shape: MujocoGeometry) -> None:
+    with pytest.raises(GeometryError, match="nobody waits"):
+        shape.plan(HOME, BEYOND, ended=lambda: True)
+
+
+def test_whoever_looks_for_a_way_may_be_lost(shape: MujocoGeometry, monkeypatch: pytest.MonkeyPatch) -> None:
+    def lost(*_: object, **__: object) -> None:
+        raise PlannerLostError("the program that looks for ways has ended; try again")
+
+    monkeypatch.setattr(shape, "plan", lost)
+    with pytest.raises(Refused, match="try again") as refused:
+        Routes(KIND, shape).around(HOME, BEYOND, speed=1.0, ended=lambda: False)
+    assert refused.value.code == "planner_lost"
+
+
+def test_the_same_seed_finds_the_same_way(shape: MujocoGeometry) -> None:
+    assert shape.plan(HOME, BEYOND, seed=7) == shape.plan(HOME, BEYOND, seed=7)
+    assert shape.plan(HOME, BEYOND, seed=7) != shape.plan(HOME, BEYOND, seed=8)
+
+
+def test_every_leg_of_a_plan_is_clear_for_the_gate_too(shape: MujocoGeometry) -> None:
+    path = shape.plan(HOME, BEYOND, seed=3)
+    assert (path[0], path[-1]) == (tuple(HOME), tuple(BEYOND))
+    assert shape.sweep(path).clearance is None
+
+
+def test_a_straight_way_that_needs_another_posture_or_leads_through_something_is_refused(shape: MujocoGeometry) -> None:
+    routes, begin = Routes(KIND, shape), shape.poses(HOME)["flange"]
+    through = (-0.249, -0.414, begin[2], *begin[3:])
+    for pose in (through, (-begin[0], -begin[1], *begin[2:]), (begin[0], begin[1], -0.05, *begin[3:])):
+        with pytest.raises(Refused) as refused:
+            routes.straight(HOME, "flange", pose, speed=0.5)
+        assert refused.value.code in {"not_straight", "no_room", "out_of_reach"}

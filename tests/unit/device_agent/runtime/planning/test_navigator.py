@@ -1,0 +1,245 @@
+"""Going to a place in the room: around what stands there, and never without knowing where the robot is."""
+
+import math
+import threading
+from dataclasses import asdict
+
+import numpy as np
+import pytest
+
+from device_agent.perception.occupancy_grid import Floor, OccupancyGrid
+from device_agent.ports import script_calls
+from device_agent.ports.driver import REST, Twist
+from device_agent.protocol import StopLatch
+from device_agent.runtime.actions.device_context import Body
+from device_agent.runtime.actions.robot_api import ScriptRobot
+from device_agent.runtime.authority.lease_gate import Refused
+from device_agent.runtime.planning import navigator as errand_module
+from device_agent.runtime.planning.navigator import (
+    EVERY_S,
+    PATIENCE_S,
+    SHORT_PATIENCE_S,
+    Errand,
+    Place,
+    Whereabouts,
+    way,
+)
+from device_agent.runtime.readings import Reading, Room
+from tests.fakes.drivers import BASE, PERIOD_S, robot_type
+from tests.harness.agent.controller_fixture import Rig
+
+LIMITS = Twist(0.3, 0.0, 1.5)
+
+
+def room(*walls: tuple[float, float, float, float]) -> OccupancyGrid:
+    """Four by four metres, seen, with boxes (lowest x, y, highest x, y)."""
+    grid = OccupancyGrid((-2.0, -2.0), (2.0, 2.0))
+    places = np.array([(x, y) for x in np.arange(-1.98, 2, 0.04) for y in np.arange(-1.98, 2, 0.04)])
+    taken = np.zeros(len(places), dtype=bool)
+    for x0, y0, x1, y1 in walls:
+        taken |= (places[:, 0] >= x0) & (places[:, 0] <= x1) & (places[:, 1] >= y0) & (places[:, 1] <= y1)
+    for _ in range(5):
+        grid.see_points("lidar", places, taken)
+    return grid
+
+
+def go(errand: Errand, grid: OccupancyGrid, place: Place, *, seconds: float = 60.0) -> list[Place]:
+    """Where an ideal base comes."""
+    places = [place]
+    for _ in range(round(seconds / EVERY_S)):
+        twist = errand.twist(places[-1], grid)
+        if twist is None:
+            return places
+        assert all(abs(part) <= most + 1e-9 for part, most in zip(twist, LIMITS, strict=True))
+        last = places[-1]
+        yaw = last.yaw_rad + twist.turn_rad_s * EVERY_S / 2
+        places.append(
+            Place(
+                last.x_m + twist.forward_m_s * EVERY_S * math.cos(yaw),
+                last.y_m + twist.forward_m_s * EVERY_S * math.sin(yaw),
+                last.yaw_rad + twist.turn_rad_s * EVERY_S,
+            )
+        )
+    pytest.fail(f"not there: {places[-1]}")
+
+
+def test_it_goes_around_a_wall_and_stands_as_asked() -> None:
+    grid = room((-0.1, -2.0, 0.1, 0.8))
+    errand = Errand((1.2, -1.0), 1.5, limits=LIMITS, radius_m=0.25)
+    places = go(errand, grid, Place(-1.2, -1.0, 2.0))
+    assert math.dist((places[-1].x_m, places[-1].y_m), (1.2, -1.0)) <= 0.08
+    assert places[-1].yaw_rad == pytest.approx(1.5, abs=0.05)
+    taken = grid.blocked(0.15)
+    assert not any(taken.at(place.x_m, place.y_m) for place in places)
+
+
+def test_without_a_heading_it_ends_as_it_comes() -> None:
+    places = go(Errand((1.0, 0.0), None, limits=LIMITS, radius_m=0.25), room(), Place(0.0, 0.0, 0.0))
+    assert abs(places[-1].yaw_rad) < 0.4
+
+
+def test_where_no_way_leads_is_refused() -> None:
+    shut = room((-0.1, -2.0, 0.1, 2.0))
+    for goal, code in (((1.0, 0.0), "no_way"), ((0.0, 0.0), "taken"), ((9.0, 0.0), "out_of_room")):
+        with pytest.raises(Refused) as refused:
+            Errand(goal, None, limits=LIMITS, radius_m=0.25).twist(Place(-1.0, 0.0, 0.0), shut)
+        assert refused.value.code == code
+
+
+def test_somebody_who_stands_in_the_way_is_gone_around_or_waited_for() -> None:
+    floor = Floor(np.zeros((5, 5), dtype=bool), (0.0, 0.0), 1.0)
+    assert way(floor, (0.5, 0.5), (4.5, 0.5))[-1] == (4.5, 0.5)
+    floor.blocked[:, 2] = True
+    with pytest.raises(Refused, match="no free way"):
+        way(floor, (0.5, 0.5), (4.5, 0.5))
+
+
+def test_a_refusal_names_the_nearest_place_that_has_a_way() -> None:
+    for goal, code, near in (((1.0, 0.0), "no_way", r"x_m -0\.\d+, y_m -?0\.0"), ((0.0, 0.3), "taken", r"y_m 0\.\d+")):
+        with pytest.raises(Refused, match=f"nearest place to go to is .*{near}") as refused:
+            Errand(goal, None, limits=LIMITS, radius_m=0.25).twist(Place(-1.0, 0.0, 0.0), room((-0.1, -2.0, 0.1, 2.0)))
+        assert refused.value.code == code
+    full = Floor(np.ones((5, 5), dtype=bool), (0.0, 0.0), 1.0)
+    with pytest.raises(Refused, match=r"or nobody has seen it$"):
+        way(full, (0.5, 0.5), (4.5, 0.5))
+
+
+def test_who_stands_too_near_to_something_leaves_it_for_the_nearest_free_place() -> None:
+    floor = Floor(np.zeros((40, 40), dtype=bool), (0.0, 0.0), 0.05)
+    floor.blocked[:, :6] = True
+    places = way(floor, (0.08, 1.0), (1.5, 1.0))
+    assert places[0] == pytest.approx((0.325, 1.025))
+    floor.blocked[:, :20] = True
+    with pytest.raises(Refused, match="no free way"):
+        way(floor, (0.08, 1.0), (1.5, 1.0))
+
+
+def test_a_way_leads_between_things_corner_by_corner() -> None:
+    floor = Floor(np.eye(6, dtype=bool)[::-1].copy(), (0.0, 0.0), 1.0)
+    floor.blocked[0, 5] = False
+    assert way(floor, (0.5, 0.5), (5.5, 5.5))[-1] == (5.5, 5.5)
+
+
+def test_a_place_that_is_taken_from_the_beginning_is_not_waited_for_long() -> None:
+    errand = Errand((1.0, 0.0), None, limits=LIMITS, radius_m=0.25)
+    taken = Refused("taken", "")
+    assert errand.patience_s(taken) == SHORT_PATIENCE_S
+    assert errand.patience_s(Refused("out_of_room", "")) == 0
+    errand.twist(Place(0.0, 0.0, 0.0), room())
+    assert errand.patience_s(taken) == PATIENCE_S
+
+
+def test_the_room_corrects_what_the_wheels_believe() -> None:
+    where = Whereabouts("qbo")
+    wheels = Reading({"x_m": 1.0, "y_m": 0.0, "yaw_rad": 0.5}, 0.02)
+    seen = Reading({"x_m.qbo": 1.2, "y_m.qbo": 0.1, "age_s.qbo": 0.2}, 0.1)
+    assert where.place(wheels, None) == Place(1.0, 0.0, 0.5)
+    found = where.place(wheels, seen)
+    assert (found.x_m, found.y_m, found.yaw_rad) == pytest.approx((1.2, 0.1, 0.5))
+    assert where.place(wheels, None).x_m == pytest.approx(1.2), "what it has learned stays"
+
+
+def test_without_wheels_that_count_the_room_alone_tells() -> None:
+    seen = Reading({"x_m.nao": 1.2, "y_m.nao": 0.1, "yaw_rad.nao": 0.3}, 0.1)
+    assert Whereabouts("nao").place(None, seen) == Place(1.2, 0.1, 0.3)
+
+
+@pytest.mark.parametrize(
+    "seen",
+    [
+        None,
+        Reading({"x_m.nao": 1.2, "y_m.nao": 0.1}, 0.1),
+        Reading({"x_m.nao": 1.2, "y_m.nao": 0.1, "yaw_rad.nao": 0.3}, 1.5),
+        Reading({"x_m.nao": 1.2, "y_m.nao": 0.1, "yaw_rad.nao": 0.3, "age_s.nao": 2.0}, 0.1),
+        Reading({"x_m.nao": math.nan, "y_m.nao": 0.1, "yaw_rad.nao": 0.3}, 0.1),
+        Reading({"x_m.qbo": 1.2, "y_m.qbo": 0.1, "yaw_rad.qbo": 0.3}, 0.1),
+    ],
+)
+def test_a_robot_that_nobody_sees_does_not_go(seen: Reading | None) -> None:
+    with pytest.raises(Refused, match="nobody knows where the robot is"):
+        Whereabouts("nao").place(None, seen)
+
+
+def test_at_its_place_it_only_turns() -> None:
+    errand = Errand((0.0, 0.0), 1.0, limits=LIMITS, radius_m=0.25)
+    twist = errand.twist(Place(0.01, 0.0, 0.0), room())
+    assert twist is not None
+    assert (twist.forward_m_s, twist.left_m_s) == (REST.forward_m_s, REST.left_m_s)
+    assert twist.turn_rad_s > 0
+
+
+class Toy:
+    """A base that goes as it is told, in a thread of its own."""
+
+    def __init__(self, ground: OccupancyGrid | None) -> None:
+        self.rig = Rig(base=BASE)
+        self.at = Place(0.0, 0.0, 0.0)
+        self.over = threading.Event()
+        body = Body(
+            robot_type=robot_type(BASE),
+            controller=self.rig.controller,
+            observe=lambda: None,
+            geometry=None,
+            skills=None,
+            room=Room(space="s", agent="a", own=["toy"]),
+            reported=lambda: {"odometry": Reading(asdict(self.at), 0.0)},
+            name="toy",
+            ground=lambda: ground,
+        )
+        self.robot = ScriptRobot(body)
+        self.robot.begin(1, lambda _: None)
+        self.thread = threading.Thread(target=self.live, daemon=True)
+        self.thread.start()
+
+    def live(self) -> None:
+        while not self.over.wait(PERIOD_S):
+            self.rig.now_s += PERIOD_S
+            twist = self.rig.controller.step(self.rig.now_s).twist
+            at = self.at
+            self.at = Place(
+                at.x_m + twist.forward_m_s * PERIOD_S * math.cos(at.yaw_rad),
+                at.y_m + twist.forward_m_s * PERIOD_S * math.sin(at.yaw_rad),
+                at.yaw_rad + twist.turn_rad_s * PERIOD_S,
+            )
+
+    def end(self) -> None:
+        self.robot.give_back()
+        self.over.set()
+        self.thread.join()
+
+
+def test_a_robot_goes_to_a_place_and_rests_there() -> None:
+    toy = Toy(room())
+    toy.robot.do(script_calls.GoTo(x_m=0.3, y_m=0.0, yaw_rad=0.3))
+    assert math.dist((toy.at.x_m, toy.at.y_m), (0.3, 0.0)) < 0.15
+    assert not toy.rig.controller.moving
+    toy.end()
+
+
+def test_who_cannot_see_the_room_or_waits_in_vain_says_so(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(errand_module, "PATIENCE_S", 0.15)
+    monkeypatch.setattr(errand_module, "SHORT_PATIENCE_S", 0.15)
+    shut = room((0.5, -2, 0.7, 2))
+    for ground, x_m, code in ((None, 1.0, "no_ground"), (shut, 0.6, "taken"), (room(), 9.0, "out_of_room")):
+        toy = Toy(ground)
+        with pytest.raises(Refused) as refused:
+            toy.robot.do(script_calls.GoTo(x_m=x_m, y_m=0.0))
+        assert refused.value.code == code
+        toy.end()
+
+
+def test_an_errand_that_loses_the_device_ends() -> None:
+    toy = Toy(room())
+    threading.Timer(0.3, lambda: toy.rig.controller.stop(StopLatch(by="ann", reason="", at_ms=0))).start()
+    with pytest.raises(Refused, match="stopped"):
+        toy.robot.do(script_calls.GoTo(x_m=1.5, y_m=0.0))
+    toy.end()
+    with pytest.raises(Refused):
+        toy.robot.do(script_calls.GoTo(x_m=1.5, y_m=0.0))
+
+
+def test_a_place_is_finite_and_a_robot_without_a_base_goes_nowhere() -> None:
+    with pytest.raises(Refused, match="does not drive"):
+        Errand.of(0.0, 0.0, None, robot_type())
+    with pytest.raises(Refused, match="finite"):
+        Errand.of(math.nan, 0.0, None, robot_type(BASE))

@@ -1,0 +1,283 @@
+"""Ways: inside every limit, gone along to their end, and never left, not even to brake."""
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+from itertools import pairwise
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from device_agent.ports.geometry import Clearance, Sweep, never
+from device_agent.protocol import Mode, Pose
+from device_agent.runtime.authority.lease_gate import Refused
+from device_agent.runtime.control.goals import Outcome
+from device_agent.runtime.planning import trajectory
+from device_agent.runtime.planning.motion_planner import Routes, quaternion_of
+from device_agent.runtime.planning.trajectory import Floats, Way
+from tests.fakes.drivers import PERIOD_S, robot_type
+from tests.harness.agent.controller_fixture import Rig, Wall, interruptions, lost
+
+JOINTS = robot_type().joints
+CORNER = [[0.0, 0.0], [1.2, 0.0], [1.2, 1.0]]
+
+
+def anywhere(_: Floats) -> bool:
+    return True
+
+
+def along(corners: list[list[float]], *, speed: float = 1.0) -> Way:
+    points = trajectory.smooth(corners, anywhere)
+    assert points is not None
+    return trajectory.timed(points, JOINTS, speed=speed, step_s=PERIOD_S)
+
+
+def slopes(positions: Floats) -> list[float]:
+    """The highest velocity, acceleration and jerk of any joint."""
+    found, step = [], positions
+    for _ in range(3):
+        step = np.diff(step, axis=0) / PERIOD_S
+        found.append(float(np.max(np.abs(step), initial=0.0)))
+    return found
+
+
+positions = st.lists(st.floats(-2.9, 2.9), min_size=2, max_size=2)
+
+
+@settings(max_examples=25, deadline=None)
+@given(corners=st.lists(positions, min_size=2, max_size=5), speed=st.floats(0.05, 1.0))
+def test_whatever_the_corners_every_limit_holds(corners: list[list[float]], speed: float) -> None:
+    found = along(corners, speed=speed)
+    velocity, acceleration, jerk = slopes(found.position_rad)
+    assert velocity <= 3.0 * speed * 1.01
+    assert acceleration <= 8.0 * 1.02
+    assert jerk <= 80.0 * 1.05
+    assert found.position_rad[0] == pytest.approx(corners[0], abs=1e-9)
+    assert found.position_rad[-1] == pytest.approx(corners[-1], abs=1e-9)
+    assert not found.velocity_rad_s[[0, -1]].any()
+
+
+def test_a_way_to_where_the_device_is_ends_at_once() -> None:
+    found = along([[0.5, 0.1], [0.5, 0.1]])
+    assert found.duration_s < 1.0
+    assert not found.velocity_rad_s.any()
+
+
+def test_a_way_of_one_leg_is_straight_and_nearly_as_quick_as_a_move() -> None:
+    found = along([[0.0, 0.0], [2.0, 1.0]])
+    assert found.position_rad[:, 0] == pytest.approx(2 * found.position_rad[:, 1], abs=1e-9)
+    rig = Rig()
+    tenure = rig.controller.begin_action(epoch=1, on_lost=lost)
+    move = rig.controller.move(tenure, {"shoulder": 2.0, "elbow": 1.0}, speed=1.0)
+    began_s = rig.now_s
+    while not move.finished.is_set():
+        rig.run(PERIOD_S)
+    assert found.duration_s <= 1.3 * (rig.now_s - began_s)
+
+
+def test_corners_are_rounded_off_as_widely_as_there_is_room() -> None:
+    def near(path: Floats) -> bool:
+        """Only what stays near to the corner's two legs is clear."""
+        away = np.minimum(np.abs(path[:, 1]), np.abs(path[:, 0] - 1.2))
+        return bool(np.all(away < 0.02))
+
+    wide, narrow = trajectory.smooth(CORNER, anywhere), trajectory.smooth(CORNER, near)
+    assert wide is not None
+    assert narrow is not None
+    assert len(wide) < len(narrow)
+    assert near(trajectory.timed(narrow, JOINTS, speed=1.0, step_s=PERIOD_S).position_rad)
+    assert trajectory.smooth(CORNER, lambda _: False) is None
+
+
+def test_the_device_goes_along_a_way_and_rests_at_its_end() -> None:
+    rig, found = Rig(), along(CORNER)
+    tenure = rig.controller.begin_action(epoch=1, on_lost=lost)
+    passage = rig.controller.go_along(tenure, found)
+    gone = ride(rig, found.duration_s + 0.1)
+    assert passage.outcome is Outcome.REACHED
+    assert gone[: len(found.position_rad) - 1] == pytest.approx(found.position_rad[1:], abs=1e-6)
+    assert rig.controller.commanded_rad == pytest.approx([1.2, 1.0], abs=1e-9)
+    assert not rig.controller.moving
+
+
+def ride(rig: Rig, seconds: float) -> Floats:
+    gone = []
+    for _ in range(round(seconds / PERIOD_S)):
+        rig.now_s += PERIOD_S
+        gone.append(rig.controller.step(rig.now_s).position_rad)
+    return np.array(gone)
+
+
+def check_on(found: Way, gone: Floats) -> None:
+    """Every place is one of the way's."""
+    for place in gone:
+        assert float(np.min(np.linalg.norm(found.position_rad - place, axis=1))) < 0.015
+
+
+@pytest.mark.parametrize("cause", sorted(set(interruptions()) - {"expiry"}))
+@pytest.mark.parametrize("after_s", [0.1, 0.45, 0.7])
+def test_whatever_takes_the_device_away_brakes_it_on_its_way(cause: str, after_s: float) -> None:
+    rig, found = Rig(), along(CORNER)
+    rig.take(1, lease_s=5.0)
+    tenure = rig.controller.begin_action(epoch=1, on_lost=lost)
+    passage = rig.controller.go_along(tenure, found)
+    before = ride(rig, after_s)
+    assert before[-1] != pytest.approx(before[-2], abs=1e-6)
+    interruptions()[cause](rig)  # type: ignore[operator]
+    gone = ride(rig, 0.3)
+    assert passage.outcome is Outcome.INTERRUPTED
+    assert not rig.controller.moving
+    assert gone[-1] == pytest.approx(gone[-2], abs=1e-6)
+    check_on(found, gone)
+    assert slopes(np.concatenate((before[-4:], gone)))[1] <= 20.0 + 0.5
+
+
+def test_the_room_slows_a_way_and_lets_it_speed_up_again_inside_the_limits() -> None:
+    rig, found = Rig(), along(CORNER)
+    tenure = rig.controller.begin_action(epoch=1, on_lost=lost)
+    passage = rig.controller.go_along(tenure, found)
+    gone = [ride(rig, 0.4)]
+    rig.controller.restrict("room", 0.3, "somebody is near")
+    gone.append(ride(rig, 1.5))
+    slow = np.max(np.abs(np.diff(gone[-1][-40:], axis=0))) / PERIOD_S
+    assert slow <= 0.3 * 3.0 + 1e-6
+    rig.controller.lift("room")
+    gone.append(ride(rig, 3.0))
+    assert passage.outcome is Outcome.REACHED
+    assert any("somebody is near" in one for one in passage.limited)
+    whole = np.concatenate(gone)
+    check_on(found, whole)
+    assert slopes(whole)[1] <= 8.0 * 1.05
+
+
+def test_what_appears_on_a_way_holds_it_before() -> None:
+    rig, found = Rig(geometry=Wall(0.5)), along(CORNER)
+    tenure = rig.controller.begin_action(epoch=1, on_lost=lost)
+    passage = rig.controller.go_along(tenure, found)
+    gone = ride(rig, 3.0)
+    assert passage.why is not None
+    assert passage.why.code == "no_room"
+    assert np.max(gone[:, 1]) <= 0.5 + 1e-6
+    check_on(found, gone)
+
+
+def test_a_late_control_loop_counts_what_it_missed_as_braked_on_a_way_too() -> None:
+    rig, found = Rig(), along(CORNER)
+    tenure = rig.controller.begin_action(epoch=1, on_lost=lost)
+    rig.controller.go_along(tenure, found)
+    ride(rig, 0.5)
+    rig.controller.end_action(tenure)
+    ride(rig, 2 * PERIOD_S)
+    rig.now_s += 0.08
+    gone = ride(rig, 0.15)
+    assert not rig.controller.moving
+    check_on(found, gone)
+
+
+def test_a_move_that_follows_waits_until_the_device_rests_on_its_way() -> None:
+    rig, found = Rig(), along(CORNER)
+    tenure = rig.controller.begin_action(epoch=1, on_lost=lost)
+    passage = rig.controller.go_along(tenure, found)
+    ride(rig, 0.5)
+    move = rig.controller.move(tenure, {"shoulder": 0.0, "elbow": 0.0}, speed=1.0)
+    assert passage.outcome is Outcome.INTERRUPTED
+    gone = ride(rig, 3.0)
+    assert move.outcome is Outcome.REACHED
+    assert slopes(gone)[1] <= 20.5
+
+
+def test_a_way_that_begins_elsewhere_or_leaves_a_range_is_refused() -> None:
+    rig = Rig()
+    tenure = rig.controller.begin_action(epoch=1, on_lost=lost)
+    for corners, code in (
+        ([[0.1, 0.0], [1.0, 0.0]], "moved"),
+        ([[0.0, 0.0], [0.0, 3.2]], "out_of_range"),
+    ):
+        with pytest.raises(Refused) as refused:
+            rig.controller.go_along(tenure, along(corners))
+        assert refused.value.code == code
+    broken = along([[0.0, 0.0], [1.0, 0.0]])
+    broken.position_rad[3, 1] = math.nan
+    with pytest.raises(Refused, match="leads elbow out of its range"):
+        rig.controller.go_along(tenure, broken)
+    rig.controller.move(tenure, {"elbow": 1.0}, speed=1.0)
+    rig.run(0.3)
+    with pytest.raises(Refused, match="no longer where the way begins"):
+        rig.controller.go_along(tenure, along(CORNER))
+    assert rig.controller.mode is Mode.ACTION
+
+
+def test_a_target_is_looked_at_before_a_way_to_it() -> None:
+    rig = Rig(geometry=Wall())
+    tenure = rig.controller.begin_action(epoch=1, on_lost=lost)
+    assert rig.controller.target(tenure, {"elbow": 0.5}) == [0.0, 0.5]
+    with pytest.raises(Refused, match="no room there"):
+        rig.controller.target(tenure, {"elbow": 1.5})
+
+
+def test_an_orientation_has_a_direction_and_is_given_once() -> None:
+    poses = {"hand": (0.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0)}
+    assert quaternion_of(poses, "hand", None, None) == (0.0, 1.0, 0.0, 0.0)
+    assert quaternion_of(poses, "hand", (2.0, 0.0, 0.0, 0.0), None) == (1.0, 0.0, 0.0, 0.0)
+    assert quaternion_of(poses, "hand", None, (math.pi, 0.0, 0.0)) == pytest.approx((0.0, 1.0, 0.0, 0.0), abs=1e-9)
+    for frame, quaternion, rpy in (
+        ("foot", None, None),
+        ("hand", (0.0, 0.0, 0.0, 0.0), None),
+        ("hand", (1.0, 0.0, 0.0, 0.0), (0.0, 0.0, 0.0)),
+    ):
+        with pytest.raises(Refused):
+            quaternion_of(poses, frame, quaternion, rpy)
+
+
+def test_samples_of_a_way_are_joined_smoothly() -> None:
+    found = along(CORNER)
+    fine = np.array([found.at(time_s)[0] for time_s in np.arange(-0.1, found.duration_s + 0.1, 0.001)])
+    steps = [float(np.linalg.norm(b - a)) for a, b in pairwise(fine)]
+    assert max(steps) <= math.hypot(3.0, 3.0) * 0.001 * 1.02
+    assert max(abs(b - a) for a, b in pairwise(steps)) <= math.hypot(8.0, 8.0) * 1e-6 * 1.5
+
+
+def test_after_its_last_try_a_way_is_taken_as_it_is(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(trajectory, "_TRIES", 1)
+    assert along(CORNER).position_rad[-1] == pytest.approx([1.2, 1.0], abs=1e-9)
+
+
+class Narrow(Wall):
+    """Plans a corner, and calls every way that has one too narrow to go along."""
+
+    def plan(
+        self,
+        start_rad: Sequence[float],
+        goal_rad: Sequence[float],
+        *,
+        seed: int = 0,
+        within_s: float = 5.0,
+        ended: Callable[[], bool] = never,
+    ) -> tuple[tuple[float, ...], ...]:
+        del seed, within_s, ended
+        return (tuple(start_rad), (1.0, 0.0), tuple(goal_rad))
+
+    def sweep(self, path_rad: Sequence[Sequence[float]]) -> Sweep:
+        del path_rad
+        return Sweep(0.0, Clearance(-0.01, ("hand", "wall")))
+
+
+class Sliding(Narrow):
+    """Its hand is where its first joint says."""
+
+    frames = ("hand",)
+
+    def poses(self, position_rad: Sequence[float]) -> Mapping[str, Pose]:
+        return {"hand": (position_rad[0], 0.0, 0.0, 1.0, 0.0, 0.0, 0.0)}
+
+    def solve(self, frame: str, pose: Pose, start_rad: Sequence[float]) -> tuple[float, ...]:
+        del frame, start_rad
+        return (pose[0], 0.0)
+
+
+def test_a_way_that_is_too_narrow_is_refused() -> None:
+    with pytest.raises(Refused, match="too narrow"):
+        Routes(robot_type(), Narrow()).around([0.0, 0.0], [1.0, 1.0], speed=1.0, ended=never)
+    with pytest.raises(Refused, match="something is in the way: clearance: hand"):
+        Routes(robot_type(), Sliding()).straight([0.0, 0.0], "hand", (0.1, 0, 0, 1, 0, 0, 0), speed=1.0)

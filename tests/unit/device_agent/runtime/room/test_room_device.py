@@ -1,0 +1,457 @@
+"""A whole room device with a toy sensor and a broker that is a list: what it measures, and what may be done with it."""
+
+import math
+import threading
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from device_agent.ports.sensor import Capture, Frame, SensorError
+from device_agent.ports.uploads import UploadError
+from device_agent.protocol import (
+    Ack,
+    AckStatus,
+    CancelAction,
+    CaptureRaw,
+    Control,
+    Description,
+    Gather,
+    Measurements,
+    Mode,
+    MoveJoints,
+    ReleaseLease,
+    ResetStop,
+    RoomTask,
+    SetControl,
+    Shoot,
+    Stop,
+    StopDevice,
+    Stream,
+    camera_frames,
+    topics,
+)
+from device_agent.protocol.codec import MAX_BYTES
+from device_agent.protocol.manifests.room import Control as RoomControl
+from device_agent.protocol.manifests.room import RoomDevice
+from device_agent.runtime.authority.interlocks import Interlock
+from device_agent.runtime.readings import Room
+from device_agent.runtime.room.room_device import Instrument
+from tests.harness.agent.device_harness import Bench, eventually, shown
+
+JPEG = b"\xff\xd8 a picture \xff\xd9"
+ENTRY = RoomDevice(
+    name="arm",  # the bench's device is called so
+    kind="window",
+    label="Window",
+    driver="toy",
+    streams=(Stream(name="air", rate_hz=20.0), Stream(name="rain", rate_hz=5.0)),
+    cameras=(Stream(name="garden", rate_hz=20.0),),
+    captures=("image",),
+    controls=(RoomControl(name="opening", label="Opening", unit="m", lower=0.0, upper=0.5),),
+    position_m=(1.0, -2.0, 1.5),
+)
+
+
+class ToySensor:
+    """Measures how often it was asked."""
+
+    simulated = True
+
+    def __init__(self) -> None:
+        self.reads: dict[str, int] = {"air": 0, "rain": 0}
+        self.broken = ""
+        self.set_to: list[float] = []
+        self.holds = 0
+        self.closed = False
+        self.picture = JPEG
+        self.values: dict[str, float | bool] = {}
+
+    def connect(self) -> None:
+        self._check()
+
+    def read(self, stream: str) -> dict[str, float | bool]:
+        self._check()
+        self.reads[stream] += 1
+        return {"reads": float(self.reads[stream]), **self.values} if stream == "air" else {}
+
+    def frame(self, _camera: str) -> Frame | None:
+        self._check()
+        return None if not self.picture else Frame(4, 3, self.picture, time.monotonic())
+
+    def capture(self, _name: str) -> Capture:
+        self._check()
+        return Capture("image/png", b"PNG")
+
+    def set(self, _control: str, value: float) -> float:
+        self._check()
+        self.set_to.append(value)
+        return value / 2
+
+    def hold(self) -> None:
+        self._check()
+        self.holds += 1
+
+    def raw(self) -> None:
+        return None
+
+    def close(self) -> None:
+        self.closed = True
+
+    def _check(self) -> None:
+        if self.broken:
+            raise SensorError(self.broken)
+
+
+class ToyStore:
+    """Remembers what was stored."""
+
+    def __init__(self) -> None:
+        self.stored: list[dict[str, Any]] = []
+        self.full = False
+
+    def store(self, device: str, **more: Any) -> str:
+        if self.full:
+            raise UploadError("the store is full; delete something")
+        self.stored.append({"device": device, **more})
+        return "u1"
+
+
+class RoomBench(Bench):
+    def __init__(self, folder: Path, **more: Any) -> None:
+        self.sensor, self.store = ToySensor(), ToyStore()
+        self.uploads = more.pop("uploads", self.store)
+        instrument = Instrument(self.sensor, more.pop("entry", ENTRY), self.uploads)
+        super().__init__(folder, driver=instrument, kind=ENTRY.robot_type(), **more)  # type: ignore[arg-type]
+        self.device.start()
+
+    def done(self, request: RoomTask, **more: Any) -> Ack:
+        """What became of an action."""
+        return self.end(self.command(request, epoch=self.epoch(), **more))
+
+    def epoch(self) -> int:
+        """A new one for each action, as the cloud gives it."""
+        self.given = getattr(self, "given", 0) + 1
+        return self.given
+
+    def measured(self, stream: str = "air") -> list[Measurements]:
+        return self.heard(topics.TELE, Measurements, stream)
+
+    def pictures(self) -> list[bytes]:
+        wanted = topics.device("s", "a", "arm", topics.CAM, "garden")
+        return [payload for topic, payload in self.said if topic == wanted]
+
+
+@pytest.fixture
+def bench(tmp_path: Path) -> Iterator[RoomBench]:
+    bench = RoomBench(tmp_path)
+    yield bench
+    bench.stop()
+
+
+def grows(things: Callable[[], list[Any]], by: int = 3) -> None:
+    before = len(things())
+    eventually(lambda: len(things()) >= before + by)
+
+
+def test_it_says_what_it_has_and_which_actions_it_takes(bench: RoomBench) -> None:
+    bench.device.link_changed(True)
+    described: Description = eventually(lambda: bench.heard(topics.DESC, Description))[-1]
+    assert described.joints == ()
+    assert described.limits == ()
+    assert described.robot_type == described.kind == "window"
+    assert described.streams == ENTRY.streams
+    assert described.cameras == ENTRY.cameras
+    assert described.captures == ("image",)
+    assert described.position_m == (1.0, -2.0, 1.5)
+    assert described.controls == (Control(name="opening", label="Opening", unit="m", lower=0.0, upper=0.5),)
+    assert described.actions == ("gather", "shoot", "capture", "set_control")
+    assert described.simulated
+
+
+def test_streams_are_told_in_order_and_what_says_nothing_is_not_told(bench: RoomBench) -> None:
+    grows(bench.measured)
+    told = bench.measured()
+    assert [each.sequence for each in told] == list(range(1, len(told) + 1))
+    assert [each.tick_ms for each in told] == sorted(each.tick_ms for each in told)
+    assert all(set(each.values) == {"reads"} for each in told)
+    eventually(lambda: bench.sensor.reads["rain"] > 1)
+    assert bench.measured("rain") == []
+
+
+def test_numbers_that_are_none_are_left_out(bench: RoomBench) -> None:
+    bench.sensor.values = {"hot": math.nan, "cold": -math.inf, "well": True}
+    eventually(lambda: any("well" in each.values for each in bench.measured()))
+    assert not any({"hot", "cold"} & set(each.values) for each in bench.measured())
+
+
+def test_pictures_travel_with_their_header_and_are_not_kept(bench: RoomBench) -> None:
+    grows(bench.pictures)
+    told = [camera_frames.decode(picture) for picture in bench.pictures()]
+    assert [each.sequence for each in told] == list(range(1, len(told) + 1))
+    assert all((each.width, each.height, each.jpeg) == (4, 3, JPEG) for each in told)
+    assert not any(topics.CAM in item.topic for item in bench.outbox._incoming)
+
+
+def test_a_camera_that_has_no_picture_yet_films_none(bench: RoomBench) -> None:
+    grows(bench.pictures)
+    bench.sensor.picture = b""
+    grows(bench.measured)
+    filmed = len(bench.pictures())
+    grows(bench.measured)
+    assert len(bench.pictures()) <= filmed + 1, "one may have been on its way"
+
+
+def test_a_picture_that_is_too_large_is_a_fault_that_says_what_to_do(bench: RoomBench) -> None:
+    bench.device.link_changed(True)
+    bench.sensor.picture = bytes(MAX_BYTES)
+    state = shown(bench, lambda state: state.faults)
+    assert "smaller pictures" in state.faults[0].message
+
+
+def test_a_gathering_changes_the_rate_tells_how_far_it_is_and_ends_by_itself(bench: RoomBench) -> None:
+    before = bench.sensor.reads["rain"]
+    command = bench.command(Gather(streams=("air", "rain"), rate_hz=50.0, duration_s=1.5), epoch=bench.epoch())
+    ack = bench.end(command)
+    assert ack.status is AckStatus.DONE
+    assert bench.sensor.reads["rain"] - before > 20, "ten times its own rate"
+    assert 20 < ack.result["samples"]["air"] <= 80
+    assert ack.result["samples"]["rain"] == 0, "it had nothing to say"
+    progress = [each.progress for each in bench.acks(command) if each.status is AckStatus.STARTED]
+    assert any(share and 0 < share < 1 for share in progress)
+    assert bench.device._driver.rate_hz("air") == 20.0  # type: ignore[union-attr]
+
+
+def test_a_gathering_can_be_cancelled_and_nobody_else_gathers_meanwhile(bench: RoomBench) -> None:
+    first = bench.command(Gather(rate_hz=1.0, duration_s=3000.0), epoch=bench.epoch())
+    eventually(lambda: any(ack.status is AckStatus.STARTED for ack in bench.acks(first)))
+    second = bench.end(bench.command(Gather(rate_hz=2.0, duration_s=1.0), epoch=bench.given))
+    assert (second.status, second.reason and second.reason.code) == (AckStatus.FAILED, "busy")
+    bench.command(CancelAction(action=first), epoch=bench.given)
+    assert bench.end(first).status is AckStatus.CANCELLED
+    grows(bench.measured)
+
+
+def test_one_shot_gives_the_values_in_its_answer(bench: RoomBench) -> None:
+    bench.sensor.values = {"temperature_c": 21.5}
+    ack = bench.done(Shoot(streams=("air",)))
+    assert ack.status is AckStatus.DONE
+    assert ack.result["values"]["air"]["temperature_c"] == 21.5
+    assert set(bench.done(Shoot()).result["values"]) == {"air", "rain"}
+
+
+def test_a_capture_is_stored_and_named_in_the_answer(bench: RoomBench) -> None:
+    ack = bench.done(CaptureRaw(name="image"))
+    assert ack.result == {"upload": "u1", "media_type": "image/png", "length": 3}
+    stored = bench.store.stored[0]
+    assert {key: stored[key] for key in ("device", "stream", "media_type", "content")} == {
+        "device": "arm",
+        "stream": "image",
+        "media_type": "image/png",
+        "content": b"PNG",
+    }
+    assert stored["name"].startswith("arm-image-")
+    assert stored["name"].endswith(".png")
+
+
+def test_a_control_is_set_within_its_limits_and_says_what_was_applied(bench: RoomBench) -> None:
+    ack = bench.done(SetControl(control="opening", value=0.4))
+    assert (ack.status, ack.result) == (AckStatus.DONE, {"applied": {"opening": 0.2}})
+    for value, code in ((0.6, "out_of_range"), (-0.1, "out_of_range")):
+        refused = bench.done(SetControl(control="opening", value=value))
+        assert (refused.status, refused.reason and refused.reason.code) == (AckStatus.FAILED, code)
+    assert bench.sensor.set_to == [0.4]
+
+
+@pytest.mark.parametrize(
+    ("request_", "code", "said"),
+    [
+        (Shoot(streams=("wind",)), "unknown_stream", "there are air, rain"),
+        (Gather(streams=("wind",), rate_hz=1.0, duration_s=1.0), "unknown_stream", "there are air, rain"),
+        (CaptureRaw(name="film"), "unknown_capture", "there are: image"),
+        (SetControl(control="colour", value=1.0), "unknown_control", "there are: opening"),
+        (MoveJoints(position_rad={"elbow": 1.0}), "cannot", "it has"),
+    ],
+)
+def test_what_it_has_not_is_refused_with_what_it_has(bench: RoomBench, request_: Any, code: str, said: str) -> None:
+    ack = bench.done(request_)
+    assert ack.status is AckStatus.FAILED
+    assert ack.reason is not None
+    assert ack.reason.code == code
+    assert said in ack.reason.message
+
+
+def test_an_instrument_checks_numbers_itself() -> None:
+    instrument = Instrument(ToySensor(), ENTRY, None)
+    for value in (math.nan, math.inf):
+        with pytest.raises(Exception, match="must be a finite number"):
+            instrument.set("opening", value)
+
+
+def test_a_robot_takes_no_orders_for_room_devices(tmp_path: Path) -> None:
+    bench = Bench(tmp_path)
+    bench.device.start()
+    try:
+        ack = bench.end(bench.command(Shoot(), epoch=1))
+        assert (ack.status, ack.reason and ack.reason.code) == (AckStatus.FAILED, "cannot")
+    finally:
+        bench.stop()
+
+
+def test_a_device_without_streams_or_store_says_so(tmp_path: Path) -> None:
+    bench = RoomBench(tmp_path, uploads=None, entry=RoomDevice(
+        name="arm", kind="window", label="Window", driver="toy", captures=("image",)
+    ))  # fmt: skip
+    try:
+        for request, code in ((Shoot(), "no_streams"), (CaptureRaw(name="image"), "no_store")):
+            ack = bench.done(request)
+            assert (ack.status, ack.reason and ack.reason.code) == (AckStatus.FAILED, code)
+    finally:
+        bench.stop()
+
+
+def test_what_fails_is_told_as_it_was_said(bench: RoomBench) -> None:
+    bench.store.full = True
+    ack = bench.done(CaptureRaw(name="image"))
+    assert ack.reason is not None
+    assert (ack.reason.code, ack.reason.message) == ("not_stored", "the store is full; delete something")
+    instrument = bench.device._driver
+    assert isinstance(instrument, Instrument)
+    bench.sensor.broken = "it is wet"
+    for deed in (
+        lambda: instrument.shoot(()),
+        lambda: instrument.capture("image"),
+        lambda: instrument.set("opening", 0.1),
+    ):
+        with pytest.raises(Exception, match="it is wet"):
+            deed()
+
+
+def test_stop_holds_what_moves_and_refuses_until_it_is_reset_and_measuring_goes_on(bench: RoomBench) -> None:
+    gathering = bench.command(Gather(rate_hz=20.0, duration_s=3000.0), epoch=bench.epoch())
+    eventually(lambda: any(ack.status is AckStatus.STARTED for ack in bench.acks(gathering)))
+    bench.command(StopDevice(), epoch=0)
+    assert bench.end(gathering).status is AckStatus.FAILED
+    eventually(lambda: bench.sensor.holds == 1)
+    refused = bench.done(SetControl(control="opening", value=0.1))
+    assert (refused.status, refused.reason and refused.reason.code) == (AckStatus.FAILED, "stopped")
+    grows(bench.measured)
+    assert bench.sensor.holds == 1, "once is enough"
+    assert bench.end(bench.command(ResetStop(), epoch=bench.epoch())).status is AckStatus.DONE
+    assert bench.done(SetControl(control="opening", value=0.1)).status is AckStatus.DONE
+
+
+def test_the_loss_of_the_lease_ends_a_gathering(bench: RoomBench) -> None:
+    gathering = bench.command(Gather(rate_hz=20.0, duration_s=3000.0), epoch=bench.epoch())
+    eventually(lambda: any(ack.status is AckStatus.STARTED for ack in bench.acks(gathering)))
+    bench.command(ReleaseLease(), epoch=bench.given)
+    assert bench.end(gathering).reason.code == "lease_lost"  # type: ignore[union-attr]
+
+
+def test_a_sensor_that_does_not_answer_is_a_fault_that_ends_when_it_answers(bench: RoomBench) -> None:
+    bench.device.link_changed(True)
+    grows(bench.measured)
+    bench.sensor.broken = "no answer on the bus; is it plugged in?"
+    state = shown(bench, lambda state: state.faults)
+    assert state.mode is Mode.FAULT
+    assert state.faults[0].message == bench.sensor.broken
+    refused = bench.done(Shoot())
+    assert (refused.status, refused.reason and refused.reason.code) == (AckStatus.FAILED, "fault")
+    bench.sensor.broken = ""
+    shown(bench, lambda state: not state.faults)
+    grows(bench.measured)
+
+
+def test_a_sensor_that_is_not_there_at_the_start_is_a_fault_and_keeps_nobody_from_starting(tmp_path: Path) -> None:
+    started = threading.Event()
+    original = ToySensor.connect
+
+    def absent(self: ToySensor) -> None:
+        if not started.is_set():
+            raise SensorError("nobody at home")
+        original(self)
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(ToySensor, "connect", absent)
+        bench = RoomBench(tmp_path)
+        try:
+            bench.device.link_changed(True)
+            assert shown(bench, lambda state: state.faults).faults[0].message == "nobody at home"
+            started.set()
+            grows(bench.measured)
+        finally:
+            bench.stop()
+
+
+def test_an_error_of_the_driver_is_a_fault_and_not_the_end_of_it(bench: RoomBench) -> None:
+    bench.device.link_changed(True)
+
+    def odd(_stream: str) -> dict[str, float]:
+        raise ZeroDivisionError
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(bench.sensor, "read", odd)
+        assert "internal error" in shown(bench, lambda state: state.faults).faults[0].message
+    shown(bench, lambda state: not state.faults)
+    grows(bench.measured)
+
+
+def test_the_room_holds_a_room_device_too(tmp_path: Path) -> None:
+    rule = Interlock(device="other-zone", stream="presence", field="near", equals=1.0, stale_s=5.0)
+    bench = RoomBench(tmp_path, interlocks=(rule,))
+    try:
+        refused = bench.done(SetControl(control="opening", value=0.1))
+        assert (refused.status, refused.reason and refused.reason.code) == (AckStatus.FAILED, "interlock")
+        assert bench.sensor.holds == 1
+    finally:
+        bench.stop()
+
+
+def test_what_it_measures_is_what_the_agents_others_read_of_the_room(bench: RoomBench) -> None:
+    room = Room(space="s", agent="a", own=["arm"], named=[("arm", "air")])
+    bench.device._room = room
+    eventually(lambda: room.latest("arm", "air"))
+
+
+def test_stop_by_message_latches(bench: RoomBench) -> None:
+    bench.device.link_changed(True)
+    bench.receive(topics.STOP, b'{"id":"x","by":"ann"}')
+    assert shown(bench, lambda state: state.stop).mode in {Mode.STOPPED, Mode.IDLE}
+    assert Stop(id="x", by="ann").by == shown(bench, lambda state: state.stop).stop.by  # type: ignore[union-attr]
+
+
+def test_it_lets_the_driver_go_at_the_end_also_when_it_is_ended_twice(tmp_path: Path) -> None:
+    bench = RoomBench(tmp_path)
+    bench.device.stop()
+    bench.stop()
+    assert bench.sensor.closed
+
+
+class ToyThermometer:
+    """Has nothing that moves, and is read by nobody."""
+
+    simulated = False
+
+    def connect(self) -> None: ...
+
+    def read(self, stream: str) -> dict[str, float | bool]:
+        return {stream: 1.0}
+
+    def capture(self, name: str) -> Capture:
+        raise SensorError(name)
+
+    def set(self, control: str, value: float) -> float:
+        raise SensorError(f"{control} {value}")
+
+    def raw(self) -> None: ...
+
+    def close(self) -> None: ...
+
+
+def test_what_cannot_move_need_not_be_held_and_what_is_no_camera_films_nothing() -> None:
+    instrument = Instrument(ToyThermometer(), ENTRY, None)
+    instrument.hold()
+    assert instrument.cameras == ()
+    assert not instrument.simulated

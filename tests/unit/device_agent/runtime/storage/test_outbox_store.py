@@ -1,0 +1,170 @@
+"""What is kept on disk stays in order, within its bound, and what had to go is counted."""
+
+import sqlite3
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from device_agent.runtime.storage.outbox_store import Dropped, Item, Shelf, ShelfError
+
+OWN = "ts/v1/s/a/"
+EVENT, LATE = OWN + "arm/event", OWN + "arm/late/joints"
+NOW_MS = 1_800_000_000_000
+
+
+def make(path: Path, *, own: str = OWN, max_bytes: int = 10**6, max_age_ms: int = 3_600_000) -> Shelf:
+    return Shelf(path, own=own, max_bytes=max_bytes, max_age_ms=max_age_ms)
+
+
+@pytest.fixture
+def shelf(tmp_path: Path) -> Iterator[Shelf]:
+    shelf = make(tmp_path / "outbox.db")
+    shelf.open()
+    yield shelf
+    shelf.close()
+
+
+def item(number: int, topic: str = LATE, *, at_ms: int = NOW_MS, size: int = 1) -> Item:
+    return Item(topic, str(number).encode().ljust(size), at_ms, late="/late/" in topic)
+
+
+def numbers(shelf: Shelf, *, late: bool = True, last: int = 0, limit: int = 100_000) -> list[int]:
+    return [int(found.payload) for _, found in shelf.after(last, late=late, limit=limit)]
+
+
+def dropped(shelf: Shelf) -> list[Dropped]:
+    told: list[Dropped] = []
+
+    def event(what: Dropped) -> Item:
+        told.append(what)
+        return Item(what.device + "/event", b"0", NOW_MS, late=False)
+
+    shelf.tell_dropped(event)
+    return told
+
+
+def test_it_gives_back_what_was_put_in_oldest_first_page_by_page(shelf: Shelf) -> None:
+    shelf.put([item(1), item(2, EVENT), item(3)], now_ms=NOW_MS)
+    shelf.put([item(4)], now_ms=NOW_MS)
+    assert numbers(shelf) == [1, 3, 4]
+    assert numbers(shelf, late=False) == [2]
+    (first, found), (second, _) = shelf.after(0, late=True, limit=2)
+    assert found == item(1)
+    assert numbers(shelf, last=second) == [4]
+    shelf.remove([first, 999])
+    assert numbers(shelf) == [3, 4]
+
+
+def test_a_restart_keeps_all_but_what_was_for_another_space(tmp_path: Path) -> None:
+    before = make(tmp_path / "db")
+    before.open()
+    before.put([item(1), item(2, EVENT)], now_ms=NOW_MS)
+    before.count({(OWN + "arm", True): 3})
+    before.close()
+    before.close()
+    same = make(tmp_path / "db")
+    same.open()
+    assert (numbers(same), numbers(same, late=False)) == ([1], [2])
+    same.close()
+    moved = make(tmp_path / "db", own="ts/v1/other/a/")
+    moved.open()
+    assert (numbers(moved), numbers(moved, late=False), dropped(moved)) == ([], [], [])
+    moved.close()
+
+
+def test_beyond_its_bound_the_oldest_measurements_go_first_then_events_and_are_counted(tmp_path: Path) -> None:
+    shelf = make(tmp_path / "db", max_bytes=200_000)
+    shelf.open()
+    for number in range(300):
+        shelf.put([item(number, EVENT, size=200), item(number, size=1000)], now_ms=NOW_MS)
+        assert shelf._bytes <= 200_000
+    assert numbers(shelf, late=False) == list(range(300)), "no event goes while there are measurements"
+    left = numbers(shelf)
+    assert left == list(range(300 - len(left), 300)), "the oldest went"
+    (told,) = dropped(shelf)
+    assert told == Dropped(OWN + "arm", measurements=300 - len(left), events=0)
+    for number in range(300, 2000):
+        shelf.put([item(number, EVENT, size=200)], now_ms=NOW_MS)
+    events = numbers(shelf, late=False)
+    assert events[-1] == 1999
+    assert numbers(shelf) == []
+    (told,) = dropped(shelf)
+    assert told.events + len(events) == 2001, "all that are not there, and the one that told, are counted"
+    shelf.close()
+
+
+def test_the_sum_of_what_is_kept_is_true_after_anything(tmp_path: Path) -> None:
+    shelf = make(tmp_path / "db", max_bytes=50_000)
+    shelf.open()
+    for number in range(200):
+        shelf.put([item(number, size=number), item(number, EVENT)], now_ms=NOW_MS + number)
+        shelf.remove([number // 2, number // 3])
+        if number % 50 == 0:
+            shelf.tell_dropped(lambda what: Item(what.device + "/event", b"0", NOW_MS, late=False))
+    kept = shelf._bytes
+    shelf.close()
+    again = make(tmp_path / "db")
+    again.open()
+    assert again._bytes == kept
+    again.close()
+
+
+def test_what_is_too_old_is_dropped_and_counted(shelf: Shelf) -> None:
+    shelf.put([item(1), item(2, at_ms=NOW_MS + 3_000_000), item(3, EVENT)], now_ms=NOW_MS)
+    shelf.bound(now_ms=NOW_MS + 3_700_000)
+    assert (numbers(shelf), numbers(shelf, late=False)) == ([2], [3])
+    shelf.bound(now_ms=NOW_MS + 31 * 24 * 3_600_000)
+    assert numbers(shelf, late=False) == [3], "what happened stays worth telling"
+    assert dropped(shelf) == [Dropped(OWN + "arm", measurements=2, events=0)]
+    assert dropped(shelf) == [], "told once"
+
+
+def test_what_nobody_confirms_is_dropped_and_counted(shelf: Shelf) -> None:
+    shelf.put([item(1), item(2)], now_ms=NOW_MS)
+    shelf.drop([number for number, _ in shelf.after(0, late=True, limit=1)])
+    assert numbers(shelf) == [2]
+    assert dropped(shelf)[0].measurements == 1
+
+
+def test_the_event_that_tells_is_kept_in_the_same_step(shelf: Shelf) -> None:
+    shelf.count({(OWN + "arm", True): 2, (OWN + "arm", False): 1, (OWN + "leg", True): 5})
+    shelf.count({(OWN + "arm", True): 2})
+    assert dropped(shelf) == [Dropped(OWN + "arm", 4, 1), Dropped(OWN + "leg", 5, 0)]
+    assert [found.topic for _, found in shelf.after(0, late=False, limit=9)] == [OWN + "arm/event", OWN + "leg/event"]
+
+
+def test_a_damaged_file_is_laid_aside(tmp_path: Path) -> None:
+    path = tmp_path / "outbox.db"
+    path.write_bytes(b"no database" * 1000)
+    shelf = make(path)
+    shelf.open()
+    shelf.put([item(1)], now_ms=NOW_MS)
+    assert numbers(shelf) == [1]
+    assert path.with_suffix(".damaged").exists()
+    shelf.close()
+
+
+def test_where_nothing_can_be_written_it_says_so(tmp_path: Path) -> None:
+    with pytest.raises(ShelfError, match="cannot be used"):
+        make(tmp_path / "none" / "outbox.db").open()
+    closed = make(tmp_path / "db")
+    for call in (lambda: closed.put([item(1)], now_ms=NOW_MS), lambda: closed.after(0, late=True, limit=1)):
+        with pytest.raises(ShelfError, match="is not open"):
+            call()
+
+
+def test_a_full_disk_changes_nothing_and_is_named(tmp_path: Path, shelf: Shelf) -> None:
+    shelf.put([item(1)], now_ms=NOW_MS)
+    before = shelf._bytes
+    shelf._use().execute("PRAGMA max_page_count = 1")
+    with pytest.raises(ShelfError, match="is the disk full"):
+        shelf.put([item(2), item(3, size=500_000)], now_ms=NOW_MS)
+    assert (numbers(shelf), shelf._bytes) == ([1], before)
+    shelf._use().execute("PRAGMA max_page_count = 100000")
+    shelf.put([item(4)], now_ms=NOW_MS)
+    assert numbers(shelf) == [1, 4]
+    with sqlite3.connect(tmp_path / "outbox.db") as other:
+        other.execute("DROP TABLE kept")
+    with pytest.raises(ShelfError, match="cannot be read"):
+        shelf.after(0, late=True, limit=1)

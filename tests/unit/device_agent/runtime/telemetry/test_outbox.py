@@ -1,0 +1,374 @@
+"""Events are never lost and measurements rarely, nobody waits for the disk, and live messages wait for nothing kept."""
+
+import threading
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from device_agent.protocol import Event, codec, topics
+from device_agent.protocol.events import EventKind
+from device_agent.runtime.storage.outbox_store import Item, Shelf, ShelfError
+from device_agent.runtime.telemetry import outbox as module
+from device_agent.runtime.telemetry.outbox import BUSY_RATE_HZ, RATE_HZ, Outbox
+from tests.harness.agent.device_harness import eventually
+
+ARM = "ts/v1/s/a/arm"
+LATE = ARM + "/late/joints"
+
+
+class Link:
+    """A transport that takes what it is told to take, and confirms when it is told to."""
+
+    def __init__(self) -> None:
+        self.takes = True
+        self.confirms = True
+        self.said: list[tuple[str, bytes]] = []
+        self.open: list[Callable[[], None]] = []
+
+    def publish(self, topic: str, payload: bytes, *, qos: int, delivered: Callable[[], None]) -> bool:
+        assert qos == 1
+        if not self.takes:
+            return False
+        self.said.append((topic, payload))
+        if self.confirms:
+            delivered()
+        else:
+            self.open.append(delivered)
+        return True
+
+    def confirm(self) -> None:
+        while self.open:
+            self.open.pop(0)()
+
+    def payloads(self, kind: str = topics.LATE) -> list[bytes]:
+        return [payload for topic, payload in self.said if f"/{kind}" in topic]
+
+    def events(self, kind: EventKind) -> list[Event]:
+        found = [codec.decode(payload, Event) for payload in self.payloads(topics.EVENT) if payload.startswith(b"{")]
+        return [event for event in found if event.kind == kind]
+
+
+class Bench:
+    """An outbox whose rounds are walked by hand."""
+
+    def __init__(self, folder: Path, **limits: int) -> None:
+        self.path = folder / "outbox.db"
+        self.limits = {"max_bytes": 10**6, "max_age_ms": 10**15} | limits
+        self.link = Link()
+        self.now_s = 1000.0
+        self.moves = False
+        self.renew()
+
+    def renew(self) -> None:
+        """As after a restart."""
+        self.shelf = Shelf(self.path, own="ts/v1/s/a/", **self.limits)
+        self.outbox = Outbox(
+            self.shelf, publish=self.link.publish, teller=ARM, quiet=lambda: not self.moves, keep_hz=1.0
+        )
+
+    def rounds(self, count: int = 1, step_s: float = 0.25) -> None:
+        for _ in range(count):
+            self.now_s += step_s
+            self.outbox._round(self.now_s)
+
+    def event(self, name: str) -> None:
+        self.outbox.happened(ARM + "/event", name.encode(), at_ms=1)
+
+    def measure(self, first: int, last: int, *, sent: bool, each_s: float = 1.0) -> None:
+        for number in range(first, last):
+            self.now_s += each_s
+            self.outbox.measured(LATE, str(number).encode(), at_ms=number, sent=sent, now_s=self.now_s)
+
+    def kept(self, *, late: bool = True) -> list[str]:
+        return [found.payload.decode() for _, found in self.shelf.after(0, late=late, limit=10**6)]
+
+
+@pytest.fixture
+def bench(tmp_path: Path) -> Iterator[Bench]:
+    bench = Bench(tmp_path)
+    yield bench
+    bench.shelf.close()
+
+
+def test_an_event_is_on_disk_before_it_is_sent_and_gone_once_it_is_confirmed(bench: Bench) -> None:
+    bench.outbox.link_changed(True)
+    bench.link.confirms = False
+    bench.event("held")
+    bench.rounds()
+    assert bench.link.payloads(topics.EVENT) == [b"held"]
+    assert bench.kept(late=False) == ["held"]
+    bench.rounds(20)
+    assert bench.link.payloads(topics.EVENT) == [b"held"], "it is under way"
+    bench.link.confirm()
+    bench.rounds()
+    assert bench.kept(late=False) == []
+
+
+def test_what_was_not_confirmed_when_the_link_was_lost_is_sent_again_in_order(bench: Bench) -> None:
+    bench.outbox.link_changed(True)
+    bench.link.confirms = False
+    for name in ("one", "two", "three"):
+        bench.event(name)
+    bench.rounds()
+    bench.link.open.pop(0)()
+    bench.outbox.link_changed(False)
+    bench.rounds()
+    bench.link.said.clear()
+    bench.link.open.clear()
+    bench.link.confirms = True
+    bench.outbox.link_changed(True)
+    bench.rounds(2)
+    assert bench.link.payloads(topics.EVENT) == [b"two", b"three"]
+    assert bench.kept(late=False) == []
+
+
+def test_a_restart_sends_what_was_kept(bench: Bench) -> None:
+    bench.event("before")
+    bench.measure(0, 3, sent=False)
+    bench.rounds()
+    bench.shelf.close()
+    bench.renew()
+    bench.outbox.link_changed(True)
+    bench.rounds(4)
+    assert [payload for _, payload in bench.link.said] == [b"before", b"0", b"1", b"2"], "events first"
+
+
+def test_measurements_are_kept_thinned_only_while_nobody_hears_them(bench: Bench) -> None:
+    bench.outbox.link_changed(True)
+    bench.measure(0, 1000, sent=True, each_s=0.02)
+    bench.rounds()
+    assert bench.kept() == []
+    bench.measure(1000, 2000, sent=False, each_s=0.02)
+    bench.rounds()
+    assert 19 <= len(bench.kept()) <= 21, "one a second of twenty seconds"
+
+
+def test_what_was_sent_shortly_before_the_link_was_found_lost_is_kept_too(bench: Bench) -> None:
+    bench.outbox.link_changed(True)
+    bench.rounds()
+    bench.measure(0, 30, sent=True)
+    bench.outbox.link_changed(False)
+    bench.measure(30, 32, sent=False)
+    bench.rounds()
+    assert bench.kept() == [str(number) for number in range(19, 32)], "the last ten seconds, in order"
+
+
+def test_it_sends_slowly_and_more_slowly_while_something_moves(bench: Bench) -> None:
+    bench.measure(0, 500, sent=False)
+    bench.rounds()
+    bench.outbox.link_changed(True)
+    bench.rounds(4)
+    assert len(bench.link.said) <= module._WINDOW + RATE_HZ
+    before = len(bench.link.said)
+    bench.rounds(40)
+    assert 9 * RATE_HZ <= len(bench.link.said) - before <= 11 * RATE_HZ
+    bench.moves = True
+    before = len(bench.link.said)
+    bench.rounds(40)
+    assert 9 * BUSY_RATE_HZ <= len(bench.link.said) - before <= 11 * BUSY_RATE_HZ
+    assert bench.link.payloads() == [str(number).encode() for number in range(len(bench.link.said))]
+
+
+def test_after_the_link_has_come_it_waits_for_whoever_stores_to_be_back_too(tmp_path: Path) -> None:
+    bench = Bench(tmp_path)
+    bench.outbox.settle_s = 8.0
+    bench.event("held")
+    for _ in range(2):
+        bench.outbox.link_changed(True)
+        bench.rounds(32)
+        assert bench.link.said == []
+    bench.rounds(2)
+    assert bench.link.payloads(topics.EVENT) == [b"held"]
+    bench.event("live")
+    bench.rounds()
+    assert bench.link.payloads(topics.EVENT) == [b"held", b"live"], "from then on at once"
+    bench.shelf.close()
+
+
+def test_no_more_than_a_window_is_under_way(bench: Bench) -> None:
+    bench.measure(0, 100, sent=False)
+    bench.link.confirms = False
+    bench.outbox.link_changed(True)
+    bench.rounds(40)
+    assert len(bench.link.said) == module._WINDOW
+    bench.link.confirm()
+    bench.rounds(8)
+    assert len(bench.link.said) == 2 * module._WINDOW
+
+
+def test_a_link_whose_queue_is_full_is_tried_again(bench: Bench) -> None:
+    bench.outbox.link_changed(True)
+    bench.link.takes = False
+    bench.event("held")
+    bench.rounds(3)
+    bench.link.takes = True
+    bench.rounds()
+    assert bench.link.payloads(topics.EVENT) == [b"held"]
+
+
+def test_what_is_never_confirmed_is_sent_some_times_and_then_dropped_and_counted(bench: Bench) -> None:
+    bench.outbox.link_changed(True)
+    bench.link.confirms = False
+    bench.event("refused")
+    bench.rounds(int(4 * module._CONFIRM_S * (module._TRIES + 1)))
+    assert bench.link.payloads(topics.EVENT).count(b"refused") == module._TRIES
+    assert bench.kept(late=False) == []
+    bench.outbox.link_changed(False)
+    bench.outbox.link_changed(True)
+    bench.rounds()
+    (told,) = bench.link.events(EventKind.BUFFER_DROPPED)
+    assert told.data == {"measurements": 0, "events": 1}
+
+
+def test_what_did_not_fit_is_told_after_the_link_has_come_back(tmp_path: Path) -> None:
+    bench = Bench(tmp_path, max_bytes=50_000)
+    bench.measure(0, 2000, sent=False)
+    bench.rounds()
+    left = len(bench.kept())
+    bench.outbox.link_changed(True)
+    bench.rounds()
+    (told,) = bench.link.events(EventKind.BUFFER_DROPPED)
+    assert told.data == {"measurements": 2000 - left, "events": 0}
+    assert (told.device, told.severity) == ("arm", "warning")
+    bench.shelf.close()
+
+
+def test_a_thread_that_is_stuck_costs_a_bounded_memory_and_what_it_costs_is_counted(
+    bench: Bench, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(module, "_MOST_INCOMING", 10)
+    for number in range(14):
+        bench.event(str(number))
+    bench.rounds()
+    assert bench.kept(late=False) == [str(number) for number in range(4, 14)]
+    bench.outbox.link_changed(True)
+    bench.rounds(4)
+    (told,) = bench.link.events(EventKind.BUFFER_DROPPED)
+    assert told.data["events"] == 4
+
+
+class TestFullDisk:
+    @pytest.fixture
+    def full(self, bench: Bench, monkeypatch: pytest.MonkeyPatch) -> list[bool]:
+        """While its only entry is true, nothing can be put on disk."""
+        put, full = bench.shelf.put, [True]
+
+        def fail(items: Any, **options: Any) -> None:
+            if full[0]:
+                raise ShelfError("outbox.db cannot be written: is the disk full?")
+            put(items, **options)
+
+        monkeypatch.setattr(bench.shelf, "put", fail)
+        return full
+
+    def test_events_go_out_from_memory_and_it_is_said(self, bench: Bench, full: list[bool]) -> None:
+        assert full
+        bench.outbox.link_changed(True)
+        bench.event("held")
+        bench.rounds(2)
+        assert b"held" in bench.link.payloads(topics.EVENT)
+        (told,) = bench.link.events(EventKind.BUFFER_FAILED)
+        assert told.severity == "error"
+        assert "disk full" in told.message
+        bench.event("next")
+        bench.rounds(40)
+        assert bench.link.payloads(topics.EVENT).count(b"next") == 1
+        assert len(bench.link.events(EventKind.BUFFER_FAILED)) == 1, "once"
+
+    def test_events_wait_in_memory_for_the_disk_and_measurements_are_counted(
+        self, bench: Bench, full: list[bool]
+    ) -> None:
+        bench.event("first")
+        bench.measure(0, 5, sent=False)
+        bench.rounds()
+        full[0] = False
+        bench.event("second")
+        bench.rounds()
+        assert bench.kept(late=False) == []
+        bench.rounds(int(4 * module._SAVE_AGAIN_S))
+        assert bench.kept(late=False)[::2] == ["first", "second"], "with what was said of the disk between"
+        bench.outbox.link_changed(True)
+        bench.rounds(2)
+        (told,) = bench.link.events(EventKind.BUFFER_DROPPED)
+        assert told.data == {"measurements": 5, "events": 0}
+
+    def test_memory_is_bounded(self, bench: Bench, full: list[bool]) -> None:
+        assert full
+        for number in range(module._MOST_UNSAVED + 20):
+            bench.event(str(number))
+        bench.rounds()
+        assert len(bench.outbox._unsaved) == module._MOST_UNSAVED
+
+    def test_what_is_only_in_memory_and_never_confirmed_is_let_go(self, bench: Bench, full: list[bool]) -> None:
+        assert full
+        bench.link.confirms = False
+        bench.outbox.link_changed(True)
+        bench.event("refused")
+        bench.rounds(int(4 * module._CONFIRM_S * (module._TRIES + 1)))
+        assert bench.link.payloads(topics.EVENT).count(b"refused") == module._TRIES
+        assert bench.outbox._unsaved == {}
+
+
+def test_a_folder_that_cannot_be_used_stops_nothing(tmp_path: Path) -> None:
+    bench = Bench(tmp_path)
+    bench.path = tmp_path / "missing" / "outbox.db"
+    bench.renew()
+    bench.outbox.link_changed(True)
+    bench.event("held")
+    bench.rounds(2)
+    assert b"held" in bench.link.payloads(topics.EVENT)
+    bench.path.parent.mkdir()
+    bench.rounds(int(4 * module._SAVE_AGAIN_S) + 1)
+    bench.event("again")
+    bench.link.takes = False
+    bench.rounds()
+    assert bench.kept(late=False) == ["again"]
+    bench.shelf.close()
+
+
+def test_an_error_in_reading_is_trouble_too_and_one_nobody_thought_of_ends_nothing(
+    bench: Bench, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    bench.outbox.link_changed(True)
+
+    def fail(error: Exception) -> Callable[..., list[tuple[int, Item]]]:
+        def after(*_: object, **__: object) -> list[tuple[int, Item]]:
+            raise error
+
+        return after
+
+    with monkeypatch.context() as patch:
+        patch.setattr(bench.shelf, "after", fail(ShelfError("outbox.db cannot be read")))
+        bench.event("one")
+        bench.rounds()
+    assert "cannot be read" in caplog.text
+    with monkeypatch.context() as patch:
+        patch.setattr(bench.shelf, "after", fail(RuntimeError("a mistake")))
+        bench.rounds()
+    assert "a mistake" in caplog.text
+    bench.rounds(int(4 * module._SAVE_AGAIN_S) + 1)
+    assert b"one" in bench.link.payloads(topics.EVENT)
+
+
+def test_as_a_thread_it_sends_at_once_and_its_last_words_before_it_ends(tmp_path: Path) -> None:
+    bench = Bench(tmp_path)
+    bench.outbox.start()
+    bench.outbox.link_changed(True)
+    bench.event("held")
+    eventually(lambda: bench.link.payloads(topics.EVENT) == [b"held"])
+    bench.link.confirms = False
+    bench.event("goodbye")
+    later = threading.Timer(0.1, bench.link.confirm)
+    later.start()
+    bench.outbox.stop()
+    bench.outbox.stop()
+    later.join()
+    assert bench.link.payloads(topics.EVENT) == [b"held", b"goodbye"]
+    bench.renew()
+    bench.shelf.open()
+    bench.event("x")
+    bench.rounds()
+    assert bench.kept(late=False)[-1] == "x"
+    bench.shelf.close()

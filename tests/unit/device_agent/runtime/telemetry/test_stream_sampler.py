@@ -1,0 +1,195 @@
+"""What a driver measures besides joints: told at its rate, beside the control loop, whatever goes wrong with it."""
+
+import logging
+import math
+import threading
+import time
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import pytest
+
+from device_agent.ports.driver import DriverError
+from device_agent.protocol import Measurements, Stream, codec, topics
+from device_agent.runtime.authority.interlocks import Interlock
+from device_agent.runtime.telemetry.stream_sampler import Reporter
+from tests.fakes.drivers import ToyDriver, robot_type
+from tests.harness.agent.device_harness import Bench, eventually
+from tests.unit.device_agent.runtime.actions.test_robot_api import play
+
+WITHIN_S = 60.0
+JOINTS, SONAR, HEALTH = (Stream(name=name, rate_hz=100.0) for name in ("joints", "sonar", "health"))
+Answer = Callable[[], Mapping[str, float | bool]]
+
+
+class Gauge(ToyDriver):
+    """Measures what it is told to."""
+
+    def __init__(self, **answers: Answer) -> None:
+        super().__init__()
+        self.answers = answers
+        self.asked: list[str] = []
+
+    def report(self, stream: str) -> Mapping[str, float | bool]:
+        self.asked.append(stream)
+        return self.answers[stream]()
+
+
+class Bell:
+    """Keeps what was told, and waits for more."""
+
+    def __init__(self) -> None:
+        self.told: list[tuple[str, Measurements]] = []
+        self._more = threading.Condition()
+
+    def __call__(self, stream: str, measured: Measurements) -> None:
+        with self._more:
+            self.told.append((stream, measured))
+            self._more.notify_all()
+
+    def of(self, stream: str) -> list[Measurements]:
+        return [measured for name, measured in self.told if name == stream]
+
+    def wait(self, stream: str, count: int) -> list[Measurements]:
+        with self._more:
+            assert self._more.wait_for(lambda: len(self.of(stream)) >= count, WITHIN_S)
+            return self.of(stream)
+
+
+def run(gauge: Gauge | None, *streams: Stream, tell: Callable[[str, Measurements], None]) -> Reporter:
+    reporter = Reporter(streams, gauge, name="cart", tell=tell)
+    reporter.start()
+    return reporter
+
+
+def test_each_stream_but_the_joints_is_measured_and_counted() -> None:
+    gauge, bell = Gauge(sonar=lambda: {"distance_m.left": 0.8}, health=lambda: {"charging": True}), Bell()
+    reporter = run(gauge, JOINTS, SONAR, HEALTH, tell=bell)
+    sonar, health = bell.wait("sonar", 3), bell.wait("health", 3)
+    reporter.stop()
+    reporter.stop()
+    assert [measured.sequence for measured in sonar[:3]] == [1, 2, 3]
+    assert sonar[0].values == {"distance_m.left": 0.8}
+    assert health[0].values == {"charging": True}
+    assert "joints" not in gauge.asked
+    assert reporter.latest()["sonar"].values == {"distance_m.left": 0.8}
+    assert 0 <= reporter.latest()["sonar"].age_s < WITHIN_S
+
+
+def test_each_stream_has_its_own_rate() -> None:
+    fast, slow = Stream(name="fast", rate_hz=200.0), Stream(name="slow", rate_hz=0.01)
+    gauge, bell = Gauge(fast=lambda: {"a": 1.0}, slow=lambda: {"a": 1.0}), Bell()
+    reporter = run(gauge, fast, slow, tell=bell)
+    bell.wait("fast", 20)
+    reporter.stop()
+    assert len(bell.of("slow")) == 1
+
+
+def test_what_is_no_number_is_left_out_and_nothing_tells_nothing() -> None:
+    gauge = Gauge(sonar=lambda: {"a": math.nan, "b": math.inf, "c": 0.5}, health=lambda: {"a": math.nan})
+    bell = Bell()
+    reporter = run(gauge, SONAR, HEALTH, tell=bell)
+    told = bell.wait("sonar", 2)
+    reporter.stop()
+    assert told[0].values == {"c": 0.5}
+    assert bell.of("health") == []
+    assert gauge.asked.count("health") > 0
+
+
+def test_trouble_with_one_stream_is_logged_once_and_ends_nothing(caplog: pytest.LogCaptureFixture) -> None:
+    well = threading.Event()
+
+    def broken() -> Mapping[str, float | bool]:
+        if well.is_set():
+            return {"a": 1.0}
+        raise DriverError("no answer from the sonar")
+
+    gauge, bell = Gauge(sonar=broken, health=lambda: {"a": 1 / 0}), Bell()
+    with caplog.at_level(logging.WARNING):
+        reporter = run(gauge, SONAR, HEALTH, tell=bell)
+        while gauge.asked.count("sonar") < 5:
+            time.sleep(0.005)
+        well.set()
+        bell.wait("sonar", 1)
+        reporter.stop()
+    told = [record.getMessage() for record in caplog.records]
+    assert told.count("cart: stream sonar: no answer from the sonar") == 1
+    assert told.count("cart: stream sonar: is measured again") == 1
+    assert sum("internal error: ZeroDivisionError" in text for text in told) == 1
+
+
+def test_a_driver_that_measures_only_joints_is_asked_for_nothing() -> None:
+    bell = Bell()
+    for reporter in (run(None, SONAR, tell=bell), run(Gauge(), JOINTS, tell=bell)):
+        reporter.stop()
+        assert reporter.latest() == {}
+    assert bell.told == []
+
+
+def test_a_device_tells_its_streams(tmp_path: Path) -> None:
+    kind = msgspec.structs.replace(robot_type(), streams=(SONAR,))
+    bench = Bench(tmp_path, kind=kind, driver=Gauge(sonar=lambda: {"distance_m": 0.8}))
+    bench.device.start()
+    try:
+        deadline_s = time.monotonic() + WITHIN_S
+        while not any(topic.endswith("/tele/sonar") for topic, _ in list(bench.said)):
+            assert time.monotonic() < deadline_s
+            time.sleep(0.01)
+    finally:
+        bench.stop()
+    payload = next(payload for topic, payload in bench.said if topics.parse(topic).name == "sonar")
+    assert codec.decode(payload, Measurements).values == {"distance_m": 0.8}
+
+
+def test_a_script_reads_what_its_own_robot_measures(tmp_path: Path) -> None:
+    kind = msgspec.structs.replace(robot_type(), streams=(SONAR,))
+    bench = Bench(tmp_path, kind=kind, driver=Gauge(sonar=lambda: {"distance_m": 0.8}))
+    bench.device.start()
+    lines = (
+        "import time\n"
+        "while 'sonar' not in robot.state()['streams']: time.sleep(0.01)\n"
+        "sonar = robot.state()['streams']['sonar']\n"
+        "print(sonar['values'], sonar['age_s'] >= 0)\n"
+    )
+    assert play(bench, lines) == "{'distance_m': 0.8} True\n"
+    bench.stop()
+
+
+def test_an_interlock_holds_a_robot_by_what_it_measures_itself(tmp_path: Path) -> None:
+    kind = msgspec.structs.replace(robot_type(), streams=(SONAR,))
+    near = Interlock(device="arm", stream="sonar", field="distance_m", below=0.5)
+    away_m = [0.8]
+    bench = Bench(tmp_path, kind=kind, driver=Gauge(sonar=lambda: {"distance_m": away_m[0]}), interlocks=[near])
+    bench.device.start()
+    eventually(lambda: not bench.device._controller.restrictions)
+    away_m[0] = 0.2
+    (held,) = eventually(lambda: bench.device._controller.restrictions)
+    assert "distance_m" in held.why
+    bench.stop()
+
+
+class Island(Bench):
+    """A device whose link takes no measurement while it is down."""
+
+    down = True
+
+    def publish(self, topic: str, payload: bytes, **more: Any) -> bool:
+        if self.down:
+            return False
+        return super().publish(topic, payload, **more)
+
+
+def test_what_was_measured_while_the_link_was_down_is_told_late(tmp_path: Path) -> None:
+    kind = msgspec.structs.replace(robot_type(), streams=(SONAR,))
+    gauge = Gauge(sonar=lambda: {"distance_m": 0.8})
+    bench = Island(tmp_path, kind=kind, driver=gauge)
+    bench.outbox.link_changed(False)
+    bench.device.start()
+    eventually(lambda: gauge.asked.count("sonar") > 5)
+    bench.down = False
+    bench.outbox.link_changed(True)
+    late = eventually(lambda: bench.heard(topics.LATE, Measurements, "sonar"))
+    assert late[0].values == {"distance_m": 0.8}
+    bench.stop()

@@ -1,0 +1,95 @@
+"""An agent with a device and a link that are toys: who hears what, and when."""
+
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from device_agent.ports.transport import LinkChanged, Receive
+from device_agent.protocol import Measurements, Mode, Stop, codec, topics
+from device_agent.runtime.agent import Agent
+from device_agent.runtime.readings import Room
+from device_agent.runtime.storage.outbox_store import Shelf
+from device_agent.runtime.telemetry.outbox import Outbox
+from tests.harness.agent.device_harness import Bench, eventually
+
+
+class ToyLink:
+    """A link that the test moves by hand."""
+
+    def __init__(self, bench: Bench) -> None:
+        self._bench = bench
+        self.held_first = False
+        self.stopped = 0
+
+    def start(self, receive: Receive, link_changed: LinkChanged) -> None:
+        self.held_first = self._bench.device._loop.seen is not None
+        self.receive, self.link_changed = receive, link_changed
+
+    def publish(self, *_: Any, **__: Any) -> bool:
+        return False
+
+    def stop(self) -> None:
+        self.stopped += 1
+
+
+class Whole:
+    def __init__(self, bench: Bench, folder: Path) -> None:
+        self.bench = bench
+        self.link = ToyLink(bench)
+        self.room = Room(space="s", agent="a", own=["arm"], named=[("other-pir", "presence")])
+        shelf = Shelf(folder / "whole.db", own="ts/v1/s/a/", max_bytes=10**6, max_age_ms=3_600_000)
+        self.outbox = Outbox(shelf, publish=bench.publish, teller="ts/v1/s/a/arm")
+        self.agent = Agent({"arm": bench.device}, self.link, outbox=self.outbox, room=self.room, address=("s", "a"))
+
+
+@pytest.fixture
+def whole(tmp_path: Path):
+    whole = Whole(Bench(tmp_path), tmp_path)
+    whole.agent.start()
+    whole.link.link_changed(True)
+    yield whole
+    whole.agent.stop()
+    whole.bench.outbox.stop()
+    whole.bench.journal.close()
+
+
+def test_a_device_holds_before_anybody_can_speak_to_it(whole: Whole) -> None:
+    assert whole.link.held_first
+    assert whole.agent.quiet
+
+
+def test_what_arrives_reaches_its_device(whole: Whole) -> None:
+    whole.link.receive("ts/v1/s/a/arm/stop", codec.encode(Stop(id="s1", by="bob")))
+    eventually(lambda: whole.bench.telemetry().mode is Mode.STOPPED)
+
+
+@pytest.mark.parametrize("topic", ["ts/v1/s/a/leg/stop", "ts/v2/s/a/arm/stop", "$SYS", "", "ts/v1/x/y/arm/stop"])
+def test_what_is_for_nobody_here_harms_nothing(whole: Whole, topic: str) -> None:
+    whole.link.receive(topic, codec.encode(Stop(id="s1", by="bob")))
+    assert whole.bench.telemetry().mode is Mode.IDLE
+
+
+def test_what_others_of_the_space_measure_goes_to_the_room(whole: Whole) -> None:
+    measured = Measurements(tick_ms=1, at_ms=1, sequence=1, values={"present": True})
+    topic = topics.device("s", "other", "pir", topics.TELE, "presence")
+    whole.link.receive(topic, codec.encode(measured))
+    reading = whole.room.latest("other-pir", "presence")
+    assert reading is not None
+    assert reading.values == {"present": True}
+
+
+def test_a_lost_link_is_told_to_every_device(whole: Whole) -> None:
+    running = whole.bench.command(whole.bench.script("wait(600)"), epoch=1)
+    eventually(lambda: whole.bench.acks(running)[1:])
+    assert not whole.agent.quiet
+    whole.link.link_changed(False)
+    reason = whole.bench.end(running).reason
+    assert reason is not None
+    assert reason.code == "link_lost"
+
+
+def test_it_may_be_stopped_twice(whole: Whole) -> None:
+    whole.agent.stop()
+    whole.agent.stop()
+    assert whole.link.stopped == 2

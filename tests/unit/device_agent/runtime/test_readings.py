@@ -1,0 +1,119 @@
+"""What the agent knows of its space: the newest readings of what it was told to listen to, by its own clock."""
+
+import pytest
+
+from device_agent.protocol import JointTelemetry, Measurements, Mode, codec, topics
+from device_agent.protocol.errors import ProtocolError
+from device_agent.runtime.authority.lease_gate import Refused
+from device_agent.runtime.readings import OVERTAKEN_S, Reading, Room
+
+
+class Clock:
+    now_s = 100.0
+
+    def __call__(self) -> float:
+        return self.now_s
+
+
+@pytest.fixture
+def clock() -> Clock:
+    return Clock()
+
+
+@pytest.fixture
+def room(clock: Clock) -> Room:
+    named = [("sensors-pir", "presence"), ("lamp", "light"), ("sensors-arm", "joints")]
+    return Room(space="lab", agent="own", own=["arm", "lamp"], named=named, clock_s=clock)
+
+
+def measured(sequence: int = 1, *, tick_ms: int = 1, at_ms: int = 1, **values: float) -> Measurements:
+    return Measurements(tick_ms=tick_ms, at_ms=at_ms, sequence=sequence, values=values)
+
+
+def topic(device: str = "pir", stream: str = "presence", *, agent: str = "sensors", space: str = "lab") -> topics.Topic:
+    return topics.Topic(space, agent, device, topics.TELE, stream)
+
+
+def hear(room: Room, message: Measurements | JointTelemetry, where: topics.Topic | None = None) -> None:
+    room.receive(where or topic(), codec.encode(message))
+
+
+def value(room: Room) -> float | None:
+    reading = room.latest("sensors-pir", "presence")
+    return None if reading is None else reading.values["present"]
+
+
+def test_it_subscribes_to_what_is_named_of_others_by_exact_name(room: Room) -> None:
+    assert room.topics() == ("ts/v1/lab/sensors/arm/tele/joints", "ts/v1/lab/sensors/pir/tele/presence")
+
+
+def test_the_newest_reading_is_given_with_its_age_since_it_arrived(room: Room, clock: Clock) -> None:
+    assert room.latest("sensors-pir", "presence") is None
+    hear(room, measured(present=1.0, at_ms=2**50))
+    clock.now_s += 1.5
+    assert room.latest("sensors-pir", "presence") == Reading({"present": 1.0}, 1.5)
+    hear(room, measured(2, present=0.0, at_ms=1))
+    assert room.latest("sensors-pir", "presence") == Reading({"present": 0.0}, 0.0)
+
+
+def test_an_own_device_is_named_by_its_name_or_its_id(room: Room) -> None:
+    room.note("lamp", "light", measured(lux=80.0))
+    assert room.latest("lamp", "light") == room.latest("own-lamp", "light") == Reading({"lux": 80.0}, 0.0)
+    room.note("arm", "heat", measured(t_c=20.0))
+    with pytest.raises(Refused, match="own-arm/heat is not listened to"):
+        room.latest("arm", "heat")
+
+
+def test_joints_are_read_by_their_place(room: Room) -> None:
+    telemetry = JointTelemetry(
+        tick_ms=1,
+        at_ms=1,
+        sequence=1,
+        mode=Mode.IDLE,
+        position_rad=(0.5, 1.0),
+        velocity_rad_s=(0.0, 0.1),
+        effort_nm=(1.0, 2.0),
+        commanded_rad=(0.5, 1.0),
+    )
+    hear(room, telemetry, topic("arm", "joints"))
+    reading = room.latest("sensors-arm", "joints")
+    assert reading is not None
+    assert (reading.values["position_rad.1"], reading.values["effort_nm.0"]) == (1.0, 1.0)
+
+
+def test_what_is_not_listened_to_is_refused_and_says_what_is(room: Room) -> None:
+    with pytest.raises(Refused, match=r"name it under \[\[room\]\].*own-lamp/light, sensors-arm/joints") as refused:
+        room.latest("sensors-door", "open")
+    assert refused.value.code == "unknown_stream"
+    with pytest.raises(Refused, match="There is: none"):
+        Room(space="lab", agent="own", own=["arm"]).latest("x-y", "z")
+
+
+def test_what_was_not_asked_for_costs_no_memory(room: Room) -> None:
+    for number in range(1000):
+        hear(room, measured(present=1.0), topic(f"d{number}"))
+    hear(room, measured(present=1.0), topic(space="elsewhere"))
+    room.receive(topics.Topic("lab", "sensors", "pir", topics.LATE, "presence"), codec.encode(measured(present=1.0)))
+    assert room._heard == {}
+
+
+@pytest.mark.parametrize("payload", [b"", b"{}", b'{"tick_ms":1,"at_ms":1,"sequence":1,"values":{"present":NaN}}'])
+def test_what_cannot_be_read_changes_nothing(room: Room, payload: bytes) -> None:
+    hear(room, measured(present=0.0))
+    with pytest.raises(ProtocolError):
+        room.receive(topic(), payload)
+    assert value(room) == 0.0
+
+
+def test_a_message_that_was_overtaken_is_left_out_but_a_sender_that_began_anew_is_heard(
+    room: Room, clock: Clock
+) -> None:
+    hear(room, measured(7, tick_ms=700, present=1.0))
+    hear(room, measured(6, tick_ms=600, present=0.0))
+    hear(room, measured(7, tick_ms=700, present=0.0))
+    assert value(room) == 1.0
+    hear(room, measured(1, tick_ms=900, present=2.0))
+    assert value(room) == 2.0, "the agent there restarted"
+    clock.now_s += OVERTAKEN_S
+    hear(room, measured(1, tick_ms=5, present=3.0))
+    assert value(room) == 3.0, "the machine there restarted"

@@ -1,0 +1,145 @@
+"""Faults put into simulated room devices: by a file, while they run, and gone with it."""
+
+from collections.abc import Iterator
+from pathlib import Path
+
+import msgspec
+import numpy as np
+import pytest
+
+from device_agent.ports.sensor import Camera, Image, Movable, RoomDriver, SensorError
+from device_agent.protocol.errors import ProtocolError
+from device_agent.protocol.manifests import room
+from device_agent.sensors.mujoco import fault_injection, scalar_sensors
+from device_agent.sensors.mujoco.fault_injection import WELL, Ailments, read
+from tests.harness.agent.rooms import LAB, StillWorld
+
+
+@pytest.fixture(scope="module")
+def world() -> StillWorld:
+    return StillWorld(manifest=msgspec.structs.replace(room.load(LAB), robots=()))
+
+
+@pytest.fixture
+def file(tmp_path: Path) -> Path:
+    return tmp_path / "faults.toml"
+
+
+class Ward:
+    """Connects devices of the laboratory, each with the file."""
+
+    def __init__(self, world: StillWorld, file: Path) -> None:
+        self._world, self._file = world, file
+        self._drivers: list[RoomDriver] = []
+
+    def __call__(self, name: str) -> RoomDriver:
+        entry = self._world.entry(name)
+        options = {**entry.options, "faults": str(self._file)}
+        driver = self._world.driver(msgspec.structs.replace(entry, options=options))
+        driver.connect()
+        self._drivers.append(driver)
+        return driver
+
+    def close(self) -> None:
+        for driver in self._drivers:
+            driver.close()
+
+
+@pytest.fixture
+def ward(world: StillWorld, file: Path) -> Iterator[Ward]:
+    ward = Ward(world, file)
+    yield ward
+    ward.close()
+
+
+def test_without_the_file_a_device_is_as_it_always_is(ward: Ward) -> None:
+    co2, camera, door = ward("co2"), ward("camera"), ward("door")
+    assert 500 < co2.read("co2")["co2_ppm"] < 800
+    assert not isinstance(co2, Camera)
+    assert isinstance(camera, Camera)
+    assert camera.frame("colour") is not None
+    assert isinstance(door, Movable)
+    assert door.set("opening", 0.0) == 0.0
+    door.hold()
+
+
+def test_a_stuck_meter_tells_its_last_value_and_is_free_again_without_the_file(ward: Ward, file: Path) -> None:
+    co2 = ward("co2")
+    last = co2.read("co2")
+    file.write_text('stuck = ["co2"]')
+    assert [co2.read("co2") for _ in range(20)] == [last] * 20
+    file.unlink()
+    assert len({co2.read("co2")["co2_ppm"] for _ in range(20)}) > 3
+
+
+def test_a_silent_stream_gives_nothing_and_still_says_what_there_is(ward: Ward, file: Path) -> None:
+    pir = ward("pir")
+    file.write_text('silent = ["motion"]')
+    assert pir.read("motion") == {}
+    with pytest.raises(SensorError, match="motion"):
+        pir.read("nonsense")
+
+
+def test_a_value_drifts_by_so_much_a_minute(ward: Ward, file: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    now_s = [1000.0]
+    clock = type("Clock", (), {"monotonic": staticmethod(lambda: now_s[0])})
+    monkeypatch.setattr(fault_injection, "time", clock)
+    monkeypatch.setattr(scalar_sensors, "time", clock)
+    co2 = ward("co2")
+    before = np.mean([co2.read("co2")["co2_ppm"] for _ in range(50)])
+    file.write_text("drift = { co2_ppm = 50.0 }")
+    co2.read("co2")
+    now_s[0] += 600.0
+    after = np.mean([co2.read("co2")["co2_ppm"] for _ in range(50)])
+    assert after - before == pytest.approx(500.0, abs=15.0)
+
+
+def test_what_is_unreachable_answers_nothing_and_is_still_told_to_hold(ward: Ward, file: Path) -> None:
+    door = ward("door")
+    file.write_text("unreachable = true")
+    for call in (lambda: door.read("settings"), lambda: door.set("opening", 0.5), door.connect, door.raw):
+        with pytest.raises(SensorError, match="'door' does not answer; see that it has power"):
+            call()
+    assert isinstance(door, Movable)
+    door.hold()
+
+
+def test_a_stuck_camera_shows_one_picture_for_ever_and_a_silent_one_none(ward: Ward, file: Path) -> None:
+    camera = ward("camera")
+    assert isinstance(camera, Camera)
+    moving = {frame.content for frame in (camera.frame("colour") for _ in range(3)) if frame is not None}
+    assert len(moving) == 3, "grain"
+    seen = camera.raw()
+    assert isinstance(seen, Image)
+    file.write_text('stuck = ["colour"]')
+    frames = [camera.frame("colour") for _ in range(3)]
+    assert len({frame.content for frame in frames if frame is not None}) == 1
+    assert len({frame.taken_s for frame in frames if frame is not None}) == 3, "it says that each is new"
+    again = camera.raw()
+    assert isinstance(again, Image)
+    assert again.rgb is seen.rgb
+    file.write_text('silent = ["colour"]  # now')
+    assert camera.frame("colour") is None
+    with pytest.raises(SensorError, match="gives nothing"):
+        camera.raw()
+
+
+@pytest.mark.parametrize(
+    ("text", "says"),
+    [
+        ('stuck = ["nose"]', "no stream or camera 'nose'; there are: co2, image"),
+        ("broken = true", "unknown field `broken`; there are: unreachable, silent, stuck, drift"),
+        ("silent = [", "there are: unreachable"),
+    ],
+)
+def test_a_wrong_file_says_what_there_is(text: str, says: str) -> None:
+    with pytest.raises(ProtocolError) as refused:
+        read(text, ["co2", "image"])
+    assert says in str(refused.value)
+    assert read("", []) == WELL == Ailments()
+
+
+def test_a_path_of_faults_that_is_none_is_refused(world: StillWorld) -> None:
+    entry = msgspec.structs.replace(world.entry("pir"), options={"faults": 3})
+    with pytest.raises(SensorError, match="path of a file"):
+        world.driver(entry)

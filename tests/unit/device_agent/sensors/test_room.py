@@ -1,0 +1,316 @@
+"""In the simulated laboratory sensors tell what people, doors and robots do; each with the errors of its kind."""
+
+import math
+from collections.abc import Callable
+from itertools import pairwise
+
+import msgspec
+import numpy as np
+import pytest
+
+from device_agent.ports.sensor import Image, RoomDriver, Scan, SensorError, Surroundings
+from device_agent.protocol import Stream
+from device_agent.protocol.manifests import room
+from device_agent.protocol.manifests.room import RoomDevice
+from device_agent.sensors import load, names
+from device_agent.sensors import mujoco as simulated
+from device_agent.sensors.mujoco import cameras, shared_view
+from device_agent.sensors.mujoco.noise import ERRORS, Errors, Probe, generator
+from tests.harness.agent.rooms import LAB, StillWorld
+
+ROUND_S = 45.0
+"""Longer than the person's way round the room."""
+LEG_M = 0.35
+
+
+@pytest.fixture(autouse=True)
+def present(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Everything that looks sees the present: time is driven by hand."""
+    monkeypatch.setattr(shared_view, "OLDEST_S", -1.0)
+    monkeypatch.setattr(cameras, "FRESH_S", -1.0)
+
+
+@pytest.fixture
+def world() -> StillWorld:
+    """The laboratory without its robots, which take most of the time."""
+    return StillWorld(manifest=msgspec.structs.replace(room.load(LAB), robots=()))
+
+
+@pytest.fixture
+def lab() -> StillWorld:
+    """With them."""
+    return StillWorld()
+
+
+def connected(world: StillWorld, device: RoomDevice | str) -> RoomDriver:
+    driver = world.driver(device)
+    driver.connect()
+    return driver
+
+
+def changed(device: RoomDevice, **fields: object) -> RoomDevice:
+    return msgspec.structs.replace(device, **fields)
+
+
+def scan(driver: RoomDriver) -> Scan:
+    raw = driver.raw()
+    assert isinstance(raw, Scan)
+    return raw
+
+
+def image(driver: RoomDriver) -> Image:
+    raw = driver.raw()
+    assert isinstance(raw, Image)
+    return raw
+
+
+def until(world: StillWorld, wanted: Callable[[], bool], step_s: float = 0.25) -> None:
+    for _ in range(round(ROUND_S / step_s)):
+        if wanted():
+            return
+        world.go_on(step_s)
+    pytest.fail("not within a round of the person")
+
+
+def met_by(scan: Scan) -> np.ndarray:
+    """Where in the room the beams met something, shape (m, 2) [m]."""
+    seen = np.isfinite(scan.range_m)
+    beams = np.stack((np.cos(scan.angle_rad), np.sin(scan.angle_rad), np.zeros_like(scan.angle_rad)), axis=1)
+    points: np.ndarray = scan.position_m + (beams * np.where(seen, scan.range_m, 0)[:, None]) @ scan.rotation.T
+    return points[seen, :2]
+
+
+# ---------------------------------------------------------------- somebody moves
+
+
+def test_the_motion_detector_tells_that_somebody_walks_and_forgets_who_stands(world: StillWorld) -> None:
+    pir = connected(world, "pir")
+    told: list[tuple[bool, float]] = []
+    for _ in range(round(ROUND_S / 0.25)):
+        before = world.place("person")
+        world.go_on(0.25)
+        told.append((bool(pir.read("motion")["present"]), math.dist(before, world.place("person")) / 0.25))
+    assert {present for present, _ in told} == {True, False}
+    rose = [speed for (before, _), (after, speed) in pairwise(told) if after and not before]
+    assert rose, "it never woke"
+    assert min(rose) > 0.1, "it woke while nobody walked"
+
+
+def test_the_motion_detector_does_not_see_furniture_that_moves_nor_through_a_wall(world: StillWorld) -> None:
+    entry = world.entry("pir")
+    still = connected(world, changed(entry, options={"warm": ["chair"]}))
+    door = connected(world, changed(entry, options={"warm": ["nobody"]}))
+    world.set("door", 1.5)
+    for _ in range(20):
+        world.go_on(0.25)
+        assert not still.read("motion")["present"]
+        assert not door.read("motion")["present"], "the door is not warm"
+
+
+def test_the_lidar_meets_the_legs_of_whoever_walks_where_they_are(world: StillWorld) -> None:
+    lidar = connected(world, "lidar")
+    empty = scan(lidar).range_m
+    seen = 0
+    for _ in range(40):
+        world.go_on(1.0)
+        now = scan(lidar)
+        x, y, _ = world.place("person")
+        nearer = np.isfinite(now.range_m) & (now.range_m < empty - 0.25)
+        points = met_by(now)[nearer[np.isfinite(now.range_m)]]
+        distance_m = np.hypot(*(points - (x, y)).T)
+        seen += bool((distance_m < LEG_M).any())
+    assert seen > 25, f"the person was met in {seen} of 40 scans"
+
+
+def test_a_scan_has_the_errors_of_its_kind_and_leaves_the_lidar_itself_out(world: StillWorld) -> None:
+    lidar = connected(world, "lidar")
+    scans = np.array([scan(lidar).range_m for _ in range(60)])
+    known = np.isfinite(scans).all(axis=0)
+    assert known.sum() > 200
+    mean, spread = scans[:, known].mean(axis=0), scans[:, known].std(axis=0)
+    assert np.median(spread / np.maximum(0.005, 0.01 * mean)) == pytest.approx(1.0, abs=0.15)
+    assert scans.min() >= 0.15
+
+
+def test_the_cameras_see_a_robot_that_moves(lab: StillWorld) -> None:
+    corner, turning = connected(lab, "camera"), connected(lab, "pan_tilt")
+    model = lab.model
+    arm = [index for index in range(model.nu) if model.actuator(index).name.startswith("ur5/")]
+    for camera in (corner, turning):
+        noise = difference(image(camera), image(camera))
+        before = image(camera)
+        now = lab.world.snapshot().ctrl[arm]
+        lab.world.command("test", np.array(arm), now + np.array([1.2, 0.4, -0.6, 0, 0, 0]), ramp_s=1.0)
+        lab.go_on(2.0)
+        after = image(camera)
+        assert difference(before, after) > noise + 20, "the picture is the same"
+        camera.close()
+
+
+def difference(one: Image, other: Image) -> int:
+    """How many pixels changed by more than grain."""
+    assert one.rgb is not None
+    assert other.rgb is not None
+    return int((np.abs(one.rgb.astype(int) - other.rgb.astype(int)).max(axis=2) > 25).sum())
+
+
+def test_the_depth_camera_measures_how_far_the_person_is(world: StillWorld) -> None:
+    depth = connected(world, "depth")
+
+    def seen() -> bool:
+        now = image(depth)
+        assert now.depth_m is not None
+        row_column, z = onto(now, np.array(world.place("person")))
+        height, width = now.depth_m.shape
+        row, column = row_column
+        if not (5 <= row < height - 5 and 5 <= column < width - 5 and 0.5 < z < 7):
+            return False
+        patch = now.depth_m[row - 2 : row + 3, column - 2 : column + 3]
+        return bool(abs(np.median(patch) - z) < 0.3)
+
+    until(world, seen)
+    depth.close()
+
+
+def onto(image: Image, point: np.ndarray) -> tuple[tuple[int, int], float]:
+    """Row and column of a point of the room in a picture, and how far along the line of sight it is [m]."""
+    pixels = image.depth_m if image.depth_m is not None else image.rgb
+    assert pixels is not None
+    height, width = pixels.shape[:2]
+    x, y, z = image.rotation.T @ (point - image.position_m)
+    focal = height / 2 / math.tan(image.fovy_rad / 2)
+    return (round(height / 2 - focal * y / -z), round(width / 2 + focal * x / -z)), -z
+
+
+def test_depth_agrees_with_a_ray_and_is_without_end_beyond_reach(world: StillWorld) -> None:
+    entry = world.entry("depth")
+    near = connected(world, changed(entry, options={"furthest_m": 2.0}))
+    depth_m = image(near).depth_m
+    assert depth_m is not None
+    assert np.isinf(depth_m).any()
+    assert depth_m[np.isfinite(depth_m)].max() < 2.1
+    near.close()
+
+
+def test_the_door_contact_follows_the_door_and_the_door_its_control(world: StillWorld) -> None:
+    door, contact = connected(world, "door"), connected(world, "door_contact")
+    assert contact.read("contact") == {"open": False}
+    assert door.set("opening", 0.5) == pytest.approx(0.5)
+    world.go_on(0.6)
+    assert contact.read("contact") == {"open": True}
+    assert 0.05 < door.read("settings")["opening"] < 0.45, "a door takes its time"
+    world.go_on(4.0)
+    assert door.read("settings")["opening"] == pytest.approx(0.5, abs=0.05)
+    door.set("opening", 0.0)
+    world.go_on(6.0)
+    assert contact.read("contact") == {"open": False}
+
+
+def test_a_door_that_is_held_stays_where_it_is(world: StillWorld) -> None:
+    door = connected(world, "door")
+    door.set("opening", 1.0)
+    world.go_on(1.0)
+    door.hold()  # type: ignore[attr-defined]
+    held = door.read("settings")["opening"]
+    world.go_on(5.0)
+    assert door.read("settings")["opening"] == pytest.approx(held, abs=0.08)
+
+
+def test_a_camera_that_turns_sees_something_else_and_says_where_it_looks(world: StillWorld) -> None:
+    camera = connected(world, "pan_tilt")
+    before = image(camera)
+    camera.set("pan", 1.0)
+    world.go_on(5.0)
+    after = image(camera)
+    assert camera.read("settings")["pan"] == pytest.approx(1.0, abs=0.03)
+    cosine = float(before.rotation[:, 2] @ after.rotation[:, 2])
+    assert 0.5 < math.acos(cosine) < 1.2
+    assert difference(before, after) > 5000
+    camera.close()
+
+
+def test_the_lamp_changes_what_the_light_meter_tells(world: StillWorld) -> None:
+    lamp, meter = connected(world, "lamp"), connected(world, changed(world.entry("light"), options={"seed": 3}))
+    lamp.set("level", 0.0)
+    world.go_on(0.02)
+    dark = meter.read("light")["light_lux"]
+    lamp.set("level", 1.0)
+    world.go_on(0.02)
+    until(world, lambda: meter.read("light")["light_lux"] > dark + 100, step_s=0.02)
+
+
+# ---------------------------------------------------------------- errors of sensors
+
+
+def test_a_probe_is_wrong_by_its_offset_and_jitter_and_the_same_again_with_the_same_seed() -> None:
+    errors = Errors(offset=2.0, jitter=0.5)
+    told = [[Probe(errors, generator("one", seed)).read(20.0, 0.0) for _ in range(3)] for seed in (1, 1, 2)]
+    assert told[0] == told[1] != told[2]
+    offsets = [np.mean([probe.read(0.0, each) for each in range(200)]) for probe in probes(errors, 300)]
+    assert np.std(offsets) == pytest.approx(2.0, rel=0.15)
+
+
+def probes(errors: Errors, count: int) -> list[Probe]:
+    return [Probe(errors, generator("many", seed)) for seed in range(count)]
+
+
+def test_a_probe_follows_a_step_in_its_time() -> None:
+    probe = Probe(Errors(lag_s=10.0), generator("slow", 0))
+    assert probe.read(0.0, 0.0) == 0
+    assert probe.read(1.0, 10.0) == pytest.approx(1 - math.exp(-1))
+    assert probe.read(1.0, 100.0) == pytest.approx(1, abs=1e-3)
+
+
+@pytest.mark.parametrize("quantity", ERRORS)
+def test_no_probe_tells_less_than_there_can_be_or_finer_than_it_can(quantity: str) -> None:
+    errors = ERRORS[quantity]
+    for probe in probes(errors, 20):
+        told = probe.read(0.3, 0.0)
+        assert told >= errors.least
+        assert told / errors.step == pytest.approx(round(told / errors.step), abs=1e-3)
+
+
+# ---------------------------------------------------------------- what cannot be made
+
+
+def test_a_name_that_is_none_is_refused_with_those_there_are() -> None:
+    with pytest.raises(SensorError, match=r"no sensor driver 'crystal_ball'; there are: .*mujoco"):
+        load("crystal_ball")
+    assert {"mujoco", "perception"} <= set(names())
+
+
+@pytest.mark.parametrize(
+    ("changes", "said"),
+    [
+        ({"kind": "telescope"}, "no kind 'telescope'; it has: camera, .*thermostat"),
+        ({"options": {"colour": "red"}}, "no option 'colour'; it has: .*joint"),
+        ({"options": {"joint": 3}}, "option 'joint' .* is 3, of the wrong type"),
+        ({"options": {"seed": True}}, "option 'seed' .* is True, of the wrong type"),
+    ],
+)
+def test_an_entry_that_cannot_be_is_refused(world: StillWorld, changes: dict[str, object], said: str) -> None:
+    with pytest.raises(SensorError, match=said):
+        world.driver(changed(world.entry("door_contact"), **changes))
+
+
+def test_a_name_that_the_model_lacks_is_refused_with_those_it_has(world: StillWorld) -> None:
+    driver = world.driver(changed(world.entry("door_contact"), options={"joint": "gate"}))
+    with pytest.raises(SensorError, match=r"no joint 'gate'; it has: .*door"):
+        driver.connect()
+
+
+def test_a_picture_that_nobody_could_draw_is_refused(world: StillWorld) -> None:
+    with pytest.raises(SensorError, match="at most 1920 x 1080"):
+        world.driver(changed(world.entry("camera"), options={"width": 100_000}))
+
+
+def test_a_real_room_has_no_simulated_devices(world: StillWorld) -> None:
+    with pytest.raises(SensorError, match="its room has no model"):
+        simulated.create(world.entry("pir"), LAB, Surroundings(neighbours={}))
+
+
+def test_a_quantity_that_the_room_lacks_is_told(world: StillWorld, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(StillWorld, "quantities", {"temperature_c": 20.0})
+    meter = connected(world, changed(world.entry("co2"), streams=(Stream(name="co2", rate_hz=1.0),)))
+    with pytest.raises(SensorError, match="this room has no co2_ppm; it has: temperature_c"):
+        meter.read("co2")

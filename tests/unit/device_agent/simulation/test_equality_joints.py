@@ -1,0 +1,75 @@
+"""Joints without a motor of their own: what is worked out is where the physics takes them."""
+
+import mujoco
+import numpy as np
+import pytest
+
+from device_agent.simulation.mjcf.equality_joints import Ties
+
+HAND = """
+<mujoco><compiler angle="radian"/>
+<default><geom size=".01" mass=".01" contype="0"/><joint armature=".01" damping=".1"/></default>
+<worldbody>
+  <body><joint name="a" axis="0 0 1" range="-1 1"/><geom/></body>
+  <body><joint name="b" axis="0 0 1" ref="0.3"/><geom/></body>
+  <body><joint name="twice_a" axis="0 0 1" ref="0.1"/><geom/></body>
+  <body><joint name="chained" type="slide" axis="1 0 0"/><geom/></body>
+  <body><joint name="mixed" axis="0 1 0"/><geom/></body>
+  <body><joint name="free_one" axis="0 1 0"/><geom/></body>
+</worldbody>
+<tendon>
+  <fixed name="mix"><joint joint="mixed" coef="2"/><joint joint="a" coef="-1"/><joint joint="b" coef="0.5"/></fixed>
+</tendon>
+<equality>
+  <joint joint1="chained" joint2="twice_a" polycoef="0.2 0.05 0 0 0"/>
+  <joint joint1="a" joint2="twice_a" polycoef="-0.05 0.5 0 0 0"/>
+  <tendon tendon1="mix" polycoef="0.1 0 0 0 0"/>
+</equality>
+<actuator><position name="a" joint="a" kp="5" kv="0.5"/><position name="b" joint="b" kp="5" kv="0.5"/></actuator>
+</mujoco>
+"""
+
+
+def model_of(text: str = HAND):
+    return mujoco.MjModel.from_xml_string(text)
+
+
+def test_tied_joints_are_settled_where_the_physics_takes_them():
+    model = model_of()
+    model.opt.gravity[:] = 0
+    model.opt.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
+    data = mujoco.MjData(model)
+    random = np.random.default_rng(3)
+    for _ in range(5):
+        data.ctrl[:] = random.uniform(-0.8, 0.8, model.nu)
+        mujoco.mj_step(model, data, nstep=4000)
+        settled = data.qpos.copy()
+        settled[[2, 3, 4]] = 9.0
+        Ties(model).settle(settled)
+        assert settled == pytest.approx(data.qpos, abs=2e-3)
+
+
+def test_each_is_told_by_what_is_not_tied_itself():
+    model = model_of()
+    ties = Ties(model)
+    assert [model.joint(tie.joint).name for tie in ties.all] == ["twice_a", "chained", "mixed"]
+    assert ties.of(model.joint("chained").id) == pytest.approx({model.joint("a").id: 0.1})
+    assert ties.of(model.joint("mixed").id) == pytest.approx({model.joint("a").id: 0.5, model.joint("b").id: -0.25})
+    assert ties.of(model.joint("free_one").id) == {}
+    assert ties.offset(model.joint("free_one").id) == 0.0
+
+
+def test_a_ring_of_ties_and_one_that_is_switched_off_are_left_alone():
+    ring = HAND.replace(
+        "</equality>",
+        '<joint joint1="free_one" joint2="mixed"/><joint joint1="mixed" joint2="free_one"/></equality>',
+    ).replace('<tendon tendon1="mix"', '<tendon active="false" tendon1="mix"')
+    model = model_of(ring)
+    assert [model.joint(tie.joint).name for tie in Ties(model).all] == ["twice_a", "chained"]
+
+
+def test_a_model_without_ties_is_left_as_it_is():
+    model = model_of("<mujoco><worldbody><body><joint/><geom size='.1'/></body></worldbody></mujoco>")
+    qpos = np.array([0.7])
+    Ties(model).settle(qpos)
+    assert qpos.tolist() == [0.7]

@@ -1,0 +1,361 @@
+"""A room in simulation: robots that share a world, somebody who walks, what air, light and sound do."""
+
+import gc
+import math
+from pathlib import Path
+
+import msgspec
+import mujoco
+import numpy as np
+import pytest
+
+from device_agent.drivers import mujoco as driver
+from device_agent.drivers.mujoco import World
+from device_agent.ports.driver import DriverError, MobileDriver, Twist
+from device_agent.protocol.manifests import robot_type, room
+from device_agent.protocol.manifests.room import Room
+from device_agent.simulation import world_registry
+from device_agent.simulation.room.climate import Climate, water_g_m3
+from device_agent.simulation.room.pedestrian import Walker
+from device_agent.simulation.room.sound import heard_db
+
+ROBOTS = Path(__file__).parents[3] / "robots"
+LAB = ROBOTS / "rooms" / "lab"
+MANIFEST = room.load(LAB)
+
+
+def lab(manifest: Room = MANIFEST) -> World:
+    types = {robot.type: robot_type.load(ROBOTS / robot.type) for robot in manifest.robots}
+    world = world_registry.make(manifest, LAB, types)
+    world.build()
+    return world
+
+
+EMPTY = msgspec.structs.replace(MANIFEST, robots=())
+"""Without its robots it is five times as fast."""
+
+
+def changed(**climate: float) -> Room:
+    return msgspec.structs.replace(MANIFEST, climate=msgspec.structs.replace(MANIFEST.climate, **climate))
+
+
+def warnings(world: World) -> list[str]:
+    return [
+        name
+        for name, kind in mujoco.mjtWarning.__members__.items()
+        if kind != mujoco.mjtWarning.mjNWARNING and world._data.warning[int(kind)].number
+    ]
+
+
+def test_two_thousand_steps_under_chance_are_finite_and_the_same_again():
+    def play() -> list[np.ndarray]:
+        world, random, seen = lab(), np.random.default_rng(5), []
+        lower, upper = world.model.actuator_ctrlrange.T
+        own = np.flatnonzero(["/" in world.model.actuator(index).name for index in range(world.model.nu)])
+        home = world.snapshot().ctrl[own]
+        for _ in range(100):
+            target = np.clip(home + random.uniform(-0.1, 0.1, len(own)), lower[own], upper[own])
+            world.command("all", own, target, ramp_s=0.04)
+            seen.append(world.step(20).qpos)
+        assert warnings(world) == []
+        assert np.isfinite(seen).all()
+        return seen
+
+    for first, second in zip(play(), play(), strict=True):
+        assert np.array_equal(first, second)
+
+
+def test_every_robot_stands_where_the_manifest_puts_it():
+    world = lab()
+    for robot in MANIFEST.robots:
+        kind = robot_type.load(ROBOTS / robot.type)
+        arm = driver.MujocoDriver(
+            robot_type=kind, world=world, device=robot.name, prefix=world_registry.prefix(robot.name)
+        )
+        arm._resolve(world.model)
+        x, y, _ = world.snapshot().body_position_m[arm._base]
+        assert math.dist((x, y), robot.position_m[:2]) < 0.05
+        assert [world.snapshot().position_rad[f"{robot.name}/{name}"] for name in kind.home_rad] == pytest.approx(
+            list(kind.home_rad.values())
+        )
+
+
+@pytest.mark.parametrize("name", ["nao", "qbo"])
+def test_a_robot_that_drives_gets_somewhere_in_the_room(name: str):
+    robot = MANIFEST.robot(name)
+    assert robot is not None
+    kind = robot_type.load(ROBOTS / robot.type)
+    world = lab()
+    mobile = driver._kind(kind)(robot_type=kind, world=world, device=name, prefix=world_registry.prefix(name))
+    assert isinstance(mobile, MobileDriver)
+    mobile._resolve(world.model)
+    mobile._connected = True
+    height_m = world.snapshot().body_position_m[mobile._base][2]
+    home = [kind.home_rad[joint.name] for joint in kind.joints]
+    for _ in range(150):
+        mobile.send(home)
+        mobile.drive(Twist(0.08, 0.0, 0.0))
+        world.step(kind.period_ms // 2)
+    x, y, z = world.snapshot().body_position_m[mobile._base]
+    assert z == pytest.approx(height_m, abs=0.03)
+    gone_m = math.dist((x, y), robot.position_m[:2])
+    assert 0.1 < gone_m < 0.3
+    towards = math.atan2(y - robot.position_m[1], x - robot.position_m[0])
+    assert abs(math.remainder(towards - robot.yaw_rad, 2 * math.pi)) < 0.3
+    assert warnings(world) == []
+
+
+def test_devices_of_one_room_share_its_world_and_it_ends_with_them():
+    first, second = world_registry.of(LAB), world_registry.of(LAB)
+    assert first is second
+    first.tell({"mark": 1.0})
+    del first, second
+    gc.collect()
+    assert "mark" not in world_registry.of(LAB).quantities
+
+
+def test_a_driver_in_a_room_is_the_robot_of_its_name():
+    kind = robot_type.load(ROBOTS / "ur5")
+    arm = driver.create(kind, ROBOTS / "ur5", {"room": str(LAB)}, "ur5")
+    arm.connect()
+    try:
+        assert arm.observe().position_rad == pytest.approx(
+            [kind.home_rad[joint.name] for joint in kind.joints], abs=1e-3
+        )
+    finally:
+        arm.close()
+    stranger = driver.create(kind, ROBOTS / "ur5", {"room": str(LAB)}, "nobody")
+    with pytest.raises(DriverError, match="no joint 'nobody/shoulder_pan'"):
+        stranger.connect()
+
+
+def test_the_drawing_of_an_arm_in_a_room_has_its_table_and_not_the_whole_room():
+    world = lab()
+    kind = robot_type.load(ROBOTS / "ur5")
+    arm = driver.MujocoDriver(robot_type=kind, world=world, device="ur5", prefix="ur5/")
+    arm._resolve(world.model)
+    arm._connected = True
+    twin = arm.twin()
+    assert twin is not None
+    assert twin.bodies[0].name == "scene"
+    assert 7 <= len(twin.bodies[0].geometries) < 20
+    assert len(msgspec.json.encode(twin)) < 64_000
+    assert [1.65 - 1.95, 0.0, -0.02] in [
+        pytest.approx(list(shape.position_m), abs=1e-9) for shape in twin.bodies[0].geometries
+    ]
+
+
+def test_a_copy_is_of_one_moment_and_shows_poses():
+    world = lab()
+    snapshot = world.step(500)
+    data = mujoco.MjData(world.model)
+    world.copy(data)
+    assert data.time == snapshot.time_s
+    assert np.abs(data.xpos - snapshot.body_position_m).max() < 1e-12
+    assert np.array_equal(data.mocap_pos, snapshot.mocap_position_m)
+
+
+# ------------------------------------------------------------ the person
+
+
+def walked(world: World, seconds: float) -> np.ndarray:
+    body = world.model.body("person").id
+    return np.array([world.step(50).body_position_m[body] for _ in range(round(seconds / 0.1))])
+
+
+def shapes_of_the_person(world: World) -> list[int]:
+    model = world.model
+    return [geom for geom in range(model.ngeom) if model.body(model.geom_bodyid[geom]).name.startswith("person")]
+
+
+def test_the_person_walks_its_way_and_keeps_its_feet_on_the_floor():
+    world = lab(EMPTY)
+    way = walked(world, 45)
+    for corner in MANIFEST.people[0].path_m:
+        assert np.hypot(*(way[:, :2] - corner).T).min() < 0.1
+    speed = np.hypot(*np.diff(way[:, :2], axis=0).T) / 0.1
+    assert 0.7 < speed.max() < 0.9
+    geoms = [
+        g for g in range(world.model.ngeom) if world.model.body(world.model.geom_bodyid[g]).name.startswith("person")
+    ]
+    assert len(geoms) > 15
+    data = mujoco.MjData(world.model)
+    lowest = []
+    for _ in range(30):
+        world.step(50)
+        world.copy(data)
+        lowest.append(min(data.geom_xpos[g][2] - world.model.geom_size[g][0] for g in geoms))
+    assert np.abs(lowest).max() < 0.03
+
+
+def test_the_persons_way_is_free_of_furniture_and_of_where_robots_begin():
+    world = lab()
+    data = mujoco.MjData(world.model)
+    world.copy(data)
+    people = shapes_of_the_person(world)
+    hit = np.full(1, -1, dtype=np.int32)
+    corners = np.array(MANIFEST.people[0].path_m)
+    for here, there in zip(corners, np.roll(corners, -1, axis=0), strict=True):
+        for side_m in (-0.25, 0.0, 0.25):  # at its hips, elbows included
+            way = (there - here) / np.linalg.norm(there - here)
+            start = np.array((*(here + side_m * np.array((-way[1], way[0]))), 0.3))
+            away_m = mujoco.mj_ray(world.model, data, start, np.array((*way, 0.0)), None, True, -1, hit, None)
+            assert away_m < 0 or away_m > np.linalg.norm(there - here) or hit[0] in people, (here, there, int(hit[0]))
+
+
+def test_the_person_pushes_nothing():
+    world = lab()
+    person = [
+        g for g in range(world.model.ngeom) if world.model.body(world.model.geom_bodyid[g]).name.startswith("person")
+    ]
+    assert not world.model.geom_contype[person].any()
+    assert not world.model.geom_conaffinity[person].any()
+
+
+def test_the_person_waits_for_a_robot_and_turns_round():
+    way = room.Person(name="person", path_m=((0.0, 0.0), (4.0, 0.0)), pause_s=0.0)
+    walker = Walker(way)
+    robots = np.array([[2.0, 0.0, 0.0]])
+    xs = []
+    for _ in range(600):
+        walker._walk(robots)
+        xs.append(walker.position_m[0])
+    assert 1.2 < max(xs) < 1.5
+    assert min(xs[200:]) < 0.1
+
+
+def test_a_room_without_the_persons_body_says_what_is_missing():
+    manifest = msgspec.structs.replace(MANIFEST, people=(room.Person(name="nobody", path_m=((0.0, 0.0), (1.0, 0.0))),))
+    world = lab(manifest)
+    with pytest.raises(DriverError, match="no mocap body 'nobody'"):
+        world.step(2)
+
+
+# ------------------------------------------------------------ door, blinds, light
+
+
+def test_the_door_opens_at_its_own_pace_when_it_is_set():
+    world = lab(EMPTY)
+    assert world.snapshot().position_rad["door"] == pytest.approx(0.0, abs=1e-3)
+    assert world.set("door", 9.0) == 1.5
+    assert 0.05 < world.step(500).position_rad["door"] < 0.8
+    assert world.step(1500).position_rad["door"] == pytest.approx(1.5, abs=0.05)
+    assert world.settings["door"] == 1.5
+
+
+def test_a_number_that_is_none_sets_nothing():
+    world = lab(EMPTY)
+    with pytest.raises(DriverError, match="not finite"):
+        world.set("door", math.nan)
+
+
+def test_the_blinds_start_where_the_manifest_says_on_both_sides():
+    position = lab(EMPTY).snapshot().position_rad
+    assert position["blinds"] == position["blinds_east"] == MANIFEST.start["blinds"]
+
+
+def test_light_comes_from_window_and_lamp_and_cameras_see_it():
+    world = lab(EMPTY)
+    world.step(2)
+    bright, lights = world.quantities["light_lux"], world.model.light_diffuse.copy()
+    world.set("lamp", 0.0)
+    world.step(200)
+    assert world.quantities["light_lux"] == pytest.approx(
+        bright - MANIFEST.climate.lamp_lux * MANIFEST.start["lamp"], abs=5
+    )
+    assert (world.model.light_diffuse <= lights).all()
+    assert (world.model.light_diffuse[1:] == 0).all()
+    world.set("blinds", 0.0)
+    world.step(2500)
+    assert world.quantities["light_lux"] < 0.12 * MANIFEST.climate.daylight_lux
+
+
+# ------------------------------------------------------------ air
+
+
+class Air:
+    """The climate alone, by the hour."""
+
+    def __init__(self, manifest: Room = MANIFEST, *, people: int = 0) -> None:
+        self.world = World(Path("nothing"), settings={"thermostat": -50.0})
+        self.climate = Climate(manifest, self.world, [Walker(MANIFEST.people[0]) for _ in range(people)])
+
+    def after(self, hours: float, *, door: float = 0.0, blinds: float = 0.0) -> dict[str, float]:
+        for _ in range(60):
+            self.climate._advance(hours * 60, door=door, blinds=blinds)
+        self.climate._tell()
+        return dict(self.world.quantities)
+
+
+def test_co2_settles_where_the_balance_of_a_mixed_room_has_it():
+    climate = MANIFEST.climate
+    fresh_m3_h = climate.ventilation_per_h * 6 * 5 * 2.7
+    settled = climate.outside_co2_ppm + 2 * 0.018 / fresh_m3_h * 1e6
+    assert Air(people=2).after(12)["co2_ppm"] == pytest.approx(settled, abs=1)
+    assert Air().after(12)["co2_ppm"] == pytest.approx(climate.outside_co2_ppm, abs=1)
+
+
+def test_co2_and_heat_go_out_through_the_open_door():
+    shut, wide = Air(people=4).after(2), Air(people=4).after(2, door=1.0)
+    assert wide["co2_ppm"] < shut["co2_ppm"] - 400
+    assert abs(wide["temperature_c"] - MANIFEST.climate.corridor_c) < abs(
+        shut["temperature_c"] - MANIFEST.climate.corridor_c
+    )
+
+
+def test_people_warm_and_moisten_the_air():
+    empty, full = Air().after(1), Air(people=5).after(1)
+    assert full["temperature_c"] > empty["temperature_c"] + 0.5
+    assert full["humidity_percent"] > empty["humidity_percent"]
+
+
+def test_the_thermostat_is_kept():
+    air = Air()
+    air.world.settings["thermostat"] = 23.0  # type: ignore[index]
+    assert air.after(6)["temperature_c"] == pytest.approx(22.6, abs=0.45)
+    air.world.settings["thermostat"] = 12.0  # type: ignore[index]
+    assert air.after(12)["temperature_c"] < 15
+
+
+def test_a_long_step_of_the_air_is_as_good_as_many_short_ones():
+    many, one = Air(people=1), Air(people=1)
+    many.after(1)
+    one.climate._advance(3600, door=0.0, blinds=0.0)
+    one.climate._tell()
+    for name, value in many.world.quantities.items():
+        assert one.world.quantities[name] == pytest.approx(value, rel=1e-3)
+
+
+def test_water_in_the_air_is_as_the_tables_have_it():
+    assert water_g_m3(20.0, 100.0) == pytest.approx(17.3, abs=0.1)
+
+
+def test_the_air_of_the_running_lab_follows_its_door():
+    world = lab(EMPTY)
+    world.set("door", 1.5)
+    world.step(10_000)
+    # 0.018 m³/h of one person against 250 m³/h through the door: towards the corridor's air from the first minute.
+    assert world.quantities["co2_ppm"] < MANIFEST.climate.start_co2_ppm
+
+
+# ------------------------------------------------------------ sound
+
+
+def test_a_sound_is_louder_near_by_and_never_vanishes_in_a_room():
+    assert heard_db(60.0, 1.0) == pytest.approx(66.6, abs=0.2)  # the diffuse field adds to the direct one
+    assert heard_db(60.0, 0.5) > heard_db(60.0, 1.0) > heard_db(60.0, 3.0) > 60.0
+
+
+def test_footsteps_speech_and_motors_are_heard():
+    world = lab(changed(quiet_db=20.0))
+    world.step(300)
+    before = world.quantities["sound_db"]
+    mouth = driver.MujocoDriver(robot_type=robot_type.load(ROBOTS / "ur5"), world=world, device="ur5", prefix="ur5/")
+    mouth._connected = True
+    mouth.speaks(0.5)
+    world.step(100)
+    assert world.quantities["sound_db"] > before + 5
+    world.step(300)
+    assert world.quantities["sound_db"] < before + 3
+    world.step(1500)  # its first pause is over
+    assert world.quantities["sound_db"] > before + 5

@@ -1,0 +1,32 @@
+"""Many steps in one call are those that one call each would have made."""
+
+import copy
+
+import mujoco
+import numpy as np
+
+from device_agent.simulation.stepper import Stepper
+from tests.harness.agent.rooms import StillWorld
+
+
+def test_steps_in_one_call_equal_steps_one_by_one() -> None:
+    lab = StillWorld()
+    lab.go_on(0.5)
+    model = lab.model
+    one, many = mujoco.MjData(model), mujoco.MjData(model)
+    lab.copy(one)
+    many = copy.copy(one)
+    stepper, chance = Stepper(model), np.random.default_rng(5)
+    for count in (1, 2, 4, 2, 4, 1, 4):
+        rows = one.ctrl + chance.normal(0.0, 0.02, (count, model.nu))
+        push = chance.normal(0.0, 0.5, (model.nbody, 6))  # what processes of the world do is kept, too
+        one.xfrc_applied[:], many.xfrc_applied[:] = push, push
+        one.mocap_pos[:] += 0.01
+        many.mocap_pos[:] += 0.01
+        for row in rows:
+            one.ctrl[:] = row
+            mujoco.mj_step(model, one)
+        stepper.go(many, rows)
+        for what in ("time", "qpos", "qvel", "act", "ctrl", "qacc_warmstart", "xfrc_applied", "mocap_pos", "eq_active"):
+            assert np.array_equal(getattr(one, what), getattr(many, what)), what
+    assert not np.array_equal(one.qpos, model.qpos0)

@@ -1,0 +1,335 @@
+"""The world: time, commands, snapshots, trace, faults."""
+
+import json
+import logging
+import os
+import threading
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import mujoco
+import numpy as np
+import pytest
+
+from device_agent.drivers.mujoco import Placement, Snapshot, World
+from device_agent.ports.driver import DriverError
+from device_agent.protocol.manifests import robot_type
+from device_agent.simulation.scene_assembly import TIMESTEP_S
+from device_agent.simulation.world import LATE_STEPS, MAX_CATCH_UP_S
+
+UR5 = Path(__file__).parents[3] / "robots" / "ur5"
+HOME = robot_type.load(UR5).home_rad
+ALL = np.arange(6)
+
+
+def until(condition: Callable[[], bool]) -> None:
+    end = time.monotonic() + 60
+    while not condition():
+        assert time.monotonic() < end, "not within 60 s"
+        time.sleep(0.002)
+
+
+def ur5_world(trace: Path | None = None) -> World:
+    return World(UR5 / "scene.xml", home=HOME, trace=trace)
+
+
+def played() -> list[Snapshot]:
+    world = ur5_world()
+    world.build()
+    random = np.random.default_rng(3)
+    target = np.array([HOME[name] for name in HOME])
+    snapshots = []
+    for _ in range(50):
+        target = target + random.uniform(-0.02, 0.02, 6)
+        world.command("arm", ALL, target, ramp_s=0.012)
+        snapshots.append(world.step(4))
+    return snapshots
+
+
+def test_same_commands_by_hand_give_the_same_numbers():
+    for first, second in zip(played(), played(), strict=True):
+        assert first.time_s == second.time_s
+        assert np.array_equal(first.qpos, second.qpos)
+        assert np.array_equal(first.qvel, second.qvel)
+        assert np.array_equal(first.effort, second.effort)
+        assert np.array_equal(first.site_position_m, second.site_position_m)
+
+
+def test_it_starts_at_home_and_stays():
+    world = ur5_world()
+    world.build()
+    assert world.snapshot().position_rad == pytest.approx(HOME)
+    assert world.step(500).position_rad == pytest.approx(HOME, abs=1e-4)
+
+
+def test_poses_belong_to_the_positions_beside_them():
+    world = ur5_world()
+    world.build()
+    world.command("arm", ALL, [0.5, -1.2, 1.2, -1.0, -1.0, 0.5])
+    snapshot = world.step(37)
+    data = mujoco.MjData(world.model)
+    data.qpos[:] = snapshot.qpos
+    mujoco.mj_kinematics(world.model, data)
+    assert np.abs(data.site_xpos - snapshot.site_position_m).max() < 1e-12
+    assert np.abs(data.xpos - snapshot.body_position_m).max() < 1e-12
+
+
+def test_snapshot_is_a_copy_that_nobody_can_change():
+    world = ur5_world()
+    world.build()
+    snapshot = world.snapshot()
+    before = snapshot.qpos.copy()
+    world.command("arm", ALL, [1.0] * 6)
+    world.step(100)
+    assert np.array_equal(snapshot.qpos, before)
+    with pytest.raises(ValueError, match="read-only"):
+        snapshot.qpos[0] = 1.0
+
+
+def test_command_is_followed_in_a_straight_line():
+    world = ur5_world()
+    world.build()
+    start = world.snapshot().ctrl
+    world.command("arm", ALL, start + 0.06, ramp_s=0.012)
+    way = [float(world.step(1).ctrl[0] - start[0]) for _ in range(8)]
+    assert way == pytest.approx([0.01, 0.02, 0.03, 0.04, 0.05, 0.06, 0.06, 0.06])
+
+
+def test_newest_command_wins_without_a_jump():
+    world = ur5_world()
+    world.build()
+    start = world.snapshot().ctrl
+    world.command("arm", ALL, start + 0.06, ramp_s=0.012)
+    world.step(3)
+    world.command("arm", ALL, start - 1.0, ramp_s=0.012)
+    world.command("arm", ALL, start + 0.03, ramp_s=0.012)
+    assert np.abs(world.step(6).ctrl - (start + 0.03)).max() < 1e-12
+
+
+def test_a_command_is_copied():
+    world = ur5_world()
+    world.build()
+    target = world.snapshot().ctrl.copy()
+    world.command("arm", ALL, target)
+    target[:] = 3.0
+    assert world.step(1).ctrl[0] == pytest.approx(HOME["shoulder_pan"])
+
+
+@pytest.mark.parametrize("counted_by_the_model", [True, False])
+def test_effort_counts_what_holds_the_arm_against_gravity(tmp_path: Path, counted_by_the_model: bool):
+    model = (UR5 / "ur5.xml").read_text()
+    if not counted_by_the_model:
+        model = model.replace('actuatorgravcomp="true"', "")
+    (tmp_path / "arm.xml").write_text(model)
+    world = World(tmp_path / "arm.xml", home=HOME)
+    world.build()
+    assert abs(world.step(10).effort[1]) > 10  # the shoulder carries the arm
+    assert abs(world.step(10).effort[0]) < 0.1  # the base turns about the vertical
+
+
+def test_real_time_runs_while_somebody_takes_part():
+    world = ur5_world()
+    world.open()
+    world.open()
+    try:
+        until(lambda: world.snapshot().time_s > 0.05)
+        with pytest.raises(DriverError, match="real time"):
+            world.step(1)
+        world.close()
+        before = world.snapshot().time_s
+        until(lambda: world.snapshot().time_s > before)
+    finally:
+        world.close()
+    stopped = world.snapshot().time_s
+    time.sleep(0.05)
+    assert world.snapshot().time_s == stopped
+    assert "mujoco-world" not in [thread.name for thread in threading.enumerate()]
+
+
+def test_it_goes_on_where_it_stopped():
+    world = ur5_world()
+    world.open()
+    until(lambda: world.snapshot().time_s > 0.02)
+    world.close()
+    stopped = world.snapshot().time_s
+    world.open()
+    assert world.snapshot().time_s >= stopped
+    until(lambda: world.snapshot().time_s > stopped)
+    world.close()
+
+
+def test_simulated_time_never_runs_ahead_of_the_clock():
+    world = ur5_world()
+    before = time.monotonic()
+    world.open()
+    try:
+        until(lambda: world.snapshot().time_s > 0.5)
+        snapshot = world.snapshot()
+        assert snapshot.time_s <= snapshot.taken_s - before + 0.005
+    finally:
+        world.close()
+
+
+def test_a_slow_machine_loses_time_and_says_so(monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture):
+    world = ur5_world()
+    groups = 0
+    advance = world._advance
+
+    def slow(count: int) -> None:
+        nonlocal groups
+        groups += 1
+        if groups == 5:
+            time.sleep(MAX_CATCH_UP_S * 10)
+        advance(count)
+
+    monkeypatch.setattr(world, "_advance", slow)
+    before = time.monotonic()
+    with caplog.at_level(logging.WARNING):
+        world.open()
+        try:
+            until(lambda: world.snapshot().time_s > 0.3)
+            snapshot = world.snapshot()
+        finally:
+            world.close()
+    lost_s = snapshot.lag_ms / 1000
+    assert lost_s >= MAX_CATCH_UP_S * 9
+    assert "cannot keep up" in caplog.text
+    # What is lost stays lost: stepping it after all, in a burst, would be a jump.
+    assert snapshot.time_s + lost_s <= snapshot.taken_s - before + 0.005
+
+
+def test_a_diverged_world_stops_and_says_so():
+    world = ur5_world()
+    world.build()
+    world._data.qvel[0] = np.nan
+    with pytest.raises(DriverError, match="unstable"):
+        world.step(2)
+    assert "unstable" in world.snapshot().fault
+
+
+def test_a_diverged_world_does_not_jump_back_to_the_start():
+    world = ur5_world()
+    world.build()
+    world.step(100)
+    world._data.qvel[0] = np.inf
+    with pytest.raises(DriverError, match="unstable"):
+        world.step(2)
+    assert world.snapshot().time_s > 0.1
+
+
+def test_an_error_while_stepping_becomes_a_fault(monkeypatch: pytest.MonkeyPatch):
+    world = ur5_world()
+
+    def broken(count: int) -> None:
+        raise RuntimeError(f"no {count} steps today")
+
+    monkeypatch.setattr(world, "_advance", broken)
+    world.open()
+    try:
+        until(lambda: "steps today" in world.snapshot().fault)
+    finally:
+        world.close()
+
+
+def test_trace_tells_the_truth_at_100_hz(tmp_path: Path):
+    path = tmp_path / "trace.ndjson"
+    world = ur5_world(path)
+    world.open()
+    try:
+        world.command("arm", ALL, [0.2, -1.5, 1.5, -1.5, -1.5, 0.1], ramp_s=0.5)
+        until(lambda: world.snapshot().time_s > 0.3)
+    finally:
+        world.close()
+    header, *rows = [json.loads(line) for line in path.read_text().splitlines()]
+    assert header == {"joints": list(HOME), "actuators": list(HOME)}
+    assert len(rows) > 20
+    times = np.array([row["time_s"] for row in rows])
+    # A line is written after a group of steps; a world that is late makes larger ones.
+    assert np.diff(times) == pytest.approx(0.01, abs=LATE_STEPS * TIMESTEP_S + 1e-4)
+    assert np.mean(np.diff(times)) == pytest.approx(0.01, abs=0.0025)
+    ticks = [row["tick_ms"] for row in rows]
+    assert ticks == sorted(ticks)
+    assert abs(rows[-1]["at_ms"] / 1000 - time.time()) < 60
+    for row in rows:
+        assert {len(row[name]) for name in ("qpos", "qvel", "target", "ctrl")} == {6}
+    assert rows[-1]["target"] == pytest.approx([0.2, -1.5, 1.5, -1.5, -1.5, 0.1])
+    assert 0 < rows[-1]["ctrl"][0] < 0.2
+    assert 0 < rows[-1]["qpos"][0] < 0.2
+
+
+def test_a_full_disk_at_the_start_is_one_clear_error():
+    world = ur5_world(Path("/dev/full"))
+    with pytest.raises(DriverError, match="cannot write the trace"):
+        world.open()
+
+
+def test_a_trace_that_fails_later_ends_and_the_simulation_goes_on(tmp_path: Path, caplog: pytest.LogCaptureFixture):
+    pipe = tmp_path / "pipe"
+    os.mkfifo(pipe)
+    reader = os.open(pipe, os.O_RDONLY | os.O_NONBLOCK)
+    world = ur5_world(pipe)
+    with caplog.at_level(logging.WARNING):
+        world.open()
+        try:
+            os.close(reader)
+            until(lambda: "the trace ends here" in caplog.text)
+            then = world.snapshot().time_s
+            until(lambda: world.snapshot().time_s > then)
+            assert world.snapshot().fault == ""
+        finally:
+            world.close()
+
+
+def test_trace_is_appended_to(tmp_path: Path):
+    path = tmp_path / "trace.ndjson"
+    path.write_text("earlier\n")
+    world = ur5_world(path)
+    world.open()
+    world.close()
+    assert path.read_text().startswith("earlier\n{")
+
+
+def test_trace_that_cannot_be_written_is_one_clear_error(tmp_path: Path):
+    world = ur5_world(tmp_path / "no" / "trace.ndjson")
+    with pytest.raises(DriverError, match="cannot write the trace"):
+        world.open()
+
+
+@pytest.mark.parametrize("text", ["<mujoco><worldbody><geom/></worldbody></mujoco>", "not xml", ""])
+def test_a_model_that_mujoco_refuses_is_one_clear_error(tmp_path: Path, text: str):
+    scene = tmp_path / "bad.xml"
+    scene.write_text(text)
+    with pytest.raises(DriverError, match="MuJoCo cannot build this world"):
+        World(scene).build()
+
+
+def test_unknown_joint_in_home_is_named_with_the_valid_ones():
+    with pytest.raises(DriverError, match=r"no joint 'ellbow'; the model has: shoulder_pan, "):
+        World(UR5 / "scene.xml", home={"ellbow": 1.0}).build()
+
+
+def test_nothing_is_there_before_it_is_built():
+    world = ur5_world()
+    for use in (world.snapshot, lambda: world.model, lambda: world.step(1)):
+        with pytest.raises(DriverError, match="not built"):
+            use()
+
+
+def test_many_robots_share_a_world_and_move_apart(tmp_path: Path):
+    room = tmp_path / "room.xml"
+    room.write_text(
+        '<mujoco><option timestep="0.01"/><worldbody><geom type="plane" size="5 5 0.1"/></worldbody></mujoco>'
+    )
+    robots = [
+        Placement(prefix=f"{name}/", model=UR5 / "ur5.xml", position_m=(2.0 * index, 0.0, 0.5))
+        for index, name in enumerate(("a", "b", "c", "d"))
+    ]
+    world = World(room, robots=robots, home={f"{name}/elbow": 0.5 for name in "abcd"})
+    world.build()
+    assert world.model.opt.timestep == TIMESTEP_S
+    world.command("b", np.arange(6, 12), [0.3, 0.0, 0.5, 0.0, 0.0, 0.0], ramp_s=0.2)
+    position = world.step(500).position_rad
+    assert position["b/shoulder_pan"] == pytest.approx(0.3, abs=0.01)
+    assert position["a/shoulder_pan"] == pytest.approx(0.0, abs=0.01)
+    assert position["d/elbow"] == pytest.approx(0.5, abs=0.01)

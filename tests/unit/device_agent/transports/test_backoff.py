@@ -1,0 +1,61 @@
+"""Attempts to connect become rare while nothing holds, and differ from agent to agent."""
+
+import random
+
+import pytest
+
+from device_agent.transports import backoff
+from device_agent.transports.backoff import FIRST_S, LONGEST_S, BackOff
+
+
+class Clock:
+    now_s = 0.0
+
+    def monotonic(self) -> float:
+        return self.now_s
+
+
+@pytest.fixture
+def clock(monkeypatch: pytest.MonkeyPatch) -> Clock:
+    clock = Clock()
+    monkeypatch.setattr(backoff, "time", clock)
+    return clock
+
+
+def waits(back: BackOff, clock: Clock, count: int, *, each_s: float) -> list[float]:
+    found = []
+    for _ in range(count):
+        back.attempt()
+        clock.now_s += each_s
+        found.append(back.wait_s())
+    return found
+
+
+@pytest.mark.parametrize("each_s", [0.0, LONGEST_S - 0.1])
+def test_it_waits_up_to_twice_as_long_each_time_and_never_longer_than_the_bound(clock: Clock, each_s: float) -> None:
+    longest = FIRST_S
+    for wait_s in waits(BackOff(), clock, 50, each_s=each_s):
+        assert FIRST_S / 2 <= wait_s <= longest
+        longest = min(2 * longest, LONGEST_S)
+
+
+def test_links_that_break_at_once_make_few_attempts(clock: Clock) -> None:
+    random.seed(4)
+    back, attempts = BackOff(), 0
+    while clock.now_s < 600:
+        (wait_s,) = waits(back, clock, 1, each_s=0.05)
+        clock.now_s += wait_s
+        attempts += 1
+    assert attempts < 150
+
+
+def test_a_link_that_held_lets_the_next_attempt_follow_soon(clock: Clock) -> None:
+    back = BackOff()
+    waits(back, clock, 20, each_s=0.0)
+    assert waits(back, clock, 1, each_s=LONGEST_S + 0.1)[0] <= FIRST_S
+
+
+def test_agents_that_lost_one_broker_come_back_apart(clock: Clock) -> None:
+    last = [waits(BackOff(), clock, 8, each_s=0.0)[-1] for _ in range(200)]
+    assert max(last) - min(last) > LONGEST_S / 2
+    assert sum(wait_s < LONGEST_S / 4 for wait_s in last) < 120

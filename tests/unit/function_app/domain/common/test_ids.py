@@ -1,0 +1,106 @@
+"""Ids and claim codes: short, sortable where it matters, and read back only when they are whole."""
+
+import hashlib
+import re
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from device_agent.protocol.topics import is_id
+from function_app.domain.common import ids
+
+AGENT = "abcdefgh23"
+times = st.integers(min_value=0, max_value=4_102_444_800_000)  # until 2100
+names = st.from_regex(ids.DEVICE_NAME)
+
+
+@given(st.integers(min_value=0, max_value=2**64 - 1))
+def test_a_key_has_one_agent_id_of_ten_letters_and_digits(bits: int) -> None:
+    agent = ids.agent_id(f"{bits:016x}")
+    assert re.fullmatch("[a-z2-7]{10}", agent)
+    assert agent == ids.agent_id(f"{bits:016x}")
+
+
+def test_agent_ids_use_fifty_bits_of_the_key() -> None:
+    found = {ids.agent_id(hashlib.sha256(str(number).encode()).hexdigest()[:16]) for number in range(2_000)}
+    assert len(found) == 2_000
+    assert ids.agent_id("0" * 16) != ids.agent_id(f"{1 << 14:016x}")
+    assert ids.agent_id("f" * 16) == "7" * 10
+
+
+@given(names, times)
+def test_an_actions_id_is_an_id_and_says_its_device(name: str, now_ms: int) -> None:
+    device = ids.device_id(AGENT, name)
+    action = ids.command_id(device, now_ms)
+    assert is_id(action)
+    assert ids.split_device(device) == (AGENT, name)
+    assert ids.split_command(action) == (device, action[-20:])
+
+
+@given(times, times)
+def test_a_newer_actions_id_sorts_first(one: int, two: int) -> None:
+    if one != two:
+        earlier, later = sorted((one, two))
+        assert ids.new_suffix(later) < ids.new_suffix(earlier)
+
+
+def test_ids_do_not_repeat() -> None:
+    assert len({ids.new_suffix(0) for _ in range(5_000)}) == 5_000
+    assert len({ids.new_id() for _ in range(5_000)}) == 5_000
+    assert all(re.fullmatch("[a-z2-7]{16}", ids.new_id()) for _ in range(100))
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "",
+        "-",
+        AGENT,
+        f"{AGENT}-",
+        "-arm",
+        "short-arm",
+        f"{AGENT}x-arm",
+        f"{AGENT}-a/b",
+        f"{AGENT}-a b",
+        f"{AGENT}-ärm",
+        f"{AGENT}-" + "x" * 33,
+        "äbcdefgh23-arm",
+        "abcdefgh2٣-arm",
+        f"{AGENT}-arm\n",
+        f"{AGENT}-\x00",
+    ],
+)
+def test_what_is_no_device_is_not_read_as_one(text: str) -> None:
+    assert ids.split_device(text) is None
+    assert ids.split_command(f"{text}-{'0' * 20}") is None
+
+
+@pytest.mark.parametrize("suffix", ["", "0" * 19, "0" * 21, "0" * 19 + "/", "0" * 19 + " "])
+def test_what_is_no_action_is_not_read_as_one(suffix: str) -> None:
+    assert ids.split_command(f"{AGENT}-arm-{suffix}") is None
+
+
+@given(st.text())
+def test_any_text_is_read_or_refused(text: str) -> None:
+    for read in (ids.split_device, ids.split_command):
+        found = read(text)
+        assert found is None or "-".join(found) == text
+    code = ids.read_claim_code(text)
+    assert code is None or set(code) <= set(ids.CLAIM_ALPHABET)
+
+
+def test_a_claim_code_is_read_as_people_type_it() -> None:
+    for _ in range(100):
+        code = ids.new_claim_code()
+        shown = ids.show_claim_code(code)
+        assert re.fullmatch("[BCDFGHJKLMNPQRSTVWXZ]{4}-[BCDFGHJKLMNPQRSTVWXZ]{4}", shown)
+        for typed in (shown, code, shown.lower(), f" {shown[:4]} - {shown[5:]} ", shown.replace("-", "")):
+            assert ids.read_claim_code(typed) == code
+
+
+@pytest.mark.parametrize(
+    "text", ["", "BCDF-GHJ", "BCDF-GHJKL", "ABCD-EFGH", "BCDF-GHJ1", "BCDF_GHJK", "\uff22CDF-GHJK"]
+)
+def test_what_is_no_claim_code_is_refused(text: str) -> None:
+    assert ids.read_claim_code(text) is None

@@ -1,0 +1,144 @@
+"""Samples as a set by time, in windows and buckets."""
+
+import json
+import math
+import random
+from array import array
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from function_app.domain.telemetry import series
+from function_app.domain.telemetry.series import DAY, FINEST, LEVELS, MAX_VALUES, WINDOW_MS, Bucket, Keep, Samples
+from function_app.ports.tables import MAX_DATA_BYTES
+
+VALUES = st.floats(-1e300, 1e300)
+ROWS = st.lists(
+    st.tuples(st.integers(0, 40_000), st.dictionaries(st.sampled_from("abc"), VALUES, min_size=1)), max_size=60
+)
+NOW_MS = 1_800_000_000_000
+
+
+def rows_of(samples: Samples) -> dict[int, dict[str, float]]:
+    found: dict[int, dict[str, float]] = {}
+    for index, at_ms in enumerate(samples.at_ms):
+        values = {name: column[index] for name, column in samples.columns.items()}
+        found[at_ms] = {name: value for name, value in values.items() if not math.isnan(value)}
+    return found
+
+
+def truth(rows: list[tuple[int, dict[str, float]]]) -> dict[int, dict[str, float]]:
+    first: dict[int, dict[str, float]] = {}
+    for at_ms, values in rows:
+        first.setdefault(at_ms, values)
+    return first
+
+
+@given(ROWS)
+def test_of_samples_at_one_time_the_first_counts(rows: list[tuple[int, dict[str, float]]]) -> None:
+    samples = series.gather(rows)
+    assert rows_of(samples) == truth(rows)
+    assert list(samples.at_ms) == sorted(set(samples.at_ms))
+
+
+@given(ROWS)
+def test_what_is_packed_comes_out_as_it_was(rows: list[tuple[int, dict[str, float]]]) -> None:
+    samples = series.gather(rows)
+    packed = json.loads(json.dumps(series.pack(samples)))
+    assert rows_of(series.unpack(packed)) == rows_of(samples)
+
+
+@given(ROWS, ROWS)
+def test_samples_are_a_set_by_time(
+    one: list[tuple[int, dict[str, float]]], other: list[tuple[int, dict[str, float]]]
+) -> None:
+    there = series.gather(one)
+    fresh = series.unseen(series.gather(other), there)
+    assert rows_of(series.merge(there, fresh)) == truth(one + other)
+    assert len(series.unseen(series.gather(other), series.merge(there, fresh))) == 0
+
+
+@given(ROWS)
+def test_windows_hold_every_sample_once(rows: list[tuple[int, dict[str, float]]]) -> None:
+    samples = series.gather(rows)
+    found: dict[int, dict[str, float]] = {}
+    for start_ms, window in samples.windows():
+        assert start_ms % WINDOW_MS == 0
+        assert all(start_ms <= at_ms < start_ms + WINDOW_MS for at_ms in window.at_ms)
+        found |= rows_of(window)
+    assert found == rows_of(samples)
+
+
+@given(ROWS, st.randoms(use_true_random=False))
+def test_a_bucket_is_what_its_samples_are_in_whatever_order_they_came(
+    rows: list[tuple[int, dict[str, float]]], chance: random.Random
+) -> None:
+    samples = series.gather(rows)
+    parts = [samples.part(index, index + 1) for index in range(len(samples))]
+    chance.shuffle(parts)
+    bucket = Bucket()
+    for part in parts:
+        bucket.add(series.bucket(json.loads(json.dumps(series.summarize(part).data()))))
+    assert bucket.count == len(samples)
+    for name in samples.columns:
+        values = [(at_ms, each[name]) for at_ms, each in sorted(truth(rows).items()) if name in each]
+        summary = bucket.fields[name]
+        numbers = [value for _, value in values]
+        assert (summary.samples, summary.low, summary.high) == (len(values), min(numbers), max(numbers))
+        assert (summary.last_ms, summary.last) == values[-1]
+        scale = max(map(abs, numbers))
+        assert summary.total == pytest.approx(math.fsum(numbers), rel=1e-9, abs=1e-9 * scale)
+        assert series.summarize(samples).fields[name][:1] + summary[2:] == summary[:1] + summary[2:]
+
+
+@pytest.mark.parametrize("fields", [1, 2, 18, 128, 256])
+def test_a_full_window_fits_into_a_row_however_badly_it_compresses(fields: int) -> None:
+    chance = random.Random(5)  # noqa: S311 (the same noise each time)
+    times = sorted(chance.sample(range(WINDOW_MS), 9_000))
+    names = [f"{'x' * 76}{number:03d}" for number in range(fields)]
+    noise = {name: array("d", [chance.uniform(-1e9, 1e9) for _ in times]) for name in names}
+    window = series.room(Samples(array("q", [NOW_MS + at_ms for at_ms in times]), noise), Samples())
+    assert len(window) == min(9_000, MAX_VALUES // fields)
+    assert len(json.dumps(series.pack(window))) < MAX_DATA_BYTES
+    assert not series.room(window, Samples(window.at_ms, window.columns)) or fields == 1
+
+
+def test_a_bucket_of_all_fields_fits_into_a_row() -> None:
+    names = [f"{'x' * 77}{number:03d}" for number in range(series.MAX_FIELDS)]
+    value = -1.2345678901234567e300
+    bucket = series.summarize(series.gather([(NOW_MS + n, dict.fromkeys(names, value)) for n in range(3)]))
+    assert len(json.dumps(bucket.data())) < MAX_DATA_BYTES
+
+
+def test_sums_of_the_largest_values_stay_finite() -> None:
+    bucket = Bucket()
+    for day in range(2_000):
+        bucket.add(series.summarize(series.gather([(day, {"a": series.MAX_MAGNITUDE})])))
+    assert math.isfinite(bucket.fields["a"].total)
+
+
+@pytest.mark.parametrize(
+    ("hours", "points", "level"),
+    [(1, 500, "10s"), (1, 300, "1min"), (24, 1000, "10min"), (24 * 30, 1000, "1h"), (24 * 30, 100, "1d")],
+)
+def test_the_finest_buckets_that_fit_are_chosen(hours: int, points: int, level: str) -> None:
+    first_ms = NOW_MS - hours * 3_600_000
+    assert series.finest(first_ms, NOW_MS, points=points, now_ms=NOW_MS, keep=Keep()).name == level
+
+
+def test_buckets_that_are_forgotten_already_are_not_chosen() -> None:
+    first_ms = NOW_MS - 20 * DAY.span_ms
+    last_ms = first_ms + 600_000
+    assert series.finest(first_ms, last_ms, points=500, now_ms=first_ms, keep=Keep()) == FINEST
+    assert series.finest(first_ms, last_ms, points=500, now_ms=NOW_MS, keep=Keep()).name == "1min"
+    ancient_ms = NOW_MS - 3000 * DAY.span_ms
+    assert series.finest(ancient_ms, ancient_ms + 60_000, points=500, now_ms=NOW_MS, keep=Keep()).name == "1h"
+
+
+def test_keys_of_a_level_sort_by_time_and_say_their_start() -> None:
+    starts = [0, 9_000, 10_000, NOW_MS]
+    for level in LEVELS:
+        keys = [series.key(level, start_ms) for start_ms in starts]
+        assert keys == sorted(keys)
+        assert [series.start_of(key) for key in keys] == starts

@@ -1,0 +1,53 @@
+"""Waiting for a device's answer ends when its time is over, whatever else happens in that moment."""
+
+import asyncio
+import math
+from pathlib import Path
+
+from function_app.adapters.local.blobs import FileBlobs
+from function_app.adapters.local.clock import SystemClock
+from function_app.adapters.local.command_bus import MqttCommandBus
+from function_app.adapters.local.tables import SqliteTables
+from function_app.adapters.mqtt.connection import Broker
+from function_app.domain.devices.devices import Device
+from function_app.domain.identity.accounts import Role
+from function_app.ports.broker_access import ServiceCredentials
+from function_app.services.messaging.broker_relay import Relay
+from function_app.services.messaging.delivery import Delivery, Signed
+from function_app.services.messaging.mailbox import Mailbox
+from function_app.services.storage.retention import Forget
+
+ARM = Device(
+    id="aaaaaaaaaa-arm", name="arm", label="Arm", kind="arm", robot_type="ur5", agent="aaaaaaaaaa", space="s",
+    pairing="p", role=Role.OWNER, topic="ts/v1/s/aaaaaaaaaa/arm", transport="http",
+)  # fmt: skip
+
+
+class Busy(Mailbox):
+    """Something happens in it just after each look."""
+
+    async def answered(self, agent: str, command: str) -> None:
+        asyncio.get_running_loop().call_soon(self._ring, agent)
+        assert await super().answered(agent, command) is None
+
+
+async def confirmed(folder: Path, wait_ms: int) -> bool:
+    tables = SqliteTables(folder / "tables.sqlite")
+    forget = Forget(tables=tables, blobs=FileBlobs(folder / "blobs"))
+    mailbox = Busy(tables=tables, forget=forget, clock=SystemClock())
+    bus = MqttCommandBus(
+        Broker(host="127.0.0.1", port=1, credentials=lambda: ServiceCredentials("c", "u", "p", math.inf))
+    )
+    signed = Signed("aaaaaaaaaa-arm-00000000000000000000", b"{}", SystemClock().now_ms() + 5_000)
+    try:
+        async with asyncio.timeout(20):
+            return await Delivery(bus=bus, mailbox=mailbox, relay=Relay(bus=bus, clock=SystemClock())).confirmed(
+                ARM, signed, wait_ms=wait_ms
+            )
+    finally:
+        await tables.close()
+
+
+def test_a_wait_ends_in_the_moment_in_which_something_else_happens(tmp_path: Path) -> None:
+    assert asyncio.run(confirmed(tmp_path, 0)) is False
+    assert asyncio.run(confirmed(tmp_path, 30)) is False

@@ -1,0 +1,86 @@
+"""Whatever byte of a stored robot type is another, it is not used: of its manifest, its files, or its seal."""
+
+import asyncio
+import json
+import time
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import pytest
+
+from device_agent.protocol.manifests import robot_type as manifests
+from function_app.adapters.local.signing_keys import FileKeys
+from function_app.domain.common.problems import Problem
+from function_app.domain.robot_types.robot_types import TypeVersion
+from function_app.ports.tables import Row
+from function_app.services.robot_types.integrity import Seals, require_whole
+from function_app.services.storage import records
+
+ROBOTS = Path(__file__).parents[3] / "robots"
+TYPES = sorted(folder.parent.name for folder in ROBOTS.glob("*/robot.toml"))
+
+
+async def flip_each(name: str, home: Path, *, stride: int) -> tuple[int, int]:
+    """Seal a type as if it had been uploaded, and change one byte after the other; how many in files, and in rows."""
+    files = {file.name: file.read_bytes() for file in sorted((ROBOTS / name).iterdir()) if file.is_file()}
+    manifest = msgspec.to_builtins(manifests.parse(files["robot.toml"].decode()))
+    seals = Seals(keys=FileKeys(home / "keys"))
+    plain = TypeVersion(1, "ready", manifest, {file: len(content) for file, content in files.items()}, 0)
+    good = await seals.sealed("anna", name, plain, files)
+    seal = await seals.check("anna", name, good)
+
+    in_files = 0
+    for file, content in files.items():
+        require_whole(name, seal, file, content)
+        changed = bytearray(content)
+        for place in range(0, len(content), stride):
+            changed[place] ^= 1 << place % 8
+            with pytest.raises(Problem, match="was changed in the store"):
+                require_whole(name, seal, file, bytes(changed))
+            changed[place] ^= 1 << place % 8
+            in_files += 1
+
+    # What a row keeps of it, as text. A number may be written in two ways: the same one is no change.
+    row = {"manifest": good.manifest, "seal": records.fields(good.seal)}
+    stored = json.dumps(row).encode()
+    rest = {**records.fields(good), "manifest": {}, "seal": {}}
+    in_rows = 0
+    for place in range(0, len(stored), stride):
+        for bit in (0x01, 0x10):
+            read = reading(stored[:place] + bytes([stored[place] ^ bit]) + stored[place + 1 :])
+            if read is None or json.dumps(read, sort_keys=True) == json.dumps(row, sort_keys=True):
+                continue
+            with pytest.raises((Problem, msgspec.ValidationError)):
+                await seals.check("anna", name, records.read(Row("p", "k", {**rest, **read}), TypeVersion))
+        in_rows += 1
+    for account, robot_type, version in (("bert", name, 1), ("anna", "other", 1), ("anna", name, 2)):
+        with pytest.raises(Problem, match="is not what was uploaded"):
+            await seals.check(account, robot_type, replace(good, version=version))
+    return in_files, in_rows
+
+
+def reading(text: bytes) -> dict[str, Any] | None:
+    """What a store reads of it; nothing where it is no JSON any more."""
+    try:
+        read: dict[str, Any] = msgspec.json.decode(text, type=dict[str, Any])
+    except (msgspec.DecodeError, UnicodeDecodeError):
+        return None
+    return read
+
+
+@pytest.mark.parametrize("name", TYPES)
+def test_no_byte_of_a_sealed_robot_type_may_differ(name: str, tmp_path: Path) -> None:
+    asyncio.run(flip_each(name, tmp_path, stride=61))
+
+
+@pytest.mark.long
+@pytest.mark.timeout(1_800)
+@pytest.mark.parametrize("name", TYPES)
+def test_no_byte_at_all_of_a_sealed_robot_type_may_differ(name: str, tmp_path: Path) -> None:
+    begun_s = time.monotonic()
+    in_files, in_rows = asyncio.run(flip_each(name, tmp_path, stride=1))
+    took_s = time.monotonic() - begun_s
+    print(f"{name}: {in_files} bytes of files and {in_rows} of what the row keeps, each refused; {took_s:.0f} s")  # noqa: T201
+    assert in_files > 15_000

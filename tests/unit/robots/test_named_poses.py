@@ -1,0 +1,78 @@
+"""What ships can be shown: every posture, expression and behaviour, under the agent's own limits."""
+
+from pathlib import Path
+
+import pytest
+
+from device_agent import geometry
+from device_agent.protocol.manifests import robot_type
+from device_agent.runtime.authority.lease_gate import LeaseGate
+from device_agent.runtime.control.controller import Controller
+from device_agent.runtime.control.goals import Course, Outcome
+from device_agent.runtime.planning import named_poses
+from device_agent.runtime.planning.behaviour_trajectory import Line, Score
+from device_agent.runtime.planning.visemes import guessed_s
+from tests.unit.robots.folders import FOLDERS
+
+LONGEST_S = 120.0
+TEXT = "How very quickly the brown fox jumps over a lazy dog!"
+
+
+def kinds(*parts: str) -> list[Path]:
+    """The folders of types whose manifest has any of these."""
+    found = ((folder, robot_type.load(folder)) for folder in FOLDERS)
+    return [folder for folder, kind in found if any(getattr(kind, part) for part in parts)]
+
+
+class Shower:
+    """A type's controller, tick by tick, with its shape known."""
+
+    def __init__(self, folder: Path) -> None:
+        self.kind = robot_type.load(folder)
+        self.controller = Controller(self.kind, LeaseGate(), geometry=geometry.load(self.kind, folder))
+        self.controller.start_at([self.kind.home_rad[joint.name] for joint in self.kind.joints])
+        self.tenure = self.controller.begin_action(epoch=1, on_lost=lambda _: None)
+        self.now_s = 0.0
+
+    def move(self, position_rad: dict[str, float], what: str) -> None:
+        self.follow(self.controller.move(self.tenure, position_rad, speed=named_poses.EXPRESSION_SPEED), what)
+
+    def go(self, score: Score, what: str) -> None:
+        self.follow(self.controller.go_along(self.tenure, score.way()), what)
+
+    def follow(self, course: Course, what: str) -> None:
+        until_s = self.now_s + LONGEST_S
+        while not course.finished.is_set() and self.now_s < until_s:
+            self.now_s += self.kind.period_ms / 1000
+            self.controller.step(self.now_s)
+        assert course.outcome is Outcome.REACHED, f"{what}: {course.why and course.why.message}"
+
+
+@pytest.mark.parametrize("folder", kinds("postures", "expressions"), ids=lambda folder: folder.name)
+def test_every_posture_and_expression_is_taken_from_every_one_before(folder: Path) -> None:
+    shower = Shower(folder)
+    for name in shower.kind.postures:
+        shower.move(named_poses.posture(shower.kind, name), name)
+    shower.move(shower.kind.home_rad, "home")
+    for name in shower.kind.expressions:
+        shower.move(named_poses.expression(shower.kind, name, 1.0), name)
+
+
+@pytest.mark.parametrize("folder", kinds("behaviours"), ids=lambda folder: folder.name)
+def test_every_behaviour_is_played_from_home(folder: Path) -> None:
+    shower = Shower(folder)
+    for name, keyframes in shower.kind.behaviours.items():
+        score = Score(shower.kind, shower.controller.commanded_rad)
+        score.keyframes(keyframes, {frame.say: guessed_s(frame.say) for frame in keyframes})
+        shower.go(score, name)
+        shower.move(shower.kind.home_rad, f"home after {name}")
+
+
+@pytest.mark.parametrize("folder", kinds("visemes"), ids=lambda folder: folder.name)
+def test_a_mouth_forms_every_sound(folder: Path) -> None:
+    shower = Shower(folder)
+    score = Score(shower.kind, shower.controller.commanded_rad)
+    score.speak(Line(0.0, TEXT, guessed_s(TEXT)))
+    jaws = [place for place in score.way().position_rad.T if place.max() - place.min() > 0.05]
+    assert jaws, "nobody would see that it speaks"
+    shower.go(score, TEXT)

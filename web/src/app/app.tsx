@@ -1,0 +1,153 @@
+import { effect, useSignalEffect } from "@preact/signals";
+import { useEffect, useState } from "preact/hooks";
+import type { Account, Api } from "../shared/api/client";
+import { ApiError } from "../shared/api/http";
+import { Fleet } from "../features/devices/model/device-list";
+import type { FollowedInvitation } from "../features/sharing/model/invitation-link";
+import type { FollowedCode } from "../features/pairing/model/claim-code";
+import type { Session } from "../features/account/model/session";
+import { texts } from "../shared/i18n/texts";
+import { later } from "./lazy-page";
+import { Navigation } from "./navigation-bar";
+import { type At, type PageProps, ROWS } from "./page-registry";
+import { route } from "./routes";
+import { SignIn } from "../features/account/sign-in-page";
+
+const LATER = new Map([...ROWS].map(([name, { load }]) => [name, later(load)]));
+
+/** Fetch what the address names and what must not be waited for, while it is still being asked who this is. */
+export function fetchEarly(): void {
+  for (const [name, { early }] of ROWS) {
+    // What fails here is tried again, and said, when it is opened.
+    if (early === true || name === route.value.page) LATER.get(name)?.fetch().catch(() => undefined);
+  }
+}
+
+interface AppProps {
+  api: Api;
+  session: Session;
+  followed: FollowedInvitation;
+  pairing: FollowedCode;
+}
+
+export function App({ api, session, followed, pairing }: AppProps) {
+  const state = session.state.value;
+  switch (state.kind) {
+    case "checking":
+      return (
+        <main class="narrow" id="content">
+          <p class="quiet" role="status">
+            {texts.session.checking}
+          </p>
+        </main>
+      );
+    case "out":
+      return <SignIn api={api} session={session} followed={followed} pairing={pairing.code.value !== null} why={state.why} />;
+    case "in":
+      return (
+        <SignedIn
+          key={state.account.session}
+          api={api}
+          session={session}
+          followed={followed}
+          pairing={pairing}
+          account={state.account}
+        />
+      );
+  }
+}
+
+interface SignedInProps extends AppProps {
+  account: Account;
+}
+
+function SignedIn({ api, session, followed, pairing, account }: SignedInProps) {
+  const [fleet, setFleet] = useState<Fleet | null>(null);
+  useEffect(() => {
+    const made = new Fleet(api);
+    setFleet(made);
+    const forget = effect(() => {
+      // Refused credentials mean, nearly always, that the sign-in has ended: the server knows.
+      if (made.link.status.value.state === "refused") void checkSession(api, session);
+    });
+    return () => {
+      forget();
+      made.dispose();
+    };
+  }, [api, session]);
+  if (fleet === null) return null;
+  return (
+    <>
+      <a class="skip" href="#content" onClick={focusContent}>
+        {texts.skipToContent}
+      </a>
+      <Navigation account={account} session={session} />
+      <LinkBanner fleet={fleet} />
+      <Opened api={api} fleet={fleet} account={account} followed={followed} pairing={pairing} />
+    </>
+  );
+}
+
+/** The page that the address names. */
+function Opened(props: Omit<PageProps, keyof At>) {
+  const { page, at } = route.value;
+  const title = ROWS.get(page)?.title ?? "";
+  const name = typeof title === "string" ? title : title(at, props.fleet);
+  useEffect(() => {
+    document.title = texts.titled(name);
+    return () => {
+      document.title = texts.product;
+    };
+  }, [name]);
+  const Page = LATER.get(page)?.Page;
+  return Page === undefined ? null : <Page key={`${page} ${Object.values(at).join()}`} {...props} {...at} />;
+}
+
+async function checkSession(api: Api, session: Session): Promise<void> {
+  try {
+    await api.me();
+  } catch (error) {
+    if (error instanceof ApiError && error.status === 401) session.ended(texts.session.ended);
+  }
+}
+
+// The fragment is the route here, so the link moves the focus itself.
+function focusContent(event: MouseEvent): void {
+  event.preventDefault();
+  const content = document.getElementById("content");
+  content?.setAttribute("tabindex", "-1");
+  content?.focus();
+}
+
+/** Said once the connection has been away for a moment, and until it is back. */
+function LinkBanner({ fleet }: { fleet: Fleet }) {
+  const { state, why } = fleet.link.status.value;
+  const [wasUp, setWasUp] = useState(false);
+  useSignalEffect(() => {
+    if (fleet.link.up.value) setWasUp(true);
+  });
+  const lost = state === "down" || state === "refused" || (state === "connecting" && (wasUp || why !== ""));
+  const trouble = fleet.trouble.value;
+  return (
+    <div aria-live="assertive">
+      {lost && (
+        <div class="banner warn" data-testid="link-banner" data-state={state}>
+          <strong>{state === "refused" ? texts.link.refused : texts.link.down}</strong>{" "}
+          <span>{why !== "" && `${why} `}</span>
+          {state === "refused" ? (
+            <button type="button" onClick={() => fleet.link.renew()}>
+              {texts.link.retry}
+            </button>
+          ) : (
+            texts.link.again
+          )}
+        </div>
+      )}
+      {trouble !== null && (
+        <div class="banner warn">
+          {texts.link.list} {trouble}
+        </div>
+      )}
+    </div>
+  );
+}

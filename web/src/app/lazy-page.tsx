@@ -1,0 +1,51 @@
+/** A page whose code comes when it is opened, so that the first load stays small. */
+import type { ComponentType } from "preact";
+import { useEffect, useState } from "preact/hooks";
+import { texts } from "../shared/i18n/texts";
+
+export interface Later<Props> {
+  /** The page; it says so while it is still being loaded, and offers another try where that fails. */
+  Page: ComponentType<Props>;
+  /** Load it before it is opened. */
+  fetch: () => Promise<void>;
+}
+
+export function later<Props extends object>(load: () => Promise<ComponentType<Props>>): Later<Props> {
+  let known: ComponentType<Props> | null = null;
+  const fetch = async (): Promise<void> => {
+    known = await load();
+  };
+  function Page(props: Props) {
+    const [, setCame] = useState(known !== null);
+    const [failed, setFailed] = useState(false);
+    const [tries, setTries] = useState(0);
+    useEffect(() => {
+      if (known !== null) {
+        setCame(true); // It came between the drawing and now.
+        return;
+      }
+      setFailed(false);
+      fetch().then(
+        () => setCame(true),
+        () => setFailed(true),
+      );
+    }, [tries]);
+    if (known !== null) {
+      const Known = known;
+      return <Known {...props} />;
+    }
+    return (
+      <main class="page" id="content">
+        <p class="quiet" role="status">
+          {failed ? texts.later.failed : texts.loading}
+        </p>
+        {failed && (
+          <button type="button" onClick={() => setTries(tries + 1)}>
+            {texts.later.again}
+          </button>
+        )}
+      </main>
+    );
+  }
+  return { Page, fetch };
+}

@@ -1,0 +1,70 @@
+import { effect } from "@preact/signals";
+import { render } from "preact";
+import { Api } from "../shared/api/client";
+import { startClock } from "../shared/lib/clock";
+import { FollowedInvitation, invitationSecret } from "../features/sharing/model/invitation-link";
+import { FollowedCode, pairingCode } from "../features/pairing/model/claim-code";
+import { Session, signInFailure, signInToken } from "../features/account/model/session";
+import "../shared/ui/style.css";
+import { texts } from "../shared/i18n/texts";
+import { App, fetchEarly } from "./app";
+import { invitationAddress, pairAddress, replaceWith } from "./routes";
+
+const api = new Api();
+const session = new Session(api);
+const followed = new FollowedInvitation(sessionStorage);
+const pairing = new FollowedCode(sessionStorage);
+
+/** Take a sign-in token out of the address before anything else can read, show or keep it. */
+function takeToken(): string | null {
+  const token = signInToken(location.hash);
+  if (token !== null) history.replaceState(null, "", `${location.pathname}${location.search}#/`);
+  return token;
+}
+
+/** Take an invitation's secret out of the address, as with a sign-in token. */
+function takeInvitation(): void {
+  const secret = invitationSecret(location.hash);
+  if (secret === null) return;
+  history.replaceState(null, "", `${location.pathname}${location.search}#/`);
+  followed.follow(secret);
+}
+
+/** Take a claim code out of the address, as with a sign-in token. */
+function takeCode(): void {
+  const code = pairingCode(location.hash);
+  if (!location.hash.startsWith("#pair=")) return;
+  history.replaceState(null, "", `${location.pathname}${location.search}#/`);
+  if (code !== null) pairing.follow(code);
+}
+
+/** What went wrong elsewhere, taken out of the address: it is said once. */
+function takeFailure(): string {
+  const code = signInFailure(location.hash);
+  if (code === null) return "";
+  history.replaceState(null, "", `${location.pathname}${location.search}#/`);
+  if (code === "open-id-expired") return texts.session.elsewhereExpired;
+  return code === "open-id-uninvited" ? texts.session.elsewhereUninvited : texts.session.elsewhereRefused;
+}
+
+takeInvitation();
+takeCode();
+// Whoever has signed in, wherever that led, comes back to what they were invited to.
+effect(() => {
+  if (session.state.value.kind === "in" && followed.state.value.kind === "open") replaceWith(invitationAddress);
+});
+effect(() => {
+  if (session.state.value.kind === "in" && pairing.code.value !== null) replaceWith(pairAddress);
+});
+fetchEarly();
+startClock();
+void session.start(takeToken(), takeFailure());
+addEventListener("hashchange", () => {
+  takeInvitation();
+  takeCode();
+  const token = takeToken();
+  if (token !== null) void session.start(token);
+});
+
+const root = document.getElementById("app");
+if (root !== null) render(<App api={api} session={session} followed={followed} pairing={pairing} />, root);

@@ -1,0 +1,38 @@
+/** The bar above every page: the parts of the console, the account, the way out. */
+import type { Account } from "../shared/api/client";
+import type { Session } from "../features/account/model/session";
+import { texts } from "../shared/i18n/texts";
+import { PAGES, ROWS } from "./page-registry";
+import { accountAddress, fleetAddress, route } from "./routes";
+
+const LINKS = [...ROWS.values()].flatMap(({ link, pattern, part }) => (link === undefined ? [] : [{ link, pattern, part }]));
+
+export function Navigation({ account, session }: { account: Account; session: Session }) {
+  const { part: here } = PAGES[route.value.page];
+  return (
+    <header class="top">
+      <a class="brand" href={fleetAddress}>
+        {texts.product}
+      </a>
+      <nav aria-label={texts.parts.title}>
+        {LINKS.map(({ link, pattern, part }) => (
+          <a key={part} href={pattern} aria-current={part === here ? "page" : undefined}>
+            {link}
+          </a>
+        ))}
+      </nav>
+      <a
+        class="account"
+        data-testid="signed-in"
+        href={accountAddress}
+        title={texts.session.signedInAs(account.name)}
+        aria-current={here === "account" ? "page" : undefined}
+      >
+        {account.name}
+      </a>
+      <button type="button" class="plain" onClick={() => void session.signOut()}>
+        {texts.session.out}
+      </button>
+    </header>
+  );
+}

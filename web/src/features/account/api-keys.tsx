@@ -1,0 +1,265 @@
+import { useEffect, useRef, useState } from "preact/hooks";
+import type { Api, Space } from "../../shared/api/client";
+import { sentence } from "../../shared/api/http";
+import type { Fleet } from "../devices/model/device-list";
+import type { ApiKey, ApiKeyMade, SharedRole } from "../sharing/model/wire-types";
+import { texts } from "../../shared/i18n/texts";
+import { AskedForm } from "../../shared/ui/inline-form";
+import { Confirm } from "../../shared/ui/confirm-button";
+import { useFocusBack } from "../../shared/hooks/use-return-focus";
+import { MAY } from "../sharing/invite-form";
+import { Card, Choice } from "../../shared/ui/parts";
+import { Secret } from "../../shared/ui/copy-once";
+import "../sharing/sharing.css";
+
+/** What a key may be kept to, by the name it has in `only`. */
+type Names = ReadonlyMap<string, string>;
+
+export function ApiKeys({ api, fleet }: { api: Api; fleet: Fleet }) {
+  const [keys, setKeys] = useState<readonly ApiKey[] | null>(null);
+  const [spaces, setSpaces] = useState<readonly Space[]>([]);
+  const [wrong, setWrong] = useState("");
+  const [said, setSaid] = useState("");
+  const [making, setMaking] = useState(false);
+  const [made, setMade] = useState<ApiKeyMade | null>(null);
+
+  const read = async (): Promise<void> => {
+    try {
+      const [found, rooms] = await Promise.all([api.apiKeys(), api.spaces()]);
+      setKeys(found);
+      setSpaces(rooms);
+      setWrong("");
+    } catch (error) {
+      setWrong(texts.keys.failed(sentence(error)));
+    }
+  };
+  useEffect(() => void read(), [api]);
+  const revoke = async ({ id, name }: ApiKey): Promise<void> => {
+    await api.revokeApiKey(id);
+    setKeys((known) => known?.filter((each) => each.id !== id) ?? null);
+    setSaid(texts.keys.revoked(name));
+  };
+
+  const devices = [...(fleet.devices.value?.values() ?? [])];
+  const names: Names = new Map([
+    ...spaces.map(({ id, name }) => [`space:${id}`, name] as const),
+    ...devices.map(({ id, info }) => [id, info.value.label] as const),
+  ]);
+  const busy = making || made !== null;
+  const opener = useFocusBack(busy);
+  const open = busy ? null : (
+    <button type="button" ref={opener} data-testid="new-key" onClick={() => setMaking(true)}>
+      {texts.keys.new}
+    </button>
+  );
+  return (
+    <Card title={texts.keys.title} class="keys" aside={open}>
+      <p class="quiet">{texts.keys.explained}</p>
+      {made !== null && <MadeKey made={made} onDone={() => setMade(null)} />}
+      {making && (
+        <KeyForm
+          api={api}
+          names={names}
+          onMade={(fresh) => {
+            setMaking(false);
+            setMade(fresh);
+            setKeys((known) => [fresh.api_key, ...(known ?? [])]);
+          }}
+          onClose={() => setMaking(false)}
+        />
+      )}
+      {keys === null && wrong === "" && <p class="quiet">{texts.loading}</p>}
+      {keys?.length === 0 && <p class="quiet">{texts.keys.none}</p>}
+      <ul class="people" data-testid="keys">
+        {keys?.map((key) => (
+          <KeyRow key={key.id} of={key} names={names} onRevoke={() => revoke(key)} />
+        ))}
+      </ul>
+      <p class={wrong === "" ? "field-note" : "field-error"} role="status">
+        {wrong === "" ? said : wrong}
+      </p>
+    </Card>
+  );
+}
+
+function KeyRow({ of: key, names, onRevoke }: { of: ApiKey; names: Names; onRevoke: () => Promise<void> }) {
+  const only = key.only.map((each) => names.get(each) ?? texts.keys.nameless).join(", ");
+  const about = [
+    only === "" ? texts.keys.everything : texts.keys.onlyThese(only),
+    key.expired ? texts.keys.expired(key.expires_at) : texts.keys.until(key.expires_at),
+    key.last_used_at === null ? texts.keys.unused : texts.keys.used(key.last_used_at),
+    texts.keys.made2(key.created_at),
+  ];
+  return (
+    <li data-testid="key" data-name={key.name}>
+      <span class="person">
+        {key.name}
+        <span class="quiet small">{about.join(" · ")}</span>
+      </span>
+      {key.expired && <span class="chip bad">{texts.keys.expiredChip}</span>}
+      <span class={`chip role-${key.role}`}>{texts.role[key.role]}</span>
+      <Confirm
+        label={texts.keys.revoke}
+        description={texts.keys.revokeOf(key.name)}
+        question={texts.keys.revokeSure(key.name)}
+        yes={texts.keys.revokeYes}
+        busy={texts.keys.revoking}
+        keep={texts.keys.keep}
+        data-testid="revoke-key"
+        onYes={onRevoke}
+      />
+    </li>
+  );
+}
+
+function MadeKey({ made, onDone }: { made: ApiKeyMade; onDone: () => void }) {
+  const box = useRef<HTMLDivElement>(null);
+  useEffect(() => box.current?.querySelector("input")?.focus(), []);
+  return (
+    <div class="panel made" ref={box} role="group" aria-label={texts.keys.token}>
+      <p>
+        <strong>{texts.keys.made(made.api_key.name)}</strong>
+      </p>
+      <Secret id="api-key-token" label={texts.keys.token} value={made.token} />
+      <p class="quiet small">
+        {texts.keys.use} <code>Authorization: Bearer {made.token.slice(0, 3)}…</code>
+      </p>
+      <div class="row">
+        <button type="button" data-testid="key-done" onClick={onDone}>
+          {texts.keys.done}
+        </button>
+      </div>
+    </div>
+  );
+}
+
+interface KeyFormProps {
+  api: Api;
+  names: Names;
+  onMade: (made: ApiKeyMade) => void;
+  onClose: () => void;
+}
+
+const REACH = [
+  ["all", texts.keys.all],
+  ["some", texts.keys.some],
+] as const;
+
+function KeyForm({ api, names, onMade, onClose }: KeyFormProps) {
+  const [name, setName] = useState("");
+  const [role, setRole] = useState<SharedRole>("viewer");
+  const [reach, setReach] = useState<"all" | "some">("all");
+  const [only, setOnly] = useState<ReadonlySet<string>>(new Set());
+  const [days, setDays] = useState("90");
+  const [busy, setBusy] = useState(false);
+  const [wrong, setWrong] = useState("");
+  const choose = (chosen: ReadonlySet<string>): void => {
+    setOnly(chosen);
+    setWrong("");
+  };
+  const first = useRef<HTMLInputElement>(null);
+  useEffect(() => first.current?.focus(), []);
+
+  const make = async (): Promise<void> => {
+    const chosen = reach === "all" ? [] : [...only].filter((each) => names.has(each));
+    if (reach === "some" && chosen.length === 0) {
+      setWrong(texts.keys.chooseOne);
+      return;
+    }
+    setBusy(true);
+    setWrong("");
+    try {
+      onMade(await api.makeApiKey({ name: name.trim(), role, only: chosen, days: Number(days) }));
+    } catch (error) {
+      setWrong(sentence(error)); // What was typed stays.
+      setBusy(false);
+    }
+  };
+
+  return (
+    <AskedForm
+      label={texts.keys.new}
+      todo={texts.keys.make}
+      doing={texts.keys.making}
+      busy={busy}
+      wrong={wrong}
+      sendTestId="make-key"
+      onSend={make}
+      onClose={onClose}
+    >
+      <div class="field">
+        <label for="key-name">{texts.keys.name}</label>
+        <input
+          id="key-name"
+          ref={first}
+          type="text"
+          autocomplete="off"
+          required
+          maxLength={60}
+          placeholder={texts.keys.nameExample}
+          value={name}
+          onInput={(event) => setName(event.currentTarget.value)}
+        />
+      </div>
+      <div class="field">
+        <span class="label">{texts.keys.role}</span>
+        <Choice label={texts.keys.role} value={role} options={MAY} onChange={setRole} />
+      </div>
+      <div class="field">
+        <label for="key-days">{texts.keys.days}</label>
+        <input
+          id="key-days"
+          type="number"
+          min={1}
+          max={366}
+          required
+          value={days}
+          aria-describedby="key-days-note"
+          onInput={(event) => setDays(event.currentTarget.value)}
+        />
+        <p class="quiet small" id="key-days-note">
+          {texts.keys.daysNote}
+        </p>
+      </div>
+      <div class="field wide">
+        <span class="label">{texts.keys.only}</span>
+        <Choice label={texts.keys.only} value={reach} options={REACH} onChange={setReach} />
+      </div>
+      {reach === "some" && <Which names={names} chosen={only} onChange={choose} />}
+    </AskedForm>
+  );
+}
+
+interface WhichProps {
+  names: Names;
+  chosen: ReadonlySet<string>;
+  onChange: (chosen: ReadonlySet<string>) => void;
+}
+
+function Which({ names, chosen, onChange }: WhichProps) {
+  const groups = [
+    [texts.keys.spaces, [...names].filter(([id]) => id.startsWith("space:"))],
+    [texts.keys.devices, [...names].filter(([id]) => !id.startsWith("space:"))],
+  ] as const;
+  const toggle = (id: string): void => {
+    const next = new Set(chosen);
+    if (!next.delete(id)) next.add(id);
+    onChange(next);
+  };
+  return (
+    <div class="field wide which">
+      {groups.map(([title, entries]) =>
+        entries.length === 0 ? null : (
+          <fieldset key={title}>
+            <legend>{title}</legend>
+            {entries.map(([id, name]) => (
+              <label key={id} class="tick">
+                <input type="checkbox" checked={chosen.has(id)} onChange={() => toggle(id)} /> {name}
+              </label>
+            ))}
+          </fieldset>
+        ),
+      )}
+    </div>
+  );
+}

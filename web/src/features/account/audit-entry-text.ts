@@ -1,0 +1,116 @@
+/** One record of the audit list in plain English. */
+import { aboutWhat } from "./model/audit-log";
+import type { AuditRecord, Role } from "../sharing/model/wire-types";
+import { texts } from "../../shared/i18n/texts";
+
+/** What things are called, by the ids that records have. What is not in it is called by its id. */
+export interface Names {
+  accounts: ReadonlyMap<string, string>;
+  /** Devices and spaces. */
+  things: ReadonlyMap<string, string>;
+  keys: ReadonlyMap<string, string>;
+}
+
+const says = texts.activity.says;
+const ID_SHOWN = 8;
+
+export function line(record: AuditRecord, names: Names): string {
+  const { what, data } = record;
+  const message = data["message"];
+  // What is told of control over a device says so itself.
+  if (typeof message === "string") return message;
+  const who = whoDid(record);
+  const on = thing(record.on, names);
+  switch (what) {
+    case "signed-in":
+      return says.signedIn(who, says.how[text(data, "how")] ?? "");
+    case "sign-in-refused":
+      return says.refusedSignIn;
+    case "signed-out":
+      return record.key === "" ? says.signedOut(who) : says.keyEnded(who);
+    case "account-made":
+      return says.accountMade(who);
+    case "password-set":
+      return says.passwordSet(who);
+    case "api-key-made":
+      return says.keyMade(who, text(data, "name"), role(data), kept(data["only"], names));
+    case "api-key-revoked":
+      return says.keyRevoked(who, names.keys.get(aboutWhat(record.on)[1]) ?? "");
+    case "space-made":
+      return says.spaceMade(who, text(data, "name"));
+    case "agent-claimed":
+      return says.claimed(who, on, thing(text(data, "space"), names));
+    case "claim-refused":
+      return says.claimRefused(who);
+    case "agent-unpaired":
+      return says.unpaired(who, on);
+    case "agent-moved":
+      return says.moved(who, on, thing(text(data, "space"), names));
+    case "device-renamed":
+      return says.renamed(who, text(data, "label"), on);
+    case "shared":
+      return says.shared(who, on, other(data, names), role(data), until(data["expires_ms"]));
+    case "unshared":
+      if (record.who === "") return says.ranOut(on, other(data, names));
+      if (data["with"] === record.by_account) return says.left(who, on);
+      return says.unshared(who, on, other(data, names));
+    case "invited":
+      return data["role"] === "owner"
+        ? says.offered(who, on)
+        : says.invited(who, on, role(data), texts.access.uses(Number(data["uses"] ?? 1)));
+    case "invitation-redeemed":
+      return says.redeemed(who, on);
+    case "invitation-revoked":
+      return says.withdrawn(who, on);
+    case "transferred":
+      return says.transferred(who, on);
+    case "movement-saved":
+      return says.movementSaved(who, record.on);
+    case "movement-deleted":
+      return says.movementDeleted(who, record.on);
+    case "robot-type-uploaded":
+      return says.typeUploaded(who, record.on);
+    case "robot-type-deleted":
+      return says.typeDeleted(who, record.on);
+    default:
+      return says.other(who, texts.activity.kinds[what] ?? what, on);
+  }
+}
+
+function whoDid({ who, by_account: account }: AuditRecord): string {
+  if (who !== "") return who;
+  return account === "" ? texts.activity.cloud : texts.activity.somebody;
+}
+
+function thing(on: string, names: Names): string {
+  const [, id] = aboutWhat(on);
+  return names.things.get(id) ?? id;
+}
+
+function other(data: AuditRecord["data"], names: Names): string {
+  const id = text(data, "with");
+  const name = text(data, "name");
+  return name === "" ? (names.accounts.get(id) ?? texts.activity.anAccount(id.slice(0, ID_SHOWN))) : name;
+}
+
+function kept(only: unknown, names: Names): string {
+  if (!Array.isArray(only) || only.length === 0) return texts.keys.everything;
+  return texts.keys.onlyThese(only.map((each) => thing(String(each), names)).join(", "));
+}
+
+function role(data: AuditRecord["data"]): string {
+  const given = text(data, "role");
+  return given in texts.role ? texts.role[given as Role] : given;
+}
+
+/** Whatever has no end is kept as a time that never comes: far beyond what a calendar shows. */
+const NEVER_MS = Date.UTC(9000, 0);
+
+function until(ms: unknown): string {
+  return texts.until(typeof ms === "number" && ms < NEVER_MS ? new Date(ms).toISOString() : null);
+}
+
+function text(data: AuditRecord["data"], name: string): string {
+  const value = data[name];
+  return typeof value === "string" ? value : "";
+}

@@ -1,0 +1,233 @@
+import { useEffect, useMemo, useState } from "preact/hooks";
+import type { Api, Space } from "../../shared/api/client";
+import { accountsIn, AuditReader, EVERYTHING } from "./model/audit-log";
+import type { Fleet } from "../devices/model/device-list";
+import type { ApiKey, AuditQuery, AuditRecord } from "../sharing/model/wire-types";
+import { texts } from "../../shared/i18n/texts";
+import { line, type Names } from "./audit-entry-text";
+import { accountAddress } from "../../app/routes";
+import "../sharing/sharing.css";
+
+const DAY_MS = 86_400_000;
+
+interface Filter {
+  what: string;
+  on: string;
+  from: string;
+  to: string;
+}
+
+const ALL: Filter = { what: "", on: "", from: "", to: "" };
+
+/** Of date inputs, in the reader's own time; `to` with that whole day. */
+function query({ what, on, from, to }: Filter): AuditQuery {
+  const start = (date: string): number => new Date(`${date}T00:00`).getTime();
+  return {
+    ...EVERYTHING,
+    what,
+    on,
+    sinceMs: from === "" ? null : start(from),
+    untilMs: to === "" ? null : start(to) + DAY_MS,
+  };
+}
+
+/** Who did what in one's account. */
+export function ActivityPage({ api, fleet }: { api: Api; fleet: Fleet }) {
+  const reader = useMemo(() => new AuditReader(api), [api]);
+  const [filter, setFilter] = useState(ALL);
+  const [spaces, setSpaces] = useState<readonly Space[]>([]);
+  const [keys, setKeys] = useState<readonly ApiKey[]>([]);
+  useEffect(() => {
+    // Only names: where they cannot be read, ids stand in their place.
+    api.spaces().then(setSpaces, () => undefined);
+    api.apiKeys().then(setKeys, () => undefined);
+  }, [api]);
+  useEffect(() => void reader.ask(query(filter)), [reader, filter]);
+
+  const records = reader.records.value;
+  const devices = [...(fleet.devices.value?.values() ?? [])].map(({ info }) => info.value);
+  const names: Names = useMemo(
+    () => ({
+      accounts: accountsIn(records),
+      things: new Map([...spaces.map(({ id, name }) => [id, name] as const), ...devices.map(({ id, label }) => [id, label] as const)]),
+      keys: keyNames(keys, records),
+    }),
+    [records, spaces, keys, fleet.devices.value],
+  );
+  const own = devices.filter(({ role }) => role === "owner");
+  const rooms = spaces.filter(({ role }) => role === "owner");
+  const subjects: [string, [string, string][]][] = [
+    [texts.activity.control, own.map(({ id, label }) => [id, label])],
+    [
+      texts.activity.sharing,
+      [
+        ...rooms.map(({ id, name }): [string, string] => [`space:${id}`, name]),
+        ...own.map(({ id, label }): [string, string] => [`device:${id}`, label]),
+      ],
+    ],
+    [texts.keys.title, [...names.keys].map(([id, name]) => [`key:${id}`, name])],
+  ];
+  return (
+    <main class="page fleet activity" id="content">
+      <a href={accountAddress}>← {texts.activity.back}</a>
+      <h1>{texts.activity.title}</h1>
+      <p class="quiet">{texts.activity.explained}</p>
+      <Filters filter={filter} subjects={subjects} onChange={setFilter} />
+      <Records reader={reader} names={names} filtered={filter !== ALL} />
+    </main>
+  );
+}
+
+/** Of keys that are there, and of those that records tell of. */
+function keyNames(keys: readonly ApiKey[], records: readonly AuditRecord[]): ReadonlyMap<string, string> {
+  const names = new Map(keys.map(({ id, name }) => [id, name]));
+  for (const { what, on, data } of records) {
+    const { name } = data;
+    if (what === "api-key-made" && typeof name === "string") names.set(on.replace(/^key:/, ""), name);
+  }
+  return names;
+}
+
+interface FiltersProps {
+  filter: Filter;
+  /** Groups of what a record can be about: title, then values and names. */
+  subjects: readonly [string, readonly [string, string][]][];
+  onChange: (filter: Filter) => void;
+}
+
+function Filters({ filter, subjects, onChange }: FiltersProps) {
+  const set = (part: Partial<Filter>): void => onChange({ ...filter, ...part });
+  return (
+    <fieldset class="card filters">
+      <legend class="visually-hidden">{texts.activity.filters}</legend>
+      <div class="field">
+        <label for="audit-what">{texts.activity.kind}</label>
+        <select
+          id="audit-what"
+          data-testid="audit-what"
+          value={filter.what}
+          onChange={(event) => set({ what: event.currentTarget.value })}
+        >
+          <option value="">{texts.activity.any}</option>
+          {Object.entries(texts.activity.kinds).map(([kind, name]) => (
+            <option key={kind} value={kind}>
+              {name}
+            </option>
+          ))}
+        </select>
+      </div>
+      <div class="field">
+        <label for="audit-on">{texts.activity.about}</label>
+        <select id="audit-on" value={filter.on} onChange={(event) => set({ on: event.currentTarget.value })}>
+          <option value="">{texts.activity.any}</option>
+          {subjects.map(([title, entries]) =>
+            entries.length === 0 ? null : (
+              <optgroup key={title} label={title}>
+                {entries.map(([id, name]) => (
+                  <option key={id} value={id}>
+                    {name}
+                  </option>
+                ))}
+              </optgroup>
+            ),
+          )}
+        </select>
+      </div>
+      {(["from", "to"] as const).map((end) => (
+        <div class="field" key={end}>
+          <label for={`audit-${end}`}>{texts.activity[end]}</label>
+          <input
+            id={`audit-${end}`}
+            type="date"
+            value={filter[end]}
+            onChange={(event) => set({ [end]: event.currentTarget.value })}
+          />
+        </div>
+      ))}
+      {filter !== ALL && (
+        <button type="button" onClick={() => onChange(ALL)}>
+          {texts.activity.reset}
+        </button>
+      )}
+    </fieldset>
+  );
+}
+
+function Records({ reader, names, filtered }: { reader: AuditReader; names: Names; filtered: boolean }) {
+  const records = reader.records.value;
+  const busy = reader.busy.value;
+  const more = reader.more.value;
+  const trouble = reader.trouble.value;
+  const nothing = records.length === 0 && !busy && trouble === "";
+  return (
+    <>
+      <ol class="card records" data-testid="audit" hidden={records.length === 0}>
+        {records.map((record) => (
+          <Line key={record.seq} record={record} names={names} />
+        ))}
+      </ol>
+      <p class="quiet" role="status">
+        {busy
+          ? texts.loading
+          : nothing
+            ? more
+              ? texts.activity.noneYet
+              : texts.activity.none
+            : trouble === "" && `${texts.activity.shown(records.length)}${more ? "" : ` · ${texts.activity.end}`}`}
+      </p>
+      {trouble !== "" && (
+        <p class="notice bad" role="alert">
+          {texts.activity.failed(trouble)}
+        </p>
+      )}
+      {(more || trouble !== "") && (
+        <p>
+          <button type="button" disabled={busy} data-testid="older" onClick={() => void reader.older()}>
+            {trouble !== "" ? texts.activity.again : filtered ? texts.activity.further : texts.activity.more}
+          </button>
+        </p>
+      )}
+    </>
+  );
+}
+
+function Line({ record, names }: { record: AuditRecord; names: Names }) {
+  const { outcome, key, seq, at, on, by_account: account, session, hash } = record;
+  const words = texts.activity.key;
+  const details = [
+    [words.number, String(seq)],
+    [words.on, on],
+    [words.account, account],
+    [words.session, session],
+    [words.key, key],
+    [words.hash, hash],
+  ] as const;
+  return (
+    <li data-what={record.what}>
+      <details>
+        <summary>
+          <time dateTime={at}>{texts.moment(at)}</time>
+          <span class="said">
+            {line(record, names)}
+            {key !== "" && <span class="quiet"> ({texts.activity.byKey})</span>}{" "}
+            {outcome !== "done" && (
+              <span class={`chip ${outcome === "unknown" ? "" : "bad"}`} title={outcome === "unknown" ? texts.activity.unknownExplained : undefined}>
+                {texts.activity.outcome[outcome]}
+              </span>
+            )}
+          </span>
+        </summary>
+        <dl class="details">
+          {details.map(([name, value]) =>
+            value === "" ? null : (
+              <div key={name}>
+                <dt>{name}</dt>
+                <dd>{value}</dd>
+              </div>
+            ),
+          )}
+        </dl>
+      </details>
+    </li>
+  );
+}

@@ -1,0 +1,80 @@
+/** The record of what was done in one's account, read page by page. */
+import { signal, type ReadonlySignal } from "@preact/signals-core";
+import type { Api } from "../../../shared/api/client";
+import { sentence } from "../../../shared/api/http";
+import type { AuditQuery, AuditRecord } from "../../sharing/model/wire-types";
+
+const PAGE = 50;
+/** Where a filter lets little through, pages come empty: so many are asked for before the reader is asked. */
+const PAGES_AT_ONCE = 5;
+
+export const EVERYTHING: AuditQuery = { what: "", on: "", sinceMs: null, untilMs: null };
+
+export class AuditReader {
+  readonly #api: Api;
+  readonly #records = signal<readonly AuditRecord[]>([]);
+  readonly #busy = signal(false);
+  readonly #trouble = signal("");
+  readonly #more = signal(true);
+  #query = EVERYTHING;
+  #cursor: string | null = null;
+  #asked = 0;
+
+  /** The newest first. */
+  readonly records: ReadonlySignal<readonly AuditRecord[]> = this.#records;
+  readonly busy: ReadonlySignal<boolean> = this.#busy;
+  readonly trouble: ReadonlySignal<string> = this.#trouble;
+  /** Whether there may be older ones. */
+  readonly more: ReadonlySignal<boolean> = this.#more;
+
+  constructor(api: Api) {
+    this.#api = api;
+  }
+
+  /** Begin anew with another filter. */
+  ask(query: AuditQuery): Promise<void> {
+    this.#query = query;
+    this.#cursor = null;
+    this.#records.value = [];
+    this.#more.value = true;
+    return this.older();
+  }
+
+  /** Read on. What was read stays, whatever goes wrong. */
+  async older(): Promise<void> {
+    const asked = ++this.#asked;
+    this.#busy.value = true;
+    this.#trouble.value = "";
+    try {
+      for (let page = 0; page < PAGES_AT_ONCE; page += 1) {
+        const { items, cursor } = await this.#api.audit(this.#query, this.#cursor, PAGE);
+        if (asked !== this.#asked) return; // Another filter was chosen meanwhile.
+        this.#cursor = cursor;
+        this.#records.value = [...this.#records.value, ...items];
+        this.#more.value = cursor !== null;
+        if (cursor === null || items.length > 0) break;
+      }
+    } catch (error) {
+      if (asked === this.#asked) this.#trouble.value = sentence(error);
+    }
+    if (asked === this.#asked) this.#busy.value = false;
+  }
+}
+
+/** Names of accounts, as far as these records tell them. */
+export function accountsIn(records: readonly AuditRecord[]): ReadonlyMap<string, string> {
+  const names = new Map<string, string>();
+  for (const { by_account: id, who, key, data } of records) {
+    // With a key the name says the key's too.
+    if (id !== "" && who !== "" && key === "") names.set(id, who);
+    const { with: other, name } = data;
+    if (typeof other === "string" && typeof name === "string" && name !== "") names.set(other, name);
+  }
+  return names;
+}
+
+/** What a record is about: `device:abc-arm` → `["device", "abc-arm"]`; what names no kind has an empty one. */
+export function aboutWhat(on: string): [kind: string, id: string] {
+  const found = /^(device|space|agent|key):(.+)$/.exec(on);
+  return found?.[1] === undefined || found[2] === undefined ? ["", on] : [found[1], found[2]];
+}

@@ -1,0 +1,78 @@
+/** Fields of the cards that ask a robot for something. What is typed stays, whatever becomes of the request. */
+import { useId } from "preact/hooks";
+import { texts } from "../../shared/i18n/texts";
+
+interface ShareProps {
+  label: string;
+  /** 0…1 */
+  value: number;
+  least: number;
+  onChange: (value: number) => void;
+  testid?: string;
+}
+
+/** A share, in percent. */
+export function Share({ label, value, least, onChange, testid }: ShareProps) {
+  const id = useId();
+  const percent = texts.number.percent(value);
+  return (
+    <div class="act-share">
+      <label for={id}>{label}</label>
+      <input
+        id={id}
+        type="range"
+        min={least}
+        max={1}
+        step={0.05}
+        value={value}
+        aria-valuetext={percent}
+        data-testid={testid}
+        onInput={(event) => onChange(event.currentTarget.valueAsNumber)}
+      />
+      <output for={id}>{percent}</output>
+    </div>
+  );
+}
+
+interface NumberFieldProps {
+  label: string;
+  unit: string;
+  /** As it is typed. */
+  value: string;
+  onInput: (value: string) => void;
+  optional?: boolean;
+  testid?: string;
+}
+
+export function NumberField({ label, unit, value, onInput, optional = false, testid }: NumberFieldProps) {
+  const id = useId();
+  const wrong = numberOf(value) === null && !(optional && value.trim() === "");
+  return (
+    <div class="act-number">
+      <label for={id}>
+        {label} <span class="quiet">{unit}</span>
+      </label>
+      <input
+        id={id}
+        type="text"
+        inputMode="decimal"
+        value={value}
+        aria-invalid={wrong && value !== ""}
+        data-testid={testid}
+        onInput={(event) => onInput(event.currentTarget.value)}
+      />
+    </div>
+  );
+}
+
+/** `null`: none, or not finite. */
+export function numberOf(typed: string): number | null {
+  const value = Number(typed.trim().replace(",", ".").replace("−", "-"));
+  return typed.trim() === "" || !Number.isFinite(value) ? null : value;
+}
+
+/** All of them, or `null`. */
+export function numbersOf(typed: readonly string[]): number[] | null {
+  const values = typed.map(numberOf);
+  return values.every((value) => value !== null) ? values : null;
+}

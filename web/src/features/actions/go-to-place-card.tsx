@@ -1,0 +1,81 @@
+/** Go to a place in the room: pointed at on its plan, or typed. */
+import { useEffect, useMemo, useState } from "preact/hooks";
+import { degrees, radians } from "../../shared/lib/angles";
+import type { Fleet } from "../devices/model/device-list";
+import type { GoTo } from "../../shared/mqtt/protocol.generated";
+import { texts } from "../../shared/i18n/texts";
+import { Drawing, usePlan } from "../spaces/floor-plan";
+import { ask, type ActProps } from "./action-cards";
+import { NumberField, numberOf } from "./action-form-fields";
+
+const STEP_M = 0.1;
+
+export function Place({ station, no, fleet }: ActProps & { fleet: Fleet }) {
+  const { device } = station;
+  const { space, agent, name } = device.info.value;
+  const plan = usePlan(fleet, space, agent);
+  const [x, setX] = useState("");
+  const [y, setY] = useState("");
+  const [heading, setHeading] = useState("");
+  const ids = plan.devices.map(({ id }) => id).join();
+  useEffect(() => {
+    const ends = plan.devices.filter(({ id }) => id !== device.id).map((one) => one.watchMeasurements());
+    return () => ends.forEach((end) => end());
+  }, [ids]);
+
+  const mine = plan.places.find((place) => place.name === name) ?? null;
+  const [xM, yM, deg] = [numberOf(x), numberOf(y), numberOf(heading)];
+  const target = useMemo(
+    () => (xM === null || yM === null ? null : { xM, yM, yawRad: deg === null ? null : radians(deg) }),
+    [xM, yM, deg],
+  );
+  const pick = (pickedX: number, pickedY: number): void => {
+    setX(pickedX.toFixed(2));
+    setY(pickedY.toFixed(2));
+  };
+  const headless = heading.trim() !== "" && deg === null;
+  const go = (event: SubmitEvent): void => {
+    event.preventDefault();
+    if (target === null || no !== "" || headless) return;
+    const to: GoTo = { kind: "go_to", x_m: target.xM, y_m: target.yM, yaw_rad: target.yawRad };
+    if (mine === null) ask(station, to);
+    else ask(station, to, { kind: "go_to", x_m: mine.xM, y_m: mine.yM, yaw_rad: mine.yawRad });
+  };
+  return (
+    <form class="act-form" onSubmit={go}>
+      {plan.extent === null ? (
+        <p class="quiet">{plan.perception === null ? texts.plan.empty : texts.plan.waiting}</p>
+      ) : (
+        <Drawing {...plan} extent={plan.extent} hung={[]} trails={null} target={target} onPick={pick} />
+      )}
+      <p class="quiet small">{texts.acts.placeNote}</p>
+      <div class="act-numbers">
+        <NumberField label={texts.acts.axes[0]} unit="m" value={x} testid="place-x" onInput={setX} />
+        <NumberField label={texts.acts.axes[1]} unit="m" value={y} testid="place-y" onInput={setY} />
+        <NumberField label={texts.acts.heading} unit="°" optional value={heading} testid="place-heading" onInput={setHeading} />
+      </div>
+      <div class="row">
+        <button
+          type="submit"
+          class="primary"
+          data-testid="place-go"
+          disabled={target === null || headless || no !== ""}
+          title={no === "" ? undefined : no}
+        >
+          {texts.acts.goThere}
+        </button>
+        <button
+          type="button"
+          disabled={mine === null}
+          onClick={() => {
+            if (mine === null) return;
+            pick(Math.round(mine.xM / STEP_M) * STEP_M, Math.round(mine.yM / STEP_M) * STEP_M);
+            setHeading(mine.yawRad === null ? "" : degrees(mine.yawRad).toFixed(0));
+          }}
+        >
+          {texts.acts.whereItIs}
+        </button>
+      </div>
+    </form>
+  );
+}

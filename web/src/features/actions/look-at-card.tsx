@@ -1,0 +1,37 @@
+import { useState } from "preact/hooks";
+import { texts } from "../../shared/i18n/texts";
+import { ask, type ActProps } from "./action-cards";
+import { NumberField, numbersOf } from "./action-form-fields";
+
+/** Turn the gaze to a point, in the robot's own frame: x ahead, y to its left, z up. */
+export function Look({ station, no }: ActProps) {
+  const [point, setPoint] = useState(["1.0", "0.0", "0.5"]);
+  const [x, y, z] = numbersOf(point) ?? [];
+  const known = x !== undefined && y !== undefined && z !== undefined;
+  return (
+    <form
+      class="act-form"
+      onSubmit={(event) => {
+        event.preventDefault();
+        if (known && no === "") ask(station, { kind: "look_at", position_m: [x, y, z] });
+      }}
+    >
+      <div class="act-numbers">
+        {texts.acts.axes.map((axis, index) => (
+          <NumberField
+            key={axis}
+            label={axis}
+            unit="m"
+            value={point[index] ?? ""}
+            testid={`look-${index}`}
+            onInput={(value) => setPoint(point.with(index, value))}
+          />
+        ))}
+      </div>
+      <p class="quiet small">{texts.acts.lookNote}</p>
+      <button type="submit" data-testid="look" disabled={!known || no !== ""} title={no === "" ? undefined : no}>
+        {texts.acts.lookThere}
+      </button>
+    </form>
+  );
+}

@@ -1,0 +1,294 @@
+/**
+ * What a device is asked to do, each request followed from the click to its end: by the acks of the device, and by
+ * asking the cloud. Robots and room devices alike.
+ */
+import { computed, effect, signal, type ReadonlySignal } from "@preact/signals-core";
+import type { Action, ActionStatus, Api } from "../../../shared/api/client";
+import { now } from "../../../shared/lib/clock";
+import type { DeviceStore } from "../../devices/model/device-store";
+import { ApiError, sentence } from "../../../shared/api/http";
+import { newId } from "../../../shared/lib/ids";
+import type { KnownAck } from "../../../shared/mqtt/parse-messages";
+import { wayBack } from "./undo-request";
+import type { AnyRequest } from "../../../shared/api/action-requests";
+
+/**
+ * `sent`: asked for, and no answer yet. `refused`: the cloud said no. `unanswered`: it could not be reached, so nobody
+ * here knows whether it was asked of the device.
+ */
+export type RunStatus =
+  | "sent"
+  | "accepted"
+  | "started"
+  | "done"
+  | "failed"
+  | "expired"
+  | "cancelled"
+  | "refused"
+  | "unanswered";
+
+/** Who told of a step: this page itself, the device by its ack, or the cloud in an answer. */
+export type Channel = "page" | "device" | "cloud";
+
+export interface Step<Status = RunStatus> {
+  status: Status;
+  /** On the page's clock, from the click [ms]. */
+  afterMs: number;
+  heard: Channel;
+}
+
+export interface Run {
+  /** Its Idempotency-Key: the same request counts once. */
+  key: string;
+  request: AnyRequest;
+  /** On the page's clock [ms]. */
+  clickedAt: number;
+  id: string | null;
+  status: RunStatus;
+  /** The steps seen so far, in their order. */
+  steps: readonly Step[];
+  why: string;
+  output: string;
+  progress: number | null;
+  result: Readonly<Record<string, unknown>>;
+  /** What undoes it, where anything does. */
+  back: AnyRequest | null;
+}
+
+export interface Asking {
+  /** Of the lease held here; `null`: the cloud takes one for the time of the action. */
+  epoch: number | null;
+  waitFor?: "started" | "done";
+  /** After this time the device ends it [ms]. */
+  timeoutMs?: number;
+  /** What undoes it; without one, what `wayBack` finds. */
+  back?: AnyRequest;
+  /** What the cloud answers, where it was asked by another call: of many devices at once. */
+  asked?: Promise<Action>;
+}
+
+const RANK: Readonly<Record<RunStatus, number>> = {
+  sent: 0,
+  accepted: 1,
+  started: 2,
+  done: 3,
+  failed: 3,
+  expired: 3,
+  cancelled: 3,
+  refused: 3,
+  unanswered: 3,
+};
+const KEPT = 20;
+const POLL_MS = 10_000;
+const RETRY_MS = 2_000;
+/** Asked again with the same key after a broken call, but never later than this: nothing may move by surprise [ms]. */
+const AGAIN_WITHIN_MS = 2_000;
+/** The lease that the cloud took for a run is nobody's so long after its end: asked anew, the page says so too [ms]. */
+const LEASE_AFTER_MS = 1_000;
+
+function rank(status: ActionStatus): RunStatus {
+  if (status === "queued" || status === "created" || status === "published" || status === "received") return "sent";
+  return status;
+}
+
+export function ended({ status }: { status: RunStatus }): boolean {
+  return RANK[status] === RANK.done;
+}
+
+export class ActionRunner {
+  readonly #api: Api;
+  readonly #device: DeviceStore;
+  readonly #pursuits = signal<readonly Pursuit[]>([]);
+
+  /** The newest first; they stay after their end, the last twenty of them. */
+  readonly runs: ReadonlySignal<readonly Run[]> = computed(() => this.#pursuits.value.map(({ run }) => run.value));
+  /** The newest that was started from this page. */
+  readonly run: ReadonlySignal<Run | null> = computed(() => this.runs.value[0] ?? null);
+
+  constructor(api: Api, device: DeviceStore) {
+    this.#api = api;
+    this.#device = device;
+  }
+
+  /** Ask for something: under our lease where there is one, else under one that the cloud takes for this run. */
+  async start(request: AnyRequest, epoch: number | null, back?: AnyRequest): Promise<Run> {
+    return this.#begin(request, back === undefined ? { epoch } : { epoch, back }).begun;
+  }
+
+  /** Follow what was asked of this device by another call; the run after that call's answer. */
+  async follow(request: AnyRequest, asked: Promise<Action>): Promise<Run> {
+    return this.#begin(request, { epoch: null, asked }).begun;
+  }
+
+  /** Ask, and wait until it is as far as wanted, or has ended otherwise. */
+  async ask(request: AnyRequest, asking: Asking): Promise<Run> {
+    return this.#begin(request, asking).reached(asking.waitFor ?? "done");
+  }
+
+  /** End our newest run, or the action `other` that somebody else started. Why it could not be, or nothing. */
+  async cancel(other: string | null): Promise<string> {
+    const newest = this.#pursuits.value[0];
+    const id = other ?? newest?.run.value.id;
+    if (id === undefined || id === null) return "";
+    try {
+      await this.#api.cancelAction(id);
+      return "";
+    } catch (error) {
+      if (other === null) newest?.note(sentence(error));
+      return sentence(error);
+    }
+  }
+
+  dispose(): void {
+    for (const pursuit of this.#pursuits.value) pursuit.dispose();
+  }
+
+  #begin(request: AnyRequest, asking: Asking): Pursuit {
+    const pursuit = new Pursuit(this.#api, this.#device, request, asking);
+    for (const old of this.#pursuits.value.slice(KEPT - 1)) old.dispose();
+    this.#pursuits.value = [pursuit, ...this.#pursuits.value].slice(0, KEPT);
+    return pursuit;
+  }
+}
+
+/** One request on its way. */
+class Pursuit {
+  readonly #api: Api;
+  readonly #device: DeviceStore;
+  readonly #run;
+  #endAcks: () => void = () => undefined;
+  #disposed = false;
+
+  readonly run: ReadonlySignal<Run>;
+  /** The run after the first answer of the cloud. */
+  readonly begun: Promise<Run>;
+
+  constructor(api: Api, device: DeviceStore, request: AnyRequest, asking: Asking) {
+    this.#api = api;
+    this.#device = device;
+    this.#run = signal<Run>({
+      key: newId(),
+      request,
+      clickedAt: now(),
+      id: null,
+      status: "sent",
+      steps: [{ status: "sent", afterMs: 0, heard: "page" }],
+      why: "",
+      output: "",
+      progress: null,
+      result: {},
+      back: asking.back ?? wayBack(device, request),
+    });
+    this.run = this.#run;
+    this.begun = this.#begin(asking);
+    if (asking.epoch !== null) return;
+    void this.reached("done").then(() => setTimeout(() => void this.#refreshLease(), LEASE_AFTER_MS));
+  }
+
+  /** The run once it has come that far, or has ended. */
+  reached(status: "started" | "done"): Promise<Run> {
+    return new Promise((resolve) => {
+      const forget = effect(() => {
+        const run = this.#run.value;
+        if (RANK[run.status] < RANK[status] && !this.#disposed) return;
+        queueMicrotask(() => forget());
+        resolve(run);
+      });
+    });
+  }
+
+  async #refreshLease(): Promise<void> {
+    if (!this.#disposed) await this.#device.refreshLease();
+  }
+
+  note(why: string): void {
+    this.#run.value = { ...this.#run.value, why };
+  }
+
+  dispose(): void {
+    this.#disposed = true;
+    this.#endAcks();
+    // Whoever waits for it waits no longer.
+    this.#run.value = { ...this.#run.value };
+  }
+
+  async #begin(asking: Asking): Promise<Run> {
+    try {
+      const action = await this.#post(asking);
+      if (this.#disposed) return this.#run.value;
+      this.#run.value = { ...this.#run.value, id: action.id };
+      // First what the device has said meanwhile, which was heard before this answer.
+      this.#endAcks = this.#device.onAck(action.id, (ack, at) => this.#hearAck(ack, at));
+      this.#hear(action);
+      void this.#poll(action.id);
+    } catch (error) {
+      const silent = error instanceof ApiError && error.status === 0;
+      this.#advance(silent ? "unanswered" : "refused", { why: sentence(error) }, "cloud", now());
+    }
+    return this.#run.value;
+  }
+
+  async #post(asking: Asking): Promise<Action> {
+    if (asking.asked !== undefined) return asking.asked;
+    const { request, key, clickedAt } = this.#run.value;
+    try {
+      return await this.#api.ask(this.#device.id, request, asking, key);
+    } catch (error) {
+      const again = error instanceof ApiError && error.status === 0 && now() - clickedAt < AGAIN_WITHIN_MS;
+      if (!again) throw error;
+      return this.#api.ask(this.#device.id, request, asking, key);
+    }
+  }
+
+  /** The device's own acks are quicker; asking covers what this page did not hear. */
+  async #poll(id: string): Promise<void> {
+    while (!this.#disposed && !ended(this.#run.value)) {
+      try {
+        this.#hear(await this.#api.action(id, POLL_MS));
+      } catch (error) {
+        if (error instanceof ApiError && error.status === 404) {
+          this.#advance("unanswered", { why: sentence(error) }, "cloud", now());
+          return;
+        }
+        await new Promise((resolve) => setTimeout(resolve, RETRY_MS));
+      }
+    }
+  }
+
+  #hear(action: Action): void {
+    const run = this.#run.value;
+    const result = Object.keys(action.result).length > 0 ? action.result : run.result;
+    const told = { output: longer(action.output, run.output), progress: action.progress ?? run.progress, result };
+    this.#advance(rank(action.status), { why: action.reason?.message ?? "", ...told }, "cloud", now());
+  }
+
+  #hearAck(ack: KnownAck, at: number): void {
+    const run = this.#run.value;
+    const result = Object.keys(ack.result).length > 0 ? ack.result : run.result;
+    const told = { output: longer(ack.output, run.output), progress: ack.progress ?? run.progress, result };
+    this.#advance(rank(ack.status), { why: ack.reason?.message ?? run.why, ...told }, "device", at);
+  }
+
+  /** The status never goes back and the first end stays; a step that is told late still finds its place. */
+  #advance(status: RunStatus, rest: Partial<Run>, heard: Channel, at: number): void {
+    const run = this.#run.value;
+    const forward = RANK[status] > RANK[run.status];
+    const step = { status, afterMs: Math.max(0, at - run.clickedAt), heard };
+    this.#run.value = { ...run, ...rest, status: forward ? status : run.status, steps: withStep(run.steps, step) };
+  }
+}
+
+function withStep(steps: Run["steps"], step: Step): Run["steps"] {
+  const after = steps.findIndex(({ status }) => RANK[status] >= RANK[step.status]);
+  if (after < 0) return [...steps, step];
+  const next = steps[after];
+  // Known already, or another end than the first.
+  if (next === undefined || RANK[next.status] === RANK[step.status]) return steps;
+  // The answer overtook the ack: it cannot have been later than what followed it.
+  return steps.toSpliced(after, 0, { ...step, afterMs: Math.min(step.afterMs, next.afterMs) });
+}
+
+/** Output only grows; the cloud and the device may tell it at different lengths. */
+function longer(one: string, other: string): string {
+  return one.length >= other.length ? one : other;
+}

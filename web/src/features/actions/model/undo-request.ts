@@ -1,0 +1,39 @@
+/** What undoes a request: from where the device is, as it says itself, at the moment of the click. */
+import { clamp } from "../../../shared/lib/angles";
+import type { DeviceStore } from "../../devices/model/device-store";
+import type { AnyRequest } from "../../../shared/api/action-requests";
+
+/** These leave the joints elsewhere than they were. */
+const JOINTS: ReadonlySet<AnyRequest["kind"]> = new Set([
+  "move_joints",
+  "move_pose",
+  "take_posture",
+  "express",
+  "look_at",
+  "run_behaviour",
+  "run_movement",
+]);
+
+/** `null`: nothing undoes it, or nobody knows where the device is. */
+export function wayBack(device: DeviceStore, request: AnyRequest): AnyRequest | null {
+  if (request.kind === "set_stiffness") return stiffnessBefore(device, request.joints ?? []);
+  const { telemetry, description } = { telemetry: device.telemetry.value, description: device.description.value };
+  const known = JOINTS.has(request.kind) && description?.actions.includes("move_joints") === true;
+  if (!known || telemetry === null || !device.live.value) return null;
+  const positions = description.joints.flatMap((joint, index) => {
+    const measured = telemetry.message.position_rad[index];
+    // A servo may droop a little beyond its range: the way back must be one that is taken.
+    return measured === undefined ? [] : [[joint.name, clamp(measured, joint.lower_rad, joint.upper_rad)] as const];
+  });
+  return { kind: "move_joints", position_rad: Object.fromEntries(positions), plan: true };
+}
+
+/** Only where all of them held alike: one request sets one strength. */
+function stiffnessBefore(device: DeviceStore, joints: readonly string[]): AnyRequest | null {
+  const state = device.state.value;
+  const names = joints.length > 0 ? joints : (device.description.value?.joints ?? []).map(({ name }) => name);
+  const values = new Set(names.map((name) => state?.stiffness[name] ?? 1));
+  const [value] = values;
+  if (state === null || values.size !== 1 || value === undefined) return null;
+  return { kind: "set_stiffness", value, joints: [...joints] };
+}

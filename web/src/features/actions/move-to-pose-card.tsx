@@ -1,0 +1,94 @@
+import { useEffect, useState } from "preact/hooks";
+import { degrees, radians } from "../../shared/lib/angles";
+import type { DeviceStore } from "../devices/model/device-store";
+import { rollPitchYaw, unit } from "../twin/model/forward-kinematics";
+import type { Vector3 } from "../../shared/lib/vectors";
+import { texts } from "../../shared/i18n/texts";
+import { Choice } from "../../shared/ui/parts";
+import { ask, type ActProps } from "./action-cards";
+import { NumberField, numbersOf, Share } from "./action-form-fields";
+
+type Way = "direct" | "straight" | "plan";
+
+/** Bring a frame to a pose in the robot's base: metres, and turns about the base's x, y and z in degrees. */
+export function Pose({ station, description, no }: ActProps) {
+  const { device } = station;
+  const frames = description.frames;
+  const [frame, setFrame] = useState(frames.at(-1) ?? "");
+  const [fields, setFields] = useState<readonly string[]>(["", "", "", "", "", ""]);
+  const [way, setWay] = useState<Way>("plan");
+  const [speed, setSpeed] = useState(0.5);
+  const here = (): void => {
+    const pose = measured(device, frame);
+    if (pose !== null) setFields(pose);
+  };
+  const heard = device.telemetry.value !== null;
+  // A form that begins empty would have one type six numbers to move a centimetre.
+  useEffect(() => {
+    if (fields.every((field) => field === "")) here();
+  }, [heard]);
+  const values = numbersOf(fields);
+  const go = (event: SubmitEvent): void => {
+    event.preventDefault();
+    if (values === null || no !== "") return;
+    ask(station, {
+      kind: "move_pose",
+      position_m: values.slice(0, 3) as Vector3,
+      rpy_rad: values.slice(3).map(radians) as Vector3,
+      frame,
+      speed,
+      straight: way === "straight",
+      plan: way === "plan",
+    });
+  };
+  return (
+    <form class="act-form" onSubmit={go}>
+      <div class="row">
+        <label>
+          {texts.acts.frame}{" "}
+          <select value={frame} onChange={(event) => setFrame(event.currentTarget.value)}>
+            {frames.map((name) => (
+              <option key={name}>{name}</option>
+            ))}
+          </select>
+        </label>
+        <button type="button" data-testid="pose-here" disabled={!device.live.value} onClick={here}>
+          {texts.acts.here}
+        </button>
+      </div>
+      <div class="act-numbers">
+        {[...texts.acts.axes, ...texts.acts.turns].map((label, index) => (
+          <NumberField
+            key={label}
+            label={label}
+            unit={index < 3 ? "m" : "°"}
+            value={fields[index] ?? ""}
+            testid={`pose-${index}`}
+            onInput={(value) => setFields(fields.with(index, value))}
+          />
+        ))}
+      </div>
+      <Choice label={texts.acts.way} value={way} onChange={setWay} options={Object.entries(texts.acts.ways) as [Way, string][]} />
+      <Share label={texts.acts.speed} value={speed} least={0.05} onChange={setSpeed} />
+      <button
+        type="submit"
+        class="primary"
+        data-testid="pose-go"
+        disabled={values === null || no !== ""}
+        title={no === "" ? undefined : no}
+      >
+        {texts.acts.moveThere}
+      </button>
+    </form>
+  );
+}
+
+/** Where the device says that the frame is now, as the fields show it; `null` where it is not live. */
+function measured(device: DeviceStore, frame: string): readonly string[] | null {
+  const index = device.description.value?.frames.indexOf(frame) ?? -1;
+  const pose = device.telemetry.value?.message.frames[index];
+  if (pose === undefined) return null;
+  const [x, y, z, ...quaternion] = pose;
+  const turns = rollPitchYaw(unit(quaternion)).map((turn) => degrees(turn).toFixed(1));
+  return [...[x, y, z].map((metres) => metres.toFixed(3)), ...turns];
+}

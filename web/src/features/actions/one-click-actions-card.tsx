@@ -1,0 +1,72 @@
+/** What a robot shows by one button: postures, behaviours, expressions. */
+import { useState } from "preact/hooks";
+import type { AnyRequest } from "../../shared/api/action-requests";
+import { texts } from "../../shared/i18n/texts";
+import { ask, type ActProps } from "./action-cards";
+import { Share } from "./action-form-fields";
+
+interface ButtonsProps extends ActProps {
+  names: readonly string[];
+  testid: string;
+  request: (name: string) => AnyRequest;
+}
+
+function Buttons({ station, no, names, testid, request }: ButtonsProps) {
+  return (
+    <div class="act-buttons">
+      {names.map((name) => (
+        <button
+          key={name}
+          type="button"
+          data-testid={`${testid}-${name}`}
+          disabled={no !== ""}
+          title={no === "" ? undefined : no}
+          onClick={() => ask(station, request(name))}
+        >
+          {name}
+        </button>
+      ))}
+    </div>
+  );
+}
+
+export function Postures(props: ActProps) {
+  const [speed, setSpeed] = useState(0.5);
+  return (
+    <>
+      <Buttons
+        {...props}
+        names={props.description.postures}
+        testid="posture"
+        request={(name) => ({ kind: "take_posture", name, speed })}
+      />
+      <Share label={texts.acts.speed} value={speed} least={0.1} onChange={setSpeed} />
+    </>
+  );
+}
+
+export function Behaviours(props: ActProps) {
+  return (
+    <Buttons
+      {...props}
+      names={props.description.behaviours}
+      testid="behaviour"
+      request={(name) => ({ kind: "run_behaviour", name })}
+    />
+  );
+}
+
+export function Expressions(props: ActProps) {
+  const [strength, setStrength] = useState(1);
+  return (
+    <>
+      <Buttons
+        {...props}
+        names={props.description.expressions}
+        testid="expression"
+        request={(name) => ({ kind: "express", name, strength })}
+      />
+      <Share label={texts.acts.strength} value={strength} least={0} onChange={setStrength} testid="strength" />
+    </>
+  );
+}

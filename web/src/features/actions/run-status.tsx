@@ -1,0 +1,97 @@
+/** What the device does now at somebody's request: how far it is, its end, the way back. Always in sight. */
+import { useState } from "preact/hooks";
+import { ended, type ActionRunner, type Run } from "./model/action-runner";
+import type { Control } from "../control/model/lease";
+import type { DeviceStore } from "../devices/model/device-store";
+import { texts } from "../../shared/i18n/texts";
+import { whyNotAct } from "../devices/availability";
+
+interface RunStatusProps {
+  device: DeviceStore;
+  control: Control;
+  actions: ActionRunner;
+}
+
+export function RunStatus({ device, control, actions }: RunStatusProps) {
+  const [dismissed, setDismissed] = useState("");
+  const [problem, setProblem] = useState("");
+  const newest = actions.run.value;
+  const run = newest === null || newest.key === dismissed ? null : newest;
+  const told = device.live.value ? (device.state.value?.action ?? null) : null;
+  const mineRuns = run !== null && !ended(run);
+  const others = !mineRuns && told !== null && told.id !== newest?.id ? told : null;
+  const shown = run !== null || others !== null;
+  const cancel = (): void => void actions.cancel(others?.id ?? null).then(setProblem);
+  return (
+    <div class={`doing ${mineRuns || others !== null ? "running" : ""} ${shown ? "" : "nothing"}`}>
+      <div class={`run run-${run?.status ?? "none"}`} role="status" data-testid="action-status" data-status={run?.status ?? ""}>
+        {run !== null && <Told run={run} />}
+        {others !== null && <p>{texts.acts.othersDo(others.kind, others.name ?? "")}</p>}
+        {problem !== "" && <p class="field-error">{problem}</p>}
+      </div>
+      <div class="row">
+        {(mineRuns || others !== null) && device.info.value.role !== "viewer" && (
+          <button type="button" data-testid="cancel-action" onClick={cancel}>
+            {texts.movements.cancel}
+          </button>
+        )}
+        {run !== null && ended(run) && (
+          <>
+            <Back device={device} control={control} actions={actions} run={run} />
+            <button type="button" class="plain" onClick={() => setDismissed(run.key)}>
+              {texts.acts.dismiss}
+            </button>
+          </>
+        )}
+      </div>
+      {run !== null && run.output !== "" && (
+        <details class="printed" open>
+          <summary>{texts.movements.output}</summary>
+          <pre class="output" tabIndex={0}>
+            {run.output}
+          </pre>
+        </details>
+      )}
+    </div>
+  );
+}
+
+/** What was asked, the steps it has made, how far it is. */
+export function Told({ run }: { run: Run }) {
+  const name = texts.acts.asked(run.request);
+  return (
+    <>
+      <strong>{name}</strong>
+      <ol class="steps">
+        {run.steps.map((step) => (
+          <li key={step.status}>
+            {texts.movements.status[step.status]}
+            {step.afterMs > 0 && <span class="quiet"> {texts.number.milliseconds(step.afterMs)}</span>}
+          </li>
+        ))}
+      </ol>
+      {run.progress !== null && !ended(run) && <progress value={run.progress} max={1} aria-label={name} />}
+      {run.why !== "" && <p class={run.status === "done" ? "" : "field-error"}>{run.why}</p>}
+      {run.status === "unanswered" && <p class="field-error">{texts.acts.unanswered}</p>}
+    </>
+  );
+}
+
+/** Undoes what has ended, also where it ended half way; not what was never begun. */
+function Back({ device, control, actions, run }: RunStatusProps & { run: Run }) {
+  const { back } = run;
+  const begun = run.steps.some(({ status }) => status === "started");
+  if (back === null || !begun) return null;
+  const no = whyNotAct(device, control);
+  return (
+    <button
+      type="button"
+      data-testid="back"
+      disabled={no !== ""}
+      title={no === "" ? undefined : no}
+      onClick={() => void actions.start(back, control.epoch)}
+    >
+      {texts.acts.back}
+    </button>
+  );
+}

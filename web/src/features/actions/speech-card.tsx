@@ -1,0 +1,82 @@
+import { useEffect, useRef, useState } from "preact/hooks";
+import type { ActionRunner } from "./model/action-runner";
+import { texts } from "../../shared/i18n/texts";
+import { ask, type ActProps } from "./action-cards";
+
+const LONGEST = 2000;
+/** As in BCP 47: `en`, `sk`, `en-GB`; or nothing. */
+const LANGUAGE = /^([A-Za-z]{1,8}(-[A-Za-z0-9]{1,8})*)?$/;
+
+/** Enter says it; Shift and Enter begin a new line. What was said goes, what was not stays. */
+export function Speech({ station, no }: ActProps) {
+  const [text, setText] = useState("");
+  const [language, setLanguage] = useState("");
+  const asked = useRef("");
+  useSaid(station.actions, asked, (said) => setText((now) => (now === said ? "" : now)));
+  const good = LANGUAGE.test(language.trim());
+  const ready = no === "" && text.trim() !== "" && good;
+  const say = (): void => {
+    if (!ready) return;
+    asked.current = text;
+    ask(station, { kind: "say", text: text.trim(), language: language.trim() });
+  };
+  return (
+    <form
+      class="act-speech"
+      onSubmit={(event) => {
+        event.preventDefault();
+        say();
+      }}
+    >
+      <label>
+        {texts.acts.say}
+        <textarea
+          rows={2}
+          maxLength={LONGEST}
+          value={text}
+          data-testid="say-text"
+          onInput={(event) => setText(event.currentTarget.value)}
+          onKeyDown={(event) => {
+            if (event.key !== "Enter" || event.shiftKey || event.isComposing) return;
+            event.preventDefault();
+            say();
+          }}
+        />
+      </label>
+      <div class="row">
+        <label class="act-language">
+          {texts.acts.language}
+          <input
+            type="text"
+            list="say-languages"
+            value={language}
+            placeholder={texts.acts.ownLanguage}
+            aria-invalid={!good}
+            autocapitalize="off"
+            data-testid="say-language"
+            onInput={(event) => setLanguage(event.currentTarget.value)}
+          />
+        </label>
+        <datalist id="say-languages">
+          {Object.entries(texts.acts.languages).map(([code, name]) => (
+            <option key={code} value={code}>
+              {name}
+            </option>
+          ))}
+        </datalist>
+        <button type="submit" class="primary" data-testid="say" disabled={!ready} title={no === "" ? undefined : no}>
+          {texts.acts.sayIt}
+        </button>
+      </div>
+    </form>
+  );
+}
+
+/** Tells once that what was asked to be said has been begun. */
+function useSaid(actions: ActionRunner, asked: { current: string }, said: (text: string) => void): void {
+  const run = actions.run.value;
+  const begun = run?.request.kind === "say" && (run.status === "started" || run.status === "done") ? run.key : "";
+  useEffect(() => {
+    if (begun !== "") said(asked.current);
+  }, [begun]);
+}

@@ -1,0 +1,70 @@
+import { useState } from "preact/hooks";
+import { texts } from "../../shared/i18n/texts";
+import { ask, type ActProps } from "./action-cards";
+import { Share } from "./action-form-fields";
+
+const ALL = "";
+
+/** How strongly joints hold. What they hold with now is shown as the device tells it. */
+export function StiffnessCard({ station, description, no }: ActProps) {
+  const [joint, setJoint] = useState(ALL);
+  const [value, setValue] = useState(1);
+  const { device } = station;
+  const stands = description.postures.some((name) => name.startsWith("Stand"));
+  const set = (share: number): void =>
+    ask(station, { kind: "set_stiffness", value: share, joints: joint === ALL ? [] : [joint] });
+  return (
+    <div class="act-form">
+      <label>
+        {texts.acts.joint}{" "}
+        <select value={joint} data-testid="stiffness-joint" onChange={(event) => setJoint(event.currentTarget.value)}>
+          <option value={ALL}>{texts.acts.allJoints}</option>
+          {description.joints.map(({ name, label }) => (
+            <option key={name} value={name}>
+              {label}
+            </option>
+          ))}
+        </select>
+      </label>
+      <Share label={texts.acts.stiffness} value={value} least={0} onChange={setValue} testid="stiffness-value" />
+      {stands && value < 0.3 && <p class="notice warn">{texts.acts.limpWarning}</p>}
+      <div class="row">
+        <button
+          type="button"
+          data-testid="stiffness-set"
+          disabled={no !== ""}
+          title={no === "" ? undefined : no}
+          onClick={() => set(value)}
+        >
+          {value === 0 ? texts.acts.letGo : texts.acts.set}
+        </button>
+        <button
+          type="button"
+          data-testid="stiffness-full"
+          disabled={no !== ""}
+          title={no === "" ? undefined : no}
+          onClick={() => {
+            setValue(1);
+            set(1);
+          }}
+        >
+          {texts.acts.holdFully}
+        </button>
+      </div>
+      <Told told={device.state.value?.stiffness ?? null} live={device.live.value} />
+    </div>
+  );
+}
+
+/** The device names only the joints that hold with less than all their strength. */
+function Told({ told, live }: { told: Readonly<Record<string, number>> | null; live: boolean }) {
+  if (told === null) return <p class="quiet small">{texts.acts.stiffnessUnknown}</p>;
+  const less = Object.entries(told);
+  return (
+    <p class={`small ${live ? "quiet" : "old"}`} data-testid="stiffness-told" data-less={less.length}>
+      {less.length === 0
+        ? texts.acts.holdsFully
+        : texts.acts.holdsLess(less.map(([name, value]) => `${name} ${texts.number.percent(value)}`).join(", "))}
+    </p>
+  );
+}

@@ -1,0 +1,135 @@
+import { useId, useState } from "preact/hooks";
+import type { Control } from "./model/lease";
+import type { DeviceStore } from "../devices/model/device-store";
+import type { StopSwitch } from "./model/stop";
+import type { Watching } from "./model/watchers";
+import { texts } from "../../shared/i18n/texts";
+import "./control-bar.css";
+import { useFocusBack } from "../../shared/hooks/use-return-focus";
+import { Answer, AskButton, Asked, TakeOver } from "./handover-rows";
+import { WatcherNames, WatchersButton } from "./watcher-list";
+
+interface ControlBarProps {
+  device: DeviceStore;
+  control: Control;
+  stop: StopSwitch;
+  /** Who else looks at it, where that is asked. */
+  watching?: Watching;
+}
+
+/** Always in sight: who has control, taking, asking for it and giving it back, who else watches, and Stop. */
+export function ControlBar({ device, control, stop, watching }: ControlBarProps) {
+  const names = useId();
+  const [open, setOpen] = useState(false);
+  const [takingOver, setTakingOver] = useState(false);
+  const opener = useFocusBack(takingOver);
+  const watches = device.info.value.role === "viewer";
+  return (
+    <div class="control-bar" role="region" aria-label={texts.control.title}>
+      <ControlState device={device} control={control} />
+      {watching !== undefined && <WatchersButton watching={watching} open={open} names={names} onToggle={() => setOpen(!open)} />}
+      <HoldButton device={device} control={control} />
+      {!takingOver && mayTakeOver(device, control) && (
+        <button type="button" ref={opener} data-testid="take-over" onClick={() => setTakingOver(true)}>
+          {texts.handover.takeOver}
+        </button>
+      )}
+      <button
+        type="button"
+        class="stop"
+        data-testid="stop"
+        disabled={watches}
+        title={watches ? texts.control.watches : texts.stop.keyExplained}
+        aria-keyshortcuts="Escape"
+        onClick={() => {
+          control.stopped();
+          stop.press();
+        }}
+      >
+        {texts.stop.press} <kbd>{texts.stop.key}</kbd>
+      </button>
+      {takingOver && mayTakeOver(device, control) && (
+        <TakeOver device={device} control={control} onClose={() => setTakingOver(false)} />
+      )}
+      <Asked control={control} />
+      <Answer control={control} />
+      {watching !== undefined && open && <WatcherNames watching={watching} id={names} />}
+    </div>
+  );
+}
+
+/** Whether somebody has control whom this page would have to ask. */
+function anothers(device: DeviceStore, control: Control): boolean {
+  const holder = device.holder.value;
+  const { kind } = control.state.value;
+  return holder !== null && !holder.mine && kind !== "held" && kind !== "taking";
+}
+
+function mayTakeOver(device: DeviceStore, control: Control): boolean {
+  return device.info.value.role === "owner" && anothers(device, control);
+}
+
+/** Take, ask for, or give back: what there is to do now. */
+function HoldButton({ device, control }: { device: DeviceStore; control: Control }) {
+  const state = control.state.value;
+  const describedYet = device.description.value !== null;
+  const watches = device.info.value.role === "viewer";
+  if (state.kind === "held") {
+    return (
+      <button type="button" data-testid="release-control" onClick={() => void control.release()}>
+        {texts.control.release}
+      </button>
+    );
+  }
+  const asking = control.asking.state.value.kind;
+  // Where asking fails nobody may hold it any more, though the robot has not said so: then it can be taken.
+  if (anothers(device, control) && !watches && asking !== "failed") return <AskButton control={control} />;
+  const resumable = device.holder.value?.mine === true;
+  return (
+    <button
+      type="button"
+      class="primary"
+      data-testid="take-control"
+      disabled={state.kind === "taking" || !describedYet || watches}
+      title={watches ? texts.control.watches : describedYet ? undefined : texts.control.needsDescription}
+      onClick={() => void control.take()}
+    >
+      {state.kind === "taking" ? texts.control.taking : resumable ? texts.control.resume : texts.control.take}
+    </button>
+  );
+}
+
+type Shown = "mine" | "other" | "free" | "lost" | "refused" | "taking" | "handed";
+
+function ControlState({ device, control }: { device: DeviceStore; control: Control }) {
+  const [shown, text] = describe(device, control);
+  return (
+    <p class={`control-state control-${shown}`} data-testid="control-state" data-state={shown} role="status">
+      <span class="dot" aria-hidden="true" />
+      {text}
+    </p>
+  );
+}
+
+function describe(device: DeviceStore, control: Control): [Shown, string] {
+  const state = control.state.value;
+  const holder = device.holder.value;
+  const told = device.state.value?.lease ?? null;
+  const reason = told !== null && told.holder === holder?.name ? (told.reason ?? "") : "";
+  switch (state.kind) {
+    case "taking":
+      return ["taking", texts.control.taking];
+    case "held":
+      return ["mine", state.confirmed ? texts.control.mine : texts.control.unconfirmed];
+    case "lost":
+      return ["lost", texts.control.lost(holder === null || reason === "" ? state.why : texts.control.tookOver(holder.name, reason))];
+    case "refused":
+      return ["refused", texts.control.refused(state.why)];
+    case "handed":
+      return ["handed", texts.control.handed(state.to)];
+    case "none":
+      if (holder === null) return ["free", texts.control.free];
+      if (holder.mine) return ["other", texts.control.elsewhere];
+      return ["other", reason === "" ? texts.control.other(holder.name) : texts.control.tookOver(holder.name, reason)];
+  }
+}

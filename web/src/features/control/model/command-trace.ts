@@ -1,0 +1,234 @@
+/**
+ * What became of the last commands of this page: sent, accepted, started, observed, ended, each by what this page heard
+ * itself and on its own clock. A stream of setpoints is one line, as an action is.
+ */
+import { computed, effect, signal, untracked, type ReadonlySignal } from "@preact/signals-core";
+import { ended, type ActionRunner, type Run, type RunStatus, type Step } from "../../actions/model/action-runner";
+import { now } from "../../../shared/lib/clock";
+import type { Control } from "./lease";
+import type { DeviceStore } from "../../devices/model/device-store";
+import { newId } from "../../../shared/lib/ids";
+import { moves, type AnyRequest } from "../../../shared/api/action-requests";
+import type { SetpointStreamer } from "../../steering/model/setpoint-streamer";
+
+export type LineStatus = RunStatus | "observed";
+
+/** How it was seen: something moved, or the device says of itself that it does what was asked. */
+export type SeenBy = "motion" | "state";
+
+export interface Line {
+  key: string;
+  request: AnyRequest | { kind: "stream" };
+  /** On the page's clock [ms]. */
+  clickedAt: number;
+  status: RunStatus;
+  steps: readonly Step<LineStatus>[];
+  /** `null` while nothing was observed. */
+  seenBy: SeenBy | null;
+  /** Of an action a sentence; of a stream why it ended, as the streamer names it. */
+  why: string;
+}
+
+const KEPT = 20;
+/** Measured this far from where it was at the click: it moved [rad; slides and bases: m]. */
+export const MOVED = 0.005;
+/** Faster than this at the click: it moved already, for another reason [rad/s]. */
+const UNDER_WAY_RAD_S = 0.02;
+/** Telemetry that comes so late after the end may still show what was done [ms]. */
+const GRACE_MS = 400;
+const ODOMETRY = "odometry";
+const PLACE = ["x_m", "y_m", "yaw_rad"] as const;
+
+export class Evidence {
+  readonly #device: DeviceStore;
+  readonly #watches = new Map<string, Watch>();
+  readonly #seen = signal<ReadonlyMap<string, Seen>>(new Map());
+  readonly #streams = signal<readonly Line[]>([]);
+  readonly #ends: (() => void)[];
+
+  /** The newest first. */
+  readonly lines: ReadonlySignal<readonly Line[]>;
+
+  constructor(device: DeviceStore, control: Control, actions: ActionRunner) {
+    this.#device = device;
+    this.lines = computed(() => {
+      const seen = this.#seen.value;
+      const every = [...actions.runs.value.map(lineOf), ...this.#streams.value];
+      return every
+        .toSorted((a, b) => b.clickedAt - a.clickedAt)
+        .slice(0, KEPT)
+        .map((line) => withSeen(line, seen.get(line.key)));
+    });
+    this.#ends = [
+      effect(() => {
+        for (const run of actions.runs.value) this.#attend(run);
+      }),
+      effect(() => {
+        const streamer = control.streamer.value;
+        const state = streamer?.state.value ?? "idle";
+        untracked(() => this.#attendStream(streamer, state !== "idle"));
+      }),
+      effect(() => {
+        // Whatever the device says is looked at when it comes.
+        const news = [device.telemetry.value, device.state.value, device.measured(ODOMETRY).value];
+        if (news.some((one) => one !== null)) untracked(() => this.#look());
+      }),
+    ];
+  }
+
+  dispose(): void {
+    for (const end of this.#ends) end();
+    this.#watches.clear();
+  }
+
+  #attend(run: Run): void {
+    const watch = this.#watches.get(run.key);
+    if (watch === undefined) {
+      const looked = ended(run) || this.#seen.peek().has(run.key);
+      if (!looked) this.#watches.set(run.key, untracked(() => new Watch(this.#device, run.clickedAt, moves(run.request), "action")));
+      return;
+    }
+    watch.action = run.id;
+    if (ended(run) && watch.endedAt === null) watch.endedAt = now();
+  }
+
+  #attendStream(streamer: SetpointStreamer | null, running: boolean): void {
+    const [newest] = this.#streams.value;
+    const open = newest?.status === "sent" || newest?.status === "accepted" || newest?.status === "started";
+    if (running && !open) {
+      const line: Line = {
+        key: newId(),
+        request: { kind: "stream" },
+        clickedAt: now(),
+        status: "sent",
+        steps: [{ status: "sent", afterMs: 0, heard: "page" }],
+        seenBy: null,
+        why: "",
+      };
+      this.#watches.set(line.key, new Watch(this.#device, line.clickedAt, true, "streaming"));
+      this.#streams.value = [line, ...this.#streams.value].slice(0, KEPT);
+    }
+    if (!running && open) {
+      const why = streamer?.ended.peek() ?? "";
+      this.#stream(why === "reached" ? "done" : "cancelled", "page", why);
+      const watch = this.#watches.get(newest.key);
+      if (watch !== undefined) watch.endedAt = now();
+    }
+  }
+
+  /** A step of the newest stream. */
+  #stream(status: RunStatus, heard: Step["heard"], why = ""): void {
+    const [newest, ...others] = this.#streams.value;
+    if (newest === undefined || newest.steps.some((step) => step.status === status)) return;
+    const step = { status, afterMs: now() - newest.clickedAt, heard };
+    this.#streams.value = [{ ...newest, status, why, steps: [...newest.steps, step] }, ...others];
+  }
+
+  #look(): void {
+    this.#lookAtStream();
+    for (const [key, watch] of this.#watches) {
+      const seen = watch.look();
+      if (seen !== null) this.#seen.value = new Map([...this.#seen.value].slice(-2 * KEPT)).set(key, seen);
+      if (seen !== null || watch.over()) this.#watches.delete(key);
+    }
+  }
+
+  /** The telemetry that names a setpoint of this stream: the device has taken it; and then that it follows. */
+  #lookAtStream(): void {
+    const [newest] = this.#streams.value;
+    const message = this.#device.telemetry.value?.message;
+    if (newest === undefined || message === undefined || newest.steps.some(({ status }) => status === "done" || status === "cancelled")) return;
+    if (message.setpoint_sequence === 0 || message.setpoint_sent_ms < newest.clickedAt) return;
+    this.#stream("accepted", "device");
+    if (message.mode === "streaming") this.#stream("started", "device");
+  }
+}
+
+interface Seen {
+  afterMs: number;
+  by: SeenBy;
+}
+
+/** Where a device was at the click, and whether it is elsewhere since. */
+class Watch {
+  readonly #device: DeviceStore;
+  readonly #since: number;
+  readonly #motion: boolean;
+  readonly #mode: "action" | "streaming";
+  #joints: readonly number[] | null = null;
+  #place: readonly number[] | null = null;
+  #stiffness: string;
+  #changed: Seen | null = null;
+  readonly #wasBusy: boolean;
+  action: string | null = null;
+  endedAt: number | null = null;
+
+  /** `motion`: only what moves counts, unless nothing has by the end. `mode`: what the device says while it does it. */
+  constructor(device: DeviceStore, since: number, motion: boolean, mode: "action" | "streaming") {
+    this.#device = device;
+    this.#since = since;
+    this.#motion = motion;
+    this.#mode = mode;
+    const message = device.telemetry.value?.message;
+    this.#wasBusy = message?.mode === mode;
+    this.#stiffness = JSON.stringify(device.state.value?.stiffness ?? {});
+    // What moves already moves for another reason: where it is when this begins counts.
+    if (message?.velocity_rad_s.every((velocity) => Math.abs(velocity) < UNDER_WAY_RAD_S) === true) this.#take();
+  }
+
+  /** What was observed, once; `null` before. */
+  look(): Seen | null {
+    const telemetry = this.#device.telemetry.value;
+    const state = this.#device.state.value;
+    const at = now();
+    const afterMs = at - this.#since;
+    const fresh = telemetry !== null && telemetry.receivedAt >= this.#since;
+    const doing = fresh && telemetry.message.mode === this.#mode;
+    if (this.#changed === null) {
+      const says = (doing && !this.#wasBusy) || (this.action !== null && state?.action?.id === this.action);
+      const stiff = state !== null && JSON.stringify(state.stiffness) !== this.#stiffness;
+      if (says || (stiff && !this.#motion)) this.#changed = { afterMs, by: "state" };
+    }
+    if (fresh && (doing || this.endedAt !== null)) {
+      if (this.#joints === null) this.#take();
+      else if (this.#moved(telemetry.message.position_rad)) return { afterMs, by: "motion" };
+    }
+    const wanted = !this.#motion || this.over();
+    return wanted ? this.#changed : null;
+  }
+
+  over(): boolean {
+    return this.endedAt !== null && now() - this.endedAt > GRACE_MS;
+  }
+
+  #take(): void {
+    this.#joints = this.#device.telemetry.value?.message.position_rad ?? null;
+    this.#place = placeOf(this.#device);
+  }
+
+  #moved(position: readonly number[]): boolean {
+    const joints = this.#joints ?? [];
+    if (position.some((one, index) => Math.abs(one - (joints[index] ?? one)) > MOVED)) return true;
+    const place = this.#place;
+    const here = placeOf(this.#device);
+    return here?.some((one, index) => Math.abs(one - (place?.[index] ?? one)) > MOVED) === true;
+  }
+}
+
+function placeOf(device: DeviceStore): readonly number[] | null {
+  const values = device.measured(ODOMETRY).value?.message.values;
+  if (values === undefined) return null;
+  return PLACE.map((name) => Number(values[name] ?? 0));
+}
+
+function lineOf({ key, request, clickedAt, status, steps, why }: Run): Line {
+  return { key, request, clickedAt, status, steps, why, seenBy: null };
+}
+
+function withSeen(line: Line, seen: Seen | undefined): Line {
+  if (seen === undefined) return line;
+  // Its place is before the end, whichever this page happened to hear first.
+  const at = line.steps.findIndex(({ status }) => !["sent", "accepted", "started"].includes(status));
+  const step = { status: "observed", afterMs: seen.afterMs, heard: "device" } as const;
+  return { ...line, seenBy: seen.by, steps: at < 0 ? [...line.steps, step] : line.steps.toSpliced(at, 0, step) };
+}

@@ -1,0 +1,129 @@
+/** Asking whoever has control of a device for it, until there is an answer; and what it comes to. */
+import { effect, signal, type ReadonlySignal } from "@preact/signals-core";
+import type { Api, ControlRequest } from "../../../shared/api/client";
+import { now, onThisClock } from "../../../shared/lib/clock";
+import type { DeviceStore } from "../../devices/model/device-store";
+import { ApiError, sentence } from "../../../shared/api/http";
+
+/** How long the holder is given [ms]. */
+export const ANSWER_WITHIN_MS = 30_000;
+const LOOK_MS = 1_000;
+/** What was not heard of so long after its end is not waited for any longer [ms]. */
+const AFTER_MS = 5_000;
+
+export type Ended = Exclude<ControlRequest["outcome"], "open">;
+
+export type AskState =
+  | { kind: "none" }
+  | { kind: "sending" }
+  /** `until`: on the page's clock. `shown`: the device shows it to everybody, so the holder sees it at once. */
+  | { kind: "open"; id: string; epoch: number; until: number; shown: boolean; of: string }
+  | { kind: "over"; how: Ended; of: string }
+  | { kind: "failed"; why: string };
+
+export class Asking {
+  readonly #api: Api;
+  readonly #device: DeviceStore;
+  readonly #accepted: (epoch: number) => void;
+  readonly #state = signal<AskState>({ kind: "none" });
+  #timer: ReturnType<typeof setTimeout> | undefined;
+  readonly #forget: () => void;
+  #disposed = false;
+
+  readonly state: ReadonlySignal<AskState> = this.#state;
+
+  /** `accepted` is told the epoch that was handed to this session. */
+  constructor(api: Api, device: DeviceStore, accepted: (epoch: number) => void) {
+    this.#api = api;
+    this.#device = device;
+    this.#accepted = accepted;
+    // The device tells of a new epoch, or of the end of the request, before the next look would.
+    this.#forget = effect(() => {
+      const told = device.state.value?.lease ?? null;
+      const asked = this.#state.peek();
+      if (asked.kind === "open" && asked.shown && told?.request?.id !== asked.id) this.#lookIn(0);
+    });
+  }
+
+  async ask(): Promise<void> {
+    if (this.#state.value.kind === "sending" || this.#state.value.kind === "open") return;
+    const of = this.#device.holder.value?.name ?? "";
+    this.#state.value = { kind: "sending" };
+    try {
+      const { request, confirmed } = await this.#api.askForControl(this.#device.id, ANSWER_WITHIN_MS);
+      if (this.#disposed) {
+        this.#takeBack(request.id);
+        return;
+      }
+      const until = onThisClock(Date.parse(request.expires_at));
+      this.#state.value = { kind: "open", id: request.id, epoch: request.epoch, until, shown: confirmed, of };
+      this.#lookIn(LOOK_MS);
+    } catch (error) {
+      this.#state.value = { kind: "failed", why: sentence(error) };
+      void this.#device.refreshLease();
+    }
+  }
+
+  /** Ask no longer. Where it was accepted in the same moment control is here, and stays until it is given back. */
+  async withdraw(): Promise<void> {
+    const asked = this.#state.value;
+    if (asked.kind !== "open") return;
+    clearTimeout(this.#timer);
+    try {
+      await this.#api.withdrawRequest(this.#device.id, asked.id);
+      this.#end({ kind: "over", how: "withdrawn", of: asked.of });
+    } catch {
+      this.#lookIn(0);
+    }
+  }
+
+  /** What it came to has been read, or is of no interest any more. */
+  clear(): void {
+    const { kind } = this.#state.value;
+    if (kind === "over" || kind === "failed") this.#state.value = { kind: "none" };
+  }
+
+  dispose(): void {
+    this.#disposed = true;
+    const asked = this.#state.value;
+    this.#end({ kind: "none" });
+    this.#forget();
+    if (asked.kind === "open") this.#takeBack(asked.id);
+  }
+
+  /** The page is going away: the call outlives it. */
+  #takeBack(id: string): void {
+    void this.#api.withdrawRequest(this.#device.id, id, true).catch(() => undefined);
+  }
+
+  #end(state: AskState): void {
+    clearTimeout(this.#timer);
+    this.#state.value = state;
+  }
+
+  #lookIn(inMs: number): void {
+    clearTimeout(this.#timer);
+    this.#timer = setTimeout(() => void this.#look(), inMs);
+  }
+
+  async #look(): Promise<void> {
+    const asked = this.#state.value;
+    if (asked.kind !== "open") return;
+    let outcome: ControlRequest["outcome"];
+    try {
+      outcome = (await this.#api.controlRequest(this.#device.id, asked.id)).outcome;
+    } catch (error) {
+      // Another request has come after it: that its lease has ended is all that is known.
+      const gone = error instanceof ApiError && error.status === 404;
+      outcome = gone ? "ended" : now() > asked.until + AFTER_MS ? "lapsed" : "open";
+    }
+    if (this.#state.value !== asked) return;
+    if (outcome === "open") {
+      this.#lookIn(LOOK_MS);
+      return;
+    }
+    this.#end({ kind: "over", how: outcome, of: asked.of });
+    if (outcome === "accepted") this.#accepted(asked.epoch + 1);
+    else void this.#device.refreshLease();
+  }
+}

@@ -1,0 +1,136 @@
+/** Stop: told to the robot by every way there is, again and again, until the robot itself says that it has stopped. */
+import { computed, effect, signal, type ReadonlySignal } from "@preact/signals-core";
+import type { Api } from "../../../shared/api/client";
+import { sentence } from "../../../shared/api/http";
+import { now } from "../../../shared/lib/clock";
+import type { DeviceStore } from "../../devices/model/device-store";
+import { newId } from "../../../shared/lib/ids";
+import type { Link } from "../../../shared/mqtt/mqtt-link";
+import type { KnownState } from "../../../shared/mqtt/parse-messages";
+import type { Stop } from "../../../shared/mqtt/protocol.generated";
+
+export const REPEAT_MS = 200;
+/** No word from the robot for this long: the page must say so, loudly [ms]. */
+export const DOUBT_MS = 1_000;
+/** Publishing goes on this long at most; somebody must have gone to the robot by then [ms]. */
+export const GIVE_UP_MS = 60_000;
+
+export type StopState =
+  | { kind: "clear" }
+  /** Sent and not yet confirmed; `doubtful` once that takes longer than it should. */
+  | { kind: "sending"; doubtful: boolean }
+  | { kind: "latched" }
+  | { kind: "unconfirmed" };
+
+type Pressed =
+  | { kind: "sending"; at: number; doubtful: boolean }
+  /** The cloud has it from the robot that it stopped; this page has not heard it yet. */
+  | { kind: "told"; at: number }
+  | { kind: "unconfirmed" };
+
+export class StopSwitch {
+  readonly #api: Api;
+  readonly #device: DeviceStore;
+  readonly #link: Link;
+  readonly #by: string;
+  readonly #pressed = signal<Pressed | null>(null);
+  readonly #resetting = signal(false);
+  readonly #problem = signal<string | null>(null);
+  readonly #watch: () => void;
+  #timer: ReturnType<typeof setInterval> | undefined;
+  #stateAtPress: KnownState | null = null;
+
+  readonly resetting: ReadonlySignal<boolean> = this.#resetting;
+  /** What went wrong with the last stop or reset; `null` otherwise. */
+  readonly problem: ReadonlySignal<string | null> = this.#problem;
+
+  readonly state = computed<StopState>(() => {
+    const pressed = this.#pressed.value;
+    if (pressed?.kind === "sending") return { kind: "sending", doubtful: pressed.doubtful };
+    if (this.#device.stopped.value || pressed?.kind === "told") return { kind: "latched" };
+    return pressed === null ? { kind: "clear" } : { kind: "unconfirmed" };
+  });
+
+  constructor(api: Api, device: DeviceStore, link: Link, by: string) {
+    this.#api = api;
+    this.#device = device;
+    this.#link = link;
+    this.#by = by;
+    this.#watch = effect(() => {
+      const latest = device.telemetry.value;
+      const pressed = this.#pressed.value;
+      // What the robot itself says, a moment after the cloud, counts from then on.
+      if (pressed?.kind === "told" && latest !== null && latest.receivedAt > pressed.at + DOUBT_MS) {
+        queueMicrotask(() => this.#finish(null));
+      }
+      if (pressed?.kind !== "sending") return;
+      // Only what was said after the press confirms it. `state` comes without a time of arrival: any change of it is new.
+      const seen = latest !== null && latest.receivedAt >= pressed.at && latest.message.mode === "stopped";
+      const told = device.state.value !== this.#stateAtPress && device.state.value?.mode === "stopped";
+      if (seen || told) {
+        queueMicrotask(() => this.#finish(null));
+      }
+    });
+  }
+
+  /** Latch Stop. May be pressed again at any time. */
+  press(reason = "Stop pressed on the console"): void {
+    if (this.#device.info.value.role === "viewer") {
+      this.#problem.value = "You may watch this device, not stop it. Ask its owner, or whoever stands there.";
+      return;
+    }
+    this.#stateAtPress = this.#device.state.value;
+    const at = now();
+    this.#problem.value = null;
+    this.#pressed.value = { kind: "sending", at, doubtful: false };
+    const message: Stop = { id: newId(), by: this.#by.slice(0, 200), reason };
+    clearInterval(this.#timer);
+    this.#timer = setInterval(() => {
+      const age = now() - at;
+      if (age > GIVE_UP_MS) {
+        this.#finish({ kind: "unconfirmed" });
+        return;
+      }
+      if (age > DOUBT_MS) this.#pressed.value = { kind: "sending", at, doubtful: true };
+      this.#publish(message);
+    }, REPEAT_MS);
+    this.#publish(message);
+    this.#api.stop(this.#device.id, reason).then(
+      ({ confirmed }) => {
+        const pressed = this.#pressed.value;
+        if (confirmed && pressed?.kind === "sending" && pressed.at === at) this.#finish({ kind: "told", at: now() });
+      },
+      (error: unknown) => (this.#problem.value = sentence(error)),
+    );
+  }
+
+  /** Release the latch. Nothing resumes. */
+  async reset(): Promise<void> {
+    this.#resetting.value = true;
+    this.#problem.value = null;
+    try {
+      const { confirmed } = await this.#api.resetStop(this.#device.id);
+      if (!confirmed) this.#problem.value = "The robot has not confirmed the reset yet.";
+      this.#pressed.value = null;
+    } catch (error) {
+      this.#problem.value = sentence(error);
+    } finally {
+      this.#resetting.value = false;
+    }
+  }
+
+  dispose(): void {
+    clearInterval(this.#timer);
+    this.#watch();
+  }
+
+  #publish(message: Stop): void {
+    // Where the broker is out of reach the HTTP call is the other way; the banner says which one failed.
+    this.#link.publish(this.#device.topics.stop, message, 1).catch(() => undefined);
+  }
+
+  #finish(pressed: Pressed | null): void {
+    clearInterval(this.#timer);
+    this.#pressed.value = pressed;
+  }
+}

@@ -1,0 +1,45 @@
+/** Says that this page looks at a device for as long as it can be seen, and hears who else does. */
+import { signal, type ReadonlySignal } from "@preact/signals-core";
+import type { Api, Watcher } from "../../../shared/api/client";
+
+const AGAIN_MS = 10_000;
+/** What the server says itself is taken within these bounds [ms]. */
+const BOUNDS_MS = [2_000, 60_000] as const;
+
+export class Watching {
+  readonly #api: Api;
+  readonly #id: string;
+  readonly #others = signal<readonly Watcher[] | null>(null);
+  #timer: ReturnType<typeof setTimeout> | undefined;
+  #on = false;
+
+  /** Who else looks at it; `null` while that is not known. */
+  readonly others: ReadonlySignal<readonly Watcher[] | null> = this.#others;
+
+  constructor(api: Api, id: string) {
+    this.#api = api;
+    this.#id = id;
+  }
+
+  /** The page can be seen, or no longer. */
+  seen(visible: boolean): void {
+    if (visible === this.#on) return;
+    this.#on = visible;
+    clearTimeout(this.#timer);
+    if (visible) void this.#say();
+    else void this.#api.unwatch(this.#id).catch(() => undefined); // Its time runs out by itself.
+  }
+
+  async #say(): Promise<void> {
+    let inMs = AGAIN_MS;
+    try {
+      const { items, again_ms: wanted } = await this.#api.watch(this.#id);
+      if (!this.#on) return;
+      this.#others.value = items;
+      inMs = Math.min(BOUNDS_MS[1], Math.max(BOUNDS_MS[0], wanted));
+    } catch {
+      this.#others.value = null;
+    }
+    if (this.#on) this.#timer = setTimeout(() => void this.#say(), inMs);
+  }
+}

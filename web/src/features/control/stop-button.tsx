@@ -1,0 +1,63 @@
+import { useState } from "preact/hooks";
+import type { DeviceStore } from "../devices/model/device-store";
+import type { StopSwitch } from "./model/stop";
+import { texts } from "../../shared/i18n/texts";
+
+interface StopBannerProps {
+  device: DeviceStore;
+  stop: StopSwitch;
+}
+
+/** What has become of a stop. Its place is there from the start, so that a change in it is spoken. */
+export function StopBanner({ device, stop }: StopBannerProps) {
+  const state = stop.state.value;
+  const problem = stop.problem.value;
+  return (
+    <div role="alert" class="alert-slot">
+      {state.kind !== "clear" && (
+        <div class="banner stopped" data-testid="stop-banner" data-state={state.kind}>
+          {state.kind === "sending" && <strong>{state.doubtful ? texts.stop.doubtful : texts.stop.sending}</strong>}
+          {state.kind === "unconfirmed" && <strong>{texts.stop.unconfirmed}</strong>}
+          {state.kind === "latched" && <Latched device={device} stop={stop} />}
+          {problem !== null && <p>{problem}</p>}
+        </div>
+      )}
+      {state.kind === "clear" && problem !== null && <p class="notice bad">{problem}</p>}
+    </div>
+  );
+}
+
+function Latched({ device, stop }: StopBannerProps) {
+  const [asking, setAsking] = useState(false);
+  const latch = device.state.value?.stop;
+  const resetting = stop.resetting.value;
+  return (
+    <>
+      <div>
+        <strong class="big">{texts.stop.latched}</strong>{" "}
+        {latch !== undefined && latch !== null && texts.stop.by(latch.by, latch.reason)}
+        <p>{texts.stop.explain}</p>
+      </div>
+      {asking ? (
+        <div class="row" role="group" aria-label={texts.stop.confirmQuestion}>
+          <span>{texts.stop.confirmQuestion}</span>
+          <button
+            type="button"
+            data-testid="confirm-reset"
+            disabled={resetting}
+            onClick={() => void stop.reset().then(() => setAsking(false))}
+          >
+            {resetting ? texts.stop.resetting : texts.stop.confirm}
+          </button>
+          <button type="button" data-testid="keep-stopped" disabled={resetting} onClick={() => setAsking(false)}>
+            {texts.stop.keep}
+          </button>
+        </div>
+      ) : (
+        <button type="button" data-testid="reset-stop" onClick={() => setAsking(true)}>
+          {texts.stop.reset}
+        </button>
+      )}
+    </>
+  );
+}

@@ -1,0 +1,47 @@
+/** How many others look at a device, and who they are: as the server tells, for as long as it is heard. */
+import { onThisClock } from "../../shared/lib/clock";
+import type { Watching } from "./model/watchers";
+import { texts } from "../../shared/i18n/texts";
+import { Age } from "../../shared/ui/parts";
+
+interface WatchersButtonProps {
+  watching: Watching;
+  open: boolean;
+  /** The id of their names. */
+  names: string;
+  onToggle: () => void;
+}
+
+export function WatchersButton({ watching, open, names, onToggle }: WatchersButtonProps) {
+  const others = watching.others.value ?? [];
+  if (others.length === 0) return null;
+  return (
+    <button
+      type="button"
+      class="plain watchers"
+      data-testid="watchers"
+      data-count={others.length}
+      aria-expanded={open}
+      aria-controls={names}
+      onClick={onToggle}
+    >
+      {texts.others.count(others.length)}
+    </button>
+  );
+}
+
+export function WatcherNames({ watching, id }: { watching: Watching; id: string }) {
+  const others = watching.others.value ?? [];
+  if (others.length === 0) return null;
+  return (
+    <ul class="bar-row watcher-names" id={id} aria-label={texts.others.title} data-testid="watcher-names">
+      {others.map(({ name, role, mine, since }, index) => (
+        <li key={index}>
+          {name} <span class="quiet small">
+            {mine ? texts.others.mine : texts.role[role].toLowerCase()}, <Age at={onThisClock(Date.parse(since))} as={texts.others.since} />
+          </span>
+        </li>
+      ))}
+    </ul>
+  );
+}

@@ -1,0 +1,129 @@
+/** Devices of one space: robots first, with all that is known of them, then what hangs in the room. */
+import type { DeviceStore } from "./model/device-store";
+import type { Fleet } from "./model/device-list";
+import type { HealthLine } from "../health/model/health";
+import { isRoomDevice } from "./model/filter";
+import { texts } from "../../shared/i18n/texts";
+import { HeardAge, ReachChip } from "../../shared/ui/parts";
+import { deviceAddress } from "../../app/routes";
+import { PickForTogether } from "../steering/multi-select";
+
+interface DeviceListsProps {
+  devices: readonly DeviceStore[];
+  fleet: Fleet;
+  /** What the cloud has found of their health, by id. What a device says itself is shown without. */
+  found?: ReadonlyMap<string, HealthLine> | undefined;
+}
+
+export function DeviceLists({ devices, fleet, found }: DeviceListsProps) {
+  const robots = devices.filter(({ info }) => !isRoomDevice(info.value));
+  const sensors = devices.filter(({ info }) => isRoomDevice(info.value));
+  return (
+    <>
+      {robots.length > 0 && (
+        <ul class="devices" aria-label={texts.list.robots}>
+          {robots.map((device) => (
+            <RobotRow key={device.id} device={device} fleet={fleet} line={found?.get(device.id)} />
+          ))}
+        </ul>
+      )}
+      {sensors.length > 0 && (
+        <ul class="tiles" aria-label={texts.list.sensors}>
+          {sensors.map((device) => (
+            <SensorTile key={device.id} device={device} line={found?.get(device.id)} />
+          ))}
+        </ul>
+      )}
+    </>
+  );
+}
+
+function RobotRow({ device, fleet, line }: { device: DeviceStore; fleet: Fleet; line: HealthLine | undefined }) {
+  const info = device.info.value;
+  return (
+    <li class="card device-row" data-testid="device-row" data-device={device.id}>
+      <PickForTogether device={device} />
+      <a class="device-name" href={deviceAddress(device.id)}>
+        {info.label}
+        <span class="quiet">
+          {info.robot_type} · {fleet.spaceName(info.space)}
+        </span>
+      </a>
+      <dl>
+        <div>
+          <dt>{texts.fleet.status}</dt>
+          <dd>
+            <ReachChip device={device} data-testid="online" />
+          </dd>
+        </div>
+        <div>
+          <dt>{texts.fleet.heard}</dt>
+          <dd>
+            <HeardAge device={device} />
+          </dd>
+        </div>
+        <div>
+          <dt>{texts.fleet.doing}</dt>
+          <dd>
+            <Doing device={device} line={line} />
+          </dd>
+        </div>
+        <div>
+          <dt>{texts.fleet.control}</dt>
+          <dd>
+            <Holder device={device} />
+          </dd>
+        </div>
+      </dl>
+    </li>
+  );
+}
+
+function SensorTile({ device, line }: { device: DeviceStore; line: HealthLine | undefined }) {
+  const info = device.info.value;
+  const state = device.state.value;
+  return (
+    <li class="card device-row tile" data-testid="device-row" data-device={device.id}>
+      <a class="device-name" href={deviceAddress(device.id)}>
+        {info.label}
+        <span class="quiet">{info.kind.replaceAll("_", " ")}</span>
+      </a>
+      <ReachChip device={device} data-testid="online" />
+      {device.reach.value !== "online" && (
+        <span class="quiet small">
+          <HeardAge device={device} />
+        </span>
+      )}
+      {state !== null && (state.mode !== "idle" || faultsOf(device, line) > 0) && <Doing device={device} line={line} />}
+    </li>
+  );
+}
+
+/** What is wrong with it, by its own word or by what was found in its measurements: what is only worth knowing left out. */
+export function faultsOf(device: DeviceStore, line: HealthLine | undefined): number {
+  const found = line === undefined ? 0 : line.counts.error + line.counts.warning;
+  return Math.max(found, device.state.value?.faults.length ?? 0);
+}
+
+function Doing({ device, line }: { device: DeviceStore; line: HealthLine | undefined }) {
+  const state = device.state.value;
+  if (state === null) return <span class="quiet">{texts.number.unknown}</span>;
+  const faults = faultsOf(device, line);
+  const what = state.action === null ? texts.mode[state.mode] : texts.acts.running(nameOf(state.action));
+  return (
+    <span class={device.live.value ? "" : "old"}>
+      <span class={state.mode === "stopped" || state.mode === "fault" ? "chip bad" : ""}>{what}</span>
+      {faults > 0 && <span class="chip bad">{texts.fleet.faults(faults)}</span>}
+    </span>
+  );
+}
+
+function nameOf(action: { name?: string; kind: string }): string {
+  return action.name === undefined || action.name === "" ? action.kind : action.name;
+}
+
+function Holder({ device }: { device: DeviceStore }) {
+  const holder = device.holder.value;
+  if (holder === null) return <>{texts.fleet.nobody}</>;
+  return <>{holder.mine ? texts.fleet.you : holder.name}</>;
+}

@@ -1,0 +1,65 @@
+/** The devices that are operated on a page, from its opening to its end. */
+import { useEffect, useState } from "preact/hooks";
+import type { Account, Api } from "../../shared/api/client";
+import type { DeviceStore } from "./model/device-store";
+import type { Fleet } from "./model/device-list";
+import { Station } from "./model/device-session";
+
+/** One station for each device, in their order; none before the page is there. One key stops them all. */
+export function useStations(
+  api: Api,
+  fleet: Fleet,
+  devices: readonly DeviceStore[],
+  account: Account,
+): readonly Station[] {
+  const [stations, setStations] = useState<readonly Station[]>([]);
+  const ids = devices.map(({ id }) => id).join(" ");
+
+  useEffect(() => {
+    // Without a device the key is anybody's.
+    if (devices.length === 0) return undefined;
+    const made = devices.map((device) => new Station(api, fleet.link, device, account.name));
+    setStations(made);
+    const look = (): void => {
+      for (const { watching } of made) watching.seen(document.visibilityState === "visible");
+    };
+    look();
+
+    const press = (event: KeyboardEvent): void => {
+      if (event.key !== "Escape" || event.repeat) return;
+      event.preventDefault();
+      for (const station of made) station.stopNow();
+    };
+    const visibility = (): void => {
+      look();
+      if (document.visibilityState !== "hidden") return;
+      for (const { control } of made) control.hidden();
+    };
+    // The keys that are let go now are heard by nobody here.
+    const blur = (): void => {
+      for (const { control } of made) control.streamer.value?.letGo();
+    };
+    const leave = (): void => {
+      for (const { control, watching } of made) {
+        void control.release(true);
+        watching.seen(false);
+      }
+    };
+    // In the capture phase: no field or menu may keep the key from stopping a robot.
+    addEventListener("keydown", press, { capture: true });
+    document.addEventListener("visibilitychange", visibility);
+    addEventListener("blur", blur);
+    addEventListener("pagehide", leave);
+    return () => {
+      removeEventListener("keydown", press, { capture: true });
+      document.removeEventListener("visibilitychange", visibility);
+      removeEventListener("blur", blur);
+      removeEventListener("pagehide", leave);
+      for (const station of made) station.dispose();
+      setStations([]);
+    };
+    // Devices are the same as long as their ids are.
+  }, [api, fleet, ids, account]);
+
+  return stations;
+}

@@ -1,0 +1,32 @@
+import { clock, onThisClock } from "../../shared/lib/clock";
+import type { DeviceStore } from "./model/device-store";
+import { texts } from "../../shared/i18n/texts";
+import { Card } from "../../shared/ui/parts";
+
+/** What lasts (faults) and what happened (events), newest first. */
+export function Events({ device }: { device: DeviceStore }) {
+  const events = device.events.value;
+  const faults = device.state.value?.faults ?? [];
+  const age = (atMs: number): string => texts.age(Math.max(0, clock.value - onThisClock(atMs)));
+  return (
+    <Card title={texts.events.title} class="events">
+      {faults.length > 0 && (
+        <ul class="faults" aria-label={texts.events.faults}>
+          {faults.map((fault) => (
+            <li key={fault.code} class="notice bad">
+              <strong>{fault.code}</strong> {fault.message} <span class="quiet">{age(fault.since_ms)}</span>
+            </li>
+          ))}
+        </ul>
+      )}
+      {events.length === 0 && faults.length === 0 && <p class="quiet">{texts.events.none}</p>}
+      <ul class="event-list" tabIndex={0} aria-label={texts.events.title}>
+        {events.map((event) => (
+          <li key={event.id} class={event.severity}>
+            {event.message} <span class="quiet">{age(event.at_ms)}</span>
+          </li>
+        ))}
+      </ul>
+    </Card>
+  );
+}

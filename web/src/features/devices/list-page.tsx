@@ -1,0 +1,130 @@
+import { useMemo, useState } from "preact/hooks";
+import type { Api } from "../../shared/api/client";
+import type { DeviceStore } from "./model/device-store";
+import type { Fleet } from "./model/device-list";
+import { fits, type Kinds, type Wanted, type Whose } from "./model/filter";
+import { texts } from "../../shared/i18n/texts";
+import { DeviceLists, faultsOf } from "./device-list";
+import "./list.css";
+import { Choice } from "../../shared/ui/parts";
+import { usePolled } from "../../shared/hooks/use-polling";
+import { pairAddress, spaceAddress } from "../../app/routes";
+import { Spaces } from "../spaces/space-list";
+import { FirstSteps } from "../help/first-steps";
+import { OperateTogether } from "../steering/multi-select";
+
+const EVERYTHING: Wanted = { search: "", kinds: "all", whose: "all", onlyTrouble: false };
+/** Fewer devices than this are seen at a glance. */
+const SEARCH_FROM = 5;
+/** Of each device the cloud reads what is open: seldom, for what the device says itself comes without asking. */
+const HEALTH_EVERY_MS = 30_000;
+
+export function FleetPage({ api, fleet }: { api: Api; fleet: Fleet }) {
+  const devices = fleet.devices.value;
+  const [wanted, setWanted] = useState(EVERYTHING);
+  const lines = usePolled(() => api.health.all(null), HEALTH_EVERY_MS, [api]).value;
+  const health = useMemo(() => new Map(lines?.map((line) => [line.device, line])), [lines]);
+  const all = [...(devices?.values() ?? [])];
+  const shown = all.filter((device) =>
+    fits(device, fleet.spaceName(device.info.value.space), faultsOf(device, health.get(device.id)), wanted),
+  );
+  const shared = all.some((device) => device.info.value.role !== "owner");
+  return (
+    <main class="page fleet" id="content">
+      <div class="fleet-head">
+        <h1>{texts.fleet.title}</h1>
+        <a class="elsewhere" href={pairAddress} data-testid="pair">
+          {texts.pair.open}
+        </a>
+      </div>
+      {devices === null && <p class="quiet">{texts.loading}</p>}
+      {devices?.size === 0 && <FirstSteps />}
+      {all.length >= SEARCH_FROM && <Search wanted={wanted} change={setWanted} shared={shared} shown={shown.length} all={all.length} />}
+      {all.length > 0 && shown.length === 0 && (
+        <p class="row">
+          {texts.list.nothing}
+          <button type="button" onClick={() => setWanted(EVERYTHING)}>
+            {texts.list.clear}
+          </button>
+        </p>
+      )}
+      <OperateTogether devices={all} />
+      {bySpace(shown, fleet).map(([space, found]) => (
+        <section key={space} class="space-group" aria-label={fleet.spaceName(space)} data-testid="space">
+          <header class="space-head">
+            <h2>{fleet.spaceName(space)}</h2>
+            <a href={spaceAddress(space)} aria-label={texts.list.planOf(fleet.spaceName(space))} data-testid="plan-link">
+              {texts.list.plan}
+            </a>
+          </header>
+          <DeviceLists devices={found} fleet={fleet} found={health} />
+        </section>
+      ))}
+      <Spaces api={api} fleet={fleet} />
+    </main>
+  );
+}
+
+/** Rooms by name, devices in the order of the list. */
+function bySpace(devices: readonly DeviceStore[], fleet: Fleet): [string, DeviceStore[]][] {
+  const groups = new Map<string, DeviceStore[]>();
+  for (const device of devices) {
+    const { space } = device.info.value;
+    groups.set(space, [...(groups.get(space) ?? []), device]);
+  }
+  return [...groups].sort(([one], [other]) => fleet.spaceName(one).localeCompare(fleet.spaceName(other)));
+}
+
+interface SearchProps {
+  wanted: Wanted;
+  change: (wanted: Wanted) => void;
+  /** Some devices are other people's. */
+  shared: boolean;
+  shown: number;
+  all: number;
+}
+
+function Search({ wanted, change, shared, shown, all }: SearchProps) {
+  return (
+    <form class="row search" role="search" onSubmit={(event) => event.preventDefault()}>
+      <label class="visually-hidden" for="search">
+        {texts.list.search}
+      </label>
+      <input
+        id="search"
+        type="text"
+        value={wanted.search}
+        placeholder={texts.list.searchExample}
+        autocomplete="off"
+        spellcheck={false}
+        data-testid="search"
+        onInput={(event) => change({ ...wanted, search: event.currentTarget.value })}
+      />
+      <Choice
+        label={texts.list.show}
+        value={wanted.kinds}
+        onChange={(kinds) => change({ ...wanted, kinds })}
+        options={Object.entries(texts.list.kinds) as [Kinds, string][]}
+      />
+      {shared && (
+        <Choice
+          label={texts.list.whose}
+          value={wanted.whose}
+          onChange={(whose) => change({ ...wanted, whose })}
+          options={Object.entries(texts.list.whoses) as [Whose, string][]}
+        />
+      )}
+      <label class="check">
+        <input
+          type="checkbox"
+          checked={wanted.onlyTrouble}
+          onChange={(event) => change({ ...wanted, onlyTrouble: event.currentTarget.checked })}
+        />
+        {texts.list.onlyTrouble}
+      </label>
+      <span class="quiet small" role="status">
+        {texts.list.shown(shown, all)}
+      </span>
+    </form>
+  );
+}

@@ -1,0 +1,110 @@
+/** All devices that this account may see. */
+import { effect, signal, type ReadonlySignal } from "@preact/signals-core";
+import type { Api, Device } from "../../../shared/api/client";
+import { sentence } from "../../../shared/api/http";
+import { DeviceStore } from "./device-store";
+import { MqttLink, type Link } from "../../../shared/mqtt/mqtt-link";
+
+const REFRESH_MS = 15_000;
+
+export class Fleet {
+  readonly #api: Api;
+  readonly link: Link;
+  readonly #devices = signal<ReadonlyMap<string, DeviceStore> | null>(null);
+  readonly #trouble = signal<string | null>(null);
+  readonly #spaces = signal<ReadonlyMap<string, string>>(new Map());
+  readonly #ends = new Map<string, () => void>();
+  readonly #timer: ReturnType<typeof setInterval>;
+  readonly #forget: () => void;
+  #cut = false;
+
+  /** By id, in the order of the list; `null` until the first answer. */
+  readonly devices: ReadonlySignal<ReadonlyMap<string, DeviceStore> | null> = this.#devices;
+  /** Why the list could not be read the last time; `null` when it could. */
+  readonly trouble: ReadonlySignal<string | null> = this.#trouble;
+
+  constructor(api: Api, link?: Link) {
+    this.#api = api;
+    this.link = link ?? new MqttLink(() => api.credentials({ purpose: "watch" }));
+    void this.refresh();
+    this.#timer = setInterval(() => void this.refresh(), REFRESH_MS);
+    this.#forget = this.#askWhenCut();
+  }
+
+  /** The name of a space, or its id while that is all that is known. */
+  spaceName(id: string): string {
+    return this.#spaces.value.get(id) ?? id;
+  }
+
+  async refresh(): Promise<void> {
+    try {
+      this.#take(await this.#api.devices());
+      if (this.#unnamed()) this.#spaces.value = new Map((await this.#api.spaces()).map(({ id, name }) => [id, name]));
+      this.#trouble.value = null;
+    } catch (error) {
+      this.#trouble.value = sentence(error);
+    }
+  }
+
+  /** Pair an agent with this account by the code it shows; its devices. Throws `ApiError`. */
+  async claim(code: string, space: string | null = null): Promise<Device[]> {
+    const devices = await this.#api.claim(code, space);
+    await this.refresh();
+    return devices;
+  }
+
+  dispose(): void {
+    clearInterval(this.#timer);
+    this.#forget();
+    for (const end of this.#ends.values()) end();
+    this.#ends.clear();
+    this.link.close();
+  }
+
+  /** A share that ends or changes cuts the connection: what may be seen now is asked for at once, and when it is back. */
+  #askWhenCut(): () => void {
+    let was = this.link.status.value.state;
+    return effect(() => {
+      const { state } = this.link.status.value;
+      const cut = was === "up" && state !== "up" && state !== "closed";
+      const back = was !== "up" && state === "up" && this.#cut;
+      was = state;
+      if (cut) this.#cut = true;
+      if (back) this.#cut = false;
+      if (cut || back) queueMicrotask(() => void this.refresh());
+    });
+  }
+
+  #unnamed(): boolean {
+    return [...(this.#devices.value?.values() ?? [])].some(({ info }) => !this.#spaces.value.has(info.value.space));
+  }
+
+  #take(list: readonly Device[]): void {
+    const known = this.#devices.value ?? new Map<string, DeviceStore>();
+    const next = new Map<string, DeviceStore>();
+    for (const info of list) {
+      const store = known.get(info.id);
+      if (store === undefined) {
+        const added = new DeviceStore(info, this.#api, this.link);
+        this.#ends.set(info.id, added.watch());
+        next.set(info.id, added);
+      } else {
+        store.update(info);
+        next.set(info.id, store);
+      }
+    }
+    const gone = [...known.keys()].filter((id) => !next.has(id));
+    for (const id of gone) {
+      this.#ends.get(id)?.();
+      this.#ends.delete(id);
+    }
+    const added = [...next.keys()].some((id) => !known.has(id));
+    // Only a changed list is a new list for what draws it.
+    if (added || gone.length > 0 || this.#devices.value === null) {
+      const first = this.#devices.value === null;
+      this.#devices.value = next;
+      // What the broker lets this connection hear was fixed when its credentials were made.
+      if (added && !first) this.link.renew();
+    }
+  }
+}

@@ -1,0 +1,34 @@
+/** Which devices a list shows: by what was typed, by what they are, by whether they need somebody to look. */
+import type { Device } from "../../../shared/api/client";
+import type { DeviceStore } from "./device-store";
+
+export type Kinds = "all" | "robots" | "sensors";
+export type Whose = "all" | "mine" | "shared";
+
+export interface Wanted {
+  /** Words, all of which have to be somewhere in label, name, type, kind or room. */
+  search: string;
+  kinds: Kinds;
+  whose: Whose;
+  onlyTrouble: boolean;
+}
+
+/** A room device's entry in its room makes its type, so type and kind are one. */
+export function isRoomDevice({ kind, robot_type: type }: Pick<Device, "kind" | "robot_type">): boolean {
+  return kind === type;
+}
+
+/** `faults`: how many the device tells of, or the cloud has found. */
+export function fits(device: DeviceStore, space: string, faults: number, wanted: Wanted): boolean {
+  const { search, kinds, whose, onlyTrouble } = wanted;
+  const info = device.info.value;
+  if (whose !== "all" && (info.role === "owner") !== (whose === "mine")) return false;
+  if (kinds !== "all" && isRoomDevice(info) !== (kinds === "sensors")) return false;
+  if (onlyTrouble && faults === 0 && !needsALook(device)) return false;
+  const text = [info.label, info.name, info.kind, info.robot_type, space].join(" ").toLowerCase().replaceAll("_", " ");
+  return search.toLowerCase().split(/\s+/).every((word) => text.includes(word));
+}
+
+function needsALook(device: DeviceStore): boolean {
+  return device.reach.value !== "online" || device.stopped.value || device.state.value?.mode === "fault";
+}

@@ -1,0 +1,74 @@
+/** The frame of a page about one device beside its own: who it is, its control, its Stop, and its other pages. */
+import type { ComponentChildren } from "preact";
+import type { Account, Api } from "../../shared/api/client";
+import type { DeviceStore } from "./model/device-store";
+import type { Fleet } from "./model/device-list";
+import type { Station } from "./model/device-session";
+import { texts } from "../../shared/i18n/texts";
+import { ControlBar } from "../control/control-bar";
+import { HeardAge, ReachChip } from "../../shared/ui/parts";
+import { deviceAddress, fleetAddress, healthAddressOf, timesAddressOf } from "../../app/routes";
+import { useStations } from "./device-sessions";
+import { StopBanner } from "../control/stop-button";
+
+interface DeviceFrameProps {
+  api: Api;
+  fleet: Fleet;
+  account: Account;
+  id: string;
+  page: "health" | "times";
+  children: (station: Station) => ComponentChildren;
+}
+
+export function DeviceFrame({ id, ...rest }: DeviceFrameProps) {
+  const devices = rest.fleet.devices.value;
+  const device = devices?.get(id);
+  if (device !== undefined) return <Framed key={id} device={device} {...rest} />;
+  return (
+    <main class="narrow" id="content">
+      <p role="status">{devices === null ? texts.loading : texts.device.missing}</p>
+      <a href={fleetAddress}>{texts.device.back}</a>
+    </main>
+  );
+}
+
+interface FramedProps extends Omit<DeviceFrameProps, "id"> {
+  device: DeviceStore;
+}
+
+function Framed({ api, fleet, account, device, page, children }: FramedProps) {
+  const [station] = useStations(api, fleet, [device], account);
+  if (station === undefined) return null;
+  const { label } = device.info.value;
+  const pages = [
+    [texts.care.operate, deviceAddress(device.id), false],
+    [texts.parts.health, healthAddressOf("device", device.id), page === "health"],
+    [texts.parts.times, timesAddressOf(device.id), page === "times"],
+  ] as const;
+  return (
+    <>
+      <ControlBar device={device} control={station.control} stop={station.stop} />
+      <main class="page operate care" id="content">
+        <div class="heading">
+          <a href={fleetAddress}>← {texts.device.back}</a>
+          <h1>{texts.care.title[page](label)}</h1>
+          <p class="reach">
+            <ReachChip device={device} data-testid="online" />
+            <span class="quiet">
+              {texts.fleet.heard}: <HeardAge device={device} />
+            </span>
+          </p>
+          <nav class="care-pages" aria-label={texts.care.pages(label)}>
+            {pages.map(([name, address, here]) => (
+              <a key={address} href={address} aria-current={here ? "page" : undefined}>
+                {name}
+              </a>
+            ))}
+          </nav>
+        </div>
+        <StopBanner device={device} stop={station.stop} />
+        {children(station)}
+      </main>
+    </>
+  );
+}

@@ -1,0 +1,313 @@
+/** How one device is: what is watched of it with its trend, and its faults from the first report to the end. */
+import { useEffect, useMemo, useRef, useState } from "preact/hooks";
+import type { Api } from "../../shared/api/client";
+import {
+  healthNow,
+  isLate,
+  newestOf,
+  openCount,
+  standings,
+  toldBy,
+  watchedQuantity,
+  worstFirst,
+  type DeviceHealth,
+  type Fault,
+  type StoredStream,
+  type Watched,
+} from "./model/health";
+import type { DeviceStore } from "../devices/model/device-store";
+import { sentence } from "../../shared/api/http";
+import { quantityOf, type Quantity } from "../sensors/model/quantities";
+import { texts } from "../../shared/i18n/texts";
+import { FaultItem } from "./fault-item";
+import { codes, HealthWord, useTold } from "./health-chip";
+import { Card, Choice } from "../../shared/ui/parts";
+import { usePolled } from "../../shared/hooks/use-polling";
+import { shown } from "../sensors/readings-card";
+import { Trend } from "./trend-chart";
+
+const EVERY_MS = 5_000;
+const PAST = 50;
+
+interface Chosen {
+  stream: string;
+  field: string;
+}
+
+export function DeviceHealthView({ api, device }: { api: Api; device: DeviceStore }) {
+  const { value, trouble, again } = usePolled(() => api.health.of(device.id), EVERY_MS, [api, device]);
+  const told = toldBy(device);
+  useTold(codes(told), again);
+  const past = usePast(api, device, value?.faults.map(({ id }) => id).join(" ") ?? "");
+  const [chosen, setChosen] = useState<Chosen | null>(null);
+  const trend = useRef<HTMLDivElement>(null);
+  const fields = useMemo(() => worstFirst(value?.fields ?? []), [value]);
+  const first = fields[0] ?? null;
+  const at = chosen ?? first;
+  const show = (stream: string, field: string): void => {
+    setChosen({ stream, field });
+    trend.current?.scrollIntoView({ block: "nearest" });
+    trend.current?.focus();
+  };
+  return (
+    <div class="desk care-desk">
+      <div class="column">
+        <Now device={device} value={value} trouble={trouble} />
+        <Faults api={api} device={device} open={value?.faults ?? null} past={past} again={again} show={show} />
+      </div>
+      <div class="column">
+        <div ref={trend} tabIndex={-1} class="trend-place">
+          {at === null ? (
+            <Card title={texts.trend.title}>
+              <p class="quiet">{value === null ? texts.loading : texts.care.nothingWatched}</p>
+            </Card>
+          ) : (
+            <Chart api={api} device={device} at={at} fields={fields} faults={[...(value?.faults ?? []), ...past.items]} />
+          )}
+        </div>
+        <Fields device={device} fields={fields} at={at} show={(stream, field) => setChosen({ stream, field })} />
+        <Others api={api} device={device} fields={fields} at={at} choose={setChosen} />
+      </div>
+    </div>
+  );
+}
+
+function Now({ device, value, trouble }: { device: DeviceStore; value: DeviceHealth | null; trouble: string }) {
+  const told = toldBy(device);
+  const count = openCount(value?.faults ?? null, told);
+  return (
+    <div class="row care-sum">
+      {value !== null && <HealthWord health={healthNow(value.health, told, device.reach.value)} />}
+      <p role="status" data-testid="open-faults" data-count={count}>
+        {value === null && trouble === "" ? texts.loading : texts.care.open(count)}
+      </p>
+      <button type="button" class="plain no-print" onClick={() => print()}>
+        {texts.care.print}
+      </button>
+      {trouble !== "" && <p class="notice bad">{texts.care.failed(trouble)}</p>}
+    </div>
+  );
+}
+
+interface Past {
+  items: readonly Fault[];
+  more: boolean;
+  why: string;
+  older: () => void;
+}
+
+/** Faults that are over; read anew when the open ones change. */
+function usePast(api: Api, device: DeviceStore, open: string): Past {
+  const [items, setItems] = useState<readonly Fault[]>([]);
+  const [cursor, setCursor] = useState<string | null>(null);
+  const [why, setWhy] = useState("");
+  const asked = useRef(0);
+  const read = (from: string | null): void => {
+    const mine = ++asked.current;
+    api.health.past(device.id, from, PAST).then(
+      (page) => {
+        if (mine !== asked.current) return;
+        setItems((known) => (from === null ? page.items : [...known, ...page.items]));
+        setCursor(page.cursor);
+        setWhy("");
+      },
+      (error: unknown) => mine === asked.current && setWhy(sentence(error)),
+    );
+  };
+  useEffect(() => {
+    read(null);
+    return () => void (asked.current += 1);
+  }, [api, device, open]);
+  return { items, more: cursor !== null, why, older: () => read(cursor) };
+}
+
+type Which = "open" | "past";
+
+interface FaultsProps {
+  api: Api;
+  device: DeviceStore;
+  open: readonly Fault[] | null;
+  past: Past;
+  again: () => void;
+  show: (stream: string, field: string) => void;
+}
+
+function Faults({ api, device, open, past, again, show }: FaultsProps) {
+  const [which, setWhich] = useState<Which>("open");
+  const listed = which === "open" ? standings(open ?? [], toldBy(device)) : standings(past.items, []).map((one) => ({ ...one, agreement: "same" as const }));
+  return (
+    <Card
+      title={texts.care.faults}
+      class="fault-card"
+      aside={<Choice label={texts.care.whichFaults} value={which} onChange={setWhich} options={Object.entries(texts.care.faultLists) as [Which, string][]} />}
+    >
+      {listed.length === 0 && <p class="quiet">{open === null ? texts.loading : texts.care.noFaults[which]}</p>}
+      <ul class="fault-list" data-testid={`faults-${which}`}>
+        {listed.map((one) => (
+          <FaultItem key={one.stored?.id ?? one.told?.code} api={api} device={device} standing={one} changed={again} show={show} />
+        ))}
+      </ul>
+      {which === "past" && past.why !== "" && <p class="notice bad">{texts.care.failed(past.why)}</p>}
+      {which === "past" && past.more && (
+        <button type="button" onClick={past.older}>
+          {texts.care.older}
+        </button>
+      )}
+    </Card>
+  );
+}
+
+interface ChartProps {
+  api: Api;
+  device: DeviceStore;
+  at: Chosen;
+  fields: readonly Watched[];
+  faults: readonly Fault[];
+}
+
+function Chart({ api, device, at: { stream, field }, fields, faults }: ChartProps) {
+  const description = device.description.value;
+  const watched = fields.find((one) => one.stream === stream && one.field === field) ?? null;
+  // A new object with the same limits is no reason to build a new chart.
+  const limits = watched === null ? "" : [watched.label, watched.unit, watched.low, watched.high, watched.warning_low, watched.warning_high].join(" ");
+  const quantity = useMemo((): Quantity => {
+    if (watched !== null) return watchedQuantity(watched, description);
+    return quantityOf(description ?? { controls: [], diagnostics: [] }, stream, field);
+  }, [description, stream, field, limits]);
+  return <Trend key={`${stream}/${field}`} api={api} device={device} quantity={quantity} watched={watched} faults={faults} />;
+}
+
+interface FieldsProps {
+  device: DeviceStore;
+  fields: readonly Watched[];
+  at: Chosen | null;
+  show: (stream: string, field: string) => void;
+}
+
+/** All that is watched: what it is now, what is usual, what is allowed; a press shows its trend. */
+function Fields({ device, fields, at, show }: FieldsProps) {
+  const description = device.description.value;
+  if (fields.length === 0) return null;
+  return (
+    <Card title={texts.care.watched}>
+      <div class="scroll" tabIndex={0} role="region" aria-label={texts.care.watched}>
+        <table class="watched" data-testid="watched">
+          <thead>
+            <tr>
+              {texts.care.columns.map((name) => (
+                <th key={name} scope="col">
+                  {name}
+                </th>
+              ))}
+            </tr>
+          </thead>
+          <tbody>
+            {fields.map((one) => (
+              <Field
+                key={`${one.stream}/${one.field}`}
+                device={device}
+                watched={one}
+                quantity={watchedQuantity(one, description)}
+                chosen={at?.stream === one.stream && at.field === one.field}
+                show={show}
+              />
+            ))}
+          </tbody>
+        </table>
+      </div>
+    </Card>
+  );
+}
+
+interface FieldProps {
+  device: DeviceStore;
+  watched: Watched;
+  quantity: Quantity;
+  chosen: boolean;
+  show: (stream: string, field: string) => void;
+}
+
+function Field({ device, watched, quantity, chosen, show }: FieldProps) {
+  const { stream, field, findings, advice } = watched;
+  const newest = newestOf(device, stream, field);
+  const value = newest === null ? watched.value : Number(newest.value);
+  const old = newest === null || isLate(device, stream);
+  const text = (one: number): string => `${shown(quantity, one)} ${quantity.unit}`.trim();
+  const span = (low: number | null, high: number | null): string => texts.care.span(low === null ? null : text(low), high === null ? null : text(high));
+  return (
+    <tr data-testid="watched-row" data-field={`${stream}.${field}`}>
+      <th scope="row">
+        <button type="button" class="plain" aria-pressed={chosen} onClick={() => show(stream, field)}>
+          {quantity.label}
+        </button>
+        {findings.length > 0 && (
+          <p class="found">
+            {findings.map((kind) => (
+              <span key={kind} class="chip reach-stale">
+                {texts.care.kind[kind] ?? kind}
+              </span>
+            ))}{" "}
+            {advice}
+          </p>
+        )}
+      </th>
+      <td class={old ? "old" : ""} title={old ? texts.care.storedAt(texts.moment(watched.updated_at)) : undefined}>
+        {text(value)}
+      </td>
+      <td>{watched.usual_low === null ? texts.number.unknown : span(watched.usual_low, watched.usual_high)}</td>
+      <td>{span(watched.warning_low ?? watched.low, watched.warning_high ?? watched.high)}</td>
+    </tr>
+  );
+}
+
+interface OthersProps {
+  api: Api;
+  device: DeviceStore;
+  fields: readonly Watched[];
+  at: Chosen | null;
+  choose: (chosen: Chosen) => void;
+}
+
+/** What is stored and not watched has a trend too. */
+function Others({ api, device, fields, at, choose }: OthersProps) {
+  const [streams, setStreams] = useState<readonly StoredStream[]>([]);
+  useEffect(() => {
+    let wanted = true;
+    // Without the list there are the watched ones still.
+    api.health.streams(device.id).then((found) => wanted && setStreams(found), () => undefined);
+    return () => void (wanted = false);
+  }, [api, device]);
+  const description = device.description.value ?? { controls: [], diagnostics: [] };
+  const watched = new Set(fields.map(({ stream, field }) => `${stream}/${field}`));
+  const others = streams
+    .map(({ name, fields: all }) => [name, all.filter((field) => !watched.has(`${name}/${field}`))] as const)
+    .filter(([, left]) => left.length > 0);
+  if (others.length === 0) return null;
+  const value = at === null || watched.has(`${at.stream}/${at.field}`) ? "" : `${at.stream}/${at.field}`;
+  return (
+    <Card title={texts.care.others} class="no-print">
+      <label class="field">
+        {texts.care.pickOther}
+        <select
+          value={value}
+          data-testid="other-fields"
+          onChange={(event) => {
+            const [stream, ...field] = event.currentTarget.value.split("/");
+            if (stream !== undefined && stream !== "") choose({ stream, field: field.join("/") });
+          }}
+        >
+          <option value="">{texts.care.noOther}</option>
+          {others.map(([stream, left]) => (
+            <optgroup key={stream} label={stream.replaceAll("_", " ")}>
+              {left.map((field) => (
+                <option key={field} value={`${stream}/${field}`}>
+                  {quantityOf(description, stream, field).label}
+                </option>
+              ))}
+            </optgroup>
+          ))}
+        </select>
+      </label>
+    </Card>
+  );
+}

@@ -1,0 +1,182 @@
+/** One fault, from its first report to its end, and what happened around it. */
+import { useRef, useState } from "preact/hooks";
+import type { Api } from "../../shared/api/client";
+import { around, type Fault, type Standing, type StoredEvent } from "./model/health";
+import { onThisClock } from "../../shared/lib/clock";
+import type { DeviceStore } from "../devices/model/device-store";
+import { sentence } from "../../shared/api/http";
+import { texts } from "../../shared/i18n/texts";
+import { Age } from "../../shared/ui/parts";
+
+interface FaultItemProps {
+  api: Api;
+  device: DeviceStore;
+  standing: Standing;
+  /** Something was done: the cloud is to be asked again. */
+  changed: () => void;
+  /** Show the trend of what was measured. */
+  show: (stream: string, field: string) => void;
+}
+
+const CHIP = { error: "bad", warning: "reach-stale", info: "" } as const;
+
+export function FaultItem({ api, device, standing, changed, show }: FaultItemProps) {
+  const { stored, told, agreement } = standing;
+  const head = useRef<HTMLHeadingElement>(null);
+  const severity = stored?.severity ?? "error";
+  return (
+    <li
+      class={`fault ${stored?.state === "cleared" ? "ended" : severity}`}
+      data-testid="fault"
+      data-code={stored?.code ?? told?.code}
+      data-state={stored?.state ?? "told"}
+    >
+      <h3 ref={head} tabIndex={-1}>
+        <span class={`chip ${CHIP[severity]}`}>{texts.care.severity[severity]}</span>{" "}
+        {texts.care.kind[stored?.kind ?? "reported"] ?? stored?.kind} <span class="quiet">{stored?.code ?? told?.code}</span>
+      </h3>
+      <p>{stored?.message ?? told?.message}</p>
+      {agreement !== "same" && (
+        <p class="quiet small" data-testid="agreement" data-agreement={agreement}>
+          {texts.care.agreement[agreement]}
+        </p>
+      )}
+      {stored === null ? (
+        told !== null && (
+          <p class="quiet small">
+            <Age at={onThisClock(told.since_ms)} as={texts.care.saidSince} />
+          </p>
+        )
+      ) : (
+        <>
+          <Life fault={stored} />
+          <div class="row no-print">
+            {stored.state === "raised" && (
+              <Acknowledge api={api} device={device} fault={stored} done={() => (changed(), head.current?.focus())} />
+            )}
+            {stored.stream !== "" && (
+              <button type="button" onClick={() => show(stored.stream, stored.field)}>
+                {texts.care.showTrend}
+              </button>
+            )}
+          </div>
+          <Around api={api} device={device} fault={stored} />
+        </>
+      )}
+    </li>
+  );
+}
+
+/** Raised, seen, cleared: each with its time. */
+function Life({ fault }: { fault: Fault }) {
+  const words = texts.care.life;
+  const moment = (at: string, what: string) => (
+    <>
+      <strong>{what}</strong> <time dateTime={at}>{texts.moment(at)}</time>{" "}
+      <span class="quiet">
+        <Age at={onThisClock(Date.parse(at))} />
+      </span>
+    </>
+  );
+  return (
+    <>
+      <ol class="life" aria-label={words.title}>
+        <li class="past">{moment(fault.raised_at, words.raised)}</li>
+        <li class={fault.acknowledged_at === null ? "" : "past"}>
+          {fault.acknowledged_at === null
+            ? fault.cleared_at === null
+              ? words.unseen
+              : words.neverSeen
+            : moment(fault.acknowledged_at, words.seen(fault.acknowledged_by))}
+        </li>
+        <li class={fault.cleared_at === null ? "" : "past"}>
+          {fault.cleared_at === null ? words.open : moment(fault.cleared_at, words.cleared)}
+        </li>
+      </ol>
+      <p class="quiet small">
+        {[words.source[fault.source], words.count(fault.count), words.worsened(fault.worsened)].filter((one) => one !== "").join(" · ")}
+      </p>
+    </>
+  );
+}
+
+interface AcknowledgeProps {
+  api: Api;
+  device: DeviceStore;
+  fault: Fault;
+  done: () => void;
+}
+
+function Acknowledge({ api, device, fault, done }: AcknowledgeProps) {
+  const [busy, setBusy] = useState(false);
+  const [why, setWhy] = useState("");
+  if (device.info.value.role === "viewer") return <span class="quiet small">{texts.care.watchOnly}</span>;
+  const acknowledge = (): void => {
+    setBusy(true);
+    setWhy("");
+    api.health.acknowledge(device.id, fault.id).then(done, (error: unknown) => {
+      setBusy(false);
+      setWhy(sentence(error));
+    });
+  };
+  return (
+    <>
+      <button type="button" class="primary" data-testid="acknowledge" disabled={busy} onClick={acknowledge}>
+        {busy ? texts.care.saving : texts.care.acknowledge}
+      </button>
+      <span class="quiet small">{texts.care.noUndo}</span>
+      {why !== "" && (
+        <span role="alert" class="field-error">
+          {why}
+        </span>
+      )}
+    </>
+  );
+}
+
+const PAGE = 200;
+const PAGES = 5;
+const SHOWN = 50;
+
+/** What the device and the cloud told in the minute before, during, and in the minute after; read when it is opened. */
+function Around({ api, device, fault }: Pick<FaultItemProps, "api" | "device"> & { fault: Fault }) {
+  const [events, setEvents] = useState<readonly StoredEvent[] | null>(null);
+  const [why, setWhy] = useState("");
+  const open = (): void => {
+    setWhy("");
+    eventsAround(api, device.id, fault).then(setEvents, (error: unknown) => setWhy(sentence(error)));
+  };
+  return (
+    <details class="around no-print" onToggle={(event) => event.currentTarget.open && open()}>
+      <summary>{texts.care.around}</summary>
+      {why !== "" && <p class="notice bad">{why}</p>}
+      {events === null && why === "" && <p class="quiet">{texts.loading}</p>}
+      {events !== null && (
+        <ul class="event-list">
+          {events.slice(0, SHOWN).map((event) => (
+            <li key={event.id} class={event.severity}>
+              <time class="quiet" dateTime={event.at}>
+                {texts.time(Date.parse(event.at))}
+              </time>{" "}
+              {texts.care.event[event.kind] ?? event.kind.replaceAll("-", " ")}: {event.message}
+            </li>
+          ))}
+          {events.length === 0 && <li class="quiet">{texts.care.nothingAround}</li>}
+        </ul>
+      )}
+    </details>
+  );
+}
+
+async function eventsAround(api: Api, device: string, fault: Fault): Promise<StoredEvent[]> {
+  const [from, to] = around(fault);
+  const found: StoredEvent[] = [];
+  let cursor: string | null = null;
+  for (let page = 0; page < PAGES; page += 1) {
+    const { items, cursor: next } = await api.health.events(device, cursor, PAGE);
+    found.push(...items.filter(({ at }) => Date.parse(at) >= from && Date.parse(at) <= to));
+    cursor = next;
+    if (cursor === null || Date.parse(items.at(-1)?.at ?? "") < from) break;
+  }
+  return found;
+}

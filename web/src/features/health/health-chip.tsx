@@ -1,0 +1,51 @@
+/** How a device is, in a word. */
+import { useEffect } from "preact/hooks";
+import type { Api } from "../../shared/api/client";
+import type { DeviceStore } from "../devices/model/device-store";
+import { openCount, toldBy, type HealthState } from "./model/health";
+import { texts } from "../../shared/i18n/texts";
+import { usePolled, type Polled } from "../../shared/hooks/use-polling";
+import { healthAddressOf } from "../../app/routes";
+
+const EVERY_MS = 15_000;
+/** What a device says reaches the cloud's tables a moment later. */
+const STORED_AFTER_MS = 1_500;
+
+const KIND: Readonly<Record<HealthState, string>> = { ok: "reach-online", unknown: "", warning: "reach-stale", fault: "bad" };
+
+export function HealthWord({ health }: { health: HealthState }) {
+  return (
+    <span class={`chip ${KIND[health]}`} data-testid="health" data-health={health}>
+      {texts.care.health[health]}
+    </span>
+  );
+}
+
+/** Ask again when the device itself says something else about its faults: at once, and when that is stored. */
+export function useTold(told: string, again: Polled<unknown>["again"]): void {
+  useEffect(() => {
+    again();
+    const timer = setTimeout(again, STORED_AFTER_MS);
+    return () => clearTimeout(timer);
+  }, [told, again]);
+}
+
+/** The number of open faults, as the way to the health page. */
+export function HealthChip({ api, device }: { api: Api; device: DeviceStore }) {
+  const told = toldBy(device);
+  const { value, again } = usePolled(() => api.health.of(device.id), EVERY_MS, [api, device]);
+  useTold(codes(told), again);
+  if (value === null && told === null) return null;
+  const count = openCount(value?.faults ?? null, told);
+  const bad = (told?.length ?? 0) > 0 || value?.health === "fault";
+  const kind = count === 0 ? "" : bad ? "bad" : "reach-stale";
+  return (
+    <a class={`chip ${kind}`} href={healthAddressOf("device", device.id)} data-testid="health-chip" data-count={count}>
+      {texts.care.chip(count)}
+    </a>
+  );
+}
+
+export function codes(told: readonly { code: string }[] | null): string {
+  return told === null ? "?" : told.map(({ code }) => code).join(" ");
+}

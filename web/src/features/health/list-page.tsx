@@ -1,0 +1,144 @@
+/** How devices are: all of them, those of a space, or one. */
+import { useComputed } from "@preact/signals";
+import { useState } from "preact/hooks";
+import type { Account, Api } from "../../shared/api/client";
+import { healthNow, RANK, toldBy, type HealthLine, type HealthState } from "./model/health";
+import { onThisClock } from "../../shared/lib/clock";
+import type { DeviceStore } from "../devices/model/device-store";
+import type { Fleet } from "../devices/model/device-list";
+import { texts } from "../../shared/i18n/texts";
+import { DeviceFrame } from "../devices/page-frame";
+import { DeviceHealthView } from "./device-page";
+import { codes, HealthWord, useTold } from "./health-chip";
+import { Age, Choice, HeardAge, ReachChip } from "../../shared/ui/parts";
+import { usePolled } from "../../shared/hooks/use-polling";
+import { healthAddress, healthAddressOf, spaceAddress } from "../../app/routes";
+import "./health.css";
+
+const EVERY_MS = 10_000;
+
+interface HealthPageProps {
+  api: Api;
+  fleet: Fleet;
+  account: Account;
+  /** Of one device, or empty. */
+  device: string;
+  /** Of one space, or empty. */
+  space: string;
+}
+
+export function HealthPage({ device, space, ...rest }: HealthPageProps) {
+  if (device === "") return <HealthList api={rest.api} fleet={rest.fleet} space={space} />;
+  return (
+    <DeviceFrame {...rest} id={device} page="health">
+      {(station) => <DeviceHealthView api={rest.api} device={station.device} />}
+    </DeviceFrame>
+  );
+}
+
+/** A line with what the page sees of the device by itself. */
+interface Shown {
+  line: HealthLine;
+  device: DeviceStore | null;
+  health: HealthState;
+}
+
+type Which = "all" | "look";
+
+function HealthList({ api, fleet, space }: { api: Api; fleet: Fleet; space: string }) {
+  const { value, trouble, again } = usePolled(() => api.health.all(space === "" ? null : space), EVERY_MS, [api, space]);
+  const [which, setWhich] = useState<Which>("all");
+  const devices = fleet.devices.value;
+  const told = useComputed(() =>
+    [...(fleet.devices.value?.values() ?? [])].map((device) => `${device.id} ${codes(toldBy(device))}`).join(" "),
+  );
+  useTold(told.value, again);
+  const lines = (value ?? []).map((line): Shown => {
+    const device = devices?.get(line.device) ?? null;
+    const health = device === null ? line.health : healthNow(line.health, toldBy(device), device.reach.value);
+    return { line, device, health };
+  });
+  lines.sort((one, other) => RANK[other.health] - RANK[one.health]);
+  const counted = (["fault", "warning", "unknown", "ok"] as const).map(
+    (health) => [health, lines.filter((one) => one.health === health).length] as const,
+  );
+  const shown = which === "all" ? lines : lines.filter(({ health }) => health !== "ok");
+  const spaces = [...new Set([...(devices?.values() ?? [])].map(({ info }) => info.value.space))];
+  return (
+    <main class="page fleet care" id="content">
+      <h1>{space === "" ? texts.care.all : texts.care.title.health(fleet.spaceName(space))}</h1>
+      <p class="quiet">{texts.care.explained}</p>
+      <nav class="care-pages" aria-label={texts.care.spaces}>
+        <a href={healthAddress} aria-current={space === "" ? "page" : undefined}>
+          {texts.care.everywhere}
+        </a>
+        {spaces.map((id) => (
+          <a key={id} href={healthAddressOf("space", id)} aria-current={space === id ? "page" : undefined}>
+            {fleet.spaceName(id)}
+          </a>
+        ))}
+      </nav>
+      {trouble !== "" && <p class="notice bad">{texts.care.failed(trouble)}</p>}
+      {value === null && trouble === "" && <p class="quiet">{texts.loading}</p>}
+      {value !== null && (
+        <div class="row care-sum">
+          <p role="status" data-testid="health-counts">
+            {texts.care.counts(counted.filter(([, count]) => count > 0).map(([health, count]) => `${count} ${texts.care.health[health].toLowerCase()}`))}
+          </p>
+          <Choice label={texts.list.show} value={which} onChange={setWhich} options={Object.entries(texts.care.which) as [Which, string][]} />
+        </div>
+      )}
+      {value !== null && shown.length === 0 && <p>{lines.length === 0 ? texts.fleet.none : texts.care.allWell}</p>}
+      <ul class="devices" aria-label={texts.care.devices}>
+        {shown.map((one) => (
+          <Line key={one.line.device} shown={one} fleet={fleet} />
+        ))}
+      </ul>
+      {space !== "" && <a href={spaceAddress(space)}>{texts.list.planOf(fleet.spaceName(space))}</a>}
+    </main>
+  );
+}
+
+function Line({ shown: { line, device, health }, fleet }: { shown: Shown; fleet: Fleet }) {
+  const told = device === null ? null : toldBy(device);
+  const { worst, counts } = line;
+  // The list names the worst of what is stored; what the device says besides is said by it.
+  const news = (told ?? []).filter(({ code }) => code !== worst?.code);
+  const stored = counts.error + counts.warning + counts.info;
+  return (
+    <li class="card health-row" data-testid="health-row" data-device={line.device} data-health={health}>
+      <a class="device-name" href={healthAddressOf("device", line.device)}>
+        {line.label}
+        <span class="quiet">
+          {device === null ? "" : `${device.info.value.robot_type.replaceAll("_", " ")} · `}
+          {fleet.spaceName(line.space)}
+        </span>
+      </a>
+      <span class="health-words">
+        <HealthWord health={health} />
+        {device !== null && <ReachChip device={device} />}
+        {device !== null && device.reach.value !== "online" && (
+          <span class="quiet small">
+            {texts.fleet.heard}: <HeardAge device={device} />
+          </span>
+        )}
+      </span>
+      <div class="health-what">
+        {worst !== null && (
+          <p>
+            {worst.message}{" "}
+            <span class="quiet">
+              {texts.care.since(texts.sinceWhen(Date.parse(worst.raised_at)))}, <Age at={onThisClock(Date.parse(worst.raised_at))} />
+              {worst.acknowledged_at !== null && ` · ${texts.care.life.seen(worst.acknowledged_by)}`}
+            </span>
+          </p>
+        )}
+        {news.map((fault) => (
+          <p key={fault.code}>{fault.message}</p>
+        ))}
+        {stored > 1 && <p class="quiet small">{texts.care.open(stored)}</p>}
+        {worst === null && news.length === 0 && <p class="quiet">{texts.care.nothing[health === "unknown" ? "unknown" : "ok"]}</p>}
+      </div>
+    </li>
+  );
+}

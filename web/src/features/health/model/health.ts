@@ -1,0 +1,245 @@
+/** How devices are: what is watched of them, and their faults from the first report to the end. */
+import type { DeviceStore, Reach } from "../../devices/model/device-store";
+import type { Http, Page } from "../../../shared/api/http";
+import type { KnownDescription, KnownTelemetry } from "../../../shared/mqtt/parse-messages";
+import type { Event, Fault as ReportedFault } from "../../../shared/mqtt/protocol.generated";
+import { quantityOf, type Quantity } from "../../sensors/model/quantities";
+
+export type Severity = Event["severity"];
+/** `unknown`: nothing is heard of it. */
+export type HealthState = "ok" | "unknown" | "warning" | "fault";
+
+export interface Fault {
+  /** Counts down with time: of all faults the newest sorts first. */
+  id: string;
+  code: string;
+  state: "raised" | "acknowledged" | "cleared";
+  /** Who noticed: the device itself, the detectors, or the cloud, which no longer hears of it. */
+  source: "device" | "detector" | "cloud";
+  kind: string;
+  severity: Severity;
+  message: string;
+  stream: string;
+  field: string;
+  value: number | null;
+  baseline: number | null;
+  limit: number | null;
+  raised_at: string;
+  acknowledged_at: string | null;
+  acknowledged_by: string;
+  cleared_at: string | null;
+  /** The first, second … of its code. */
+  count: number;
+  worsened: number;
+}
+
+/** One watched field, by means over ten seconds. */
+export interface Watched {
+  stream: string;
+  field: string;
+  label: string;
+  unit: string;
+  advice: string;
+  value: number;
+  baseline: number;
+  usual_low: number | null;
+  usual_high: number | null;
+  warning_low: number | null;
+  warning_high: number | null;
+  low: number | null;
+  high: number | null;
+  slope_per_s: number | null;
+  limit_in_s: number | null;
+  findings: string[];
+  updated_at: string;
+}
+
+interface Counts {
+  error: number;
+  warning: number;
+  info: number;
+}
+
+export interface DeviceHealth {
+  device: string;
+  health: HealthState;
+  online: boolean;
+  last_seen_at: string | null;
+  counts: Counts;
+  faults: Fault[];
+  fields: Watched[];
+}
+
+/** One device in the list of all. */
+export interface HealthLine {
+  device: string;
+  label: string;
+  space: string;
+  health: HealthState;
+  online: boolean;
+  last_seen_at: string | null;
+  counts: Counts;
+  worst: Fault | null;
+}
+
+export interface StoredEvent {
+  id: string;
+  kind: string;
+  severity: Severity;
+  message: string;
+  data: Record<string, unknown>;
+  at: string;
+}
+
+export interface StoredStream {
+  name: string;
+  fields: string[];
+}
+
+/** One method for each call. All of them throw `ApiError`, and nothing else. */
+export class HealthApi {
+  readonly #http: Http;
+
+  constructor(http: Http) {
+    this.#http = http;
+  }
+
+  /** Every device's health, worst first; of one space, or of all. */
+  async all(space: string | null): Promise<HealthLine[]> {
+    const lines = await this.#http.all<HealthLine>(space === null ? "/diagnostics" : `/spaces/${space}/diagnostics`);
+    return lines.sort((one, other) => RANK[other.health] - RANK[one.health] || one.label.localeCompare(other.label));
+  }
+
+  of(device: string): Promise<DeviceHealth> {
+    return this.#http.call("GET", `/devices/${device}/diagnostics`);
+  }
+
+  /** Faults that are over, the newest first. */
+  past(device: string, cursor: string | null, limit: number): Promise<Page<Fault>> {
+    return this.#http.call("GET", `/devices/${device}/faults?open=false&${paging(cursor, limit)}`);
+  }
+
+  acknowledge(device: string, fault: string): Promise<Fault> {
+    return this.#http.call("POST", `/devices/${device}/faults/${fault}/acknowledge`);
+  }
+
+  /** What happened, the newest first. */
+  events(device: string, cursor: string | null, limit: number): Promise<Page<StoredEvent>> {
+    return this.#http.call("GET", `/devices/${device}/events?${paging(cursor, limit)}`);
+  }
+
+  streams(device: string): Promise<StoredStream[]> {
+    return this.#http.all(`/devices/${device}/data`);
+  }
+}
+
+function paging(cursor: string | null, limit: number): string {
+  return new URLSearchParams({ limit: String(limit), ...(cursor === null ? {} : { cursor }) }).toString();
+}
+
+export const RANK: Readonly<Record<HealthState, number>> = { ok: 0, unknown: 1, warning: 2, fault: 3 };
+
+/** A fault as the cloud has it and as the device says it now: where the two differ, that is shown. */
+export interface Standing {
+  /** What the cloud has stored of it; `null`: only the device says so. */
+  stored: Fault | null;
+  /** What the device says; `null`: not, or not any more, or it is no fault that the device itself tells. */
+  told: ReportedFault | null;
+  /** `same`: the two agree, or there is nothing to compare; `unstored`, `ended`: one of them does not know it yet. */
+  agreement: "same" | "unstored" | "ended" | "unheard";
+}
+
+/**
+ * Open faults of the cloud and of the device's own word, worst first.
+ *
+ * @param told What the device says; `null` where it cannot be heard: what it last said then counts for nothing.
+ */
+export function standings(open: readonly Fault[], told: readonly ReportedFault[] | null): Standing[] {
+  const left = new Map((told ?? []).map((fault) => [fault.code, fault]));
+  const found = open.map((stored): Standing => {
+    if (stored.source !== "device") return { stored, told: null, agreement: "same" };
+    if (told === null) return { stored, told: null, agreement: "unheard" };
+    const heard = left.get(stored.code) ?? null;
+    left.delete(stored.code);
+    return { stored, told: heard, agreement: heard === null ? "ended" : "same" };
+  });
+  return [...[...left.values()].map((one): Standing => ({ stored: null, told: one, agreement: "unstored" })), ...found];
+}
+
+/** What the device says of its own faults now; `null` where it cannot be heard. */
+export function toldBy(device: DeviceStore): readonly ReportedFault[] | null {
+  return device.live.value ? (device.state.value?.faults ?? null) : null;
+}
+
+/** Open faults, by whoever knows of them: what the device says now and what the cloud has found. */
+export function openCount(stored: readonly Pick<Fault, "source" | "code">[] | null, told: readonly ReportedFault[] | null): number {
+  if (stored === null) return told?.length ?? 0;
+  if (told === null) return stored.length;
+  return stored.filter(({ source }) => source !== "device").length + told.length;
+}
+
+/** What is worse of what the cloud has judged and what the page sees of the device by itself. */
+export function healthNow(stored: HealthState, told: readonly ReportedFault[] | null, reach: Reach): HealthState {
+  if ((told?.length ?? 0) > 0) return "fault";
+  if (stored === "ok" && (reach === "offline" || reach === "stale")) return "unknown";
+  return stored;
+}
+
+/** What a watched field is called and in which unit it is shown, with its limits. */
+export function watchedQuantity(watched: Watched, description: KnownDescription | null): Quantity {
+  const { stream, field, label, unit, advice, low, high, warning_low, warning_high } = watched;
+  const [name = field, ...part] = field.split(".");
+  const limited = [low, high, warning_low, warning_high].some((limit) => limit !== null);
+  const listed = label !== name;
+  const judged = { stream, fields: field, label, unit, advice, low, high, warning_low, warning_high, change: null, horizon_s: 0, questions: [] };
+  const known = { controls: description?.controls ?? [], diagnostics: limited || listed ? [judged] : [] };
+  const quantity = quantityOf(known, stream, field);
+  if (!listed) return { ...quantity, judged: limited ? judged : null };
+  return { ...quantity, label: [label, ...part.map(plain)].join(" · ") };
+}
+
+function plain(name: string): string {
+  return name.replaceAll("_", " ");
+}
+
+export interface Newest {
+  /** On the agent's wall clock [ms since 1970]. */
+  atMs: number;
+  value: number | boolean;
+}
+
+const JOINTS = "joints";
+const OF_JOINTS = ["position_rad", "velocity_rad_s", "effort_nm"] as const;
+const LOOP_AGE = "loop_age_ms";
+
+/** The newest of a field that this page has heard from the device; `null` before the first. */
+export function newestOf(device: DeviceStore, stream: string, field: string): Newest | null {
+  const message = stream === JOINTS ? device.telemetry.value?.message : device.measured(stream).value?.message;
+  if (message === undefined) return null;
+  const value = "values" in message ? message.values[field] : ofJoints(device, message, field);
+  return value === undefined ? null : { atMs: message.at_ms, value };
+}
+
+function ofJoints(device: DeviceStore, message: KnownTelemetry, field: string): number | undefined {
+  if (field === LOOP_AGE) return message.mode === "streaming" ? message.loop_age_ms : undefined;
+  const quantity = OF_JOINTS.find((one) => field.startsWith(`${one}.`));
+  if (quantity === undefined) return undefined;
+  const joint = device.description.value?.joints.findIndex(({ name }) => field === `${quantity}.${name}`) ?? -1;
+  return message[quantity][joint];
+}
+
+/** Whether what was heard of a stream is older than it should be. */
+export function isLate(device: DeviceStore, stream: string): boolean {
+  return stream === JOINTS ? !device.live.value : device.late(stream);
+}
+
+/** Of what is watched: what is found first, then in the order of the list. */
+export function worstFirst(fields: readonly Watched[]): Watched[] {
+  return [...fields].sort((one, other) => other.findings.length - one.findings.length);
+}
+
+/** What happened in the time around a fault [ms since 1970]. */
+export function around(fault: Fault, marginMs = 60_000): [fromMs: number, toMs: number] {
+  const end = fault.cleared_at === null ? Infinity : Date.parse(fault.cleared_at) + marginMs;
+  return [Date.parse(fault.raised_at) - marginMs, end];
+}

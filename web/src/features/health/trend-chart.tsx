@@ -1,0 +1,135 @@
+/** One measured field over hours, days, weeks: the stored series with its least and greatest, continued live. */
+import { useMemo, useState } from "preact/hooks";
+import type { Api } from "../../shared/api/client";
+import { serverNow } from "../../shared/lib/clock";
+import type { DeviceStore } from "../devices/model/device-store";
+import { isLate, newestOf, type Fault, type Watched } from "./model/health";
+import type { Quantity } from "../sensors/model/quantities";
+import type { Recording } from "../sensors/model/stored-series";
+import { texts } from "../../shared/i18n/texts";
+import { History, useRecording } from "../sensors/history-card";
+import { Card, Choice } from "../../shared/ui/parts";
+import { Figure, Limits, shown } from "../sensors/readings-card";
+
+type Span = keyof typeof texts.trend.spans;
+const HOUR_MS = 3_600_000;
+const SPAN_MS: Readonly<Record<Span, number>> = { "10min": HOUR_MS / 6, hour: HOUR_MS, day: 24 * HOUR_MS, week: 7 * 24 * HOUR_MS, month: 30 * 24 * HOUR_MS };
+const ROWS = 200;
+
+interface TrendProps {
+  api: Api;
+  device: DeviceStore;
+  quantity: Quantity;
+  /** What the detectors know of it; `null`: it is not watched. */
+  watched: Watched | null;
+  /** All that is and was wrong with the device. */
+  faults: readonly Fault[];
+}
+
+export function Trend({ api, device, quantity, watched, faults }: TrendProps) {
+  const [span, setSpan] = useState<Span>("hour");
+  const [view, setView] = useState<"chart" | "table">("chart");
+  const spanMs = SPAN_MS[span];
+  const { recording, trouble } = useRecording(api, device, quantity, spanMs);
+  const newest = newestOf(device, quantity.stream, quantity.field);
+  const late = isLate(device, quantity.stream);
+  const low = watched?.usual_low ?? null;
+  const high = watched?.usual_high ?? null;
+  const own = faults.filter(({ stream, field }) => stream === quantity.stream && field === quantity.field);
+  const since = serverNow() - spanMs;
+  const inSpan = own.filter(({ cleared_at: end }) => end === null || Date.parse(end) >= since);
+  const marks = {
+    usual: low === null || high === null ? null : ([quantity.shown(low), quantity.shown(high)] as const),
+    faults: inSpan.map(({ raised_at, cleared_at, severity }) => ({
+      from: Date.parse(raised_at) / 1000,
+      to: cleared_at === null ? null : Date.parse(cleared_at) / 1000,
+      severity,
+    })),
+  };
+  return (
+    <Card
+      title={quantity.label}
+      class="trend"
+      aside={<Choice label={texts.room.span} value={span} onChange={setSpan} options={Object.entries(texts.trend.spans) as [Span, string][]} />}
+    >
+      <div class="row">
+        <p class={`figure-now ${late ? "old" : ""}`} data-testid="trend-now" data-value={newest === null ? "" : Number(newest.value)}>
+          {newest === null ? (
+            <span class="quiet small">{texts.trend.notHeard}</span>
+          ) : typeof newest.value === "boolean" ? (
+            <strong>{texts.room.yesNo[newest.value ? 0 : 1]}</strong>
+          ) : (
+            <Figure quantity={quantity} value={newest.value} />
+          )}
+        </p>
+        <Choice label={texts.trend.view} value={view} onChange={setView} options={Object.entries(texts.trend.views) as ["chart" | "table", string][]} />
+      </div>
+      {view === "chart" ? (
+        <History recording={recording} quantity={quantity} spanMs={spanMs} binary={false} old={late} marks={marks} />
+      ) : (
+        <Rows recording={recording} quantity={quantity} spanMs={spanMs} />
+      )}
+      {quantity.judged !== null && <Limits quantity={quantity} />}
+      {watched !== null && <p class="quiet small">{usual(watched, quantity)}</p>}
+      {inSpan.length > 0 && (
+        <ul class="trend-faults" aria-label={texts.trend.faults}>
+          {inSpan.map((fault) => (
+            <li key={fault.id} class={fault.severity} data-testid="trend-fault" data-code={fault.code}>
+              {texts.trend.fault(
+                texts.care.kind[fault.kind] ?? fault.kind,
+                texts.sinceWhen(Date.parse(fault.raised_at)),
+                fault.cleared_at === null ? null : texts.sinceWhen(Date.parse(fault.cleared_at)),
+              )}
+            </li>
+          ))}
+        </ul>
+      )}
+      {trouble !== "" && <p class="quiet small">{texts.room.noHistory(trouble)}</p>}
+    </Card>
+  );
+}
+
+/** What the detectors have learnt of it, in words. */
+function usual({ usual_low: low, usual_high: high, slope_per_s: slope, limit_in_s: left }: Watched, quantity: Quantity): string {
+  const text = (value: number): string => `${shown(quantity, value)} ${quantity.unit}`.trim();
+  const said = [low === null || high === null ? texts.trend.learning : texts.trend.usual(text(low), text(high))];
+  const perMinute = slope === null ? 0 : (quantity.shown(slope) - quantity.shown(0)) * 60;
+  if (Math.abs(perMinute) >= 0.0005) said.push(texts.trend.slope(perMinute > 0, `${Math.abs(perMinute).toPrecision(2)} ${quantity.unit}`));
+  if (left !== null) said.push(texts.trend.limitIn(texts.lasting.about(left)));
+  return said.join(" ");
+}
+
+/** The same in figures, the newest first. */
+function Rows({ recording, quantity, spanMs }: { recording: Recording; quantity: Quantity; spanMs: number }) {
+  const samples = useMemo(() => recording.samples(serverNow() - spanMs).reverse(), [recording, spanMs, Math.floor(serverNow() / 2000)]);
+  return (
+    <>
+      <p class="quiet small" role="status">
+        {texts.trend.rows(Math.min(ROWS, samples.length), samples.length)}
+      </p>
+      <div class="scroll rows" tabIndex={0} role="region" aria-label={texts.room.values(quantity.label)}>
+        <table data-testid="trend-table">
+          <thead>
+            <tr>
+              {texts.trend.columns.map((name) => (
+                <th key={name} scope="col">
+                  {name}
+                </th>
+              ))}
+            </tr>
+          </thead>
+          <tbody>
+            {samples.slice(0, ROWS).map((one) => (
+              <tr key={one.at}>
+                <th scope="row">{texts.sinceWhen(one.at)}</th>
+                {[one.mean, one.low, one.high].map((value, index) => (
+                  <td key={index}>{`${shown(quantity, value)} ${quantity.unit}`}</td>
+                ))}
+              </tr>
+            ))}
+          </tbody>
+        </table>
+      </div>
+    </>
+  );
+}

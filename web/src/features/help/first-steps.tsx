@@ -1,0 +1,27 @@
+/** What who has no device yet can do: make an agent, run it, pair it; with a simulated robot where there is no other. */
+import { texts } from "../../shared/i18n/texts";
+import { Card } from "../../shared/ui/parts";
+import { robotTypesAddress } from "../../app/routes";
+import { AgentCommands } from "./agent-commands";
+import { WhatDoISee } from "./page-explainer";
+
+/** Comes with every installation, and is simulated unless somebody names a real one. */
+const EXAMPLE = { name: "arm", type: "ur5" };
+
+export function FirstSteps() {
+  const words = texts.help.first;
+  return (
+    <Card title={words.title} class="first-steps">
+      <p>{words.explained}</p>
+      <ol class="next-steps" data-testid="first-steps">
+        <AgentCommands {...EXAMPLE} />
+        <li>{words.pair}</li>
+      </ol>
+      <p>
+        {words.simulated} <a href={robotTypesAddress}>{words.types}</a>
+      </p>
+      <p class="quiet">{words.shared}</p>
+      <WhatDoISee page="fleet" />
+    </Card>
+  );
+}

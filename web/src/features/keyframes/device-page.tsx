@@ -1,0 +1,87 @@
+/** The keyframe editor of one device: the same for an arm, a humanoid, a base and a head. */
+import type { Account, Api } from "../../shared/api/client";
+import type { DeviceStore } from "../devices/model/device-store";
+import type { Fleet } from "../devices/model/device-list";
+import { texts } from "../../shared/i18n/texts";
+import { ControlBar } from "../control/control-bar";
+import { ReachChip } from "../../shared/ui/parts";
+import { deviceAddress, fleetAddress, keyframesAddress } from "../../app/routes";
+import { useStations } from "../devices/device-sessions";
+import { StopBanner } from "../control/stop-button";
+import { Desk } from "./editor";
+import { Loaded, useSource } from "./load-movement";
+import { measuredPose } from "./preview-twin";
+
+interface KeyframesPageProps {
+  api: Api;
+  fleet: Fleet;
+  account: Account;
+  id: string;
+  /** Of the movement; empty: a new one. */
+  name: string;
+}
+
+export function KeyframesPage({ api, fleet, account, id, name }: KeyframesPageProps) {
+  const devices = fleet.devices.value;
+  const device = devices?.get(id);
+  if (device === undefined) {
+    return (
+      <main class="page" id="content">
+        <p class="quiet">{devices === null ? texts.loading : texts.device.missing}</p>
+        {devices !== null && <a href={fleetAddress}>{texts.device.back}</a>}
+      </main>
+    );
+  }
+  return <OfDevice key={id} api={api} fleet={fleet} account={account} device={device} name={name} />;
+}
+
+interface OfDeviceProps {
+  api: Api;
+  fleet: Fleet;
+  account: Account;
+  device: DeviceStore;
+  name: string;
+}
+
+function OfDevice({ api, fleet, account, device, name }: OfDeviceProps) {
+  const [station] = useStations(api, fleet, [device], account);
+  const { robot_type: robotType, label } = device.info.value;
+  const loaded = useSource(api, robotType, name);
+  if (station === undefined) return null;
+  return (
+    <>
+      <ControlBar device={device} control={station.control} stop={station.stop} />
+      <main class="page operate kf-page" id="content">
+        <div class="heading">
+          <a href={deviceAddress(device.id)}>← {label}</a>
+          <h1>{texts.keyframes.title}</h1>
+          <p class="quiet">
+            {robotType.replaceAll("_", " ")}
+            {name !== "" && ` · ${name}`}
+          </p>
+          <p class="reach">
+            <ReachChip device={device} data-testid="online" />
+          </p>
+        </div>
+        <StopBanner device={device} stop={station.stop} />
+        <Loaded robotType={robotType} name={name} {...loaded}>
+          {(source) => (
+            <Desk
+              api={api}
+              name={name}
+              source={source}
+              robotType={robotType}
+              robot={device.description.value}
+              twin={device.twin.value}
+              measured={measuredPose(device)}
+              // A new movement begins where the robot is: its first word is waited for, where it is there to say one.
+              waits={measuredPose(device) === null && device.reach.value !== "offline"}
+              station={station}
+              address={(saved) => keyframesAddress(device.id, saved)}
+            />
+          )}
+        </Loaded>
+      </main>
+    </>
+  );
+}

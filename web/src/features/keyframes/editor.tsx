@@ -1,0 +1,119 @@
+/** What keyframes are edited with, with a robot or without. */
+import { useEffect, useRef, useState } from "preact/hooks";
+import type { Api } from "../../shared/api/client";
+import { begun, Drafts, Editor } from "./model/editor";
+import type { Positions, Robot } from "./model/keyframes";
+import type { KnownTwin } from "../../shared/mqtt/parse-messages";
+import type { Station } from "../devices/model/device-session";
+import { texts } from "../../shared/i18n/texts";
+import { KeyframeCard } from "./keyframe-inspector";
+import "./keyframes.css";
+import { Record } from "./record-panel";
+import { Save } from "./save-panel";
+import type { There } from "./load-movement";
+import { Problems, Timeline } from "./timeline";
+import { Twin } from "./preview-twin";
+
+interface DeskProps {
+  api: Api;
+  /** Of the movement; empty: a new one. */
+  name: string;
+  source: There;
+  robotType: string;
+  /** `null` until it has been heard of. */
+  robot: Robot | null;
+  twin: KnownTwin | null;
+  /** Where the robot is. */
+  measured: Positions | null;
+  /** Where a new movement begins that begins nowhere else. */
+  home?: Positions;
+  /** A new movement must not begin yet. */
+  waits: boolean;
+  /** `null`: there is no robot, and nothing can be recorded or run. */
+  station: Station | null;
+  /** Where a movement of this name is edited. */
+  address: (name: string) => string;
+}
+
+const drafts = new Drafts(localStorage);
+
+export function Desk(props: DeskProps) {
+  const { api, station, name: first, source, robotType, robot, twin, measured, waits, address } = props;
+  const begin = measured ?? props.home ?? null;
+  const [name, setName] = useState(first);
+  const [version, setVersion] = useState(source.version);
+  const [editor, setEditor] = useState<Editor | null>(null);
+  const draftOf = useRef(first);
+  const [restored, setRestored] = useState(false);
+  const [unkept, setUnkept] = useState(false);
+  const ready = robot !== null && (!waits || source.saved !== null);
+
+  // Made once: what becomes of the robot later, or of the connection, must not touch what is being edited.
+  useEffect(() => {
+    if (!ready || editor !== null) return;
+    const draft = drafts.read(robotType, first);
+    setRestored(draft !== null && JSON.stringify(draft) !== JSON.stringify(source.saved));
+    const from = { saved: source.saved, draft, fresh: begun(robot, begin) };
+    setEditor(new Editor(robot, from, (movement) => setUnkept(!drafts.keep(robotType, draftOf.current, movement))));
+  }, [ready, editor]);
+  useEffect(() => () => editor?.dispose(), [editor]);
+  useKeys(editor);
+
+  if (editor === null) return <p class="quiet">{texts.keyframes.waiting}</p>;
+  const onSaved = (saved: string, at: number): void => {
+    draftOf.current = saved;
+    setName(saved);
+    setVersion(at);
+    setRestored(false);
+    // The address of what it is now; the page stays as it is.
+    history.replaceState(null, "", address(saved));
+  };
+  return (
+    <>
+      {restored && (
+        <p class="notice warn kf-restored" role="status" data-testid="kf-restored">
+          {texts.keyframes.restored}{" "}
+          <button
+            type="button"
+            onClick={() => {
+              if (source.saved === null) editor.change(begun(editor.robot, begin));
+              else editor.revert();
+              setRestored(false);
+            }}
+          >
+            {source.saved === null ? texts.keyframes.beginAnew : texts.keyframes.revert}
+          </button>
+        </p>
+      )}
+      {unkept && <p class="notice warn">{texts.keyframes.unkept}</p>}
+      <div class="desk kf-desk">
+        <div class="column">
+          <Twin twin={twin} device={station?.device ?? null} editor={editor} />
+          <Timeline editor={editor} measured={measured} />
+          {station !== null && <Record device={station.device} editor={editor} />}
+        </div>
+        <div class="column">
+          <Save api={api} station={station} editor={editor} robotType={robotType} name={name} version={version} onSaved={onSaved} />
+          <Problems editor={editor} />
+          <KeyframeCard editor={editor} measured={measured} />
+        </div>
+      </div>
+    </>
+  );
+}
+
+/** Undo and redo by keys, but not in a field of text, which has its own. */
+function useKeys(editor: Editor | null): void {
+  useEffect(() => {
+    if (editor === null) return undefined;
+    const press = (event: KeyboardEvent): void => {
+      const typing = event.target instanceof HTMLInputElement && event.target.type === "text";
+      if (typing || !(event.ctrlKey || event.metaKey) || event.key.toLowerCase() !== "z") return;
+      event.preventDefault();
+      if (event.shiftKey) editor.redo();
+      else editor.undo();
+    };
+    addEventListener("keydown", press);
+    return () => removeEventListener("keydown", press);
+  }, [editor]);
+}

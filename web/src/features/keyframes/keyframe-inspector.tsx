@@ -1,0 +1,296 @@
+/** The keyframe that is chosen: its time, where its joints are, and what is done there. */
+import { useState } from "preact/hooks";
+import { degrees, radians } from "../../shared/lib/angles";
+import type { Editor } from "./model/editor";
+import {
+  can,
+  setDeed,
+  setPose,
+  setPosition,
+  setTime,
+  type Deed,
+  type Deeds,
+  type Keyframe,
+  type Positions,
+} from "./model/keyframes";
+import type { Joint } from "../../shared/mqtt/protocol.generated";
+import { texts } from "../../shared/i18n/texts";
+import { Card } from "../../shared/ui/parts";
+import { JointRow } from "../steering/joint-slider";
+
+interface KeyframeCardProps {
+  editor: Editor;
+  measured: Positions | null;
+}
+
+export function KeyframeCard({ editor, measured }: KeyframeCardProps) {
+  const index = editor.chosen.value;
+  const movement = editor.movement.value;
+  const keyframe = movement.keyframes[index];
+  if (keyframe === undefined) return null;
+  return (
+    <Card title={texts.keyframes.number(index + 1)} class="kf-keyframe">
+      <TimeFields key={index} editor={editor} index={index} keyframe={keyframe} />
+      <button
+        type="button"
+        data-testid="kf-take-pose"
+        disabled={measured === null}
+        title={measured === null ? texts.keyframes.notLive : undefined}
+        onClick={() => measured !== null && editor.change(setPose(movement, index, measured, editor.robot))}
+      >
+        {texts.keyframes.takePose}
+      </button>
+      <Joints editor={editor} index={index} keyframe={keyframe} measured={measured} />
+      <DeedFields editor={editor} index={index} keyframe={keyframe} />
+    </Card>
+  );
+}
+
+interface PartProps {
+  editor: Editor;
+  index: number;
+  keyframe: Keyframe;
+}
+
+function TimeFields({ editor, index, keyframe }: PartProps) {
+  const [shifting, setShifting] = useState(true);
+  const before = editor.movement.value.keyframes[index - 1];
+  const set = (time: number): void => editor.change(setTime(editor.movement.value, index, time, shifting));
+  if (before === undefined) return <p class="quiet small">{texts.keyframes.first}</p>;
+  return (
+    <div class="row kf-times">
+      <NumberField id="kf-time" label={texts.keyframes.time} value={keyframe.time_s} digits={2} onSet={set} />
+      <NumberField
+        id="kf-lasts"
+        label={texts.keyframes.lasts}
+        value={keyframe.time_s - before.time_s}
+        digits={2}
+        onSet={(lasts) => set(before.time_s + lasts)}
+      />
+      <label class="check">
+        <input type="checkbox" checked={shifting} onChange={(event) => setShifting(event.currentTarget.checked)} />
+        {texts.keyframes.shifting}
+      </label>
+    </div>
+  );
+}
+
+interface NumberFieldProps {
+  id: string;
+  label: string;
+  value: number;
+  digits: number;
+  onSet: (value: number) => void;
+}
+
+/** A number that counts at Enter or when the field is left. */
+export function NumberField({ id, label, value, digits, onSet }: NumberFieldProps) {
+  const [typed, setTyped] = useState<string | null>(null);
+  const commit = (): void => {
+    const wanted = Number(typed?.replace(",", "."));
+    if (typed !== null && typed.trim() !== "" && Number.isFinite(wanted)) onSet(wanted);
+    setTyped(null);
+  };
+  return (
+    <span class="kf-number-field">
+      <label for={id}>{label}</label>
+      <input
+        id={id}
+        type="text"
+        inputMode="decimal"
+        data-testid={id}
+        value={typed ?? value.toFixed(digits)}
+        onInput={(event) => setTyped(event.currentTarget.value)}
+        onBlur={commit}
+        onKeyDown={(event) => {
+          if (event.key === "Enter") commit();
+        }}
+      />
+    </span>
+  );
+}
+
+function Joints({ editor, index, keyframe, measured }: PartProps & { measured: Positions | null }) {
+  const { robot } = editor;
+  const followers = new Set(robot.mirrors.map(({ joint }) => joint));
+  const pose = editor.poseAtKeyframe(index);
+  const wrong = new Set(editor.problems.value.flatMap(({ keyframe: at, joint }) => (at === index && joint !== null ? [joint] : [])));
+  return (
+    <div class="kf-joints" role="group" aria-label={texts.keyframes.joints} tabIndex={0} onPointerUp={() => editor.settle()}>
+      {robot.joints
+        .filter(({ name }) => !followers.has(name))
+        .map((joint) => (
+          <JointOf
+            key={joint.name}
+            editor={editor}
+            index={index}
+            joint={joint}
+            here={joint.name in keyframe.position_rad}
+            target={keyframe.position_rad[joint.name] ?? pose[joint.name]}
+            measured={measured?.[joint.name]}
+            wrong={wrong.has(joint.name)}
+          />
+        ))}
+    </div>
+  );
+}
+
+interface JointOfProps {
+  editor: Editor;
+  index: number;
+  joint: Joint;
+  /** Whether this keyframe says where it is; else it only passes here. */
+  here: boolean;
+  target: number | undefined;
+  measured: number | undefined;
+  wrong: boolean;
+}
+
+function JointOf({ editor, index, joint, here, target, measured, wrong }: JointOfProps) {
+  const set = (position: number | null): void =>
+    editor.change(
+      setPosition(editor.movement.value, index, joint, position, editor.robot),
+      position === null ? "" : `${index}-${joint.name}`,
+    );
+  const start = (joint.lower_rad + joint.upper_rad) / 2;
+  return (
+    <div class={`kf-joint ${here ? "" : "passes"} ${wrong ? "wrong" : ""}`}>
+      <JointRow joint={joint} targetRad={target ?? start} measuredRad={measured} onSet={set} />
+      <label class="check small quiet">
+        <input
+          type="checkbox"
+          data-testid={`kf-here-${joint.name}`}
+          aria-label={texts.keyframes.hereFor(joint.label)}
+          checked={here}
+          onChange={(event) => set(event.currentTarget.checked ? (target ?? start) : null)}
+        />
+        {here ? texts.keyframes.here : texts.keyframes.passes}
+      </label>
+    </div>
+  );
+}
+
+/** What else is done there: only what the robot says that it can do. */
+function DeedFields({ editor, index, keyframe }: PartProps) {
+  const { robot } = editor;
+  const set = <D extends Deed>(deed: D, value: Deeds[D] | undefined): void =>
+    editor.change(setDeed(editor.movement.value, index, deed, value), `${index}-${deed}`);
+  const named = [
+    ["posture", robot.postures],
+    ["behaviour", robot.behaviours],
+    ["express", robot.expressions],
+  ] as const;
+  const { say, drive, go_to: place } = keyframe;
+  if (!Object.keys(texts.keyframes.deeds).some((deed) => can(robot, deed as Deed))) return null;
+  return (
+    <fieldset class="kf-deeds" onFocusOut={() => editor.settle()}>
+      <legend>{texts.keyframes.deedsTitle}</legend>
+      <p class="quiet small">{texts.keyframes.deedsNote}</p>
+      {named.map(
+        ([deed, names]) =>
+          can(robot, deed) && (
+            <div class="field" key={deed}>
+              <label for={`kf-${deed}`}>{texts.keyframes.deeds[deed]}</label>
+              <select
+                id={`kf-${deed}`}
+                data-testid={`kf-${deed}`}
+                value={keyframe[deed] ?? ""}
+                onChange={(event) => set(deed, event.currentTarget.value === "" ? undefined : event.currentTarget.value)}
+              >
+                <option value="">{texts.keyframes.nothing}</option>
+                {names.map((name) => (
+                  <option key={name}>{name}</option>
+                ))}
+              </select>
+            </div>
+          ),
+      )}
+      {can(robot, "say") && (
+        <div class="field">
+          <label for="kf-say">{texts.keyframes.deeds.say}</label>
+          <input
+            id="kf-say"
+            type="text"
+            data-testid="kf-say"
+            maxLength={500}
+            value={say ?? ""}
+            onInput={(event) => set("say", event.currentTarget.value === "" ? undefined : event.currentTarget.value)}
+          />
+        </div>
+      )}
+      {can(robot, "drive") && (
+        <Toggle
+          deed="drive"
+          on={drive !== undefined}
+          onToggle={(on) => set("drive", on ? { forward_m_s: 0.1, turn_rad_s: 0, duration_s: 2 } : undefined)}
+        >
+          {drive !== undefined && (
+            <div class="row">
+              <NumberField
+                id="kf-forward"
+                label={texts.keyframes.forward}
+                value={drive.forward_m_s}
+                digits={2}
+                onSet={(forward_m_s) => set("drive", { ...drive, forward_m_s })}
+              />
+              <NumberField
+                id="kf-turn"
+                label={texts.keyframes.turn}
+                value={degrees(drive.turn_rad_s)}
+                digits={0}
+                onSet={(turn) => set("drive", { ...drive, turn_rad_s: round(radians(turn)) })}
+              />
+              <NumberField
+                id="kf-duration"
+                label={texts.keyframes.duration}
+                value={drive.duration_s}
+                digits={1}
+                onSet={(duration_s) => set("drive", { ...drive, duration_s })}
+              />
+            </div>
+          )}
+        </Toggle>
+      )}
+      {can(robot, "go_to") && (
+        <Toggle deed="go_to" on={place !== undefined} onToggle={(on) => set("go_to", on ? { x_m: 0, y_m: 0 } : undefined)}>
+          {place !== undefined && (
+            <div class="row">
+              <NumberField id="kf-x" label={texts.keyframes.x} value={place.x_m} digits={2} onSet={(x_m) => set("go_to", { ...place, x_m })} />
+              <NumberField id="kf-y" label={texts.keyframes.y} value={place.y_m} digits={2} onSet={(y_m) => set("go_to", { ...place, y_m })} />
+              <NumberField
+                id="kf-yaw"
+                label={texts.keyframes.yaw}
+                value={degrees(place.yaw_rad ?? 0)}
+                digits={0}
+                onSet={(yaw) => set("go_to", { ...place, yaw_rad: round(radians(yaw)) })}
+              />
+            </div>
+          )}
+        </Toggle>
+      )}
+    </fieldset>
+  );
+}
+
+function round(value: number): number {
+  return Number(value.toFixed(4));
+}
+
+interface ToggleProps {
+  deed: "drive" | "go_to";
+  on: boolean;
+  onToggle: (on: boolean) => void;
+  children: preact.ComponentChildren;
+}
+
+function Toggle({ deed, on, onToggle, children }: ToggleProps) {
+  return (
+    <div class="field">
+      <label class="check">
+        <input type="checkbox" data-testid={`kf-${deed}`} checked={on} onChange={(event) => onToggle(event.currentTarget.checked)} />
+        {texts.keyframes.deeds[deed]}
+      </label>
+      {children}
+    </div>
+  );
+}

@@ -1,0 +1,194 @@
+/** One movement that is being edited: its changes, what is chosen, the preview, and the draft that outlives the page. */
+import { computed, effect, signal, type ReadonlySignal } from "@preact/signals-core";
+import {
+  addAfter,
+  duplicate,
+  plan,
+  poseAt,
+  poseOf,
+  problems,
+  remove,
+  type Movement,
+  type Positions,
+  type Robot,
+} from "./keyframes";
+import { readMovement } from "./script-codec";
+import { Undoable } from "../../../shared/lib/undo-history";
+
+/** What keeps drafts: a browser's storage. */
+export type Storage = Pick<globalThis.Storage, "getItem" | "setItem" | "removeItem">;
+
+export class Editor {
+  readonly robot: Robot;
+  readonly #history: Undoable<Movement>;
+  readonly #chosen = signal(0);
+  readonly #at = signal(0);
+  readonly #playing = signal(false);
+  readonly #saved;
+  readonly #forget: () => void;
+
+  readonly movement: ReadonlySignal<Movement>;
+  readonly canUndo: ReadonlySignal<boolean>;
+  readonly canRedo: ReadonlySignal<boolean>;
+  readonly plan;
+  readonly problems;
+  /** Index of the keyframe that is being edited. */
+  readonly chosen;
+  /** Where the preview is, in the time that the robot would need [s]. */
+  readonly at: ReadonlySignal<number> = this.#at;
+  readonly playing: ReadonlySignal<boolean> = this.#playing;
+  /** Whether the movement is another than the one that the cloud has. */
+  readonly changed;
+  /** Where the joints are at this moment of the preview [rad]. */
+  readonly pose;
+
+  /** `saved`: as the cloud has it, `null`: it has none. `draft`: what was left here before. `fresh`: where neither is. */
+  constructor(
+    robot: Robot,
+    from: { saved: Movement | null; draft: Movement | null; fresh: Movement },
+    keep: (movement: Movement | null) => void,
+  ) {
+    const { saved, draft, fresh } = from;
+    this.robot = robot;
+    const history = new Undoable(draft ?? saved ?? fresh);
+    this.#history = history;
+    this.#saved = signal(saved);
+    this.movement = history.now;
+    this.canUndo = history.canUndo;
+    this.canRedo = history.canRedo;
+    this.plan = computed(() => plan(history.now.value, robot));
+    this.problems = computed(() => problems(history.now.value, robot));
+    this.chosen = computed(() => Math.min(this.#chosen.value, history.now.value.keyframes.length - 1));
+    this.changed = computed(() => JSON.stringify(history.now.value) !== JSON.stringify(this.#saved.value));
+    this.pose = computed(() => this.plan.value.at(this.#at.value));
+    // What nobody has touched yet is no draft.
+    this.#forget = effect(() => keep(this.changed.value && (draft !== null || this.canUndo.value) ? this.movement.value : null));
+  }
+
+  change(next: Movement, gesture = ""): void {
+    this.#playing.value = false;
+    this.#history.change(next, gesture);
+    this.#show();
+  }
+
+  /** The end of a drag. */
+  settle(): void {
+    this.#history.settle();
+  }
+
+  undo(): void {
+    this.#history.undo();
+    this.#show();
+  }
+
+  redo(): void {
+    this.#history.redo();
+    this.#show();
+  }
+
+  choose(index: number): void {
+    this.#playing.value = false;
+    this.#chosen.value = Math.max(0, Math.min(index, this.movement.value.keyframes.length - 1));
+    this.#show();
+  }
+
+  /** A keyframe after the one that is chosen, with all joints as they are there. */
+  add(positions: Positions): void {
+    this.change(addAfter(this.movement.value, this.chosen.value, poseOf(positions, this.robot)));
+    this.choose(this.chosen.value + 1);
+  }
+
+  copy(): void {
+    this.change(duplicate(this.movement.value, this.chosen.value));
+    this.choose(this.chosen.value + 1);
+  }
+
+  drop(): void {
+    this.change(remove(this.movement.value, this.chosen.value));
+    this.choose(this.chosen.value);
+  }
+
+  /** Every joint at a keyframe, also those that are only on their way there [rad]. */
+  poseAtKeyframe(index: number): Positions {
+    return this.plan.value.at(this.plan.value.reached_s[index] ?? 0);
+  }
+
+  /** The preview to a moment, on the scale of the keyframes' own times [s]. */
+  scrub(asked_s: number): void {
+    this.#playing.value = false;
+    this.#at.value = this.plan.value.played(asked_s);
+  }
+
+  play(): void {
+    if (this.#at.value >= this.plan.value.duration_s - 1e-6) this.#at.value = 0;
+    this.#playing.value = true;
+  }
+
+  pause(): void {
+    this.#playing.value = false;
+  }
+
+  /** So much time has passed [s]. */
+  tick(passed_s: number): void {
+    if (!this.#playing.value) return;
+    this.#at.value = Math.min(this.#at.value + passed_s, this.plan.value.duration_s);
+    if (this.#at.value >= this.plan.value.duration_s) this.#playing.value = false;
+  }
+
+  /** The cloud has it now as it is. */
+  saved(movement: Movement): void {
+    this.#saved.value = movement;
+  }
+
+  /** Back to what the cloud has; that can be undone. */
+  revert(): void {
+    if (this.#saved.value !== null) this.change(this.#saved.value);
+    this.choose(0);
+  }
+
+  dispose(): void {
+    this.#forget();
+  }
+
+  #show(): void {
+    this.#at.value = this.plan.value.reached_s[this.chosen.value] ?? 0;
+  }
+}
+
+/** A movement of one keyframe: the robot as it is, or, where nobody knows that, with every joint at 0 or next to it. */
+export function begun(robot: Robot, measured: Positions | null): Movement {
+  const positions = measured ?? poseAt(Object.fromEntries(robot.joints.map(({ name }) => [name, 0])), robot);
+  return { description: "", keyframes: [{ time_s: 0, position_rad: poseOf(positions, robot) }] };
+}
+
+/** Drafts by robot type and name; a movement without a name yet has one draft a robot type. */
+export class Drafts {
+  readonly #storage: Storage;
+
+  constructor(storage: Storage) {
+    this.#storage = storage;
+  }
+
+  read(robotType: string, name: string): Movement | null {
+    try {
+      return readMovement(JSON.parse(this.#storage.getItem(key(robotType, name)) ?? "null"));
+    } catch {
+      return null; // Nothing that can be read is no draft.
+    }
+  }
+
+  /** Whether it could be kept: a browser's storage can be full, or forbidden. */
+  keep(robotType: string, name: string, movement: Movement | null): boolean {
+    try {
+      if (movement === null) this.#storage.removeItem(key(robotType, name));
+      else this.#storage.setItem(key(robotType, name), JSON.stringify(movement));
+      return true;
+    } catch {
+      return false;
+    }
+  }
+}
+
+function key(robotType: string, name: string): string {
+  return `telescope.keyframes.${robotType}.${name}`;
+}

@@ -1,0 +1,163 @@
+/** What a robot did, as its telemetry told it, and as few keyframes that come near enough to it. */
+import { signal, type ReadonlySignal } from "@preact/signals-core";
+import { fromZero, poseOf, tidy, type Keyframe, type Movement, type Positions, type Robot } from "./keyframes";
+import type { KnownEvent, KnownTelemetry } from "../../../shared/mqtt/parse-messages";
+
+export interface Sample {
+  /** Since the beginning [s]. */
+  time_s: number;
+  position_rad: readonly number[];
+}
+
+/** Nothing was heard between these times [s]: the way there is a guess. */
+export interface Gap {
+  from_s: number;
+  to_s: number;
+}
+
+export interface Take {
+  samples: readonly Sample[];
+  gaps: readonly Gap[];
+  said: readonly { time_s: number; text: string }[];
+}
+
+const NOTHING: Take = { samples: [], gaps: [], said: [] };
+/** Five samples of 20 a second. */
+const GAP_S = 0.25;
+/** Twenty minutes of 20 a second. */
+const MOST = 24_000;
+
+export class Recorder {
+  readonly #take = signal<Take>(NOTHING);
+  readonly #running = signal(false);
+  #samples: Sample[] = [];
+  #gaps: Gap[] = [];
+  #said: { time_s: number; text: string }[] = [];
+  #last: KnownTelemetry | null = null;
+
+  readonly take: ReadonlySignal<Take> = this.#take;
+  readonly running: ReadonlySignal<boolean> = this.#running;
+
+  start(): void {
+    [this.#samples, this.#gaps, this.#said, this.#last] = [[], [], [], null];
+    this.#running.value = true;
+    this.#tell();
+  }
+
+  stop(): void {
+    this.#running.value = false;
+    this.#tell();
+  }
+
+  /** On the robot's own clock; where that has begun again, on the wall's. */
+  hear(message: KnownTelemetry): void {
+    if (!this.#running.value || message === this.#last) return;
+    const last = this.#last;
+    const ticks = last === null ? 0 : message.tick_ms - last.tick_ms;
+    const since = last === null ? 0 : (ticks > 0 ? ticks : Math.max(1, message.at_ms - last.at_ms)) / 1000;
+    const before = this.#samples.at(-1)?.time_s ?? 0;
+    const time_s = before + since;
+    if (since > GAP_S) this.#gaps.push({ from_s: before, to_s: time_s });
+    this.#samples.push({ time_s, position_rad: message.position_rad });
+    this.#last = message;
+    if (this.#samples.length >= MOST) this.stop();
+    else if (this.#samples.length % 10 === 0 || last === null) this.#tell();
+  }
+
+  /** What the robot said is a fact of this moment. */
+  hearEvent(event: KnownEvent): void {
+    const text = event.data["text"];
+    if (!this.#running.value || event.kind !== "said" || typeof text !== "string" || this.#last === null) return;
+    const begun_ms = this.#last.at_ms - (this.#samples.at(-1)?.time_s ?? 0) * 1000;
+    this.#said.push({ time_s: Math.max(0, (event.at_ms - begun_ms) / 1000), text });
+    this.#tell();
+  }
+
+  /** Of an earlier page. */
+  restore(take: Take): void {
+    this.#take.value = take;
+  }
+
+  forget(): void {
+    this.#take.value = NOTHING;
+  }
+
+  #tell(): void {
+    this.#take.value = { samples: [...this.#samples], gaps: [...this.#gaps], said: [...this.#said] };
+  }
+}
+
+/** Between two times; they count from the first. */
+export function trim(take: Take, from_s: number, to_s: number): Take {
+  const within = (time: number): boolean => time >= from_s && time <= to_s;
+  return {
+    samples: take.samples.filter(({ time_s }) => within(time_s)),
+    gaps: take.gaps.filter((gap) => within(gap.from_s) && within(gap.to_s)),
+    said: take.said.filter(({ time_s }) => within(time_s)),
+  };
+}
+
+/** Indices of the samples that are kept, so that none is further from the lines between them (Ramer–Douglas–Peucker). */
+export function kept(samples: readonly Sample[], toleranceRad: number, always: ReadonlySet<number>): number[] {
+  const found = new Set([0, samples.length - 1, ...always]);
+  const open = pairs([...found].sort((a, b) => a - b));
+  for (let pair = open.pop(); pair !== undefined; pair = open.pop()) {
+    const [begin, end] = pair;
+    let worst = { index: -1, off: toleranceRad };
+    for (let index = begin + 1; index < end; index += 1) {
+      const off = offLine(samples, begin, end, index);
+      if (off > worst.off) worst = { index, off };
+    }
+    if (worst.index < 0) continue;
+    found.add(worst.index);
+    open.push([begin, worst.index], [worst.index, end]);
+  }
+  return [...found].filter((index) => index >= 0).sort((a, b) => a - b);
+}
+
+function pairs(list: readonly number[]): [number, number][] {
+  return list.slice(1).map((one, index) => [list[index] ?? 0, one]);
+}
+
+/** How far a sample is from the line between two others, in the joint that is furthest from it [rad]. */
+function offLine(samples: readonly Sample[], begin: number, end: number, index: number): number {
+  const [from, to, one] = [samples[begin], samples[end], samples[index]];
+  if (from === undefined || to === undefined || one === undefined) return 0;
+  const share = (one.time_s - from.time_s) / (to.time_s - from.time_s);
+  return one.position_rad.reduce((most, place, joint) => {
+    const [a, b] = [from.position_rad[joint] ?? place, to.position_rad[joint] ?? place];
+    return Math.max(most, Math.abs(place - (a + share * (b - a))));
+  }, 0);
+}
+
+/** Keyframes that come as near as `toleranceRad` to what was recorded. Joints that did not move are named once. */
+export function keyframesOf(take: Take, toleranceRad: number, robot: Robot): Keyframe[] {
+  const { samples } = take;
+  if (samples.length === 0) return [];
+  const edges = new Set(take.gaps.flatMap(({ from_s, to_s }) => [indexAt(samples, from_s), indexAt(samples, to_s)]));
+  const words = new Map(take.said.map(({ time_s, text }) => [indexAt(samples, time_s), text]));
+  const indices = kept(samples, toleranceRad, new Set([...edges, ...words.keys()]));
+  const moved = robot.joints.filter((_, joint) => {
+    const places = samples.map(({ position_rad }) => position_rad[joint] ?? 0);
+    return Math.max(...places) - Math.min(...places) > toleranceRad;
+  });
+  const made = indices.map((index, number): Keyframe => {
+    const sample = samples[index];
+    const all: Positions = Object.fromEntries(robot.joints.map(({ name }, joint) => [name, sample?.position_rad[joint] ?? 0]));
+    const pose = poseOf(all, robot);
+    const named = moved.map(({ name }) => name);
+    const say = words.get(index);
+    return {
+      time_s: tidy(sample?.time_s ?? 0, 0, Infinity),
+      position_rad: number === 0 ? pose : Object.fromEntries(Object.entries(pose).filter(([name]) => named.includes(name))),
+      ...(say === undefined ? {} : { say }),
+    };
+  });
+  const movement: Movement = { description: "", keyframes: made };
+  return [...fromZero(movement).keyframes];
+}
+
+function indexAt(samples: readonly Sample[], time: number): number {
+  const found = samples.findIndex(({ time_s }) => time_s >= time - 1e-9);
+  return found < 0 ? samples.length - 1 : found;
+}

@@ -1,0 +1,142 @@
+/**
+ * Where a joint is between keyframes, as the robot will play them: `device_agent/runtime/planning/keyframe_trajectory.py` does the same, and
+ * `tests/unit/device_agent/runtime/planning/timelines.json` holds both equal. Between two places a polynomial of the fifth degree that accelerates
+ * at neither; its speed where it passes is the harmonic mean of what it needs before and after, so that it never goes back.
+ */
+import { clamp } from "../../../shared/lib/angles";
+import type { Joint } from "../../../shared/mqtt/protocol.generated";
+
+export type JointLimits = Pick<Joint, "max_velocity_rad_s" | "max_acceleration_rad_s2" | "max_jerk_rad_s3">;
+
+/** One place at which a joint is at a time [s], [rad]. */
+export interface Stay {
+  number: number;
+  place: number;
+}
+
+/** What limits a stretch most. */
+export type Limiting = "velocity" | "acceleration" | "jerk";
+
+export interface Stretch {
+  /** How many times as long it must take; up to 1 it is slow enough. */
+  over: number;
+  by: Limiting;
+}
+
+/** More than this is too fast: a little is rounding. */
+export const FITS = 1.0005;
+const LOOKS = 33;
+const TRIES = 100;
+
+type Parts = readonly [way: number, begin: number, end: number];
+
+/** Rows: place, speed, acceleration, jerk; columns: of the way, of the speed at the beginning, at the end. */
+function shape(u: number): readonly Parts[] {
+  const [u2, u3, u4] = [u * u, u ** 3, u ** 4];
+  return [
+    [10 * u3 - 15 * u4 + 6 * u4 * u, u - 6 * u3 + 8 * u4 - 3 * u4 * u, -4 * u3 + 7 * u4 - 3 * u4 * u],
+    [30 * u2 - 60 * u3 + 30 * u4, 1 - 18 * u2 + 32 * u3 - 15 * u4, -12 * u2 + 28 * u3 - 15 * u4],
+    [60 * u - 180 * u2 + 120 * u3, -36 * u + 96 * u2 - 60 * u3, -24 * u + 84 * u2 - 60 * u3],
+    [60 - 360 * u + 360 * u2, -36 + 192 * u - 180 * u2, -24 + 168 * u - 180 * u2],
+  ];
+}
+
+const LOOK = Array.from({ length: LOOKS }, (_, index) => shape(index / (LOOKS - 1)));
+
+function sum(row: Parts | undefined, parts: Parts): number {
+  return row === undefined ? 0 : row[0] * parts[0] + row[1] * parts[1] + row[2] * parts[2];
+}
+
+/** One joint's way through its places. Before and after it rests. */
+export class Curve {
+  readonly times: readonly number[];
+  readonly places: readonly number[];
+  readonly #speeds: readonly number[];
+
+  constructor(times: readonly number[], places: readonly number[]) {
+    this.times = times;
+    this.places = places;
+    const slopes = places.slice(1).map((place, index) => (place - at(places, index)) / (at(times, index + 1) - at(times, index)));
+    this.#speeds = places.map((_, index) => {
+      const [before, after] = [slopes[index - 1] ?? 0, slopes[index] ?? 0];
+      return before * after > 0 ? (2 * before * after) / (before + after) : 0;
+    });
+  }
+
+  /** Where it is at a time [rad]. */
+  at(time: number): number {
+    const end = this.times.findIndex((one) => one > time);
+    if (end === 0) return at(this.places, 0);
+    if (end < 0) return at(this.places, this.places.length - 1);
+    const [from, to] = [at(this.places, end - 1), at(this.places, end)];
+    const lasts = at(this.times, end) - at(this.times, end - 1);
+    const row = shape((time - at(this.times, end - 1)) / lasts)[0];
+    return clamp(from + sum(row, this.#parts(end)), Math.min(from, to), Math.max(from, to));
+  }
+
+  /** How fast each stretch is for a joint; the first leads to the second place. */
+  stretches(joint: JointLimits): Stretch[] {
+    return this.places.slice(1).map((_, index) => this.#stretch(index + 1, joint));
+  }
+
+  #stretch(end: number, joint: JointLimits): Stretch {
+    const parts = this.#parts(end);
+    const lasts = at(this.times, end) - at(this.times, end - 1);
+    const most = (order: number): number => Math.max(...LOOK.map((rows) => Math.abs(sum(rows[order], parts)))) / lasts ** order;
+    const all: Stretch[] = [
+      { by: "velocity", over: most(1) / joint.max_velocity_rad_s },
+      { by: "acceleration", over: Math.sqrt(most(2) / joint.max_acceleration_rad_s2) },
+      { by: "jerk", over: Math.cbrt(most(3) / joint.max_jerk_rad_s3) },
+    ];
+    return all.reduce((worst, one) => (one.over > worst.over ? one : worst));
+  }
+
+  #parts(end: number): Parts {
+    const lasts = at(this.times, end) - at(this.times, end - 1);
+    const way = at(this.places, end) - at(this.places, end - 1);
+    return [way, at(this.#speeds, end - 1) * lasts, at(this.#speeds, end) * lasts];
+  }
+}
+
+export function at(list: readonly number[], index: number): number {
+  return list[index] ?? NaN;
+}
+
+/** Times from the gaps between them. */
+export function moments(gaps: readonly number[]): number[] {
+  const found = [0];
+  for (const gap of gaps) found.push((found.at(-1) ?? 0) + gap);
+  return found;
+}
+
+export function curveOf(stays: readonly Stay[], times: readonly number[]): Curve {
+  return new Curve(
+    stays.map(({ number }) => at(times, number)),
+    stays.map(({ place }) => place),
+  );
+}
+
+/**
+ * The gaps between keyframes [s], each as long as the limits ask for: as the robot does it, when they are too short. A
+ * longer one changes the speed in others, hence again and again.
+ */
+export function fitted(gaps: readonly number[], tracks: readonly { joint: JointLimits; stays: readonly Stay[] }[]): number[] {
+  let now = [...gaps];
+  let longest = 1;
+  for (let tries = 0; tries < TRIES; tries += 1) {
+    const longer = now.map(() => 1);
+    const times = moments(now);
+    for (const { joint, stays } of tracks) {
+      curveOf(stays, times)
+        .stretches(joint)
+        .forEach(({ over }, index) => {
+          const [begin, end] = [stays[index]?.number ?? 0, stays[index + 1]?.number ?? 0];
+          for (let gap = begin; gap < end; gap += 1) longer[gap] = Math.max(at(longer, gap), over);
+        });
+    }
+    longest = Math.max(1, ...longer);
+    if (longest <= FITS) return now;
+    now = now.map((gap, index) => gap * at(longer, index));
+  }
+  return now.map((gap) => gap * longest);
+}

@@ -1,0 +1,86 @@
+/** The movement on the robot's twin, and the robot itself as a shadow of it. */
+import { useSignalEffect } from "@preact/signals";
+import { useEffect } from "preact/hooks";
+import type { DeviceStore } from "../devices/model/device-store";
+import type { Editor } from "./model/editor";
+import type { KnownTwin } from "../../shared/mqtt/parse-messages";
+import type { Positions } from "./model/keyframes";
+import { texts } from "../../shared/i18n/texts";
+import { Card } from "../../shared/ui/parts";
+import type { LiveScene } from "../twin/scene";
+import { useScene } from "../twin/use-scene";
+
+/** Where the robot is measured to be, while that is what it is [rad]. */
+export function measuredPose(device: DeviceStore): Positions | null {
+  const message = device.telemetry.value?.message;
+  const joints = device.description.value?.joints;
+  if (message === undefined || joints === undefined || !device.live.value) return null;
+  return Object.fromEntries(joints.map(({ name }, index) => [name, message.position_rad[index] ?? 0]));
+}
+
+interface TwinProps {
+  twin: KnownTwin | null;
+  /** Whose measured pose is the shadow; `null`: a robot type without a robot. */
+  device: DeviceStore | null;
+  editor: Editor;
+}
+
+export function Twin({ twin, device, editor }: TwinProps) {
+  const { canvas, box, scene, said } = useScene(twin);
+  usePreviewClock(editor);
+  const playing = editor.playing.value;
+  const count = editor.movement.value.keyframes.length;
+  return (
+    <Card
+      title={texts.keyframes.twin}
+      class="view kf-twin"
+      aside={
+        <button type="button" class="plain" onClick={() => scene?.resetView()} disabled={scene === null}>
+          {texts.view.reset}
+        </button>
+      }
+    >
+      {scene !== null && <Follow scene={scene} device={device} editor={editor} />}
+      <div ref={box} class="canvas-box" data-testid="kf-view" data-frames="0">
+        {/* Keyed: a canvas whose context is gone cannot be drawn on again. */}
+        <canvas key={twin} ref={canvas} aria-label={texts.keyframes.twinLabel} role="img" />
+        {twin === null && <p class="over quiet">{texts.view.waiting}</p>}
+        {said !== "" && <p class="over notice">{said}</p>}
+        <p class={`tag ${playing ? "kf-preview" : ""}`}>
+          {playing ? texts.keyframes.previewing : texts.keyframes.numberOf(editor.chosen.value + 1, count)}
+        </p>
+      </div>
+      <p class="quiet small kf-legend">
+        {device === null ? (
+          texts.keyframes.noRobot
+        ) : (
+          <>
+            <span class="kf-swatch" aria-hidden="true" /> {device.live.value ? texts.keyframes.ghost : texts.keyframes.noGhost}
+          </>
+        )}
+      </p>
+    </Card>
+  );
+}
+
+function Follow({ scene, device, editor }: { scene: LiveScene; device: DeviceStore | null; editor: Editor }) {
+  useSignalEffect(() => scene.show(editor.pose.value, device === null ? null : measuredPose(device)));
+  return null;
+}
+
+/** The preview goes on with each frame that the browser draws. */
+function usePreviewClock(editor: Editor): void {
+  const playing = editor.playing.value;
+  useEffect(() => {
+    if (!playing) return undefined;
+    let before: number | null = null;
+    let asked = 0;
+    const step = (time: number): void => {
+      editor.tick(before === null ? 0 : (time - before) / 1000);
+      before = time;
+      asked = requestAnimationFrame(step);
+    };
+    asked = requestAnimationFrame(step);
+    return () => cancelAnimationFrame(asked);
+  }, [editor, playing]);
+}

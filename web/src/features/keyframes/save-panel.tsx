@@ -1,0 +1,165 @@
+/** The movement's name; saving it as a script, and running that on the robot. */
+import { useState } from "preact/hooks";
+import type { Api } from "../../shared/api/client";
+import { sentence } from "../../shared/api/http";
+import type { Editor } from "./model/editor";
+import { LONGEST_SCRIPT, writeScript } from "./model/script-codec";
+import { MovementChanged } from "../movements/model/movement-library";
+import type { Station } from "../devices/model/device-session";
+import { texts } from "../../shared/i18n/texts";
+import { RunStatus } from "../actions/run-status";
+import { Card } from "../../shared/ui/parts";
+import { whyNotAct } from "../devices/availability";
+
+interface SaveProps {
+  api: Api;
+  /** `null`: there is no robot that it could run on. */
+  station: Station | null;
+  editor: Editor;
+  robotType: string;
+  /** As the cloud knows it; empty: not yet. */
+  name: string;
+  /** Of the version that this was made from; 0: of none. */
+  version: number;
+  onSaved: (name: string, version: number) => void;
+}
+
+export function Save({ api, station, editor, robotType, name, version, onSaved }: SaveProps) {
+  const [wanted, setWanted] = useState(name);
+  const [busy, setBusy] = useState(false);
+  const [said, setSaid] = useState("");
+  const [newer, setNewer] = useState<number | null>(null);
+  const movement = editor.movement.value;
+  const errors = editor.problems.value.filter(({ severity }) => severity === "error").length;
+  const source = writeScript(movement);
+  const tooLong = source.length > LONGEST_SCRIPT;
+  const named = /^[A-Za-z0-9_-]{1,64}$/.test(wanted);
+  const changed = editor.changed.value || wanted !== name;
+
+  /** Gives whether the cloud has it now. */
+  const save = async (basedOn = wanted === name ? version : 0): Promise<boolean> => {
+    setBusy(true);
+    setSaid("");
+    setNewer(null);
+    try {
+      const made = await api.library.save(robotType, wanted, source, basedOn);
+      editor.saved(movement);
+      onSaved(wanted, made.version);
+      setSaid(texts.keyframes.savedAs(made.version));
+      return true;
+    } catch (error) {
+      if (error instanceof MovementChanged) setNewer(error.version);
+      else setSaid(sentence(error));
+      return false;
+    } finally {
+      setBusy(false);
+    }
+  };
+
+  return (
+    <Card title={texts.keyframes.script} class="kf-save">
+      <div class="row kf-names">
+        <div class="field">
+          <label for="kf-name">{texts.keyframes.name}</label>
+          <input
+            id="kf-name"
+            type="text"
+            data-testid="kf-name"
+            value={wanted}
+            autocomplete="off"
+            spellcheck={false}
+            aria-describedby="kf-name-note"
+            onInput={(event) => setWanted(event.currentTarget.value)}
+          />
+        </div>
+        <div class="field kf-description">
+          <label for="kf-description">{texts.keyframes.description}</label>
+          <input
+            id="kf-description"
+            type="text"
+            data-testid="kf-description"
+            maxLength={200}
+            value={movement.description}
+            onInput={(event) => editor.change({ ...movement, description: event.currentTarget.value }, "description")}
+            onBlur={() => editor.settle()}
+          />
+        </div>
+      </div>
+      <p class={named || wanted === "" ? "quiet small" : "field-error"} id="kf-name-note">
+        {texts.keyframes.nameNote}
+      </p>
+      <div class="row">
+        <button type="button" data-testid="kf-save" disabled={busy || !named || !changed || tooLong} onClick={() => void save()}>
+          {busy ? texts.keyframes.saving : texts.keyframes.save}
+        </button>
+        {station !== null && (
+          <Run station={station} name={wanted} changed={changed} blocked={busy || !named || tooLong} errors={errors} save={save} />
+        )}
+      </div>
+      {station === null && <p class="quiet small">{texts.keyframes.runsOnDevice}</p>}
+      {tooLong && <p class="field-error">{texts.keyframes.tooLong}</p>}
+      <p role="status" data-testid="kf-said" data-version={version}>
+        {said}
+      </p>
+      {newer !== null && (
+        <p class="notice warn" role="alert">
+          {newer === 0 ? texts.keyframes.deleted : texts.keyframes.newer(newer)}{" "}
+          <button type="button" onClick={() => void save(newer)}>
+            {texts.keyframes.saveOver}
+          </button>
+        </p>
+      )}
+      {station !== null && <RunStatus device={station.device} control={station.control} actions={station.actions} />}
+      <details>
+        <summary>{texts.keyframes.seeScript}</summary>
+        <pre class="output kf-source" tabIndex={0} data-testid="kf-source">
+          {source}
+        </pre>
+      </details>
+    </Card>
+  );
+}
+
+interface RunProps {
+  station: Station;
+  name: string;
+  /** It is not saved as it stands: that is done first. */
+  changed: boolean;
+  blocked: boolean;
+  errors: number;
+  save: () => Promise<boolean>;
+}
+
+function Run({ station, name, changed, blocked, errors, save }: RunProps) {
+  const [speed, setSpeed] = useState(1);
+  const why = whyNotAct(station.device, station.control);
+  const run = async (): Promise<void> => {
+    if (changed && !(await save())) return;
+    await station.actions.start({ kind: "run_movement", name, parameters: { speed } }, station.control.epoch);
+  };
+  return (
+    <>
+      <button
+        type="button"
+        class="primary"
+        data-testid="kf-run"
+        disabled={blocked || errors > 0 || why !== ""}
+        onClick={() => void run()}
+      >
+        {changed ? texts.keyframes.saveAndRun : texts.keyframes.run}
+      </button>
+      <label class="kf-speed">
+        {texts.keyframes.speed}
+        <select value={String(speed)} data-testid="kf-speed" onChange={(event) => setSpeed(Number(event.currentTarget.value))}>
+          {[0.25, 0.5, 0.75, 1, 1.5, 2].map((one) => (
+            <option key={one} value={String(one)}>
+              {texts.keyframes.percent(one)}
+            </option>
+          ))}
+        </select>
+      </label>
+      {errors > 0 && <p class="quiet small">{texts.keyframes.mendFirst}</p>}
+      {errors === 0 && why !== "" && <p class="quiet small">{why}</p>}
+    </>
+  );
+}

@@ -1,0 +1,74 @@
+import type { Control } from "../control/model/lease";
+import type { DeviceStore } from "../devices/model/device-store";
+import { texts } from "../../shared/i18n/texts";
+
+interface LatencyProps {
+  device: DeviceStore;
+  control: Control;
+}
+
+/** The round trip of what is streamed, and how fresh what comes back is. */
+export function Latency({ device, control }: LatencyProps) {
+  const figures = control.roundTrip.figures.value;
+  const telemetry = device.telemetry.value;
+  const age = device.telemetryAgeMs.value;
+  const watchdog = device.description.value?.watchdog_ms;
+  const ms = texts.number.milliseconds;
+  const loopAge = telemetry !== null && telemetry.message.setpoint_sequence > 0 ? telemetry.message.loop_age_ms : null;
+  return (
+    <>
+      <div
+        class="figure"
+        data-testid="round-trip"
+        data-value={figures?.medianMs.toFixed(2) ?? ""}
+        data-p95={figures?.p95Ms.toFixed(2) ?? ""}
+        data-latest={figures?.latestMs.toFixed(2) ?? ""}
+        data-samples={figures?.samples ?? 0}
+      >
+        <h3>{texts.latency.roundTrip}</h3>
+        {figures === null ? (
+          <p class="quiet">{texts.latency.none}</p>
+        ) : (
+          <dl class="figures">
+            <Figure name={texts.latency.median} value={ms(figures.medianMs)} />
+            <Figure name={texts.latency.p95} value={ms(figures.p95Ms)} />
+            <Figure name={texts.latency.latest} value={ms(figures.latestMs)} />
+          </dl>
+        )}
+        <p class="quiet small">{texts.latency.explained}</p>
+      </div>
+      <dl class={`figures ${device.live.value ? "" : "old"}`}>
+        <Figure
+          name={texts.latency.telemetryAge}
+          value={age === null ? texts.number.unknown : ms(age)}
+          data-testid="telemetry-age"
+        />
+        <Figure
+          name={texts.latency.loopAge}
+          value={loopAge === null ? texts.number.unknown : ms(loopAge)}
+          title={texts.latency.loopExplained}
+        />
+        <Figure
+          name={texts.latency.watchdog}
+          value={watchdog === undefined || watchdog === 0 ? texts.number.unknown : ms(watchdog)}
+        />
+      </dl>
+    </>
+  );
+}
+
+interface FigureProps {
+  name: string;
+  value: string;
+  title?: string;
+  "data-testid"?: string;
+}
+
+function Figure({ name, value, ...rest }: FigureProps) {
+  return (
+    <div {...rest}>
+      <dt>{name}</dt>
+      <dd>{value}</dd>
+    </div>
+  );
+}

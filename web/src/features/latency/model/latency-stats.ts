@@ -1,0 +1,154 @@
+/** How long things take: the stored samples of operators, agents and the cloud, and what they come to. */
+import type { Http } from "../../../shared/api/http";
+import { percentile } from "./round-trip";
+
+export const TRANSPORTS = ["mqtt", "websocket", "http", "http-poll", "xmpp"] as const;
+/** `http` is long polling where an agent does it; `http-poll` asks at an interval. */
+export type Transport = (typeof TRANSPORTS)[number];
+
+export const PATHS = [
+  "command-started",
+  "command-answered",
+  "received-started",
+  "operator-device",
+  "operator-cloud",
+  "device-cloud",
+] as const;
+/** From where to where; each is measured on one clock. */
+export type Path = (typeof PATHS)[number];
+
+export interface Sample {
+  /** By the clock of who measured [ms since 1970]. */
+  atMs: number;
+  ms: number;
+}
+
+/** One transport and path, as the cloud tells it. */
+export interface StoredTimes {
+  transport: Transport;
+  path: Path;
+  /** Of the whole span, and so are the figures: there may be more than samples are kept. */
+  count: number;
+  mean_ms: number | null;
+  max_ms: number | null;
+  p50_ms: number | null;
+  p95_ms: number | null;
+  p99_ms: number | null;
+  /** The newest samples as they came, of whatever span. */
+  at_ms: number[];
+  ms: number[];
+}
+
+export class TimesApi {
+  readonly #http: Http;
+
+  constructor(http: Http) {
+    this.#http = http;
+  }
+
+  async of(device: string, fromMs: number): Promise<StoredTimes[]> {
+    const { items } = await this.#http.call<{ items: StoredTimes[] }>("GET", `/devices/${device}/latency?from=${Math.round(fromMs)}`);
+    return items;
+  }
+
+  /** Ask the server whether it is well: there and back over HTTP. */
+  async ask(): Promise<void> {
+    await this.#http.call("GET", "/health");
+  }
+}
+
+/** What is drawn as one line: one device, transport and path. */
+export interface Line {
+  device: string;
+  transport: Transport;
+  path: Path;
+  /** In the order of time. */
+  samples: readonly Sample[];
+  /** How many the cloud has counted in the span; more than there are samples where older ones are only in its sums. */
+  stored: number;
+}
+
+export interface Wanted {
+  /** `null`: all of them. */
+  device: string | null;
+  transport: Transport | null;
+  path: Path | null;
+  /** Nothing older [ms since 1970]. */
+  sinceMs: number;
+}
+
+export function lineKey({ device, transport, path }: Pick<Line, "device" | "transport" | "path">): string {
+  return `${device} ${transport} ${path}`;
+}
+
+/**
+ * Lines of what is stored and of what was measured here and is not stored yet.
+ *
+ * @param stored By device.
+ * @param fresh Measured on this page; a sample that has come back from the cloud counts once.
+ */
+export function linesOf(stored: ReadonlyMap<string, readonly StoredTimes[]>, fresh: readonly Line[], wanted: Wanted): Line[] {
+  const found = new Map<string, Line>();
+  for (const [device, items] of stored) {
+    for (const { transport, path, at_ms, ms, count } of items) {
+      const samples = at_ms.map((atMs, index): Sample => ({ atMs, ms: ms[index] ?? 0 }));
+      found.set(lineKey({ device, transport, path }), { device, transport, path, samples, stored: count });
+    }
+  }
+  for (const line of fresh) {
+    const known = found.get(lineKey(line));
+    const seen = new Set(known?.samples.map(({ atMs, ms }) => `${atMs} ${ms}`));
+    const more = line.samples.filter(({ atMs, ms }) => !seen.has(`${atMs} ${ms}`));
+    const samples = [...(known?.samples ?? []), ...more].sort((one, other) => one.atMs - other.atMs);
+    found.set(lineKey(line), { ...line, samples, stored: known?.stored ?? 0 });
+  }
+  return [...found.values()]
+    .filter((line) => [null, line.device].includes(wanted.device) && [null, line.transport].includes(wanted.transport))
+    .filter((line) => wanted.path === null || line.path === wanted.path)
+    .map((line) => ({ ...line, samples: line.samples.filter(({ atMs }) => atMs >= wanted.sinceMs) }))
+    .filter(({ samples }) => samples.length > 0)
+    .sort((one, other) => lineKey(one).localeCompare(lineKey(other)));
+}
+
+export interface Figures {
+  count: number;
+  meanMs: number;
+  medianMs: number;
+  p95Ms: number;
+  p99Ms: number;
+  maxMs: number;
+}
+
+/** Of samples as they came; there must be one at least. */
+export function figuresOf(samples: readonly Sample[]): Figures {
+  const sorted = samples.map(({ ms }) => ms).sort((one, other) => one - other);
+  return {
+    count: sorted.length,
+    meanMs: sorted.reduce((sum, ms) => sum + ms, 0) / sorted.length,
+    medianMs: percentile(sorted, 0.5),
+    p95Ms: percentile(sorted, 0.95),
+    p99Ms: percentile(sorted, 0.99),
+    maxMs: sorted.at(-1) ?? NaN,
+  };
+}
+
+/** For each time the share of samples that took no longer, 0…1. */
+export function shares(samples: readonly Sample[]): [ms: number[], share: number[]] {
+  const sorted = samples.map(({ ms }) => ms).sort((one, other) => one - other);
+  const ends = [...new Set(sorted)];
+  return [ends, ends.map((ms) => (sorted.findLastIndex((one) => one <= ms) + 1) / sorted.length)];
+}
+
+/** A table for other programs, of exactly what is drawn: one row for each sample, after one of names. */
+export function csv(lines: readonly Line[], label: (device: string) => string): string {
+  const rows = lines.flatMap((line) =>
+    line.samples.map(({ atMs, ms }) => [line.device, label(line.device), line.transport, line.path, new Date(atMs).toISOString(), String(ms)]),
+  );
+  return [["device", "label", "transport", "path", "at", "ms"], ...rows].map((row) => row.map(cell).join(",") + "\r\n").join("");
+}
+
+/** As RFC 4180; what a spreadsheet would take for a formula is no name of ours, and is quoted into text. */
+function cell(text: string): string {
+  const safe = /^[=+\-@\t]/.test(text) ? `'${text}` : text;
+  return /[",\r\n']/.test(safe) ? `"${safe.replaceAll('"', '""')}"` : safe;
+}

@@ -1,0 +1,78 @@
+/** Times that this page has measured, on their way to the cloud: in batches, seldom, and none twice. */
+import { effect } from "@preact/signals-core";
+import type { Api, LatencyBatch } from "../../../shared/api/client";
+import { now } from "../../../shared/lib/clock";
+import { ApiError } from "../../../shared/api/http";
+import { newId } from "../../../shared/lib/ids";
+import type { RoundTrip } from "./round-trip";
+
+export const EVERY_MS = 10_000;
+/** The cloud takes no more at once, and keeps no more as they came. */
+const MOST = 1_000;
+
+/** What waits for the cloud to come back; later ones are let go. */
+const MOST_PARCELS = 6;
+
+type Sample = LatencyBatch["samples"][number];
+
+/** With its key it counts once, however often it is sent. */
+interface Parcel {
+  key: string;
+  batch: LatencyBatch;
+}
+
+export class LatencySamples {
+  readonly #api: Api;
+  readonly #device: string;
+  readonly #timer: ReturnType<typeof setInterval>;
+  readonly #forget: () => void;
+  /** From a setpoint to the telemetry that answers it, over the broker. */
+  readonly #setpoints: Sample[] = [];
+  /** From a call to its answer, over HTTP: of the calls that bring these times. */
+  readonly #calls: Sample[] = [];
+  readonly #parcels: Parcel[] = [];
+  #sending = false;
+
+  constructor(api: Api, device: string, roundTrip: RoundTrip, everyMs = EVERY_MS) {
+    this.#api = api;
+    this.#device = device;
+    this.#timer = setInterval(() => void this.send(), everyMs);
+    this.#forget = effect(() => {
+      const latest = roundTrip.figures.value?.latestMs;
+      if (latest !== undefined && this.#setpoints.length < MOST) this.#setpoints.push({ at_ms: Date.now(), ms: latest });
+    });
+  }
+
+  /** Send what there is; what could not be sent goes again, as it was, with the next. */
+  async send(): Promise<void> {
+    if (this.#sending) return;
+    this.#sending = true;
+    if (this.#setpoints.length > 0) this.#pack("websocket", "operator-device", this.#setpoints.splice(0));
+    if (this.#calls.length > 0) this.#pack("http", "operator-cloud", this.#calls.splice(0));
+    for (const parcel of this.#parcels.splice(0)) await this.#post(parcel);
+    this.#sending = false;
+  }
+
+  dispose(): void {
+    clearInterval(this.#timer);
+    this.#forget();
+    void this.send();
+  }
+
+  #pack(transport: LatencyBatch["transport"], path: LatencyBatch["path"], samples: readonly Sample[]): void {
+    this.#parcels.push({ key: newId(), batch: { transport, path, samples } });
+  }
+
+  async #post(parcel: Parcel): Promise<void> {
+    const askedAt = now();
+    try {
+      await this.#api.addLatency(this.#device, parcel.batch, parcel.key);
+      // Alone they are no reason to send anything.
+      if (parcel.batch.path === "operator-device") this.#calls.push({ at_ms: Date.now(), ms: now() - askedAt });
+    } catch (error) {
+      // Refused as they are, they would be again.
+      const later = error instanceof ApiError && (error.status === 0 || error.status === 429 || error.status >= 500);
+      if (later && this.#parcels.length < MOST_PARCELS) this.#parcels.push(parcel);
+    }
+  }
+}

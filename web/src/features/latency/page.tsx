@@ -1,0 +1,269 @@
+/** How long things take: of all devices, or of one, where it can be measured here and now. */
+import { useMemo, useState } from "preact/hooks";
+import type { Account, Api } from "../../shared/api/client";
+import { serverNow } from "../../shared/lib/clock";
+import type { DeviceStore } from "../devices/model/device-store";
+import type { Fleet } from "../devices/model/device-list";
+import { Measure } from "./model/probe";
+import { publishedFor, SOURCES, type Published } from "./model/published-figures";
+import type { Station } from "../devices/model/device-session";
+import { csv, figuresOf, lineKey, linesOf, PATHS, TRANSPORTS, type Line, type Path, type StoredTimes, type Transport } from "./model/latency-stats";
+import { texts } from "../../shared/i18n/texts";
+import { DeviceFrame } from "../devices/page-frame";
+import { MeasureNow } from "./probe-panel";
+import { Card, Choice } from "../../shared/ui/parts";
+import { usePolled } from "../../shared/hooks/use-polling";
+import { TimesPlots, type Axis, type Scale } from "./plots";
+import "../health/health.css";
+
+const EVERY_MS = 10_000;
+const AT_ONCE = 4;
+const HOUR_MS = 3_600_000;
+
+type Span = keyof typeof texts.times.spans;
+const SPAN_MS: Readonly<Record<Span, number>> = { hour: HOUR_MS, day: 24 * HOUR_MS, week: 7 * 24 * HOUR_MS, month: 30 * 24 * HOUR_MS };
+
+interface TimesPageProps {
+  api: Api;
+  fleet: Fleet;
+  account: Account;
+  /** Of one device, or empty. */
+  device: string;
+}
+
+export function TimesPage({ device, ...rest }: TimesPageProps) {
+  const devices = rest.fleet.devices.value;
+  if (device !== "") {
+    return (
+      <DeviceFrame {...rest} id={device} page="times">
+        {(station) => <OfDevice api={rest.api} fleet={rest.fleet} station={station} />}
+      </DeviceFrame>
+    );
+  }
+  return (
+    <main class="page care care-times" id="content">
+      <h1>{texts.times.all}</h1>
+      <p class="quiet">{texts.times.explained}</p>
+      {devices === null ? <p class="quiet">{texts.loading}</p> : <Times api={rest.api} devices={[...devices.values()]} fresh={NONE} />}
+    </main>
+  );
+}
+
+const NONE: readonly Line[] = [];
+
+function OfDevice({ api, fleet, station }: { api: Api; fleet: Fleet; station: Station }) {
+  const { device, control } = station;
+  const measure = useMemo(() => new Measure(api, fleet.link, device, () => control.epoch), [api, fleet, device, control]);
+  return (
+    <div class="care-times">
+      <p class="quiet">{texts.times.explained}</p>
+      <MeasureNow device={device} measure={measure} />
+      <Times api={api} devices={[device]} fresh={measure.lines} />
+    </div>
+  );
+}
+
+interface Filter {
+  device: string | null;
+  transport: Transport | null;
+  /** `undefined`: not chosen yet. */
+  path: Path | null | undefined;
+  span: Span;
+}
+
+function Times({ api, devices, fresh }: { api: Api; devices: readonly DeviceStore[]; fresh: readonly Line[] }) {
+  const [filter, setFilter] = useState<Filter>({ device: null, transport: null, path: undefined, span: "day" });
+  const [axis, setAxis] = useState<Axis>("order");
+  const [scale, setScale] = useState<Scale>("log");
+  const sinceMs = serverNow() - SPAN_MS[filter.span];
+  const ids = devices.map(({ id }) => id);
+  const { value, trouble } = usePolled(
+    () => readAll(api, ids, serverNow() - SPAN_MS[filter.span]),
+    EVERY_MS,
+    [api, ids.join(" "), filter.span, fresh.length],
+  );
+  const all = linesOf(value ?? new Map<string, StoredTimes[]>(), fresh, { device: filter.device, transport: filter.transport, path: null, sinceMs });
+  const path = filter.path === undefined ? mostOf(all) : filter.path;
+  const lines = path === null ? all : all.filter((line) => line.path === path);
+  const published = publishedFor(path);
+  const label = (id: string): string => devices.find((device) => device.id === id)?.info.value.label ?? id;
+  const name = (line: Line): string =>
+    texts.times.line(label(line.device), texts.times.transport[line.transport], path === null ? texts.times.path[line.path] : null);
+  const count = lines.reduce((sum, { samples }) => sum + samples.length, 0);
+  return (
+    <>
+      <fieldset class="card times-tools">
+        <legend class="visually-hidden">{texts.times.filters}</legend>
+        {devices.length > 1 && (
+          <Pick
+            id="times-device"
+            label={texts.times.device}
+            all={texts.times.allDevices}
+            value={filter.device}
+            options={devices.map((device) => [device.id, device.info.value.label])}
+            onChange={(device) => setFilter({ ...filter, device })}
+          />
+        )}
+        <Pick
+          id="times-path"
+          label={texts.times.part}
+          all={texts.times.allParts}
+          value={path}
+          options={PATHS.map((one) => [one, texts.times.path[one]])}
+          onChange={(chosen) => setFilter({ ...filter, path: chosen })}
+        />
+        <Pick
+          id="times-transport"
+          label={texts.times.via}
+          all={texts.times.allTransports}
+          value={filter.transport}
+          options={TRANSPORTS.map((one) => [one, texts.times.transport[one]])}
+          onChange={(transport) => setFilter({ ...filter, transport })}
+        />
+        <Choice label={texts.times.span} value={filter.span} onChange={(span) => setFilter({ ...filter, span })} options={Object.entries(texts.times.spans) as [Span, string][]} />
+        <Choice label={texts.times.axis} value={axis} onChange={setAxis} options={Object.entries(texts.times.axes) as [Axis, string][]} />
+        <Choice label={texts.times.scale} value={scale} onChange={setScale} options={Object.entries(texts.times.scales) as [Scale, string][]} />
+      </fieldset>
+      {trouble !== "" && <p class="notice bad">{texts.times.failed(trouble)}</p>}
+      {value === null && trouble === "" && <p class="quiet">{texts.loading}</p>}
+      {value !== null && count === 0 && (
+        <p class="notice" data-testid="no-times">
+          {texts.times.none} {texts.times.how}
+        </p>
+      )}
+      <TimesPlots lines={lines} name={name} published={published} axis={axis} scale={scale} />
+      <FiguresCard lines={lines} name={name} save={() => save(csv(lines, label))} />
+      <PublishedCard published={published} />
+    </>
+  );
+}
+
+/** The part of which there are most samples; `null`, which is all, while there is none. */
+function mostOf(lines: readonly Line[]): Path | null {
+  const counts = PATHS.map((path) => [path, lines.filter((line) => line.path === path).reduce((sum, { samples }) => sum + samples.length, 0)] as const);
+  const [path, most] = counts.reduce((best, one) => (one[1] > best[1] ? one : best), ["command-started", 0]);
+  return most === 0 ? null : path;
+}
+
+async function readAll(api: Api, ids: readonly string[], fromMs: number): Promise<Map<string, StoredTimes[]>> {
+  const found = new Map<string, StoredTimes[]>();
+  for (let first = 0; first < ids.length; first += AT_ONCE) {
+    const part = ids.slice(first, first + AT_ONCE);
+    const read = await Promise.all(part.map((id) => api.times.of(id, fromMs)));
+    part.forEach((id, index) => found.set(id, read[index] ?? []));
+  }
+  return found;
+}
+
+interface PickProps<T extends string> {
+  id: string;
+  label: string;
+  /** The choice that leaves nothing out. */
+  all: string;
+  value: T | null;
+  options: readonly (readonly [T, string])[];
+  onChange: (value: T | null) => void;
+}
+
+function Pick<T extends string>({ id, label, all, value, options, onChange }: PickProps<T>) {
+  return (
+    <div class="field">
+      <label for={id}>{label}</label>
+      <select
+        id={id}
+        data-testid={id}
+        value={value ?? ""}
+        onChange={(event) => onChange(options.find(([one]) => one === event.currentTarget.value)?.[0] ?? null)}
+      >
+        <option value="">{all}</option>
+        {options.map(([one, text]) => (
+          <option key={one} value={one}>
+            {text}
+          </option>
+        ))}
+      </select>
+    </div>
+  );
+}
+
+interface FiguresCardProps {
+  lines: readonly Line[];
+  name: (line: Line) => string;
+  save: () => void;
+}
+
+function FiguresCard({ lines, name, save: press }: FiguresCardProps) {
+  const ms = texts.number.milliseconds;
+  if (lines.length === 0) return null;
+  return (
+    <Card
+      title={texts.times.figures}
+      aside={
+        <button type="button" data-testid="times-csv" onClick={press}>
+          {texts.times.csv}
+        </button>
+      }
+    >
+      <div class="scroll" tabIndex={0} role="region" aria-label={texts.times.figures}>
+        <table data-testid="times-figures">
+          <thead>
+            <tr>
+              {texts.times.columns.map((column) => (
+                <th key={column} scope="col">
+                  {column}
+                </th>
+              ))}
+            </tr>
+          </thead>
+          <tbody>
+            {lines.map((line, index) => {
+              const figures = figuresOf(line.samples);
+              return (
+                <tr key={lineKey(line)} data-testid="times-line" data-count={figures.count} data-path={line.path} data-transport={line.transport}>
+                  <th scope="row">
+                    <span class={`key-line series-${(index % 8) + 1}`} aria-hidden="true" /> {name(line)}
+                  </th>
+                  <td title={line.stored > figures.count ? texts.times.more(line.stored) : undefined}>{figures.count}</td>
+                  {[figures.medianMs, figures.meanMs, figures.p95Ms, figures.p99Ms, figures.maxMs].map((value, at) => (
+                    <td key={at}>{ms(value)}</td>
+                  ))}
+                </tr>
+              );
+            })}
+          </tbody>
+        </table>
+      </div>
+    </Card>
+  );
+}
+
+/** What papers have printed for this part, each with its source. */
+function PublishedCard({ published }: { published: readonly Published[] }) {
+  const sources = [...new Set(published.map(({ source }) => source))];
+  return (
+    <Card title={texts.times.publishedTitle}>
+      {published.length === 0 && <p class="quiet">{texts.times.publishedNone}</p>}
+      <ul class="published">
+        {published.map(({ id, ms, source }) => (
+          <li key={id} data-testid="published" data-ms={ms}>
+            <strong>{`${ms} ${texts.times.milliseconds}`}</strong> {texts.times.source(texts.times.published[id] ?? id, SOURCES[source].short)}
+          </li>
+        ))}
+      </ul>
+      {sources.map((source) => (
+        <p key={source} class="quiet small">
+          {SOURCES[source].citation}
+        </p>
+      ))}
+    </Card>
+  );
+}
+
+function save(content: string): void {
+  const link = document.createElement("a");
+  link.href = URL.createObjectURL(new Blob([content], { type: "text/csv" }));
+  link.download = texts.times.csvName;
+  link.click();
+  // The browser has its own hold of it once the click was taken.
+  setTimeout(() => URL.revokeObjectURL(link.href), 10_000);
+}

@@ -1,0 +1,154 @@
+/** Response times as the papers plot them, and their shares. Loaded only where they are looked at. */
+import uPlot from "uplot";
+import "uplot/dist/uPlot.min.css";
+import { texts } from "../../shared/i18n/texts";
+import { colour } from "../../shared/ui/canvas-theme";
+
+/** One line: along x and along y, each in its own order. */
+export interface Drawn {
+  label: string;
+  colour: string;
+  x: number[];
+  y: number[];
+}
+
+export interface Reference {
+  label: string;
+  ms: number;
+}
+
+export interface TimesChart {
+  draw(lines: readonly Drawn[], references: readonly Reference[]): void;
+  dispose(): void;
+}
+
+/** Along x: the number of a sample, its time [s since 1970], or how long it took [ms]. */
+export type Along = "order" | "time" | "ms";
+
+interface Options {
+  along: Along;
+  /** Whether times are drawn by their logarithm. */
+  log: boolean;
+}
+
+/** uPlot's number for it: its own name for that is only there for a compiler that sees its source. */
+// eslint-disable-next-line @typescript-eslint/no-unsafe-enum-assignment
+const LOG: uPlot.Scale.Distr = 3;
+const LABEL_PX = 11;
+
+export function createTimesChart(box: HTMLElement, { along, log }: Options): TimesChart {
+  let references: readonly Reference[] = [];
+  let plot: uPlot | null = null;
+  let drawn = "";
+  const reach = (low: number | null, high: number | null): [number, number] => {
+    const all = [low, high, ...references.map(({ ms }) => ms)].filter((one) => one !== null && one > 0) as number[];
+    if (all.length === 0) return [1, 1000];
+    const [least, most] = [Math.min(...all), Math.max(...all)];
+    return log ? [least / 1.4, most * 1.6] : [0, most * 1.1];
+  };
+  const build = (lines: readonly Drawn[]): uPlot => {
+    const axis = { stroke: colour("--quiet"), grid: { stroke: colour("--line"), width: 1 }, ticks: { stroke: colour("--line"), width: 1 } };
+    // The end of a logarithmic axis is no round number.
+    const inMs = (ticks: (number | null)[]): string[] =>
+      ticks.map((tick) => (tick === null ? "" : `${Number(tick.toPrecision(3))} ${texts.times.milliseconds}`));
+    const times = { ...(log ? { distr: LOG, log: 10 as const } : {}), range: (_: uPlot, low: number | null, high: number | null) => reach(low, high) };
+    const stepped = uPlot.paths.stepped?.({ align: 1 });
+    return new uPlot(
+      {
+        width: Math.max(1, box.clientWidth),
+        height: Math.max(1, box.clientHeight),
+        legend: { show: false },
+        cursor: { show: false },
+        scales: {
+          x: along === "ms" ? { time: false, ...times } : { time: false },
+          y: along === "ms" ? { range: [0, 100] } : times,
+        },
+        axes: [
+          { ...axis, space: 60, values: (_, ticks) => (along === "ms" ? inMs(ticks) : ticks.map((tick) => (along === "time" ? texts.sinceWhen(tick * 1000).slice(0, 14) : whole(tick)))) },
+          { ...axis, size: 70, values: (_, ticks) => (along === "ms" ? ticks.map((tick) => `${tick} ${texts.times.percent}`) : inMs(ticks)) },
+        ],
+        series: [
+          {},
+          ...lines.map((line) => ({
+            label: line.label,
+            stroke: line.colour,
+            width: 1.75,
+            spanGaps: true,
+            points: { show: along !== "ms", size: 5, fill: line.colour },
+            ...(along === "ms" && stepped !== undefined ? { paths: stepped } : {}),
+          })),
+        ],
+        hooks: { draw: [(chart) => paint(chart, references, along)] },
+      },
+      aligned(lines),
+      box,
+    );
+  };
+  const observer = new ResizeObserver(() => {
+    if (box.clientWidth > 0) plot?.setSize({ width: box.clientWidth, height: box.clientHeight });
+  });
+  observer.observe(box);
+  return {
+    draw(lines, given) {
+      references = given;
+      // uPlot takes other values of the same lines; for other lines it is built anew.
+      const names = lines.map((line) => `${line.label} ${line.colour}`).join("\n");
+      if (plot !== null && names === drawn) {
+        plot.setData(aligned(lines));
+        return;
+      }
+      plot?.destroy();
+      plot = build(lines);
+      drawn = names;
+    },
+    dispose() {
+      observer.disconnect();
+      plot?.destroy();
+    },
+  };
+}
+
+function aligned(lines: readonly Drawn[]): uPlot.AlignedData {
+  if (lines.length === 0) return [[]];
+  return uPlot.join(lines.map(({ x, y }) => [x, y] as uPlot.AlignedData));
+}
+
+function whole(tick: number): string {
+  return Number.isInteger(tick) ? String(tick) : "";
+}
+
+/** Published figures: dashed, each with its name, which stands where there is room for it. */
+function paint(plot: uPlot, references: readonly Reference[], along: Along): void {
+  const { ctx, bbox } = plot;
+  const ratio = devicePixelRatio;
+  const upright = along === "ms";
+  ctx.save();
+  ctx.strokeStyle = colour("--marker");
+  ctx.lineWidth = ratio;
+  ctx.font = `${LABEL_PX * ratio}px system-ui, sans-serif`;
+  ctx.textAlign = "left";
+  ctx.textBaseline = "alphabetic";
+  ctx.setLineDash([6 * ratio, 4 * ratio]);
+  let last = Infinity;
+  for (const { label, ms } of [...references].sort((one, other) => other.ms - one.ms)) {
+    const at = plot.valToPos(ms, upright ? "x" : "y", true);
+    ctx.beginPath();
+    if (upright) {
+      ctx.moveTo(at, bbox.top);
+      ctx.lineTo(at, bbox.top + bbox.height);
+    } else {
+      ctx.moveTo(bbox.left, at);
+      ctx.lineTo(bbox.left + bbox.width, at);
+    }
+    ctx.stroke();
+    // The list beside the chart names them all; here only what does not cover the one before.
+    if (upright || Math.abs(at - last) < LABEL_PX * 1.2 * ratio) continue;
+    const text = `${label}: ${ms} ${texts.times.milliseconds}`;
+    ctx.fillStyle = colour("--surface");
+    ctx.fillRect(bbox.left + 2 * ratio, at - (LABEL_PX + 3) * ratio, ctx.measureText(text).width + 4 * ratio, (LABEL_PX + 2) * ratio);
+    ctx.fillStyle = colour("--marker");
+    ctx.fillText(text, bbox.left + 4 * ratio, at - 3 * ratio, bbox.width - 8 * ratio);
+    last = at;
+  }
+  ctx.restore();
+}

@@ -1,0 +1,89 @@
+/** The papers' plots: response times over samples, and beside them the share that was no slower. */
+import { useEffect, useRef, useState } from "preact/hooks";
+import type { Published } from "./model/published-figures";
+import { shares, type Line } from "./model/latency-stats";
+import { texts } from "../../shared/i18n/texts";
+import { Card } from "../../shared/ui/parts";
+import { onColourChange, seriesColour } from "../../shared/ui/canvas-theme";
+import type { Along, Drawn, Reference, TimesChart } from "./plot-canvas";
+
+export type Axis = keyof typeof texts.times.axes;
+export type Scale = keyof typeof texts.times.scales;
+
+interface TimesPlotsProps {
+  lines: readonly Line[];
+  name: (line: Line) => string;
+  published: readonly Published[];
+  axis: Axis;
+  scale: Scale;
+}
+
+export function TimesPlots({ lines, name, published, axis, scale }: TimesPlotsProps) {
+  const references = published.map(({ id, ms }) => ({ label: texts.times.published[id] ?? id, ms }));
+  const over = lines.map((line, index): Drawn => {
+    const x = line.samples.map(({ atMs }, place) => (axis === "time" ? atMs / 1000 + place / 1e6 : place + 1));
+    return { label: name(line), colour: seriesColour(index), x, y: line.samples.map(({ ms }) => ms) };
+  });
+  const share = lines.map((line, index): Drawn => {
+    const [x, y] = shares(line.samples);
+    return { label: name(line), colour: seriesColour(index), x, y: y.map((one) => one * 100) };
+  });
+  return (
+    <div class="times-charts">
+      <TimesCard title={texts.times.overTime} along={axis} scale={scale} lines={over} references={references} />
+      <TimesCard title={texts.times.shares} along="ms" scale={scale} lines={share} references={references} />
+    </div>
+  );
+}
+
+interface TimesCardProps {
+  title: string;
+  along: Along;
+  scale: Scale;
+  lines: readonly Drawn[];
+  references: readonly Reference[];
+}
+
+function TimesCard({ title, along, scale, lines, references }: TimesCardProps) {
+  const box = useRef<HTMLDivElement>(null);
+  const chart = useRef<TimesChart | null>(null);
+  const [failed, setFailed] = useState(false);
+  const [repaint, setRepaint] = useState(0);
+  const wanted = useRef({ lines, references });
+  wanted.current = { lines, references };
+  useEffect(() => onColourChange(() => setRepaint((count) => count + 1)), []);
+  useEffect(() => {
+    if (box.current === null) return;
+    const element = box.current;
+    let alive = true;
+    import("./plot-canvas").then(
+      ({ createTimesChart }) => {
+        if (!alive) return;
+        chart.current = createTimesChart(element, { along, log: scale === "log" });
+        chart.current.draw(wanted.current.lines, wanted.current.references);
+      },
+      () => setFailed(true),
+    );
+    return () => {
+      alive = false;
+      chart.current?.dispose();
+      chart.current = null;
+    };
+  }, [along, scale, repaint]);
+  useEffect(() => chart.current?.draw(lines, references), [lines, references]);
+  const samples = lines.reduce((sum, { x }) => sum + x.length, 0);
+  return (
+    <Card title={title}>
+      {failed && <p class="notice">{texts.plot.failed}</p>}
+      <div
+        ref={box}
+        class="times-chart"
+        data-testid={`times-${along === "ms" ? "shares" : "samples"}`}
+        data-samples={samples}
+        data-references={references.length}
+        role="img"
+        aria-label={texts.times.chart(title, lines.length, samples)}
+      />
+    </Card>
+  );
+}

@@ -1,0 +1,64 @@
+/** Measuring here and now, by what moves nothing. */
+import { TIMES, waysOf, type Measure } from "./model/probe";
+import type { DeviceStore } from "../devices/model/device-store";
+import { texts } from "../../shared/i18n/texts";
+import { Card } from "../../shared/ui/parts";
+
+export function MeasureNow({ device, measure }: { device: DeviceStore; measure: Measure }) {
+  const progress = measure.progress.value;
+  const why = measure.why.value;
+  const ways = waysOf(device);
+  const count = measure.lines.reduce((sum, { samples }) => sum + samples.length, 0);
+  const watches = device.info.value.role === "viewer";
+  const done = progress === null ? 0 : ways.indexOf(progress.way) * TIMES + progress.done;
+  return (
+    <Card
+      title={texts.times.measure}
+      aside={
+        progress === null ? (
+          // What may be asked of a device is known once it has said what it is.
+          <button
+            type="button"
+            class="primary"
+            data-testid="measure"
+            disabled={device.description.value === null}
+            onClick={() => void measure.run(ways)}
+          >
+            {texts.times.measure}
+          </button>
+        ) : (
+          <button type="button" data-testid="measure-stop" onClick={() => measure.stop()}>
+            {texts.times.stop}
+          </button>
+        )
+      }
+    >
+      <p class="quiet small">
+        {texts.times.measureExplained(ways.map((way) => texts.times.ways[way]))} {!ways.includes("device") && texts.times.robotNote}{" "}
+        {watches && texts.times.viewer}
+      </p>
+      {progress !== null && (
+        <>
+          <progress max={ways.length * TIMES} value={done} aria-label={texts.times.measure} />
+          <p class="small">{texts.times.measuring(texts.times.ways[progress.way], progress.done, progress.of)}</p>
+        </>
+      )}
+      <p class="small" role="status" data-testid="measured" data-count={count} data-busy={progress !== null}>
+        {progress === null && count > 0 && texts.times.measureDone(count)}
+      </p>
+      {why !== "" && (
+        <p class="notice bad" role="alert">
+          {texts.times.ended(why)}
+        </p>
+      )}
+      {measure.unstored && !watches && (
+        <p class="row">
+          {texts.times.notStored}
+          <button type="button" onClick={() => void measure.store()}>
+            {texts.times.store}
+          </button>
+        </p>
+      )}
+    </Card>
+  );
+}

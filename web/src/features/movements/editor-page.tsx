@@ -1,0 +1,352 @@
+/** One movement: its script, what is wrong with it, its versions, and running it. */
+import { useSignalEffect } from "@preact/signals";
+import { useEffect, useMemo, useRef, useState } from "preact/hooks";
+import type { Account, Api } from "../../shared/api/client";
+import { now } from "../../shared/lib/clock";
+import type { Fleet } from "../devices/model/device-list";
+import { sentence } from "../../shared/api/http";
+import { readScript } from "../keyframes/model/script-codec";
+import { keptDraft } from "../../shared/lib/local-storage";
+import type { Checked, Scripting } from "./model/movement-library";
+import { Manuscript } from "./model/script-draft";
+import { failureMark, placed, type Place } from "../../shared/lib/text-offsets";
+import type { Station } from "../devices/model/device-session";
+import { texts } from "../../shared/i18n/texts";
+import { Age, Card } from "../../shared/ui/parts";
+import { movementsAddress, typeKeyframesAddress } from "../../app/routes";
+import { useStations } from "../devices/device-sessions";
+import { CodeEditor } from "./code-editor";
+import { ManyBar, RunPanel, robotsOf } from "./run-on-many";
+import { storage } from "../../shared/hooks/browser-storage";
+import { Difference, Versions } from "./version-list";
+import "./movements.css";
+
+interface EditorPageProps {
+  api: Api;
+  fleet: Fleet;
+  account: Account;
+  robotType: string;
+  name: string;
+}
+
+export function EditorPage({ api, fleet, account, robotType, name }: EditorPageProps) {
+  const script = useMemo(
+    () => new Manuscript(api.library, robotType, name, keptDraft(storage(), account.id, robotType, name), texts.library.template),
+    [api, account, robotType, name],
+  );
+  const [chosen, setChosen] = useState<readonly string[]>([]);
+  const devices = robotsOf(fleet, robotType, account.id).own.filter(({ id }) => chosen.includes(id));
+  const stations = useStations(api, fleet, devices, account);
+  const loading = script.loading.value;
+  useEffect(() => void script.load(), [script]);
+  return (
+    <>
+      {stations.length > 0 && <ManyBar stations={stations} />}
+      <main class="page operate movement-page" id="content">
+        <div class="heading">
+          <a href={movementsAddress}>← {texts.library.title}</a>
+          <h1>{name}</h1>
+          <p class="quiet">
+            {robotType.replaceAll("_", " ")}
+            {loading.kind === "there" && <AsKeyframes script={script} />}
+          </p>
+        </div>
+        {loading.kind === "loading" && (
+          <p class="quiet" role="status">
+            {texts.loading}
+          </p>
+        )}
+        {loading.kind === "failed" && (
+          <p class="notice bad" role="alert">
+            {texts.editor.failed(loading.why)}{" "}
+            <button type="button" onClick={() => void script.load()}>
+              {texts.movements.retry}
+            </button>
+          </p>
+        )}
+        {loading.kind === "there" && (
+          <Desk
+            api={api}
+            fleet={fleet}
+            account={account}
+            script={script}
+            stations={stations}
+            chosen={chosen}
+            onChoose={setChosen}
+          />
+        )}
+      </main>
+    </>
+  );
+}
+
+/** Offered as long as its script is exactly what the keyframe editor would write. */
+function AsKeyframes({ script }: { script: Manuscript }) {
+  const saved = script.base.value?.source;
+  if (saved === undefined || script.changed.value || readScript(saved).kind !== "keyframes") return null;
+  return (
+    <>
+      {" · "}
+      <a href={typeKeyframesAddress(script.robotType, script.name)} data-testid="as-keyframes">
+        {texts.keyframes.editAs}
+      </a>
+    </>
+  );
+}
+
+interface DeskProps {
+  api: Api;
+  fleet: Fleet;
+  account: Account;
+  script: Manuscript;
+  stations: readonly Station[];
+  chosen: readonly string[];
+  onChoose: (chosen: readonly string[]) => void;
+}
+
+function Desk({ api, fleet, account, script, stations, chosen, onChoose }: DeskProps) {
+  const { robotType, name } = script;
+  const [checked, setChecked] = useState<{ of: string; found: Checked } | null>(null);
+  const base = script.base.value;
+  const unsaved = script.changed.value;
+  // While it is written its own PARAMETERS count, as far as they can be read.
+  const schema = unsaved && checked?.found.savable === true ? checked.found.parameters_schema : (base?.parameters_schema ?? null);
+  return (
+    <div class="desk">
+      <div class="column">
+        <Code api={api} fleet={fleet} script={script} stations={stations} checked={checked} onChecked={setChecked} />
+      </div>
+      <div class="column">
+        <RunPanel
+          api={api}
+          fleet={fleet}
+          account={account}
+          robotType={robotType}
+          movement={name}
+          schema={schema}
+          stations={stations}
+          chosen={chosen}
+          onChoose={onChoose}
+          unsaved={unsaved}
+          beforeRun={() => script.save()}
+        />
+        <Versions
+          api={api}
+          robotType={robotType}
+          name={name}
+          newest={base?.version ?? 0}
+          text={script.text.value}
+          onRestore={async (source) => {
+            script.edit(source);
+            await script.save();
+          }}
+        />
+      </div>
+    </div>
+  );
+}
+
+interface CodeProps {
+  api: Api;
+  fleet: Fleet;
+  script: Manuscript;
+  stations: readonly Station[];
+  checked: { of: string; found: Checked } | null;
+  onChecked: (checked: { of: string; found: Checked }) => void;
+}
+
+function Code({ api, fleet, script, stations, checked, onChecked }: CodeProps) {
+  const host = useRef<HTMLDivElement>(null);
+  const editor = useRef<CodeEditor | null>(null);
+  const saveButton = useRef<HTMLButtonElement>(null);
+  const parameters = useRef<readonly string[]>([]);
+  const failure = useRef<{ of: string; places: readonly Place[] }>({ of: "", places: [] });
+  const [places, setPlaces] = useState<readonly Place[]>([]);
+  const [unchecked, setUnchecked] = useState("");
+  parameters.current = Object.keys(checked?.found.parameters_schema?.properties ?? {});
+
+  useEffect(() => {
+    if (host.current === null) return undefined;
+    let scripting: Scripting | null = null;
+    void api.library.scripting(script.robotType).then((found) => {
+      scripting = { ...found, names: { ...found.names, devices: deviceNames(fleet) } };
+    }, () => undefined); // Then there is no completion; the check says that the server is away.
+    const made = new CodeEditor(host.current, {
+      text: script.text.value,
+      label: texts.editor.label(script.name),
+      described: texts.editor.keys,
+      scripting: () => scripting,
+      parameters: () => parameters.current,
+      check: async (text) => {
+        try {
+          const found = await api.library.check(script.robotType, text);
+          onChecked({ of: text, found });
+          setUnchecked("");
+          const all = [...found.marks.map((mark) => placed(text, mark)), ...(failure.current.of === text ? failure.current.places : [])];
+          setPlaces(all);
+          return all;
+        } catch (error) {
+          setUnchecked(sentence(error));
+          return [];
+        }
+      },
+      onChange: (text) => script.edit(text),
+      onSave: () => void script.save(),
+      onLeave: () => saveButton.current?.focus(),
+    });
+    editor.current = made;
+    return () => {
+      made.dispose();
+      editor.current = null;
+    };
+  }, [api, fleet, script]);
+
+  // What was put in its place from elsewhere: another version, what was saved.
+  useSignalEffect(() => {
+    const text = script.text.value;
+    if (editor.current !== null && editor.current.text !== text) editor.current.replace(text);
+  });
+
+  const why = stations.map(({ actions }) => actions.run.value).find((run) => run?.status === "failed")?.why ?? "";
+  useEffect(() => {
+    const mark = failureMark(why);
+    const text = script.text.peek();
+    failure.current = mark === null ? { of: "", places: [] } : { of: text, places: [placed(text, mark)] };
+    editor.current?.checkAgain();
+  }, [script, why]);
+
+  return (
+    <Card title={texts.editor.title} class="code-card" aside={<SaveState script={script} />}>
+      <Restored script={script} />
+      <div class="code" data-testid="code" data-checked={String(checked?.of === script.text.value)} ref={host} />
+      <div class="row">
+        <button
+          type="button"
+          class="primary"
+          ref={saveButton}
+          data-testid="save-movement"
+          disabled={script.saving.value || !script.changed.value}
+          aria-keyshortcuts="Control+S"
+          onClick={() => void script.save()}
+        >
+          {script.saving.value ? texts.editor.saving : texts.editor.save}
+        </button>
+        <span class="quiet small">{texts.editor.keys}</span>
+      </div>
+      <div role="alert">
+        {script.why.value !== "" && (
+          <p class="notice bad" data-testid="save-refused">
+            {texts.editor.refused(script.why.value)}
+          </p>
+        )}
+        <ConflictNotice script={script} />
+      </div>
+      {unchecked !== "" && <p class="notice warn">{texts.editor.unchecked(unchecked)}</p>}
+      <Problems places={places} text={script.text.value} onGo={(place) => editor.current?.goTo(place.from)} />
+    </Card>
+  );
+}
+
+function deviceNames(fleet: Fleet): string[] {
+  return [...new Set([...(fleet.devices.value?.values() ?? [])].map(({ info }) => info.value.name))].sort();
+}
+
+function SaveState({ script }: { script: Manuscript }) {
+  const base = script.base.value;
+  const text =
+    base === null
+      ? texts.editor.isNew
+      : script.changed.value
+        ? texts.editor.changed(base.version)
+        : texts.editor.isSaved(base.version, base.built_in);
+  return (
+    <span class="quiet small" role="status" data-testid="save-state" data-version={base?.version ?? 0} data-changed={String(script.changed.value)}>
+      {text}
+    </span>
+  );
+}
+
+/** The text that this browser has kept is shown again; going back from it can be undone in turn. */
+function Restored({ script }: { script: Manuscript }) {
+  const [given, setGiven] = useState<string | null>(null);
+  const at = script.restored.value;
+  if (given !== null && !script.changed.value) {
+    return (
+      <p class="notice" role="status">
+        {texts.editor.discarded}{" "}
+        <button
+          type="button"
+          onClick={() => {
+            script.edit(given);
+            setGiven(null);
+          }}
+        >
+          {texts.editor.bringBack}
+        </button>
+      </p>
+    );
+  }
+  if (at === null) return null;
+  return (
+    <p class="notice warn" role="status" data-testid="restored">
+      <Age at={now() - Math.max(0, Date.now() - at)} as={texts.editor.restored} />{" "}
+      <button type="button" data-testid="discard-draft" onClick={() => setGiven(script.discard())}>
+        {texts.editor.discard}
+      </button>
+    </p>
+  );
+}
+
+function ConflictNotice({ script }: { script: Manuscript }) {
+  const conflict = script.conflict.value;
+  if (conflict === null) return null;
+  const { theirs } = conflict;
+  return (
+    <div class="notice warn conflict" data-testid="conflict">
+      <p>{theirs === null ? texts.editor.deleted : texts.editor.conflict(theirs.version, theirs.updated_at)}</p>
+      {theirs !== null && (
+        <Difference before={theirs.source} after={script.text.value} label={texts.editor.bothLabel(theirs.version)} />
+      )}
+      <div class="row">
+        <button type="button" data-testid="save-over" onClick={() => void script.saveOver()}>
+          {texts.editor.saveMine}
+        </button>
+        {theirs !== null && (
+          <button type="button" data-testid="take-theirs" onClick={() => script.takeTheirs()}>
+            {texts.editor.takeTheirs(theirs.version)}
+          </button>
+        )}
+      </div>
+    </div>
+  );
+}
+
+interface ProblemsProps {
+  places: readonly Place[];
+  text: string;
+  onGo: (place: Place) => void;
+}
+
+/** The same as the marks in the text, as a list: for who does not see or reach those. */
+function Problems({ places, text, onGo }: ProblemsProps) {
+  return (
+    <section aria-label={texts.editor.problems}>
+      <p class="quiet small" role="status" data-testid="problem-count" data-count={places.length}>
+        {texts.editor.count(places.filter((place) => place.severity === "error").length, places.length)}
+      </p>
+      <ul class="problems">
+        {places.map((place) => {
+          const line = text.slice(0, place.from).split("\n").length;
+          return (
+            <li key={`${place.from}-${place.message}`} class={place.severity} data-testid="problem" data-line={line}>
+              <button type="button" class="plain" onClick={() => onGo(place)}>
+                {texts.editor.line(line)}
+              </button>{" "}
+              {place.message}
+            </li>
+          );
+        })}
+      </ul>
+    </section>
+  );
+}

@@ -1,0 +1,190 @@
+/** Movements of the robot types: what is in the library, saving, checking, and running one on many robots. */
+import type { Action } from "../../../shared/api/client";
+import { ApiError, type Http } from "../../../shared/api/http";
+
+/** What an operator may set: a small part of JSON Schema, with units. */
+export type Schema = {
+  title?: string;
+  description?: string;
+  unit?: string;
+  default?: unknown;
+} & (
+  | { type: "number"; minimum?: number; maximum?: number; exclusiveMinimum?: number; exclusiveMaximum?: number }
+  | { type: "integer"; minimum?: number; maximum?: number }
+  | { type: "string"; enum?: string[]; minLength?: number; maxLength?: number }
+  | { type: "boolean" }
+  | { type: "array"; items: Schema; minItems?: number; maxItems?: number }
+  | ObjectSchema
+);
+
+export interface ObjectSchema {
+  type: "object";
+  properties?: Record<string, Schema>;
+  required?: string[];
+  additionalProperties?: boolean;
+}
+
+export type Parameters = Record<string, unknown>;
+
+export interface Movement {
+  name: string;
+  description: string;
+  version: number;
+  sha256: string;
+  updated_at: string;
+  built_in: boolean;
+  /** `null`: it takes whatever it is given. */
+  parameters_schema: ObjectSchema | null;
+}
+
+export interface MovementSource extends Movement {
+  source: string;
+}
+
+export interface RobotTypeEntry {
+  type: string;
+  label: string;
+  kind: string;
+  built_in: boolean;
+  state: "checking" | "ready" | "refused";
+}
+
+/** What is wrong with a script: lines from 1, columns from 0, in characters. An `error` keeps it from being saved. */
+export interface Mark {
+  severity: "error" | "warning";
+  message: string;
+  line: number;
+  column: number;
+  end_line: number;
+  end_column: number;
+}
+
+export interface Checked {
+  marks: Mark[];
+  savable: boolean;
+  description: string;
+  parameters_schema: ObjectSchema | null;
+}
+
+export interface ScriptParameter {
+  name: string;
+  kind: "positional" | "keyword" | "rest";
+  type?: string;
+  default?: string;
+  /** What its strings are names of. */
+  names?: string;
+}
+
+export interface ScriptCall {
+  name: string;
+  signature: string;
+  doc: string;
+  details?: string;
+  parameters?: ScriptParameter[];
+}
+
+export interface ScriptValue {
+  name: string;
+  type: string;
+  doc: string;
+  attributes?: ScriptValue[];
+  methods?: ScriptCall[];
+}
+
+/** What a script finds, and what the robot type has by name: `joints`, `frames`, `postures` … */
+export interface Scripting {
+  api: { values: ScriptValue[]; functions: ScriptCall[]; modules: string[] };
+  names: Record<string, string[]>;
+}
+
+/** What became of one device of many: its action, or why there is none. */
+export interface FleetItem {
+  device: string;
+  status: number;
+  action: Action | null;
+  problem: { detail: string } | null;
+}
+
+/** The newest version is another than the one that a script was made from; it has not been saved. */
+export class MovementChanged extends ApiError {
+  override name = "MovementChanged";
+  /** The newest; 0: the movement has been deleted. */
+  readonly version: number;
+
+  constructor(error: ApiError) {
+    super(error.status, error.code, error.message, error.extra);
+    this.version = Number(error.extra["version"]);
+  }
+}
+
+/** All of its methods throw `ApiError`, and nothing else. */
+export class Library {
+  readonly #http: Http;
+
+  constructor(http: Http) {
+    this.#http = http;
+  }
+
+  robotTypes(): Promise<RobotTypeEntry[]> {
+    return this.#http.all("/robot-types");
+  }
+
+  list(robotType: string): Promise<Movement[]> {
+    return this.#http.all(at(robotType));
+  }
+
+  /** The newest version, or the one that is asked for. */
+  get(robotType: string, name: string, version?: number): Promise<MovementSource> {
+    return this.#http.call("GET", at(robotType, name) + (version === undefined ? "" : `?version=${version}`));
+  }
+
+  /** Newest first. */
+  versions(robotType: string, name: string): Promise<Movement[]> {
+    return this.#http.all(`${at(robotType, name)}/versions`);
+  }
+
+  /**
+   * Save a new version. `basedOn`: the version that it was made from, 0 for a new movement.
+   * Throws `MovementChanged` where another is the newest; `ApiError` with `extra.line` where it is no Python.
+   */
+  async save(robotType: string, name: string, source: string, basedOn: number): Promise<Movement> {
+    try {
+      return await this.#http.call("PUT", at(robotType, name), { body: { source, based_on: basedOn } });
+    } catch (error) {
+      throw error instanceof ApiError && error.code === "movement-changed" ? new MovementChanged(error) : error;
+    }
+  }
+
+  /** All versions of one's own; a built-in one of the same name shows again. */
+  async remove(robotType: string, name: string): Promise<void> {
+    await this.#http.call("DELETE", at(robotType, name));
+  }
+
+  check(robotType: string, source: string): Promise<Checked> {
+    return this.#http.call("POST", `/robot-types/${encodeURIComponent(robotType)}/scripting/check`, { body: { source } });
+  }
+
+  scripting(robotType: string): Promise<Scripting> {
+    return this.#http.call("GET", `/robot-types/${encodeURIComponent(robotType)}/scripting`);
+  }
+
+  /** Run a movement on several devices by one call; each has an answer of its own. `epochs`: of the leases held here. */
+  async runOnMany(
+    devices: readonly string[],
+    movement: string,
+    parameters: Parameters,
+    epochs: Readonly<Record<string, number>>,
+    key: string,
+  ): Promise<FleetItem[]> {
+    const request = { kind: "run_movement", name: movement, parameters };
+    const body = { devices, request, epochs, wait_ms: 3000, wait_for: "started" };
+    const headers = { "Idempotency-Key": key };
+    const { items } = await this.#http.call<{ items: FleetItem[] }>("POST", "/actions", { body, waitMs: 3000, headers });
+    return items;
+  }
+}
+
+function at(robotType: string, name?: string): string {
+  const movements = `/robot-types/${encodeURIComponent(robotType)}/movements`;
+  return name === undefined ? movements : `${movements}/${encodeURIComponent(name)}`;
+}

@@ -1,0 +1,148 @@
+/** A script while somebody writes it: from which version, what is not saved yet, and what others have saved meanwhile. */
+import { computed, signal, type ReadonlySignal } from "@preact/signals-core";
+import { ApiError, sentence } from "../../../shared/api/http";
+import type { Draft, Kept } from "../../../shared/lib/local-storage";
+import { MovementChanged, type Library, type Movement, type MovementSource } from "./movement-library";
+
+export type Loading = { kind: "loading" } | { kind: "there" } | { kind: "failed"; why: string };
+
+/** Somebody has saved meanwhile; `theirs` is `null` where the movement has been deleted. */
+export interface Conflict {
+  theirs: MovementSource | null;
+}
+
+export class Manuscript {
+  readonly robotType: string;
+  readonly name: string;
+  readonly #library: Library;
+  readonly #kept: Kept<Draft>;
+  readonly #template: string;
+  readonly #loading = signal<Loading>({ kind: "loading" });
+  readonly #base = signal<MovementSource | null>(null);
+  readonly #text = signal("");
+  readonly #saving = signal(false);
+  readonly #why = signal("");
+  readonly #conflict = signal<Conflict | null>(null);
+  readonly #restored = signal<number | null>(null);
+  #basedOn = 0;
+
+  readonly loading: ReadonlySignal<Loading> = this.#loading;
+  /** What was saved last, as far as this page knows; `null`: nothing yet. */
+  readonly base: ReadonlySignal<MovementSource | null> = this.#base;
+  readonly text: ReadonlySignal<string> = this.#text;
+  readonly saving: ReadonlySignal<boolean> = this.#saving;
+  /** Why the last save was refused; empty otherwise. */
+  readonly why: ReadonlySignal<string> = this.#why;
+  readonly conflict: ReadonlySignal<Conflict | null> = this.#conflict;
+  /** When the text was written that this browser has kept and that is shown again [ms since 1970]; else `null`. */
+  readonly restored: ReadonlySignal<number | null> = this.#restored;
+  /** Whether there is something to save. */
+  readonly changed = computed(() => this.#base.value === null || this.#text.value !== this.#base.value.source);
+
+  /** `template`: what a movement begins with that there is not yet. */
+  constructor(library: Library, robotType: string, name: string, kept: Kept<Draft>, template: string) {
+    this.#library = library;
+    this.robotType = robotType;
+    this.name = name;
+    this.#kept = kept;
+    this.#template = template;
+  }
+
+  async load(): Promise<void> {
+    this.#loading.value = { kind: "loading" };
+    try {
+      this.#base.value = await this.#newest();
+    } catch (error) {
+      this.#loading.value = { kind: "failed", why: sentence(error) };
+      return;
+    }
+    const saved = this.#base.value?.source ?? this.#template;
+    const draft = this.#kept.read();
+    const fits = draft !== null && draft.source !== saved;
+    this.#text.value = fits ? draft.source : saved;
+    this.#restored.value = fits ? draft.at : null;
+    this.#basedOn = fits ? draft.basedOn : (this.#base.value?.version ?? 0);
+    this.#loading.value = { kind: "there" };
+  }
+
+  edit(text: string): void {
+    if (text === this.#text.value) return;
+    this.#text.value = text;
+    this.#keep();
+  }
+
+  /** Go back to what is saved; returns the text that was given up. */
+  discard(): string {
+    const given = this.#text.value;
+    this.#text.value = this.#base.value?.source ?? this.#template;
+    this.#basedOn = this.#base.value?.version ?? 0;
+    this.#restored.value = null;
+    this.#conflict.value = null;
+    this.#kept.drop();
+    return given;
+  }
+
+  /** Whether it is saved now. The text stays whatever happens. */
+  async save(): Promise<boolean> {
+    if (this.#saving.value) return false;
+    const source = this.#text.value;
+    this.#saving.value = true;
+    this.#why.value = "";
+    try {
+      const saved = await this.#library.save(this.robotType, this.name, source, this.#basedOn);
+      this.#take(saved, source);
+      return true;
+    } catch (error) {
+      if (error instanceof MovementChanged) await this.#find();
+      else this.#why.value = sentence(error);
+      return false;
+    } finally {
+      this.#saving.value = false;
+    }
+  }
+
+  /** Save this text as the newest, over what others have saved: theirs stays among the versions. */
+  async saveOver(): Promise<boolean> {
+    this.#basedOn = this.#conflict.value?.theirs?.version ?? 0;
+    this.#conflict.value = null;
+    return this.save();
+  }
+
+  /** Go on with what others have saved; returns the text that was given up. */
+  takeTheirs(): string {
+    const theirs = this.#conflict.value?.theirs ?? null;
+    this.#base.value = theirs;
+    return this.discard();
+  }
+
+  #take(saved: Movement, source: string): void {
+    this.#base.value = { ...saved, source };
+    this.#basedOn = saved.version;
+    this.#conflict.value = null;
+    this.#restored.value = null;
+    // Somebody may have written on while it was saved.
+    this.#keep();
+  }
+
+  #keep(): void {
+    if (this.#text.value === (this.#base.value?.source ?? this.#template)) this.#kept.drop();
+    else this.#kept.write({ source: this.#text.value, basedOn: this.#basedOn, at: Date.now() });
+  }
+
+  async #find(): Promise<void> {
+    try {
+      this.#conflict.value = { theirs: await this.#newest() };
+    } catch (error) {
+      this.#why.value = sentence(error);
+    }
+  }
+
+  async #newest(): Promise<MovementSource | null> {
+    try {
+      return await this.#library.get(this.robotType, this.name);
+    } catch (error) {
+      if (error instanceof ApiError && error.code === "movement-unknown") return null;
+      throw error;
+    }
+  }
+}

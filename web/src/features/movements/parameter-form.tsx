@@ -1,0 +1,133 @@
+/** What an operator may set for a movement, as fields; what is wrong stands beside each. */
+import { useId, useMemo, useState } from "preact/hooks";
+import { keptParameters } from "../../shared/lib/local-storage";
+import type { ObjectSchema, Parameters } from "./model/movement-library";
+import { fieldsOf, fill, read, type Field, type Filled, type Wrong } from "./model/parameter-form";
+import { texts } from "../../shared/i18n/texts";
+import { storage } from "../../shared/hooks/browser-storage";
+
+export interface ParameterValues {
+  fields: readonly Field[];
+  filled: Filled;
+  wrong: Readonly<Record<string, Wrong>>;
+  set: (name: string, text: string) => void;
+  /** Back to the defaults. */
+  reset: () => void;
+  /** What to run with, and kept for the next time; `null` where something is wrong, which is said from then on. */
+  take: () => Parameters | null;
+}
+
+/** The values for one movement, beginning with those that were used last here. */
+export function useParameters(
+  account: string,
+  robotType: string,
+  movement: string,
+  schema: ObjectSchema | null,
+): ParameterValues {
+  const shape = JSON.stringify(schema);
+  const fields = useMemo(() => fieldsOf(JSON.parse(shape) as ObjectSchema | null), [shape]);
+  const kept = useMemo(() => keptParameters(storage(), account, robotType, movement), [account, robotType, movement]);
+  const [typed, setTyped] = useState<Filled>({});
+  const [asked, setAsked] = useState(false);
+  const start = useMemo(() => fill(fields, kept.read() ?? {}), [fields, kept]);
+  // What was typed into fields that are there no more does no harm.
+  const filled = { ...start, ...typed };
+  const { values, wrong } = read(fields, filled);
+  return {
+    fields,
+    filled,
+    wrong: asked ? wrong : Object.fromEntries(Object.entries(wrong).filter(([name]) => name in typed)),
+    set: (name, text) => setTyped({ ...typed, [name]: text }),
+    reset: () => {
+      setTyped(fill(fields));
+      setAsked(false);
+    },
+    take: () => {
+      setAsked(true);
+      if (Object.keys(wrong).length > 0) return null;
+      if (fields.length > 0) kept.write(values);
+      return values;
+    },
+  };
+}
+
+export function ParameterFields({ values, disabled }: { values: ParameterValues; disabled?: boolean }) {
+  if (values.fields.length === 0) return <p class="quiet">{texts.parameters.none}</p>;
+  return (
+    <div class="parameters">
+      {values.fields.map((field) => (
+        <ParameterField
+          key={field.name}
+          field={field}
+          text={values.filled[field.name] ?? ""}
+          wrong={values.wrong[field.name] ?? null}
+          disabled={disabled ?? false}
+          onText={(text) => values.set(field.name, text)}
+        />
+      ))}
+    </div>
+  );
+}
+
+interface ParameterFieldProps {
+  field: Field;
+  text: string;
+  wrong: Wrong | null;
+  disabled: boolean;
+  onText: (text: string) => void;
+}
+
+function ParameterField({ field, text, wrong, disabled, onText }: ParameterFieldProps) {
+  const id = useId();
+  const said = {
+    id,
+    disabled,
+    "aria-invalid": wrong !== null,
+    "aria-describedby": `${id}-note`,
+    "data-testid": `parameter-${field.name}`,
+  };
+  const onInput = (event: { currentTarget: { value: string } }): void => onText(event.currentTarget.value);
+  const range = texts.parameters.range(field.least, field.most, field.unit);
+  return (
+    <div class={`field ${field.kind === "yes-no" ? "yes-no" : ""}`}>
+      <label for={id}>
+        {field.title}
+        {field.unit !== "" && <span class="quiet"> [{field.unit}]</span>}
+        {!field.required && field.kind !== "yes-no" && field.schema.default === undefined && (
+          <span class="quiet"> {texts.parameters.optional}</span>
+        )}
+      </label>
+      {field.kind === "yes-no" ? (
+        <input
+          type="checkbox"
+          {...said}
+          checked={text === "true"}
+          onChange={(event) => onText(String(event.currentTarget.checked))}
+        />
+      ) : field.kind === "choice" ? (
+        <select {...said} value={text} onChange={onInput}>
+          {text === "" && <option value="">{texts.parameters.choose}</option>}
+          {field.choices.map((choice) => (
+            <option key={choice} value={choice}>
+              {choice}
+            </option>
+          ))}
+        </select>
+      ) : (
+        <input
+          type="text"
+          {...said}
+          inputMode={field.kind === "number" || field.kind === "integer" ? "decimal" : undefined}
+          autocomplete="off"
+          value={text}
+          onInput={onInput}
+        />
+      )}
+      <p id={`${id}-note`} class={wrong === null ? "quiet small" : "field-error"}>
+        {wrong === null
+          ? [field.description, range, texts.parameters.how[field.kind]].filter((one) => one !== "").join(" · ")
+          : texts.parameters.wrong(wrong, field.unit)}
+      </p>
+    </div>
+  );
+}

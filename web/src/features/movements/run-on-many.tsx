@@ -1,0 +1,229 @@
+/** One movement on many robots at once: who takes part, and what becomes of each. */
+import { useEffect, useState } from "preact/hooks";
+import { ended } from "../actions/model/action-runner";
+import type { Account, Api } from "../../shared/api/client";
+import type { DeviceStore } from "../devices/model/device-store";
+import type { Fleet } from "../devices/model/device-list";
+import { ApiError } from "../../shared/api/http";
+import { newId } from "../../shared/lib/ids";
+import type { ObjectSchema, Parameters } from "./model/movement-library";
+import type { Station } from "../devices/model/device-session";
+import { texts } from "../../shared/i18n/texts";
+import { Told } from "../actions/run-status";
+import { Card, ReachChip } from "../../shared/ui/parts";
+import { deviceAddress } from "../../app/routes";
+import { StopBanner } from "../control/stop-button";
+import { whyNotAct } from "../devices/availability";
+import { ParameterFields, useParameters } from "./parameter-form";
+
+/** The account's robots of a type: what its library has runs on them. On others' robots their owners' movements run. */
+export function robotsOf(fleet: Fleet, robotType: string, account: string): { own: DeviceStore[]; others: DeviceStore[] } {
+  const all = [...(fleet.devices.value?.values() ?? [])].filter(
+    ({ info }) => info.value.robot_type === robotType && info.value.role !== "viewer",
+  );
+  const mine = ({ info }: DeviceStore): boolean => info.value.owner.id === account;
+  return { own: all.filter(mine), others: all.filter((device) => !mine(device)) };
+}
+
+/** Always in sight while robots are chosen: whatever runs, one button stops all of it, and so does one key. */
+export function ManyBar({ stations }: { stations: readonly Station[] }) {
+  const running = stations.filter(({ actions }) => isRunning(actions.run.value));
+  return (
+    <div class="control-bar" role="region" aria-label={texts.many.bar}>
+      <p class="control-state" role="status" data-testid="many-state">
+        <span class="dot" aria-hidden="true" />
+        {running.length === 0 ? texts.many.chosen(stations.length) : texts.many.running(running.length, stations.length)}
+      </p>
+      {running.length > 0 && (
+        <button
+          type="button"
+          data-testid="cancel-all"
+          onClick={() => {
+            for (const { actions } of running) void actions.cancel(null);
+          }}
+        >
+          {running.length === 1 ? texts.movements.cancel : texts.many.cancelAll}
+        </button>
+      )}
+      <button
+        type="button"
+        class="stop"
+        data-testid="stop-all"
+        title={texts.stop.keyExplained}
+        aria-keyshortcuts="Escape"
+        onClick={() => {
+          for (const station of stations) station.stopNow();
+        }}
+      >
+        {stations.length === 1 ? texts.stop.press : texts.many.stopAll} <kbd>{texts.stop.key}</kbd>
+      </button>
+    </div>
+  );
+}
+
+interface RunPanelProps {
+  api: Api;
+  fleet: Fleet;
+  account: Account;
+  robotType: string;
+  movement: string;
+  schema: ObjectSchema | null;
+  stations: readonly Station[];
+  chosen: readonly string[];
+  onChoose: (chosen: readonly string[]) => void;
+  /** Whether the text has to be saved first; it says why it cannot be run otherwise. */
+  unsaved: boolean;
+  /** Saves what is not saved; whether it is saved now. */
+  beforeRun: () => Promise<boolean>;
+}
+
+export function RunPanel(props: RunPanelProps) {
+  const { api, fleet, account, robotType, movement, schema, stations, chosen, onChoose, unsaved, beforeRun } = props;
+  const [asking, setAsking] = useState(false);
+  const [why, setWhy] = useState("");
+  const values = useParameters(account.id, robotType, movement, schema);
+  const { own, others } = robotsOf(fleet, robotType, account.id);
+  const running = asking || stations.some(({ actions }) => isRunning(actions.run.value));
+  const here = own.map(({ id }) => id).join(" ");
+
+  // One that is gone is chosen no more. None is chosen by itself: from then on Escape is a Stop, also while one writes.
+  useEffect(() => {
+    const ids = here.split(" ");
+    const next = chosen.filter((id) => ids.includes(id));
+    if (next.length < chosen.length) onChoose(next);
+  }, [here]);
+
+  const run = async (): Promise<void> => {
+    const parameters = values.take();
+    setWhy(parameters === null ? texts.parameters.mend : "");
+    if (parameters === null) return;
+    setAsking(true);
+    try {
+      if (!unsaved || (await beforeRun())) await start(api, stations, movement, parameters);
+    } finally {
+      setAsking(false);
+    }
+  };
+
+  return (
+    <Card title={texts.many.title} class="run-panel">
+      <fieldset class="robots" disabled={running}>
+        <legend>{texts.many.robots}</legend>
+        {own.length === 0 && <p class="quiet">{texts.many.none}</p>}
+        {own.map((device) => (
+          <label key={device.id} class="robot-choice">
+            <input
+              type="checkbox"
+              data-testid={`choose-${device.info.value.name}`}
+              checked={chosen.includes(device.id)}
+              onChange={(event) =>
+                onChoose(event.currentTarget.checked ? [...chosen, device.id] : chosen.filter((id) => id !== device.id))
+              }
+            />
+            <span>
+              {device.info.value.label} <span class="quiet small">{device.info.value.name}</span>
+            </span>
+            <ReachChip device={device} />
+          </label>
+        ))}
+        {own.length > 1 && (
+          <button type="button" class="plain" onClick={() => onChoose(own.map(({ id }) => id))}>
+            {texts.many.chooseAll}
+          </button>
+        )}
+        {others.length > 0 && <p class="quiet small">{texts.many.others(others.map(({ info }) => info.value.label))}</p>}
+      </fieldset>
+      <form
+        class="parameter-form"
+        onSubmit={(event) => {
+          event.preventDefault();
+          void run();
+        }}
+      >
+        <h3>{texts.parameters.title}</h3>
+        <ParameterFields values={values} disabled={running} />
+        <div class="row">
+          <button type="submit" class="primary" data-testid="run-many" disabled={running || stations.length === 0}>
+            {asking ? texts.many.asking : unsaved ? texts.many.saveAndRun(stations.length) : texts.many.run(stations.length)}
+          </button>
+          {values.fields.length > 0 && (
+            <button type="button" class="plain" disabled={running} onClick={values.reset}>
+              {texts.parameters.reset}
+            </button>
+          )}
+        </div>
+        <p class="field-error" role="alert">
+          {why}
+        </p>
+      </form>
+      <ul class="run-rows" aria-label={texts.many.rows}>
+        {stations.map((station) => (
+          <RunRow key={station.device.id} station={station} />
+        ))}
+      </ul>
+    </Card>
+  );
+}
+
+/** One call for all of them; each station follows its own action. */
+async function start(api: Api, stations: readonly Station[], movement: string, parameters: Parameters): Promise<void> {
+  const request = { kind: "run_movement", name: movement, parameters } as const;
+  const epochs = Object.fromEntries(
+    stations.flatMap(({ device, control }) => (control.epoch === null ? [] : [[device.id, control.epoch]])),
+  );
+  const ids = stations.map(({ device }) => device.id);
+  const asked = api.library.runOnMany(ids, movement, parameters, epochs, newId());
+  await Promise.all(
+    stations.map(({ device, actions }) =>
+      actions.follow(
+        request,
+        asked.then((items) => {
+          const item = items.find((each) => each.device === device.id);
+          if (item?.action === null || item === undefined) {
+            throw new ApiError(item?.status ?? 500, "refused", item?.problem?.detail ?? texts.many.noAnswer);
+          }
+          return item.action;
+        }),
+      ),
+    ),
+  );
+}
+
+function RunRow({ station }: { station: Station }) {
+  const { device, control, stop, actions } = station;
+  const run = actions.run.value;
+  const { label, name } = device.info.value;
+  const no = isRunning(run) ? "" : whyNotAct(device, control);
+  return (
+    <li class="run-row" data-testid={`run-${name}`} data-status={run?.status ?? ""}>
+      <div class="row">
+        <a href={deviceAddress(device.id)}>
+          <strong>{label}</strong> <span class="small">{name}</span>
+        </a>
+        <ReachChip device={device} />
+        {isRunning(run) && (
+          <button type="button" aria-label={texts.many.cancelOf(`${label} ${name}`)} onClick={() => void actions.cancel(null)}>
+            {texts.movements.cancel}
+          </button>
+        )}
+        <button type="button" class="stop" aria-label={texts.many.stopOf(`${label} ${name}`)} onClick={() => station.stopNow()}>
+          {texts.stop.press}
+        </button>
+      </div>
+      <div class={`run run-${run?.status ?? "none"}`} role="status">
+        {run !== null && <Told run={run} />}
+        {run === null && no !== "" && <p class="quiet">{no}</p>}
+      </div>
+      {run !== null && run.output !== "" && (
+        <pre class="output" tabIndex={0} aria-label={texts.many.outputOf(`${label} ${name}`)}>
+          {run.output}
+        </pre>
+      )}
+      <StopBanner device={device} stop={stop} />
+    </li>
+  );
+}
+
+function isRunning(run: Station["actions"]["run"]["value"]): boolean {
+  return run !== null && !ended(run);
+}

@@ -1,0 +1,242 @@
+/** Pairing an agent: by the code it shows or the link it prints, into a space; and then naming what has come. */
+import { useEffect, useRef, useState } from "preact/hooks";
+import type { Api, Device, Space } from "../../shared/api/client";
+import type { Fleet } from "../devices/model/device-list";
+import { ApiError, sentence } from "../../shared/api/http";
+import { readCode, type FollowedCode } from "./model/claim-code";
+import { texts } from "../../shared/i18n/texts";
+import { Naming } from "../devices/rename";
+import "./pairing.css";
+import { Card, HeardAge, ReachChip } from "../../shared/ui/parts";
+import { deviceAddress, fleetAddress } from "../../app/routes";
+
+interface PairingPageProps {
+  api: Api;
+  fleet: Fleet;
+  pairing: FollowedCode;
+}
+
+export function PairingPage({ api, fleet, pairing }: PairingPageProps) {
+  const [paired, setPaired] = useState<readonly Device[] | null>(null);
+  return (
+    <main class="page pairing" id="content">
+      <p>
+        <a href={fleetAddress}>← {texts.device.back}</a>
+      </p>
+      <h1>{texts.pair.title}</h1>
+      {paired === null ? (
+        <PairForm
+          api={api}
+          fleet={fleet}
+          pairing={pairing}
+          onPaired={(devices) => {
+            pairing.drop();
+            setPaired(devices);
+          }}
+        />
+      ) : (
+        <Paired api={api} fleet={fleet} devices={paired} onAnother={() => setPaired(null)} />
+      )}
+    </main>
+  );
+}
+
+const NEW = "new";
+
+interface PairFormProps extends PairingPageProps {
+  onPaired: (devices: readonly Device[]) => void;
+}
+
+/** Whatever a link says, nothing is claimed without a click. What was typed stays until it has come to something. */
+function PairForm({ api, fleet, pairing, onPaired }: PairFormProps) {
+  const linked = pairing.code.value;
+  const [typed, setTyped] = useState(linked ?? "");
+  const [spaces, setSpaces] = useState<readonly Space[] | null>(null);
+  const [space, setSpace] = useState("");
+  const [name, setName] = useState("");
+  const [busy, setBusy] = useState(false);
+  const [wrong, setWrong] = useState("");
+  const code = useRef<HTMLInputElement>(null);
+
+  useEffect(() => {
+    if (linked !== null) setTyped(linked);
+  }, [linked]);
+  useEffect(() => {
+    code.current?.focus();
+    // Where they cannot be read it goes into the first one, as the server has it.
+    api.spaces().then(
+      (all) => setSpaces(all.filter(({ role }) => role === "owner")),
+      () => setSpaces([]),
+    );
+  }, [api]);
+
+  const into = async (): Promise<string | null> => {
+    if (space !== NEW) return space === "" ? null : space;
+    const made = await api.makeSpace(name.trim());
+    // It is there now, whatever becomes of the rest: another try goes into it, and makes no second one.
+    setSpaces([...(spaces ?? []), made]);
+    setSpace(made.id);
+    return made.id;
+  };
+
+  const pair = async (): Promise<void> => {
+    const read = readCode(typed);
+    if (read === null) {
+      setWrong(texts.pair.malformed);
+      code.current?.focus();
+      return;
+    }
+    setWrong("");
+    setBusy(true);
+    try {
+      onPaired(await fleet.claim(read, await into()));
+    } catch (error) {
+      const unknown = error instanceof ApiError && error.code === "claim-code-unknown";
+      setWrong(unknown ? texts.pair.unknown : sentence(error));
+      setBusy(false);
+      code.current?.focus();
+    }
+  };
+
+  return (
+    <Card title={texts.pair.byCode}>
+      <p class="quiet">{linked === null ? texts.pair.explain : texts.pair.linked}</p>
+      <form
+        class="fields"
+        onSubmit={(event) => {
+          event.preventDefault();
+          void pair();
+        }}
+      >
+        <div class="field">
+          <label for="claim-code">{texts.pair.code}</label>
+          <input
+            id="claim-code"
+            ref={code}
+            class="code"
+            data-testid="claim-code"
+            type="text"
+            autocomplete="off"
+            autocapitalize="characters"
+            spellcheck={false}
+            placeholder={texts.pair.example}
+            maxLength={20}
+            required
+            value={typed}
+            aria-invalid={wrong !== ""}
+            aria-describedby="claim-answer"
+            onInput={(event) => setTyped(event.currentTarget.value)}
+          />
+        </div>
+        <div class="field">
+          <label for="claim-space">{texts.pair.into}</label>
+          <select
+            id="claim-space"
+            data-testid="claim-space"
+            value={space}
+            onChange={(event) => setSpace(event.currentTarget.value)}
+          >
+            {(spaces ?? []).length === 0 && <option value="">{texts.pair.firstSpace}</option>}
+            {spaces?.map(({ id, name: called }, index) => (
+              <option key={id} value={index === 0 && space === "" ? "" : id}>
+                {called}
+              </option>
+            ))}
+            <option value={NEW}>{texts.pair.newSpace}</option>
+          </select>
+        </div>
+        {space === NEW && (
+          <div class="field">
+            <label for="claim-space-name">{texts.spaces.name}</label>
+            <input
+              id="claim-space-name"
+              type="text"
+              autocomplete="off"
+              required
+              maxLength={200}
+              value={name}
+              onInput={(event) => setName(event.currentTarget.value)}
+            />
+          </div>
+        )}
+        <div class="row">
+          <button type="submit" class="primary" data-testid="claim" disabled={busy}>
+            {busy ? texts.pair.busy : texts.pair.submit}
+          </button>
+          {linked !== null && (
+            <button
+              type="button"
+              disabled={busy}
+              onClick={() => {
+                pairing.drop();
+                setTyped("");
+              }}
+            >
+              {texts.pair.notThis}
+            </button>
+          )}
+        </div>
+        <p id="claim-answer" class="field-error" role="alert">
+          {wrong}
+        </p>
+      </form>
+    </Card>
+  );
+}
+
+interface PairedProps {
+  api: Api;
+  fleet: Fleet;
+  devices: readonly Device[];
+  onAnother: () => void;
+}
+
+/** What has come, to be named: before it is paired nobody can know what stands behind a code. */
+function Paired({ api, fleet, devices, onAnother }: PairedProps) {
+  const heading = useRef<HTMLHeadingElement>(null);
+  useEffect(() => heading.current?.focus(), []);
+  return (
+    <section class="card" aria-labelledby="paired" data-testid="paired">
+      <h2 id="paired" ref={heading} tabIndex={-1}>
+        {texts.pair.done(devices.length)}
+      </h2>
+      <p class="quiet">{texts.pair.doneNote}</p>
+      <ul class="paired-list">
+        {devices.map((device) => (
+          <PairedDevice key={device.id} api={api} fleet={fleet} info={device} />
+        ))}
+      </ul>
+      <div class="row">
+        <button type="button" onClick={onAnother}>
+          {texts.pair.another}
+        </button>
+      </div>
+    </section>
+  );
+}
+
+function PairedDevice({ api, fleet, info }: { api: Api; fleet: Fleet; info: Device }) {
+  const device = fleet.devices.value?.get(info.id);
+  const called = device?.info.value ?? info;
+  return (
+    <li data-testid="paired-device">
+      <a href={deviceAddress(info.id)}>{called.label}</a>
+      <span class="quiet small">
+        {called.robot_type.replaceAll("_", " ")} · {fleet.spaceName(called.space)}
+      </span>
+      <span role="status">
+        {device === undefined || device.heardAt.value === null ? (
+          <span class="quiet small">{texts.pair.waiting}</span>
+        ) : (
+          <>
+            <ReachChip device={device} data-testid="online" />{" "}
+            <span class="quiet small" aria-hidden="true">
+              <HeardAge device={device} />
+            </span>
+          </>
+        )}
+      </span>
+      {device !== undefined && <Naming api={api} device={device} />}
+    </li>
+  );
+}

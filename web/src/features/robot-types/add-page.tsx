@@ -1,0 +1,145 @@
+/** Adding a robot type: choose its files, look at what they are, save. */
+import { useEffect, useMemo } from "preact/hooks";
+import type { Api } from "../../shared/api/client";
+import { clock } from "../../shared/lib/clock";
+import { TypeDraft } from "./model/upload-draft";
+import { MANIFEST } from "./model/upload-files";
+import { texts } from "../../shared/i18n/texts";
+import { Card } from "../../shared/ui/parts";
+import { robotTypeAddress, robotTypesAddress } from "../../app/routes";
+import { ChooseFiles, ChosenFiles } from "./file-picker";
+import { Findings } from "./findings-list";
+import { Found } from "./upload-findings";
+import { ModelView } from "./model-viewer";
+import { StartAgent } from "./start-agent";
+import "./robot-types.css";
+
+export function AddRobotTypePage({ api }: { api: Api }) {
+  const draft = useMemo(() => new TypeDraft(api.robotTypes), [api]);
+  useEffect(() => () => draft.dispose(), [draft]);
+  const words = texts.robotTypes.adding;
+  return (
+    <main class="page fleet robot-types" id="content" data-testid="add-type" data-step={draft.step.value}>
+      <a href={robotTypesAddress}>← {texts.robotTypes.title}</a>
+      <h1>{words.title}</h1>
+      {draft.step.value === "saved" ? (
+        <Saved draft={draft} />
+      ) : (
+        <>
+          <Card title={words.files}>
+            <p class="quiet">{words.explained}</p>
+            <ChooseFiles draft={draft} />
+          </Card>
+          <Progress draft={draft} />
+          <Outcome draft={draft} />
+          <ChosenFiles draft={draft} />
+        </>
+      )}
+    </main>
+  );
+}
+
+/** What is under way, with how long it has taken. */
+function Progress({ draft }: { draft: TypeDraft }) {
+  const step = draft.step.value;
+  const words = texts.robotTypes.adding;
+  const fault = draft.fault.value;
+  return (
+    <div role="status" data-testid="type-progress">
+      {(step === "sending" || step === "checking" || step === "saving") && (
+        <div class="card">
+          <p>
+            {words.under[step]} <span class="quiet">{texts.robotTypes.seconds((clock.value - draft.since.value) / 1000)}</span>
+          </p>
+          <progress aria-label={words.under[step]} />
+        </div>
+      )}
+      {step === "wrong" && fault !== null && <p class="notice bad">{words.fault[fault](MANIFEST)}</p>}
+      {draft.trouble.value !== "" && (
+        <p class="notice bad row">
+          <span>{words.unsent(draft.trouble.value)}</span>
+          {step === "unsent" && (
+            <button type="button" onClick={() => void draft.check()}>
+              {texts.later.again}
+            </button>
+          )}
+        </p>
+      )}
+    </div>
+  );
+}
+
+function Outcome({ draft }: { draft: TypeDraft }) {
+  const words = texts.robotTypes.adding;
+  const look = draft.look.value;
+  const model = draft.model.value;
+  const step = draft.step.value;
+  const good = look !== null && (step === "good" || step === "saving");
+  return (
+    <>
+      <Findings findings={draft.errors.value} level="error" />
+      <Findings findings={draft.warnings.value} level="warning" />
+      {good && (
+        <>
+          <Card title={words.good(look.robot_type.label)} class="save-type">
+            <p>{words.look}</p>
+            <div class="row">
+              <button
+                type="button"
+                class="primary"
+                data-testid="save-type"
+                disabled={step === "saving"}
+                onClick={() => void draft.save()}
+              >
+                {words.save(look.robot_type.type)}
+              </button>
+              <span class="quiet small">{words.expires(texts.moment(look.expires_at))}</span>
+            </div>
+          </Card>
+          <div class="two">
+            {model === null ? (
+              <p class="quiet">{texts.robotTypes.model.none}</p>
+            ) : (
+              <ModelView twin={model.twin} joints={look.robot_type.joints} />
+            )}
+            <Found type={look.robot_type} model={model} files={draft.files.value} />
+          </div>
+        </>
+      )}
+    </>
+  );
+}
+
+function Saved({ draft }: { draft: TypeDraft }) {
+  const type = draft.saved.value;
+  const words = texts.robotTypes.adding;
+  if (type === null) return null;
+  return (
+    <>
+      <Card title={words.saved(type.label, type.upload?.version ?? type.version)}>
+        <p role="status" data-testid="type-saved">
+          {words.savedExplained}
+        </p>
+        {draft.movements.value.length > 0 && (
+          <ul class="plain-list" data-testid="saved-movements">
+            {draft.movements.value.map(({ name, why }) => (
+              <li key={name} data-accepted={why === ""}>
+                <strong>{name}</strong>{" "}
+                <span class={why === "" ? "quiet" : "field-error"}>{why === "" ? words.accepted : why}</span>
+              </li>
+            ))}
+          </ul>
+        )}
+        <p class="row">
+          <a href={robotTypeAddress(type.type)} data-testid="open-type">
+            {words.open}
+          </a>
+          <button type="button" class="plain" onClick={() => void draft.clear()}>
+            {words.another}
+          </button>
+        </p>
+      </Card>
+      <StartAgent type={type.type} builtIn={false} />
+    </>
+  );
+}

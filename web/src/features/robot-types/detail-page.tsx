@@ -1,0 +1,247 @@
+/** One robot type: what every robot of it has in common. */
+import { useCallback } from "preact/hooks";
+import type { Api, Device } from "../../shared/api/client";
+import { degrees } from "../../shared/lib/angles";
+import { readFindings } from "./model/parse-findings";
+import type { Fleet } from "../devices/model/device-list";
+import { ApiError } from "../../shared/api/http";
+import type { RobotType, TypeModel } from "./model/robot-types";
+import { texts } from "../../shared/i18n/texts";
+import { Confirm } from "../../shared/ui/confirm-button";
+import { Card } from "../../shared/ui/parts";
+import { addRobotTypeAddress, deviceAddress, replaceWith, robotTypesAddress } from "../../app/routes";
+import { Findings } from "./findings-list";
+import { ModelView } from "./model-viewer";
+import { StartAgent } from "./start-agent";
+import { StateChip } from "./status-chip";
+import { Trouble } from "../../shared/ui/load-error";
+import { useLoaded } from "../../shared/hooks/use-resource";
+import "./robot-types.css";
+
+interface TypePageProps {
+  api: Api;
+  fleet: Fleet;
+  id: string;
+}
+
+export function RobotTypePage({ api, fleet, id }: TypePageProps) {
+  const { value: type, trouble, again } = useLoaded(useCallback(() => api.robotTypes.get(id), [api, id]));
+  const devices = [...(fleet.devices.value?.values() ?? [])]
+    .map(({ info }) => info.value)
+    .filter(({ robot_type: used }) => used === id);
+  return (
+    <main class="page fleet robot-types" id="content">
+      <a href={robotTypesAddress}>← {texts.robotTypes.title}</a>
+      {type === null && trouble === "" && (
+        <p class="quiet" role="status">
+          {texts.loading}
+        </p>
+      )}
+      <Trouble said={trouble} again={again} />
+      {type !== null && <Loaded api={api} type={type} devices={devices} />}
+    </main>
+  );
+}
+
+function Loaded({ api, type, devices }: { api: Api; type: RobotType; devices: readonly Device[] }) {
+  const words = texts.robotTypes;
+  const upload = type.upload;
+  return (
+    <>
+      <header class="title-row">
+        <h1>{type.label}</h1>
+        <StateChip type={type} />
+      </header>
+      <p>{type.description}</p>
+      {upload?.state === "refused" && <Findings findings={readFindings(upload.errors)} level="error" />}
+      {upload !== null && <Findings findings={readFindings(upload.warnings)} level="warning" />}
+      <div class="two">
+        {type.state === "ready" ? <Model api={api} type={type} /> : <p class="quiet">{words.model.notReady}</p>}
+        <Facts type={type} devices={devices} />
+      </div>
+      <Joints type={type} />
+      <div class="two">
+        <Movements api={api} type={type} />
+        <Files api={api} type={type} />
+      </div>
+      {type.state === "ready" && devices.length === 0 && <StartAgent type={type.type} builtIn={type.built_in} />}
+      {!type.built_in && <Own api={api} type={type} />}
+    </>
+  );
+}
+
+function Model({ api, type }: { api: Api; type: RobotType }) {
+  const load = useCallback(async (): Promise<TypeModel | "none"> => {
+    try {
+      return await api.robotTypes.model(type.type);
+    } catch (error) {
+      if (error instanceof ApiError && error.code === "model-unknown") return "none";
+      throw error;
+    }
+  }, [api, type]);
+  const { value, trouble, again } = useLoaded(load);
+  if (trouble !== "") return <Trouble said={trouble} again={again} />;
+  if (value === null) return <p class="quiet">{texts.loading}</p>;
+  if (value === "none") return <p class="quiet">{texts.robotTypes.model.none}</p>;
+  return <ModelView twin={value.twin} joints={type.joints} />;
+}
+
+function Facts({ type, devices }: { type: RobotType; devices: readonly Device[] }) {
+  const words = texts.robotTypes;
+  const upload = type.upload;
+  return (
+    <Card title={words.facts.title}>
+      <dl class="facts">
+        <dt>{words.facts.id}</dt>
+        <dd>{type.type}</dd>
+        <dt>{words.facts.kind}</dt>
+        <dd>{type.kind}</dd>
+        <dt>{words.column.version}</dt>
+        <dd>
+          {type.version} · {type.built_in ? words.facts.builtIn : words.facts.own}
+        </dd>
+        {upload !== null && (
+          <>
+            <dt>{words.facts.uploaded}</dt>
+            <dd>{words.facts.upload(upload.version, texts.moment(upload.uploaded_at))}</dd>
+          </>
+        )}
+        <dt>{words.facts.driver}</dt>
+        <dd>{type.driver}</dd>
+        <dt>{words.facts.abilities}</dt>
+        <dd>
+          <ul class="row">
+            {type.capabilities.map((name) => (
+              <li key={name} class="chip">
+                {name.replaceAll("_", " ")}
+              </li>
+            ))}
+          </ul>
+        </dd>
+        <dt>{words.facts.frames}</dt>
+        <dd>{type.frames.join(", ")}</dd>
+      </dl>
+      <h3>{words.facts.devices}</h3>
+      {devices.length === 0 ? (
+        <p class="quiet">{words.facts.noDevices}</p>
+      ) : (
+        <ul>
+          {devices.map(({ id, label }) => (
+            <li key={id}>
+              <a href={deviceAddress(id)}>{label}</a>
+            </li>
+          ))}
+        </ul>
+      )}
+    </Card>
+  );
+}
+
+function Joints({ type }: { type: RobotType }) {
+  const words = texts.robotTypes.joints;
+  return (
+    <Card title={words.title(type.joints.length)}>
+      <div class="scroll" tabIndex={0} role="region" aria-label={words.title(type.joints.length)}>
+        <table class="joint-table" data-testid="joint-table">
+          <thead>
+            <tr>
+              <th scope="col">{words.name}</th>
+              <th scope="col">{words.from}</th>
+              <th scope="col">{words.to}</th>
+              <th scope="col">{words.fastest}</th>
+            </tr>
+          </thead>
+          <tbody>
+            {type.joints.map((joint) => (
+              <tr key={joint.name}>
+                <th scope="row">
+                  {joint.label} <span class="quiet small">{joint.name}</span>
+                </th>
+                <td>{texts.number.degrees(degrees(joint.lower_rad))}</td>
+                <td>{texts.number.degrees(degrees(joint.upper_rad))}</td>
+                <td>{words.speed(texts.number.degrees(degrees(joint.max_velocity_rad_s)))}</td>
+              </tr>
+            ))}
+          </tbody>
+        </table>
+      </div>
+    </Card>
+  );
+}
+
+function Movements({ api, type }: { api: Api; type: RobotType }) {
+  const ready = type.state === "ready";
+  const load = useCallback(() => (ready ? api.robotTypes.movements(type.type) : Promise.resolve([])), [api, type, ready]);
+  const { value, trouble, again } = useLoaded(load);
+  return (
+    <Card title={texts.movements.title}>
+      <Trouble said={trouble} again={again} />
+      {value === null && trouble === "" && <p class="quiet">{texts.loading}</p>}
+      {value?.length === 0 && <p class="quiet">{texts.movements.none}</p>}
+      {value !== null && value.length > 0 && (
+        <ul class="plain-list" data-testid="type-movements">
+          {value.map(({ name, description }) => (
+            <li key={name}>
+              <strong>{name}</strong> <span class="quiet small">{description}</span>
+            </li>
+          ))}
+        </ul>
+      )}
+    </Card>
+  );
+}
+
+function Files({ api, type }: { api: Api; type: RobotType }) {
+  const words = texts.robotTypes.files;
+  const ready = type.state === "ready";
+  return (
+    <Card
+      title={words.title}
+      aside={
+        ready && (
+          <a href={api.robotTypes.archiveAddress(type.type)} download={`${type.type}.zip`}>
+            {words.all}
+          </a>
+        )
+      }
+    >
+      <ul class="plain-list">
+        {Object.entries(type.files).map(([name, length]) => (
+          <li key={name}>
+            {ready ? (
+              <a href={api.robotTypes.fileAddress(type.type, name)} download={name.split("/").pop()}>
+                {name}
+              </a>
+            ) : (
+              name
+            )}{" "}
+            <span class="quiet small">{texts.files.size(length)}</span>
+          </li>
+        ))}
+      </ul>
+    </Card>
+  );
+}
+
+function Own({ api, type }: { api: Api; type: RobotType }) {
+  const words = texts.robotTypes.own_type;
+  return (
+    <Card title={words.title}>
+      <p>
+        <a href={addRobotTypeAddress}>{words.next}</a>
+      </p>
+      <Confirm
+        label={words.remove}
+        question={words.question(type.label)}
+        yes={words.yes}
+        busy={words.busy}
+        keep={words.keep}
+        data-testid="delete-type"
+        onYes={async () => {
+          await api.robotTypes.delete(type.type);
+          replaceWith(robotTypesAddress);
+        }}
+      />
+    </Card>
+  );
+}

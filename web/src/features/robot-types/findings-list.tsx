@@ -1,0 +1,46 @@
+/** What is wrong with a robot type, or worth knowing: where it stands, what it is, what to do. */
+import { degrees } from "../../shared/lib/angles";
+import type { Finding } from "./model/parse-findings";
+import { texts } from "../../shared/i18n/texts";
+
+interface FindingsProps {
+  findings: readonly Finding[];
+  level: "error" | "warning";
+}
+
+export function Findings({ findings, level }: FindingsProps) {
+  if (findings.length === 0) return null;
+  const words = texts.robotTypes.findings;
+  return (
+    <section class={`card findings ${level}`} data-testid={`${level}s`} aria-label={words.title[level](findings.length)}>
+      <h2>{words.title[level](findings.length)}</h2>
+      <ol>
+        {findings.map((finding, index) => (
+          <li key={index} data-testid={level} data-kind={finding.kind}>
+            <p class="where">
+              {finding.file === "" ? words.whole : finding.file}
+              {finding.line !== null && <span>, {words.line(finding.line)}</span>}
+            </p>
+            <p>{what(finding)}</p>
+            {advice(finding) !== "" && <p class="quiet">{advice(finding)}</p>}
+          </li>
+        ))}
+      </ol>
+    </section>
+  );
+}
+
+function what({ kind, said, about, range_rad }: Finding): string {
+  const words = texts.robotTypes.findings;
+  if (kind === "missing") return words.missing(about);
+  if (kind === "torn") return words.torn;
+  if (kind === "range" && range_rad !== null) {
+    const [lower, upper] = range_rad.map((rad) => texts.number.degrees(degrees(rad)));
+    return (said.includes("actuator") ? words.motorRange : words.range)(about, lower ?? "", upper ?? "");
+  }
+  return said;
+}
+
+function advice({ kind, file, about }: Finding): string {
+  return texts.robotTypes.findings.advice[kind](file, about);
+}

@@ -1,0 +1,81 @@
+/** A robot type's model, moved by sliders: what it looks like, and how far each joint goes. */
+import { useEffect, useState } from "preact/hooks";
+import { degrees, radians } from "../../shared/lib/angles";
+import type { KnownTwin } from "../../shared/mqtt/parse-messages";
+import type { Joint } from "../../shared/mqtt/protocol.generated";
+import { texts } from "../../shared/i18n/texts";
+import { Card } from "../../shared/ui/parts";
+import { useScene } from "../twin/use-scene";
+
+interface ModelViewProps {
+  twin: KnownTwin;
+  joints: readonly Joint[];
+}
+
+/** The nearest to zero that the limits allow. */
+function atRest(joint: Joint): number {
+  return Math.min(joint.upper_rad, Math.max(joint.lower_rad, 0));
+}
+
+export function ModelView({ twin, joints }: ModelViewProps) {
+  const rest = Object.fromEntries(joints.map((joint) => [joint.name, atRest(joint)]));
+  const [pose, setPose] = useState<Readonly<Record<string, number>>>(rest);
+  const { canvas, box, scene, said } = useScene(twin);
+  useEffect(() => scene?.show(pose, null), [scene, pose]);
+  const words = texts.robotTypes.model;
+  return (
+    <Card
+      title={words.title}
+      class="model"
+      aside={
+        <span class="row">
+          <button type="button" class="plain" onClick={() => setPose(rest)}>
+            {words.rest}
+          </button>
+          <button type="button" class="plain" disabled={scene === null} onClick={() => scene?.resetView()}>
+            {texts.view.reset}
+          </button>
+        </span>
+      }
+    >
+      <div ref={box} class="canvas-box" data-testid="model-view" data-frames="0">
+        <canvas key={twin} ref={canvas} aria-label={words.label} role="img" />
+        {said !== "" && <p class="over notice">{said}</p>}
+      </div>
+      <p class="quiet small">{words.explained}</p>
+      <ul class="model-joints" aria-label={words.joints}>
+        {joints.map((joint) => (
+          <JointSlider
+            key={joint.name}
+            joint={joint}
+            at_rad={pose[joint.name] ?? 0}
+            onChange={(at_rad) => setPose({ ...pose, [joint.name]: at_rad })}
+          />
+        ))}
+      </ul>
+    </Card>
+  );
+}
+
+function JointSlider({ joint, at_rad, onChange }: { joint: Joint; at_rad: number; onChange: (at_rad: number) => void }) {
+  const { degrees: said, wholeDegrees } = texts.number;
+  const id = `model-joint-${joint.name}`;
+  return (
+    <li>
+      <label for={id}>{joint.label}</label>
+      <input
+        id={id}
+        data-testid={id}
+        type="range"
+        min={degrees(joint.lower_rad)}
+        max={degrees(joint.upper_rad)}
+        step="any"
+        value={degrees(at_rad)}
+        aria-valuetext={said(degrees(at_rad))}
+        onInput={(event) => onChange(radians(Number(event.currentTarget.value)))}
+      />
+      <output for={id}>{said(degrees(at_rad))}</output>
+      <span class="quiet small">{texts.robotTypes.range(wholeDegrees(degrees(joint.lower_rad)), wholeDegrees(degrees(joint.upper_rad)))}</span>
+    </li>
+  );
+}

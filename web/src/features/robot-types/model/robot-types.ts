@@ -1,0 +1,157 @@
+/** Robot types over the HTTP API: those that one may see, and one that is looked at before it is saved. */
+import type { Http } from "../../../shared/api/http";
+import { readTwin, type KnownTwin } from "../../../shared/mqtt/parse-messages";
+import type { Robot } from "../../keyframes/model/keyframes";
+import type { Joint, Mirror, Narrowing } from "../../../shared/mqtt/protocol.generated";
+
+export type TypeState = "checking" | "ready" | "refused";
+
+export interface TypeUpload {
+  version: number;
+  state: TypeState;
+  errors: string[];
+  warnings: string[];
+  uploaded_at: string;
+}
+
+export interface RobotType {
+  type: string;
+  label: string;
+  kind: string;
+  version: number;
+  description: string;
+  driver: string;
+  joints: Joint[];
+  frames: string[];
+  capabilities: string[];
+  home_rad: Record<string, number>;
+  mirrors: Mirror[];
+  narrowing: Narrowing[];
+  postures: string[];
+  expressions: string[];
+  behaviours: string[];
+  /** What its robots may be asked for; each says itself what it really takes. */
+  actions: string[];
+  streams: { name: string; rate_hz: number }[];
+  built_in: boolean;
+  state: TypeState;
+  /** Name → bytes. */
+  files: Record<string, number>;
+  upload: TypeUpload | null;
+}
+
+/** An upload that is not saved: nobody else sees it, and it goes by itself. */
+export interface Look {
+  id: string;
+  expires_at: string;
+  robot_type: RobotType;
+}
+
+/** The model as the page draws it, and what else is in it. */
+export interface TypeModel {
+  twin: KnownTwin;
+  actuators: string[];
+  cameras: string[];
+}
+
+export interface TypeMovement {
+  name: string;
+  description: string;
+  version: number;
+  built_in: boolean;
+}
+
+/** What is sent of a folder: files are text where they are XML, else base64; movements are scripts by name. */
+export interface TypeFolder {
+  manifest: string;
+  files: Record<string, string>;
+  movements: Record<string, string>;
+}
+
+interface TwinAnswer {
+  device: string;
+  bodies: unknown;
+  actuators: string[];
+  cameras: string[];
+}
+
+/** What the keyframe editor needs to know of any robot of a type. */
+export function robotOf({ joints, narrowing, mirrors, postures, expressions, behaviours, capabilities, actions }: RobotType): Robot {
+  const counted = mirrors.map(({ joint, of, factor = 1 }) => ({ joint, of, factor }));
+  return { joints, narrowing, mirrors: counted, postures, expressions, behaviours, capabilities, actions };
+}
+
+/** How long a large upload may take on a slow line [ms]. */
+const SENDING_MS = 170_000;
+/** What the server is asked to wait for a verdict on what is saved [ms]. */
+const VERDICT_MS = 20_000;
+
+/** All of its methods throw `ApiError`, and nothing else but a `MessageError` where a drawing is not one. */
+export class RobotTypes {
+  readonly #http: Http;
+
+  constructor(http: Http) {
+    this.#http = http;
+  }
+
+  list(): Promise<RobotType[]> {
+    return this.#http.all("/robot-types");
+  }
+
+  get(type: string): Promise<RobotType> {
+    return this.#http.call("GET", `/robot-types/${type}`);
+  }
+
+  model(type: string): Promise<TypeModel> {
+    return this.#model(`/robot-types/${type}/twin`);
+  }
+
+  movements(type: string): Promise<TypeMovement[]> {
+    return this.#http.all(`/robot-types/${type}/movements`);
+  }
+
+  putMovement(type: string, name: string, source: string): Promise<TypeMovement> {
+    return this.#http.call("PUT", `/robot-types/${type}/movements/${encodeURIComponent(name)}`, { body: { source } });
+  }
+
+  async delete(type: string): Promise<void> {
+    await this.#http.call("DELETE", `/robot-types/${type}`);
+  }
+
+  /** Where all its files are, as one archive. */
+  archiveAddress(type: string): string {
+    return `/api/v1/robot-types/${type}/archive`;
+  }
+
+  fileAddress(type: string, name: string): string {
+    return `/api/v1/robot-types/${type}/files/${name}`;
+  }
+
+  /** Upload for a look; the verdict is asked for afterwards. */
+  look(folder: TypeFolder): Promise<Look> {
+    return this.#http.call("POST", "/robot-type-looks", { body: { ...folder, wait_ms: 0 }, waitMs: SENDING_MS });
+  }
+
+  lookAgain(id: string): Promise<Look> {
+    return this.#http.call("GET", `/robot-type-looks/${id}`);
+  }
+
+  lookModel(id: string): Promise<TypeModel> {
+    return this.#model(`/robot-type-looks/${id}/twin`);
+  }
+
+  save(id: string): Promise<RobotType> {
+    const body = { wait_ms: VERDICT_MS };
+    return this.#http.call("POST", `/robot-type-looks/${id}/save`, { body, waitMs: VERDICT_MS });
+  }
+
+  async drop(id: string): Promise<void> {
+    await this.#http.call("DELETE", `/robot-type-looks/${id}`, { keepalive: true });
+  }
+
+  async #model(path: string): Promise<TypeModel> {
+    const { actuators, cameras, ...twin } = await this.#http.call<TwinAnswer>("GET", path);
+    // Read as what a robot says of itself is: a page draws nothing that has not been looked at.
+    return { twin: readTwin(new TextEncoder().encode(JSON.stringify(twin))), actuators, cameras };
+  }
+}

@@ -1,0 +1,246 @@
+/** A robot type on its way: files that stay until it is saved, and what the server's checkers make of them. */
+import { batch, computed, signal, type ReadonlySignal } from "@preact/signals-core";
+import { now } from "../../../shared/lib/clock";
+import { readFindings, type Finding } from "./parse-findings";
+import { ApiError, sentence } from "../../../shared/api/http";
+import type { Look, RobotType, RobotTypes, TypeModel } from "./robot-types";
+import { choose, MANIFEST, MAX_BYTES, pack, size, type Files } from "./upload-files";
+
+export type DraftStep = "empty" | "sending" | "checking" | "good" | "wrong" | "unsent" | "saving" | "saved";
+
+/** How a movement that came with the type fared when it was saved. */
+export interface SavedMovement {
+  name: string;
+  /** Empty: it was accepted. */
+  why: string;
+}
+
+/** What is wrong before anything is sent. */
+export type LocalFault = "no-manifest" | "too-large" | null;
+
+const ASK_EVERY_MS = 500;
+
+/** Files may be exchanged at any time: what is under way for the ones before is forgotten. */
+export class TypeDraft {
+  readonly #types: RobotTypes;
+  readonly #files = signal<Files>(new Map());
+  readonly #left = signal<readonly string[]>([]);
+  readonly #step = signal<DraftStep>("empty");
+  readonly #look = signal<Look | null>(null);
+  readonly #model = signal<TypeModel | null>(null);
+  readonly #errors = signal<readonly string[]>([]);
+  readonly #trouble = signal("");
+  readonly #saved = signal<RobotType | null>(null);
+  readonly #movements = signal<readonly SavedMovement[]>([]);
+  readonly #since = signal(0);
+  #round = 0;
+  #disposed = false;
+
+  readonly files: ReadonlySignal<Files> = this.#files;
+  /** Chosen, and of no use to a robot type. */
+  readonly left: ReadonlySignal<readonly string[]> = this.#left;
+  readonly step: ReadonlySignal<DraftStep> = this.#step;
+  readonly look: ReadonlySignal<Look | null> = this.#look;
+  readonly model: ReadonlySignal<TypeModel | null> = this.#model;
+  /** Why nothing came of the last try, such as a server that cannot be reached. */
+  readonly trouble: ReadonlySignal<string> = this.#trouble;
+  readonly saved: ReadonlySignal<RobotType | null> = this.#saved;
+  readonly movements: ReadonlySignal<readonly SavedMovement[]> = this.#movements;
+  /** When the step that is under way began, on the page's clock [ms]. */
+  readonly since: ReadonlySignal<number> = this.#since;
+  readonly errors: ReadonlySignal<readonly Finding[]> = computed(() => readFindings(this.#errors.value));
+  readonly warnings: ReadonlySignal<readonly Finding[]> = computed(() =>
+    readFindings(this.#look.value?.robot_type.upload?.warnings ?? []),
+  );
+  readonly fault: ReadonlySignal<LocalFault> = computed(() => {
+    const files = this.#files.value;
+    if (files.size === 0) return null;
+    if (!files.has(MANIFEST)) return "no-manifest";
+    return size(files) > MAX_BYTES ? "too-large" : null;
+  });
+  readonly busy: ReadonlySignal<boolean> = computed(() => ["sending", "checking", "saving"].includes(this.#step.value));
+
+  constructor(types: RobotTypes) {
+    this.#types = types;
+  }
+
+  /** Files that come beside those that are there, in the place of those of the same name; then all is checked. */
+  async add(entries: Files): Promise<void> {
+    const { files, left } = choose(entries);
+    // A single file is exchanged by its own name, wherever it lies in the folder.
+    for (const [name, content] of [...files]) {
+      const known = [...this.#files.value.keys()].filter((each) => each.endsWith(`/${name}`));
+      if (name.includes("/") || this.#files.value.has(name) || known.length !== 1) continue;
+      files.delete(name);
+      files.set(known[0] ?? name, content);
+    }
+    await this.#change(new Map([...this.#files.value, ...files]), left);
+  }
+
+  /** One file in the place of another, whatever it is called where it came from. */
+  async replace(name: string, content: Uint8Array): Promise<void> {
+    await this.#change(new Map([...this.#files.value, [name, content]]), []);
+  }
+
+  async remove(name: string): Promise<void> {
+    await this.#change(new Map([...this.#files.value].filter(([each]) => each !== name)), []);
+  }
+
+  async clear(): Promise<void> {
+    await this.#change(new Map(), []);
+  }
+
+  /** Send all files, and wait for what the checkers say. */
+  async check(): Promise<void> {
+    const round = this.#begin("sending");
+    const folder = pack(this.#files.value);
+    if (folder === null || this.fault.value !== null) {
+      this.#step.value = this.#files.value.size === 0 ? "empty" : "wrong";
+      return;
+    }
+    try {
+      let look = await this.#types.look(folder);
+      if (this.#past(round)) {
+        void this.#forget(look);
+        return;
+      }
+      batch(() => {
+        this.#look.value = look;
+        this.#to("checking");
+      });
+      while (look.robot_type.upload?.state === "checking") {
+        await new Promise((resolve) => setTimeout(resolve, ASK_EVERY_MS));
+        if (this.#past(round)) return;
+        look = await this.#types.lookAgain(look.id);
+        if (this.#past(round)) return;
+      }
+      const errors = look.robot_type.upload?.errors ?? [];
+      const model = errors.length === 0 ? await this.#modelOf(look) : null;
+      if (this.#past(round)) return;
+      batch(() => {
+        this.#look.value = look;
+        this.#errors.value = errors;
+        this.#model.value = model;
+        this.#to(errors.length === 0 ? "good" : "wrong");
+      });
+    } catch (error) {
+      if (!this.#past(round)) this.#refuse(error);
+    }
+  }
+
+  /** Make it a robot type, and give it the movements that came with it. */
+  async save(): Promise<void> {
+    const look = this.#look.value;
+    if (look === null || this.#step.value !== "good") return;
+    const round = this.#round;
+    this.#trouble.value = "";
+    this.#to("saving");
+    try {
+      let saved = await this.#types.save(look.id);
+      while (saved.upload?.state === "checking") {
+        await new Promise((resolve) => setTimeout(resolve, ASK_EVERY_MS));
+        if (this.#past(round)) return;
+        saved = await this.#types.get(saved.type);
+      }
+      const movements = await this.#saveMovements(saved.type);
+      if (this.#past(round)) return;
+      batch(() => {
+        this.#look.value = null;
+        this.#saved.value = saved;
+        this.#movements.value = movements;
+        this.#to("saved");
+      });
+    } catch (error) {
+      if (this.#past(round)) return;
+      batch(() => {
+        this.#trouble.value = sentence(error);
+        this.#to("good");
+      });
+    }
+  }
+
+  dispose(): void {
+    this.#disposed = true;
+    this.#dropLook();
+  }
+
+  async #modelOf(look: Look): Promise<TypeModel | null> {
+    try {
+      return await this.#types.lookModel(look.id);
+    } catch (error) {
+      // One that cannot be drawn can be good all the same; a warning says so.
+      if (error instanceof ApiError && error.code === "model-unknown") return null;
+      throw error;
+    }
+  }
+
+  async #saveMovements(type: string): Promise<SavedMovement[]> {
+    const saved: SavedMovement[] = [];
+    for (const [name, source] of Object.entries(pack(this.#files.value)?.movements ?? {})) {
+      try {
+        await this.#types.putMovement(type, name, source);
+        saved.push({ name, why: "" });
+      } catch (error) {
+        saved.push({ name, why: sentence(error) });
+      }
+    }
+    return saved;
+  }
+
+  async #change(files: Files, left: readonly string[]): Promise<void> {
+    batch(() => {
+      this.#files.value = files;
+      this.#left.value = left;
+    });
+    await this.check();
+  }
+
+  #begin(step: DraftStep): number {
+    this.#dropLook();
+    batch(() => {
+      this.#model.value = null;
+      this.#errors.value = [];
+      this.#trouble.value = "";
+      this.#saved.value = null;
+      this.#movements.value = [];
+      this.#to(step);
+    });
+    this.#round += 1;
+    return this.#round;
+  }
+
+  #to(step: DraftStep): void {
+    this.#step.value = step;
+    this.#since.value = now();
+  }
+
+  /** The server has said no to the files, or nothing at all. */
+  #refuse(error: unknown): void {
+    const told = error instanceof ApiError ? error.extra["errors"] : undefined;
+    const errors = Array.isArray(told) ? told.filter((each): each is string => typeof each === "string") : [];
+    const refused = error instanceof ApiError && (error.status === 422 || error.code === "robot-type-built-in");
+    batch(() => {
+      this.#errors.value = errors.length > 0 || !refused ? errors : [`robot.toml: ${sentence(error)}`];
+      this.#trouble.value = refused ? "" : sentence(error);
+      this.#to(refused ? "wrong" : "unsent");
+    });
+  }
+
+  #past(round: number): boolean {
+    return this.#disposed || round !== this.#round;
+  }
+
+  #dropLook(): void {
+    const look = this.#look.value;
+    this.#look.value = null;
+    if (look !== null) void this.#forget(look);
+  }
+
+  async #forget(look: Look): Promise<void> {
+    try {
+      await this.#types.drop(look.id);
+    } catch {
+      // It goes by itself.
+    }
+  }
+}

@@ -1,0 +1,17 @@
+import type { RobotType } from "./model/robot-types";
+import { texts } from "../../shared/i18n/texts";
+
+/** Whether a type can be used, and how its newest upload fares. */
+export function StateChip({ type }: { type: RobotType }) {
+  const newer = type.upload !== null && type.upload.version !== type.version ? type.upload : null;
+  return (
+    <span class="row">
+      <span class={`chip type-${type.state}`} data-testid="type-state" data-state={type.state}>
+        {texts.robotTypes.state[type.state]}
+      </span>
+      {newer !== null && (
+        <span class={`chip type-${newer.state}`}>{texts.robotTypes.newer(newer.version, texts.robotTypes.state[newer.state])}</span>
+      )}
+    </span>
+  );
+}

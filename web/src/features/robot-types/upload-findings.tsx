@@ -1,0 +1,45 @@
+/** What the checkers have found in an upload. */
+import { degrees } from "../../shared/lib/angles";
+import type { RobotType, TypeModel } from "./model/robot-types";
+import { pack, type Files } from "./model/upload-files";
+import { texts } from "../../shared/i18n/texts";
+import { Card } from "../../shared/ui/parts";
+
+interface FoundProps {
+  type: RobotType;
+  model: TypeModel | null;
+  files: Files;
+}
+
+export function Found({ type, model, files }: FoundProps) {
+  const words = texts.robotTypes.found;
+  const { wholeDegrees } = texts.number;
+  const movements = Object.keys(pack(files)?.movements ?? {});
+  const lists: [string, string[]][] = [
+    [
+      words.joints,
+      type.joints.map((joint) =>
+        words.joint(
+          joint.label,
+          texts.robotTypes.range(wholeDegrees(degrees(joint.lower_rad)), wholeDegrees(degrees(joint.upper_rad))),
+        ),
+      ),
+    ],
+    [words.actuators, model?.actuators ?? []],
+    [words.cameras, model?.cameras ?? []],
+    [words.movements, movements],
+    [words.abilities, type.capabilities.map((name) => name.replaceAll("_", " "))],
+  ];
+  return (
+    <Card title={words.title}>
+      <dl class="found" data-testid="found">
+        {lists.map(([name, entries]) => (
+          <div key={name}>
+            <dt>{words.count(name, entries.length)}</dt>
+            <dd>{entries.length === 0 ? words.none : entries.join(" · ")}</dd>
+          </div>
+        ))}
+      </dl>
+    </Card>
+  );
+}

@@ -1,0 +1,57 @@
+/** What there is to be seen of a robot: through its own cameras, or from the room that it stands in. */
+import { useEffect, useState } from "preact/hooks";
+import type { DeviceStore } from "../devices/model/device-store";
+import type { Fleet } from "../devices/model/device-list";
+import { texts } from "../../shared/i18n/texts";
+import { CameraCard } from "./camera-card";
+
+interface View {
+  key: string;
+  device: DeviceStore;
+  camera: string;
+}
+
+interface WatchingProps {
+  device: DeviceStore;
+  views: readonly View[];
+}
+
+/** The robot's own cameras first, then those of its space. */
+export function useViews(fleet: Fleet, device: DeviceStore): readonly View[] {
+  const all = fleet.devices.value;
+  const space = device.info.value.space;
+  const others = [...(all?.values() ?? [])].filter(({ id, info }) => id !== device.id && info.value.space === space);
+  const ids = others.map(({ id }) => id).join();
+  useEffect(() => {
+    const ends = others.map((one) => one.watchDescription());
+    return () => ends.forEach((end) => end());
+  }, [ids]);
+  return [device, ...others].flatMap((one) =>
+    (one.description.value?.cameras ?? []).map(({ name }) => ({ key: `${one.id}/${name}`, device: one, camera: name })),
+  );
+}
+
+export function Watching({ device, views }: WatchingProps) {
+  const [chosen, setChosen] = useState("");
+  const view = views.find(({ key }) => key === chosen) ?? views[0];
+  if (view === undefined) return null;
+  const name = ({ device: of, camera }: View): string =>
+    of === device ? texts.watching.own(camera) : texts.watching.from(of.info.value.label, camera);
+  const choice = views.length > 1 && (
+    <select
+      aria-label={texts.watching.choose}
+      data-testid="watch-from"
+      value={view.key}
+      onChange={(event) => setChosen(event.currentTarget.value)}
+    >
+      {views.map((one) => (
+        <option key={one.key} value={one.key}>
+          {name(one)}
+        </option>
+      ))}
+    </select>
+  );
+  return (
+    <CameraCard key={view.key} device={view.device} name={view.camera} instrument={null} title={texts.watching.title} aside={choice} />
+  );
+}

@@ -1,0 +1,87 @@
+import { useState } from "preact/hooks";
+import type { Upload } from "../../shared/api/client";
+import { onThisClock } from "../../shared/lib/clock";
+import type { DeviceStore } from "../devices/model/device-store";
+import type { Instrument } from "./model/room-device-action";
+import { texts } from "../../shared/i18n/texts";
+import { Age, Card } from "../../shared/ui/parts";
+import { whyNot } from "../devices/availability";
+
+/** Captures that are taken and shown by a card of their own. */
+const SHOWN_ELSEWHERE = ["image", "depth", "scan"];
+
+interface FilesProps {
+  device: DeviceStore;
+  instrument: Instrument;
+}
+
+/** What was captured, by whomever, to take home. */
+export function Files({ device, instrument }: FilesProps) {
+  const uploads = instrument.uploads.value;
+  const more = (device.description.value?.captures ?? []).filter((name) => !SHOWN_ELSEWHERE.includes(name));
+  const no = whyNot(device);
+  const [taking, setTaking] = useState("");
+  const take = async (name: string): Promise<void> => {
+    setTaking(name);
+    await instrument.capture(name);
+    setTaking("");
+  };
+  return (
+    <Card title={texts.files.title}>
+      {more.length > 0 && (
+        <div class="row">
+          {more.map((name) => (
+            <button
+              key={name}
+              type="button"
+              data-testid={`capture-${name}`}
+              disabled={no !== "" || instrument.busy.value !== null}
+              title={no}
+              onClick={() => void take(name)}
+            >
+              {taking === name ? texts.files.taking : texts.files.take(name)}
+            </button>
+          ))}
+        </div>
+      )}
+      {uploads === null && <p class="quiet">{texts.loading}</p>}
+      {uploads?.length === 0 && <p class="quiet">{texts.files.none}</p>}
+      {uploads !== null && uploads.length > 0 && (
+        <ul class="file-list" data-testid="files">
+          {uploads.map((upload) => (
+            <File key={upload.id} upload={upload} instrument={instrument} />
+          ))}
+        </ul>
+      )}
+    </Card>
+  );
+}
+
+function File({ upload, instrument }: { upload: Upload; instrument: Instrument }) {
+  const name = upload.name === "" ? upload.stream : upload.name;
+  const download = async (): Promise<void> => {
+    // Its address lasts for an hour, so it is made when it is wanted.
+    const found = await instrument.find(upload.id);
+    if (found === null) return;
+    const link = document.createElement("a");
+    link.href = found.url;
+    link.download = name;
+    link.rel = "noopener";
+    // Where the store is on another site, `download` counts for nothing: this page must stay.
+    link.target = "_blank";
+    link.click();
+  };
+  return (
+    <li>
+      <span class="file-name">
+        {name}
+        <span class="quiet small">
+          {texts.files.size(upload.length)} · <Age at={onThisClock(Date.parse(upload.at))} />
+        </span>
+      </span>
+      <button type="button" aria-label={texts.files.downloadNamed(name)} onClick={() => void download()}>
+        {texts.files.download}
+      </button>
+    </li>
+  );
+}

@@ -1,0 +1,213 @@
+/** What one field has measured over time: from the cloud's store, continued with what this page hears. */
+import { effect } from "@preact/signals";
+import { useEffect, useMemo, useRef, useState } from "preact/hooks";
+import type { Api } from "../../shared/api/client";
+import { serverNow } from "../../shared/lib/clock";
+import type { DeviceStore } from "../devices/model/device-store";
+import { newestOf } from "../health/model/health";
+import { ApiError, sentence } from "../../shared/api/http";
+import { digits, type Quantity } from "./model/quantities";
+import { Recording } from "./model/stored-series";
+import { texts } from "../../shared/i18n/texts";
+import type { Marks, SeriesChart } from "../../shared/charts/series-chart";
+import { colour, onColourChange } from "../../shared/ui/canvas-theme";
+
+const DRAW_EVERY_MS = 500;
+const POINTS = 400;
+/** The cloud stores what it hears some seconds later: asked again, it fills the gap up to what was heard here. */
+const AGAIN_MS = 30_000;
+const FAR = 10;
+
+/** What was stored in this span and what has come since. `loads` rises with each answer of the cloud. */
+export function useRecording(api: Api, device: DeviceStore, { stream, field }: Quantity, spanMs: number) {
+  const recording = useMemo(() => new Recording(), [device, stream, field]);
+  const [trouble, setTrouble] = useState("");
+  const [loads, setLoads] = useState(0);
+  useEffect(
+    () =>
+      effect(() => {
+        const newest = newestOf(device, stream, field);
+        if (newest !== null) recording.add(newest.atMs, Number(newest.value));
+      }),
+    [recording, device, stream, field],
+  );
+  useEffect(() => {
+    let wanted = true;
+    const load = (): void => {
+      api.series(device.id, stream, serverNow() - spanMs, POINTS, field).then(
+        (series) => {
+          if (!wanted) return;
+          recording.load(series, field);
+          setTrouble("");
+          setLoads((count) => count + 1);
+        },
+        (error: unknown) => {
+          // Nothing of this stream has been stored yet.
+          const unknown = error instanceof ApiError && error.status === 404;
+          if (wanted && !unknown) setTrouble(sentence(error));
+        },
+      );
+    };
+    load();
+    const timer = setInterval(load, AGAIN_MS);
+    return () => {
+      wanted = false;
+      clearInterval(timer);
+    };
+  }, [api, device, recording, stream, field, spanMs]);
+  return { recording, trouble, loads };
+}
+
+interface HistoryProps {
+  recording: Recording;
+  quantity: Quantity;
+  spanMs: number;
+  binary: boolean;
+  old: boolean;
+  /** What else is to be seen. With it the plot can be read point by point, by keyboard or pointer. */
+  marks?: Omit<Marks, "cursor">;
+}
+
+type Columns = [number[], (number | null)[], (number | null)[], (number | null)[]];
+
+export function History({ recording, quantity, spanMs, binary, old, marks }: HistoryProps) {
+  const box = useRef<HTMLDivElement>(null);
+  const [failed, setFailed] = useState(false);
+  const [repaint, setRepaint] = useState(0);
+  const [reading, setReading] = useState("");
+  /** Where the reader is [s since 1970]; `null`: nowhere. */
+  const cursor = useRef<number | null>(null);
+  const drawn = useRef<{ columns: Columns; chart: SeriesChart | null; draw: () => void }>({
+    columns: [[], [], [], []],
+    chart: null,
+    draw: () => undefined,
+  });
+  const shown = useRef(marks);
+  shown.current = marks;
+  useEffect(() => onColourChange(() => setRepaint((count) => count + 1)), []);
+  useEffect(() => {
+    if (box.current === null) return;
+    const element = box.current;
+    let alive = true;
+    const draw = (): void => {
+      const until = Math.max(serverNow(), recording.samples(0).at(-1)?.at ?? 0);
+      const [times, ...values] = recording.columns(until - spanMs);
+      const inUnit = values.map((column) => column.map((one) => (one === null ? null : quantity.shown(one))));
+      const columns = [times, ...inUnit] as Columns;
+      drawn.current.columns = columns;
+      const given = shown.current;
+      const extra = given === undefined ? undefined : { ...given, cursor: cursor.current };
+      drawn.current.chart?.draw((until - spanMs) / 1000, until / 1000, times, inUnit, extra);
+      const seen = columns[1].filter((one) => one !== null);
+      element.setAttribute("data-points", String(seen.length));
+      element.setAttribute("aria-label", described(quantity, seen));
+      if (given !== undefined) tellPlace(element, columns, cursor.current, quantity);
+    };
+    drawn.current.draw = draw;
+    import("../../shared/charts/series-chart").then(
+      ({ createSeriesChart }) => {
+        if (!alive) return;
+        drawn.current.chart = createSeriesChart(element, { quantity, binary, colour: colour("--series-1") });
+        draw();
+      },
+      () => setFailed(true),
+    );
+    const timer = setInterval(draw, DRAW_EVERY_MS);
+    return () => {
+      alive = false;
+      clearInterval(timer);
+      drawn.current.chart?.dispose();
+      drawn.current.chart = null;
+    };
+  }, [recording, quantity, spanMs, binary, repaint]);
+
+  const goTo = (time: number | null): void => {
+    cursor.current = time;
+    drawn.current.draw();
+    const { columns } = drawn.current;
+    setReading(time === null ? "" : said(columns, nearest(columns, time), quantity));
+  };
+  const press = (event: KeyboardEvent): void => {
+    const { columns } = drawn.current;
+    const to = steps(event.key, columns, cursor.current);
+    if (to === null) return;
+    event.preventDefault();
+    goTo(columns[0][to] ?? null);
+  };
+  const point = (event: PointerEvent): void => {
+    const { chart, columns } = drawn.current;
+    if (chart !== null) goTo(columns[0][nearest(columns, chart.timeAt(event.clientX))] ?? null);
+  };
+
+  if (failed) return <p class="notice">{texts.plot.failed}</p>;
+  const kind = `chart series ${binary ? "binary" : ""} ${old ? "old" : ""}`;
+  if (marks === undefined) return <div ref={box} class={kind} data-testid="series" role="img" />;
+  return (
+    <>
+      <div
+        ref={box}
+        class={kind}
+        data-testid="series"
+        role="slider"
+        aria-orientation="horizontal"
+        aria-label={quantity.label}
+        aria-valuenow={0}
+        tabIndex={0}
+        onKeyDown={press}
+        onPointerMove={point}
+        onPointerLeave={() => goTo(null)}
+        onBlur={() => goTo(null)}
+      />
+      <p class="reading-at small" data-testid="reading-at">
+        {reading === "" ? <span class="quiet">{texts.trend.keys}</span> : reading}
+      </p>
+    </>
+  );
+}
+
+/** What a screen reader is told of the cursor. */
+function tellPlace(element: HTMLElement, columns: Columns, cursor: number | null, quantity: Quantity): void {
+  const at = nearest(columns, cursor ?? Infinity);
+  element.setAttribute("aria-valuemin", "0");
+  element.setAttribute("aria-valuemax", String(Math.max(0, columns[0].length - 1)));
+  element.setAttribute("aria-valuenow", String(Math.max(0, at)));
+  element.setAttribute("aria-valuetext", said(columns, at, quantity));
+}
+
+/** The index of the measured point next to a time; -1 where there is none. */
+function nearest([times, means]: Columns, time: number): number {
+  let found = -1;
+  times.forEach((one, index) => {
+    const away = time === Infinity ? -one : Math.abs(one - time);
+    const best = time === Infinity ? -(times[found] ?? -Infinity) : Math.abs((times[found] ?? -Infinity) - time);
+    if (means[index] !== null && away < best) found = index;
+  });
+  return found;
+}
+
+/** Where a key leads: the index of a measured point, or `null` where the key means nothing here. */
+function steps(key: string, columns: Columns, cursor: number | null): number | null {
+  const by = { ArrowLeft: -1, ArrowRight: 1, PageUp: -FAR, PageDown: FAR, Home: -Infinity, End: Infinity }[key];
+  const measured = columns[1].flatMap((mean, index) => (mean === null ? [] : [index]));
+  if (by === undefined || measured.length === 0) return null;
+  const here = measured.indexOf(nearest(columns, cursor ?? Infinity));
+  const to = Math.min(measured.length - 1, Math.max(0, here + by));
+  return measured[to] ?? null;
+}
+
+function said([times, means, lows, highs]: Columns, index: number, { unit }: Quantity): string {
+  const [at, mean, low, high] = [times[index], means[index], lows[index], highs[index]];
+  if (at === undefined || mean === undefined || mean === null) return texts.trend.nothing;
+  const places = digits(Math.max(Math.abs(mean) / 100, 0.01));
+  const text = (value: number): string => `${value.toFixed(places)} ${unit}`.trim();
+  const band = low === high || low === null || high === null || low === undefined || high === undefined ? null : [text(low), text(high)] as const;
+  return texts.trend.at(texts.sinceWhen(at * 1000), text(mean), band);
+}
+
+function described({ label, unit }: Quantity, seen: readonly number[]): string {
+  if (seen.length === 0) return texts.room.chartEmpty(label);
+  let [low, high] = [Infinity, -Infinity];
+  for (const one of seen) [low, high] = [Math.min(low, one), Math.max(high, one)];
+  const places = digits(high - low);
+  return texts.room.chart(label, low.toFixed(places), high.toFixed(places), unit);
+}

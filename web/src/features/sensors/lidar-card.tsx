@@ -1,0 +1,181 @@
+import { useEffect, useRef, useState } from "preact/hooks";
+import { sentence } from "../../shared/api/http";
+import { now } from "../../shared/lib/clock";
+import type { DeviceStore } from "../devices/model/device-store";
+import type { Instrument } from "./model/room-device-action";
+import { readScan, type LidarScan } from "../../shared/mqtt/parse-messages";
+import type { Values } from "../spaces/model/room-perception";
+import { texts } from "../../shared/i18n/texts";
+import { canvasBox } from "../../shared/ui/hidpi-canvas";
+import { contentOf } from "./use-capture-content";
+import { Age, Card } from "../../shared/ui/parts";
+import { colour, onColourChange } from "../../shared/ui/canvas-theme";
+import { whyNot } from "../devices/availability";
+
+const RANGE = "range";
+const LABEL_PX = 12;
+
+interface Taken {
+  scan: LidarScan;
+  at: number;
+}
+
+/** What a lidar sees, round it and to scale: its nearest things live, and every beam of a scan that was taken. */
+export function ScanCard({ device, instrument }: { device: DeviceStore; instrument: Instrument | null }) {
+  const canvas = useRef<HTMLCanvasElement>(null);
+  const [taken, setTaken] = useState<Taken | null>(null);
+  const [trouble, setTrouble] = useState("");
+  const [repaint, setRepaint] = useState(0);
+  const newest = device.measured(RANGE).value;
+  const sectors = sectorsOf(newest?.message.values ?? {});
+  const late = device.late(RANGE);
+
+  useEffect(() => onColourChange(() => setRepaint((count) => count + 1)), []);
+  useEffect(() => {
+    if (canvas.current === null) return;
+    return canvasBox(canvas.current, (context, width, height) => draw(context, width, height, sectors, taken?.scan ?? null));
+  }, [newest, taken, repaint]);
+
+  const take = async (): Promise<void> => {
+    const found = await instrument?.capture("scan");
+    if (found === null || found === undefined) return;
+    try {
+      const scan = readScan(new TextDecoder().decode(await contentOf(found)));
+      setTaken({ scan, at: now() });
+      setTrouble("");
+    } catch (error) {
+      setTrouble(sentence(error));
+    }
+  };
+
+  const nearest = sectors.length === 0 ? null : Math.min(...sectors);
+  const no = whyNot(device);
+  return (
+    <Card
+      title={texts.scan.title}
+      class="picture"
+      aside={
+        nearest !== null && (
+          <span class={`quiet ${late ? "old" : ""}`}>
+            {texts.scan.nearest} <strong class="value">{texts.depth.read(nearest.toFixed(2))}</strong>
+          </span>
+        )
+      }
+    >
+      <div class={`canvas-box scan-box ${late ? "old" : ""}`}>
+        <canvas
+          ref={canvas}
+          role="img"
+          data-testid="scan"
+          data-beams={taken?.scan.range_m.length ?? 0}
+          aria-label={nearest === null ? texts.scan.labelEmpty : texts.scan.label(nearest.toFixed(2))}
+        />
+      </div>
+      <p class="quiet small">
+        {sectors.length > 0 && `${texts.scan.live} `}
+        {taken === null ? (
+          instrument !== null && texts.scan.noPoints
+        ) : (
+          <Age at={taken.at} as={(age) => texts.scan.points(taken.scan.range_m.length, age)} />
+        )}
+        {late && newest !== null && <Age at={newest.receivedAt} as={(age) => ` ${texts.room.late(age)}`} />}
+      </p>
+      {instrument !== null && (
+        <div class="row">
+          <button
+            type="button"
+            class="primary"
+            data-testid="scan-shot"
+            disabled={no !== "" || instrument.busy.value !== null}
+            title={no}
+            onClick={() => void take()}
+          >
+            {instrument.busy.value === "capture" ? texts.camera.taking : texts.scan.shot}
+          </button>
+        </div>
+      )}
+      {instrument !== null && instrument.why.value !== "" && <p class="notice bad">{instrument.why.value}</p>}
+      {trouble !== "" && <p class="notice bad">{trouble}</p>}
+    </Card>
+  );
+}
+
+/** `range_m.0`, `range_m.1` …: the nearest thing in each sector, the first beginning at the lidar's x axis. */
+function sectorsOf(values: Values): number[] {
+  const found: number[] = [];
+  for (let index = 0; typeof values[`range_m.${index}`] === "number"; index += 1) found.push(Number(values[`range_m.${index}`]));
+  return found;
+}
+
+/** Its x axis is up, counter-clockwise is to the left, as one looks down on it. As large as what is seen allows. */
+function draw(context: CanvasRenderingContext2D, width: number, height: number, sectors: number[], scan: LidarScan | null): void {
+  const wide = (2 * Math.PI) / sectors.length;
+  const beams = (scan?.range_m ?? []).flatMap((m, index) => (m === null ? [] : [spot(scan?.angle_rad[index] ?? 0, m)]));
+  const arcs = sectors.flatMap((m, index) => [0, 0.5, 1].map((share) => spot((index + share) * wide, m)));
+  const seen = [[-0.5, -0.5], [0.5, 0.5], ...arcs, ...beams] as const;
+  const [xs, ys] = [seen.map(([right]) => right), seen.map(([, up]) => up)];
+  const [left, right, low, high] = [Math.min(...xs), Math.max(...xs), Math.min(...ys), Math.max(...ys)];
+  const scale = Math.min((width - 4 * LABEL_PX) / (right - left), (height - 4 * LABEL_PX) / (high - low));
+  const [x, y] = [width / 2 - ((left + right) / 2) * scale, height / 2 + ((low + high) / 2) * scale];
+  paintRings(context, x, y, Math.ceil(Math.hypot(width, height) / scale), scale);
+
+  context.fillStyle = colour("--series-1");
+  context.strokeStyle = colour("--series-1");
+  sectors.forEach((m, index) => {
+    // On a canvas angles run clockwise from the right; here counter-clockwise from the top.
+    const [from, to] = [-Math.PI / 2 - (index + 1) * wide, -Math.PI / 2 - index * wide];
+    context.globalAlpha = 0.12;
+    context.beginPath();
+    context.moveTo(x, y);
+    context.arc(x, y, m * scale, from, to);
+    context.fill();
+    context.globalAlpha = 1;
+    context.lineWidth = 2.5;
+    context.beginPath();
+    context.arc(x, y, m * scale, from, to);
+    context.stroke();
+  });
+
+  context.fillStyle = colour("--series-2");
+  for (const [right, up] of beams) context.fillRect(x + right * scale - 1.5, y - up * scale - 1.5, 3, 3);
+  context.fillStyle = colour("--text");
+  context.beginPath();
+  context.arc(x, y, 4, 0, 2 * Math.PI);
+  context.fill();
+}
+
+/** A place to the right of and above the lidar [m]. */
+function spot(angle: number, m: number): readonly [number, number] {
+  return [-Math.sin(angle) * m, Math.cos(angle) * m];
+}
+
+function paintRings(context: CanvasRenderingContext2D, x: number, y: number, rings: number, scale: number): void {
+  context.strokeStyle = colour("--line-strong");
+  context.fillStyle = colour("--quiet");
+  context.lineWidth = 1;
+  context.font = `${LABEL_PX}px system-ui, sans-serif`;
+  // Every metre, but for what would stand too close to be read.
+  const every = Math.max(1, Math.ceil(26 / scale));
+  for (let ring = 1; ring <= rings; ring += 1) {
+    context.globalAlpha = 0.35;
+    context.beginPath();
+    context.arc(x, y, ring * scale, 0, 2 * Math.PI);
+    context.stroke();
+    context.globalAlpha = 1;
+    if (ring % every !== 0) continue;
+    context.fillText(`${ring} m`, x + 4, y - ring * scale - 3);
+    context.fillText(`${ring} m`, x + 4, y + ring * scale - 3);
+  }
+  context.globalAlpha = 0.35;
+  for (let spoke = 0; spoke < 4; spoke += 1) {
+    const angle = (spoke * Math.PI) / 2;
+    context.beginPath();
+    context.moveTo(x, y);
+    context.lineTo(x + Math.cos(angle) * rings * scale, y + Math.sin(angle) * rings * scale);
+    context.stroke();
+  }
+  context.globalAlpha = 1;
+  context.textAlign = "right";
+  context.fillText(`${texts.scan.ahead} ↑`, x - 6, y - scale * 0.5);
+  context.textAlign = "left";
+}

@@ -1,0 +1,141 @@
+import { useState } from "preact/hooks";
+import type { DeviceStore } from "../devices/model/device-store";
+import type { Instrument } from "./model/room-device-action";
+import { quantityOf } from "./model/quantities";
+import { texts } from "../../shared/i18n/texts";
+import { Age, Card, Choice } from "../../shared/ui/parts";
+import { shown } from "./readings-card";
+import { whyNot } from "../devices/availability";
+
+const LEAST_HZ = 0.001;
+const MOST_HZ = 50;
+/** More values of a single measurement than this would push all else away; the rest is in its own card. */
+const MOST_SHOWN = 12;
+
+type Time = keyof typeof texts.gather.times;
+
+interface GatherProps {
+  device: DeviceStore;
+  instrument: Instrument;
+}
+
+/** Measuring at another rate for a while, and measuring once. */
+export function Gather({ device, instrument }: GatherProps) {
+  const own = Math.max(...(device.description.value?.streams ?? []).map(({ rate_hz: rate }) => rate), LEAST_HZ);
+  const [rate, setRate] = useState(String(Math.min(MOST_HZ, Math.max(1, own * 2))));
+  const [time, setTime] = useState<Time>("60");
+  const action = device.state.value?.action ?? null;
+  const running = action?.kind === "gather";
+  const rateHz = Number(rate);
+  const valid = rate.trim() !== "" && rateHz >= LEAST_HZ && rateHz <= MOST_HZ;
+  const no = whyNot(device);
+  const busy = instrument.busy.value;
+
+  const submit = (event: SubmitEvent): void => {
+    event.preventDefault();
+    if (running) void instrument.stopGathering();
+    else if (valid && no === "" && busy === null) void instrument.gather([], rateHz, Number(time));
+  };
+
+  return (
+    <Card title={texts.gather.title}>
+      <p class="quiet small">{texts.gather.explain}</p>
+      <form class="gather" onSubmit={submit}>
+        <label>
+          {texts.gather.rate}
+          <input
+            type="text"
+            inputMode="decimal"
+            value={rate}
+            disabled={running}
+            aria-invalid={!valid}
+            data-testid="gather-rate"
+            onInput={(event) => setRate(event.currentTarget.value)}
+          />
+        </label>
+        <Choice
+          label={texts.gather.time}
+          value={time}
+          onChange={setTime}
+          options={Object.entries(texts.gather.times) as [Time, string][]}
+        />
+        <div class="row">
+        <button
+          type="submit"
+          class="primary"
+          data-testid="gather"
+          aria-pressed={running}
+          disabled={!running && (!valid || no !== "" || busy !== null)}
+          title={no}
+        >
+          {running ? texts.gather.stop : texts.gather.start}
+        </button>
+        <button
+          type="button"
+          data-testid="shoot"
+          disabled={no !== "" || busy !== null || action !== null}
+          title={no}
+          onClick={() => void instrument.shoot()}
+        >
+          {texts.gather.once}
+        </button>
+        </div>
+      </form>
+      {!valid && <p class="field-error">{texts.gather.badRate}</p>}
+      <div role="status" data-testid="gather-state" data-running={String(running)}>
+        {running ? (
+          <>
+            {texts.gather.running(Math.round((action.progress ?? 0) * 100))}
+            <progress value={action.progress ?? 0} max={1} />
+          </>
+        ) : (
+          <span class="quiet">{action === null ? texts.gather.rest : texts.gather.busy}</span>
+        )}
+      </div>
+      <Paces device={device} />
+      {instrument.why.value !== "" && <p class="notice bad">{instrument.why.value}</p>}
+      <Once device={device} instrument={instrument} />
+    </Card>
+  );
+}
+
+/** How often each stream really comes. */
+function Paces({ device }: { device: DeviceStore }) {
+  const paces = (device.description.value?.streams ?? []).flatMap(({ name }) => {
+    const everyMs = device.measured(name).value?.everyMs ?? null;
+    return everyMs === null || everyMs <= 0 || device.late(name) ? [] : [texts.gather.pace(name, pace(1000 / everyMs))];
+  });
+  return paces.length === 0 ? null : <p class="quiet small">{paces.join(" · ")}</p>;
+}
+
+function pace(hz: number): string {
+  return hz < 1 ? hz.toFixed(2) : texts.number.oneDigit(hz);
+}
+
+function Once({ device, instrument }: GatherProps) {
+  const shot = instrument.shot.value;
+  const description = device.description.value;
+  if (shot === null || description === null) return null;
+  const rows = Object.entries(shot.streams).flatMap(([stream, values]) =>
+    Object.entries(values).map(([field, value]) => ({ quantity: quantityOf(description, stream, field), value })),
+  );
+  return (
+    <div data-testid="shot">
+      <p class="quiet small">
+        <Age at={shot.at} as={texts.gather.onceTaken} />
+      </p>
+      <dl class="figures">
+        {rows.slice(0, MOST_SHOWN).map(({ quantity, value }) => (
+          <div key={`${quantity.stream} ${quantity.field}`}>
+            <dt>{quantity.label}</dt>
+            <dd>
+              {typeof value === "boolean"
+                ? (texts.room.state[quantity.field] ?? texts.room.yesNo)[value ? 0 : 1]
+                : `${shown(quantity, value)} ${quantity.unit}`}
+            </dd>
+          </div>
+        ))}
+      </dl>
+    </div>
+  );
+}

@@ -1,0 +1,169 @@
+/** What this page asks of one room device: one thing at a time, and what became of it. */
+import { signal, type ReadonlySignal } from "@preact/signals-core";
+import { type ActionRunner, type Asking, type Run } from "../../actions/model/action-runner";
+import type { Api, Upload } from "../../../shared/api/client";
+import { sentence } from "../../../shared/api/http";
+import { now } from "../../../shared/lib/clock";
+import type { DeviceStore } from "../../devices/model/device-store";
+import { readApplied, readShot } from "../../../shared/mqtt/parse-messages";
+import type { RoomRequest } from "../../../shared/api/action-requests";
+import type { Values } from "../../spaces/model/room-perception";
+
+/** A short question is answered, or has failed, within this time [ms]. */
+const TIMEOUT_MS = 30_000;
+/** A survey of a room takes ten seconds by itself. */
+const CAPTURE_TIMEOUT_MS = 120_000;
+const MARGIN_MS = 15_000;
+
+export interface Shot {
+  /** On the page's clock, when the answer came [ms]. */
+  at: number;
+  streams: Readonly<Record<string, Values>>;
+}
+
+export interface Taken {
+  upload: Upload;
+  url: string;
+}
+
+/** What a control was asked to be, and what the device says it has made of it. */
+export interface Setting {
+  asked: number;
+  /** `null` while the answer is awaited, or where there was none. */
+  applied: number | null;
+  why: string;
+}
+
+export class Instrument {
+  readonly #api: Api;
+  readonly #device: DeviceStore;
+  readonly #actions: ActionRunner;
+  readonly #epoch: () => number | null;
+  readonly #busy = signal<RoomRequest["kind"] | null>(null);
+  readonly #why = signal("");
+  readonly #shot = signal<Shot | null>(null);
+  readonly #settings = signal<ReadonlyMap<string, Setting>>(new Map());
+  readonly #uploads = signal<readonly Upload[] | null>(null);
+  readonly #wanted = new Map<string, number>();
+  #setting = false;
+
+  /** What is asked for just now. */
+  readonly busy: ReadonlySignal<RoomRequest["kind"] | null> = this.#busy;
+  /** Why the last thing asked for did not happen; empty otherwise. */
+  readonly why: ReadonlySignal<string> = this.#why;
+  /** The last single measurement. */
+  readonly shot: ReadonlySignal<Shot | null> = this.#shot;
+  readonly settings: ReadonlySignal<ReadonlyMap<string, Setting>> = this.#settings;
+  /** Captured files, newest first; `null` before the first answer. */
+  readonly uploads: ReadonlySignal<readonly Upload[] | null> = this.#uploads;
+
+  /** `epoch`: of the lease that this page holds, if it does. */
+  constructor(api: Api, device: DeviceStore, actions: ActionRunner, epoch: () => number | null) {
+    this.#api = api;
+    this.#device = device;
+    this.#actions = actions;
+    this.#epoch = epoch;
+  }
+
+  /** Have streams measured at this rate; whoever watches hears them. Nothing is kept waiting for their end. */
+  async gather(streams: string[], rateHz: number, durationS: number): Promise<void> {
+    const request = { kind: "gather", streams, rate_hz: rateHz, duration_s: durationS } as const;
+    await this.#ask(request, "started", durationS * 1000 + MARGIN_MS);
+  }
+
+  /** End what the device does now, whoever began it. */
+  async stopGathering(): Promise<void> {
+    const running = this.#device.state.value?.action ?? null;
+    if (running === null) return;
+    this.#why.value = await this.#actions.cancel(running.id);
+  }
+
+  async shoot(): Promise<void> {
+    const done = await this.#ask({ kind: "shoot", streams: [] }, "done", TIMEOUT_MS);
+    if (done === null) return;
+    this.#try(() => (this.#shot.value = { at: now(), streams: readShot(done.result) }));
+  }
+
+  /** Take something raw; where it can be read, or `null` where it failed, which `why` says. */
+  async capture(name: string): Promise<Taken | null> {
+    const done = await this.#ask({ kind: "capture", name }, "done", CAPTURE_TIMEOUT_MS);
+    const id = done?.result["upload"];
+    if (typeof id !== "string") return null;
+    void this.list();
+    return this.find(id);
+  }
+
+  /** A captured file, with an address. */
+  async find(id: string): Promise<Taken | null> {
+    try {
+      const { url, ...upload } = await this.#api.upload(this.#device.id, id);
+      return { upload, url };
+    } catch (error) {
+      this.#why.value = sentence(error);
+      return null;
+    }
+  }
+
+  async list(): Promise<void> {
+    try {
+      this.#uploads.value = await this.#api.uploads(this.#device.id, 50);
+    } catch (error) {
+      this.#why.value = sentence(error);
+    }
+  }
+
+  /** Set a control. While one setting is under way, only the newest of those that follow is sent. */
+  async set(control: string, value: number): Promise<void> {
+    this.#wanted.set(control, value);
+    this.#note(control, { asked: value, applied: null, why: "" });
+    if (this.#setting) return;
+    this.#setting = true;
+    try {
+      for (let next = this.#next(); next !== null; next = this.#next()) await this.#setOne(...next);
+    } finally {
+      this.#setting = false;
+    }
+  }
+
+  #next(): [string, number] | null {
+    const [first] = this.#wanted;
+    if (first === undefined) return null;
+    this.#wanted.delete(first[0]);
+    return first;
+  }
+
+  async #setOne(control: string, value: number): Promise<void> {
+    const done = await this.#ask({ kind: "set_control", control, value }, "done", TIMEOUT_MS);
+    const why = this.#why.value;
+    this.#why.value = "";
+    let setting: Setting = { asked: value, applied: null, why };
+    if (done !== null) {
+      this.#try(() => (setting = { asked: value, applied: readApplied(done.result)[control] ?? null, why: "" }));
+    }
+    // Asked anew meanwhile: that one's answer counts.
+    if (!this.#wanted.has(control)) this.#note(control, setting);
+  }
+
+  #note(control: string, setting: Setting): void {
+    this.#settings.value = new Map(this.#settings.value).set(control, setting);
+  }
+
+  /** The run once it has come as far as wanted; `null` where it did not, which `why` says. */
+  async #ask(request: RoomRequest, waitFor: Required<Asking>["waitFor"], timeoutMs: number): Promise<Run | null> {
+    this.#busy.value = request.kind;
+    this.#why.value = "";
+    const run = await this.#actions.ask(request, { epoch: this.#epoch(), waitFor, timeoutMs });
+    this.#busy.value = null;
+    if (run.status === "done" || (waitFor === "started" && run.status === "started")) return run;
+    this.#why.value = run.why === "" ? run.status : run.why;
+    return null;
+  }
+
+  #try(read: () => void): void {
+    try {
+      read();
+    } catch (error) {
+      this.#why.value = sentence(error);
+    }
+  }
+}

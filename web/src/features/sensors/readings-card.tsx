@@ -1,0 +1,199 @@
+/** What one stream measures: a number with its history, a state with since when, or, of many values, a table. */
+import { useMemo, useState } from "preact/hooks";
+import type { Api } from "../../shared/api/client";
+import { onThisClock } from "../../shared/lib/clock";
+import type { DeviceStore } from "../devices/model/device-store";
+import { digits, judge, quantityOf, type Quantity } from "./model/quantities";
+import type { Recording } from "./model/stored-series";
+import { texts } from "../../shared/i18n/texts";
+import { History, useRecording } from "./history-card";
+import { Age, Card, Choice } from "../../shared/ui/parts";
+
+/** More values than this are a table. */
+const MOST_CARDS = 4;
+/** What can be set goes by the names of its controls. */
+const SETTINGS = "settings";
+
+type Span = keyof typeof texts.room.spans;
+const SPAN_MS: Readonly<Record<Span, number>> = { "10min": 600_000, "1h": 3_600_000, "24h": 86_400_000 };
+
+interface ReadingsProps {
+  api: Api;
+  device: DeviceStore;
+  stream: string;
+}
+
+export function Readings({ api, device, stream }: ReadingsProps) {
+  const values = device.measured(stream).value?.message.values ?? {};
+  const description = device.description.value;
+  const fields = Object.keys(values);
+  const known = fields.join(" ");
+  const quantities = useMemo(
+    () => (description === null ? [] : named(fields.map((field) => quantityOf(description, stream, field)))),
+    [description, stream, known],
+  );
+  if (fields.length === 0) {
+    return (
+      <Card title={capital(stream)}>
+        <p class="quiet">{texts.room.nothingYet}</p>
+      </Card>
+    );
+  }
+  if (fields.length > MOST_CARDS) return <Table device={device} stream={stream} quantities={quantities} />;
+  return (
+    <>
+      {quantities.map((quantity) => (
+        <Reading key={quantity.field} api={api} device={device} quantity={quantity} />
+      ))}
+    </>
+  );
+}
+
+/** The only value of a stream is what the room calls the stream. */
+function named(quantities: Quantity[]): Quantity[] {
+  const [only] = quantities;
+  if (quantities.length !== 1 || only === undefined || only.judged === null || only.stream === SETTINGS) return quantities;
+  return [{ ...only, label: only.judged.label }];
+}
+
+interface ReadingProps {
+  api: Api;
+  device: DeviceStore;
+  quantity: Quantity;
+}
+
+function Reading({ api, device, quantity }: ReadingProps) {
+  const [span, setSpan] = useState<Span>("10min");
+  const newest = device.measured(quantity.stream).value;
+  const value = newest?.message.values[quantity.field];
+  const late = device.late(quantity.stream);
+  const { recording, trouble, loads } = useRecording(api, device, quantity, SPAN_MS[span]);
+  const binary = typeof value === "boolean";
+  return (
+    <Card
+      title={quantity.label}
+      class="reading"
+      aside={
+        <Choice
+          label={texts.room.span}
+          value={span}
+          onChange={setSpan}
+          options={Object.entries(texts.room.spans) as [Span, string][]}
+        />
+      }
+    >
+      <p class={`figure-now ${late ? "old" : ""}`} data-testid={`value-${quantity.field}`} data-value={String(value ?? "")}>
+        {binary ? (
+          <Status recording={recording} field={quantity.field} value={value} loads={loads} />
+        ) : (
+          typeof value === "number" && <Figure quantity={quantity} value={value} />
+        )}
+        {late && newest !== null && (
+          <span class="chip reach-stale">
+            <Age at={newest.receivedAt} as={texts.room.late} />
+          </span>
+        )}
+      </p>
+      <History recording={recording} quantity={quantity} spanMs={SPAN_MS[span]} binary={binary} old={late} />
+      {quantity.judged !== null && !binary && <Limits quantity={quantity} />}
+      {trouble !== "" && <p class="quiet small">{texts.room.noHistory(trouble)}</p>}
+    </Card>
+  );
+}
+
+export function Figure({ quantity, value }: { quantity: Quantity; value: number }) {
+  const judgement = judge(value, quantity.judged);
+  return (
+    <>
+      <strong>{shown(quantity, value)}</strong> <span class="unit">{quantity.unit}</span>
+      {quantity.judged !== null && judgement !== "well" && (
+        <span class={`chip ${judgement === "bad" ? "bad" : "reach-stale"}`} title={quantity.judged.advice}>
+          {texts.room.judged[judgement]}
+        </span>
+      )}
+    </>
+  );
+}
+
+/** A door's contact, a motion detector: what it says, and since when it has said so. */
+function Status({ recording, field, value, loads }: { recording: Recording; field: string; value: boolean; loads: number }) {
+  const since = useMemo(() => recording.since(), [recording, value, loads]);
+  const [yes, no] = texts.room.state[field] ?? texts.room.yesNo;
+  return (
+    <>
+      <span class={`lamp ${value ? "lit" : ""}`} aria-hidden="true" />
+      <strong>{value ? yes : no}</strong>
+      {since !== null && (
+        <span class="quiet">
+          {(since.atLeast ? texts.room.sinceLonger : texts.room.since)(texts.sinceWhen(since.at))}
+          {" · "}
+          <Age at={onThisClock(since.at)} />
+        </span>
+      )}
+    </>
+  );
+}
+
+export function Limits({ quantity }: { quantity: Quantity }) {
+  const { judged, unit, shown: inUnit } = quantity;
+  if (judged === null) return null;
+  const text = (limit: number | null): string | null => (limit === null ? null : String(Number(inUnit(limit).toFixed(2))));
+  const said = texts.room.limits(text(judged.warning_low ?? judged.low), text(judged.warning_high ?? judged.high), unit);
+  return said === "" ? null : <p class="quiet small">{said}</p>;
+}
+
+function Table({ device, stream, quantities }: { device: DeviceStore; stream: string; quantities: readonly Quantity[] }) {
+  const newest = device.measured(stream).value;
+  const late = device.late(stream);
+  return (
+    <Card
+      title={capital(stream)}
+      aside={
+        late &&
+        newest !== null && (
+          <span class="chip reach-stale">
+            <Age at={newest.receivedAt} as={texts.room.late} />
+          </span>
+        )
+      }
+    >
+      <div class="scroll" tabIndex={0} role="region" aria-label={texts.room.values(stream)}>
+        <table class={late ? "old" : ""}>
+          <thead>
+            <tr>
+              <th scope="col">{texts.room.name}</th>
+              <th scope="col">{texts.room.value}</th>
+            </tr>
+          </thead>
+          <tbody>
+            {quantities.map((quantity) => {
+              const value = newest?.message.values[quantity.field];
+              return (
+                <tr key={quantity.field}>
+                  <th scope="row">{quantity.label}</th>
+                  <td>{value === undefined ? texts.number.unknown : cell(quantity, value)}</td>
+                </tr>
+              );
+            })}
+          </tbody>
+        </table>
+      </div>
+    </Card>
+  );
+}
+
+function cell(quantity: Quantity, value: number | boolean): string {
+  if (typeof value === "boolean") return texts.room.yesNo[value ? 0 : 1];
+  return `${shown(quantity, value)} ${quantity.unit}`.trim();
+}
+
+/** Three figures that say something; what is whole stays whole. */
+export function shown(quantity: Quantity, value: number): string {
+  const converted = quantity.shown(value);
+  if (Number.isInteger(converted)) return String(converted);
+  return converted.toFixed(digits(Math.max(Math.abs(converted), 0.01)));
+}
+
+function capital(text: string): string {
+  return (text.charAt(0).toUpperCase() + text.slice(1)).replaceAll("_", " ");
+}

@@ -1,0 +1,126 @@
+import { useState } from "preact/hooks";
+import { clamp } from "../../shared/lib/angles";
+import type { DeviceStore } from "../devices/model/device-store";
+import type { Instrument } from "./model/room-device-action";
+import { quantityOf, type Quantity } from "./model/quantities";
+import type { Control } from "../../shared/mqtt/protocol.generated";
+import { texts } from "../../shared/i18n/texts";
+import { Card } from "../../shared/ui/parts";
+import { whyNot } from "../devices/availability";
+
+const STREAM = "settings";
+const STEPS = 100;
+
+interface SettingsProps {
+  device: DeviceStore;
+  instrument: Instrument;
+}
+
+/** What can be set, within the limits of the device's own description, and what it is now. */
+export function Settings({ device, instrument }: SettingsProps) {
+  const description = device.description.value;
+  const no = whyNot(device);
+  if (description === null) return null;
+  return (
+    <Card title={texts.settings.title} aside={no !== "" && <span class="quiet">{no}</span>}>
+      {description.controls.map((control) => (
+        <Setting
+          key={control.name}
+          device={device}
+          instrument={instrument}
+          control={control}
+          text={textOf(control, quantityOf(description, STREAM, control.name))}
+          disabled={no !== ""}
+        />
+      ))}
+    </Card>
+  );
+}
+
+/** A control's value as it is read: shares in per cent, angles in degrees, with as many digits as a step deserves. */
+function textOf({ lower, upper }: Control, { unit, shown }: Quantity): (value: number) => string {
+  const spread = shown(upper) - shown(lower);
+  const places = spread > 50 ? 0 : spread > 5 ? 1 : 2;
+  // No minus before a nought.
+  return (value) => `${(Number(shown(value).toFixed(places)) + 0).toFixed(places)} ${unit}`.trim();
+}
+
+interface SettingProps extends SettingsProps {
+  control: Control;
+  text: (value: number) => string;
+  disabled: boolean;
+}
+
+function Setting({ device, instrument, control, text, disabled }: SettingProps) {
+  /** While a hand is on it. */
+  const [held, setHeld] = useState<number | null>(null);
+  const measured = device.measured(STREAM).value?.message.values[control.name];
+  const late = device.late(STREAM);
+  const setting = instrument.settings.value.get(control.name);
+  const now = typeof measured === "number" ? measured : null;
+  const asked = held ?? setting?.asked ?? now ?? control.lower;
+  const send = (value: number): void => {
+    setHeld(null);
+    void instrument.set(control.name, clamp(value, control.lower, control.upper));
+  };
+  const ends = texts.settings.ends[control.name];
+  const share = now === null ? null : (now - control.lower) / (control.upper - control.lower);
+  return (
+    <div class="setting">
+      <div class="setting-head">
+        <span class="joint-name">{control.label}</span>
+        <span class={`measured ${late ? "old" : ""}`} data-testid={`now-${control.name}`} data-value={now ?? ""}>
+          {texts.settings.now} {now === null ? texts.number.unknown : text(now)}
+        </span>
+      </div>
+      <div class="track">
+        <span class="limit quiet">{text(control.lower)}</span>
+        <div class="rail">
+          <input
+            type="range"
+            min={control.lower}
+            max={control.upper}
+            step={(control.upper - control.lower) / STEPS}
+            value={asked}
+            disabled={disabled}
+            aria-label={texts.settings.slider(control.label)}
+            aria-valuetext={text(asked)}
+            data-testid={`set-${control.name}`}
+            onInput={(event) => setHeld(event.currentTarget.valueAsNumber)}
+            onChange={(event) => send(event.currentTarget.valueAsNumber)}
+          />
+          {share !== null && <span class={`marker ${late ? "old" : ""}`} aria-hidden="true" style={{ "--at": String(clamp(share, 0, 1)) }} />}
+        </div>
+        <span class="limit quiet">{text(control.upper)}</span>
+      </div>
+      <div class="row setting-foot">
+        {ends !== undefined &&
+          [control.lower, control.upper].map((value, index) => (
+            <button
+              key={value}
+              type="button"
+              disabled={disabled}
+              aria-pressed={setting !== undefined ? setting.asked === value : now === value}
+              data-testid={`${control.name}-${index === 0 ? "least" : "most"}`}
+              onClick={() => send(value)}
+            >
+              {ends[index === 0 ? 0 : 1]}
+            </button>
+          ))}
+        <span class="small" role="status" data-testid={`applied-${control.name}`} data-value={setting?.applied ?? ""}>
+          {held !== null ? (
+            text(held)
+          ) : setting === undefined ? (
+            ""
+          ) : setting.why !== "" ? (
+            <span class="stream-limited">{texts.settings.refused(setting.why)}</span>
+          ) : setting.applied === null ? (
+            texts.settings.applying
+          ) : (
+            texts.settings.applied(text(setting.applied))
+          )}
+        </span>
+      </div>
+    </div>
+  );
+}

@@ -1,0 +1,14 @@
+/** The content of a captured file, for who draws it. */
+import type { Taken } from "./model/room-device-action";
+import { texts } from "../../shared/i18n/texts";
+
+/** Throws an `Error` whose message is fit for the page: the store may be elsewhere, and not let this page read. */
+export async function contentOf({ url }: Taken): Promise<Uint8Array<ArrayBuffer>> {
+  try {
+    const response = await fetch(url, { credentials: "omit" });
+    if (!response.ok) throw new Error(String(response.status));
+    return new Uint8Array(await response.arrayBuffer());
+  } catch {
+    throw new Error(texts.files.unreadable);
+  }
+}

@@ -1,0 +1,364 @@
+import { useEffect, useMemo, useRef, useState } from "preact/hooks";
+import type { Account, Api } from "../../shared/api/client";
+import { ApiError, sentence } from "../../shared/api/http";
+import type { Invitation, Person, Role, Share, SharedRole, Target } from "./model/wire-types";
+import { secondsLeft, Sharing } from "./model/shares";
+import type { Whole } from "./model/transfers";
+import { texts } from "../../shared/i18n/texts";
+import { AskedForm } from "../../shared/ui/inline-form";
+import { Confirm } from "../../shared/ui/confirm-button";
+import { useFocusBack } from "../../shared/hooks/use-return-focus";
+import { InviteForm, MAY } from "./invite-form";
+import { AS_IT_IS, LastingField, seconds } from "../../shared/ui/duration-picker";
+import { Card, Choice } from "../../shared/ui/parts";
+import { spaceAddress } from "../../app/routes";
+import { Transfer } from "./transfer-panel";
+import "./sharing.css";
+
+/** While a link is out somebody may use it at any moment. */
+const LOOK_AGAIN_MS = 5_000;
+const LASTS = ["keep", "never", "hour", "workday", "day", "week", "month", "date"] as const;
+
+interface AccessProps {
+  api: Api;
+  account: Account;
+  target: Target;
+  /** What is handed over where it is, and the names of all that goes with it. */
+  whole: Whole;
+  goes: readonly string[];
+  owner: Person;
+  role: Role;
+  /** Of a device: the space through which others have access too. */
+  space?: { id: string; name: string };
+  /** One's own part was given up. */
+  onLeft: () => void;
+}
+
+type PartProps = Omit<AccessProps, "goes" | "role" | "whole">;
+
+const ID = "access";
+
+/** Bring who has access into sight, and the focus there. The fragment is the route here: a link cannot do it. */
+export function goToAccess(): void {
+  const card = document.getElementById(ID);
+  card?.scrollIntoView({ block: "start" });
+  card?.querySelector<HTMLElement>("button, input")?.focus({ preventScroll: true });
+}
+
+/** Who has access to a device or a space, and for its owner all that changes it. */
+export function Access({ role, whole, goes, ...rest }: AccessProps) {
+  return (
+    <div id={ID} class="access" data-testid="access">
+      {role === "owner" ? <OwnersAccess {...rest} /> : <OwnPart role={role} {...rest} />}
+      {role === "owner" && <Transfer api={rest.api} of={whole} goes={goes} />}
+    </div>
+  );
+}
+
+function OwnPart({ api, account, target, owner, role, onLeft }: PartProps & { role: SharedRole }) {
+  const leave = async (): Promise<void> => {
+    try {
+      await api.unshare(target, account.id);
+    } catch (error) {
+      const through = target.kind === "device" && error instanceof ApiError && error.code === "share-unknown";
+      throw through ? new Error(texts.access.elsewhere) : error;
+    }
+    onLeft();
+  };
+  return (
+    <Card title={texts.access.title}>
+      <p>{texts.access.owned(owner.name, texts.role[role])}</p>
+      <Confirm
+        label={texts.access.leave}
+        question={texts.access.leaveSure}
+        yes={texts.access.leaveYes}
+        busy={texts.access.leaving}
+        keep={texts.access.keep}
+        onYes={leave}
+      />
+    </Card>
+  );
+}
+
+function OwnersAccess({ api, target, owner, space }: PartProps) {
+  const { kind, id } = target;
+  const sharing = useMemo(() => new Sharing(api, { kind, id }), [api, kind, id]);
+  const [inviting, setInviting] = useState(false);
+  useEffect(() => {
+    void sharing.refresh();
+    const timer = setInterval(() => {
+      if (sharing.waits.value && document.visibilityState === "visible") void sharing.refresh();
+    }, LOOK_AGAIN_MS);
+    return () => clearInterval(timer);
+  }, [sharing]);
+
+  const shares = sharing.shares.value;
+  const trouble = sharing.trouble.value;
+  const opener = useFocusBack(inviting);
+  const open = inviting ? null : (
+    <button type="button" ref={opener} data-testid="invite" onClick={() => setInviting(true)}>
+      {texts.invite.open}
+    </button>
+  );
+  return (
+    <Card title={texts.access.title} aside={open}>
+      {kind === "space" && <p class="quiet small">{texts.access.spaceNote}</p>}
+      {inviting && <InviteForm sharing={sharing} onClose={() => setInviting(false)} />}
+      {trouble !== "" && (
+        <p class="notice bad" role="alert">
+          {texts.access.failed(trouble)}{" "}
+          <button type="button" onClick={() => void sharing.refresh()}>
+            {texts.access.again}
+          </button>
+        </p>
+      )}
+      {shares === null && trouble === "" && <p class="quiet">{texts.access.loading}</p>}
+      <Undo sharing={sharing} />
+      <ul class="people" data-testid="people">
+        <li>
+          <span class="person">
+            {owner.name} <span class="quiet">({texts.access.you})</span>
+          </span>
+          <span class="chip">{texts.role.owner}</span>
+        </li>
+        {shares?.map((share) => (
+          <PersonRow key={share.account.id} share={share} sharing={sharing} />
+        ))}
+      </ul>
+      {shares?.length === 0 && <p class="quiet">{texts.access.none}</p>}
+      <OpenLinks sharing={sharing} />
+      {space !== undefined && <ThroughSpace api={api} space={space} />}
+    </Card>
+  );
+}
+
+/** What was taken away last, and the way back. */
+function Undo({ sharing }: { sharing: Sharing }) {
+  const ended = sharing.ended.value;
+  const [busy, setBusy] = useState(false);
+  const [said, setSaid] = useState<{ text: string; wrong: boolean } | null>(null);
+  const button = useRef<HTMLButtonElement>(null);
+  useEffect(() => {
+    if (ended === null) return;
+    setSaid(null);
+    button.current?.focus(); // The button that was pressed has gone with its line.
+  }, [ended]);
+  const undo = async (): Promise<void> => {
+    const name = ended?.account.name ?? "";
+    setBusy(true);
+    try {
+      await sharing.undo();
+      setSaid({ text: texts.access.restored(name), wrong: false });
+    } catch (error) {
+      setSaid({ text: sentence(error), wrong: true });
+    } finally {
+      setBusy(false);
+    }
+  };
+  return (
+    <div role="status">
+      {ended !== null && (
+        <p class="notice row" data-testid="removed">
+          <span>{texts.access.removed(ended.account.name)}</span>
+          <button type="button" ref={button} disabled={busy} data-testid="undo" onClick={() => void undo()}>
+            {busy ? texts.access.undoing : texts.access.undo}
+          </button>
+        </p>
+      )}
+      {ended !== null && sharing.rest.value !== "" && <p class="notice warn">{sharing.rest.value}</p>}
+      {said !== null && <p class={said.wrong ? "field-error" : "field-note"}>{said.text}</p>}
+    </div>
+  );
+}
+
+function PersonRow({ share, sharing }: { share: Share; sharing: Sharing }) {
+  const { name } = share.account;
+  const [changing, setChanging] = useState(false);
+  const [busy, setBusy] = useState(false);
+  const [said, setSaid] = useState({ text: "", wrong: false });
+  const opener = useFocusBack(changing);
+  const remove = async (): Promise<void> => {
+    setBusy(true);
+    try {
+      await sharing.end(share); // This row goes with it.
+    } catch (error) {
+      setSaid({ text: sentence(error), wrong: true });
+      setBusy(false);
+    }
+  };
+  return (
+    <li data-testid="person" data-name={name}>
+      <span class="person">
+        {name}
+        <span class="quiet small">
+          {texts.until(share.expires_at)} · {texts.access.since(share.by, share.created_at)}
+        </span>
+      </span>
+      <span class={`chip role-${share.role}`} title={texts.roleExplained[share.role]}>
+        {texts.role[share.role]}
+      </span>
+      <span class="row">
+        <button
+          type="button"
+          class="plain"
+          ref={opener}
+          aria-label={texts.access.changeOf(name)}
+          aria-expanded={changing}
+          onClick={() => setChanging(!changing)}
+        >
+          {texts.access.change}
+        </button>
+        <button
+          type="button"
+          class="plain"
+          data-testid="remove"
+          aria-label={texts.access.removeOf(name)}
+          disabled={busy}
+          onClick={() => void remove()}
+        >
+          {busy ? texts.access.removing : texts.access.remove}
+        </button>
+      </span>
+      {changing && (
+        <ChangeForm
+          share={share}
+          sharing={sharing}
+          onDone={(text) => {
+            setChanging(false);
+            setSaid({ text, wrong: false });
+          }}
+        />
+      )}
+      <p class={said.wrong ? "field-error" : "field-note"} role="status" hidden={said.text === ""}>
+        {said.text}
+      </p>
+    </li>
+  );
+}
+
+interface ChangeFormProps {
+  share: Share;
+  sharing: Sharing;
+  /** With what there is to say; empty: nothing was changed. */
+  onDone: (text: string) => void;
+}
+
+function ChangeForm({ share, sharing, onDone }: ChangeFormProps) {
+  const [role, setRole] = useState(share.role);
+  const [lasts, setLasts] = useState(AS_IT_IS);
+  const [busy, setBusy] = useState(false);
+  const [wrong, setWrong] = useState("");
+  const save = async (): Promise<void> => {
+    const forS = seconds(lasts, secondsLeft(share.expires_at));
+    if (forS === undefined) {
+      setWrong(texts.lasting.past);
+      return;
+    }
+    setBusy(true);
+    setWrong("");
+    try {
+      const { account, role: now, expires_at: until } = await sharing.put(share.account.name, role, forS);
+      onDone(texts.access.changed(account.name, texts.role[now], texts.until(until)));
+    } catch (error) {
+      setWrong(sentence(error));
+      setBusy(false);
+    }
+  };
+  return (
+    <AskedForm
+      label={texts.access.changeOf(share.account.name)}
+      todo={texts.access.save}
+      doing={texts.access.saving}
+      busy={busy}
+      wrong={wrong}
+      onSend={save}
+      onClose={() => onDone("")}
+    >
+      <div class="field">
+        <span class="label">{texts.invite.role}</span>
+        <Choice label={texts.invite.role} value={role} options={MAY} onChange={setRole} />
+      </div>
+      <LastingField
+        id={`lasts-${share.account.id}`}
+        label={texts.invite.lasts}
+        value={lasts}
+        choices={LASTS}
+        onChange={setLasts}
+      />
+    </AskedForm>
+  );
+}
+
+function OpenLinks({ sharing }: { sharing: Sharing }) {
+  const invitations = sharing.invitations.value;
+  if (invitations.length === 0) return null;
+  return (
+    <>
+      <h3>{texts.access.links}</h3>
+      <ul class="people" data-testid="open-links">
+        {invitations.map((each) => (
+          <OpenLink key={each.id} invitation={each} sharing={sharing} />
+        ))}
+      </ul>
+    </>
+  );
+}
+
+function OpenLink({ invitation, sharing }: { invitation: Invitation; sharing: Sharing }) {
+  const { role, uses, share_s: shareS } = invitation;
+  const terms = [texts.access.uses(uses), texts.access.lasts(shareS)];
+  return (
+    <li>
+      <span class="person">
+        {texts.access.linkFor[role]}
+        <span class="quiet small">{[...terms, texts.until(invitation.expires_at)].join(" · ")}</span>
+      </span>
+      <Confirm
+        label={texts.access.withdraw}
+        description={`${texts.access.withdraw}: ${texts.access.linkFor[role]}`}
+        question={texts.access.withdrawSure}
+        yes={texts.access.withdrawYes}
+        busy={texts.access.withdrawing}
+        keep={texts.access.keep}
+        onYes={() => sharing.withdraw(invitation)}
+      />
+    </li>
+  );
+}
+
+/** Who has access to a device because the space it stands in is shared with them. */
+function ThroughSpace({ api, space }: { api: Api; space: { id: string; name: string } }) {
+  const [shares, setShares] = useState<readonly Share[]>([]);
+  const [wrong, setWrong] = useState("");
+  useEffect(() => {
+    let wanted = true;
+    api.shares({ kind: "space", id: space.id }).then(
+      (found) => wanted && setShares(found),
+      (error: unknown) => wanted && setWrong(sentence(error)),
+    );
+    return () => {
+      wanted = false;
+    };
+  }, [api, space.id]);
+  if (wrong !== "") return <p class="field-error">{texts.access.failed(wrong)}</p>;
+  if (shares.length === 0) return null;
+  return (
+    <>
+      <h3>{texts.access.inSpace}</h3>
+      <p class="quiet small">
+        {texts.access.inSpaceNote} <a href={spaceAddress(space.id)}>{space.name}</a>
+      </p>
+      <ul class="people">
+        {shares.map((share) => (
+          <li key={share.account.id}>
+            <span class="person">
+              {share.account.name}
+              <span class="quiet small">{texts.until(share.expires_at)}</span>
+            </span>
+            <span class={`chip role-${share.role}`}>{texts.role[share.role]}</span>
+          </li>
+        ))}
+      </ul>
+    </>
+  );
+}

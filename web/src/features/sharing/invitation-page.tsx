@@ -1,0 +1,227 @@
+import { useEffect, useRef, useState } from "preact/hooks";
+import type { Account, Api, Space } from "../../shared/api/client";
+import { ApiError, sentence } from "../../shared/api/http";
+import type { Fleet } from "../devices/model/device-list";
+import type { FollowedInvitation } from "./model/invitation-link";
+import type { Invitation } from "./model/wire-types";
+import { texts } from "../../shared/i18n/texts";
+import { Confirm } from "../../shared/ui/confirm-button";
+import { Card } from "../../shared/ui/parts";
+import { deviceAddress, fleetAddress, replaceWith, spaceAddress } from "../../app/routes";
+
+interface InvitationPageProps {
+  api: Api;
+  fleet: Fleet;
+  account: Account;
+  followed: FollowedInvitation;
+}
+
+/** What an invitation offers, and taking it. */
+export function InvitationPage(props: InvitationPageProps) {
+  const [accepted, setAccepted] = useState<Invitation | null>(null);
+  const state = props.followed.state.value;
+  return (
+    <main class="page invitation" id="content">
+      {accepted !== null ? (
+        <Accepted invitation={accepted} />
+      ) : state.kind === "open" ? (
+        <Offer key={state.secret} {...props} secret={state.secret} away={state.away} onAccepted={setAccepted} />
+      ) : state.kind === "joined" ? (
+        <Joined {...props} />
+      ) : (
+        <p>
+          <a href={fleetAddress}>{texts.invitation.toDevices}</a>
+        </p>
+      )}
+    </main>
+  );
+}
+
+interface OfferProps extends InvitationPageProps {
+  secret: string;
+  away: boolean;
+  onAccepted: (invitation: Invitation) => void;
+}
+
+function Offer({ api, fleet, account, followed, secret, away, onAccepted }: OfferProps) {
+  const [offer, setOffer] = useState<Invitation | null>(null);
+  const [own, setOwn] = useState<readonly Space[]>([]);
+  const [space, setSpace] = useState<string | null>(null);
+  const [busy, setBusy] = useState(false);
+  const [wrong, setWrong] = useState<{ text: string; final: boolean } | null>(null);
+
+  const failed = (error: unknown): void => {
+    const final = error instanceof ApiError && error.code === "invitation-unknown";
+    // An account that was made at the provider has taken it on the way here.
+    if (final && away) followed.joined();
+    else setWrong({ text: sentence(error), final });
+  };
+  const look = async (): Promise<void> => {
+    setWrong(null);
+    try {
+      const found = await api.lookAtInvitation(secret);
+      if (found.kind === "agent") setOwn((await api.spaces()).filter(({ role }) => role === "owner"));
+      setOffer(found);
+    } catch (error) {
+      failed(error);
+    }
+  };
+  useEffect(() => void look(), [api, secret]);
+
+  const accept = async (): Promise<void> => {
+    setBusy(true);
+    setWrong(null);
+    try {
+      const taken = await api.redeemInvitation(secret, space);
+      await fleet.refresh();
+      onAccepted(taken);
+      followed.drop();
+    } catch (error) {
+      failed(error);
+      setBusy(false);
+    }
+  };
+  const refuse = (): void => {
+    followed.drop();
+    replaceWith(fleetAddress);
+  };
+
+  const hands = offer?.role === "owner";
+  const title =
+    offer === null
+      ? texts.invitation.title
+      : hands
+        ? texts.invitation.hands(offer.by, offer.label)
+        : texts.invitation.offers(offer.by, offer.label);
+  return (
+    <>
+      <h1>{title}</h1>
+      {offer === null && wrong === null && (
+        <p class="quiet" role="status">
+          {texts.invitation.looking}
+        </p>
+      )}
+      {offer !== null && <Terms offer={offer} />}
+      {offer?.kind === "agent" && own.length > 1 && (
+        <div class="field">
+          <label for="into-space">{texts.invitation.into}</label>
+          <select id="into-space" value={space ?? ""} onChange={(event) => setSpace(event.currentTarget.value)}>
+            {own.map(({ id, name }) => (
+              <option key={id} value={id}>
+                {name}
+              </option>
+            ))}
+          </select>
+        </div>
+      )}
+      <p class="quiet">{texts.invitation.as(account.name)}</p>
+      <div role="alert">{wrong !== null && <p class="notice bad">{wrong.text}</p>}</div>
+      <div class="row">
+        {offer !== null && hands && wrong?.final !== true && (
+          <Confirm
+            label={texts.invitation.acceptTransfer}
+            question={texts.invitation.handsSure(offer.label)}
+            yes={texts.invitation.handsYes}
+            busy={texts.invitation.accepting}
+            keep={texts.invitation.handsKeep}
+            onYes={accept}
+            data-testid="accept"
+          />
+        )}
+        {offer !== null && !hands && wrong?.final !== true && (
+          <button type="button" class="primary" data-testid="accept" disabled={busy} onClick={() => void accept()}>
+            {busy ? texts.invitation.accepting : texts.invitation.accept}
+          </button>
+        )}
+        {offer === null && wrong !== null && !wrong.final && (
+          <button type="button" onClick={() => void look()}>
+            {texts.invitation.retry}
+          </button>
+        )}
+        <button type="button" disabled={busy} onClick={refuse}>
+          {wrong?.final === true ? texts.invitation.toDevices : texts.invitation.notNow}
+        </button>
+      </div>
+    </>
+  );
+}
+
+function Terms({ offer: { role, kind, share_s: shareS } }: { offer: Invitation }) {
+  if (role === "owner") {
+    return (
+      <ul class="terms" data-testid="terms">
+        {[...texts.invitation.handsNote, texts.invitation.declined].map((line) => (
+          <li key={line}>{line}</li>
+        ))}
+      </ul>
+    );
+  }
+  return (
+    <ul class="terms" data-testid="terms">
+      <li>{texts.invitation.may[role]}</li>
+      {texts.invitation.kind[kind] !== "" && <li>{texts.invitation.kind[kind]}</li>}
+      <li>{texts.invitation.lasts(shareS)}</li>
+    </ul>
+  );
+}
+
+function Accepted({ invitation: { kind, target, label, role } }: { invitation: Invitation }) {
+  const address = kind === "device" ? deviceAddress(target) : kind === "space" ? spaceAddress(target) : fleetAddress;
+  const next = useRef<HTMLAnchorElement>(null);
+  useEffect(() => next.current?.focus(), []);
+  return (
+    <>
+      <h1>{role === "owner" ? texts.invitation.taken(label) : texts.invitation.accepted(label)}</h1>
+      <p>
+        <a class="elsewhere" ref={next} data-testid="open-it" href={address}>
+          {kind === "agent" ? texts.invitation.toDevices : texts.invitation.openIt(label)}
+        </a>
+      </p>
+    </>
+  );
+}
+
+/** The account was made with the invitation: all that is shared with it came from there. */
+function Joined({ api, fleet, account }: InvitationPageProps) {
+  const [spaces, setSpaces] = useState<readonly Space[] | null>(null);
+  const [wrong, setWrong] = useState("");
+  useEffect(() => {
+    api.spaces().then(setSpaces, (error: unknown) => setWrong(sentence(error)));
+  }, [api]);
+  const devices = fleet.devices.value;
+  const waiting = (spaces === null && wrong === "") || devices === null;
+  const rooms = spaces?.filter(({ role }) => role !== "owner") ?? [];
+  const things = [...(devices?.values() ?? [])].map(({ info }) => info.value).filter(({ role }) => role !== "owner");
+  const nothing = !waiting && wrong === "" && rooms.length + things.length === 0;
+  return (
+    <>
+      <h1>{texts.session.signedInAs(account.name)}</h1>
+      <p role="status">
+        {waiting ? texts.loading : nothing ? texts.invitation.joinedNothing : texts.invitation.joined}
+      </p>
+      {wrong !== "" && <p class="notice bad">{texts.spaces.failed(wrong)}</p>}
+      {rooms.length + things.length > 0 && (
+        <Card title={texts.fleet.title}>
+          <ul class="people" data-testid="shared-with-me">
+            {rooms.map(({ id, name, role }) => (
+              <li key={id}>
+                <a class="person" href={spaceAddress(id)}>
+                  {name}
+                </a>
+                <span class={`chip role-${role}`}>{texts.role[role]}</span>
+              </li>
+            ))}
+            {things.map(({ id, label, role }) => (
+              <li key={id}>
+                <a class="person" href={deviceAddress(id)}>
+                  {label}
+                </a>
+                <span class={`chip role-${role}`}>{texts.role[role]}</span>
+              </li>
+            ))}
+          </ul>
+        </Card>
+      )}
+    </>
+  );
+}

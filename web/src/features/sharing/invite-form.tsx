@@ -1,0 +1,120 @@
+import { useEffect, useRef, useState } from "preact/hooks";
+import { sentence } from "../../shared/api/http";
+import type { InvitationMade, SharedRole } from "./model/wire-types";
+import type { Sharing } from "./model/shares";
+import { texts } from "../../shared/i18n/texts";
+import { AccountNameField, AskedForm } from "../../shared/ui/inline-form";
+import { FOR_GOOD, LastingField, ONE_DAY, seconds } from "../../shared/ui/duration-picker";
+import { MadeLink } from "../../shared/ui/link-once";
+import { Choice } from "../../shared/ui/parts";
+
+const HOW = [
+  ["link", texts.invite.byLink],
+  ["name", texts.invite.byName],
+] as const;
+export const MAY = [
+  ["operator", texts.invite.operate],
+  ["viewer", texts.invite.watch],
+] as const;
+const LASTS = ["never", "hour", "workday", "day", "week", "month", "date"] as const;
+const VALID = ["hour", "day", "week", "month"] as const;
+
+interface InviteFormProps {
+  sharing: Sharing;
+  onClose: () => void;
+}
+
+/** Invite by the name of an account, or by a link. What was typed stays until it has come to something. */
+export function InviteForm({ sharing, onClose }: InviteFormProps) {
+  const [how, setHow] = useState<"link" | "name">("link");
+  const [name, setName] = useState("");
+  const [role, setRole] = useState<SharedRole>("operator");
+  const [lasts, setLasts] = useState(FOR_GOOD);
+  const [uses, setUses] = useState("1");
+  const [valid, setValid] = useState(ONE_DAY);
+  const [busy, setBusy] = useState(false);
+  const [wrong, setWrong] = useState("");
+  const [done, setDone] = useState("");
+  const [made, setMade] = useState<InvitationMade | null>(null);
+  const form = useRef<HTMLFormElement>(null);
+  useEffect(() => form.current?.querySelector("input")?.focus(), []);
+
+  const send = async (): Promise<void> => {
+    setWrong("");
+    setDone("");
+    const forS = seconds(lasts);
+    if (forS === undefined) {
+      setWrong(texts.lasting.past);
+      return;
+    }
+    setBusy(true);
+    try {
+      if (how === "name") {
+        const share = await sharing.put(name.trim(), role, forS);
+        setDone(texts.invite.shared(share.account.name));
+        setName("");
+      } else {
+        const validS = seconds(valid) ?? 0; // Its choices are all lengths.
+        setMade(await sharing.invite({ role, uses: Number(uses), share_s: forS, expires_in_s: validS }));
+      }
+    } catch (error) {
+      setWrong(sentence(error));
+    } finally {
+      setBusy(false);
+    }
+  };
+
+  if (made !== null) {
+    const note = texts.invite.madeNote(texts.role[made.role], made.uses, texts.until(made.expires_at));
+    return <MadeLink link={made.link} note={note} onDone={onClose} />;
+  }
+  return (
+    <AskedForm
+      label={texts.invite.title}
+      todo={how === "name" ? texts.invite.share : texts.invite.make}
+      doing={how === "name" ? texts.invite.sharing : texts.invite.making}
+      busy={busy}
+      close={texts.invite.close}
+      wrong={wrong}
+      done={done}
+      answerId="invite-answer"
+      form={form}
+      sendTestId="invite-send"
+      onSend={send}
+      onClose={onClose}
+    >
+      <Choice label={texts.invite.how} value={how} options={HOW} onChange={setHow} />
+      <p class="quiet small">{how === "name" ? texts.invite.nameNote : texts.invite.linkNote}</p>
+      {how === "name" && (
+        <AccountNameField id="invite-name" answerId="invite-answer" value={name} wrong={wrong !== ""} onInput={setName} />
+      )}
+      <div class="field">
+        <span class="label">{texts.invite.role}</span>
+        <Choice label={texts.invite.role} value={role} options={MAY} onChange={setRole} />
+        <p class="quiet small">{texts.roleExplained[role]}</p>
+      </div>
+      <LastingField id="invite-lasts" label={texts.invite.lasts} value={lasts} choices={LASTS} onChange={setLasts} />
+      {how === "link" && (
+        <>
+          <LastingField id="invite-valid" label={texts.invite.valid} value={valid} choices={VALID} onChange={setValid} />
+          <div class="field">
+            <label for="invite-uses">{texts.invite.uses}</label>
+            <input
+              id="invite-uses"
+              type="number"
+              min={1}
+              max={50}
+              required
+              value={uses}
+              aria-describedby="invite-uses-note"
+              onInput={(event) => setUses(event.currentTarget.value)}
+            />
+            <p class="quiet small" id="invite-uses-note">
+              {texts.invite.usesNote}
+            </p>
+          </div>
+        </>
+      )}
+    </AskedForm>
+  );
+}

@@ -1,0 +1,36 @@
+/** Handing an agent with its devices, or a space with all that is in it, over to another account that accepts it. */
+import type { Http } from "../../../shared/api/http";
+import type { Invitation, InvitationMade } from "./wire-types";
+
+/** What can change hands. */
+export interface Whole {
+  kind: "agent" | "space";
+  id: string;
+}
+
+/** All of its methods throw `ApiError`, and nothing else. */
+export class Transfers {
+  readonly #http: Http;
+
+  constructor(http: Http) {
+    this.#http = http;
+  }
+
+  /** Those that can still be accepted, oldest first. */
+  open(of: Whole): Promise<Invitation[]> {
+    return this.#http.all(at(of));
+  }
+
+  /** `account`: who alone may accept it, by name; `null`: whoever has the link. */
+  offer(of: Whole, account: string | null, forS: number): Promise<InvitationMade> {
+    return this.#http.call("POST", at(of), { body: { account, expires_in_s: forS } });
+  }
+
+  async withdraw(of: Whole, id: string): Promise<void> {
+    await this.#http.call("DELETE", `${at(of)}/${id}`);
+  }
+}
+
+function at({ kind, id }: Whole): string {
+  return `/${kind}s/${id}/transfers`;
+}

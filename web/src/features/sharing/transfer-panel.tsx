@@ -1,0 +1,148 @@
+/** Handing something over for good: the offer, those that are out, and taking them back. For its owner. */
+import { useEffect, useRef, useState } from "preact/hooks";
+import type { Api } from "../../shared/api/client";
+import { sentence } from "../../shared/api/http";
+import type { Invitation, InvitationMade } from "./model/wire-types";
+import type { Whole } from "./model/transfers";
+import { texts } from "../../shared/i18n/texts";
+import { AccountNameField, AskedForm } from "../../shared/ui/inline-form";
+import { Confirm } from "../../shared/ui/confirm-button";
+import { useFocusBack } from "../../shared/hooks/use-return-focus";
+import { LastingField, ONE_DAY, seconds } from "../../shared/ui/duration-picker";
+import { MadeLink } from "../../shared/ui/link-once";
+import { Card, Choice } from "../../shared/ui/parts";
+import { usePolled } from "../../shared/hooks/use-polling";
+import "./sharing.css";
+
+/** While an offer is out somebody may accept it at any moment. */
+const LOOK_AGAIN_MS = 5_000;
+const VALID = ["hour", "day", "week", "month"] as const;
+const TO = [
+  ["name", texts.transfer.toName],
+  ["link", texts.transfer.toLink],
+] as const;
+
+interface TransferProps {
+  api: Api;
+  of: Whole;
+  /** All that goes along, by name. */
+  goes: readonly string[];
+}
+
+export function Transfer({ api, of, goes }: TransferProps) {
+  const { value: offers, trouble, again } = usePolled(() => api.transfers.open(of), LOOK_AGAIN_MS, [api, of.kind, of.id]);
+  const [step, setStep] = useState<"closed" | "asking" | InvitationMade>("closed");
+  const opener = useFocusBack(step !== "closed");
+  const open = step !== "closed" ? null : (
+    <button type="button" ref={opener} data-testid="transfer" onClick={() => setStep("asking")}>
+      {texts.transfer.open}
+    </button>
+  );
+  return (
+    <div data-testid="transfers">
+      <Card title={texts.transfer.title} aside={open}>
+        {step === "asking" && (
+          <OfferForm
+            api={api}
+            of={of}
+            goes={goes}
+            onMade={(made) => {
+              setStep(made);
+              again();
+            }}
+            onClose={() => setStep("closed")}
+          />
+        )}
+        {typeof step === "object" && (
+          <MadeLink link={step.link} note={texts.transfer.madeNote(texts.until(step.expires_at))} onDone={() => setStep("closed")} />
+        )}
+        {trouble !== "" && (
+          <p class="notice bad" role="alert">
+            {texts.transfer.failed(trouble)}
+          </p>
+        )}
+        {offers?.length === 0 && step === "closed" && <p class="quiet">{texts.transfer.none}</p>}
+        {offers !== null && offers.length > 0 && (
+          <ul class="people" data-testid="offers">
+            {offers.map((offer) => (
+              <OpenOffer key={offer.id} offer={offer} withdraw={() => api.transfers.withdraw(of, offer.id)} onGone={again} />
+            ))}
+          </ul>
+        )}
+      </Card>
+    </div>
+  );
+}
+
+interface OpenOfferProps {
+  offer: Invitation;
+  withdraw: () => Promise<void>;
+  onGone: () => void;
+}
+
+function OpenOffer({ offer: { account, expires_at: until }, withdraw, onGone }: OpenOfferProps) {
+  const name = texts.transfer.offered(account?.name ?? null);
+  return (
+    <li>
+      <span class="person">
+        {name}
+        <span class="quiet small">{texts.transfer.waits(texts.until(until))}</span>
+      </span>
+      <Confirm
+        label={texts.access.withdraw}
+        description={`${texts.access.withdraw}: ${name}`}
+        question={texts.transfer.withdrawSure}
+        yes={texts.access.withdrawYes}
+        busy={texts.access.withdrawing}
+        keep={texts.access.keep}
+        onYes={async () => {
+          await withdraw();
+          onGone();
+        }}
+      />
+    </li>
+  );
+}
+
+interface OfferFormProps extends TransferProps {
+  onMade: (made: InvitationMade) => void;
+  onClose: () => void;
+}
+
+/** What was typed stays until it has come to something. */
+function OfferForm({ api, of, goes, onMade, onClose }: OfferFormProps) {
+  const [to, setTo] = useState<"name" | "link">("name");
+  const [name, setName] = useState("");
+  const [valid, setValid] = useState(ONE_DAY);
+  const [busy, setBusy] = useState(false);
+  const [wrong, setWrong] = useState("");
+  const form = useRef<HTMLFormElement>(null);
+  useEffect(() => form.current?.querySelector("input")?.focus(), []);
+  const send = async (): Promise<void> => {
+    setWrong("");
+    setBusy(true);
+    try {
+      onMade(await api.transfers.offer(of, to === "name" ? name.trim() : null, seconds(valid) ?? 0));
+    } catch (error) {
+      setWrong(sentence(error));
+      setBusy(false);
+    }
+  };
+  const { todo, doing, title } = texts.transfer;
+  const asked = { label: title, todo, doing, busy, wrong, form, answerId: "transfer-answer", sendTestId: "transfer-send" };
+  return (
+    <AskedForm {...asked} onSend={send} onClose={onClose}>
+      <ul class="terms" data-testid="transfer-terms">
+        <li>{texts.transfer.goes[of.kind](goes)}</li>
+        {texts.transfer.terms.map((line) => (
+          <li key={line}>{line}</li>
+        ))}
+      </ul>
+      <Choice label={texts.transfer.to} value={to} options={TO} onChange={setTo} />
+      {to === "name" && (
+        <AccountNameField id="transfer-name" answerId="transfer-answer" value={name} wrong={wrong !== ""} onInput={setName} />
+      )}
+      <LastingField id="transfer-valid" label={texts.transfer.valid} value={valid} choices={VALID} onChange={setValid} />
+    </AskedForm>
+  );
+}

@@ -1,0 +1,71 @@
+import { useEffect, useState } from "preact/hooks";
+import type { Account, Api, Space } from "../../shared/api/client";
+import { sentence } from "../../shared/api/http";
+import type { Fleet } from "../devices/model/device-list";
+import { texts } from "../../shared/i18n/texts";
+import { Access } from "../sharing/access-list";
+import { WhatDoISee } from "../help/page-explainer";
+import { Room } from "./room-view";
+import { fleetAddress, healthAddressOf, replaceWith } from "../../app/routes";
+
+interface SpacePageProps {
+  api: Api;
+  fleet: Fleet;
+  account: Account;
+  id: string;
+}
+
+/** One space: what stands in it, and who has access to it. */
+export function SpacePage({ api, fleet, account, id }: SpacePageProps) {
+  const [space, setSpace] = useState<Space | null | undefined>(undefined);
+  const [wrong, setWrong] = useState("");
+  const devices = fleet.devices.value;
+  useEffect(() => {
+    let wanted = true;
+    api.spaces().then(
+      (found) => {
+        if (!wanted) return;
+        setSpace(found.find((each) => each.id === id) ?? null);
+        setWrong("");
+      },
+      (error: unknown) => wanted && setWrong(texts.spaces.failed(sentence(error))),
+    );
+    return () => {
+      wanted = false;
+    };
+    // Asked again when devices come or go: with a share that ended the space is gone too.
+  }, [api, id, devices]);
+
+  const inIt = [...(devices?.values() ?? [])].filter(({ info }) => info.value.space === id);
+  return (
+    <main class="page space" id="content">
+      <a href={fleetAddress}>← {texts.device.back}</a>
+      {wrong !== "" && <p class="notice bad">{wrong}</p>}
+      {space === undefined && wrong === "" && <p class="quiet">{texts.loading}</p>}
+      {space === null && <p role="status">{texts.spaces.missing}</p>}
+      {space !== undefined && space !== null && (
+        <>
+          <h1>{space.name}</h1>
+          <p>
+            <a href={healthAddressOf("space", id)}>{texts.care.title.health(space.name)}</a>
+          </p>
+          {inIt.length === 0 ? <p class="quiet">{texts.spaces.empty}</p> : <Room fleet={fleet} id={id} />}
+          <WhatDoISee page="space" />
+          <Access
+            api={api}
+            account={account}
+            target={{ kind: "space", id }}
+            whole={{ kind: "space", id }}
+            goes={inIt.map(({ info }) => info.value.label)}
+            owner={space.owner}
+            role={space.role}
+            onLeft={() => {
+              void fleet.refresh();
+              replaceWith(fleetAddress);
+            }}
+          />
+        </>
+      )}
+    </main>
+  );
+}

@@ -1,0 +1,484 @@
+/** The floor of a room as its perception knows it: what is taken, who is where, and what hangs where. */
+import { effect } from "@preact/signals";
+import { useEffect, useMemo, useRef, useState } from "preact/hooks";
+import { degrees } from "../../shared/lib/angles";
+import { clock, now } from "../../shared/lib/clock";
+import type { DeviceStore } from "../devices/model/device-store";
+import type { Fleet } from "../devices/model/device-list";
+import { quantityOf } from "../sensors/model/quantities";
+import { apart, extent, readFloor, readPlaces, type Extent, type Floor, type Place } from "./model/room-perception";
+import { texts } from "../../shared/i18n/texts";
+import { canvasBox } from "../../shared/ui/hidpi-canvas";
+import { Age, Card } from "../../shared/ui/parts";
+import { useNames } from "./floor-plan-labels";
+import { shown } from "../sensors/readings-card";
+import { deviceAddress } from "../../app/routes";
+import { colour, onColourChange } from "../../shared/ui/canvas-theme";
+
+const POSITIONS = "positions";
+const OCCUPANCY = "occupancy";
+const RANGE = "range";
+const TRAIL_MS = 30_000;
+/** Whom no sensor has seen for this long is drawn as one whose place is old [s]. */
+const UNSEEN_S = 2;
+const PIN_PX = 24;
+
+interface PlanProps {
+  fleet: Fleet;
+  space: string;
+  /** Whose frame it is: devices of one agent share it. */
+  agent: string;
+}
+
+interface Hung {
+  device: DeviceStore;
+  position: readonly [number, number, number];
+  number: number;
+}
+
+/** What one agent tells of its room now. */
+export interface Known {
+  devices: readonly DeviceStore[];
+  perception: DeviceStore | null;
+  hung: readonly Hung[];
+  places: readonly Place[];
+  floor: Floor | null;
+  /** `null` before anything has been told. */
+  extent: Extent | null;
+  old: boolean;
+  receivedAt: number | null;
+}
+
+export function usePlan(fleet: Fleet, space: string, agent: string): Known {
+  const all = fleet.devices.value;
+  const devices = useMemo(
+    () => [...(all?.values() ?? [])].filter(({ info }) => info.value.space === space && info.value.agent === agent),
+    [all, space, agent],
+  );
+  const perception = devices.find((one) => one.description.value?.streams.some(({ name }) => name === POSITIONS)) ?? null;
+  const hung = hungOf(devices);
+  const newest = perception?.measured(POSITIONS).value ?? null;
+  const grid = perception?.measured(OCCUPANCY).value ?? null;
+  const floor = useMemo(() => (grid === null ? null : readFloor(grid.message.values)), [grid]);
+  const places = useMemo(() => (newest === null ? [] : readPlaces(newest.message.values)), [newest]);
+  const key = hung.map(({ position }) => position.join()).join(" ");
+  const shownExtent = useMemo(
+    () => extent(floor === null ? [] : [floor], [...hung.map(({ position: [x, y] }) => [x, y] as const)]),
+    [floor, key],
+  );
+  const old = perception?.late(POSITIONS) === true || perception?.live.value === false;
+  return { devices, perception, hung, places, floor, extent: shownExtent, old, receivedAt: newest?.receivedAt ?? null };
+}
+
+export function Plan({ fleet, space, agent }: PlanProps) {
+  const { devices, perception, hung, places, floor, extent: shownExtent, old, receivedAt } = usePlan(fleet, space, agent);
+  const late = perception?.late(POSITIONS) === true;
+  const waiting = receivedAt === null && floor === null;
+  return (
+    <Card title={texts.plan.title} class="plan" aside={<Legend />}>
+      <div class="plan-parts">
+        <div class="plan-part">
+      {shownExtent === null ? (
+        <p class="quiet">{perception === null ? texts.plan.empty : texts.plan.waiting}</p>
+      ) : (
+        <Drawing
+          extent={shownExtent}
+          floor={floor}
+          places={places}
+          hung={hung}
+          devices={devices}
+          trails={perception}
+          old={old}
+          receivedAt={receivedAt}
+        />
+      )}
+      {late && receivedAt !== null && (
+        <p class="notice warn" role="status">
+          <Age at={receivedAt} as={texts.plan.stale} />
+        </p>
+      )}
+      {waiting && shownExtent !== null && <p class="quiet">{perception === null ? texts.plan.empty : texts.plan.waiting}</p>}
+        </div>
+        <div class="plan-part">
+      {places.length > 0 && <Who places={places} devices={devices} receivedAt={receivedAt ?? 0} old={late} />}
+      {hung.length > 0 && <HungList hung={hung} />}
+        </div>
+      </div>
+    </Card>
+  );
+}
+
+/** Those that say where they are, in the order of the list. */
+function hungOf(devices: readonly DeviceStore[]): Hung[] {
+  return devices
+    .flatMap((device) => {
+      const position = device.description.value?.position_m ?? null;
+      return position === null ? [] : [{ device, position }];
+    })
+    .map((one, index) => ({ ...one, number: index + 1 }));
+}
+
+function deviceOf(place: Place, devices: readonly DeviceStore[]): DeviceStore | null {
+  return devices.find(({ info }) => info.value.name === place.name) ?? null;
+}
+
+function nameOf(place: Place, devices: readonly DeviceStore[]): string {
+  return deviceOf(place, devices)?.info.value.label ?? texts.plan.person(place.name);
+}
+
+interface DrawingProps {
+  extent: Extent;
+  floor: Floor | null;
+  places: readonly Place[];
+  hung: readonly Hung[];
+  devices: readonly DeviceStore[];
+  /** Whose positions leave a trail. */
+  trails: DeviceStore | null;
+  old: boolean;
+  receivedAt: number | null;
+  /** Where somebody wants to go. */
+  target?: { xM: number; yM: number; yawRad: number | null } | null;
+  /** Called with the place that was pointed at; nothing on the plan is a link then. */
+  onPick?: (xM: number, yM: number) => void;
+}
+
+type Trail = { at: number; x: number; y: number }[];
+
+export function Drawing({ extent: room, floor, places, hung, devices, trails, old, receivedAt, target, onPick }: DrawingProps) {
+  const canvas = useRef<HTMLCanvasElement>(null);
+  const box = useRef<HTMLDivElement>(null);
+  const [width, setWidth] = useState(0);
+  const [repaint, setRepaint] = useState(0);
+  const trail = useTrails(trails);
+  const [wide, high] = [room.highX - room.lowX, room.highY - room.lowY];
+  const x = (m: number): string => `${(100 * (m - room.lowX)) / wide}%`;
+  const y = (m: number): string => `${(100 * (room.highY - m)) / high}%`;
+
+  useEffect(() => onColourChange(() => setRepaint((count) => count + 1)), []);
+  useEffect(() => {
+    if (box.current === null) return;
+    const element = box.current;
+    const observer = new ResizeObserver(() => setWidth(element.clientWidth));
+    observer.observe(element);
+    return () => observer.disconnect();
+  }, []);
+  useEffect(() => {
+    if (canvas.current === null) return;
+    return canvasBox(canvas.current, (context, wideIs, highIs) => paint(context, wideIs, highIs, room, floor, trail.current));
+  }, [room, floor, places, repaint]);
+
+  const pins = useMemo(() => {
+    if (width === 0) return [];
+    const scale = width / wide;
+    const at = hung.map(({ position: [atX, atY] }) => [(atX - room.lowX) * scale, (room.highY - atY) * scale] as const);
+    const edge = PIN_PX / 2;
+    const within = at.map(
+      ([atX, atY]) => [Math.min(width - edge, Math.max(edge, atX)), Math.min(high * scale - edge, Math.max(edge, atY))] as const,
+    );
+    // In shares of the box: at another size they are in the right place at once, and then moved apart anew.
+    return apart(within, PIN_PX + 1, [width, high * scale]).map(([atX, atY]) => [atX / width, atY / (high * scale)] as const);
+  }, [room, width, hung.map(({ device }) => device.id).join()]);
+  const px = (share: number, of: number): number => (share * of * width) / wide;
+  useNames(
+    box,
+    places.map(({ xM, yM }) => [px((xM - room.lowX) / wide, wide), px((room.highY - yM) / high, high)]),
+    pins.map(([left, top]) => [px(left, wide), px(top, high)]),
+  );
+
+  return (
+    <div
+      ref={box}
+      class={`plan-box ${old ? "old" : ""}`}
+      style={{ aspectRatio: `${wide} / ${high}` }}
+      role="group"
+      aria-label={texts.plan.label(places.length)}
+      data-testid="plan"
+      data-places={places.length}
+      data-floor={floor === null ? "" : `${floor.columns}x${floor.rows}`}
+    >
+      <canvas ref={canvas} aria-hidden="true" />
+      {hung.map((one, index) => {
+        const [left, top] = (pins[index] ?? [0.5, 0.5]).map((share) => `${100 * share}%`);
+        return (
+          <a
+            key={one.device.id}
+            class={`pin ${one.device.live.value ? "" : "old"}`}
+            style={{ left, top }}
+            href={deviceAddress(one.device.id)}
+            title={one.device.info.value.label}
+            aria-label={`${one.number}: ${one.device.info.value.label}`}
+          >
+            {one.number}
+          </a>
+        );
+      })}
+      {places.map((place, index) => (
+        <Mark
+          key={place.name}
+          place={place}
+          index={index}
+          device={deviceOf(place, devices)}
+          label={nameOf(place, devices)}
+          left={x(place.xM)}
+          top={y(place.yM)}
+          receivedAt={receivedAt ?? 0}
+        />
+      ))}
+      {target !== null && target !== undefined && (
+        <span class="plan-goal" aria-hidden="true" data-testid="goal" style={{ left: x(target.xM), top: y(target.yM) }}>
+          {target.yawRad !== null && <span class="arrow" style={{ transform: `rotate(${-target.yawRad}rad)` }} />}
+        </span>
+      )}
+      {onPick !== undefined && (
+        // For who points. The same can be typed, so no key need find its way here.
+        <div
+          class="plan-pick"
+          aria-hidden="true"
+          data-testid="pick"
+          onClick={(event) => {
+            const at = event.currentTarget.getBoundingClientRect();
+            onPick(
+              room.lowX + ((event.clientX - at.left) / at.width) * wide,
+              room.highY - ((event.clientY - at.top) / at.height) * high,
+            );
+          }}
+        />
+      )}
+    </div>
+  );
+}
+
+interface MarkProps {
+  place: Place;
+  index: number;
+  device: DeviceStore | null;
+  label: string;
+  left: string;
+  top: string;
+  receivedAt: number;
+}
+
+/** A disc with an arrow the way it goes. A robot's opens its page; a person has none. */
+function Mark({ place, device, label, left, top, receivedAt, index }: MarkProps) {
+  const ageS = place.ageS + Math.max(0, clock.value - receivedAt) / 1000;
+  const unseen = ageS > UNSEEN_S;
+  const content = (
+    <>
+      {place.yawRad !== null && <span class="arrow" style={{ transform: `rotate(${-place.yawRad}rad)` }} aria-hidden="true" />}
+      <span class="who-leader" aria-hidden="true" />
+      <span class="disc" aria-hidden="true">
+        {texts.plan.letter(index)}
+      </span>
+      <span class="who-label">
+        {label}
+        {unseen && <span class="small"> · {texts.plan.unseen(ageS)}</span>}
+      </span>
+    </>
+  );
+  const common = {
+    class: `who ${device === null ? "human" : "robot"} series-${(index % 8) + 1} ${unseen ? "old" : ""}`,
+    style: { left, top },
+    "data-testid": `place-${place.name}`,
+    "data-x": place.xM,
+    "data-y": place.yM,
+  };
+  if (device === null) return <span {...common}>{content}</span>;
+  return (
+    <a {...common} href={deviceAddress(device.id)}>
+      {content}
+    </a>
+  );
+}
+
+/** Where everybody was in the last half minute, on the page's clock. */
+function useTrails(perception: DeviceStore | null): { readonly current: ReadonlyMap<string, Trail> } {
+  const trails = useRef(new Map<string, Trail>());
+  useEffect(() => {
+    trails.current = new Map();
+    if (perception === null) return;
+    return effect(() => {
+      const newest = perception.measured(POSITIONS).value;
+      if (newest === null) return;
+      for (const { name, xM, yM } of readPlaces(newest.message.values)) {
+        const since = now() - TRAIL_MS;
+        const trail = (trails.current.get(name) ?? []).filter(({ at }) => at > since);
+        trails.current.set(name, [...trail, { at: newest.receivedAt, x: xM, y: yM }]);
+      }
+    });
+  }, [perception]);
+  return trails;
+}
+
+function paint(
+  context: CanvasRenderingContext2D,
+  width: number,
+  height: number,
+  room: Extent,
+  floor: Floor | null,
+  trails: ReadonlyMap<string, Trail>,
+): void {
+  const scale = width / (room.highX - room.lowX);
+  const x = (m: number): number => (m - room.lowX) * scale;
+  const y = (m: number): number => height - (m - room.lowY) * scale;
+  if (floor !== null) paintFloor(context, floor, x, y, scale);
+  paintMetres(context, room, x, y, width, height);
+  context.lineWidth = 2;
+  context.lineJoin = "round";
+  [...trails.keys()].sort().forEach((name, index) => {
+    const trail = trails.get(name) ?? [];
+    context.strokeStyle = colour(`--series-${(index % 8) + 1}`);
+    context.globalAlpha = 0.45;
+    context.beginPath();
+    for (const point of trail) context.lineTo(x(point.x), y(point.y));
+    context.stroke();
+  });
+  context.globalAlpha = 1;
+}
+
+function paintFloor(
+  context: CanvasRenderingContext2D,
+  floor: Floor,
+  x: (m: number) => number,
+  y: (m: number) => number,
+  scale: number,
+): void {
+  const fills = { free: colour("--surface"), taken: colour("--plan-taken"), unknown: colour("--plan-unknown") };
+  const side = floor.sideM * scale;
+  for (let row = 0; row < floor.rows; row += 1) {
+    for (let column = 0; column < floor.columns; column += 1) {
+      context.fillStyle = fills[floor.cell(column, row)];
+      const [left, top] = [x(floor.lowerXM + column * floor.sideM), y(floor.lowerYM + (row + 1) * floor.sideM)];
+      // A little more than its square: no line of the ground shines through between two.
+      context.fillRect(left, top, side + 0.6, side + 0.6);
+    }
+  }
+}
+
+function paintMetres(
+  context: CanvasRenderingContext2D,
+  room: Extent,
+  x: (m: number) => number,
+  y: (m: number) => number,
+  width: number,
+  height: number,
+): void {
+  context.strokeStyle = colour("--quiet");
+  context.globalAlpha = 0.18;
+  context.lineWidth = 1;
+  context.beginPath();
+  for (let m = Math.ceil(room.lowX); m <= room.highX; m += 1) {
+    context.moveTo(x(m), 0);
+    context.lineTo(x(m), height);
+  }
+  for (let m = Math.ceil(room.lowY); m <= room.highY; m += 1) {
+    context.moveTo(0, y(m));
+    context.lineTo(width, y(m));
+  }
+  context.stroke();
+  context.globalAlpha = 1;
+}
+
+function Legend() {
+  return (
+    <ul class="plan-key quiet small">
+      <li class="key-taken">{texts.plan.key.taken}</li>
+      <li class="key-unknown">{texts.plan.key.unknown}</li>
+      <li class="key-metre">{texts.plan.metre}</li>
+    </ul>
+  );
+}
+
+interface WhoProps {
+  places: readonly Place[];
+  devices: readonly DeviceStore[];
+  receivedAt: number;
+  old: boolean;
+}
+
+function Who({ places, devices, receivedAt, old }: WhoProps) {
+  const metres = (m: number): string => m.toFixed(2);
+  const since = Math.max(0, clock.value - receivedAt);
+  const { column } = texts.plan;
+  return (
+    <div class="scroll" tabIndex={0} role="region" aria-label={texts.plan.who}>
+      <table class={old ? "old" : ""}>
+        <thead>
+          <tr>
+            {[column.name, column.place, column.heading, column.seen].map((name) => (
+              <th key={name} scope="col">
+                {name}
+              </th>
+            ))}
+          </tr>
+        </thead>
+        <tbody>
+          {places.map((place, index) => {
+            const device = deviceOf(place, devices);
+            const label = nameOf(place, devices);
+            return (
+              <tr key={place.name}>
+                <th scope="row">
+                  <span class={`swatch series-${(index % 8) + 1}`} aria-hidden="true">
+                    {texts.plan.letter(index)}
+                  </span>
+                  {device === null ? label : <a href={deviceAddress(device.id)}>{label}</a>}
+                </th>
+                <td>{texts.plan.place(metres(place.xM), metres(place.yM))}</td>
+                <td>{place.yawRad === null ? texts.number.unknown : texts.number.wholeDegrees(degrees(place.yawRad))}</td>
+                <td>{texts.age(place.ageS * 1000 + since)}</td>
+              </tr>
+            );
+          })}
+        </tbody>
+      </table>
+    </div>
+  );
+}
+
+/** The numbers of the plan, with what each of them says now. */
+function HungList({ hung }: { hung: readonly Hung[] }) {
+  return (
+    <>
+      <h3>{texts.plan.sensors}</h3>
+      <ol class="hung">
+        {hung.map(({ device, number }) => (
+          <li key={device.id}>
+            <span class="pin-number" aria-hidden="true">
+              {number}
+            </span>
+            <a href={deviceAddress(device.id)}>{device.info.value.label}</a>
+            <Says device={device} />
+          </li>
+        ))}
+      </ol>
+    </>
+  );
+}
+
+/** What it measures: of a lidar the nearest thing, of others the first two values. */
+function Says({ device }: { device: DeviceStore }) {
+  const description = device.description.value;
+  const stream = description?.streams[0]?.name;
+  if (description === null || stream === undefined) return null;
+  const newest = device.measured(stream).value;
+  const values = Object.entries(newest?.message.values ?? {});
+  if (newest === null || values.length === 0) return <span class="quiet">{texts.number.unknown}</span>;
+  const late = device.late(stream);
+  const said = (field: string, value: number | boolean): string => {
+    if (typeof value === "boolean") return (texts.room.state[field] ?? texts.room.yesNo)[value ? 0 : 1];
+    const quantity = quantityOf(description, stream, field);
+    return `${shown(quantity, value)} ${quantity.unit}`;
+  };
+  const [first, second] = stream === RANGE ? [[...values].sort(([, a], [, b]) => Number(a) - Number(b))[0]] : values;
+  return (
+    <span class={late ? "old" : "value"}>
+      {[first, second].flatMap((one) => (one === undefined ? [] : [said(...one)])).join(", ")}
+      {late && (
+        <span class="small">
+          {" "}
+          <Age at={newest.receivedAt} />
+        </span>
+      )}
+    </span>
+  );
+}

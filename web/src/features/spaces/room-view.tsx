@@ -1,0 +1,35 @@
+import { useEffect } from "preact/hooks";
+import type { Fleet } from "../devices/model/device-list";
+import { texts } from "../../shared/i18n/texts";
+import { DeviceLists } from "../devices/device-list";
+import { Plan } from "./floor-plan";
+
+/** A room: its plan, and its devices. */
+export function Room({ fleet, id }: { fleet: Fleet; id: string }) {
+  const all = fleet.devices.value;
+  const devices = [...(all?.values() ?? [])].filter(({ info }) => info.value.space === id);
+  const ids = devices.map((device) => device.id).join();
+  useEffect(() => {
+    const ends = devices.map((device) => device.watchMeasurements());
+    return () => ends.forEach((end) => end());
+    // By id: a new list of the same devices is no reason to ask for everything anew.
+  }, [ids]);
+  const agents = [...new Set(devices.map(({ info }) => info.value.agent))];
+  // An agent tells of a room where one of its devices says where it hangs, or who is where.
+  const drawn = agents.filter((agent) =>
+    devices.some(({ info, description }) => {
+      const told = description.value;
+      if (info.value.agent !== agent || told === null) return false;
+      return told.position_m !== null || told.streams.some(({ name }) => name === "positions");
+    }),
+  );
+  return (
+    <>
+      {drawn.length === 0 && <p class="quiet">{texts.plan.empty}</p>}
+      {drawn.map((agent) => (
+        <Plan key={agent} fleet={fleet} space={id} agent={agent} />
+      ))}
+      <DeviceLists devices={devices} fleet={fleet} />
+    </>
+  );
+}

@@ -1,0 +1,100 @@
+import { useEffect, useState } from "preact/hooks";
+import type { Api, Space } from "../../shared/api/client";
+import { sentence } from "../../shared/api/http";
+import type { Fleet } from "../devices/model/device-list";
+import { texts } from "../../shared/i18n/texts";
+import { Card } from "../../shared/ui/parts";
+import { spaceAddress } from "../../app/routes";
+import "../sharing/sharing.css";
+
+/** The spaces that one may see, and making one. */
+export function Spaces({ api, fleet }: { api: Api; fleet: Fleet }) {
+  const [spaces, setSpaces] = useState<readonly Space[] | null>(null);
+  const [wrong, setWrong] = useState("");
+  const devices = fleet.devices.value;
+  const read = async (): Promise<void> => {
+    try {
+      setSpaces(await api.spaces());
+      setWrong("");
+    } catch (error) {
+      setWrong(texts.spaces.failed(sentence(error)));
+    }
+  };
+  // A device that came or went may have brought or taken a space.
+  useEffect(() => void read(), [api, devices]);
+  const count = (id: string): number =>
+    [...(devices?.values() ?? [])].filter(({ info }) => info.value.space === id).length;
+  return (
+    <Card title={texts.spaces.title} class="spaces">
+      {spaces === null && wrong === "" && <p class="quiet">{texts.loading}</p>}
+      {spaces?.length === 0 && <p class="quiet">{texts.spaces.none}</p>}
+      <ul class="people">
+        {spaces?.map(({ id, name, role, owner }) => (
+          <li key={id}>
+            <a class="person" href={spaceAddress(id)} data-testid="space-link">
+              {name}
+            </a>
+            <span class="quiet small">
+              {texts.spaces.devices(count(id))}
+              {role !== "owner" && ` · ${texts.spaces.of(owner.name)}`}
+            </span>
+            <span class={`chip role-${role}`}>{texts.role[role]}</span>
+          </li>
+        ))}
+      </ul>
+      <p class="field-error" aria-live="polite" hidden={wrong === ""}>
+        {wrong}
+      </p>
+      <MakeSpace api={api} onMade={() => void read()} />
+    </Card>
+  );
+}
+
+function MakeSpace({ api, onMade }: { api: Api; onMade: () => void }) {
+  const [name, setName] = useState("");
+  const [busy, setBusy] = useState(false);
+  const [said, setSaid] = useState({ text: "", wrong: false });
+  const make = async (): Promise<void> => {
+    setBusy(true);
+    setSaid({ text: "", wrong: false });
+    try {
+      const made = await api.makeSpace(name.trim());
+      setName("");
+      setSaid({ text: texts.spaces.made(made.name), wrong: false });
+      onMade();
+    } catch (error) {
+      setSaid({ text: sentence(error), wrong: true });
+    } finally {
+      setBusy(false);
+    }
+  };
+  return (
+    <form
+      class="row-form"
+      onSubmit={(event) => {
+        event.preventDefault();
+        void make();
+      }}
+    >
+      <label for="space-name">{texts.spaces.name}</label>
+      <div class="row">
+        <input
+          id="space-name"
+          type="text"
+          autocomplete="off"
+          required
+          maxLength={200}
+          value={name}
+          aria-describedby="space-answer"
+          onInput={(event) => setName(event.currentTarget.value)}
+        />
+        <button type="submit" disabled={busy}>
+          {busy ? texts.spaces.making : texts.spaces.make}
+        </button>
+      </div>
+      <p id="space-answer" class={said.wrong ? "field-error" : "field-note"} aria-live="polite">
+        {said.text}
+      </p>
+    </form>
+  );
+}

@@ -1,0 +1,44 @@
+/** Whether a page may move a robot now, and what has become of what it streams. */
+import type { Control } from "../control/model/lease";
+import type { DeviceStore } from "../devices/model/device-store";
+import type { SetpointStreamer } from "./model/setpoint-streamer";
+import { texts } from "../../shared/i18n/texts";
+
+/** Why nothing here can move the robot now; `null` when it can. */
+export function whyBlocked(device: DeviceStore, control: Control): string | null {
+  if (control.streamer.value === null) return texts.joints.takeFirst;
+  const mode = device.mode.value;
+  if (device.stopped.value) return texts.joints.stopped;
+  if (!device.live.value) return texts.joints.waiting;
+  if (mode === "action") return texts.joints.busy;
+  if (control.linkStatus.value?.state !== "up") return texts.control.noWay;
+  return null;
+}
+
+interface StreamNoteProps {
+  device: DeviceStore;
+  streamer: SetpointStreamer | null;
+  blocked: string | null;
+}
+
+export function StreamNote({ device, streamer, blocked }: StreamNoteProps) {
+  const [state, text] = streamText(device, streamer, blocked);
+  const limited = state === "streaming" && device.limited.value !== "";
+  return (
+    <span class={`quiet stream-${limited ? "limited" : state}`} data-testid="stream-state" data-state={state} role="status">
+      {text}
+    </span>
+  );
+}
+
+function streamText(device: DeviceStore, streamer: SetpointStreamer | null, blocked: string | null): [string, string] {
+  if (blocked !== null || streamer === null) return ["blocked", blocked ?? ""];
+  const state = streamer.state.value;
+  if (state === "waiting") return [state, texts.joints.waiting];
+  if (state === "streaming") {
+    if (device.limited.value !== "") return [state, texts.joints.limited(device.limited.value)];
+    return [state, streamer.way.value === "joints" ? texts.joints.streaming : texts.steer.holding];
+  }
+  const ended = streamer.ended.value;
+  return [state, ended === null ? "" : texts.joints.ended[ended]];
+}

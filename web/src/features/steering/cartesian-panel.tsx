@@ -1,0 +1,137 @@
+import { useState } from "preact/hooks";
+import { degrees, radians } from "../../shared/lib/angles";
+import type { DeviceStore } from "../devices/model/device-store";
+import { JOG_KEYS } from "./model/keymap";
+import { rollPitchYaw, unit } from "../twin/model/forward-kinematics";
+import { direction, jogOf, sumOf, type Direction } from "./model/steerable-parts";
+import { texts } from "../../shared/i18n/texts";
+import { Choice } from "../../shared/ui/parts";
+import { useHeldPad } from "./use-gamepad";
+import { useHeld } from "./use-held-inputs";
+import { HoldButton } from "./hold-button";
+import { useHeldKeys } from "./keyboard-help";
+import type { PanelProps } from "./panel-props";
+import { SpeedField } from "../../shared/ui/number-with-unit";
+
+/** What a hand may ask for beside a robot [mm/s], as ISO 10218-1 bounds it where people are near; and turning [°/s]. */
+const LINEAR_MM_S = { least: 5, most: 250, step: 5, first: 60 };
+const ANGULAR_DEG_S = { least: 1, most: 60, step: 1, first: 15 };
+
+const AXES = ["x", "y", "z"] as const;
+const TURNS = ["roll", "pitch", "yaw"] as const;
+const SIGNS = [1, -1] as const;
+
+type Axes = "base" | "tool";
+
+/** A frame moved along and about axes while a pad, a key or a stick is held. */
+export function JogPanel({ device, streamer, active, pad }: PanelProps) {
+  const frames = device.description.value?.frames ?? [];
+  const [picked, setPicked] = useState<string | null>(null);
+  const [axes, setAxes] = useState<Axes>("base");
+  const [linear, setLinear] = useState(LINEAR_MM_S.first);
+  const [angular, setAngular] = useState(ANGULAR_DEG_S.first);
+  const frame = picked !== null && frames.includes(picked) ? picked : (frames.at(-1) ?? "");
+  const speed = { linear_m_s: linear / 1000, angular_rad_s: radians(angular) };
+  const held = useHeld<Direction>(streamer, (parts) => jogOf(sumOf(parts), speed, frame, axes === "tool"));
+  useHeldKeys(active && streamer !== null, held, JOG_KEYS);
+  useHeldPad(pad, held, ({ left, right, lift, cross }): Direction => ({
+    along: [left[1], -left[0], lift],
+    about: [right[0], right[1], -cross[0]],
+  }));
+
+  return (
+    <div class="jog">
+      <div class="row jog-choices">
+        <label>
+          {texts.steer.frame}{" "}
+          <select value={frame} data-testid="jog-frame" onChange={(event) => setPicked(event.currentTarget.value)}>
+            {frames.map((name) => (
+              <option key={name}>{name}</option>
+            ))}
+          </select>
+        </label>
+        <Choice
+          label={texts.steer.axes}
+          value={axes}
+          onChange={setAxes}
+          options={[
+            ["base", texts.steer.inBase],
+            ["tool", texts.steer.inTool],
+          ]}
+        />
+      </div>
+      <div class="pads">
+        {([
+          ["along", AXES, texts.steer.along],
+          ["about", TURNS, texts.steer.about],
+        ] as const).map(([kind, names, title]) => (
+          <div key={kind} role="group" aria-label={title} class="pad-group">
+            <h3>{title}</h3>
+            {names.map((name, axis) => (
+              <div key={name} class="pad-row">
+                {SIGNS.map((sign) => (
+                  <HoldButton
+                    key={sign}
+                    held={held}
+                    name={`${name}${sign > 0 ? "+" : "-"}`}
+                    part={direction(kind, axis as 0 | 1 | 2, sign)}
+                    label={texts.steer.pad(name, sign)}
+                    disabled={streamer === null}
+                  >
+                    {texts.steer.padShort(name, sign)}
+                  </HoldButton>
+                ))}
+              </div>
+            ))}
+          </div>
+        ))}
+      </div>
+      <SpeedField
+        label={texts.steer.linear}
+        name="linear"
+        range={LINEAR_MM_S}
+        value={linear}
+        shown={texts.steer.millimetres(linear)}
+        onChange={setLinear}
+      />
+      <SpeedField
+        label={texts.steer.angular}
+        name="angular"
+        range={ANGULAR_DEG_S}
+        value={angular}
+        shown={texts.steer.degreesPerSecond(angular)}
+        onChange={setAngular}
+      />
+      <LivePose device={device} frame={frame} />
+    </div>
+  );
+}
+
+/** Where the frame is measured to be, in the robot's base. */
+function LivePose({ device, frame }: { device: DeviceStore; frame: string }) {
+  const index = device.description.value?.frames.indexOf(frame) ?? -1;
+  const pose = device.telemetry.value?.message.frames[index];
+  const at = pose?.slice(0, 3);
+  const turned = pose === undefined ? undefined : rollPitchYaw(unit([pose[3], pose[4], pose[5], pose[6]])).map(degrees);
+  return (
+    <dl
+      class={`figures live-pose ${device.live.value ? "" : "old"}`}
+      data-testid="live-pose"
+      data-value={at?.map((part) => part.toFixed(4)).join(" ") ?? ""}
+      aria-label={texts.steer.poseOf(frame)}
+    >
+      {AXES.map((name, axis) => (
+        <div key={name}>
+          <dt>{name}</dt>
+          <dd>{at === undefined ? texts.number.unknown : texts.steer.metres(at[axis] ?? NaN)}</dd>
+        </div>
+      ))}
+      {TURNS.map((name, axis) => (
+        <div key={name}>
+          <dt>{name}</dt>
+          <dd>{turned === undefined ? texts.number.unknown : texts.number.degrees(turned[axis] ?? NaN)}</dd>
+        </div>
+      ))}
+    </dl>
+  );
+}

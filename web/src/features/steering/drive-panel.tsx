@@ -1,0 +1,111 @@
+import { useState } from "preact/hooks";
+import { degrees } from "../../shared/lib/angles";
+import type { DeviceStore } from "../devices/model/device-store";
+import { DRIVE_KEYS } from "./model/keymap";
+import type { BaseLimits } from "../../shared/mqtt/protocol.generated";
+import { AT_REST, driveOf, pushed, type Push } from "./model/steerable-parts";
+import type { SetpointStreamer } from "./model/setpoint-streamer";
+import { texts } from "../../shared/i18n/texts";
+import { useHeldPad } from "./use-gamepad";
+import { useHeld } from "./use-held-inputs";
+import { HoldButton } from "./hold-button";
+import { useHeldKeys } from "./keyboard-help";
+import type { PanelProps } from "./panel-props";
+import { SpeedField } from "../../shared/ui/number-with-unit";
+import { Stick } from "./virtual-stick";
+
+const PERCENT = { least: 5, most: 100, step: 5, first: 50 };
+
+/** The base driven while a stick, a key or a gamepad is held. */
+export function DrivePanel({ device, streamer, active, pad }: PanelProps) {
+  const limits = device.description.value?.base ?? { forward_m_s: 0, left_m_s: 0, turn_rad_s: 0 };
+  const [percent, setPercent] = useState(PERCENT.first);
+  const held = useHeld<Push>(streamer, (parts) => driveOf(pushed(parts), limits, percent / 100));
+  useHeldKeys(active && streamer !== null, held, DRIVE_KEYS);
+  useHeldPad(pad, held, ({ left, right }) => ({ forward: left[1], turn: -left[0], left: -right[0] }));
+  const aside = limits.left_m_s > 0;
+  return (
+    <div class="drive">
+      <div class="drive-hands">
+        {aside && (
+          <HoldButton
+            held={held}
+            name="left"
+            part={{ ...AT_REST, left: 1 }}
+            label={texts.steer.sideways.left}
+            disabled={streamer === null}
+          >
+            ←
+          </HoldButton>
+        )}
+        <Stick held={held} disabled={streamer === null} />
+        {aside && (
+          <HoldButton
+            held={held}
+            name="right"
+            part={{ ...AT_REST, left: -1 }}
+            label={texts.steer.sideways.right}
+            disabled={streamer === null}
+          >
+            →
+          </HoldButton>
+        )}
+      </div>
+      <SpeedField
+        label={texts.steer.upTo}
+        name="drive"
+        range={PERCENT}
+        value={percent}
+        shown={texts.steer.driveSpeed((limits.forward_m_s * percent) / 100, degrees((limits.turn_rad_s * percent) / 100))}
+        onChange={setPercent}
+      />
+      <Velocities device={device} streamer={streamer} limits={limits} />
+    </div>
+  );
+}
+
+const PARTS = ["forward_m_s", "left_m_s", "turn_rad_s"] as const;
+
+interface VelocitiesProps {
+  device: DeviceStore;
+  streamer: SetpointStreamer | null;
+  limits: BaseLimits;
+}
+
+/** What is asked of the base, and what it says that it does, where it measures that. */
+function Velocities({ device, streamer, limits }: VelocitiesProps) {
+  const stream = device.description.value?.streams.find(({ name }) => name === "odometry")?.name;
+  const measured = stream === undefined ? null : device.measured(stream).value;
+  const asked = streamer?.velocity.value;
+  const shown = PARTS.filter((part) => limits[part] > 0);
+  const values = measured?.message.values ?? {};
+  const measures = shown.some((part) => typeof values[part] === "number");
+  const text = (part: (typeof PARTS)[number], value: unknown): string =>
+    typeof value === "number"
+      ? part === "turn_rad_s"
+        ? texts.steer.degreesPerSecond(Math.round(degrees(value)))
+        : texts.steer.metresPerSecond(value)
+      : texts.number.unknown;
+  return (
+    <table class="velocities" data-testid="velocities" data-forward={String(values["forward_m_s"] ?? "")}>
+      <thead>
+        <tr>
+          <td />
+          <th scope="col">{texts.steer.asked}</th>
+          {measures && <th scope="col">{texts.steer.measured}</th>}
+        </tr>
+      </thead>
+      <tbody>
+        {shown.map((part) => (
+          <tr key={part}>
+            <th scope="row">{texts.steer.part[part]}</th>
+            <td>{text(part, asked?.kind === "drive" ? asked[part] : 0)}</td>
+            {measures && (
+              <td class={stream !== undefined && device.late(stream) ? "old" : "measured"}>{text(part, values[part])}</td>
+            )}
+          </tr>
+        ))}
+      </tbody>
+    </table>
+  );
+}

@@ -1,0 +1,49 @@
+import type { ComponentChildren } from "preact";
+import { useEffect } from "preact/hooks";
+import type { Held } from "./model/held-inputs";
+
+interface HoldButtonProps<T> {
+  held: Held<T>;
+  name: string;
+  part: T;
+  label: string;
+  disabled: boolean;
+  class?: string;
+  children: ComponentChildren;
+}
+
+/** It counts while it is held, by pointer or by Space or Enter: a pointer that is lost, or a focus, lets it go. */
+export function HoldButton<T>({ held, name, part, label, disabled, children, ...rest }: HoldButtonProps<T>) {
+  useEffect(() => () => held.release(name), [held, name]);
+  const letGo = (): void => held.release(name);
+  return (
+    <button
+      type="button"
+      class={`hold ${rest.class ?? ""}`}
+      data-testid={`hold-${name}`}
+      aria-label={label}
+      title={label}
+      disabled={disabled}
+      onPointerDown={(event) => {
+        if (event.button !== 0) return;
+        event.currentTarget.setPointerCapture(event.pointerId);
+        held.press(name, part);
+      }}
+      onPointerUp={letGo}
+      onPointerCancel={letGo}
+      onLostPointerCapture={letGo}
+      onBlur={letGo}
+      onContextMenu={(event) => event.preventDefault()}
+      onKeyDown={(event) => {
+        if (event.key !== " " && event.key !== "Enter") return;
+        event.preventDefault();
+        if (!event.repeat) held.press(name, part);
+      }}
+      onKeyUp={(event) => {
+        if (event.key === " " || event.key === "Enter") letGo();
+      }}
+    >
+      {children}
+    </button>
+  );
+}

@@ -1,0 +1,141 @@
+/** One joint to be set: a number, a slider with its limits, and beside them where it is measured to be. */
+import { useRef, useState } from "preact/hooks";
+import { degrees, radians } from "../../shared/lib/angles";
+import type { Joint } from "../../shared/mqtt/protocol.generated";
+import { texts } from "../../shared/i18n/texts";
+
+interface JointRowProps {
+  joint: Joint;
+  /** Where it is to be [rad]; `undefined`: nobody knows. */
+  targetRad: number | undefined;
+  /** Where it is measured [rad]; `undefined`: it is not. */
+  measuredRad: number | undefined;
+  /** Sets the target [rad]; `null`: it cannot be set now. */
+  onSet: ((positionRad: number) => void) | null;
+  /** What is measured is no longer what is. */
+  old?: boolean;
+  /** It is the one that keys move. */
+  chosen?: boolean;
+}
+
+export function JointRow({ joint, targetRad, measuredRad, onSet, old = false, chosen = false }: JointRowProps) {
+  const measured = measuredRad === undefined ? undefined : degrees(measuredRad);
+  const target = targetRad === undefined ? undefined : degrees(targetRad);
+  const lower = degrees(joint.lower_rad);
+  const upper = degrees(joint.upper_rad);
+  const set = (deg: number): void => onSet?.(radians(deg));
+  return (
+    <div
+      class={`joint ${old ? "old" : ""} ${chosen ? "chosen" : ""}`}
+      role="group"
+      aria-label={joint.label}
+      aria-current={chosen}
+      data-testid={`joint-${joint.name}`}
+    >
+      <span class="joint-name">{joint.label}</span>
+      <TargetField joint={joint} target={target} disabled={onSet === null} onSet={set} />
+      <span
+        class="measured"
+        data-testid={`measured-${joint.name}`}
+        data-value={measured?.toFixed(3) ?? ""}
+        title={texts.joints.measured(joint.label)}
+      >
+        {measured === undefined ? texts.number.unknown : texts.number.degrees(measured)}
+      </span>
+      <div class="track">
+        <span class="limit quiet" aria-hidden="true">
+          {texts.number.wholeDegrees(lower)}
+        </span>
+        <span class="rail">
+        <input
+          type="range"
+          data-testid={`slider-${joint.name}`}
+          aria-label={texts.joints.slider(joint.label)}
+          aria-valuetext={target === undefined ? texts.number.unknown : texts.number.degrees(target)}
+          min={lower}
+          max={upper}
+          step="any"
+          value={target ?? (lower + upper) / 2}
+          disabled={onSet === null || target === undefined}
+          onInput={(event) => set(event.currentTarget.valueAsNumber)}
+          onKeyDown={(event) => {
+            const step = stepOf(event);
+            if (step === null) return;
+            event.preventDefault();
+            if (target !== undefined && step !== 0) set(target + step);
+          }}
+        />
+        {measured !== undefined && (
+          <span class="marker" aria-hidden="true" style={{ "--at": String((measured - lower) / (upper - lower)) }} />
+        )}
+        </span>
+        <span class="limit quiet" aria-hidden="true">
+          {texts.number.wholeDegrees(upper)}
+        </span>
+      </div>
+    </div>
+  );
+}
+
+/** Degrees that a key moves a slider; 0 for a key that must do nothing; `null` for keys that are not ours. */
+function stepOf(event: KeyboardEvent): number | null {
+  const size = event.shiftKey ? 10 : event.altKey ? 0.1 : 1;
+  switch (event.key) {
+    case "ArrowRight":
+    case "ArrowUp":
+      return size;
+    case "ArrowLeft":
+    case "ArrowDown":
+      return -size;
+    case "PageUp":
+      return 10;
+    case "PageDown":
+      return -10;
+    case "Home":
+    case "End":
+      // One key must not send a joint across its whole range.
+      return 0;
+    default:
+      return null;
+  }
+}
+
+interface TargetFieldProps {
+  joint: Joint;
+  target: number | undefined;
+  disabled: boolean;
+  onSet: (deg: number) => void;
+}
+
+/** The target as a number. What is typed counts at Enter, and is forgotten when the field is left. */
+function TargetField({ joint, target, disabled, onSet }: TargetFieldProps) {
+  const [typed, setTyped] = useState<string | null>(null);
+  const field = useRef<HTMLInputElement>(null);
+  const shown = target === undefined ? "" : texts.number.oneDigit(target);
+  const commit = (): void => {
+    const value = Number(typed?.replace(",", "."));
+    if (typed !== null && typed.trim() !== "" && Number.isFinite(value)) onSet(value);
+    setTyped(null);
+    field.current?.select();
+  };
+  return (
+    <span class="target">
+      <input
+        ref={field}
+        type="text"
+        inputMode="decimal"
+        data-testid={`target-${joint.name}`}
+        data-value={target?.toFixed(3) ?? ""}
+        aria-label={texts.joints.target(joint.label)}
+        value={typed ?? shown}
+        disabled={disabled}
+        onInput={(event) => setTyped(event.currentTarget.value)}
+        onBlur={() => setTyped(null)}
+        onKeyDown={(event) => {
+          if (event.key === "Enter") commit();
+        }}
+      />
+      <span aria-hidden="true">{texts.joints.unit}</span>
+    </span>
+  );
+}

@@ -1,0 +1,166 @@
+import { effect, type ReadonlySignal, useComputed, useSignalEffect } from "@preact/signals";
+import { useEffect, useMemo, useRef, useState } from "preact/hooks";
+import { clamp, radians } from "../../shared/lib/angles";
+import type { DeviceStore } from "../devices/model/device-store";
+import { Held } from "./model/held-inputs";
+import { JOINT_KEYS, jointOfKey } from "./model/keymap";
+import type { KnownTelemetry } from "../../shared/mqtt/parse-messages";
+import type { Joint } from "../../shared/mqtt/protocol.generated";
+import type { SetpointStreamer } from "./model/setpoint-streamer";
+import { texts } from "../../shared/i18n/texts";
+import { useDrawn } from "../../shared/hooks/use-frame-signal";
+import { useHeldPad } from "./use-gamepad";
+import { JointRow } from "./joint-slider";
+import { useHeldKeys, useKey } from "./keyboard-help";
+import type { PanelProps } from "./panel-props";
+
+/** How fast a held key moves the target [rad/s], and how far ahead of the joint at most [rad]. */
+const RATE_RAD_S = radians(20);
+const LEAD_RAD = radians(4);
+const STEP_MS = 40;
+/** What differs by less is shown the same [rad]. */
+const SHOWN_RAD = 1e-5;
+
+export function JointsPanel({ device, streamer, active, pad }: PanelProps) {
+  const description = device.description.value;
+  const joints = description?.joints ?? [];
+  const [chosen, setChosen] = useState(0);
+  const rows = useRef<HTMLDivElement>(null);
+  useTurning({ device, streamer, active, pad }, chosen);
+  const telemetry = useDrawn(device.telemetry);
+
+  const choose = (index: number): void => {
+    const next = clamp(index, 0, joints.length - 1);
+    setChosen(next);
+    rows.current?.children[next]?.scrollIntoView({ block: "nearest" });
+  };
+  useKey(active && joints.length > 0, (event) => {
+    const index = jointOfKey(event.code);
+    if (index !== null && index < joints.length) choose(index);
+    else if (event.key === "[") choose(chosen - 1);
+    else if (event.key === "]") choose(chosen + 1);
+    else return false;
+    return true;
+  });
+  const cross = useRef(0);
+  useSignalEffect(() => {
+    const step = pad.reading.value?.cross[1] ?? 0;
+    if (step !== 0 && cross.current === 0) choose(chosen - step);
+    cross.current = step;
+  });
+
+  if (description === null) return <p class="quiet">{texts.joints.noDescription}</p>;
+  return (
+    <>
+      <div class="joint-head" aria-hidden="true">
+        <span>{texts.joints.heading.joint}</span>
+        <span>{texts.joints.heading.target}</span>
+        <span>{texts.joints.heading.measured}</span>
+      </div>
+      <div class="joint-rows" ref={rows}>
+        {joints.map((joint, index) => (
+          <LiveJoint
+            key={joint.name}
+            joint={joint}
+            index={index}
+            device={device}
+            telemetry={telemetry}
+            streamer={streamer}
+            chosen={active && streamer !== null && index === chosen}
+          />
+        ))}
+      </div>
+      <p class="quiet small">{texts.joints.keys}</p>
+    </>
+  );
+}
+
+interface LiveJointProps extends Pick<PanelProps, "device" | "streamer"> {
+  joint: Joint;
+  index: number;
+  telemetry: DeviceStore["telemetry"];
+  chosen: boolean;
+}
+
+/** Reads what changes many times a second by itself, so that the panel need not. */
+function LiveJoint({ joint, index, device, telemetry, streamer, chosen }: LiveJointProps) {
+  const measured = useShown(telemetry, (message) => message.position_rad[index]);
+  const commanded = useShown(telemetry, (message) => message.commanded_rad[index]);
+  return (
+    <JointRow
+      joint={joint}
+      targetRad={streamer?.targets.value[joint.name] ?? commanded.value}
+      measuredRad={measured.value}
+      old={!device.live.value}
+      chosen={chosen}
+      onSet={streamer === null ? null : (positionRad) => streamer.setTarget(joint.name, positionRad)}
+    />
+  );
+}
+
+/** One position of the newest telemetry: the same number for as long as the row would look the same. */
+function useShown(
+  telemetry: DeviceStore["telemetry"],
+  of: (message: KnownTelemetry) => number | undefined,
+): ReadonlySignal<number | undefined> {
+  return useComputed(() => {
+    const at = telemetry.value === null ? undefined : of(telemetry.value.message);
+    return at === undefined ? undefined : Math.round(at / SHOWN_RAD) * SHOWN_RAD;
+  });
+}
+
+/** Turns the chosen joint while a key, or the stick of a gamepad, is held: its target runs ahead by a little. */
+function useTurning({ device, streamer, active, pad }: PanelProps, chosen: number): void {
+  const amount = useRef(0);
+  const held = useMemo(
+    () =>
+      new Held<number>((parts) => {
+        amount.current = clamp(
+          parts.reduce((sum, part) => sum + part, 0),
+          -1,
+          1,
+        );
+      }),
+    [],
+  );
+  // Without control arrows scroll the page, as ever.
+  useHeldKeys(active && streamer !== null, held, JOINT_KEYS);
+  useHeldPad(pad, held, ({ left }) => left[1]);
+  useEffect(
+    () =>
+      effect(() => {
+        // As with a velocity: what has ended the stream ends what was held.
+        const ended = streamer?.ended.value ?? null;
+        if (streamer === null || (ended !== null && ended !== "reached")) held.releaseAll();
+      }),
+    [held, streamer],
+  );
+  useEffect(() => {
+    const drop = (): void => held.releaseAll();
+    addEventListener("blur", drop);
+    document.addEventListener("visibilitychange", drop);
+    return () => {
+      removeEventListener("blur", drop);
+      document.removeEventListener("visibilitychange", drop);
+      drop();
+    };
+  }, [held]);
+  const joint = device.description.value?.joints[chosen];
+  useEffect(() => {
+    if (streamer === null || joint === undefined) return;
+    held.releaseAll();
+    const timer = setInterval(() => {
+      if (amount.current !== 0) turn(streamer, joint, device.telemetry.peek()?.message.position_rad[chosen]);
+    }, STEP_MS);
+    const turn = (to: SetpointStreamer, one: Joint, measuredRad: number | undefined): void => {
+      if (measuredRad === undefined) return;
+      to.follow();
+      const target = (to.targets.peek()[one.name] ?? measuredRad) + (amount.current * RATE_RAD_S * STEP_MS) / 1000;
+      to.setTarget(one.name, clamp(target, measuredRad - LEAD_RAD, measuredRad + LEAD_RAD));
+    };
+    return () => {
+      clearInterval(timer);
+      held.releaseAll();
+    };
+  }, [streamer, joint, chosen, device, held]);
+}

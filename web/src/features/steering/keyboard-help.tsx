@@ -1,0 +1,93 @@
+/** The keys that move a robot: what they are, and who hears them. */
+import { signal } from "@preact/signals";
+import { useEffect, useRef } from "preact/hooks";
+import type { Held } from "./model/held-inputs";
+import type { Way } from "./model/steerable-parts";
+import { texts } from "../../shared/i18n/texts";
+
+const STORED = "telescope-keys";
+/** Whether keys move a robot from anywhere on the page; else only while the focus is on its controls. */
+const everywhere = signal(localStorage.getItem(STORED) !== "off");
+
+const TEXT = 'input:not([type="range"], [type="checkbox"], [type="radio"]), textarea, select, [contenteditable], .cm-editor';
+/** What moves by arrows itself. */
+const ARROWS_TAKEN = 'input, [role="tab"], [role="radiogroup"], [tabindex="0"]:not([data-takes-keys])';
+
+/** Whether a key is meant for the robot, and not for what has the focus. */
+function forTheRobot(event: KeyboardEvent): boolean {
+  if (event.ctrlKey || event.metaKey || event.altKey || event.defaultPrevented) return false;
+  const at = event.target instanceof Element ? event.target : null;
+  if (at === null) return true;
+  if (at.closest(TEXT) !== null) return false;
+  if (event.code.startsWith("Arrow") && at.closest(ARROWS_TAKEN) !== null) return false;
+  return everywhere.value || at.closest("[data-takes-keys]") !== null;
+}
+
+/** Hear keys while `active`; what `onKey` answers with `true` was for the robot, and does nothing else. */
+export function useKey(active: boolean, onKey: (event: KeyboardEvent) => boolean): void {
+  const newest = useRef(onKey);
+  newest.current = onKey;
+  useEffect(() => {
+    if (!active) return;
+    const down = (event: KeyboardEvent): void => {
+      if (forTheRobot(event) && newest.current(event)) event.preventDefault();
+    };
+    addEventListener("keydown", down);
+    return () => removeEventListener("keydown", down);
+  }, [active]);
+}
+
+/** Hold what a key stands for while it is down. A key that comes up is heard wherever the focus has gone. */
+export function useHeldKeys<T>(active: boolean, held: Held<T>, map: Readonly<Record<string, T>>): void {
+  useKey(active, (event) => {
+    const part = map[event.code];
+    if (part === undefined) return false;
+    if (!event.repeat) held.press(event.code, part);
+    return true;
+  });
+  useEffect(() => {
+    if (!active) return;
+    const up = (event: KeyboardEvent): void => {
+      if (event.code in map) held.release(event.code);
+    };
+    addEventListener("keyup", up, { capture: true });
+    return () => {
+      removeEventListener("keyup", up, { capture: true });
+      held.releaseAll();
+    };
+  }, [active, held, map]);
+}
+
+/** The keys of what is shown, in place: nothing may lie over Stop. */
+export function Keys({ way }: { way: Way }) {
+  const rows = [...texts.steer.keys[way], ...texts.steer.keys.always];
+  return (
+    <div class="keys" data-testid="keys">
+      <dl>
+        {rows.map(([keys, what]) => (
+          <div key={keys.join()}>
+            <dt>
+              {keys.map((key) => (
+                <kbd key={key}>{key}</kbd>
+              ))}
+            </dt>
+            <dd>{what}</dd>
+          </div>
+        ))}
+      </dl>
+      <label class="check">
+        <input
+          type="checkbox"
+          data-testid="keys-everywhere"
+          checked={everywhere.value}
+          onChange={(event) => {
+            everywhere.value = event.currentTarget.checked;
+            localStorage.setItem(STORED, everywhere.value ? "on" : "off");
+          }}
+        />
+        {texts.steer.everywhere}
+      </label>
+      <p class="quiet small">{texts.steer.padKeys[way]}</p>
+    </div>
+  );
+}

@@ -1,0 +1,101 @@
+/** What of a device can be steered, by its own description, and what a hand on the controls asks of it. */
+import { clamp } from "../../../shared/lib/angles";
+import type { KnownDescription } from "../../../shared/mqtt/parse-messages";
+import type { BaseLimits, DriveTarget, JogTarget } from "../../../shared/mqtt/protocol.generated";
+import type { Vector3 } from "../../../shared/lib/vectors";
+
+export type Way = "joints" | "jog" | "drive";
+/** A velocity: it counts only while it is held. */
+export type Velocity = JogTarget | DriveTarget;
+
+/** The kinds of setpoint that this device follows. */
+export function waysOf(description: KnownDescription | null): Way[] {
+  if (description === null) return [];
+  const ways: Way[] = [];
+  if (description.joints.length > 0) ways.push("joints");
+  // Whoever brings a frame to a pose can also move it along: both need the robot's shape.
+  if (description.actions.includes("move_pose") && description.frames.length > 0) ways.push("jog");
+  if (description.base !== null) ways.push("drive");
+  return ways;
+}
+
+/** What a velocity that has been let go leaves behind: rest, said in its own words. */
+export function restOf(velocity: Velocity): Velocity {
+  if (velocity.kind === "drive") return { kind: "drive", forward_m_s: 0, left_m_s: 0, turn_rad_s: 0 };
+  return { ...velocity, linear_m_s: [0, 0, 0], angular_rad_s: [0, 0, 0] };
+}
+
+/** Directions of a jog, -1…1 each: along x, y, z, about x, y, z. */
+export interface Direction {
+  along: Vector3;
+  about: Vector3;
+}
+
+/** Where a stick is pushed, -1…1 each: forward, to the left, turning counter-clockwise. */
+export interface Push {
+  forward: number;
+  left: number;
+  turn: number;
+}
+
+export const AT_REST: Push = { forward: 0, left: 0, turn: 0 };
+
+export interface JogSpeed {
+  linear_m_s: number;
+  angular_rad_s: number;
+}
+
+function most(vector: Vector3): number {
+  return Math.max(1, Math.hypot(...vector));
+}
+
+/** As fast in every direction: two buttons at once are no faster than one. */
+export function jogOf({ along, about }: Direction, speed: JogSpeed, frame: string, tool: boolean): JogTarget {
+  const scaled = (vector: Vector3, by: number): Vector3 => vector.map((part) => (part * by) / most(vector)) as Vector3;
+  return {
+    kind: "jog",
+    linear_m_s: scaled(along, speed.linear_m_s),
+    angular_rad_s: scaled(about, speed.angular_rad_s),
+    frame,
+    tool,
+  };
+}
+
+/** `share`: of the speed that the base can have, 0…1. */
+export function driveOf(push: Push, limits: BaseLimits, share: number): DriveTarget {
+  const part = (value: number, limit: number): number => clamp(value, -1, 1) * limit * clamp(share, 0, 1);
+  return {
+    kind: "drive",
+    forward_m_s: part(push.forward, limits.forward_m_s),
+    left_m_s: part(push.left, limits.left_m_s),
+    turn_rad_s: part(push.turn, limits.turn_rad_s),
+  };
+}
+
+/** The sum of all that is held at once. */
+export function sumOf(directions: Iterable<Direction>): Direction {
+  const sum: Direction = { along: [0, 0, 0], about: [0, 0, 0] };
+  for (const { along, about } of directions) {
+    for (const axis of [0, 1, 2] as const) {
+      sum.along[axis] = clamp(sum.along[axis] + along[axis], -1, 1);
+      sum.about[axis] = clamp(sum.about[axis] + about[axis], -1, 1);
+    }
+  }
+  return sum;
+}
+
+export function pushed(pushes: Iterable<Push>): Push {
+  const sum = { ...AT_REST };
+  for (const push of pushes) {
+    sum.forward = clamp(sum.forward + push.forward, -1, 1);
+    sum.left = clamp(sum.left + push.left, -1, 1);
+    sum.turn = clamp(sum.turn + push.turn, -1, 1);
+  }
+  return sum;
+}
+
+export function direction(kind: keyof Direction, axis: 0 | 1 | 2, sign: 1 | -1): Direction {
+  const made: Direction = { along: [0, 0, 0], about: [0, 0, 0] };
+  made[kind][axis] = sign;
+  return made;
+}

@@ -1,0 +1,124 @@
+/** Several robots on one page, each with its own control; one key and one button stop them all. */
+import { useMemo, useState } from "preact/hooks";
+import type { Account, Api } from "../../shared/api/client";
+import type { DeviceStore } from "../devices/model/device-store";
+import type { Fleet } from "../devices/model/device-list";
+import type { Station } from "../devices/model/device-session";
+import { texts } from "../../shared/i18n/texts";
+import { ControlBar } from "../control/control-bar";
+import { HeardAge, ReachChip } from "../../shared/ui/parts";
+import { deviceAddress, fleetAddress } from "../../app/routes";
+import { useStations } from "../devices/device-sessions";
+import { StopBanner } from "../control/stop-button";
+import { View3D } from "../twin/twin-view";
+import { SteerCard } from "./steering-card";
+import "./multi-robot.css";
+
+interface TogetherPageProps {
+  api: Api;
+  fleet: Fleet;
+  /** Of the devices, with commas between. */
+  ids: string;
+  account: Account;
+}
+
+export function TogetherPage({ api, fleet, ids: asked, account }: TogetherPageProps) {
+  const ids = useMemo(() => [...new Set(asked.split(","))], [asked]);
+  const all = fleet.devices.value;
+  const devices = ids.map((id) => all?.get(id)).filter((device) => device !== undefined);
+  const stations = useStations(api, fleet, devices, account);
+  const [chosen, setChosen] = useState<string | null>(null);
+  const active = stations.find(({ device }) => device.id === chosen) ?? stations[0];
+  const stopAll = (): void => {
+    for (const station of stations) station.stopNow();
+  };
+  const stoppable = devices.some(({ info }) => info.value.role !== "viewer");
+  return (
+    <>
+      <div class="control-bar all-bar" role="region" aria-label={texts.together.stopAll}>
+        <p class="control-state" role="status" data-testid="keys-for">
+          {active !== undefined && texts.together.keysFor(active.device.info.value.label)}
+        </p>
+        <button
+          type="button"
+          class="stop"
+          data-testid="stop-all"
+          disabled={!stoppable}
+          title={texts.together.stopAllExplained}
+          aria-keyshortcuts="Escape"
+          onClick={stopAll}
+        >
+          {texts.together.stopAll} <kbd>{texts.stop.key}</kbd>
+        </button>
+      </div>
+      <main class="page operate together" id="content">
+        <div class="heading">
+          <a href={fleetAddress}>← {texts.device.back}</a>
+          <h1>{texts.together.title(devices.length)}</h1>
+        </div>
+        {all === null && <p class="quiet">{texts.loading}</p>}
+        {all !== null && devices.length < ids.length && <p class="notice warn">{texts.together.missing}</p>}
+        <div class="stations">
+          {stations.map((station) => (
+            <StationPanel
+              key={station.device.id}
+              station={station}
+              active={station === active}
+              onChoose={() => setChosen(station.device.id)}
+              onStop={stopAll}
+            />
+          ))}
+        </div>
+      </main>
+    </>
+  );
+}
+
+interface StationPanelProps {
+  station: Station;
+  active: boolean;
+  onChoose: () => void;
+  onStop: () => void;
+}
+
+/** One robot: who touches it chooses it for keys and gamepad. */
+function StationPanel({ station, active, onChoose, onStop }: StationPanelProps) {
+  const { device, control, stop } = station;
+  const { label } = device.info.value;
+  return (
+    <section
+      class={`station ${active ? "chosen" : ""}`}
+      aria-label={label}
+      data-testid="station"
+      data-device={device.id}
+      data-chosen={active}
+      onPointerDownCapture={onChoose}
+      onFocusCapture={onChoose}
+    >
+      <header class="station-head">
+        <h2>
+          <a href={deviceAddress(device.id)}>{label}</a>
+        </h2>
+        <ReachChip device={device} data-testid="online" />
+        <Doing device={device} />
+        {/* The same words either way: what moves under a pointer that has just gone down gets no click. */}
+        <button type="button" class="choose" aria-pressed={active} data-testid="choose" onClick={onChoose}>
+          {texts.together.keysHere}
+        </button>
+      </header>
+      <ControlBar device={device} control={control} stop={stop} watching={station.watching} />
+      <StopBanner device={device} stop={stop} />
+      <View3D device={device} control={control} />
+      <SteerCard station={station} active={active} onStop={onStop} />
+    </section>
+  );
+}
+
+function Doing({ device }: { device: DeviceStore }) {
+  const state = device.state.value;
+  return (
+    <span class={`quiet small ${device.live.value ? "" : "old"}`}>
+      {state === null ? texts.number.unknown : texts.mode[state.mode]} · <HeardAge device={device} />
+    </span>
+  );
+}

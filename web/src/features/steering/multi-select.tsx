@@ -1,0 +1,46 @@
+/** Which robots are ticked in the list, to be operated on one page. */
+import { signal } from "@preact/signals";
+import type { DeviceStore } from "../devices/model/device-store";
+import { texts } from "../../shared/i18n/texts";
+import { togetherAddress } from "../../app/routes";
+
+const ticked = signal<readonly string[]>([]);
+
+export function PickForTogether({ device }: { device: DeviceStore }) {
+  const { id } = device;
+  return (
+    <input
+      type="checkbox"
+      class="pick"
+      data-testid="pick"
+      aria-label={texts.together.pick(device.info.value.label)}
+      checked={ticked.value.includes(id)}
+      onChange={(event) => {
+        const others = ticked.value.filter((each) => each !== id);
+        ticked.value = event.currentTarget.checked ? [...others, id] : others;
+      }}
+    />
+  );
+}
+
+/** `devices`: all that there are. What is ticked and has gone since does not count. */
+export function OperateTogether({ devices }: { devices: readonly DeviceStore[] }) {
+  const ids = ticked.value.filter((id) => devices.some((device) => device.id === id));
+  return (
+    <div role="status">
+      {ids.length > 0 && (
+        <p class="row together-offer">
+          {texts.together.picked(ids.length)}
+          {ids.length > 1 && (
+            <a class="elsewhere" href={togetherAddress(ids)} data-testid="operate-together">
+              {texts.together.open}
+            </a>
+          )}
+          <button type="button" class="plain" onClick={() => (ticked.value = [])}>
+            {texts.together.none}
+          </button>
+        </p>
+      )}
+    </div>
+  );
+}

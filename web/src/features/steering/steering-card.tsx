@@ -1,0 +1,138 @@
+/** What moves a robot by hand, in the ways that its description names: joints, a frame, the base. */
+import { useId, useRef, useState } from "preact/hooks";
+import type { ComponentType } from "preact";
+import type { Station } from "../devices/model/device-session";
+import { waysOf, type Way } from "./model/steerable-parts";
+import { texts } from "../../shared/i18n/texts";
+import { Card } from "../../shared/ui/parts";
+import { StreamNote, whyBlocked } from "./blocked-notice";
+import { DrivePanel } from "./drive-panel";
+import { usePad, type PadNews } from "./use-gamepad";
+import { JogPanel } from "./cartesian-panel";
+import { JointsPanel } from "./joints-panel";
+import { Keys, useKey } from "./keyboard-help";
+import type { PanelProps } from "./panel-props";
+import "./steering.css";
+
+const PANELS: Readonly<Record<Way, ComponentType<PanelProps>>> = {
+  joints: JointsPanel,
+  jog: JogPanel,
+  drive: DrivePanel,
+};
+
+interface SteerCardProps {
+  station: Station;
+  /** Whether keys and gamepad are this robot's: of several, one. */
+  active?: boolean;
+  /** What the gamepad's button for it stops. */
+  onStop: () => void;
+}
+
+export function SteerCard({ station, active = true, onStop }: SteerCardProps) {
+  const { device, control } = station;
+  const ways = waysOf(device.description.value);
+  const [picked, setPicked] = useState<Way>("joints");
+  const [keysShown, setKeysShown] = useState(false);
+  const id = useId();
+  const way = ways.includes(picked) ? picked : (ways[0] ?? "joints");
+  const blocked = whyBlocked(device, control);
+  const streamer = blocked === null ? control.streamer.value : null;
+  const pad = usePad(active, onStop);
+  useKey(active, (event) => {
+    if (event.repeat) return false;
+    if (event.key === "?") setKeysShown(!keysShown);
+    else if (event.code === "KeyT") takeOrRelease(station);
+    else return false;
+    return true;
+  });
+  const Panel = PANELS[way];
+  return (
+    <Card
+      title={ways.length > 1 ? texts.steer.title : texts.joints.title}
+      class="joints steer"
+      data-testid="steer-card"
+      aside={<StreamNote device={device} streamer={control.streamer.value} blocked={blocked} />}
+    >
+      <div class="steer-top">
+        {ways.length > 1 && <Tabs ways={ways} way={way} id={id} onChange={setPicked} />}
+        <button
+          type="button"
+          class="plain"
+          data-testid="show-keys"
+          aria-expanded={keysShown}
+          onClick={() => setKeysShown(!keysShown)}
+        >
+          {texts.steer.showKeys} <kbd>?</kbd>
+        </button>
+      </div>
+      <p class="pad-news small quiet" role="status" data-testid="gamepad">
+        {news(pad.news.value)}
+      </p>
+      {keysShown && <Keys way={way} />}
+      <div
+        {...(ways.length > 1 ? { role: "tabpanel", id: `${id}-panel`, "aria-labelledby": `${id}-${way}` } : {})}
+        class="steer-panel"
+        data-testid={`steer-${way}`}
+      >
+        <Panel device={device} streamer={streamer} active={active} pad={pad} />
+      </div>
+    </Card>
+  );
+}
+
+/** As the button does it, and where it would. */
+function takeOrRelease({ device, control }: Station): void {
+  if (control.streamer.value !== null) void control.release();
+  else if (device.description.value !== null && device.info.value.role !== "viewer") void control.take();
+}
+
+function news(what: PadNews | null): string {
+  return what === null ? "" : texts.steer.pads[what.kind](what.id);
+}
+
+interface TabsProps {
+  ways: readonly Way[];
+  way: Way;
+  id: string;
+  onChange: (way: Way) => void;
+}
+
+function Tabs({ ways, way, id, onChange }: TabsProps) {
+  const list = useRef<HTMLDivElement>(null);
+  const go = (step: number): void => {
+    const next = ways[(ways.indexOf(way) + step + ways.length) % ways.length];
+    if (next === undefined) return;
+    onChange(next);
+    list.current?.querySelector<HTMLElement>(`#${CSS.escape(`${id}-${next}`)}`)?.focus();
+  };
+  return (
+    <div
+      ref={list}
+      class="tabs"
+      role="tablist"
+      aria-label={texts.steer.ways}
+      onKeyDown={(event) => {
+        if (event.key === "ArrowRight") go(1);
+        else if (event.key === "ArrowLeft") go(-1);
+        else return;
+        event.preventDefault();
+      }}
+    >
+      {ways.map((each) => (
+        <button
+          key={each}
+          type="button"
+          role="tab"
+          id={`${id}-${each}`}
+          data-testid={`tab-${each}`}
+          aria-selected={each === way}
+          aria-controls={`${id}-panel`}
+          tabIndex={each === way ? 0 : -1}
+          onClick={() => onChange(each)}
+        >
+          {texts.steer.way[each]}
+        </button>
+      ))}
+    </div>
+  );
+}

@@ -1,0 +1,82 @@
+import { useEffect, useState } from "preact/hooks";
+import { clamp } from "../../shared/lib/angles";
+import type { Held } from "./model/held-inputs";
+import type { Push } from "./model/steerable-parts";
+import { texts } from "../../shared/i18n/texts";
+
+/** Nearer to the middle than this is the middle. */
+const MIDDLE = 0.1;
+const NAME = "stick";
+
+interface StickProps {
+  held: Held<Push>;
+  disabled: boolean;
+}
+
+/** A round stick: up is forward, to a side turns. It springs back when it is let go, or its pointer is lost. */
+export function Stick({ held, disabled }: StickProps) {
+  const [at, setAt] = useState<[number, number]>([0, 0]);
+  const letGo = (): void => {
+    setAt([0, 0]);
+    held.release(NAME);
+  };
+  useEffect(() => {
+    if (disabled) setAt([0, 0]);
+    return () => held.release(NAME);
+  }, [held, disabled]);
+  const place = (event: PointerEvent & { currentTarget: HTMLElement }): [number, number] => {
+    const box = event.currentTarget.getBoundingClientRect();
+    const radius = box.width * 0.38;
+    const x = (event.clientX - box.left - box.width / 2) / radius;
+    const y = (box.top + box.height / 2 - event.clientY) / radius;
+    const length = Math.max(1, Math.hypot(x, y));
+    return [clamp(x / length, -1, 1), clamp(y / length, -1, 1)];
+  };
+  const part = ([x, y]: [number, number]): Push => {
+    const small = Math.hypot(x, y) < MIDDLE;
+    return { forward: small ? 0 : y, turn: small ? 0 : -x, left: 0 };
+  };
+  return (
+    <div
+      class={`stick ${disabled ? "off" : ""}`}
+      data-testid="stick"
+      data-takes-keys
+      role="application"
+      aria-label={texts.steer.stick}
+      aria-disabled={disabled}
+      tabIndex={0}
+      onPointerDown={(event) => {
+        if (disabled || event.button !== 0) return;
+        event.currentTarget.setPointerCapture(event.pointerId);
+        const now = place(event);
+        setAt(now);
+        held.press(NAME, part(now));
+      }}
+      onPointerMove={(event) => {
+        if (disabled || !event.currentTarget.hasPointerCapture(event.pointerId)) return;
+        const now = place(event);
+        setAt(now);
+        held.keep(NAME, part(now));
+      }}
+      onPointerUp={letGo}
+      onPointerCancel={letGo}
+      onLostPointerCapture={letGo}
+      onBlur={letGo}
+      onContextMenu={(event) => event.preventDefault()}
+    >
+      <span class="stick-mark up" aria-hidden="true">
+        ↑
+      </span>
+      <span class="stick-mark down" aria-hidden="true">
+        ↓
+      </span>
+      <span class="stick-mark left" aria-hidden="true">
+        ↺
+      </span>
+      <span class="stick-mark right" aria-hidden="true">
+        ↻
+      </span>
+      <span class="knob" style={{ "--x": String(at[0]), "--y": String(-at[1]) }} aria-hidden="true" />
+    </div>
+  );
+}

@@ -1,0 +1,116 @@
+import { useState } from "preact/hooks";
+import { degrees } from "../../shared/lib/angles";
+import type { DeviceStore } from "../devices/model/device-store";
+import { jointFrames, rollPitchYaw, unit } from "./model/forward-kinematics";
+import type { Pose } from "../../shared/lib/vectors";
+import { texts } from "../../shared/i18n/texts";
+import { Card, Choice } from "../../shared/ui/parts";
+
+type Form = "degrees" | "quaternion";
+type Which = "told" | "joints";
+
+interface Frame {
+  name: string;
+  pose: Pose | undefined;
+}
+
+/** Position and rotation of every joint's frame in the robot's base, as the paper's application shows them. */
+export function PoseTable({ device }: { device: DeviceStore }) {
+  const [form, setForm] = useState<Form>("degrees");
+  const [which, setWhich] = useState<Which>("told");
+  const frames = which === "told" ? told(device) : reckoned(device);
+  return (
+    <Card
+      title={texts.poses.title}
+      class="poses"
+      aside={
+        <Choice
+          label={texts.poses.showAs}
+          value={form}
+          onChange={setForm}
+          options={[
+            ["degrees", texts.poses.asDegrees],
+            ["quaternion", texts.poses.asQuaternion],
+          ]}
+        />
+      }
+    >
+      {device.twin.value !== null && (
+        <Choice
+          label={texts.poses.which}
+          value={which}
+          onChange={setWhich}
+          options={[
+            ["told", texts.poses.told],
+            ["joints", texts.poses.joints],
+          ]}
+        />
+      )}
+      {frames.length === 0 ? (
+        <p class="quiet">{texts.poses.none}</p>
+      ) : (
+        <div class="scroll poses-scroll" tabIndex={0} role="region" aria-label={texts.poses.table}>
+          <table class={device.live.value ? "" : "old"} data-testid="poses">
+            <thead>
+              <tr>
+                <th scope="col">{texts.poses.frame}</th>
+                <th scope="col">{texts.poses.position}</th>
+                <th scope="col">{form === "degrees" ? texts.poses.asDegrees : texts.poses.asQuaternion}</th>
+              </tr>
+            </thead>
+            <tbody>
+              {frames.map(({ name, pose }) => (
+                <PoseRow key={name} name={name} pose={pose} form={form} />
+              ))}
+            </tbody>
+          </table>
+        </div>
+      )}
+      {which === "joints" && <p class="quiet small">{texts.poses.reckoned}</p>}
+      {!device.live.value && frames.some(({ pose }) => pose !== undefined) && <p class="quiet small">{texts.poses.old}</p>}
+    </Card>
+  );
+}
+
+/** Those that the robot itself measures. */
+function told(device: DeviceStore): Frame[] {
+  const poses = device.telemetry.value?.message.frames ?? [];
+  return (device.description.value?.frames ?? []).map((name, index) => ({ name, pose: poses[index] }));
+}
+
+/** Where each joint is by the robot's own drawing, with its joints as they were measured last. */
+function reckoned(device: DeviceStore): Frame[] {
+  const [twin, description] = [device.twin.value, device.description.value];
+  const message = device.telemetry.value?.message;
+  if (twin === null || description === null || message === undefined) return [];
+  const positions: Record<string, number> = {};
+  description.joints.forEach((joint, index) => (positions[joint.name] = message.position_rad[index] ?? 0));
+  const labels = new Map(description.joints.map(({ name, label }) => [name, label]));
+  return jointFrames(twin, positions).map(({ name, position_m: at, quaternion }) => ({
+    name: labels.get(name) ?? name,
+    pose: [...at, ...quaternion],
+  }));
+}
+
+function PoseRow({ name, pose, form }: { name: string; pose: Pose | undefined; form: Form }) {
+  const cells = pose === undefined ? [texts.number.unknown, texts.number.unknown] : poseText(pose, form);
+  return (
+    <tr>
+      <th scope="row">{name}</th>
+      {cells.map((text, index) => (
+        <td key={index}>{text}</td>
+      ))}
+    </tr>
+  );
+}
+
+function poseText([x, y, z, qw, qx, qy, qz]: Pose, form: Form): [string, string] {
+  const position = columns([x, y, z], 3);
+  if (form === "quaternion") return [position, columns([qw, qx, qy, qz], 3)];
+  return [position, columns(rollPitchYaw(unit([qw, qx, qy, qz])).map(degrees), 1)];
+}
+
+/** Numbers side by side, each as wide as the others whatever its sign. */
+function columns(values: readonly number[], digits: number): string {
+  return values.map((value) => (Math.abs(value) < 0.5 / 10 ** digits ? 0 : value).toFixed(digits).padStart(digits + 5)).join(" ");
+}

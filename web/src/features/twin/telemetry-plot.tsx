@@ -1,0 +1,120 @@
+import { useEffect, useRef, useState } from "preact/hooks";
+import { degrees } from "../../shared/lib/angles";
+import { now } from "../../shared/lib/clock";
+import type { DeviceStore } from "../devices/model/device-store";
+import type { Quantity } from "./model/recent-telemetry";
+import type { Joint } from "../../shared/mqtt/protocol.generated";
+import { texts } from "../../shared/i18n/texts";
+import type { Chart } from "../../shared/charts/live-chart";
+import { Card, Choice } from "../../shared/ui/parts";
+import { onColourChange, seriesColour } from "../../shared/ui/canvas-theme";
+
+const QUANTITIES: readonly Quantity[] = ["position_rad", "velocity_rad_s", "effort_nm"];
+/** Often enough to look alive, seldom enough to leave the sliders their time [ms]. */
+const DRAW_EVERY_MS = 66;
+
+export function Plot({ device }: { device: DeviceStore }) {
+  const joints = device.description.value?.joints ?? [];
+  const [quantity, setQuantity] = useState<Quantity>("position_rad");
+  const [hidden, setHidden] = useState<ReadonlySet<string>>(new Set());
+  const [failed, setFailed] = useState(false);
+  const [repaint, setRepaint] = useState(0);
+  const box = useRef<HTMLDivElement>(null);
+
+  const shown = joints.map((joint, index) => ({ joint, index })).filter(({ joint }) => !hidden.has(joint.name));
+  const wanted = shown.map(({ joint }) => joint.name).join(" ");
+
+  useEffect(() => onColourChange(() => setRepaint((count) => count + 1)), []);
+
+  useEffect(() => {
+    if (box.current === null || wanted === "") return;
+    const element = box.current;
+    let alive = true;
+    let chart: Chart | null = null;
+    let asked = 0;
+    let drawnAt = 0;
+    const indices = shown.map(({ index }) => index);
+    const draw = (at: number): void => {
+      asked = requestAnimationFrame(draw);
+      if (at - drawnAt < DRAW_EVERY_MS) return;
+      drawnAt = at;
+      const [times, ...values] = device.history.columns(quantity, indices, now());
+      const inUnit = quantity === "effort_nm" ? values : values.map((column) => column.map(toDegrees));
+      chart?.draw([times, ...inUnit]);
+    };
+    import("../../shared/charts/live-chart").then(
+      ({ createChart }) => {
+        if (!alive) return;
+        const lines = shown.map(({ joint, index }) => ({
+          label: joint.label,
+          colour: seriesColour(index),
+          limits: limitsOf(joint, quantity),
+        }));
+        chart = createChart(element, lines, texts.plot.unit[quantity]);
+        asked = requestAnimationFrame(draw);
+      },
+      () => setFailed(true),
+    );
+    return () => {
+      alive = false;
+      cancelAnimationFrame(asked);
+      chart?.dispose();
+    };
+    // `shown` is in `wanted`, by name: a new array with the same joints is no reason to build a new chart.
+  }, [device, quantity, wanted, repaint]);
+
+  const toggle = (name: string): void => {
+    const next = new Set(hidden);
+    if (!next.delete(name)) next.add(name);
+    setHidden(next);
+  };
+
+  return (
+    <Card
+      title={texts.plot.title}
+      class="plot"
+      aside={
+        <Choice
+          label={texts.plot.choose}
+          value={quantity}
+          onChange={setQuantity}
+          options={QUANTITIES.map((one) => [one, texts.plot.quantity[one]] as const)}
+        />
+      }
+    >
+      {failed && <p class="notice">{texts.plot.failed}</p>}
+      <div
+        ref={box}
+        class={`chart ${device.live.value ? "" : "old"}`}
+        data-testid="plot"
+        role="img"
+        aria-label={texts.plot.label(texts.plot.quantity[quantity])}
+      />
+      <fieldset class="legend">
+        <legend class="visually-hidden">{texts.plot.joints}</legend>
+        {joints.map((joint, index) => (
+          <label key={joint.name} class={`series-${(index % 8) + 1}`}>
+            <input type="checkbox" checked={!hidden.has(joint.name)} onChange={() => toggle(joint.name)} />
+            {joint.label} <span class="quiet">{texts.plot.limits(limitsOf(joint, quantity), texts.plot.unit[quantity])}</span>
+          </label>
+        ))}
+      </fieldset>
+    </Card>
+  );
+}
+
+function toDegrees(value: number | null): number | null {
+  return value === null ? null : degrees(value);
+}
+
+/** What the robot keeps a joint within, by its description, in the plot's unit. */
+function limitsOf(joint: Joint, quantity: Quantity): [number, number] {
+  switch (quantity) {
+    case "position_rad":
+      return [degrees(joint.lower_rad), degrees(joint.upper_rad)];
+    case "velocity_rad_s":
+      return [-degrees(joint.max_velocity_rad_s), degrees(joint.max_velocity_rad_s)];
+    case "effort_nm":
+      return [-joint.max_effort_nm, joint.max_effort_nm];
+  }
+}

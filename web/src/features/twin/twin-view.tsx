@@ -1,0 +1,59 @@
+import { useSignalEffect } from "@preact/signals";
+import type { Control } from "../control/model/lease";
+import type { DeviceStore } from "../devices/model/device-store";
+import { texts } from "../../shared/i18n/texts";
+import { Card } from "../../shared/ui/parts";
+import type { LiveScene } from "./scene";
+import { useScene } from "./use-scene";
+
+interface View3DProps {
+  device: DeviceStore;
+  control: Control;
+}
+
+export function View3D({ device, control }: View3DProps) {
+  const twin = device.twin.value;
+  const { canvas, box, scene, trouble, said } = useScene(twin);
+
+  return (
+    <Card
+      title={texts.view.title}
+      class="view"
+      aside={
+        <button type="button" class="plain" onClick={() => scene?.resetView()} disabled={scene === null}>
+          {texts.view.reset}
+        </button>
+      }
+    >
+      {scene !== null && <Follow scene={scene} device={device} control={control} />}
+      <div
+        ref={box}
+        class={`canvas-box ${device.live.value ? "" : "old"}`}
+        data-testid="view-3d"
+        data-frames="0"
+        data-trouble={trouble ?? ""}
+      >
+        {/* Keyed: a canvas whose context is gone cannot be drawn on again. */}
+        <canvas key={twin} ref={canvas} aria-label={texts.view.label} role="img" />
+        {twin === null && <p class="over quiet">{texts.view.waiting}</p>}
+        {trouble !== null && <p class="over notice">{said}</p>}
+        {trouble === null && scene !== null && !device.live.value && <p class="tag">{texts.view.staleNote}</p>}
+      </div>
+      <p class="quiet small">{texts.view.ghost}</p>
+    </Card>
+  );
+}
+
+/** Hands telemetry and targets to the scene, without drawing anything itself. */
+function Follow({ scene, device, control }: View3DProps & { scene: LiveScene }) {
+  useSignalEffect(() => {
+    const message = device.telemetry.value?.message;
+    const joints = device.description.value?.joints;
+    if (message === undefined || joints === undefined) return;
+    const measured: Record<string, number> = {};
+    joints.forEach((joint, index) => (measured[joint.name] = message.position_rad[index] ?? 0));
+    // A velocity leads nowhere in particular: then there is no ghost.
+    scene.show(measured, control.streamer.value?.goal.value ?? null);
+  });
+  return null;
+}

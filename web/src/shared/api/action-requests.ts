@@ -1,0 +1,49 @@
+/** All that a device can be asked to do: one union, whoever asks. Which of it a device takes, its description says. */
+import type {
+  CaptureRaw,
+  Drive,
+  Express,
+  Gather,
+  GoTo,
+  LookAt,
+  MoveJoints,
+  MovePose,
+  RunBehaviour,
+  Say,
+  SetControl,
+  SetStiffness,
+  Shoot,
+  TakePosture,
+} from "../mqtt/protocol.generated";
+
+/** A movement by its name: the cloud adds the script, in its newest version. */
+export interface AskMovement {
+  kind: "run_movement";
+  name: string;
+  parameters?: Record<string, unknown>;
+}
+
+export type RobotRequest =
+  | AskMovement
+  | MoveJoints
+  | MovePose
+  | Say
+  | Express
+  | TakePosture
+  | RunBehaviour
+  | SetStiffness
+  | LookAt
+  | Drive
+  | GoTo;
+
+/** What is asked of a room device. */
+export type RoomRequest = Gather | Shoot | CaptureRaw | SetControl;
+
+export type AnyRequest = RobotRequest | RoomRequest;
+
+/** Of these nothing has to move: the device itself says that it does them. */
+const STILL: ReadonlySet<AnyRequest["kind"]> = new Set(["say", "set_stiffness", "gather", "shoot", "capture", "set_control"]);
+
+export function moves({ kind }: { kind: AnyRequest["kind"] | "stream" }): boolean {
+  return kind === "stream" || !STILL.has(kind);
+}

@@ -1,0 +1,446 @@
+/** The HTTP API, as far as the console uses it. The session travels in a cookie that no script can read. */
+import { HealthApi } from "../../features/health/model/health";
+import { Http, type Page } from "./http";
+import { Library, type Movement } from "../../features/movements/model/movement-library";
+import type { Asking } from "../../features/actions/model/action-runner";
+import type { AckStatus, Reason } from "../mqtt/protocol.generated";
+import type { AnyRequest } from "./action-requests";
+import type {
+  ApiKey,
+  ApiKeyMade,
+  ApiKeyWanted,
+  AuditPage,
+  AuditQuery,
+  Invitation,
+  InvitationMade,
+  InvitationWanted,
+  Person,
+  Role,
+  Share,
+  SharedRole,
+  Target,
+} from "../../features/sharing/model/wire-types";
+import { RobotTypes } from "../../features/robot-types/model/robot-types";
+import { Transfers } from "../../features/sharing/model/transfers";
+import { TimesApi } from "../../features/latency/model/latency-stats";
+
+export interface Account {
+  id: string;
+  name: string;
+  session: string;
+}
+
+/** How one may sign in here; `open_id`: at a provider elsewhere. */
+export interface Methods {
+  password: boolean;
+  open_id: { name: string; address: string } | null;
+}
+
+export interface SignInSession {
+  id: string;
+  how: "link" | "password" | "open-id";
+  since: string;
+  address: string;
+  program: string;
+  mine: boolean;
+}
+
+/** Somebody asks for control. `ended`: the lease that it asked for has ended otherwise. */
+export interface ControlRequest {
+  id: string;
+  by: string;
+  epoch: number;
+  mine: boolean;
+  asked_at: string;
+  expires_at: string;
+  outcome: "open" | "accepted" | "refused" | "withdrawn" | "lapsed" | "ended";
+}
+
+export interface Lease {
+  holder: string;
+  epoch: number;
+  expires_at: string;
+  mine: boolean;
+  /** Why it was taken from somebody else. */
+  reason?: string;
+  /** The open one. */
+  request?: ControlRequest | null;
+}
+
+/** Somebody else who looks at a device. `mine`: this very account, signed in elsewhere. */
+export interface Watcher {
+  name: string;
+  role: Role;
+  mine: boolean;
+  since: string;
+}
+
+export interface Device {
+  id: string;
+  name: string;
+  label: string;
+  kind: string;
+  robot_type: string;
+  agent: string;
+  space: string;
+  /** What this account may do with it. A viewer watches, and changes nothing. */
+  role: Role;
+  owner: Person;
+  topic: string;
+  online: boolean;
+  last_seen_at: string | null;
+  lease: Lease | null;
+}
+
+export interface Granted {
+  epoch: number;
+  holder: string;
+  expires_at: string;
+  lease_ms: number;
+  confirmed: boolean;
+}
+
+export type { Movement };
+
+export type ActionStatus = AckStatus | "queued" | "created" | "published";
+
+export interface Action {
+  id: string;
+  device: string;
+  status: ActionStatus;
+  epoch: number;
+  who: string;
+  reason: Reason | null;
+  progress: number | null;
+  output: string;
+  result: Record<string, unknown>;
+}
+
+/** Times of one kind, each measured on this page's clock alone. */
+export interface LatencyBatch {
+  transport: "websocket" | "http";
+  path: "operator-device" | "operator-cloud";
+  samples: readonly { at_ms: number; ms: number }[];
+}
+
+/** A captured file. */
+export interface Upload {
+  id: string;
+  stream: string;
+  name: string;
+  at: string;
+  content_type: string;
+  length: number;
+  verified: boolean;
+}
+
+/** A stretch of a stream: of `raw` samples `mean` is the value itself, and there are no others. */
+export interface Series {
+  resolution: string;
+  span_ms: number;
+  at_ms: number[];
+  fields: Record<string, { mean: (number | null)[]; min: (number | null)[]; max: (number | null)[]; last: (number | null)[] }>;
+}
+
+export interface Credentials {
+  client_id: string;
+  username: string;
+  password: string;
+  lifetime_s: number;
+  publish: string[];
+  subscribe: string[];
+  websocket_url: string;
+}
+
+export type Purpose = { purpose: "watch" } | { purpose: "control"; device: string; epoch: number };
+
+export interface Space {
+  id: string;
+  name: string;
+  role: Role;
+  owner: Person;
+}
+
+interface SignedIn {
+  account: { id: string; name: string };
+  session: string;
+  csrf_token: string;
+}
+
+/** One method for each call. All of them throw `ApiError`, and nothing else. */
+export class Api {
+  readonly #http: Http;
+  /** How devices are. */
+  readonly health: HealthApi;
+  readonly library: Library;
+  readonly robotTypes: RobotTypes;
+  /** How long things take. */
+  readonly times: TimesApi;
+  readonly transfers: Transfers;
+
+  constructor(base = "/api/v1") {
+    this.#http = new Http(base);
+    this.health = new HealthApi(this.#http);
+    this.library = new Library(this.#http);
+    this.robotTypes = new RobotTypes(this.#http);
+    this.times = new TimesApi(this.#http);
+    this.transfers = new Transfers(this.#http);
+  }
+
+  async signIn(link: string): Promise<Account> {
+    return this.#signedIn(await this.#http.call("POST", "/auth/sign-in", { body: { link } }));
+  }
+
+  async signInByPassword(name: string, password: string): Promise<Account> {
+    return this.#signedIn(await this.#http.call("POST", "/auth/password", { body: { name, password } }));
+  }
+
+  /** Make an account with an invitation's secret: signs in to it, and redeems the invitation. */
+  async makeAccount(invitation: string, name: string, password: string): Promise<Account> {
+    return this.#signedIn(await this.#http.call("POST", "/auth/accounts", { body: { invitation, name, password } }));
+  }
+
+  /** Where a browser goes on to sign in elsewhere, with an invitation for who has no account yet. */
+  async beginElsewhere(invitation: string): Promise<string> {
+    const begun = await this.#http.call<{ address: string }>("POST", "/auth/oidc/start", { body: { invitation } });
+    return begun.address;
+  }
+
+  methods(): Promise<Methods> {
+    return this.#http.call("GET", "/auth/methods");
+  }
+
+  async setPassword(password: string, old: string): Promise<void> {
+    const body = old === "" ? { password } : { password, old_password: old };
+    await this.#http.call("PUT", "/accounts/me/password", { body });
+  }
+
+  sessions(): Promise<SignInSession[]> {
+    return this.#http.all("/accounts/me/sessions");
+  }
+
+  async endSession(id: string): Promise<void> {
+    await this.#http.call("DELETE", `/accounts/me/sessions/${id}`);
+  }
+
+  async endOtherSessions(): Promise<void> {
+    await this.#http.call("DELETE", "/accounts/me/sessions");
+  }
+
+  async signOut(): Promise<void> {
+    await this.#http.call("POST", "/auth/sign-out");
+  }
+
+  async me(): Promise<Account> {
+    const { csrf_token: csrf, ...account } = await this.#http.call<Account & { csrf_token: string | null }>("GET", "/accounts/me");
+    this.#http.trust(csrf ?? "");
+    return account;
+  }
+
+  devices(): Promise<Device[]> {
+    return this.#http.all("/devices");
+  }
+
+  spaces(): Promise<Space[]> {
+    return this.#http.all("/spaces");
+  }
+
+  makeSpace(name: string): Promise<Space> {
+    return this.#http.call("POST", "/spaces", { body: { name } });
+  }
+
+  shares(target: Target): Promise<Share[]> {
+    return this.#http.all(`${at(target)}/shares`);
+  }
+
+  /** Share, or change a share; `forS` null: until it is ended. */
+  share(target: Target, account: string, role: SharedRole, forS: number | null): Promise<Share> {
+    return this.#http.call("POST", `${at(target)}/shares`, { body: { account, role, expires_in_s: forS } });
+  }
+
+  /** What is still under way where the broker has not answered; empty where all has ended. */
+  async unshare(target: Target, account: string): Promise<string> {
+    const rest = await this.#http.call<{ detail: string } | null>("DELETE", `${at(target)}/shares/${account}`);
+    return rest?.detail ?? "";
+  }
+
+  invitations(target: Target): Promise<Invitation[]> {
+    return this.#http.all(`${at(target)}/invitations`);
+  }
+
+  invite(target: Target, wanted: InvitationWanted): Promise<InvitationMade> {
+    return this.#http.call("POST", `${at(target)}/invitations`, { body: wanted });
+  }
+
+  async withdrawInvitation(target: Target, id: string): Promise<void> {
+    await this.#http.call("DELETE", `${at(target)}/invitations/${id}`);
+  }
+
+  lookAtInvitation(secret: string): Promise<Invitation> {
+    return this.#http.call("POST", "/invitations/look", { body: { secret } });
+  }
+
+  redeemInvitation(secret: string, space: string | null): Promise<Invitation> {
+    return this.#http.call("POST", "/invitations/redeem", { body: space === null ? { secret } : { secret, space } });
+  }
+
+  apiKeys(): Promise<ApiKey[]> {
+    return this.#http.all("/api-keys");
+  }
+
+  makeApiKey(wanted: ApiKeyWanted): Promise<ApiKeyMade> {
+    return this.#http.call("POST", "/api-keys", { body: wanted });
+  }
+
+  async revokeApiKey(id: string): Promise<void> {
+    await this.#http.call("DELETE", `/api-keys/${id}`);
+  }
+
+  /** One page of what was done in the account, the newest first. */
+  audit(query: AuditQuery, cursor: string | null, limit: number): Promise<AuditPage> {
+    const asked = new URLSearchParams({ limit: String(limit) });
+    if (query.what !== "") asked.set("what", query.what);
+    if (query.on !== "") asked.set("on", query.on);
+    if (query.sinceMs !== null) asked.set("from", String(query.sinceMs));
+    if (query.untilMs !== null) asked.set("to", String(query.untilMs));
+    if (cursor !== null) asked.set("cursor", cursor);
+    return this.#http.call("GET", `/accounts/me/audit?${asked.toString()}`);
+  }
+
+  /** Pair an agent by the code it shows; `space` null: into the first one. */
+  async claim(code: string, space: string | null = null): Promise<Device[]> {
+    const body = space === null ? { code } : { code, space };
+    const answer = await this.#http.call<{ devices: Device[] }>("POST", "/agents/claim", { body });
+    return answer.devices;
+  }
+
+  takeLease(device: string, leaseMs: number): Promise<Granted> {
+    const waitMs = 1000;
+    return this.#http.call("POST", `/devices/${device}/lease`, { body: { lease_ms: leaseMs, wait_ms: waitMs }, waitMs });
+  }
+
+  renewLease(device: string, leaseMs: number, epoch: number): Promise<Granted> {
+    return this.#http.call("POST", `/devices/${device}/lease`, { body: { lease_ms: leaseMs, epoch } });
+  }
+
+  async lease(device: string): Promise<Lease | null> {
+    return (await this.#http.call<{ lease: Lease | null }>("GET", `/devices/${device}/lease`)).lease;
+  }
+
+  async releaseLease(device: string, epoch: number, leaving = false): Promise<void> {
+    await this.#http.call("DELETE", `/devices/${device}/lease?epoch=${epoch}`, { keepalive: leaving });
+  }
+
+  /** Take control from whoever has it, who reads the reason. For owners. */
+  takeOver(device: string, leaseMs: number, reason: string): Promise<Granted> {
+    const waitMs = 1000;
+    const body = { lease_ms: leaseMs, wait_ms: waitMs, take_over: true, reason };
+    return this.#http.call("POST", `/devices/${device}/lease`, { body, waitMs });
+  }
+
+  /** Ask the holder for control; `confirmed`: the device shows it. */
+  askForControl(device: string, withinMs: number): Promise<{ request: ControlRequest; confirmed: boolean }> {
+    const waitMs = 1000;
+    return this.#http.call("POST", requests(device), { body: { within_ms: withinMs, wait_ms: waitMs }, waitMs });
+  }
+
+  controlRequest(device: string, id: string): Promise<ControlRequest> {
+    return this.#http.call("GET", `${requests(device)}/${id}`);
+  }
+
+  /** Give who asks the control that this session holds, or keep it. */
+  async answerRequest(device: string, id: string, accept: boolean): Promise<void> {
+    await this.#http.call("POST", `${requests(device)}/${id}/${accept ? "accept" : "refuse"}`);
+  }
+
+  async withdrawRequest(device: string, id: string, leaving = false): Promise<void> {
+    await this.#http.call("DELETE", `${requests(device)}/${id}`, { keepalive: leaving });
+  }
+
+  /** Say that this page looks at a device, and hear who else does. */
+  watch(device: string): Promise<{ items: Watcher[]; again_ms: number }> {
+    return this.#http.call("PUT", `/devices/${device}/watchers`);
+  }
+
+  async unwatch(device: string): Promise<void> {
+    await this.#http.call("DELETE", `/devices/${device}/watchers`, { keepalive: true });
+  }
+
+  /** `null`: call it as its agent does. */
+  rename(device: string, label: string | null): Promise<Device> {
+    return this.#http.call("PUT", `/devices/${device}/label`, { body: { label } });
+  }
+
+  /** What can be run on a device: its owner's movements for its robot type, and those that come with the type. */
+  movements(device: string): Promise<Movement[]> {
+    return this.#http.all(`/devices/${device}/movements`);
+  }
+
+  /** Ask something of a device; the answer comes when it has got as far as wanted, or after some seconds. */
+  ask(device: string, request: AnyRequest, { epoch, waitFor, timeoutMs }: Asking, key: string): Promise<Action> {
+    const waitMs = waitFor === "done" ? 10_000 : 3_000;
+    const body = {
+      request,
+      wait_ms: waitMs,
+      wait_for: waitFor ?? "started",
+      ...(timeoutMs === undefined ? {} : { timeout_ms: timeoutMs }),
+      ...(epoch === null ? {} : { epoch }),
+    };
+    return this.#http.call("POST", `/devices/${device}/actions`, { body, waitMs, headers: { "Idempotency-Key": key } });
+  }
+
+  /** Add times that this page has measured. */
+  async addLatency(device: string, batch: LatencyBatch, key: string): Promise<void> {
+    await this.#http.call("POST", `/devices/${device}/latency`, { body: batch, headers: { "Idempotency-Key": key } });
+  }
+
+  /** The newest captured files of a device. */
+  async uploads(device: string, limit: number): Promise<Upload[]> {
+    return (await this.#http.call<Page<Upload>>("GET", `/devices/${device}/uploads?limit=${limit}`)).items;
+  }
+
+  /** One captured file, and where its content can be read for an hour. */
+  upload(device: string, id: string): Promise<Upload & { url: string }> {
+    return this.#http.call("GET", `/devices/${device}/uploads/${id}`);
+  }
+
+  /** What a stream has measured in between [ms since 1970], in at most so many points. */
+  series(device: string, stream: string, fromMs: number, points: number, field: string): Promise<Series> {
+    const query = new URLSearchParams({ from: String(Math.round(fromMs)), points: String(points), fields: field });
+    return this.#http.call("GET", `/devices/${device}/data/${stream}?${query.toString()}`);
+  }
+
+  action(id: string, waitMs: number): Promise<Action> {
+    return this.#http.call("GET", `/actions/${id}?wait_ms=${waitMs}&wait_for=done`, { waitMs });
+  }
+
+  cancelAction(id: string): Promise<Action> {
+    return this.#http.call("POST", `/actions/${id}/cancel`);
+  }
+
+  stop(device: string, reason: string): Promise<{ confirmed: boolean }> {
+    return this.#http.call("POST", `/devices/${device}/stop`, { body: { reason }, keepalive: true });
+  }
+
+  resetStop(device: string): Promise<{ confirmed: boolean }> {
+    return this.#http.call("POST", `/devices/${device}/stop/reset`);
+  }
+
+  credentials(purpose: Purpose): Promise<Credentials> {
+    return this.#http.call("POST", "/mqtt/credentials", { body: purpose });
+  }
+
+  #signedIn(answer: SignedIn): Account {
+    this.#http.trust(answer.csrf_token);
+    return { ...answer.account, session: answer.session };
+  }
+}
+
+function requests(device: string): string {
+  return `/devices/${device}/lease/requests`;
+}
+
+/** Where what is shared stands. */
+function at({ kind, id }: Target): string {
+  return `/${kind}s/${id}`;
+}

@@ -1,0 +1,195 @@
+/** A line over time with the limits that its room gives. Loaded only where one is looked at. */
+import uPlot from "uplot";
+import "uplot/dist/uPlot.min.css";
+import { digits, type Quantity } from "../../features/sensors/model/quantities";
+import { texts } from "../i18n/texts";
+import { colour } from "../ui/canvas-theme";
+
+/** What is drawn beside the line itself. */
+export interface Marks {
+  /** Where values usually are, in the unit shown. */
+  usual: readonly [low: number, high: number] | null;
+  /** Faults, on the time axis [s since 1970]; `to` null: still open. */
+  faults: readonly { from: number; to: number | null; severity: "info" | "warning" | "error" }[];
+  /** Where the reader's cursor is [s since 1970]. */
+  cursor: number | null;
+}
+
+export interface SeriesChart {
+  /** Times [s since 1970]; columns: means, lows, highs. */
+  draw(from: number, to: number, times: number[], columns: (number | null)[][], marks?: Marks): void;
+  /** The time at a place of the page [s since 1970]. */
+  timeAt(clientX: number): number;
+  dispose(): void;
+}
+
+interface Options {
+  quantity: Quantity;
+  /** A state: 1 is the first of its two words. */
+  binary: boolean;
+  colour: string;
+}
+
+/** A limit is shown where it does not make what is measured too small to be read. */
+const LIMIT_WITHIN = 12;
+/** Of the value: smaller changes are noise, and are drawn as what they are. */
+const SMALLEST_SHARE = 0.02;
+const UNMARKED: Marks = { usual: null, faults: [], cursor: null };
+/** Of the strip at the bottom that shows when there was a fault [px]. */
+const STRIP_PX = 6;
+
+export function createSeriesChart(box: HTMLElement, { quantity, binary, colour: line }: Options): SeriesChart {
+  const axis = { stroke: colour("--quiet"), grid: { stroke: colour("--line"), width: 1 }, ticks: { stroke: colour("--line"), width: 1 } };
+  const stepped = uPlot.paths.stepped?.({ align: 1 });
+  let between: [number, number] = [0, 1];
+  let marks = UNMARKED;
+  const chart = new uPlot(
+    {
+      width: Math.max(1, box.clientWidth),
+      height: Math.max(1, box.clientHeight),
+      legend: { show: false },
+      cursor: { show: false },
+      scales: {
+        x: { time: true, range: () => between },
+        y: { range: (_, low, high) => (binary ? [-0.15, 1.15] : range(quantity, marks.usual, low, high)) },
+      },
+      axes: [
+        { ...axis, space: 70, values: (_, ticks) => ticks.map((tick) => shortTime(tick, between)) },
+        binary
+          ? { ...axis, grid: { show: false }, size: 124, splits: () => [0, 1], values: () => words(quantity.field) }
+          : { ...axis, size: (_, values) => widest(values), values: (_, ticks) => ticks.map((tick) => label(tick, ticks, quantity.unit)) },
+      ],
+      series: [
+        {},
+        {
+          stroke: line,
+          width: 1.75,
+          points: { show: false },
+          ...(binary && stepped !== undefined ? { paths: stepped, fill: `${line}33` } : {}),
+        },
+        { stroke: "transparent", points: { show: false } },
+        { stroke: "transparent", points: { show: false } },
+      ],
+      ...(binary ? {} : { bands: [{ series: [3, 2] as [number, number], fill: `${line}33` }] }),
+      hooks: { drawClear: [(plot) => paintLimits(plot, quantity)], draw: [(plot) => paintMarks(plot, marks)] },
+    },
+    [[], [], [], []],
+    box,
+  );
+  const observer = new ResizeObserver(() => {
+    if (box.clientWidth > 0) chart.setSize({ width: box.clientWidth, height: box.clientHeight });
+  });
+  observer.observe(box);
+  return {
+    draw(from, to, times, columns, given = UNMARKED) {
+      between = [from, to];
+      marks = given;
+      const extended = binary && times.length > 0 ? holding(to, times, columns) : { times, columns };
+      chart.setData([extended.times, ...extended.columns] as uPlot.AlignedData);
+    },
+    timeAt: (clientX) => chart.posToVal(clientX - chart.over.getBoundingClientRect().left, "x"),
+    dispose() {
+      observer.disconnect();
+      chart.destroy();
+    },
+  };
+}
+
+/** A state holds until it changes: the last one reaches to now. */
+function holding(to: number, times: number[], columns: (number | null)[][]): { times: number[]; columns: (number | null)[][] } {
+  return { times: [...times, to], columns: columns.map((column) => [...column, column.at(-1) ?? null]) };
+}
+
+function words(field: string): string[] {
+  const [yes, no] = texts.room.state[field] ?? texts.room.yesNo;
+  return [no, yes];
+}
+
+function range({ judged, shown }: Quantity, usual: Marks["usual"], low: number | null, high: number | null): [number, number] {
+  const middle = ((low ?? 0) + (high ?? 0)) / 2;
+  const room = Math.max((high ?? 0) - (low ?? 0), SMALLEST_SHARE * Math.abs(middle), 0.1);
+  let [from, to] = [Math.min(low ?? 0, middle - room / 2), Math.max(high ?? 1, middle + room / 2)];
+  const reach = LIMIT_WITHIN * Math.max(room, 0.15 * Math.abs(middle));
+  const limits = [judged?.warning_low, judged?.warning_high].flatMap((limit) => (limit === null || limit === undefined ? [] : [shown(limit)]));
+  for (const limit of [...limits, ...(usual ?? [])]) {
+    if (Math.abs(limit - middle) <= reach) [from, to] = [Math.min(from, limit), Math.max(to, limit)];
+  }
+  const pad = (to - from) * 0.08;
+  return [low !== null && low >= 0 ? Math.max(0, from - pad) : from - pad, to + pad];
+}
+
+function paintLimits(plot: uPlot, { judged, shown }: Quantity): void {
+  if (judged === null) return;
+  const { ctx, bbox } = plot;
+  const { min = NaN, max = NaN } = plot.scales["y"] ?? {};
+  if (!(max > min)) return;
+  const y = (value: number): number => Math.min(bbox.top + bbox.height, Math.max(bbox.top, plot.valToPos(value, "y", true)));
+  const fill = (from: number, to: number, name: string): void => {
+    if (to <= from) return;
+    ctx.fillStyle = colour(name);
+    ctx.fillRect(bbox.left, y(to), bbox.width, y(from) - y(to));
+  };
+  const or = (value: number | null, otherwise: number): number => (value === null ? otherwise : shown(value));
+  const low = or(judged.low, min);
+  const high = or(judged.high, max);
+  const wellLow = or(judged.warning_low, low);
+  const wellHigh = or(judged.warning_high, high);
+  if ([judged.low, judged.high, judged.warning_low, judged.warning_high].every((one) => one === null)) return;
+  ctx.save();
+  fill(Math.max(min, wellLow), Math.min(max, wellHigh), "--good-ground");
+  fill(Math.max(min, low), Math.min(max, wellLow), "--warn-ground");
+  fill(Math.max(min, wellHigh), Math.min(max, high), "--warn-ground");
+  fill(min, Math.min(max, low), "--bad-ground");
+  fill(Math.max(min, high), max, "--bad-ground");
+  ctx.restore();
+}
+
+/** The band of what is usual as two dashed lines, faults as a strip below with a line where each began, the cursor. */
+function paintMarks(plot: uPlot, { usual, faults, cursor }: Marks): void {
+  const { ctx, bbox } = plot;
+  const right = bbox.left + bbox.width;
+  const bottom = bbox.top + bbox.height;
+  const ratio = devicePixelRatio;
+  const x = (time: number): number => Math.min(right, Math.max(bbox.left, plot.valToPos(time, "x", true)));
+  const line = (points: readonly [x: number, y: number][], name: string, dash: number[]): void => {
+    ctx.strokeStyle = colour(name);
+    ctx.lineWidth = ratio;
+    ctx.setLineDash(dash.map((length) => length * ratio));
+    ctx.beginPath();
+    points.forEach(([px, py], index) => (index === 0 ? ctx.moveTo(px, py) : ctx.lineTo(px, py)));
+    ctx.stroke();
+  };
+  ctx.save();
+  for (const value of usual ?? []) {
+    const y = plot.valToPos(value, "y", true);
+    if (y >= bbox.top && y <= bottom) line([[bbox.left, y], [right, y]], "--quiet", [6, 4]);
+  }
+  for (const { from, to, severity } of faults) {
+    const name = SEVERITY_COLOUR[severity];
+    const [begin, end] = [x(from), to === null ? right : x(to)];
+    ctx.fillStyle = colour(name);
+    ctx.fillRect(begin, bottom - STRIP_PX * ratio, Math.max(end - begin, 2 * ratio), STRIP_PX * ratio);
+    if (plot.valToPos(from, "x", true) >= bbox.left) line([[begin, bbox.top], [begin, bottom]], name, [2, 3]);
+  }
+  if (cursor !== null) line([[x(cursor), bbox.top], [x(cursor), bottom]], "--text", []);
+  ctx.restore();
+}
+
+const SEVERITY_COLOUR = { info: "--accent", warning: "--warn", error: "--bad" } as const;
+
+/** Of an axis [px]: as much as its longest label takes, and as much as labels of three digits at least. */
+function widest(values: readonly string[] | null): number {
+  const longest = Math.max(0, ...(values ?? []).map((text) => text.length));
+  return Math.max(66, 16 + longest * 7.5);
+}
+
+function shortTime(tick: number, [from, to]: [number, number]): string {
+  const text = texts.time(tick * 1000);
+  if (to - from > 2 * 86_400) return texts.day(tick * 1000);
+  return to - from > 1200 ? text.slice(0, 5) : text;
+}
+
+function label(tick: number, ticks: readonly number[], unit: string): string {
+  const step = Math.abs((ticks[1] ?? 1) - (ticks[0] ?? 0));
+  return `${tick.toFixed(step >= 1 ? 0 : digits(step) - 1)} ${unit}`;
+}

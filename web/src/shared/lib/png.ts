@@ -1,0 +1,105 @@
+/**
+ * Grey pictures of 16 bits, as depth cameras capture them: a browser's own decoder would keep 8 of them.
+ * Reads what ISO/IEC 15948 allows of that kind, but for interlacing.
+ */
+import { MessageError } from "../mqtt/parse-messages";
+
+/** Distances by pixel, row by row from the top [m]; 0 where nothing was within reach. */
+export interface DepthPicture {
+  width: number;
+  height: number;
+  depthM: Float32Array;
+}
+
+const SIGNATURE = [0x89, 0x50, 0x4e, 0x47, 0x0d, 0x0a, 0x1a, 0x0a];
+const IHDR = 0x49484452;
+const IDAT = 0x49444154;
+const MAX_PIXELS = 1920 * 1080;
+const BYTES = 2;
+const MM_PER_M = 1000;
+
+/** Throws `MessageError`. */
+export async function readDepth(file: Uint8Array): Promise<DepthPicture> {
+  if (!SIGNATURE.every((byte, index) => file[index] === byte)) throw new MessageError("the depth picture is no PNG");
+  const view = new DataView(file.buffer, file.byteOffset, file.byteLength);
+  const parts: Uint8Array<ArrayBuffer>[] = [];
+  let size: { width: number; height: number } | null = null;
+  for (let at = SIGNATURE.length; at + 8 <= file.byteLength; ) {
+    const length = view.getUint32(at);
+    const kind = view.getUint32(at + 4);
+    const begin = at + 8;
+    if (begin + length > file.byteLength) throw new MessageError("the depth picture is cut off");
+    if (kind === IHDR && length === 13) size = header(view, begin);
+    if (kind === IDAT) parts.push(file.slice(begin, begin + length));
+    at = begin + length + 4;
+  }
+  if (size === null) throw new MessageError("the depth picture has no header");
+  return { ...size, depthM: metres(unfiltered(await inflate(parts), size.width, size.height)) };
+}
+
+function header(view: DataView, at: number): { width: number; height: number } {
+  const width = view.getUint32(at);
+  const height = view.getUint32(at + 4);
+  if (width < 1 || height < 1 || width * height > MAX_PIXELS) throw new MessageError("the depth picture is too large");
+  // Bits a sample, then: grey, the one compression and the one filter method there are, not interlaced.
+  const kind = [16, 0, 0, 0, 0].every((wanted, index) => view.getUint8(at + 8 + index) === wanted);
+  if (!kind) throw new MessageError("the depth picture is not grey with 16 bits");
+  return { width, height };
+}
+
+async function inflate(parts: Uint8Array<ArrayBuffer>[]): Promise<Uint8Array> {
+  const stream = new Blob(parts).stream().pipeThrough(new DecompressionStream("deflate"));
+  try {
+    return new Uint8Array(await new Response(stream).arrayBuffer());
+  } catch {
+    throw new MessageError("the depth picture is damaged");
+  }
+}
+
+/** Rows without the filters by which they were made smaller. */
+function unfiltered(raw: Uint8Array, width: number, height: number): Uint8Array {
+  const stride = width * BYTES;
+  if (raw.length !== height * (stride + 1)) throw new MessageError("the depth picture is damaged");
+  const out = new Uint8Array(height * stride);
+  const at = (index: number): number => out[index] ?? 0;
+  for (let row = 0; row < height; row += 1) {
+    const filter = raw[row * (stride + 1)] ?? 0;
+    for (let column = 0; column < stride; column += 1) {
+      const index = row * stride + column;
+      const left = column < BYTES ? 0 : at(index - BYTES);
+      const up = row === 0 ? 0 : at(index - stride);
+      const corner = column < BYTES || row === 0 ? 0 : at(index - stride - BYTES);
+      out[index] = (raw[row * (stride + 1) + 1 + column] ?? 0) + predicted(filter, left, up, corner);
+    }
+  }
+  return out;
+}
+
+function predicted(filter: number, left: number, up: number, corner: number): number {
+  switch (filter) {
+    case 0:
+      return 0;
+    case 1:
+      return left;
+    case 2:
+      return up;
+    case 3:
+      return (left + up) >> 1;
+    case 4:
+      return paeth(left, up, corner);
+    default:
+      throw new MessageError("the depth picture is damaged");
+  }
+}
+
+function paeth(left: number, up: number, corner: number): number {
+  const guess = left + up - corner;
+  const [byLeft, byUp, byCorner] = [Math.abs(guess - left), Math.abs(guess - up), Math.abs(guess - corner)];
+  if (byLeft <= byUp && byLeft <= byCorner) return left;
+  return byUp <= byCorner ? up : corner;
+}
+
+function metres(bytes: Uint8Array): Float32Array {
+  const view = new DataView(bytes.buffer);
+  return Float32Array.from({ length: bytes.length / BYTES }, (_, index) => view.getUint16(index * BYTES) / MM_PER_M);
+}

@@ -1,0 +1,31 @@
+/** Places in a script: the server counts characters, an editor the units of UTF-16. */
+import type { Mark } from "../../features/movements/model/movement-library";
+
+export interface Place {
+  from: number;
+  to: number;
+  severity: Mark["severity"];
+  message: string;
+}
+
+/** A mark's place in a text, as its offset; nothing lies outside of it, and nothing is empty where it can be helped. */
+export function placed(text: string, { severity, message, line, column, end_line, end_column }: Mark): Place {
+  const lines = text.split(/\r\n?|\n/);
+  const starts = [0];
+  for (const each of lines) starts.push((starts.at(-1) ?? 0) + each.length + 1);
+  const at = (row: number, characters: number): number => {
+    const index = Math.min(Math.max(row, 1), lines.length) - 1;
+    const units = Array.from(lines[index] ?? "").slice(0, characters).join("").length;
+    return Math.min((starts[index] ?? 0) + units, text.length);
+  };
+  const from = at(line, column);
+  return { from, to: Math.max(at(end_line, end_column), Math.min(from + 1, text.length)), severity, message };
+}
+
+/** Where a run of this script failed, when its end says so: the jail begins with the line. */
+export function failureMark(why: string): Mark | null {
+  const found = /\bline (\d+): (.+)/s.exec(why);
+  if (found === null) return null;
+  const line = Number(found[1]);
+  return { severity: "error", message: found[2] ?? "", line, column: 0, end_line: line, end_column: 10_000 };
+}

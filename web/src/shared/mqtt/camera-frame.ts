@@ -1,0 +1,35 @@
+/** Pictures of `cam/{name}`: a header of 20 bytes, then the JPEG, as device_agent/protocol/camera_frames.py has them. */
+import { MessageError } from "./parse-messages";
+
+export interface CameraFrame {
+  /** Counts up from one start of the agent to the next. */
+  sequence: number;
+  /** When it was taken, on the agent's monotonic clock [ms]. */
+  tickMs: number;
+  /** In pixels. */
+  width: number;
+  height: number;
+  jpeg: Uint8Array;
+}
+
+const HEADER_BYTES = 20;
+const MAX_BYTES = 128 * 1024;
+/** `TS`, version 1, JPEG. */
+const MAGIC = 0x54530101;
+const JPEG_BEGINS = 0xffd8;
+
+/** Throws `MessageError`. */
+export function readFrame(payload: Uint8Array): CameraFrame {
+  const whole = payload.byteLength > HEADER_BYTES + 2 && payload.byteLength <= MAX_BYTES;
+  if (!whole) throw new MessageError(`a picture of ${payload.byteLength} bytes is none`);
+  const view = new DataView(payload.buffer, payload.byteOffset, payload.byteLength);
+  if (view.getUint32(0) !== MAGIC) throw new MessageError("the header is not that of a picture of version 1");
+  if (view.getUint16(HEADER_BYTES) !== JPEG_BEGINS) throw new MessageError("the picture is no JPEG");
+  return {
+    sequence: view.getUint32(4),
+    tickMs: Number(view.getBigUint64(8)),
+    width: view.getUint16(16),
+    height: view.getUint16(18),
+    jpeg: payload.subarray(HEADER_BYTES),
+  };
+}

@@ -1,0 +1,362 @@
+/**
+ * One connection to the broker that keeps itself alive: it fetches its own short-lived credentials, moves to new ones
+ * before they run out without losing a message, and comes back after a loss with new ones.
+ */
+import { computed, signal, type ReadonlySignal } from "@preact/signals-core";
+import type { MqttClient } from "mqtt";
+import type { Credentials } from "../api/client";
+import { ApiError, sentence } from "../api/http";
+import { now } from "../lib/clock";
+import { matches } from "./topics";
+
+export type LinkState = "connecting" | "up" | "down" | "refused" | "closed";
+
+export interface LinkStatus {
+  state: LinkState;
+  /** Why it is down or refused; empty otherwise. */
+  why: string;
+}
+
+/** `retained`: the broker had kept it, so it was said before this page asked. */
+export type Receiver = (topic: string, payload: Uint8Array, retained: boolean) => void;
+
+/** What the rest of the core needs of a connection. */
+export interface Link {
+  readonly status: ReadonlySignal<LinkStatus>;
+  readonly up: ReadonlySignal<boolean>;
+  /** Hear a topic or filter; returns what ends it. */
+  subscribe(filter: string, receiver: Receiver): () => void;
+  /** Send now or fail: nothing is ever kept for later. Resolves when sent (QoS 0) or acknowledged (QoS 1). */
+  publish(topic: string, message: object, qos: 0 | 1): Promise<void>;
+  /** There to the broker and back: resolves when it has answered. */
+  ping(): Promise<void>;
+  /** Fetch new credentials, for what has become visible since, and move to them. */
+  renew(): void;
+  close(): void;
+}
+
+/** Event Grid and AWS IoT Core take no more filters than this in one SUBSCRIBE. */
+const FILTERS_AT_ONCE = 8;
+const KEEPALIVE_S = 60;
+const PING_AFTER_SILENCE_MS = 5_000;
+const DEAD_AFTER_SILENCE_MS = 12_000;
+const CONNECT_TIMEOUT_MS = 8_000;
+const NO_CONNECTION = "There is no connection to the broker.";
+const BACKOFF_MS = [250, 500, 1_000, 2_000, 4_000] as const;
+const REFRESH_MARGIN_MS = 60_000;
+
+interface Connection {
+  client: MqttClient;
+  credentials: Credentials;
+  obtainedAt: number;
+  heardAt: number;
+  retired: boolean;
+  /** How many pings the broker has not answered yet: it answers them in their order. */
+  pings: number;
+}
+
+export class MqttLink implements Link {
+  readonly #obtain: () => Promise<Credentials>;
+  readonly #status = signal<LinkStatus>({ state: "connecting", why: "" });
+  readonly #receivers = new Map<string, Set<Receiver>>();
+  readonly #wildcards = new Set<string>();
+  /** Topic → the filters that cover it: looked for once, not at each message. Empty after each change of filters. */
+  readonly #covering = new Map<string, readonly string[]>();
+  #current: Connection | null = null;
+  #opening = false;
+  #again = false;
+  #attempts = 0;
+  #timer: ReturnType<typeof setTimeout> | undefined;
+  readonly #watch: ReturnType<typeof setInterval>;
+  readonly #fresh = new Set<string>();
+  readonly #closing = new AbortController();
+
+  readonly status: ReadonlySignal<LinkStatus> = this.#status;
+  readonly up = computed(() => this.#status.value.state === "up");
+
+  constructor(obtain: () => Promise<Credentials>) {
+    this.#obtain = obtain;
+    this.#watch = setInterval(() => this.#checkAlive(), PING_AFTER_SILENCE_MS);
+    void this.#open();
+  }
+
+  subscribe(filter: string, receiver: Receiver): () => void {
+    const receivers = this.#receivers.get(filter) ?? new Set();
+    receivers.add(receiver);
+    this.#receivers.set(filter, receivers);
+    if (isWildcard(filter)) this.#wildcards.add(filter);
+    this.#covering.clear();
+    if (receivers.size === 1) this.#subscribeSoon(filter);
+    return () => {
+      receivers.delete(receiver);
+      if (receivers.size > 0 || this.#receivers.get(filter) !== receivers) return;
+      this.#receivers.delete(filter);
+      this.#wildcards.delete(filter);
+      this.#covering.clear();
+      this.#fresh.delete(filter);
+      const client = this.#current?.client;
+      if (client?.connected) client.unsubscribe(filter, () => undefined);
+    };
+  }
+
+  publish(topic: string, message: object, qos: 0 | 1): Promise<void> {
+    const client = this.#current?.client;
+    if (!client?.connected) return Promise.reject(new Error(NO_CONNECTION));
+    return new Promise((resolve, reject) => {
+      client.publish(topic, JSON.stringify(message), { qos }, (error) => {
+        if (error) reject(error);
+        else resolve();
+      });
+    });
+  }
+
+  ping(): Promise<void> {
+    const connection = this.#current;
+    if (!connection?.client.connected) return Promise.reject(new Error(NO_CONNECTION));
+    const { client } = connection;
+    return new Promise((resolve, reject) => {
+      let before = connection.pings;
+      const settle = (): void => {
+        clearTimeout(timer);
+        client.off("packetreceive", heard);
+        client.off("close", lost);
+      };
+      const heard = ({ cmd }: { cmd: string }): void => {
+        if (cmd !== "pingresp") return;
+        before -= 1;
+        if (before >= 0) return;
+        settle();
+        resolve();
+      };
+      const lost = (): void => {
+        settle();
+        reject(new Error("The broker did not answer."));
+      };
+      const timer = setTimeout(lost, CONNECT_TIMEOUT_MS);
+      client.on("packetreceive", heard);
+      client.on("close", lost);
+      client.sendPing();
+    });
+  }
+
+  renew(): void {
+    void this.#open();
+  }
+
+  close(): void {
+    this.#closing.abort();
+    clearTimeout(this.#timer);
+    clearInterval(this.#watch);
+    this.#receivers.clear();
+    this.#wildcards.clear();
+    this.#drop();
+    this.#status.value = { state: "closed", why: "" };
+  }
+
+  /** Open a connection beside the current one, if any, and put it in its place. */
+  async #open(): Promise<void> {
+    if (this.#closed) return;
+    if (this.#opening) {
+      this.#again = true;
+      return;
+    }
+    this.#opening = true;
+    clearTimeout(this.#timer);
+    if (this.#current === null) this.#status.value = { ...this.#status.value, state: "connecting" };
+    try {
+      const obtainedAt = now();
+      const credentials = await this.#obtain();
+      const client = await connect(credentials, this.#closing.signal);
+      await this.#adopt({ client, credentials, obtainedAt, heardAt: now(), retired: false, pings: 0 });
+    } catch (error) {
+      this.#failed(error);
+    } finally {
+      this.#opening = false;
+    }
+    if (this.#again) {
+      this.#again = false;
+      void this.#open();
+    }
+  }
+
+  get #closed(): boolean {
+    return this.#closing.signal.aborted;
+  }
+
+  async #adopt(next: Connection): Promise<void> {
+    const { client, credentials } = next;
+    client.on("message", (topic, payload, packet) => {
+      next.heardAt = now();
+      // Two connections may deliver for a moment: every receiver takes a message twice without harm.
+      if (!next.retired) this.#deliver(topic, payload, packet.retain);
+    });
+    client.on("packetreceive", ({ cmd }) => {
+      next.heardAt = now();
+      if (cmd === "pingresp") next.pings -= 1;
+    });
+    client.on("packetsend", ({ cmd }) => {
+      if (cmd === "pingreq") next.pings += 1;
+    });
+    client.on("close", () => this.#lost(next));
+    client.on("error", () => undefined); // 'close' follows, and says what there is to say.
+    const previous = this.#current;
+    this.#current = next;
+    this.#fresh.clear();
+    await subscribeAll(client, [...this.#receivers.keys()]);
+    if (previous !== null) retire(previous);
+    if (!client.connected) throw new Error("The broker closed the connection.");
+    this.#attempts = 0;
+    this.#status.value = { state: "up", why: "" };
+    const lifetimeMs = credentials.lifetime_s * 1000;
+    const spentMs = now() - next.obtainedAt;
+    const refreshMs = Math.max(lifetimeMs - Math.min(REFRESH_MARGIN_MS, lifetimeMs / 3) - spentMs, 1_000);
+    clearTimeout(this.#timer);
+    this.#timer = setTimeout(() => void this.#open(), refreshMs);
+  }
+
+  #lost(connection: Connection): void {
+    if (this.#current !== connection || this.#closed) return;
+    this.#drop();
+    this.#status.value = { state: "down", why: "The connection to the broker was lost." };
+    if (!this.#opening) this.#retry();
+  }
+
+  #failed(error: unknown): void {
+    if (this.#closed) return;
+    const refused = error instanceof ApiError && [401, 403, 404, 409].includes(error.status);
+    if (refused) {
+      this.#drop();
+      this.#status.value = { state: "refused", why: sentence(error) };
+      return;
+    }
+    if (this.#current === null || !this.#current.client.connected) {
+      this.#drop();
+      this.#status.value = { state: "down", why: sentence(error) };
+    }
+    this.#retry();
+  }
+
+  #retry(): void {
+    const step = BACKOFF_MS[Math.min(this.#attempts, BACKOFF_MS.length - 1)] ?? 4_000;
+    this.#attempts += 1;
+    clearTimeout(this.#timer);
+    this.#timer = setTimeout(() => void this.#open(), step * (0.75 + Math.random() / 2));
+  }
+
+  #drop(): void {
+    const connection = this.#current;
+    this.#current = null;
+    if (connection !== null) retire(connection);
+  }
+
+  #deliver(topic: string, payload: Uint8Array, retained: boolean): void {
+    let filters = this.#covering.get(topic);
+    if (filters === undefined) {
+      filters = [topic, ...[...this.#wildcards].filter((filter) => matches(filter, topic))];
+      this.#covering.set(topic, filters);
+    }
+    for (const filter of filters) this.#receivers.get(filter)?.forEach((receiver) => receiver(topic, payload, retained));
+  }
+
+  /** Subscriptions of one turn go out together, in as few packets as the limit allows. */
+  #subscribeSoon(filter: string): void {
+    if (this.#fresh.size === 0) {
+      queueMicrotask(() => {
+        const filters = [...this.#fresh];
+        this.#fresh.clear();
+        const client = this.#current?.client;
+        if (client?.connected) subscribeAll(client, filters).catch(() => undefined); // Lost: all are asked for again.
+      });
+    }
+    this.#fresh.add(filter);
+  }
+
+  /** A link that died without a word is found here, long before the broker's keep-alive. */
+  #checkAlive(): void {
+    const connection = this.#current;
+    if (!connection?.client.connected) return;
+    const silenceMs = now() - connection.heardAt;
+    if (silenceMs > DEAD_AFTER_SILENCE_MS && silenceMs < 4 * DEAD_AFTER_SILENCE_MS) {
+      this.#lost(connection);
+    } else if (silenceMs > PING_AFTER_SILENCE_MS / 2) {
+      // After a long sleep of the page the silence says nothing: ask first.
+      if (silenceMs >= 4 * DEAD_AFTER_SILENCE_MS) connection.heardAt = now();
+      connection.client.sendPing();
+    }
+  }
+}
+
+function isWildcard(filter: string): boolean {
+  return filter.includes("+") || filter.endsWith("#");
+}
+
+function retire(connection: Connection): void {
+  connection.retired = true;
+  connection.client.end(true);
+}
+
+async function connect(credentials: Credentials, closing: AbortSignal): Promise<MqttClient> {
+  const { default: mqtt } = await import("mqtt");
+  closing.throwIfAborted();
+  return new Promise((resolve, reject) => {
+    const client = mqtt.connect(credentials.websocket_url, {
+      protocolVersion: 4,
+      clean: true,
+      clientId: credentials.client_id,
+      username: credentials.username,
+      password: credentials.password,
+      keepalive: KEEPALIVE_S,
+      connectTimeout: CONNECT_TIMEOUT_MS,
+      // Credentials run out, so a reconnect starts with new ones: ours to do.
+      reconnectPeriod: 0,
+      resubscribe: false,
+      queueQoSZero: false,
+      // Its other timers are a worker made from a blob, which the page's policy forbids.
+      timerVariant: "native",
+    });
+    const settle = (): void => {
+      client.off("error", failed);
+      client.off("close", unreachable);
+      closing.removeEventListener("abort", unreachable);
+    };
+    const failed = (error: Error): void => {
+      settle();
+      client.on("error", () => undefined); // What it says after its end is of no use.
+      client.end(true);
+      reject(error);
+    };
+    const unreachable = (): void => {
+      failed(new Error("The broker cannot be reached."));
+    };
+    client.once("connect", () => {
+      settle();
+      resolve(client);
+    });
+    client.on("error", failed);
+    client.on("close", unreachable);
+    closing.addEventListener("abort", unreachable);
+  });
+}
+
+async function subscribeAll(client: MqttClient, filters: readonly string[]): Promise<void> {
+  for (let start = 0; start < filters.length; start += FILTERS_AT_ONCE) {
+    const batch = filters.slice(start, start + FILTERS_AT_ONCE);
+    // Telemetry is published at QoS 0 and stays so; asking for 1 keeps what matters at 1.
+    await new Promise<void>((resolve, reject) => {
+      const failed = (): void => {
+        clearTimeout(timer);
+        client.off("close", failed);
+        reject(new Error("The broker did not answer."));
+      };
+      const timer = setTimeout(failed, CONNECT_TIMEOUT_MS);
+      client.once("close", failed);
+      client.subscribe(batch, { qos: 1 }, () => {
+        // A refused filter is no reason to give up the others: what it would bring stays unknown, and is shown so.
+        clearTimeout(timer);
+        client.off("close", failed);
+        if (client.connected) resolve();
+        else failed();
+      });
+    });
+  }
+}

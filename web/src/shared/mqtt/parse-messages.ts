@@ -1,0 +1,444 @@
+/**
+ * Reads what arrives from the broker: JSON of the contract's types, every number finite, every list of the length it
+ * must have. Unknown fields pass, so that this page still reads a newer robot. Nothing unchecked is ever drawn.
+ */
+import type { Pose, Quaternion, Vector3 } from "../lib/vectors";
+import type {
+  Ack,
+  AckStatus,
+  ActionState,
+  BaseLimits,
+  Body,
+  Control,
+  Description,
+  Diagnostic,
+  Event,
+  Fault,
+  Geometry,
+  InterlockRule,
+  Joint,
+  JointTelemetry,
+  LeaseState,
+  Measurements,
+  Mirror,
+  Mode,
+  Narrowing,
+  OpenRequest,
+  Presence,
+  Reason,
+  Restriction,
+  State,
+  StopLatch,
+  Stream,
+  TwinJoint,
+} from "./protocol.generated";
+
+/** A message that is not what the contract says; the text names the field. */
+export class MessageError extends Error {
+  override name = "MessageError";
+}
+
+/** Largest message of the contract [bytes]. */
+const MAX_BYTES = 128 * 1024;
+const MAX_JOINTS = 128;
+const MAX_BODIES = 512;
+
+/**
+ * Checks one value; `at` is where it stands and `key` its place there, for the error's text. They are put together only
+ * for what is wrong: of ten robots two hundred messages come a second, each with a hundred numbers.
+ */
+export type Check<T> = (value: unknown, at: string, key?: string | number) => T;
+
+function place(at: string, key?: string | number): string {
+  if (key === undefined) return at;
+  return typeof key === "number" ? `${at}[${key}]` : `${at}.${key}`;
+}
+
+function fail(at: string, wanted: string, key?: string | number): never {
+  throw new MessageError(`${place(at, key)} is not ${wanted}`);
+}
+
+const number: Check<number> = (value, at, key) =>
+  typeof value === "number" && Number.isFinite(value) ? value : fail(at, "a finite number", key);
+
+const count: Check<number> = (value, at, key) =>
+  Number.isSafeInteger(value) && (value as number) >= 0 ? (value as number) : fail(at, "a whole number from 0", key);
+
+const text: Check<string> = (value, at, key) => (typeof value === "string" ? value : fail(at, "text", key));
+
+const flag: Check<boolean> = (value, at, key) => (typeof value === "boolean" ? value : fail(at, "true or false", key));
+
+const anything: Check<Record<string, unknown>> = (value, at, key) =>
+  typeof value === "object" && value !== null && !Array.isArray(value)
+    ? (value as Record<string, unknown>)
+    : fail(at, "an object", key);
+
+function oneOf<const T extends string>(...names: T[]): Check<T> {
+  return (value, at, key) => {
+    const found = names.find((name) => name === value);
+    return found ?? fail(at, `one of ${names.join(", ")}`, key);
+  };
+}
+
+function list<T>(item: Check<T>, longest: number): Check<T[]> {
+  return (value, at, key) => {
+    if (!Array.isArray(value) || value.length > longest) fail(at, `a list of at most ${longest}`, key);
+    const here = place(at, key);
+    return value.map((entry, index) => item(entry, here, index));
+  };
+}
+
+/** Numbers by name, of which none is taken for a part of what every object has. */
+const byName: Check<Record<string, number>> = (value, at, key) => {
+  const entries = Object.entries(anything(value, at, key));
+  if (entries.length > MAX_JOINTS) fail(at, `at most ${MAX_JOINTS} numbers`, key);
+  const here = place(at, key);
+  return Object.fromEntries(entries.map(([name, entry]) => [name, number(entry, here, name)]));
+};
+
+function numbers<T extends number[]>(length: T["length"]): Check<T> {
+  return (value, at, key) => {
+    if (!Array.isArray(value) || value.length !== length) fail(at, `${length} numbers`, key);
+    const here = place(at, key);
+    return value.map((entry, index) => number(entry, here, index)) as T;
+  };
+}
+
+function optional<T>(check: Check<T>, otherwise: T): Check<T> {
+  return (value, at, key) => (value === undefined ? otherwise : check(value, at, key));
+}
+
+function nullable<T>(check: Check<T>): Check<T | null> {
+  return (value, at, key) => (value === undefined || value === null ? null : check(value, at, key));
+}
+
+type Fields<T> = { [K in keyof T]-?: Check<T[K]> };
+
+function object<T extends object>(fields: Fields<T>): Check<T> {
+  const entries = Object.entries<Check<unknown>>(fields as Record<string, Check<unknown>>);
+  return (value, at, key) => {
+    const given = anything(value, at, key);
+    const here = place(at, key);
+    return Object.fromEntries(entries.map(([name, check]) => [name, check(given[name], here, name)])) as T;
+  };
+}
+
+const vector3 = numbers<Vector3>(3);
+const quaternion = numbers<Quaternion>(4);
+const pose = numbers<Pose>(7);
+const mode = oneOf<Mode>("idle", "streaming", "action", "holding", "stopped", "fault");
+
+const presence = object<Required<Presence>>({
+  online: flag,
+  session: count,
+  at_ms: count,
+  software: optional(text, ""),
+});
+
+const joint = object<Joint>({
+  name: text,
+  label: text,
+  lower_rad: number,
+  upper_rad: number,
+  max_velocity_rad_s: number,
+  max_acceleration_rad_s2: number,
+  max_jerk_rad_s3: number,
+  max_effort_nm: number,
+});
+
+const mirror = object<Required<Mirror>>({ joint: text, of: text, factor: optional(number, 1) });
+const narrowing = object<Narrowing>({ joint: text, by: text, table: list(vector3, 200) });
+
+const stream = object<Stream>({ name: text, rate_hz: number });
+
+const control = object<Required<Control>>({
+  name: text,
+  label: text,
+  unit: optional(text, ""),
+  lower: number,
+  upper: number,
+});
+
+const diagnostic = object<Required<Diagnostic>>({
+  stream: optional(text, ""),
+  fields: text,
+  label: text,
+  unit: optional(text, ""),
+  advice: optional(text, ""),
+  low: nullable(number),
+  high: nullable(number),
+  warning_low: nullable(number),
+  warning_high: nullable(number),
+  change: nullable(number),
+  horizon_s: optional(number, 0),
+  questions: optional(list(text, MAX_JOINTS), []),
+});
+
+const description = object<KnownDescription>({
+  device: text,
+  kind: text,
+  robot_type: text,
+  label: text,
+  joints: optional(list(joint, MAX_JOINTS), []),
+  mirrors: optional(list(mirror, MAX_JOINTS), []),
+  narrowing: optional(list(narrowing, MAX_JOINTS), []),
+  frames: optional(list(text, MAX_JOINTS), []),
+  capabilities: optional(list(text, MAX_JOINTS), []),
+  actions: optional(list(text, MAX_JOINTS), []),
+  postures: optional(list(text, MAX_JOINTS), []),
+  expressions: optional(list(text, MAX_JOINTS), []),
+  behaviours: optional(list(text, MAX_JOINTS), []),
+  streams: optional(list(stream, MAX_JOINTS), []),
+  cameras: optional(list(stream, MAX_JOINTS), []),
+  captures: optional(list(text, MAX_JOINTS), []),
+  controls: optional(list(control, MAX_JOINTS), []),
+  watchdog_ms: optional(count, 0),
+  max_loop_age_ms: optional(count, 0),
+  simulated: optional(flag, false),
+  limits: optional(list(text, MAX_JOINTS), []),
+  scripts: optional(oneOf("jailed", "refused", "trusted"), "refused"),
+  scripts_note: optional(text, ""),
+  interlocks: optional(
+    list(object<InterlockRule>({ name: text, action: oneOf("slow", "hold"), speed: number, stale_ms: count }), MAX_JOINTS),
+    [],
+  ),
+  diagnostics: optional(list(diagnostic, MAX_JOINTS), []),
+  position_m: nullable(vector3),
+  base: nullable(object<BaseLimits>({ forward_m_s: number, left_m_s: number, turn_rad_s: number })),
+});
+
+const geometry = object<Geometry>({
+  shape: oneOf("box", "sphere", "capsule", "cylinder", "ellipsoid", "plane"),
+  size_m: vector3,
+  position_m: vector3,
+  quaternion,
+  rgba: quaternion,
+});
+
+const twinJoint = object<Required<TwinJoint>>({
+  name: text,
+  kind: oneOf("hinge", "slide"),
+  axis: vector3,
+  anchor_m: vector3,
+  reference_rad: optional(number, 0),
+  follows: optional(byName, {}),
+});
+
+const body = object<Required<Body>>({
+  name: text,
+  parent: number,
+  position_m: vector3,
+  quaternion,
+  joint: nullable<TwinJoint>(twinJoint),
+  geometries: optional(list(geometry, MAX_BODIES), []),
+});
+
+const twin = object<{ device: string; bodies: Required<Body>[] }>({ device: text, bodies: list(body, MAX_BODIES) });
+
+const state = object<Required<State>>({
+  device: text,
+  at_ms: count,
+  tick_ms: count,
+  mode,
+  epoch: count,
+  ended_epoch: optional(count, 0),
+  stop: nullable(object<StopLatch>({ by: text, reason: text, at_ms: count })),
+  lease: nullable<LeaseState>(
+    object<Required<LeaseState>>({
+      holder: text,
+      epoch: count,
+      expires_in_ms: count,
+      reason: optional(text, ""),
+      request: nullable(object<OpenRequest>({ id: text, by: text, expires_in_ms: count })),
+    }),
+  ),
+  action: nullable<ActionState>(
+    object<Required<ActionState>>({
+      id: text,
+      kind: text,
+      name: optional(text, ""),
+      progress: optional(number, 0),
+    }),
+  ),
+  faults: optional(list(object<Fault>({ code: text, message: text, since_ms: count }), MAX_JOINTS), []),
+  restrictions: optional(list(object<Restriction>({ source: text, speed: number, why: text }), MAX_JOINTS), []),
+  stiffness: optional(byName, {}),
+});
+
+const measured = list(number, MAX_JOINTS);
+
+const jointTelemetry = object<Required<JointTelemetry>>({
+  tick_ms: count,
+  at_ms: count,
+  sequence: count,
+  mode,
+  position_rad: measured,
+  velocity_rad_s: measured,
+  effort_nm: measured,
+  commanded_rad: measured,
+  frames: optional(list(pose, MAX_JOINTS), []),
+  epoch: optional(count, 0),
+  setpoint_sequence: optional(count, 0),
+  setpoint_sent_ms: optional(number, 0),
+  loop_age_ms: optional(number, 0),
+  limited: optional(list(text, MAX_JOINTS), []),
+});
+
+/** Numbers and states by name. */
+const values: Check<Record<string, number | boolean>> = (value, at, key) => {
+  const entries = Object.entries(anything(value, at, key));
+  if (entries.length > MAX_JOINTS) fail(at, `at most ${MAX_JOINTS} values`, key);
+  const here = place(at, key);
+  return Object.fromEntries(
+    entries.map(([name, entry]) => [name, typeof entry === "boolean" ? entry : number(entry, here, name)]),
+  );
+};
+
+const measurements = object<Measurements>({ tick_ms: count, at_ms: count, sequence: count, values });
+
+const event = object<Required<Event>>({
+  id: text,
+  device: text,
+  at_ms: count,
+  kind: text,
+  severity: oneOf("info", "warning", "error"),
+  message: text,
+  data: optional(anything, {}),
+});
+
+const ack = object<Required<Ack>>({
+  id: text,
+  status: oneOf<AckStatus>("received", "accepted", "started", "done", "failed", "expired", "cancelled"),
+  sequence: count,
+  at_ms: count,
+  tick_ms: count,
+  reason: nullable(object<Reason>({ code: text, message: text })),
+  progress: nullable(number),
+  output: optional(text, ""),
+  result: optional(anything, {}),
+});
+
+const decoder = new TextDecoder("utf-8", { fatal: true });
+
+function read<T>(payload: Uint8Array, check: Check<T>, name: string): T {
+  if (payload.byteLength > MAX_BYTES) throw new MessageError(`${name} is longer than ${MAX_BYTES} bytes`);
+  let value: unknown;
+  try {
+    value = JSON.parse(decoder.decode(payload));
+  } catch {
+    throw new MessageError(`${name} is not JSON`);
+  }
+  return check(value, name);
+}
+
+export type KnownDiagnostic = Required<Diagnostic>;
+export type KnownDescription = Required<Omit<Description, "diagnostics" | "mirrors">> & {
+  diagnostics: KnownDiagnostic[];
+  mirrors: Required<Mirror>[];
+};
+export type KnownBody = Required<Body>;
+export interface KnownTwin {
+  device: string;
+  bodies: KnownBody[];
+}
+export type KnownState = Required<State>;
+export type KnownTelemetry = Required<JointTelemetry>;
+export type KnownAck = Required<Ack>;
+export type KnownEvent = Required<Event>;
+
+/** `conn`. Throws `MessageError`. */
+export function readPresence(payload: Uint8Array): Required<Presence> {
+  return read(payload, presence, "conn");
+}
+
+/** `desc`. Joint ranges must be ranges, and names must differ. Throws `MessageError`. */
+export function readDescription(payload: Uint8Array): KnownDescription {
+  const found = read(payload, description, "desc");
+  for (const one of found.joints) {
+    if (one.lower_rad >= one.upper_rad) fail(`desc: range of ${one.name}`, "a range");
+  }
+  if (new Set(found.joints.map((one) => one.name)).size !== found.joints.length) fail("desc.joints", "of distinct names");
+  return found;
+}
+
+/** `desc/twin`. Parents stand before their children, so that one pass builds the tree. Throws `MessageError`. */
+export function readTwin(payload: Uint8Array): KnownTwin {
+  const found = read(payload, twin, "twin");
+  found.bodies.forEach((one, index) => {
+    if (!Number.isInteger(one.parent) || one.parent < -1 || one.parent >= index) {
+      fail(`twin.bodies[${index}].parent`, "the index of an earlier body");
+    }
+    if (Math.hypot(...one.quaternion) < 1e-6) fail(`twin.bodies[${index}].quaternion`, "a rotation");
+    if (one.joint !== null && Math.hypot(...one.joint.axis) < 1e-6) fail(`twin.bodies[${index}].joint.axis`, "an axis");
+  });
+  return found;
+}
+
+/** `state`. Throws `MessageError`. */
+export function readState(payload: Uint8Array): KnownState {
+  return read(payload, state, "state");
+}
+
+/** `tele/joints`. All four lists are of one length. Throws `MessageError`. */
+export function readTelemetry(payload: Uint8Array): KnownTelemetry {
+  const found = read(payload, jointTelemetry, "telemetry");
+  const length = found.position_rad.length;
+  for (const name of ["velocity_rad_s", "effort_nm", "commanded_rad"] as const) {
+    if (found[name].length !== length) fail(`telemetry.${name}`, `a list of ${length} numbers`);
+  }
+  return found;
+}
+
+/** `tele/{stream}` of every stream but `joints`. Throws `MessageError`. */
+export function readMeasurements(payload: Uint8Array): Measurements {
+  return read(payload, measurements, "measurements");
+}
+
+/** What a `shoot` answers: the values of each stream. Throws `MessageError`. */
+export function readShot(result: unknown): Record<string, Record<string, number | boolean>> {
+  const streams = Object.entries(anything(anything(result, "result")["values"], "result.values"));
+  return Object.fromEntries(streams.map(([name, entry]) => [name, values(entry, `result.values.${name}`)]));
+}
+
+/** What a `set_control` answers: what was applied. Throws `MessageError`. */
+export function readApplied(result: unknown): Record<string, number> {
+  return byName(anything(result, "result")["applied"], "result.applied");
+}
+
+/** One turn of a lidar, as its capture `scan` tells it. `range_m` is `null` where a beam met nothing. */
+export interface LidarScan {
+  at_ms: number;
+  angle_rad: number[];
+  range_m: (number | null)[];
+  furthest_m: number;
+}
+
+const MAX_BEAMS = 100_000;
+
+/** A file `scan`. Throws `MessageError`. */
+export function readScan(content: string): LidarScan {
+  let given: unknown;
+  try {
+    given = JSON.parse(content);
+  } catch {
+    throw new MessageError("scan is not JSON");
+  }
+  const found = object<LidarScan>({
+    at_ms: count,
+    angle_rad: list(number, MAX_BEAMS),
+    range_m: list(nullable(number), MAX_BEAMS),
+    furthest_m: number,
+  })(given, "scan");
+  if (found.angle_rad.length !== found.range_m.length) fail("scan.range_m", "as long as angle_rad");
+  return found;
+}
+
+/** `event`. Throws `MessageError`. */
+export function readEvent(payload: Uint8Array): KnownEvent {
+  return read(payload, event, "event");
+}
+
+/** `ack`. Throws `MessageError`. */
+export function readAck(payload: Uint8Array): KnownAck {
+  return read(payload, ack, "ack");
+}

@@ -1,0 +1,48 @@
+import { useRef, useState } from "preact/hooks";
+import { texts } from "../i18n/texts";
+
+interface SecretProps {
+  id: string;
+  label: string;
+  value: string;
+}
+
+/** What is shown once, with a button that copies it. */
+export function Secret({ id, label, value }: SecretProps) {
+  const field = useRef<HTMLInputElement>(null);
+  const [said, setSaid] = useState("");
+  const copy = async (): Promise<void> => {
+    try {
+      await navigator.clipboard.writeText(value);
+      setSaid(texts.once.copied);
+    } catch {
+      // Browsers keep the clipboard from a page that came without TLS from another machine.
+      field.current?.focus();
+      field.current?.select();
+      setSaid(texts.once.byHand);
+    }
+  };
+  return (
+    <div class="secret">
+      <label for={id}>{label}</label>
+      <div class="row">
+        <input
+          id={id}
+          ref={field}
+          data-testid={id}
+          type="text"
+          readOnly
+          spellcheck={false}
+          value={value}
+          onFocus={(event) => event.currentTarget.select()}
+        />
+        <button type="button" class="primary" data-testid={`${id}-copy`} onClick={() => void copy()}>
+          {texts.once.copy}
+        </button>
+      </div>
+      <p class="field-note" role="status">
+        {said}
+      </p>
+    </div>
+  );
+}

@@ -1,0 +1,64 @@
+/** How long something lasts: one of a few lengths, or a date. */
+import { texts } from "../i18n/texts";
+
+const LENGTHS = { hour: 3600, workday: 8 * 3600, day: 86_400, week: 7 * 86_400, month: 30 * 86_400 } as const;
+
+export interface Lasting {
+  choice: keyof typeof LENGTHS | "never" | "date" | "keep";
+  /** Of a date input, in the reader's own time. */
+  date: string;
+}
+
+export const FOR_GOOD: Lasting = { choice: "never", date: "" };
+export const AS_IT_IS: Lasting = { choice: "keep", date: "" };
+export const ONE_DAY: Lasting = { choice: "day", date: "" };
+
+/** In seconds from now; `null`: no end, `undefined`: nothing that can be. `kept`: what was left of it before. */
+export function seconds({ choice, date }: Lasting, kept: number | null = null): number | null | undefined {
+  if (choice === "never") return null;
+  if (choice === "keep") return kept;
+  if (choice !== "date") return LENGTHS[choice];
+  const left = Math.floor((new Date(date).getTime() - Date.now()) / 1000);
+  return left >= 60 ? left : undefined; // And where there is no date yet.
+}
+
+interface LastingFieldProps {
+  id: string;
+  label: string;
+  value: Lasting;
+  choices: readonly Lasting["choice"][];
+  onChange: (value: Lasting) => void;
+}
+
+export function LastingField({ id, label, value, choices, onChange }: LastingFieldProps) {
+  return (
+    <div class="field">
+      <label for={id}>{label}</label>
+      <div class="row">
+        <select
+          id={id}
+          value={value.choice}
+          onChange={(event) => {
+            const choice = choices.find((each) => each === event.currentTarget.value);
+            if (choice !== undefined) onChange({ ...value, choice });
+          }}
+        >
+          {choices.map((choice) => (
+            <option key={choice} value={choice}>
+              {texts.lasting[choice]}
+            </option>
+          ))}
+        </select>
+        {value.choice === "date" && (
+          <input
+            type="datetime-local"
+            aria-label={texts.lasting.pick}
+            required
+            value={value.date}
+            onInput={(event) => onChange({ ...value, date: event.currentTarget.value })}
+          />
+        )}
+      </div>
+    </div>
+  );
+}

@@ -1,0 +1,71 @@
+/** A form in its place on a page: what is asked, a button for it, one that leaves all as it is, and what came of it. */
+import type { ComponentChildren, Ref } from "preact";
+import { texts } from "../i18n/texts";
+
+interface AskedFormProps {
+  label: string;
+  /** Of the button that does it, and while it is being done. */
+  todo: string;
+  doing: string;
+  busy: boolean;
+  close?: string;
+  /** Empty where there is nothing to say. */
+  wrong: string;
+  done?: string;
+  /** For fields that what is wrong describes. */
+  answerId?: string;
+  form?: Ref<HTMLFormElement>;
+  sendTestId?: string;
+  onSend: () => Promise<void>;
+  onClose: () => void;
+  children: ComponentChildren;
+}
+
+export function AskedForm({ label, todo, doing, busy, wrong, done = "", onSend, onClose, children, ...rest }: AskedFormProps) {
+  return (
+    <form
+      class="panel fields"
+      ref={rest.form}
+      aria-label={label}
+      onSubmit={(event) => {
+        event.preventDefault();
+        void onSend();
+      }}
+    >
+      {children}
+      <div class="row">
+        <button type="submit" class="primary" data-testid={rest.sendTestId} disabled={busy}>
+          {busy ? doing : todo}
+        </button>
+        <button type="button" disabled={busy} onClick={onClose}>
+          {rest.close ?? texts.access.cancel}
+        </button>
+      </div>
+      <p id={rest.answerId} class={wrong === "" ? "field-note" : "field-error"} aria-live="polite">
+        {wrong === "" ? done : wrong}
+      </p>
+    </form>
+  );
+}
+
+/** Who it is for, by the name of their account. What is `wrong` stands in the form's answer, `answerId`. */
+export function AccountNameField(props: { id: string; answerId: string; value: string; wrong: boolean; onInput: (name: string) => void }) {
+  return (
+    <div class="field">
+      <label for={props.id}>{texts.invite.name}</label>
+      <input
+        id={props.id}
+        type="text"
+        autocomplete="off"
+        autocapitalize="none"
+        spellcheck={false}
+        required
+        maxLength={200}
+        value={props.value}
+        aria-invalid={props.wrong}
+        aria-describedby={props.answerId}
+        onInput={(event) => props.onInput(event.currentTarget.value)}
+      />
+    </div>
+  );
+}
