@@ -18,8 +18,9 @@ from device_agent.ports.geometry import Geometry
 from device_agent.protocol import JointTarget, Setpoint
 from device_agent.protocol.manifests import robot_type
 from device_agent.protocol.manifests.robot_type import RobotType
-from device_agent.runtime.authority.lease_gate import LeaseGate, Refused
+from device_agent.runtime.authority.lease_gate import LeaseGate
 from device_agent.runtime.control.controller import Controller
+from device_agent.runtime.errors import Refused
 
 ROBOTS = Path(__file__).parent.parent / "robots"
 SIMULATED_S = 60.0

@@ -45,8 +45,9 @@ from device_agent.protocol.security import signing
 from device_agent.runtime.authority.authority import Authority, Tenure
 from device_agent.runtime.authority.control_request import Handover
 from device_agent.runtime.authority.event_recorder import Happened, event_of
-from device_agent.runtime.authority.lease_gate import LeaseGate, Refused
+from device_agent.runtime.authority.lease_gate import LeaseGate
 from device_agent.runtime.commands.pinned_keys import Pins
+from device_agent.runtime.errors import Refused
 
 WATCHDOG_S = 0.3
 MAX_LOOP_AGE_S = 0.2

@@ -29,11 +29,12 @@ from device_agent.runtime.actions.script_policy import Trust
 from device_agent.runtime.actions.speech_output import Speaker
 from device_agent.runtime.authority.event_recorder import Audit, Happened
 from device_agent.runtime.authority.interlocks import Interlock, Interlocks
-from device_agent.runtime.authority.lease_gate import LeaseGate, Refused
+from device_agent.runtime.authority.lease_gate import LeaseGate
 from device_agent.runtime.commands.command_processor import Office
 from device_agent.runtime.commands.pinned_keys import Pins
 from device_agent.runtime.control.control_loop import ControlLoop
 from device_agent.runtime.control.controller import Controller
+from device_agent.runtime.errors import Refused
 from device_agent.runtime.readings import Room
 from device_agent.runtime.room.room_device import Instrument
 from device_agent.runtime.room.sensor_loop import SensorLoop

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 
 from device_agent.protocol import JointTelemetry, Measurements, codec, topics
 from device_agent.protocol.topics import Topic
-from device_agent.runtime.authority.lease_gate import Refused
+from device_agent.runtime.errors import Refused
 
 OVERTAKEN_S = 2.0
 """A message that is older than the one before is left out, unless silence of this length lay between: then the sender

@@ -13,8 +13,8 @@ from device_agent.config.agent_config import Configuration, HomeError, Pairing
 from device_agent.config.client_certificate import OwnCertificate
 from device_agent.ports.transport import Transport
 from device_agent.protocol import topics
-from device_agent.runtime.authority.lease_gate import Refused
 from device_agent.runtime.commands.pinned_keys import Pins
+from device_agent.runtime.errors import Refused
 from device_agent.transports import tls
 from device_agent.transports.http import responses
 from device_agent.transports.http.client import CloudApi, CloudError

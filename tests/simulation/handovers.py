@@ -13,8 +13,9 @@ from contextlib import suppress
 from dataclasses import dataclass, field
 
 from device_agent.protocol import JointTarget, Mode, Setpoint, StopLatch
-from device_agent.runtime.authority.lease_gate import Lease, LeaseGate, Refused
+from device_agent.runtime.authority.lease_gate import Lease, LeaseGate
 from device_agent.runtime.control.controller import Controller
+from device_agent.runtime.errors import Refused
 from tests.fakes.drivers import PERIOD_S, joint, robot_type
 
 HANDOVERS = 50

@@ -15,8 +15,8 @@ from device_agent.config import catalogue
 from device_agent.config.agent_config import Configuration, Home, HomeError, Pairing
 from device_agent.config.client_certificate import OwnCertificate
 from device_agent.ports.clock import CloudClock, tick_ms, wall_ms
-from device_agent.runtime.authority.lease_gate import Refused
 from device_agent.runtime.commands.pinned_keys import ADVICE, Pins
+from device_agent.runtime.errors import Refused
 from device_agent.runtime.storage.journal import Journal
 from device_agent.transports import factory, tls
 from device_agent.transports.http import responses

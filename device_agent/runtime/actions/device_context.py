@@ -11,8 +11,8 @@ from device_agent.ports.geometry import Geometry
 from device_agent.ports.skills import Skills
 from device_agent.protocol.manifests.robot_type import RobotType
 from device_agent.runtime.actions.speech_output import Speaker
-from device_agent.runtime.authority.lease_gate import Refused
 from device_agent.runtime.control.controller import Controller
+from device_agent.runtime.errors import Refused
 from device_agent.runtime.readings import Reading, Room
 from device_agent.runtime.room.room_device import Instrument
 

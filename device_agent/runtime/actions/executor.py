@@ -13,7 +13,7 @@ from device_agent.runtime.actions.device_context import Body
 from device_agent.runtime.actions.robot_api import ScriptRobot
 from device_agent.runtime.actions.script_action import MAX_OUTPUT, Cell, Script, ScriptFailed
 from device_agent.runtime.actions.script_policy import Trust
-from device_agent.runtime.authority.lease_gate import Refused
+from device_agent.runtime.errors import Refused
 from device_agent.runtime.room import room_actions
 
 Report = Callable[..., None]

@@ -11,8 +11,8 @@ from device_agent.protocol import Vector3
 from device_agent.runtime.actions.device_context import Body, by_name
 from device_agent.runtime.actions.skill_runner import Performer, check_share
 from device_agent.runtime.authority.authority import Tenure
-from device_agent.runtime.authority.lease_gate import Refused
 from device_agent.runtime.control.goals import Course, Outcome
+from device_agent.runtime.errors import Refused
 from device_agent.runtime.planning import gaze
 from device_agent.runtime.planning.keyframe_trajectory import FASTEST, Timeline
 from device_agent.runtime.planning.motion_planner import Routes, quaternion_of

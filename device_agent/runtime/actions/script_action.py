@@ -15,7 +15,7 @@ from device_agent.ports import script_calls
 from device_agent.ports.sandbox import Inmate, Jail, JailError, Limits
 from device_agent.protocol import RunMovement
 from device_agent.protocol.errors import ProtocolError
-from device_agent.runtime.authority.lease_gate import Refused
+from device_agent.runtime.errors import Refused
 
 MAX_OUTPUT = 2000
 """Characters of printed output that an ack carries; of more, the newest are kept."""

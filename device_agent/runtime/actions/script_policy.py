@@ -8,7 +8,7 @@ from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PublicKey
 from device_agent.protocol import SHIPPED, RunMovement
 from device_agent.protocol.errors import SignatureError
 from device_agent.protocol.security import signing
-from device_agent.runtime.authority.lease_gate import Refused
+from device_agent.runtime.errors import Refused
 from device_agent.runtime.storage.journal import Journal
 
 

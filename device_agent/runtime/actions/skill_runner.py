@@ -10,8 +10,8 @@ from device_agent.ports.skills import Skill, SkillError
 from device_agent.runtime.actions.device_context import Body
 from device_agent.runtime.actions.speech_output import Utterance
 from device_agent.runtime.authority.authority import Tenure
-from device_agent.runtime.authority.lease_gate import Refused
 from device_agent.runtime.control.goals import Course
+from device_agent.runtime.errors import Refused
 from device_agent.runtime.planning import named_poses
 from device_agent.runtime.planning.behaviour_trajectory import Line, Score
 

@@ -12,7 +12,7 @@ from device_agent.ports.uploads import UploadError, Uploads
 from device_agent.protocol import LANGUAGE_PATTERN
 from device_agent.protocol.events import EventKind
 from device_agent.runtime.authority.event_recorder import Happened
-from device_agent.runtime.authority.lease_gate import Refused
+from device_agent.runtime.errors import Refused
 from device_agent.runtime.planning.visemes import guessed_s
 
 STREAM = "speech"

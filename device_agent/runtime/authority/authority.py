@@ -10,8 +10,9 @@ from dataclasses import dataclass
 from device_agent.protocol import StopLatch
 from device_agent.protocol.events import EventKind
 from device_agent.runtime.authority.event_recorder import Happened, Severity, Tell
-from device_agent.runtime.authority.lease_gate import Lease, LeaseGate, Refused
+from device_agent.runtime.authority.lease_gate import Lease, LeaseGate
 from device_agent.runtime.authority.speed_restrictions import Restrictions
+from device_agent.runtime.errors import Refused
 
 
 @dataclass(eq=False)

@@ -3,7 +3,8 @@
 from dataclasses import dataclass
 
 from device_agent.protocol import AskLease
-from device_agent.runtime.authority.lease_gate import Lease, Refused
+from device_agent.runtime.authority.lease_gate import Lease
+from device_agent.runtime.errors import Refused
 
 
 @dataclass(frozen=True, slots=True)

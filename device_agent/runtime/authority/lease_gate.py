@@ -2,14 +2,7 @@
 
 from dataclasses import dataclass
 
-
-class Refused(Exception):  # noqa: N818 (an answer, not a fault)
-    """An order that this device does not obey: a code for programs, a sentence for people."""
-
-    def __init__(self, code: str, message: str) -> None:
-        super().__init__(message)
-        self.code = code
-        self.message = message
+from device_agent.runtime.errors import Refused
 
 
 @dataclass(frozen=True, slots=True)

@@ -36,9 +36,9 @@ from device_agent.protocol.security import signing
 from device_agent.runtime.actions.executor import Executor
 from device_agent.runtime.authority.control_request import Handover
 from device_agent.runtime.authority.event_recorder import Audit, Happened
-from device_agent.runtime.authority.lease_gate import Refused
 from device_agent.runtime.commands.pinned_keys import Pins
 from device_agent.runtime.control.controller import Controller
+from device_agent.runtime.errors import Refused
 from device_agent.runtime.storage.journal import Journal, JournalError
 from device_agent.runtime.telemetry.device_publisher import Condition, Voice
 

@@ -12,7 +12,7 @@ from device_agent.protocol import codec
 from device_agent.protocol.errors import ProtocolError, SignatureError
 from device_agent.protocol.security import key_rotation, signing
 from device_agent.protocol.security.key_rotation import NewKey
-from device_agent.runtime.authority.lease_gate import Refused
+from device_agent.runtime.errors import Refused
 
 _log = logging.getLogger(__name__)
 ADVICE = "run `python -m device_agent repin` on this machine, or un-pair the agent and claim it again"

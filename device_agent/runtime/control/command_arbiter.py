@@ -15,12 +15,13 @@ from device_agent.protocol.events import EventKind
 from device_agent.protocol.manifests.robot_type import RobotType
 from device_agent.runtime.authority.authority import Authority
 from device_agent.runtime.authority.event_recorder import Tell
-from device_agent.runtime.authority.lease_gate import LeaseGate, Refused
+from device_agent.runtime.authority.lease_gate import LeaseGate
 from device_agent.runtime.control.goal_executor import Helm
 from device_agent.runtime.control.joint_motion import MotionError
 from device_agent.runtime.control.joint_stiffness import Slack
 from device_agent.runtime.control.limits import Envelope
 from device_agent.runtime.control.setpoint_stream import Stream
+from device_agent.runtime.errors import Refused
 
 _CREEP_RAD_S = 0.02
 """Slower than this, setpoints that end are a slider let go at its target, not an operator lost in mid-motion."""

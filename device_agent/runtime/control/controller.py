@@ -15,10 +15,11 @@ from device_agent.protocol import Mode, Setpoint, StopLatch
 from device_agent.protocol.manifests.robot_type import RobotType
 from device_agent.runtime.authority.authority import Tenure
 from device_agent.runtime.authority.event_recorder import Tell, to_nobody
-from device_agent.runtime.authority.lease_gate import Lease, LeaseGate, Refused
+from device_agent.runtime.authority.lease_gate import Lease, LeaseGate
 from device_agent.runtime.authority.speed_restrictions import Restriction
 from device_agent.runtime.control.command_arbiter import Pilot, Tick
 from device_agent.runtime.control.goals import Drive, Move, Passage
+from device_agent.runtime.errors import Refused
 from device_agent.runtime.planning.trajectory import Way
 
 

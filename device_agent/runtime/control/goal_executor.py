@@ -8,12 +8,12 @@ import numpy as np
 from device_agent.ports.driver import REST, Twist
 from device_agent.ports.geometry import Clearance
 from device_agent.protocol.manifests.robot_type import RobotType
-from device_agent.runtime.authority.lease_gate import Refused
 from device_agent.runtime.control.base_motion import BaseMotion
 from device_agent.runtime.control.goal_tolerance import Arrival
 from device_agent.runtime.control.goals import Course, Drive, Move, Outcome, Passage
 from device_agent.runtime.control.joint_motion import Motion, MotionError
 from device_agent.runtime.control.limits import Envelope
+from device_agent.runtime.errors import Refused
 from device_agent.runtime.planning.trajectory import Way
 
 _LONGEST_DRIVE_S = 60.0

@@ -3,7 +3,7 @@
 import math
 from collections.abc import Collection, Sequence
 
-from device_agent.runtime.authority.lease_gate import Refused
+from device_agent.runtime.errors import Refused
 
 NEAR_RAD = 0.03
 """As near is there: many times what position servos leave under their own weight, and less than anybody calls short."""

@@ -5,7 +5,7 @@ from dataclasses import dataclass, field
 from enum import Enum
 
 from device_agent.ports.driver import Twist
-from device_agent.runtime.authority.lease_gate import Refused
+from device_agent.runtime.errors import Refused
 from device_agent.runtime.planning.trajectory import Way
 
 

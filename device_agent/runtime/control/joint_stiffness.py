@@ -3,7 +3,7 @@
 from collections.abc import Iterable, Mapping, Sequence
 
 from device_agent.protocol.manifests.robot_type import RobotType
-from device_agent.runtime.authority.lease_gate import Refused
+from device_agent.runtime.errors import Refused
 
 
 class Slack:

@@ -8,7 +8,7 @@ import numpy.typing as npt
 
 from device_agent.ports.geometry import Clearance, Geometry
 from device_agent.protocol.manifests.robot_type import RobotType
-from device_agent.runtime.authority.lease_gate import Refused
+from device_agent.runtime.errors import Refused
 from device_agent.runtime.planning.joint_couplings import Couplings
 
 Floats = npt.NDArray[np.float64]

@@ -7,11 +7,11 @@ from device_agent.ports.driver import REST, Twist
 from device_agent.ports.geometry import Clearance, Geometry
 from device_agent.protocol import DriveTarget, JogTarget, JointTarget, Setpoint
 from device_agent.protocol.manifests.robot_type import RobotType
-from device_agent.runtime.authority.lease_gate import Refused
 from device_agent.runtime.control.base_motion import BaseMotion
 from device_agent.runtime.control.joint_motion import Motion
 from device_agent.runtime.control.latency_limiter import LIMITED, Pace
 from device_agent.runtime.control.limits import Envelope
+from device_agent.runtime.errors import Refused
 
 WATCHDOG_S = 0.3
 """Commanded velocity is zero this long after the last fresh setpoint."""

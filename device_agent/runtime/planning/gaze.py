@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from device_agent.ports.geometry import Geometry
 from device_agent.protocol import Pose, Vector3
 from device_agent.protocol.manifests.robot_type import RobotType
-from device_agent.runtime.authority.lease_gate import Refused
+from device_agent.runtime.errors import Refused
 
 _ROUNDS = 60
 _NUDGE_RAD = 1e-5

@@ -14,7 +14,7 @@ import numpy as np
 from device_agent.ports.script_calls import Moment, Play
 from device_agent.protocol import Joint
 from device_agent.protocol.manifests.robot_type import RobotType
-from device_agent.runtime.authority.lease_gate import Refused
+from device_agent.runtime.errors import Refused
 from device_agent.runtime.planning.behaviour_trajectory import confined
 from device_agent.runtime.planning.joint_couplings import Couplings
 from device_agent.runtime.planning.trajectory import Floats, Way

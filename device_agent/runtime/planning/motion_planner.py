@@ -8,7 +8,7 @@ import numpy as np
 from device_agent.ports.geometry import Geometry, GeometryError, PlannerLostError
 from device_agent.protocol import Pose, Quaternion, Vector3
 from device_agent.protocol.manifests.robot_type import RobotType
-from device_agent.runtime.authority.lease_gate import Refused
+from device_agent.runtime.errors import Refused
 from device_agent.runtime.planning import trajectory
 from device_agent.runtime.planning.joint_couplings import Couplings
 from device_agent.runtime.planning.trajectory import Floats, Way

@@ -4,7 +4,7 @@ from collections.abc import Mapping
 from typing import TypeVar
 
 from device_agent.protocol.manifests.robot_type import RobotType
-from device_agent.runtime.authority.lease_gate import Refused
+from device_agent.runtime.errors import Refused
 
 EXPRESSION_SPEED = 0.5
 """Share of each joint's velocity limit with which an expression comes: a face that snaps frightens."""

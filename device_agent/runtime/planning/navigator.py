@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from device_agent.ports.driver import REST, Twist
 from device_agent.ports.floor_map import Floor, Ground
 from device_agent.protocol.manifests.robot_type import RobotType
-from device_agent.runtime.authority.lease_gate import Refused
+from device_agent.runtime.errors import Refused
 from device_agent.runtime.readings import Reading
 
 EVERY_S = 0.1

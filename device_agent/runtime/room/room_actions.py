@@ -6,7 +6,7 @@ from collections.abc import Callable
 from typing import Any
 
 from device_agent.protocol import CaptureRaw, Gather, RoomTask, Shoot
-from device_agent.runtime.authority.lease_gate import Refused
+from device_agent.runtime.errors import Refused
 from device_agent.runtime.room.room_device import Instrument
 
 _TELL_EVERY_S = 1.0

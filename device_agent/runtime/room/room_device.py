@@ -11,7 +11,7 @@ from device_agent.ports.sensor import Camera, Capture, Movable, RoomDriver, Sens
 from device_agent.ports.uploads import UploadError, Uploads
 from device_agent.protocol.commands import CaptureRaw, Gather, SetControl, Shoot
 from device_agent.protocol.manifests.room import Control, RoomDevice
-from device_agent.runtime.authority.lease_gate import Refused
+from device_agent.runtime.errors import Refused
 from device_agent.runtime.room.stream_watchdog import Vigil
 
 _SUFFIXES = {"image/png": "png", "image/jpeg": "jpg", "application/json": "json"}

@@ -8,8 +8,9 @@ import pytest
 from device_agent.ports.geometry import Clearance, Geometry, Sweep, never
 from device_agent.protocol import JointTarget, Mode, Pose, Setpoint, StopLatch
 from device_agent.protocol.manifests.robot_type import Base
-from device_agent.runtime.authority.lease_gate import LeaseGate, Refused
+from device_agent.runtime.authority.lease_gate import LeaseGate
 from device_agent.runtime.control.controller import Controller
+from device_agent.runtime.errors import Refused
 from tests.fakes.drivers import PERIOD_S, robot_type
 
 WALL_RAD = 1.0

@@ -12,7 +12,7 @@ from cryptography.exceptions import InvalidSignature
 from device_agent.protocol import SHIPPED, AckStatus, RunMovement
 from device_agent.protocol.security import signing
 from device_agent.runtime.actions.script_policy import Trust
-from device_agent.runtime.authority.lease_gate import Refused
+from device_agent.runtime.errors import Refused
 from device_agent.runtime.storage.journal import Journal
 from function_app.ports.tables import Row
 from function_app.services.robot_types.movements import KEPT_MS

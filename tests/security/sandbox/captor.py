@@ -27,7 +27,7 @@ from device_agent.ports import script_calls
 from device_agent.ports.sandbox import Inmate, Limits
 from device_agent.protocol import RunMovement
 from device_agent.runtime.actions.script_action import Cell, Script, ScriptFailed
-from device_agent.runtime.authority.lease_gate import Refused
+from device_agent.runtime.errors import Refused
 from device_agent.sandbox.host import WarmJail
 from tests.security.sandbox.attacks import ATTACKS
 

@@ -11,9 +11,10 @@ import pytest
 from device_agent import geometry
 from device_agent.ports.driver import Twist
 from device_agent.protocol.manifests import robot_type
-from device_agent.runtime.authority.lease_gate import LeaseGate, Refused
+from device_agent.runtime.authority.lease_gate import LeaseGate
 from device_agent.runtime.control.controller import Controller
 from device_agent.runtime.control.goals import Course, Outcome
+from device_agent.runtime.errors import Refused
 from device_agent.runtime.planning import gaze, named_poses
 from tests.unit.robots.folders import MOVEMENTS, ROBOTS, heard, whereabouts
 

@@ -16,9 +16,10 @@ from device_agent.protocol import Measurements
 from device_agent.protocol.manifests import robot_type
 from device_agent.runtime.actions.device_context import Body
 from device_agent.runtime.actions.robot_api import ScriptRobot
-from device_agent.runtime.authority.lease_gate import LeaseGate, Refused
+from device_agent.runtime.authority.lease_gate import LeaseGate
 from device_agent.runtime.control.controller import Controller
 from device_agent.runtime.control.goals import Course
+from device_agent.runtime.errors import Refused
 from device_agent.runtime.readings import Reading, Room
 from device_agent.sandbox import api
 from device_agent.sensors.perception.driver import _flat

@@ -22,9 +22,10 @@ from device_agent.protocol import StopLatch
 from device_agent.protocol.manifests import robot_type
 from device_agent.runtime.actions.device_context import Body
 from device_agent.runtime.actions.robot_api import ScriptRobot
-from device_agent.runtime.authority.lease_gate import LeaseGate, Refused
+from device_agent.runtime.authority.lease_gate import LeaseGate
 from device_agent.runtime.control.controller import Controller
 from device_agent.runtime.control.goals import Outcome
+from device_agent.runtime.errors import Refused
 from device_agent.runtime.planning.joint_couplings import Couplings
 from device_agent.runtime.planning.motion_planner import Routes
 from device_agent.runtime.readings import Room

@@ -4,7 +4,7 @@ import pytest
 
 from device_agent.protocol import JointTelemetry, Measurements, Mode, codec, topics
 from device_agent.protocol.errors import ProtocolError
-from device_agent.runtime.authority.lease_gate import Refused
+from device_agent.runtime.errors import Refused
 from device_agent.runtime.readings import OVERTAKEN_S, Reading, Room
 
 

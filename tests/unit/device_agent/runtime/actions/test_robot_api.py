@@ -39,8 +39,9 @@ from device_agent.protocol import (
 from device_agent.protocol.manifests.robot_type import Base, Gaze, RobotType
 from device_agent.runtime.actions.device_context import Body
 from device_agent.runtime.actions.robot_api import ScriptRobot
-from device_agent.runtime.authority.lease_gate import LeaseGate, Refused
+from device_agent.runtime.authority.lease_gate import LeaseGate
 from device_agent.runtime.control.controller import Controller
+from device_agent.runtime.errors import Refused
 from device_agent.runtime.planning import gaze
 from device_agent.runtime.readings import Room
 from tests.fakes.drivers import ToyDriver, robot_type

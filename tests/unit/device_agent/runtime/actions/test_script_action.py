@@ -16,7 +16,7 @@ from device_agent.ports.sandbox import JailError, Limits, Standing
 from device_agent.protocol import RunMovement
 from device_agent.runtime.actions import script_action
 from device_agent.runtime.actions.script_action import Cell, Script, ScriptFailed
-from device_agent.runtime.authority.lease_gate import Refused
+from device_agent.runtime.errors import Refused
 from tests.harness.agent.sandbox import warm_jail
 
 

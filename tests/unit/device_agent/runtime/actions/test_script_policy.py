@@ -9,7 +9,7 @@ import pytest
 from device_agent.protocol import SHIPPED, RunMovement
 from device_agent.protocol.security import signing
 from device_agent.runtime.actions.script_policy import Trust
-from device_agent.runtime.authority.lease_gate import Refused
+from device_agent.runtime.errors import Refused
 from device_agent.runtime.storage.journal import Journal
 from tests.harness.agent.device_harness import signed_movement
 

@@ -31,8 +31,8 @@ from device_agent.protocol.manifests.robot_type import RobotType
 from device_agent.runtime.actions.device_context import Body
 from device_agent.runtime.actions.skill_runner import Performer
 from device_agent.runtime.actions.speech_output import Speaker
-from device_agent.runtime.authority.lease_gate import Refused
 from device_agent.runtime.control.joint_stiffness import Slack
+from device_agent.runtime.errors import Refused
 from tests.fakes.drivers import ToyDriver, robot_type
 from tests.harness.agent.device_harness import Bench, eventually
 

@@ -4,7 +4,8 @@ import pytest
 
 from device_agent.protocol import AskLease
 from device_agent.runtime.authority.control_request import Handover
-from device_agent.runtime.authority.lease_gate import Lease, Refused
+from device_agent.runtime.authority.lease_gate import Lease
+from device_agent.runtime.errors import Refused
 
 LEASE = Lease("ann", 5, 1_000.0)
 ASKED = AskLease(request="r1", by="bob", answer_within_ms=30_000)

@@ -7,7 +7,7 @@ from device_agent.protocol import Command, GrantLease, Request, RunMovement, cod
 from device_agent.protocol.errors import ProtocolError, SignatureError
 from device_agent.protocol.security import signing
 from device_agent.runtime.actions.script_policy import Trust
-from device_agent.runtime.authority.lease_gate import Refused
+from device_agent.runtime.errors import Refused
 from tests.harness.agent.device_harness import signed_movement
 from tests.harness.agent.pinned_keys import pins_of
 

@@ -9,8 +9,8 @@ from device_agent.config.agent_config import Home, HomeError, Pairing
 from device_agent.protocol import codec
 from device_agent.protocol.security import signing
 from device_agent.protocol.security.key_rotation import KEYS_CONTEXT, NewKey
-from device_agent.runtime.authority.lease_gate import Refused
 from device_agent.runtime.commands.pinned_keys import Pins
+from device_agent.runtime.errors import Refused
 
 FIRST, SECOND, THIRD = (signing.generate() for _ in range(3))
 ENDS_MS = 5000

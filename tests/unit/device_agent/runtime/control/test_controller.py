@@ -3,8 +3,8 @@
 import pytest
 
 from device_agent.protocol import Mode, StopLatch
-from device_agent.runtime.authority.lease_gate import Refused
 from device_agent.runtime.control.goals import Outcome
+from device_agent.runtime.errors import Refused
 from tests.fakes.drivers import PERIOD_S
 from tests.harness.agent.controller_fixture import Rig, interruptions, lost
 

@@ -7,10 +7,10 @@ import pytest
 
 from device_agent.ports.driver import REST, Twist
 from device_agent.protocol import StopLatch
-from device_agent.runtime.authority.lease_gate import Refused
 from device_agent.runtime.control.base_motion import BaseMotion
 from device_agent.runtime.control.goals import Drive, Outcome
 from device_agent.runtime.control.joint_motion import MotionError
+from device_agent.runtime.errors import Refused
 from tests.fakes.drivers import BASE, PERIOD_S
 from tests.harness.agent.controller_fixture import Rig, interruptions, lost
 

@@ -10,11 +10,11 @@ from ruckig import InputParameter, Result, Ruckig, RuckigError, Trajectory
 from device_agent.ports.geometry import Sweep
 from device_agent.protocol import Mode
 from device_agent.protocol.manifests.robot_type import Workspace
-from device_agent.runtime.authority.lease_gate import Refused
 from device_agent.runtime.control.goals import Outcome
 from device_agent.runtime.control.joint_motion import Motion, MotionError, plan
 from device_agent.runtime.control.latency_limiter import Pace
 from device_agent.runtime.control.limits import Envelope
+from device_agent.runtime.errors import Refused
 from tests.fakes.drivers import PERIOD_S, robot_type
 from tests.harness.agent.controller_fixture import WALL_RAD, Rig, Wall, lost
 

@@ -14,7 +14,7 @@ import pytest
 from device_agent.ports.driver import REST, Twist
 from device_agent.ports.geometry import Clearance, Sweep
 from device_agent.protocol import DriveTarget, JogTarget, JointTarget, Mode, Setpoint, StopLatch
-from device_agent.runtime.authority.lease_gate import Refused
+from device_agent.runtime.errors import Refused
 from tests.fakes.drivers import BASE, PERIOD_S
 from tests.harness.agent.controller_fixture import Rig, Wall
 

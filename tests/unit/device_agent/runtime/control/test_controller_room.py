@@ -5,9 +5,9 @@ import math
 import pytest
 
 from device_agent.protocol import Mode
-from device_agent.runtime.authority.lease_gate import Refused
 from device_agent.runtime.authority.speed_restrictions import Restriction, Restrictions
 from device_agent.runtime.control.goals import Outcome
+from device_agent.runtime.errors import Refused
 from tests.harness.agent.controller_fixture import Rig, lost
 
 

@@ -15,8 +15,9 @@ from device_agent import geometry
 from device_agent.protocol import DriveTarget, JogTarget, JointTarget, Mode, Setpoint, StopLatch, codec
 from device_agent.protocol.errors import ProtocolError
 from device_agent.protocol.manifests import robot_type
-from device_agent.runtime.authority.lease_gate import LeaseGate, Refused
+from device_agent.runtime.authority.lease_gate import LeaseGate
 from device_agent.runtime.control.controller import Controller
+from device_agent.runtime.errors import Refused
 from tests.fakes.drivers import BASE
 from tests.harness.agent.controller_fixture import Rig, lost
 

@@ -10,11 +10,12 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from device_agent.protocol import JointTarget, Setpoint, StopLatch
-from device_agent.runtime.authority.lease_gate import LeaseGate, Refused
+from device_agent.runtime.authority.lease_gate import LeaseGate
 from device_agent.runtime.control.controller import Controller
 from device_agent.runtime.control.goals import Outcome
 from device_agent.runtime.control.joint_motion import Motion
 from device_agent.runtime.control.limits import Envelope
+from device_agent.runtime.errors import Refused
 from device_agent.runtime.planning.joint_couplings import Couplings
 from tests.fakes.head_driver import BENT, FACTOR, PERIOD_S, RANGES, SPEED, WIDE, head
 

@@ -14,8 +14,8 @@ from hypothesis import strategies as st
 
 from device_agent.ports.script_calls import Moment, Play
 from device_agent.protocol.manifests.robot_type import RobotType
-from device_agent.runtime.authority.lease_gate import Refused
 from device_agent.runtime.control.limits import Envelope
+from device_agent.runtime.errors import Refused
 from device_agent.runtime.planning.keyframe_trajectory import Timeline
 from device_agent.runtime.planning.trajectory import Way
 from tests.fakes.head_driver import RANGES, head

@@ -10,9 +10,10 @@ import pytest
 from device_agent.geometry.mujoco_geometry import MujocoGeometry
 from device_agent.ports.geometry import GeometryError, PlannerLostError
 from device_agent.protocol.manifests import robot_type
-from device_agent.runtime.authority.lease_gate import LeaseGate, Refused
+from device_agent.runtime.authority.lease_gate import LeaseGate
 from device_agent.runtime.control.controller import Controller
 from device_agent.runtime.control.goals import Outcome
+from device_agent.runtime.errors import Refused
 from device_agent.runtime.planning.motion_planner import Routes
 
 UR5 = Path(__file__).parents[3] / "robots" / "ur5"

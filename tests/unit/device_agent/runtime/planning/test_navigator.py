@@ -13,7 +13,7 @@ from device_agent.ports.driver import REST, Twist
 from device_agent.protocol import StopLatch
 from device_agent.runtime.actions.device_context import Body
 from device_agent.runtime.actions.robot_api import ScriptRobot
-from device_agent.runtime.authority.lease_gate import Refused
+from device_agent.runtime.errors import Refused
 from device_agent.runtime.planning import navigator as errand_module
 from device_agent.runtime.planning.navigator import (
     EVERY_S,

@@ -11,8 +11,8 @@ from hypothesis import strategies as st
 
 from device_agent.ports.geometry import Clearance, Sweep, never
 from device_agent.protocol import Mode, Pose
-from device_agent.runtime.authority.lease_gate import Refused
 from device_agent.runtime.control.goals import Outcome
+from device_agent.runtime.errors import Refused
 from device_agent.runtime.planning import trajectory
 from device_agent.runtime.planning.motion_planner import Routes, quaternion_of
 from device_agent.runtime.planning.trajectory import Floats, Way
