@@ -12,8 +12,8 @@ import json
 import sys
 import time
 
-from device_agent.ports.sandbox import Inmate, Limits
-from device_agent.sandbox.host import WarmJail
+from device_agent.ports.sandbox import Limits, SandboxProcess
+from device_agent.sandbox.host import SandboxHost
 
 _STUBBORN = "import signal\nfor n in (signal.SIGTERM, signal.SIGINT, signal.SIGHUP): signal.signal(n, signal.SIG_IGN)\n"
 _GREEDY = "kept = []\ntry:\n    while True: kept.append(bytearray(b'x' * 2**20))\nexcept MemoryError: pass\n"
@@ -26,7 +26,7 @@ SCRIPTS = {
 }
 
 
-def first_line(inmate: Inmate, source: str) -> None:
+def first_line(inmate: SandboxProcess, source: str) -> None:
     """Send the script and wait for what it says first."""
     with inmate.link.makefile("rwb") as lines:
         lines.readline()
@@ -38,7 +38,7 @@ def first_line(inmate: Inmate, source: str) -> None:
 
 
 def measure(
-    jail: WarmJail, source: str, runs: int, *, stranger: bool, pause_s: float = 0.0
+    jail: SandboxHost, source: str, runs: int, *, stranger: bool, pause_s: float = 0.0
 ) -> tuple[list[float], list[float]]:
     """Start and stop of each run [ms]."""
     starts, stops = [], []
@@ -65,7 +65,7 @@ def percentiles(values: list[float]) -> str:
 
 def main(runs: int = 300) -> None:
     """Measure all of it."""
-    jail = WarmJail()
+    jail = SandboxHost()
     begun_s = time.perf_counter()
     jail.start()
     print(f"warm parent ready after {(time.perf_counter() - begun_s) * 1000:.0f} ms; {runs} runs each [ms]")

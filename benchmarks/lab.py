@@ -27,7 +27,7 @@ from typing import Any
 from device_agent import __main__ as agent
 from device_agent.config.catalogue import ROOMS
 from device_agent.runtime.control import control_loop
-from device_agent.runtime.control.command_arbiter import Tick
+from device_agent.runtime.control.command_arbiter import ControlOutput
 from device_agent.runtime.control.controller import Controller
 from device_agent.simulation import world_registry
 from infra.local import __main__ as local
@@ -65,7 +65,7 @@ def run_agent(report: Path, for_s: float, arguments: Sequence[str]) -> int:
     last: dict[str, float] = {}
     step = Controller.step
 
-    def timed(controller: Controller, *given: Any, **named: Any) -> Tick:
+    def timed(controller: Controller, *given: Any, **named: Any) -> ControlOutput:
         name, at_s = threading.current_thread().name, time.monotonic()
         if name in last:
             gaps.setdefault(name, []).append(at_s - last[name])

@@ -14,7 +14,7 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 
 from device_agent import geometry
-from device_agent.ports.geometry import Geometry
+from device_agent.ports.geometry import RobotGeometry
 from device_agent.protocol import JointTarget, Setpoint
 from device_agent.protocol.manifests import robot_type
 from device_agent.protocol.manifests.robot_type import RobotType
@@ -72,7 +72,7 @@ def moves(controller: Controller, kind: RobotType) -> Iterator[None]:
         yield
 
 
-def measure(kind: RobotType, shape: Geometry | None, source: Source) -> list[float]:
+def measure(kind: RobotType, shape: RobotGeometry | None, source: Source) -> list[float]:
     """Processor time of each step in which something moves [ms]."""
     controller = Controller(kind, LeaseGate(), geometry=shape)
     controller.start_at([kind.home_rad[joint.name] for joint in kind.joints])

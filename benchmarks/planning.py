@@ -20,7 +20,7 @@ from device_agent.protocol.manifests import robot_type
 from device_agent.protocol.manifests.robot_type import RobotType
 from device_agent.runtime.authority.lease_gate import LeaseGate
 from device_agent.runtime.control.controller import Controller
-from device_agent.runtime.planning.motion_planner import Routes
+from device_agent.runtime.planning.motion_planner import MotionPlanner
 
 ROBOTS = Path(__file__).resolve().parents[1] / "robots"
 NAMES = ("ur5", "nao", "qbo", "hanson")
@@ -82,7 +82,7 @@ def measure(for_s: float, *, planning: bool) -> None:
         home = [kind.home_rad[joint.name] for joint in kind.joints]
         took_s: list[float] = []
         if planning:  # the first starts the program
-            Routes(kind, shape).around(home, [BEYOND_RAD, *home[1:]], speed=1.0, ended=ending.is_set)
+            MotionPlanner(kind, shape).around(home, [BEYOND_RAD, *home[1:]], speed=1.0, ended=ending.is_set)
         for loop in loops.values():
             loop.thread.start()
         began_s, seed = time.monotonic(), 0
@@ -91,7 +91,7 @@ def measure(for_s: float, *, planning: bool) -> None:
                 time.sleep(0.1)
                 continue
             seed += 1
-            Routes(kind, shape, seed=seed).around(home, [BEYOND_RAD, *home[1:]], speed=1.0, ended=ending.is_set)
+            MotionPlanner(kind, shape, seed=seed).around(home, [BEYOND_RAD, *home[1:]], speed=1.0, ended=ending.is_set)
             took_s.append(time.monotonic() - now_s)
             time.sleep(0.2)
         ending.set()

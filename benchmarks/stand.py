@@ -24,7 +24,8 @@ from device_agent.protocol.security.grants import Grant
 from function_app import settings
 from tests.harness.browser.product import Api, Machine, start_machine
 from tests.harness.cloud.cloud import Cloud
-from tests.harness.network.brokers import ROOT, BrokerKind
+from tests.harness.network.brokers import BrokerKind
+from tests.harness.paths import ROOT
 
 PATIENCE_S: Final = 10.0
 LEASE_MS: Final = 60_000

@@ -155,17 +155,17 @@ def _pairs(variable: str, between: str) -> dict[str, str]:
 
 def _reroute(ways: Mapping[str, str]) -> None:
     """Reach the cloud and its broker by other ports."""
-    from device_agent.transports.http.client import CloudApi
+    from device_agent.transports.http.client import CloudClient
 
     def init(begin: Any) -> Any:
-        def run(self: CloudApi, server: str, *given: Any, **named: Any) -> None:
+        def run(self: CloudClient, server: str, *given: Any, **named: Any) -> None:
             address, _, port = server.rstrip("/").rpartition(":")
             begin(self, f"{address}:{ways.get(port, port)}", *given, **named)
 
         return run
 
     def credentials(ask: Any) -> Any:
-        def run(self: CloudApi) -> dict[str, Any]:
+        def run(self: CloudClient) -> dict[str, Any]:
             found: dict[str, Any] = ask(self)
             port = str(found["tcp"]["port"])
             found["tcp"]["port"] = int(ways.get(port, port))
@@ -173,8 +173,8 @@ def _reroute(ways: Mapping[str, str]) -> None:
 
         return run
 
-    _wrap(CloudApi, "__init__", init)
-    _wrap(CloudApi, "credentials", credentials)
+    _wrap(CloudClient, "__init__", init)
+    _wrap(CloudClient, "credentials", credentials)
 
 
 def _tell_messages(tell: Tell) -> None:
@@ -198,7 +198,7 @@ def _tell_messages(tell: Tell) -> None:
 def _tell_control(tell: Tell) -> None:
     """What the device does with it."""
     from device_agent.drivers.mujoco.driver import MujocoDriver
-    from device_agent.runtime.actions.executor import Executor
+    from device_agent.runtime.actions.executor import ActionExecutor
     from device_agent.runtime.control.controller import Controller
 
     newest: dict[int, tuple[Any, ...]] = {}
@@ -233,7 +233,7 @@ def _tell_control(tell: Tell) -> None:
 
         return run
 
-    _wrap(Executor, "start", _told_first(lambda *_: tell("checked")))
+    _wrap(ActionExecutor, "start", _told_first(lambda *_: tell("checked")))
     _wrap(Controller, "offer", offered)
     _wrap(Controller, "step", stepped)
     _wrap(MujocoDriver, "send", sent)

@@ -16,7 +16,7 @@ import msgspec
 from device_agent import bootstrap, drivers, sensors
 from device_agent.cli import claim_prompt, doctor, systemd
 from device_agent.config import catalogue
-from device_agent.config.agent_config import Configuration, DeviceEntry, Home, HomeError, HttpPolling, Pairing
+from device_agent.config.agent_config import ConfigError, Configuration, DeviceEntry, Home, HttpPolling, Pairing
 from device_agent.load_generator.options import SwarmError, add_options, plan_of
 from device_agent.ports.clock import CloudClock
 from device_agent.ports.driver import DriverError
@@ -26,7 +26,7 @@ from device_agent.protocol.topics import ID_PATTERN, is_id
 from device_agent.runtime.storage.journal import JournalError
 from device_agent.transports import factory
 from device_agent.transports.http import responses
-from device_agent.transports.http.client import Claim, CloudApi, CloudError
+from device_agent.transports.http.client import Claim, CloudClient, CloudError
 
 _POLL_S = 20.0
 _OUTDATED_POLL_S = 0.5
@@ -42,7 +42,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     logging.basicConfig(level=logging.INFO, format="%(asctime)s %(levelname)s %(message)s", stream=sys.stderr)
     try:
         code: int = options.command(options)
-    except (HomeError, JournalError, DriverError, TransportError, CloudError, SwarmError, OSError) as error:
+    except (ConfigError, JournalError, DriverError, TransportError, CloudError, SwarmError, OSError) as error:
         print(f"telescope agent: {error}", file=sys.stderr)
         return _EXIT_FAILED
     except KeyboardInterrupt:
@@ -152,15 +152,15 @@ def _configuration(options: argparse.Namespace, home: Home) -> Configuration:
     """What is on file, with what was said now in its place."""
     try:
         before = home.configuration()
-    except HomeError:
+    except ConfigError:
         before = None
     if before is None and not options.device and not options.room:
-        raise HomeError("say which devices it has, for example `--device arm=ur5` or `--room lab`")
+        raise ConfigError("say which devices it has, for example `--device arm=ur5` or `--room lab`")
     server = options.server or (before.server if before else "")
     if not server.startswith(("http://", "https://")):
-        raise HomeError("say where the server is, for example `--server http://127.0.0.1:8080`")
+        raise ConfigError("say where the server is, for example `--server http://127.0.0.1:8080`")
     if options.ca and not server.startswith("https://"):
-        raise HomeError("--ca says who may speak for an https server; this one speaks http, which nobody vouches for")
+        raise ConfigError("--ca says who may speak for an https server; this one speaks http, which nobody vouches for")
     polling = _polling(options, before.http if before else HttpPolling())
     said = Configuration(
         server=server,
@@ -179,7 +179,7 @@ def _polling(options: argparse.Namespace, before: HttpPolling) -> HttpPolling:
         changed = {name: value for name, value in said.items() if value is not None}
         return msgspec.convert(msgspec.to_builtins(before) | changed, HttpPolling)
     except msgspec.ValidationError as error:
-        raise HomeError(f"--poll-ms: {error}") from error
+        raise ConfigError(f"--poll-ms: {error}") from error
 
 
 def _entries(options: argparse.Namespace) -> tuple[DeviceEntry, ...]:
@@ -193,14 +193,14 @@ def _entry(text: str) -> DeviceEntry:
     name, equals, rest = text.partition("=")
     kind, _, driver = rest.partition(":")
     if not equals or not is_id(name):
-        raise HomeError(f"'{text}' is not NAME=TYPE; a name is {ID_PATTERN}")
+        raise ConfigError(f"'{text}' is not NAME=TYPE; a name is {ID_PATTERN}")
     label = catalogue.TYPES.load(kind).label
     if driver:
         drivers.load(driver)
     return DeviceEntry(name=name, type=kind, driver=driver, label=label)
 
 
-def _announce(api: CloudApi, configuration: Configuration, *, qr: bool) -> Claim:
+def _announce(api: CloudClient, configuration: Configuration, *, qr: bool) -> Claim:
     claim = api.enroll(
         name=configuration.name,
         software=factory.SOFTWARE,
@@ -212,7 +212,7 @@ def _announce(api: CloudApi, configuration: Configuration, *, qr: bool) -> Claim
     return claim
 
 
-def _await_claim(home: Home, api: CloudApi, configuration: Configuration, claim: Claim, *, qr: bool) -> Pairing:
+def _await_claim(home: Home, api: CloudClient, configuration: Configuration, claim: Claim, *, qr: bool) -> Pairing:
     """Wait until somebody redeems the code; a code that runs out is replaced."""
     expires_s = time.monotonic() + (claim.expires_in_s or 0)
     while True:
@@ -329,13 +329,13 @@ def _repin(options: argparse.Namespace) -> int:
     with home.hold():
         before = home.pairing()
         if before is None:
-            raise HomeError("this agent is not paired, so it has pinned nothing; run `python -m device_agent enroll`")
+            raise ConfigError("this agent is not paired, so it has pinned nothing; run `python -m device_agent enroll`")
         found = bootstrap.api_of(home, home.configuration(), CloudClock()).enrollment()
         if found.get("state") != "claimed":
-            raise HomeError("the agent was un-paired; `python -m device_agent run` shows a new claim code")
+            raise ConfigError("the agent was un-paired; `python -m device_agent run` shows a new claim code")
         after = factory.pairing_of(responses.read(found, responses.Claimed))
         if after.serial < before.serial:
-            raise HomeError(
+            raise ConfigError(
                 f"the server's newest key is number {after.serial}, older than number {before.serial}, which is "
                 "pinned: it is another server, or one put back to an old state. If you trust it, un-pair the agent "
                 "there and claim it again"
@@ -355,7 +355,7 @@ def _devices(options: argparse.Namespace) -> int:
     try:
         for device in home.configuration().devices:
             print(f"device  {device.name}: {device.type}, {device.driver or catalogue.type_of(device).driver}")
-    except HomeError as error:
+    except ConfigError as error:
         print(error)
     for name in catalogue.TYPES.folders():
         print(f"type    {name}: {catalogue.TYPES.load(name).label}")
@@ -388,11 +388,11 @@ def _import_model(options: argparse.Namespace) -> int:
     try:
         folder = adopt(options.model, options.name, options.into, without=options.without)
     except AdoptError as error:
-        raise HomeError(str(error)) from error
+        raise ConfigError(str(error)) from error
     print(f"made {folder.resolve()}; look at what its robot.toml calls guessed")
     try:
         bootstrap.try_type(folder)
-    except (HomeError, DriverError, GeometryError) as error:
+    except (ConfigError, DriverError, GeometryError) as error:
         print(f"it does not run yet: {error}", file=sys.stderr)
         return _EXIT_FAILED
     print(f"it runs; name {folder.resolve().parent} in {catalogue.ROBOTS_PATH} to use it")

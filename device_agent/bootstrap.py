@@ -7,32 +7,32 @@ from pathlib import Path
 import msgspec
 
 from device_agent import drivers, geometry, sensors
-from device_agent.config.agent_config import Configuration, DeviceEntry, Home, HomeError, Pairing
+from device_agent.config.agent_config import ConfigError, Configuration, DeviceEntry, Home, Pairing
 from device_agent.config.catalogue import ROBOTS, ROOMS, TYPES, enrolled_devices, room_device_of, type_of
 from device_agent.config.client_certificate import OwnCertificate
 from device_agent.ports.clock import CloudClock, tick_ms, wall_ms
 from device_agent.ports.driver import Driver, DriverError
-from device_agent.ports.floor_map import Ground
-from device_agent.ports.geometry import Geometry, GeometryError
-from device_agent.ports.sandbox import Jail
+from device_agent.ports.floor_map import ObstacleMap
+from device_agent.ports.geometry import GeometryError, RobotGeometry
+from device_agent.ports.sandbox import Sandbox
 from device_agent.ports.sensor import RoomDriver, SensorError, Surroundings
 from device_agent.ports.transport import Transport
 from device_agent.ports.uploads import Uploads
 from device_agent.protocol import topics
 from device_agent.protocol.manifests.robot_type import RobotType
 from device_agent.runtime.agent import Agent
-from device_agent.runtime.commands.pinned_keys import Pins
+from device_agent.runtime.commands.pinned_keys import PinnedKeys
 from device_agent.runtime.device import Device
-from device_agent.runtime.readings import Room
-from device_agent.runtime.room.room_device import Instrument
+from device_agent.runtime.readings import ReadingCache
+from device_agent.runtime.room.room_device import RoomDevice
 from device_agent.runtime.storage.journal import Journal
-from device_agent.runtime.storage.outbox_store import Shelf
-from device_agent.runtime.telemetry.latency_probe import RoundTrips
+from device_agent.runtime.storage.outbox_store import OutboxStore
+from device_agent.runtime.telemetry.latency_probe import LatencyProbe
 from device_agent.runtime.telemetry.outbox import Outbox, Publish
-from device_agent.sandbox.host import WarmJail
+from device_agent.sandbox.host import SandboxHost
 from device_agent.speech import Espeak
 from device_agent.transports import factory
-from device_agent.transports.http.client import CloudApi
+from device_agent.transports.http.client import CloudClient
 from device_agent.transports.http.latency_reports import HttpLatencies
 from device_agent.transports.http.uploads import HttpUploads
 
@@ -40,7 +40,7 @@ from device_agent.transports.http.uploads import HttpUploads
 class Cell:
     """A running agent and what must be closed with it."""
 
-    def __init__(self, agent: Agent, journal: Journal, membership: factory.Membership, jail: Jail) -> None:
+    def __init__(self, agent: Agent, journal: Journal, membership: factory.PairingMonitor, jail: Sandbox) -> None:
         self._agent = agent
         self._jail = jail
         self._journal = journal
@@ -88,7 +88,7 @@ def _folder(kind: RobotType) -> Path:
     return TYPES.folders().get(kind.type, ROBOTS / kind.type)
 
 
-def geometry_of(entry: DeviceEntry, kind: RobotType) -> Geometry | None:
+def geometry_of(entry: DeviceEntry, kind: RobotType) -> RobotGeometry | None:
     """The shape of a configured device in the scene or room that it stands in.
 
     Raises:
@@ -100,7 +100,7 @@ def geometry_of(entry: DeviceEntry, kind: RobotType) -> Geometry | None:
         room = ROOMS.load(entry.room)
         robot = room.robot(entry.name)
         if robot is not None and room.model:
-            standing = geometry.Standing(
+            standing = geometry.BasePose(
                 room=ROOMS.folder(room.room) / room.model, position_m=robot.position_m, yaw_rad=robot.yaw_rad
             )
     return geometry.load(kind, _folder(kind), scene=scene, standing=standing)
@@ -137,7 +137,7 @@ def instrument_of(
     uploads: Uploads | None = None,
     *,
     faults: Path | None = None,
-) -> Instrument | None:
+) -> RoomDevice | None:
     """A configured device as a room's, not connected; ``None`` where it is a robot.
 
     Args:
@@ -159,9 +159,9 @@ def instrument_of(
     manifest = msgspec.structs.replace(device, label=entry.label or device.label, driver=driver, options=options)
     try:
         made = sensors.load(driver)(manifest, ROOMS.folder(entry.room), _surroundings(entry.room, neighbours))
-        return Instrument(made, manifest, uploads)
+        return RoomDevice(made, manifest, uploads)
     except SensorError as error:
-        raise HomeError(str(error)) from error
+        raise ConfigError(str(error)) from error
 
 
 def _surroundings(room: str, neighbours: Mapping[str, RoomDriver]) -> Surroundings:
@@ -172,16 +172,16 @@ def _surroundings(room: str, neighbours: Mapping[str, RoomDriver]) -> Surroundin
     try:
         return Surroundings(neighbours=neighbours, world=world_registry.of(ROOMS.folder(room)))
     except DriverError as error:
-        raise HomeError(str(error)) from error
+        raise ConfigError(str(error)) from error
 
 
-def api_of(home: Home, configuration: Configuration, clock: CloudClock, *, create: bool = False) -> CloudApi:
+def api_of(home: Home, configuration: Configuration, clock: CloudClock, *, create: bool = False) -> CloudClient:
     """The agent's view of the HTTP API.
 
     Raises:
         HomeError: There is no identity.
     """
-    return CloudApi(configuration.server, home.identity(create=create), clock, ca=home.authority(configuration))
+    return CloudClient(configuration.server, home.identity(create=create), clock, ca=home.authority(configuration))
 
 
 def build(home: Home, *, trace: Path | None = None) -> Cell:
@@ -199,14 +199,14 @@ def build(home: Home, *, trace: Path | None = None) -> Cell:
     configuration = home.configuration()
     pairing = home.pairing()
     if pairing is None:
-        raise HomeError(f"{home.folder} is not paired; run `python -m device_agent enroll` and redeem its claim code")
+        raise ConfigError(f"{home.folder} is not paired; run `python -m device_agent enroll` and redeem its claim code")
     clock = CloudClock()
     journal = Journal(home.journal)
     journal.open(now_ms=wall_ms())
     journal.end_open(now_ms=wall_ms(), tick_ms=tick_ms())
-    pins = Pins(pairing, save=home.save_pairing, now_ms=clock.now_ms)
-    membership = factory.Membership(pairing, configuration, enrolled_devices(configuration), pins)
-    room = Room(
+    pins = PinnedKeys(pairing, save=home.save_pairing, now_ms=clock.now_ms)
+    membership = factory.PairingMonitor(pairing, configuration, enrolled_devices(configuration), pins)
+    room = ReadingCache(
         space=pairing.space,
         agent=pairing.agent,
         own=[entry.name for entry in configuration.devices],
@@ -224,9 +224,11 @@ def build(home: Home, *, trace: Path | None = None) -> Cell:
         listen=room.topics(),
     )
     latencies = HttpLatencies(pairing.agent, _carrier(configuration), wiring.open_api)
-    transport = RoundTrips(factory.make(wiring), tell=latencies.tell, at_ms=lambda: round(clock.now_ms() or wall_ms()))
+    transport = LatencyProbe(
+        factory.make(wiring), tell=latencies.tell, at_ms=lambda: round(clock.now_ms() or wall_ms())
+    )
     outbox = _outbox(home, configuration, pairing, publish=transport.publish, quiet=lambda: agent.quiet)
-    jail = WarmJail(trusted=configuration.trusted_scripts)
+    jail = SandboxHost(trusted=configuration.trusted_scripts)
     uploads = HttpUploads(pairing.agent, lambda: api_of(home, configuration, clock))
     devices: dict[str, Device] = {}
     neighbours: dict[str, RoomDriver] = {}
@@ -268,7 +270,7 @@ def _own_streams(configuration: Configuration) -> Iterator[tuple[str, str]]:
             yield entry.name, stream.name
 
 
-def _ground(neighbours: Mapping[str, RoomDriver]) -> Ground | None:
+def _ground(neighbours: Mapping[str, RoomDriver]) -> ObstacleMap | None:
     """What stands in the room, where a device of this agent sees it now."""
     from device_agent.sensors.perception.driver import PerceptionDriver  # noqa: PLC0415 (for who goes somewhere only)
 
@@ -289,7 +291,7 @@ def _outbox(
 ) -> Outbox:
     own = f"{topics.ROOT}/{pairing.space}/{pairing.agent}/"
     buffer = configuration.buffer
-    shelf = Shelf(
+    shelf = OutboxStore(
         home.outbox, own=own, max_bytes=round(buffer.max_mb * 1e6), max_age_ms=round(buffer.max_age_h * 3_600_000)
     )
     teller = own + configuration.devices[0].name
@@ -302,15 +304,15 @@ def _device(
     entry: DeviceEntry,
     pairing: Pairing,
     *,
-    pins: Pins,
-    instrument: Instrument | None,
-    ground: Callable[[], Ground | None] | None,
+    pins: PinnedKeys,
+    instrument: RoomDevice | None,
+    ground: Callable[[], ObstacleMap | None] | None,
     journal: Journal,
     clock: CloudClock,
     transport: Transport,
     outbox: Outbox,
-    room: Room,
-    jail: Jail,
+    room: ReadingCache,
+    jail: Sandbox,
     trace: Path | None,
     faults: Path,
     uploads: Uploads,
@@ -339,8 +341,8 @@ def _device(
     )
 
 
-def _geometry(entry: DeviceEntry, kind: RobotType) -> Geometry | None:
+def _geometry(entry: DeviceEntry, kind: RobotType) -> RobotGeometry | None:
     try:
         return geometry_of(entry, kind)
     except GeometryError as error:
-        raise HomeError(str(error)) from error
+        raise ConfigError(str(error)) from error

@@ -22,7 +22,7 @@ from function_app.ports.command_feed import Orders
 from function_app.ports.device_feed import Feed, Telemetry
 from function_app.ports.signing_keys import Keys
 from function_app.ports.tables import Tables
-from function_app.ports.xmpp_connection import XmppLine
+from function_app.ports.xmpp_connection import XmppConnection
 from function_app.services.accounts.api_keys import ApiKeys
 from function_app.services.accounts.oidc_sign_in import OpenIdSignIn
 from function_app.services.accounts.passwords import Passwords
@@ -35,58 +35,58 @@ from function_app.services.actions.queue import Queues
 from function_app.services.actions.start import StartAction
 from function_app.services.actions.start_many import StartOnMany
 from function_app.services.actions.stop import StopDevices
-from function_app.services.audit.audit_log import AuditChain
-from function_app.services.audit.audit_reader import AuditTrail
-from function_app.services.control.control_events import Audit
+from function_app.services.audit.audit_log import AuditLog
+from function_app.services.audit.audit_reader import AuditReader
+from function_app.services.control.control_events import ControlEvents
 from function_app.services.control.control_requests import Handovers
-from function_app.services.control.fencing import Fence
+from function_app.services.control.fencing import ControlRevocation
 from function_app.services.control.lease_store import LeaseRows
 from function_app.services.control.leases import Leases
 from function_app.services.control.mqtt_credentials import MqttCredentials
 from function_app.services.devices.device_access import Devices
 from function_app.services.devices.rename import Rename
 from function_app.services.devices.spaces import Spaces
-from function_app.services.devices.viewers import Watchers
+from function_app.services.devices.viewers import Viewers
 from function_app.services.health.diagnostics import Diagnostics
 from function_app.services.health.faults import Faults
-from function_app.services.health.reported_faults import Conditions
+from function_app.services.health.reported_faults import ReportedFaults
 from function_app.services.identity.authenticator import Identify
 from function_app.services.identity.guess_limiter import Attempts
 from function_app.services.identity.rate_limiter import Limits
 from function_app.services.identity.sessions import Sessions
 from function_app.services.identity.sign_in import SignIn
 from function_app.services.maintenance.readiness import CheckHealth
-from function_app.services.maintenance.scheduler import Sweep
-from function_app.services.messaging.broker_relay import Relay
+from function_app.services.maintenance.scheduler import Scheduler
+from function_app.services.messaging.broker_relay import BrokerRelay
 from function_app.services.messaging.command_sender import Commands
 from function_app.services.messaging.delivery import Delivery
-from function_app.services.messaging.key_announcer import TellKeys
+from function_app.services.messaging.key_announcer import KeyAnnouncer
 from function_app.services.messaging.mailbox import Mailbox
 from function_app.services.messaging.polling import Polling
 from function_app.services.messaging.presence import PresenceIngest
 from function_app.services.messaging.xmpp_credentials import XmppAccess
-from function_app.services.pairing.agent_certificates import Certify
+from function_app.services.pairing.agent_certificates import AgentCertificates
 from function_app.services.pairing.claim import Claim
 from function_app.services.pairing.enroll import Enroll
-from function_app.services.pairing.offboarding import Leave
+from function_app.services.pairing.offboarding import Offboarding
 from function_app.services.pairing.unpair import Unpair
 from function_app.services.robot_types.catalogue import RobotTypes
-from function_app.services.robot_types.cleanup import TendRobotTypes
+from function_app.services.robot_types.cleanup import RobotTypeCleanup
 from function_app.services.robot_types.delete import DeleteRobotType
-from function_app.services.robot_types.integrity import Seals
+from function_app.services.robot_types.integrity import IntegritySeals
 from function_app.services.robot_types.model_validation import ModelChecks
 from function_app.services.robot_types.movements import Movements
-from function_app.services.robot_types.preview import LookAtRobotType
+from function_app.services.robot_types.preview import RobotTypePreview
 from function_app.services.robot_types.upload import UploadRobotType
 from function_app.services.robot_types.versions import TypeVersions
-from function_app.services.sharing.access_revocation import Unshare
+from function_app.services.sharing.access_revocation import AccessRevocation
 from function_app.services.sharing.invitations import Invitations
 from function_app.services.sharing.ownership_transfer import Transfer
 from function_app.services.sharing.shares import Sharing
-from function_app.services.storage.reminders import Pending
-from function_app.services.storage.retention import DAY_MS, Forget
+from function_app.services.storage.reminders import Reminders
+from function_app.services.storage.retention import DAY_MS, Retention
 from function_app.services.telemetry.event_log import Events
-from function_app.services.telemetry.ingest import Intake
+from function_app.services.telemetry.ingest import TelemetryIngest
 from function_app.services.telemetry.latency import Latencies
 from function_app.services.telemetry.series_reader import SeriesReader
 from function_app.services.telemetry.series_writer import SeriesWriter
@@ -110,7 +110,7 @@ class Functions:
     late: Telemetry
     access: BrokerAccess
     certificates: Certificates
-    certify: Certify
+    certify: AgentCertificates
     keys: Keys
     clock: Clock
     identify: Identify
@@ -124,7 +124,7 @@ class Functions:
     claim: Claim
     unpair: Unpair
     rename: Rename
-    watchers: Watchers
+    watchers: Viewers
     devices: Devices
     spaces: Spaces
     sharing: Sharing
@@ -133,7 +133,7 @@ class Functions:
     handovers: Handovers
     robot_types: RobotTypes
     upload_robot_type: UploadRobotType
-    look_at_robot_type: LookAtRobotType
+    look_at_robot_type: RobotTypePreview
     delete_robot_type: DeleteRobotType
     model_checks: ModelChecks
     movements: Movements
@@ -148,21 +148,21 @@ class Functions:
     presence: PresenceIngest
     polling: Polling
     mailbox: Mailbox
-    relay: Relay
-    forget: Forget
+    relay: BrokerRelay
+    forget: Retention
     events: Events
     faults: Faults
-    conditions: Conditions
+    conditions: ReportedFaults
     diagnostics: Diagnostics
     latencies: Latencies
-    intake: Intake
+    intake: TelemetryIngest
     uploads: Uploads
     transfers: Transfers | None
     series: SeriesReader
-    chain: AuditChain
-    trail: AuditTrail
+    chain: AuditLog
+    trail: AuditReader
     limits: Limits
-    sweep: Sweep
+    sweep: Scheduler
     health: CheckHealth
 
     async def close(self) -> None:
@@ -193,12 +193,12 @@ def build(settings: Settings, *, clock: Clock | None = None) -> Functions:
     bus = factory.bus(settings, access)
     feed, telemetry, late = factory.feeds(settings, access)
 
-    forget = Forget(tables=tables, blobs=blobs)
-    pending = Pending(tables=tables)
-    chain = AuditChain(tables=tables, blobs=blobs, keys=keys, forget=forget, pending=pending, clock=now)
+    forget = Retention(tables=tables, blobs=blobs)
+    pending = Reminders(tables=tables)
+    chain = AuditLog(tables=tables, blobs=blobs, keys=keys, forget=forget, pending=pending, clock=now)
     events = Events(tables=tables, forget=forget, clock=now)
     faults = Faults(tables=tables, events=events, forget=forget, clock=now)
-    conditions = Conditions(tables=tables, faults=faults, clock=now)
+    conditions = ReportedFaults(tables=tables, faults=faults, clock=now)
     identify = Identify(tables=tables, keys=keys, forget=forget, clock=now)
     sessions = Sessions(tables=tables, identify=identify, forget=forget, chain=chain, clock=now)
     sign_in = SignIn(tables=tables, sessions=sessions, chain=chain, clock=now)
@@ -209,24 +209,24 @@ def build(settings: Settings, *, clock: Clock | None = None) -> Functions:
     writer = SeriesWriter(tables=tables, forget=forget, keep=keep, clock=now)
     uploads = Uploads(tables=tables, blobs=blobs, keep_ms=settings.keep_uploads_days * DAY_MS, clock=now)
     mailbox = Mailbox(tables=tables, forget=forget, clock=now)
-    relay = Relay(bus=bus, clock=now)
+    relay = BrokerRelay(bus=bus, clock=now)
     delivery = Delivery(bus=bus, mailbox=mailbox, relay=relay)
     commands = Commands(delivery=delivery, keys=keys, clock=now)
-    robot_types = RobotTypes(tables=tables, blobs=blobs, catalogue=catalogue, seals=Seals(keys=keys))
+    robot_types = RobotTypes(tables=tables, blobs=blobs, catalogue=catalogue, seals=IntegritySeals(keys=keys))
     versions = TypeVersions(tables=tables, blobs=blobs, clock=now)
     upload_robot_type = UploadRobotType(
         tables=tables,
         versions=versions,
         catalogue=catalogue,
         robot_types=robot_types,
-        seals=Seals(keys=keys),
+        seals=IntegritySeals(keys=keys),
         chain=chain,
         clock=now,
     )
     diagnostics = Diagnostics(
         tables=tables, devices=devices, faults=faults, robot_types=robot_types, spaces=spaces, clock=now
     )
-    intake = Intake(tables=tables, writer=writer, clock=now, observers=(diagnostics.observe,))
+    intake = TelemetryIngest(tables=tables, writer=writer, clock=now, observers=(diagnostics.observe,))
     movements = Movements(
         tables=tables,
         blobs=blobs,
@@ -238,9 +238,9 @@ def build(settings: Settings, *, clock: Clock | None = None) -> Functions:
         clock=now,
     )
     rows = ActionRows(tables=tables)
-    audit = Audit(tables=tables, events=events, chain=chain, pending=pending, clock=now)
+    audit = ControlEvents(tables=tables, events=events, chain=chain, pending=pending, clock=now)
     lease_rows = LeaseRows(tables=tables, audit=audit, clock=now)
-    fence = Fence(tables=tables, commands=commands, access=access, clock=now)
+    fence = ControlRevocation(tables=tables, commands=commands, access=access, clock=now)
     leases = Leases(
         tables=tables,
         devices=devices,
@@ -273,7 +273,7 @@ def build(settings: Settings, *, clock: Clock | None = None) -> Functions:
     )
     sending = SendAction(tables=tables, devices=devices, rows=rows, commands=commands, movements=movements, clock=now)
     queues = Queues(tables=tables, devices=devices, rows=rows, pending=pending, sending=sending, audit=audit, clock=now)
-    leave = Leave(
+    leave = Offboarding(
         tables=tables,
         rows=rows,
         queues=queues,
@@ -292,7 +292,7 @@ def build(settings: Settings, *, clock: Clock | None = None) -> Functions:
         devices=devices,
         spaces=spaces,
         sign_in=sign_in,
-        unshare=Unshare(
+        unshare=AccessRevocation(
             tables=tables,
             devices=devices,
             rows=rows,
@@ -342,7 +342,7 @@ def build(settings: Settings, *, clock: Clock | None = None) -> Functions:
         late=late,
         access=access,
         certificates=factory.certificates(settings),
-        certify=Certify(certificates=factory.certificates(settings)),
+        certify=AgentCertificates(certificates=factory.certificates(settings)),
         keys=keys,
         clock=now,
         identify=identify,
@@ -375,7 +375,7 @@ def build(settings: Settings, *, clock: Clock | None = None) -> Functions:
         claim=Claim(tables=tables, sign_in=sign_in, attempts=attempts, leave=leave, chain=chain, clock=now),
         unpair=Unpair(tables=tables, sign_in=sign_in, leave=leave, chain=chain),
         rename=Rename(tables=tables, devices=devices, chain=chain),
-        watchers=Watchers(tables=tables, devices=devices, forget=forget, clock=now),
+        watchers=Viewers(tables=tables, devices=devices, forget=forget, clock=now),
         devices=devices,
         spaces=spaces,
         sharing=sharing,
@@ -392,14 +392,14 @@ def build(settings: Settings, *, clock: Clock | None = None) -> Functions:
         ),
         robot_types=robot_types,
         upload_robot_type=upload_robot_type,
-        look_at_robot_type=LookAtRobotType(
+        look_at_robot_type=RobotTypePreview(
             tables=tables,
             blobs=blobs,
             versions=versions,
             catalogue=catalogue,
             robot_types=robot_types,
             upload=upload_robot_type,
-            seals=Seals(keys=keys),
+            seals=IntegritySeals(keys=keys),
             clock=now,
         ),
         delete_robot_type=DeleteRobotType(
@@ -440,7 +440,7 @@ def build(settings: Settings, *, clock: Clock | None = None) -> Functions:
             tables=tables,
             events=events,
             conditions=conditions,
-            keys=TellKeys(keys=keys, commands=commands),
+            keys=KeyAnnouncer(keys=keys, commands=commands),
             clock=now,
         ),
         forget=forget,
@@ -454,7 +454,7 @@ def build(settings: Settings, *, clock: Clock | None = None) -> Functions:
         transfers=blobs if isinstance(blobs, FileBlobs) else None,
         series=SeriesReader(tables=tables, devices=devices, keep=keep, clock=now),
         chain=chain,
-        trail=AuditTrail(tables=tables, blobs=blobs, keys=keys),
+        trail=AuditReader(tables=tables, blobs=blobs, keys=keys),
         limits=Limits(
             per_s={
                 "address": settings.rate_address,
@@ -464,7 +464,7 @@ def build(settings: Settings, *, clock: Clock | None = None) -> Functions:
             },
             clock=now,
         ),
-        sweep=Sweep(
+        sweep=Scheduler(
             tables=tables,
             rows=rows,
             pending=pending,
@@ -482,7 +482,7 @@ def build(settings: Settings, *, clock: Clock | None = None) -> Functions:
             conditions=conditions,
             intake=intake,
             uploads=uploads,
-            robot_types=TendRobotTypes(tables=tables, blobs=blobs, clock=now),
+            robot_types=RobotTypeCleanup(tables=tables, blobs=blobs, clock=now),
             keep_actions_ms=settings.keep_actions_days * DAY_MS,
             clock=now,
         ),
@@ -501,7 +501,7 @@ def _keep(settings: Settings) -> Keep:
     )
 
 
-def xmpp_line(functions: Functions) -> XmppLine:
+def xmpp_line(functions: Functions) -> XmppConnection:
     """The cloud's own connection to the XMPP server, not yet open.
 
     Raises:

@@ -27,7 +27,7 @@ import numpy as np
 
 from device_agent.config import catalogue
 from device_agent.protocol.manifests import robot_type
-from device_agent.simulation.mjcf.equality_joints import Ties
+from device_agent.simulation.mjcf.equality_joints import EqualityJoints
 
 WIDTH, HEIGHT, CAMERA = 800, 600, "picture"
 TILE = 180
@@ -47,7 +47,7 @@ class Studio:
         self.manifest = robot_type.load(folder)
         self.model = mujoco.MjModel.from_xml_path(str(folder / self.manifest.scene))
         self.data = mujoco.MjData(self.model)
-        self._ties = Ties(self.model)
+        self._ties = EqualityJoints(self.model)
         drawing = self.model.vis.global_
         drawing.offwidth, drawing.offheight = max(drawing.offwidth, width), max(drawing.offheight, height)
         self._renderer = mujoco.Renderer(self.model, height, width)

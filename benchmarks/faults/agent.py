@@ -16,8 +16,8 @@ from pathlib import Path
 from typing import Any
 
 from device_agent.protocol import Command
-from device_agent.runtime.actions.executor import Executor
-from device_agent.runtime.control.command_arbiter import Tick
+from device_agent.runtime.actions.executor import ActionExecutor
+from device_agent.runtime.control.command_arbiter import ControlOutput
 from device_agent.runtime.control.controller import Controller
 from tests.faults import agent
 
@@ -34,7 +34,7 @@ def main(*arguments: str) -> int:
 def _tell(path: str) -> None:
     line = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM)
     line.setblocking(False)
-    step, start = Controller.step, Executor.start
+    step, start = Controller.step, ActionExecutor.start
     before: dict[str, list[float]] = {}
     names: dict[int, str] = {}
 
@@ -42,7 +42,7 @@ def _tell(path: str) -> None:
         with contextlib.suppress(OSError):  # nobody listens, or too slowly: the loop must not wait
             line.sendto(text.encode(), path)
 
-    def stepped(controller: Controller, *given: Any, **named: Any) -> Tick:
+    def stepped(controller: Controller, *given: Any, **named: Any) -> ControlOutput:
         tick = step(controller, *given, **named)
         thread = threading.current_thread().name
         if thread.endswith("-loop"):  # who brings something may begin a period as well
@@ -58,12 +58,12 @@ def _tell(path: str) -> None:
         )
         return tick
 
-    def started(executor: Executor, command: Command, order: Any) -> None:
+    def started(executor: ActionExecutor, command: Command, order: Any) -> None:
         say(f"begun {command.device} {command.id}")
         start(executor, command, order)
 
     Controller.step = stepped  # type: ignore[method-assign,assignment]
-    Executor.start = started  # type: ignore[method-assign,assignment]
+    ActionExecutor.start = started  # type: ignore[method-assign,assignment]
 
 
 def _set_clock_by_signals() -> None:

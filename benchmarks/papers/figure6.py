@@ -14,7 +14,7 @@ from benchmarks.report import Cell, Chart, Claim, Report, Table, percentile
 from benchmarks.stand import PATIENCE_S, PAYLOAD, Caller, Hand, Line, Stand, start
 from device_agent.ports.clock import CloudClock
 from device_agent.protocol.security import signing
-from device_agent.transports.http.client import CloudApi
+from device_agent.transports.http.client import CloudClient
 from tests.harness.network.brokers import HOST
 from tests.harness.network.delay import start_delay
 
@@ -76,7 +76,7 @@ def paths(stand: Stand) -> Iterator[dict[str, Exchange]]:
 
 def _announce(stand: Stand, server: str) -> Exchange:
     """An agent of a room that is paired, as the real one does it: with its own client, and signed by its own key."""
-    api = CloudApi(server, signing.generate(), CloudClock())
+    api = CloudClient(server, signing.generate(), CloudClock())
 
     def announce() -> None:
         api.enroll(name="room", software=f"bench {uuid.uuid4().hex[:8]}", transport="mqtt", devices=_DEVICES)

@@ -6,7 +6,7 @@ from device_agent.drivers import mujoco
 from device_agent.ports.clock import tick_ms, wall_ms
 from device_agent.protocol import JointTarget, JointTelemetry, Mode, Setpoint, codec
 from device_agent.protocol.manifests import robot_type
-from tests.harness.network.brokers import ROOT
+from tests.harness.paths import ROOT
 
 FOLDER: Final = ROOT / "robots" / "ur5"
 KIND: Final = robot_type.load(FOLDER)

@@ -14,7 +14,8 @@ from benchmarks.report import Cell, Claim, Table
 from benchmarks.scale.ear import Ear, Heard
 from benchmarks.scale.fleet import Fleet, Robot, Told
 from benchmarks.scale.processes import processor_s
-from tests.harness.network.brokers import ROOT, BrokerKind, RunningBroker, start_broker
+from tests.harness.network.brokers import BrokerKind, RunningBroker, start_broker
+from tests.harness.paths import ROOT
 
 ROBOTS: Final = 50
 LATE_MS: Final = 50.0

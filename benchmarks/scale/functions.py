@@ -22,7 +22,7 @@ from benchmarks.scale.askers import Answered, Askers, Request
 from benchmarks.scale.brokers import answer, program
 from benchmarks.scale.processes import processor_s
 from benchmarks.stand import PATIENCE_S, Stand, free_port, peer, start
-from tests.harness.network.brokers import ROOT
+from tests.harness.paths import ROOT
 
 CONNECTIONS: Final = 16
 PROCESSES: Final = (1, 2, 4)

@@ -17,7 +17,7 @@ from benchmarks.scale.agent import DIVIDER, LIGHT, Seen
 from benchmarks.scale.processes import processor_s, resident_mb
 from benchmarks.stand import Stand
 from tests.harness.browser.product import Api
-from tests.harness.network.brokers import ROOT
+from tests.harness.paths import ROOT
 
 Kind = Literal["light", "simulated"]
 PERIOD_MS: Final = 8.0

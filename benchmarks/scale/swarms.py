@@ -23,7 +23,7 @@ from benchmarks.stand import PATIENCE_S, Stand
 from device_agent.load_generator.kinematic_arm import DEVICE
 from device_agent.protocol import topics
 from tests.harness.browser.product import Api
-from tests.harness.network.brokers import ROOT
+from tests.harness.paths import ROOT
 
 QUICK: Final = ((100, 5.0, 0.02),)
 WHOLE: Final = ((100, 5.0, 0.02), (300, 5.0, 0.02), (1000, 2.0, 0.07))

@@ -14,7 +14,7 @@ from benchmarks.stand import LEASE_MS, PATIENCE_S, Line, Stand
 from device_agent.protocol import JointTarget, JointTelemetry, Setpoint, codec
 from device_agent.protocol.manifests import robot_type
 from tests.harness.browser.product import Api
-from tests.harness.network.brokers import ROOT
+from tests.harness.paths import ROOT
 
 _MOVEMENTS: Final = {"nao": "wave", "qbo": "look_around", "hanson": "look_around"}
 _STOPPED: Final = "hanson"

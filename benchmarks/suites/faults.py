@@ -10,7 +10,8 @@ from benchmarks.faults.rounds import Found, Rounds
 from benchmarks.faults.stops import CALL, MESSAGE, SPEEDS, Stopped, Stops, series
 from benchmarks.report import Cell, Chart, Claim, Report, Table, percentile
 from device_agent.protocol.manifests import robot_type
-from tests.harness.network.brokers import BROKERS, ROOT
+from tests.harness.network.brokers import BROKERS
+from tests.harness.paths import ROOT
 
 _STOP_MOST_MS: Final = 10.0
 _WATCHDOG_MOST_MS: Final = 350.0

@@ -41,7 +41,7 @@ SERVER_CA = "server-ca.pem"
 _log = logging.getLogger(__name__)
 
 
-class HomeError(Exception):
+class ConfigError(Exception):
     """The folder is not usable; the text says which file and what to do."""
 
 
@@ -181,11 +181,11 @@ class Home:
             _close_to_others(path)
             key = serialization.load_pem_private_key(path.read_bytes(), None)  # type: ignore[assignment]
         except FileNotFoundError as error:
-            raise HomeError(f"{self.folder} holds no agent; run `python -m device_agent enroll` first") from error
+            raise ConfigError(f"{self.folder} holds no agent; run `python -m device_agent enroll` first") from error
         except (OSError, ValueError) as error:
-            raise HomeError(f"{path} cannot be read as a private key: {error}") from error
+            raise ConfigError(f"{path} cannot be read as a private key: {error}") from error
         if not isinstance(key, Ed25519PrivateKey):
-            raise HomeError(f"{path} is not an Ed25519 key")
+            raise ConfigError(f"{path} is not an Ed25519 key")
         return key
 
     def configuration(self) -> Configuration:
@@ -199,22 +199,24 @@ class Home:
             raw = tomllib.loads(path.read_text(encoding="utf-8"))
             found = msgspec.convert(raw, Configuration)
         except FileNotFoundError as error:
-            raise HomeError(f"{path} is missing; run `python -m device_agent enroll` first") from error
+            raise ConfigError(f"{path} is missing; run `python -m device_agent enroll` first") from error
         except (OSError, tomllib.TOMLDecodeError, msgspec.ValidationError, UnicodeDecodeError) as error:
-            raise HomeError(f"{path}: {error}") from error
+            raise ConfigError(f"{path}: {error}") from error
         names = [device.name for device in found.devices]
         if not names or len(set(names)) != len(names):
-            raise HomeError(f"{path}: needs at least one device, each with a name of its own")
+            raise ConfigError(f"{path}: needs at least one device, each with a name of its own")
         for source, _ in found.sources:
             if source not in names and "-" not in source:
-                raise HomeError(
+                raise ConfigError(
                     f"{path}: '{source}' is no device of this agent ({', '.join(names)}); "
                     "name one of another agent by its id, as the console shows it"
                 )
         for device in found.devices:
             rules = [rule.name for rule in device.interlocks]
             if len(set(rules)) != len(rules):
-                raise HomeError(f"{path}: two interlocks of '{device.name}' have the same device, stream and condition")
+                raise ConfigError(
+                    f"{path}: two interlocks of '{device.name}' have the same device, stream and condition"
+                )
         return found
 
     def save_configuration(self, configuration: Configuration) -> None:
@@ -253,7 +255,7 @@ class Home:
             return None
         path = self.folder / configuration.ca
         if not path.is_file():
-            raise HomeError(f"{path} is not there, which agent.toml names as `ca`; give it again with `enroll --ca`")
+            raise ConfigError(f"{path} is not there, which agent.toml names as `ca`; give it again with `enroll --ca`")
         return path
 
     def pin_authority(self, given: Path) -> str:
@@ -266,7 +268,7 @@ class Home:
             content = given.read_bytes()
             ssl.create_default_context(cadata=content.decode())
         except (OSError, ValueError) as error:
-            raise HomeError(f"--ca: {given} cannot be read as a certificate: {error}") from error
+            raise ConfigError(f"--ca: {given} cannot be read as a certificate: {error}") from error
         write(self.folder / SERVER_CA, content)
         return SERVER_CA
 
@@ -283,7 +285,7 @@ class Home:
         except FileNotFoundError:
             return None
         except (OSError, msgspec.DecodeError, UnicodeDecodeError, RecursionError, ProtocolError) as error:
-            raise HomeError(f"{path}: {error}; delete it and enroll again") from error
+            raise ConfigError(f"{path}: {error}; delete it and enroll again") from error
         return found
 
     def save_pairing(self, pairing: Pairing | None) -> None:
@@ -304,7 +306,7 @@ class Home:
             HomeError: Another process runs it, or there is no agent.
         """
         if not self.folder.is_dir():
-            raise HomeError(f"{self.folder} holds no agent; run `python -m device_agent enroll` first")
+            raise ConfigError(f"{self.folder} holds no agent; run `python -m device_agent enroll` first")
         path = self.folder / "running.lock"
         with contextlib.ExitStack() as holding:
             try:
@@ -312,8 +314,10 @@ class Home:
                 lock.execute("BEGIN EXCLUSIVE")
             except sqlite3.Error as error:
                 if "locked" in str(error):
-                    raise HomeError(f"another process runs the agent of {self.folder} already; end it first") from error
-                raise HomeError(f"{path} cannot be written: {error}") from error
+                    raise ConfigError(
+                        f"another process runs the agent of {self.folder} already; end it first"
+                    ) from error
+                raise ConfigError(f"{path} cannot be written: {error}") from error
             yield
 
 
@@ -332,7 +336,7 @@ def write(path: Path, content: bytes) -> None:
             os.fsync(file.fileno())
         Path(temporary).replace(path)
     except OSError as error:
-        raise HomeError(f"{path} cannot be written: {error.strerror}") from error
+        raise ConfigError(f"{path} cannot be written: {error.strerror}") from error
 
 
 def _close_to_others(path: Path) -> None:

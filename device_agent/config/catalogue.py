@@ -6,11 +6,11 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Generic, TypeVar
 
-from device_agent.config.agent_config import Configuration, DeviceEntry, HomeError
+from device_agent.config.agent_config import ConfigError, Configuration, DeviceEntry
 from device_agent.protocol.errors import ProtocolError
 from device_agent.protocol.manifests import robot_type, room
 
-ROBOTS = Path(__file__).resolve().parent.parent / "robots"
+ROBOTS = Path(__file__).resolve().parents[2] / "robots"
 ROBOTS_PATH = "TELESCOPE_ROBOTS_PATH"
 """Environment: folders of other people's robot types, separated as those of ``PATH``."""
 
@@ -47,7 +47,7 @@ class Catalogue(Generic[Manifest]):
         """
         known = self.folders()
         if name not in known:
-            raise HomeError(
+            raise ConfigError(
                 f"no {self.what} '{name}'; there are: {', '.join(known)}. Name the folder that holds yours in "
                 f"{ROBOTS_PATH}, as {self.pattern.replace('*', name)}"
             )
@@ -70,7 +70,7 @@ class Catalogue(Generic[Manifest]):
         try:
             return self.read(folder)
         except ProtocolError as error:
-            raise HomeError(str(error)) from error
+            raise ConfigError(str(error)) from error
 
 
 TYPES = Catalogue(what="robot type", pattern=f"*/{robot_type.MANIFEST}", read=robot_type.load)
@@ -94,14 +94,14 @@ def type_of(entry: DeviceEntry) -> robot_type.RobotType:
     there = ROOMS.load(entry.room)
     device, robot = there.device(entry.name), there.robot(entry.name)
     if device is None and robot is None:
-        raise HomeError(f"room '{entry.room}' has no '{entry.name}'; it has: {', '.join(there.names)}")
+        raise ConfigError(f"room '{entry.room}' has no '{entry.name}'; it has: {', '.join(there.names)}")
     kind = TYPES.load(robot.type) if robot is not None else device.robot_type()  # type: ignore[union-attr]
     if kind.type != entry.type:
-        raise HomeError(f"'{entry.name}' of room '{entry.room}' is a {kind.type}, not a {entry.type}")
+        raise ConfigError(f"'{entry.name}' of room '{entry.room}' is a {kind.type}, not a {entry.type}")
     return kind
 
 
-def room_device_of(entry: DeviceEntry) -> room.RoomDevice | None:
+def room_device_of(entry: DeviceEntry) -> room.RoomDeviceManifest | None:
     """What the room's manifest says of a configured device; ``None`` where it is a robot.
 
     Raises:

@@ -2,14 +2,16 @@
 
 from pathlib import Path
 
-from device_agent.geometry.base_pose import Standing
-from device_agent.ports.geometry import Geometry, GeometryError
+from device_agent.geometry.base_pose import BasePose
+from device_agent.ports.geometry import GeometryError, RobotGeometry
 from device_agent.protocol.manifests.robot_type import RobotType
 
-__all__ = ["Standing", "load"]
+__all__ = ["BasePose", "load"]
 
 
-def load(robot_type: RobotType, folder: Path, *, scene: str = "", standing: Standing | None = None) -> Geometry | None:
+def load(
+    robot_type: RobotType, folder: Path, *, scene: str = "", standing: BasePose | None = None
+) -> RobotGeometry | None:
     """The geometry of a robot type; ``None`` where its manifest names no model.
 
     Args:

@@ -5,7 +5,7 @@ from pathlib import Path
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Standing:
+class BasePose:
     """A room's model, and the place of the robot's origin in it.
 
     Attributes:

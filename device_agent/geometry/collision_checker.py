@@ -10,7 +10,7 @@ import numpy.typing as npt
 from device_agent.geometry.collision_pairs import Pairs
 from device_agent.geometry.dependent_joints import Carried
 from device_agent.ports.geometry import Clearance, Sweep
-from device_agent.simulation.mjcf.equality_joints import Ties
+from device_agent.simulation.mjcf.equality_joints import EqualityJoints
 
 Floats = npt.NDArray[np.float64]
 Ints = npt.NDArray[np.intp]
@@ -40,7 +40,9 @@ class Probe:
         at_rad: Where it begins to look, shape (n,) [rad].
     """
 
-    def __init__(self, model: Any, qpos: Ints, pairs: Pairs, ties: Ties, at_rad: Sequence[float] | Floats) -> None:
+    def __init__(
+        self, model: Any, qpos: Ints, pairs: Pairs, ties: EqualityJoints, at_rad: Sequence[float] | Floats
+    ) -> None:
         self._model = model
         self._qpos = qpos
         self._pairs = pairs

@@ -16,7 +16,7 @@ import numpy.typing as npt
 from device_agent.geometry.lever_arms import Levers
 from device_agent.ports.geometry import Clearance, GeometryError
 from device_agent.protocol.manifests.robot_type import RobotType
-from device_agent.simulation.mjcf.equality_joints import Ties
+from device_agent.simulation.mjcf.equality_joints import EqualityJoints
 
 Floats = npt.NDArray[np.float64]
 Ints = npt.NDArray[np.intp]
@@ -63,7 +63,7 @@ class Pairs:
         frames: dict[str, tuple[bool, int]],
         *,
         base: int,
-        ties: Ties,
+        ties: EqualityJoints,
     ) -> None:
         self._model = model
         self._base = base

@@ -7,7 +7,7 @@ import numpy as np
 import numpy.typing as npt
 
 from device_agent.protocol.manifests.robot_type import RobotType
-from device_agent.simulation.mjcf.equality_joints import Ties
+from device_agent.simulation.mjcf.equality_joints import EqualityJoints
 
 Floats = npt.NDArray[np.float64]
 Ints = npt.NDArray[np.intp]
@@ -30,7 +30,7 @@ class Carried:
         whole: The same of each of the model's degrees of freedom, shape (nv, m): 0 of what the robot does not move.
     """
 
-    def __init__(self, model: Any, robot_type: RobotType, joints: Sequence[int], ties: Ties) -> None:
+    def __init__(self, model: Any, robot_type: RobotType, joints: Sequence[int], ties: EqualityJoints) -> None:
         names = [joint.name for joint in robot_type.joints]
         mirrors = {mirror.joint: mirror for mirror in robot_type.mirrors}
         self.leading: Ints = np.array([index for index, name in enumerate(names) if name not in mirrors], dtype=np.intp)

@@ -8,7 +8,7 @@ import numpy as np
 import numpy.typing as npt
 
 from device_agent.geometry.dependent_joints import Carried
-from device_agent.simulation.mjcf.equality_joints import Ties
+from device_agent.simulation.mjcf.equality_joints import EqualityJoints
 
 Floats = npt.NDArray[np.float64]
 Ints = npt.NDArray[np.intp]
@@ -47,7 +47,7 @@ class Solver:
         frames: Mapping[str, tuple[bool, int]],
         *,
         carried: Carried,
-        ties: Ties,
+        ties: EqualityJoints,
         lower: Floats,
         upper: Floats,
     ) -> None:

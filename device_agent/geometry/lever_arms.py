@@ -7,7 +7,7 @@ import mujoco
 import numpy as np
 import numpy.typing as npt
 
-from device_agent.simulation.mjcf.equality_joints import Ties
+from device_agent.simulation.mjcf.equality_joints import EqualityJoints
 
 Floats = npt.NDArray[np.float64]
 
@@ -28,7 +28,7 @@ class Levers:
         ties: Which joints go with these.
     """
 
-    def __init__(self, model: Any, joints: Sequence[int], ties: Ties) -> None:
+    def __init__(self, model: Any, joints: Sequence[int], ties: EqualityJoints) -> None:
         self._model = model
         tied = [tie.joint for tie in ties.all if tie.joint not in joints]
         self._joints = [*joints, *tied]

@@ -10,7 +10,7 @@ import mujoco
 import numpy as np
 import numpy.typing as npt
 
-from device_agent.geometry.base_pose import Standing
+from device_agent.geometry.base_pose import BasePose
 from device_agent.geometry.collision_checker import Probe
 from device_agent.geometry.collision_pairs import ROOM_PREFIX, Pairs
 from device_agent.geometry.dependent_joints import Carried
@@ -21,7 +21,7 @@ from device_agent.geometry.rrt_planner import Planner
 from device_agent.ports.geometry import Clearance, GeometryError, Sweep, never
 from device_agent.protocol import Pose
 from device_agent.protocol.manifests.robot_type import RobotType
-from device_agent.simulation.mjcf.equality_joints import Ties
+from device_agent.simulation.mjcf.equality_joints import EqualityJoints
 from device_agent.simulation.mjcf.options import agree
 
 Floats = npt.NDArray[np.float64]
@@ -42,7 +42,7 @@ class MujocoGeometry:
             in its home position.
     """
 
-    def __init__(self, robot_type: RobotType, scene: Path, *, standing: Standing | None = None) -> None:
+    def __init__(self, robot_type: RobotType, scene: Path, *, standing: BasePose | None = None) -> None:
         try:
             self._model: Any = _spec(scene, standing).compile()
         except (ValueError, OSError, mujoco.FatalError) as error:
@@ -50,7 +50,7 @@ class MujocoGeometry:
             raise GeometryError(f"{where}: MuJoCo cannot build this model: {error}") from error
         self._lock = threading.Lock()
         self._type = robot_type
-        self._ties = Ties(self._model)
+        self._ties = EqualityJoints(self._model)
         joints = [self._find(mujoco.mjtObj.mjOBJ_JOINT, "joint", joint.name) for joint in robot_type.joints]
         self._qpos = np.array([self._model.jnt_qposadr[joint] for joint in joints], dtype=np.intp)
         self._base = int(self._model.body_rootid[self._model.jnt_bodyid[joints[0]]]) if joints else 0
@@ -203,7 +203,7 @@ class MujocoGeometry:
         return index
 
 
-def _spec(scene: Path, standing: Standing | None) -> Any:
+def _spec(scene: Path, standing: BasePose | None) -> Any:
     """The robot where it stands; a room is put around it, so that the robot's own names stay as they are."""
     robot = mujoco.MjSpec.from_file(str(scene))
     if standing is None:

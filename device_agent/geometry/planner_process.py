@@ -18,7 +18,7 @@ from pathlib import Path
 
 import msgspec
 
-from device_agent.geometry.base_pose import Standing
+from device_agent.geometry.base_pose import BasePose
 from device_agent.ports.geometry import GeometryError, PlannerLostError
 from device_agent.protocol.manifests.robot_type import RobotType
 
@@ -46,7 +46,7 @@ class Site(msgspec.Struct, frozen=True, kw_only=True):
     standing: tuple[str, tuple[float, float, float], float] | None = None
 
     @classmethod
-    def of(cls, robot_type: RobotType, scene: Path, standing: Standing | None) -> "Site":
+    def of(cls, robot_type: RobotType, scene: Path, standing: BasePose | None) -> "Site":
         """As it is handed over."""
         around = None if standing is None else (str(standing.room), standing.position_m, standing.yaw_rad)
         return cls(robot_type=robot_type, scene=str(scene), standing=around)
@@ -57,12 +57,12 @@ class Site(msgspec.Struct, frozen=True, kw_only=True):
         return Path(self.scene)
 
     @property
-    def room(self) -> Standing | None:
+    def room(self) -> BasePose | None:
         """The room, as geometry takes it."""
         if self.standing is None:
             return None
         room, position_m, yaw_rad = self.standing
-        return Standing(room=Path(room), position_m=position_m, yaw_rad=yaw_rad)
+        return BasePose(room=Path(room), position_m=position_m, yaw_rad=yaw_rad)
 
 
 class Order(msgspec.Struct, frozen=True, kw_only=True):
@@ -141,7 +141,7 @@ class _Process:
         with theirs:
             try:
                 self.running = subprocess.Popen(  # noqa: S603 (our own program, run by our own interpreter)
-                    [sys.executable, "-m", __package__],
+                    [sys.executable, "-m", "device_agent.geometry.planner_worker"],
                     stdin=theirs.fileno(),
                     stdout=subprocess.DEVNULL,
                     env=os.environ | {"PYTHONPATH": str(_ROOT)},

@@ -11,7 +11,7 @@ from device_agent.geometry.collision_checker import Probe
 from device_agent.geometry.collision_pairs import Pairs
 from device_agent.geometry.joint_bounds import Bounds
 from device_agent.ports.geometry import GeometryError
-from device_agent.simulation.mjcf.equality_joints import Ties
+from device_agent.simulation.mjcf.equality_joints import EqualityJoints
 
 Floats = npt.NDArray[np.float64]
 Ints = npt.NDArray[np.intp]
@@ -40,7 +40,7 @@ class Planner:
         bounds: Where the joints may be.
     """
 
-    def __init__(self, model: Any, joints: Sequence[int], pairs: Pairs, ties: Ties, bounds: Bounds) -> None:
+    def __init__(self, model: Any, joints: Sequence[int], pairs: Pairs, ties: EqualityJoints, bounds: Bounds) -> None:
         self._model = model
         self._joints = list(joints)
         self._qpos: Ints = np.array([model.jnt_qposadr[joint] for joint in joints], dtype=np.intp)

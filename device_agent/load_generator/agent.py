@@ -7,23 +7,23 @@ from concurrent.futures import Executor
 from device_agent.config.agent_config import Pairing
 from device_agent.load_generator.connection import Dialect, Link, OlderDialect
 from device_agent.load_generator.kinematic_arm import Shape
-from device_agent.load_generator.metrics import Figures
-from device_agent.load_generator.options import Plan
+from device_agent.load_generator.metrics import Metrics
+from device_agent.load_generator.options import LoadOptions
 from device_agent.load_generator.robot import SwarmRobot
 from device_agent.ports.clock import CloudClock, wall_ms
 from device_agent.protocol import Presence, codec, topics
-from device_agent.runtime.commands.pinned_keys import Pins
+from device_agent.runtime.commands.pinned_keys import PinnedKeys
 from device_agent.transports import tls
 from device_agent.transports.backoff import BackOff
 from device_agent.transports.http import responses
-from device_agent.transports.http.client import CloudApi
+from device_agent.transports.http.client import CloudClient
 from device_agent.transports.mqtt import BrokerAccess
 
 SOFTWARE = "telescope-swarm 0.1.0"
 _REFRESH_AT = 0.8
 
 
-class Member:
+class LoadAgent:
     """One agent.
 
     Args:
@@ -39,14 +39,14 @@ class Member:
 
     def __init__(
         self,
-        plan: Plan,
-        api: CloudApi,
+        plan: LoadOptions,
+        api: CloudClient,
         pairing: Pairing,
         shape: Shape,
         *,
         clock: CloudClock,
         dialect: Dialect,
-        figures: Figures,
+        figures: Metrics,
         pool: Executor,
     ) -> None:
         self._plan = plan
@@ -61,7 +61,7 @@ class Member:
         self._robot = SwarmRobot(
             (pairing.space, pairing.agent),
             shape,
-            pins=Pins(pairing, save=lambda _: None, now_ms=clock.now_ms),
+            pins=PinnedKeys(pairing, save=lambda _: None, now_ms=clock.now_ms),
             cloud_ms=clock.now_ms,
             say=self._say,
             now_s=time.monotonic(),

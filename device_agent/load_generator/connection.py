@@ -11,7 +11,7 @@ from typing import Any
 import paho.mqtt.client as mqtt
 from paho.mqtt.enums import CallbackAPIVersion, MQTTProtocolVersion
 
-from device_agent.load_generator.metrics import Figures
+from device_agent.load_generator.metrics import Metrics
 from device_agent.transports.mqtt.transport import KEEP_ALIVE_S, BrokerAccess
 
 ANSWER_WITHIN_S = 10.0
@@ -51,7 +51,7 @@ class Link:
         dialect: Dialect,
         *,
         will: tuple[str, bytes],
-        figures: Figures,
+        figures: Metrics,
         receive: Callable[[str, bytes], None],
     ) -> None:
         self.up = False

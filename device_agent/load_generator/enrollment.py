@@ -13,14 +13,14 @@ from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
 from device_agent.config.agent_config import Pairing
 from device_agent.load_generator.account import Account
 from device_agent.load_generator.kinematic_arm import DEVICE
-from device_agent.load_generator.options import Plan, SwarmError
+from device_agent.load_generator.options import LoadOptions, SwarmError
 from device_agent.ports.clock import CloudClock
 from device_agent.protocol.manifests.robot_type import RobotType
 from device_agent.protocol.security import signing
 from device_agent.transports import factory
 from device_agent.transports.backoff import BackOff
 from device_agent.transports.http import responses
-from device_agent.transports.http.client import CloudApi, CloudError
+from device_agent.transports.http.client import CloudClient, CloudError
 
 T = TypeVar("T")
 _TRIES = 8
@@ -63,7 +63,7 @@ class Keys:
             raise SwarmError(f"{self._path} is no file of a swarm's keys; name another --home") from error
 
 
-class Register:
+class Enrollment:
     """Enrols and claims. Blocks: for the threads of a pool.
 
     Args:
@@ -72,15 +72,15 @@ class Register:
         clock: Learns the cloud's time.
     """
 
-    def __init__(self, plan: Plan, kind: RobotType, clock: CloudClock) -> None:
+    def __init__(self, plan: LoadOptions, kind: RobotType, clock: CloudClock) -> None:
         self._plan = plan
         self._kind = kind
         self._clock = clock
         self._account = Account(plan.cloud, sign_in=plan.sign_in, token=plan.token, ca=plan.ca)
 
-    def api(self, key: Ed25519PrivateKey) -> CloudApi:
+    def api(self, key: Ed25519PrivateKey) -> CloudClient:
         """One agent's view of the HTTP API."""
-        return CloudApi(self._plan.cloud, key, self._clock, ca=self._plan.ca)
+        return CloudClient(self._plan.cloud, key, self._clock, ca=self._plan.ca)
 
     def all(self, keys: list[Ed25519PrivateKey], pool: Executor, tell: Callable[[str], None]) -> list[Pairing]:
         """Every agent, known and claimed.

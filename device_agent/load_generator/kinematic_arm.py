@@ -5,7 +5,7 @@ from collections.abc import Sequence
 
 from device_agent.protocol import Joint, Stream, topics
 from device_agent.protocol.manifests.robot_type import RobotType
-from device_agent.runtime.control.limits import Envelope
+from device_agent.runtime.control.limits import MotionLimits
 
 DEVICE = "arm"
 RANGE_RAD = math.pi
@@ -58,7 +58,7 @@ class Shape:
 
     def __init__(self, kind: RobotType) -> None:
         self.kind = kind
-        self.envelope = Envelope(kind, None)
+        self.envelope = MotionLimits(kind, None)
         self.speeds_rad_s = tuple(joint.max_velocity_rad_s for joint in kind.joints)
 
 

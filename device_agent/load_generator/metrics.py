@@ -36,7 +36,7 @@ class Counts(Struct):
     refused: int = 0
 
 
-class Figures:
+class Metrics:
     """All that is known of a run. Used by the event loop alone, but for ``trouble``.
 
     Attributes:

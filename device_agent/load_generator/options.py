@@ -21,7 +21,7 @@ class SwarmError(Exception):
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Plan:
+class LoadOptions:
     """One run.
 
     Attributes:
@@ -128,13 +128,13 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     )
 
 
-def plan_of(options: argparse.Namespace) -> Plan:
+def plan_of(options: argparse.Namespace) -> LoadOptions:
     """What was asked for, checked.
 
     Raises:
         SwarmError: An option is wrong.
     """
-    plan = Plan(
+    plan = LoadOptions(
         cloud=options.cloud,
         broker=options.broker,
         ca=options.ca,

@@ -16,12 +16,9 @@ from device_agent.protocol import (
     Ack,
     AckStatus,
     ActionState,
-    AskLease,
     CancelAction,
     Command,
     Description,
-    DropRequest,
-    FollowKey,
     GrantLease,
     JointTarget,
     JointTelemetry,
@@ -31,22 +28,25 @@ from device_agent.protocol import (
     OpenRequest,
     Reason,
     ReleaseLease,
+    RequestControl,
     ResetStop,
+    RotateKey,
     Setpoint,
     State,
     Stop,
     StopDevice,
     StopLatch,
+    WithdrawRequest,
     codec,
     topics,
 )
 from device_agent.protocol.errors import ProtocolError, SignatureError
 from device_agent.protocol.security import signing
-from device_agent.runtime.authority.authority import Authority, Tenure
-from device_agent.runtime.authority.control_request import Handover
-from device_agent.runtime.authority.event_recorder import Happened, event_of
+from device_agent.runtime.authority.authority import Authority, Reservation
+from device_agent.runtime.authority.control_request import PendingControlRequest
+from device_agent.runtime.authority.event_recorder import EventRecord, event_of
 from device_agent.runtime.authority.lease_gate import LeaseGate
-from device_agent.runtime.commands.pinned_keys import Pins
+from device_agent.runtime.commands.pinned_keys import PinnedKeys
 from device_agent.runtime.errors import Refused
 
 WATCHDOG_S = 0.3
@@ -67,7 +67,7 @@ class _Run:
     """The action that runs."""
 
     command: str
-    tenure: Tenure
+    tenure: Reservation
 
 
 class SwarmRobot:
@@ -90,7 +90,7 @@ class SwarmRobot:
         address: tuple[str, str],
         shape: Shape,
         *,
-        pins: Pins,
+        pins: PinnedKeys,
         cloud_ms: Callable[[], float | None],
         say: Say,
         now_s: float,
@@ -104,7 +104,7 @@ class SwarmRobot:
         self._now_s = now_s
         self._arm = Arm(shape, now_s)
         self._authority = Authority(LeaseGate(), None, hold=lambda _: self._arm.hold(), tell=self._happened)
-        self._handover = Handover()
+        self._handover = PendingControlRequest()
         self._answers: OrderedDict[str, tuple[int, bytes]] = OrderedDict()
         self._run: _Run | None = None
         self._setpoint: Setpoint | None = None
@@ -211,7 +211,7 @@ class SwarmRobot:
         payload = codec.encode(message, limit=codec.MAX_RETAINED_BYTES)
         self._say(topics.device(*self._address, kind), payload, qos=1, retain=True)
 
-    def _happened(self, happened: Happened) -> None:
+    def _happened(self, happened: EventRecord) -> None:
         self._say(topics.device(*self._address, topics.EVENT), codec.encode(event_of(DEVICE, happened)), qos=1)
 
     def _ack(self, command: str, status: AckStatus, **more: Any) -> None:
@@ -314,17 +314,17 @@ class SwarmRobot:
                 )
             case ReleaseLease():
                 self._authority.release(command.epoch)
-            case AskLease() as asked:
+            case RequestControl() as asked:
                 lease = self._authority.lease(self._now_s)
                 self._handover.ask(asked, epoch=command.epoch, lease=lease, now_s=self._now_s)
-            case DropRequest(request=request):
+            case WithdrawRequest(request=request):
                 self._handover.drop(request)
             case StopDevice(reason=reason):
                 self._authority.stop(StopLatch(by=command.who, reason=reason, at_ms=wall_ms()))
             case ResetStop():
                 self._authority.fence(command.epoch)
                 self._authority.reset_stop()
-            case FollowKey(statements=statements):
+            case RotateKey(statements=statements):
                 self._pins.follow(statements)
             case CancelAction(action=action):
                 self._cancel(action, command.who)

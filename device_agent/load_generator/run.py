@@ -11,12 +11,12 @@ from typing import Any
 
 import msgspec
 
-from device_agent.load_generator.agent import Member
+from device_agent.load_generator.agent import LoadAgent
 from device_agent.load_generator.connection import Dialect
-from device_agent.load_generator.enrollment import Keys, Register
+from device_agent.load_generator.enrollment import Enrollment, Keys
 from device_agent.load_generator.kinematic_arm import Shape, robot_type
-from device_agent.load_generator.metrics import Figures
-from device_agent.load_generator.options import Plan, SwarmError
+from device_agent.load_generator.metrics import Metrics
+from device_agent.load_generator.options import LoadOptions, SwarmError
 from device_agent.ports.clock import CloudClock
 
 _THREADS = 8
@@ -29,7 +29,7 @@ _LOOK_EVERY_S = 1.0
 _END_WITHIN_S = 10.0
 
 
-def run(plan: Plan) -> int:
+def run(plan: LoadOptions) -> int:
     """Run the swarm to its end; the exit code: 0 when every agent was connected at once.
 
     Raises:
@@ -41,16 +41,16 @@ def run(plan: Plan) -> int:
     before_bytes = _memory_bytes()
     clock = CloudClock()
     kind = robot_type(plan.type, plan.joints, plan.rate_hz)
-    register = Register(plan, kind, clock)
+    register = Enrollment(plan, kind, clock)
     with ThreadPoolExecutor(_THREADS, "swarm") as pool:
         keys = Keys(plan.home).first(plan.count)
         pairings = register.all(keys, pool, _tell)
-        figures = Figures(plan.count)
+        figures = Metrics(plan.count)
 
         async def together() -> None:
             shape, dialect = Shape(kind), Dialect()
             members = [
-                Member(
+                LoadAgent(
                     plan, register.api(key), pairing, shape, clock=clock, dialect=dialect, figures=figures, pool=pool
                 )
                 for key, pairing in zip(keys, pairings, strict=True)
@@ -66,7 +66,7 @@ def run(plan: Plan) -> int:
 class _Crowd:
     """All members at once."""
 
-    def __init__(self, plan: Plan, members: Sequence[Member], figures: Figures, before_bytes: int) -> None:
+    def __init__(self, plan: LoadOptions, members: Sequence[LoadAgent], figures: Metrics, before_bytes: int) -> None:
         self._plan = plan
         self._members = members
         self._figures = figures
@@ -160,7 +160,7 @@ def _tell(text: str) -> None:
     print(text, flush=True)  # noqa: T201 (a terminal program prints)
 
 
-def _write(plan: Plan, found: dict[str, Any]) -> None:
+def _write(plan: LoadOptions, found: dict[str, Any]) -> None:
     text = msgspec.json.encode(found).decode()
     _tell(text)
     if plan.json is not None:

@@ -48,7 +48,7 @@ class _View:
 
 
 @dataclass(slots=True)
-class Survey:
+class BackgroundModel:
     """The empty room, by sensor. It is learned with ``look`` and ``settle``, or read from a file."""
 
     _views: dict[str, _View] = field(default_factory=dict)
@@ -109,7 +109,7 @@ class Survey:
         return file.getvalue()
 
     @classmethod
-    def read(cls, content: bytes) -> "Survey":
+    def read(cls, content: bytes) -> "BackgroundModel":
         """A survey from its file.
 
         Raises:
@@ -122,7 +122,7 @@ class Survey:
             raise SurveyError(f"this is no survey of a room ({error}); take a new one") from error
 
     @classmethod
-    def _of(cls, arrays: Mapping[str, Floats]) -> "Survey":
+    def _of(cls, arrays: Mapping[str, Floats]) -> "BackgroundModel":
         sensors = {name.rpartition(".")[0] for name in arrays}
         found = {}
         for sensor in sensors:

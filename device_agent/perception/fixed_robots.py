@@ -67,7 +67,7 @@ class _Side:
 
 
 @dataclass(slots=True)
-class Mounted:
+class FixedRobots:
     """One such robot. Not thread-safe.
 
     Attributes:

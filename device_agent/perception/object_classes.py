@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from msgspec import Struct
 
 
-class Kind(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+class ObjectClass(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """Somebody who stands on the floor and may move.
 
     Attributes:

@@ -9,9 +9,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from device_agent.perception import projection
-from device_agent.perception.background_model import Survey
-from device_agent.perception.fixed_robots import Mounted
-from device_agent.perception.object_classes import Kind, Mount, Place
+from device_agent.perception.background_model import BackgroundModel
+from device_agent.perception.fixed_robots import FixedRobots
+from device_agent.perception.object_classes import Mount, ObjectClass, Place
 from device_agent.perception.occupancy_grid import OccupancyGrid
 from device_agent.perception.tracker import Box, Track, Tracks
 from device_agent.ports.sensor import Image, Scan
@@ -62,7 +62,7 @@ class Zone:
 
 
 @dataclass(slots=True, kw_only=True)
-class Sight:
+class SensorFusion:
     """The room's knowledge. Thread-safe; one thread calls ``see``, any number ask.
 
     Attributes:
@@ -75,14 +75,14 @@ class Sight:
     """
 
     grid: OccupancyGrid
-    survey: Survey
-    kinds: Sequence[Kind]
+    survey: BackgroundModel
+    kinds: Sequence[ObjectClass]
     mounts: Sequence[Mount] = ()
     zones: Sequence[Zone] = ()
     quiet: Sequence[Box] = ()
     inside: Box = (-math.inf, -math.inf, math.inf, math.inf)
     _tracks: Tracks = field(init=False)
-    _mounted: tuple[Mounted, ...] = field(init=False)
+    _mounted: tuple[FixedRobots, ...] = field(init=False)
     _lenses: dict[str, projection.Lens] = field(default_factory=dict, init=False)
     _brightness: dict[str, dict[str, float]] = field(default_factory=dict, init=False)
     _settled_s: float | None = field(default=None, init=False)
@@ -91,7 +91,7 @@ class Sight:
 
     def __post_init__(self) -> None:
         self._tracks = Tracks(self.kinds, self.quiet)
-        self._mounted = tuple(map(Mounted, self.mounts))
+        self._mounted = tuple(map(FixedRobots, self.mounts))
 
     # ------------------------------------------------------------ what sensors saw
 

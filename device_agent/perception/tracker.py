@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from device_agent.perception.clustering import Cluster, group
-from device_agent.perception.object_classes import Kind, Place
+from device_agent.perception.object_classes import ObjectClass, Place
 
 Floats = NDArray[np.float64]
 
@@ -84,7 +84,7 @@ class Track:
     looks: int = 1
     heights: int = 0
     height_m: float = 0.0
-    kind: Kind | None = None
+    kind: ObjectClass | None = None
     number: int = 1
     yaw_rad: float | None = None
 
@@ -183,7 +183,7 @@ class Tracks:
         quiet: Where nobody appears from nothing: what moves there is a door.
     """
 
-    kinds: Sequence[Kind]
+    kinds: Sequence[ObjectClass]
     quiet: Sequence[Box] = ()
     all: list[Track] = field(default_factory=list)
     _began_s: float = field(default=math.inf, init=False)
@@ -316,7 +316,7 @@ class Tracks:
                 track.number = min(set(range(1, len(self.all) + 2)) - taken)
             self.all = [one for one in self.all if one is not before]
 
-    def _strangeness(self, track: Track, kind: Kind, now_s: float) -> float:
+    def _strangeness(self, track: Track, kind: ObjectClass, now_s: float) -> float:
         """How much there is against a track's being of a kind: how high it is, how far from where that was last.
 
         Negative logarithm of how likely it is, but for a constant: whoever was last seen long ago may be anywhere.
@@ -331,7 +331,7 @@ class Tracks:
         away_m = float(np.hypot(*(track.state[:2] - place)))
         return strange + away_m**2 / (2 * spread_m**2) + 2 * math.log(spread_m)
 
-    def _free(self, kind: Kind, now_s: float) -> bool:
+    def _free(self, kind: ObjectClass, now_s: float) -> bool:
         """Whether somebody may be this: one that there is once is not in two places."""
         return kind.several or all(one.kind != kind or now_s - one.seen_s > MISSED_S for one in self.all)
 

@@ -45,7 +45,7 @@ class Driver(Protocol):
     """Makes one kind of robot do what the agent asks.
 
     One thread calls it, the device's control loop, once per ``period_ms``: ``observe`` then ``send`` (see also
-    ``Prompt``). Neither blocks longer than a fraction of the period. The constructor touches neither disk, network nor
+    ``RunsInline``). Neither blocks longer than a fraction of the period. The constructor touches neither disk, network nor
     hardware.
     """
 
@@ -85,7 +85,7 @@ class Driver(Protocol):
 
 
 @runtime_checkable
-class Prompt(Driver, Protocol):
+class RunsInline(Driver, Protocol):
     """A driver whose ``observe``, ``send`` and ``drive`` only look into memory, as of a simulation beside it.
 
     They return within microseconds, and different threads may call them, one at a time: a Stop is then carried out by
@@ -113,7 +113,7 @@ class MobileDriver(Driver, Protocol):
 
 
 @runtime_checkable
-class Reporting(Protocol):
+class ReportsStreams(Protocol):
     """A driver that measures more than joints: what its robot type's ``streams`` name besides ``joints``."""
 
     def report(self, stream: str) -> Mapping[str, float | bool]:
@@ -131,7 +131,7 @@ class Reporting(Protocol):
 
 
 @runtime_checkable
-class Filming(Protocol):
+class HasCameras(Protocol):
     """A driver whose robot has cameras: what its robot type's ``cameras`` name."""
 
     def frame(self, camera: str) -> Frame | None:
@@ -147,7 +147,7 @@ class Filming(Protocol):
 
 
 @runtime_checkable
-class Audible(Driver, Protocol):
+class HasSpeaker(Driver, Protocol):
     """A driver whose robot is heard by others when it speaks: of a simulated robot, by what listens in its room."""
 
     def speaks(self, for_s: float) -> None:

@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 
-class Floor(Protocol):
+class FloorMap(Protocol):
     """Where the middle of something round must not be, in cells. Row 0 is at the lowest y, column 0 at the lowest x."""
 
     @property
@@ -21,12 +21,12 @@ class Floor(Protocol):
         """x, y of the middle of a cell in the room [m]."""
 
 
-class Ground(Protocol):
+class ObstacleMap(Protocol):
     """What stands and goes about in the room, as its sensors see it now. Thread-safe."""
 
     def blocked(
         self, radius_m: float, *, apart: Sequence[tuple[float, float, float]] = (), unknown: bool = True
-    ) -> Floor:
+    ) -> FloorMap:
         """Where something round with this radius would touch what is there.
 
         Args:

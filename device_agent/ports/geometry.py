@@ -58,7 +58,7 @@ class Sweep:
     clearance: Clearance | None = None
 
 
-class Geometry(Protocol):
+class RobotGeometry(Protocol):
     """One robot's shape in the scene it stands in. Thread-safe; joint positions are in the robot type's order [rad]."""
 
     @property

@@ -24,7 +24,7 @@ class Limits:
 
 
 @dataclass(frozen=True, slots=True)
-class Standing:
+class SandboxStatus:
     """How scripts run on this machine.
 
     Attributes:
@@ -36,7 +36,7 @@ class Standing:
     why: str = ""
 
 
-class Inmate(Protocol):
+class SandboxProcess(Protocol):
     """The locked process of one script.
 
     Attributes:
@@ -58,13 +58,13 @@ class Inmate(Protocol):
         """Kill it, see it dead, and let go of it. May be called twice."""
 
 
-class Jail(Protocol):
+class Sandbox(Protocol):
     """Makes inmates. Thread-safe; the constructor starts nothing."""
 
     def start(self) -> None:
         """Look what this machine has, and be ready. May be called twice. Never raises: ``refusal`` tells."""
 
-    def standing(self) -> Standing:
+    def standing(self) -> SandboxStatus:
         """How scripts of the robot's own people run here."""
 
     def refusal(self, *, stranger: bool) -> str | None:
@@ -74,7 +74,7 @@ class Jail(Protocol):
             stranger: Whether it is a script of an unknown owner, which needs one wall more.
         """
 
-    def open(self, limits: Limits, *, stranger: bool) -> Inmate:
+    def open(self, limits: Limits, *, stranger: bool) -> SandboxProcess:
         """A new locked process, which waits for its script.
 
         Raises:

@@ -33,7 +33,7 @@ class ReleaseLease(_Order, frozen=True, kw_only=True, tag="release_lease"):
     """Nobody controls the device any more; what moves is brought to a hold."""
 
 
-class AskLease(_Order, frozen=True, kw_only=True, tag="ask_lease"):
+class RequestControl(_Order, frozen=True, kw_only=True, tag="ask_lease"):
     """Show the holder, and everybody, that somebody asks for control. Changes nothing else; lapses by itself."""
 
     request: Id
@@ -41,7 +41,7 @@ class AskLease(_Order, frozen=True, kw_only=True, tag="ask_lease"):
     answer_within_ms: Annotated[int, Meta(ge=1, le=3_600_000)]
 
 
-class DropRequest(_Order, frozen=True, kw_only=True, tag="drop_request"):
+class WithdrawRequest(_Order, frozen=True, kw_only=True, tag="drop_request"):
     """Nobody asks any more: refused, or withdrawn."""
 
     request: Id
@@ -157,7 +157,7 @@ class GoTo(_Order, frozen=True, kw_only=True, tag="go_to"):
     yaw_rad: float | None = None
 
 
-class Gather(_Order, frozen=True, kw_only=True, tag="gather"):
+class CollectData(_Order, frozen=True, kw_only=True, tag="gather"):
     """Measure these streams of a room device at this rate for a time, then again as before; no streams: all."""
 
     streams: Annotated[tuple[Id, ...], Meta(max_length=16)] = ()
@@ -165,7 +165,7 @@ class Gather(_Order, frozen=True, kw_only=True, tag="gather"):
     duration_s: Annotated[float, Meta(gt=0, le=86_400)]
 
 
-class Shoot(_Order, frozen=True, kw_only=True, tag="shoot"):
+class TakePicture(_Order, frozen=True, kw_only=True, tag="shoot"):
     """Measure these streams of a room device once, now; no streams: all. The result has the ``values``."""
 
     streams: Annotated[tuple[Id, ...], Meta(max_length=16)] = ()
@@ -184,7 +184,7 @@ class SetControl(_Order, frozen=True, kw_only=True, tag="set_control"):
     value: float
 
 
-RoomTask = Gather | Shoot | CaptureRaw | SetControl
+RoomTask = CollectData | TakePicture | CaptureRaw | SetControl
 """What is done with devices of a room."""
 Task = (
     MoveJoints | MovePose | Say | Express | TakePosture | RunBehaviour | SetStiffness | LookAt | Drive | GoTo | RoomTask
@@ -212,7 +212,7 @@ class ResetStop(_Order, frozen=True, kw_only=True, tag="reset_stop"):
     """
 
 
-class FollowKey(_Order, frozen=True, kw_only=True, tag="follow_key"):
+class RotateKey(_Order, frozen=True, kw_only=True, tag="follow_key"):
     """The cloud has new keys: statements that lead to the newest, oldest first (``device_agent.protocol.security.key_rotation``).
 
     Changes nothing else, and takes the device from nobody.
@@ -224,14 +224,14 @@ class FollowKey(_Order, frozen=True, kw_only=True, tag="follow_key"):
 Request = (
     GrantLease
     | ReleaseLease
-    | AskLease
-    | DropRequest
+    | RequestControl
+    | WithdrawRequest
     | RunMovement
     | Task
     | CancelAction
     | StopDevice
     | ResetStop
-    | FollowKey
+    | RotateKey
 )
 
 

@@ -7,7 +7,7 @@ from device_agent.ports.transport import Transport
 from device_agent.protocol import topics
 from device_agent.protocol.errors import ProtocolError
 from device_agent.runtime.device import Device
-from device_agent.runtime.readings import Room
+from device_agent.runtime.readings import ReadingCache
 from device_agent.runtime.telemetry.outbox import Outbox
 
 _log = logging.getLogger(__name__)
@@ -30,7 +30,7 @@ class Agent:
         transport: Transport,
         *,
         outbox: Outbox,
-        room: Room,
+        room: ReadingCache,
         address: tuple[str, str],
     ) -> None:
         self._devices = devices

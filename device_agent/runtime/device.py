@@ -11,10 +11,10 @@ import time
 from collections.abc import Callable, Sequence
 
 from device_agent.ports.clock import CloudClock, tick_ms, wall_ms
-from device_agent.ports.driver import Audible, Driver, Filming, Reporting
-from device_agent.ports.floor_map import Ground
-from device_agent.ports.geometry import Geometry
-from device_agent.ports.sandbox import Jail
+from device_agent.ports.driver import Driver, HasCameras, HasSpeaker, ReportsStreams
+from device_agent.ports.floor_map import ObstacleMap
+from device_agent.ports.geometry import RobotGeometry
+from device_agent.ports.sandbox import Sandbox
 from device_agent.ports.skills import Skills
 from device_agent.ports.speech import Speech
 from device_agent.ports.uploads import Uploads
@@ -23,26 +23,26 @@ from device_agent.protocol.errors import ProtocolError
 from device_agent.protocol.events import EventKind
 from device_agent.protocol.manifests.robot_type import RobotType
 from device_agent.runtime.actions import call_action
-from device_agent.runtime.actions.device_context import Body
-from device_agent.runtime.actions.executor import Executor
-from device_agent.runtime.actions.script_policy import Trust
-from device_agent.runtime.actions.speech_output import Speaker
-from device_agent.runtime.authority.event_recorder import Audit, Happened
+from device_agent.runtime.actions.device_context import DeviceContext
+from device_agent.runtime.actions.executor import ActionExecutor
+from device_agent.runtime.actions.script_policy import ScriptPolicy
+from device_agent.runtime.actions.speech_output import SpeechOutput
+from device_agent.runtime.authority.event_recorder import EventRecord, EventRecorder
 from device_agent.runtime.authority.interlocks import Interlock, Interlocks
 from device_agent.runtime.authority.lease_gate import LeaseGate
-from device_agent.runtime.commands.command_processor import Office
-from device_agent.runtime.commands.pinned_keys import Pins
+from device_agent.runtime.commands.command_processor import CommandProcessor
+from device_agent.runtime.commands.pinned_keys import PinnedKeys
 from device_agent.runtime.control.control_loop import ControlLoop
 from device_agent.runtime.control.controller import Controller
 from device_agent.runtime.errors import Refused
-from device_agent.runtime.readings import Room
-from device_agent.runtime.room.room_device import Instrument
+from device_agent.runtime.readings import ReadingCache
+from device_agent.runtime.room.room_device import RoomDevice
 from device_agent.runtime.room.sensor_loop import SensorLoop
 from device_agent.runtime.storage.journal import Journal
-from device_agent.runtime.telemetry.camera_streamer import Filmer
-from device_agent.runtime.telemetry.device_publisher import Voice
+from device_agent.runtime.telemetry.camera_streamer import CameraStreamer
+from device_agent.runtime.telemetry.device_publisher import DevicePublisher
 from device_agent.runtime.telemetry.outbox import Outbox, Publish
-from device_agent.runtime.telemetry.stream_sampler import Reporter
+from device_agent.runtime.telemetry.stream_sampler import StreamSampler
 
 _REFUSED = {
     topics.CTL: EventKind.SETPOINTS_REFUSED,
@@ -62,7 +62,7 @@ class Device:
         space: Id of the space.
         agent: Id of the agent.
         robot_type: Joints, limits, period.
-        driver: Not yet connected; an ``Instrument`` for a device of a room.
+        driver: Not yet connected; an ``RoomDevice`` for a device of a room.
         journal: Open.
         cloud_clock: For ``ttl_ms``.
         keys: The cloud's keys, as far as they are pinned.
@@ -86,18 +86,18 @@ class Device:
         space: str,
         agent: str,
         robot_type: RobotType,
-        driver: Driver | Instrument,
+        driver: Driver | RoomDevice,
         journal: Journal,
         cloud_clock: CloudClock,
-        keys: Pins,
+        keys: PinnedKeys,
         publish: Publish,
         outbox: Outbox,
-        room: Room,
-        jail: Jail,
+        room: ReadingCache,
+        jail: Sandbox,
         owner: str = "",
         interlocks: Sequence[Interlock] = (),
-        geometry: Geometry | None = None,
-        ground: Callable[[], Ground | None] | None = None,
+        geometry: RobotGeometry | None = None,
+        ground: Callable[[], ObstacleMap | None] | None = None,
         speech: Speech | None = None,
         uploads: Uploads | None = None,
     ) -> None:
@@ -106,14 +106,14 @@ class Device:
         self._jail = jail
         record = journal.device(name)
         gate = LeaseGate(epoch=record.epoch, burned=record.epoch)  # a restart ends whatever lease there was
-        self._audit = Audit()
+        self._audit = EventRecorder()
         self._controller = Controller(robot_type, gate, latch=record.latch, geometry=geometry, tell=self._audit.note)
         self._controller.changed.set()
-        instrument = driver if isinstance(driver, Instrument) else None
-        self._reporter = Reporter(
-            robot_type.streams, driver if isinstance(driver, Reporting) else None, name=name, tell=self._measured
+        instrument = driver if isinstance(driver, RoomDevice) else None
+        self._reporter = StreamSampler(
+            robot_type.streams, driver if isinstance(driver, ReportsStreams) else None, name=name, tell=self._measured
         )
-        body = Body(
+        body = DeviceContext(
             robot_type=robot_type,
             controller=self._controller,
             observe=lambda: self._loop.seen,
@@ -125,15 +125,15 @@ class Device:
             name=name,
             ground=ground,
             hurry=self._hurry,
-            speaker=Speaker(
+            speaker=SpeechOutput(
                 name,
                 speech=speech,
                 uploads=uploads,
                 tell=self._audit.note,
-                heard=driver.speaks if isinstance(driver, Audible) else None,
+                heard=driver.speaks if isinstance(driver, HasSpeaker) else None,
             ),
         )
-        self.voice = Voice(
+        self.voice = DevicePublisher(
             address=(space, agent, name),
             label=label,
             robot_type=robot_type,
@@ -146,9 +146,9 @@ class Device:
             publish=publish,
             outbox=outbox,
         )
-        self._filmer = Filmer(
+        self._filmer = CameraStreamer(
             robot_type.cameras,
-            driver if isinstance(driver, Filming) else None,
+            driver if isinstance(driver, HasCameras) else None,
             name=name,
             film=self.voice.film,
             controlled=lambda: self._controller.lease(time.monotonic()) is not None,
@@ -162,9 +162,9 @@ class Device:
             note=lambda happened, code, now_s: self._audit.refused(happened, code=code, now_s=now_s),
         )
         self._loop = self._loop_of(driver, robot_type)
-        trust = Trust(device=name, robot_type=robot_type.type, owner=owner, keys=keys, journal=journal)
-        self._executor = Executor(body, trust=trust, jail=jail, report=self.voice.report, settle=journal.settle)
-        self._office = Office(
+        trust = ScriptPolicy(device=name, robot_type=robot_type.type, owner=owner, keys=keys, journal=journal)
+        self._executor = ActionExecutor(body, trust=trust, jail=jail, report=self.voice.report, settle=journal.settle)
+        self._office = CommandProcessor(
             address=(space, agent, name),
             controller=self._controller,
             executor=self._executor,
@@ -177,9 +177,9 @@ class Device:
             ailing=tuple if instrument is None else instrument.vigil.faults,
         )
 
-    def _loop_of(self, driver: Driver | Instrument, robot_type: RobotType) -> ControlLoop | SensorLoop:
+    def _loop_of(self, driver: Driver | RoomDevice, robot_type: RobotType) -> ControlLoop | SensorLoop:
         watch = self._interlocks.step
-        if isinstance(driver, Instrument):
+        if isinstance(driver, RoomDevice):
             return SensorLoop(
                 driver, self._controller, name=self.name, tell=self._measured, film=self.voice.film, watch=watch
             )
@@ -205,11 +205,13 @@ class Device:
         self._filmer.start()
         epoch, _ = self._controller.epochs
         data = {"epoch": epoch, "stopped": self._controller.latch is not None}
-        self._audit.note(Happened(EventKind.AGENT_STARTED, "the agent started; leases of before have ended", data=data))
+        self._audit.note(
+            EventRecord(EventKind.AGENT_STARTED, "the agent started; leases of before have ended", data=data)
+        )
         self.voice.scripts = scripts = self._jail.standing()
         if scripts.how != "jailed":
-            self._audit.note(Happened(_SCRIPTS[scripts.how], scripts.why, "warning", {"why": scripts.why}))
-        self._office.start(None if isinstance(self._driver, Instrument) else self._driver.twin())
+            self._audit.note(EventRecord(_SCRIPTS[scripts.how], scripts.why, "warning", {"why": scripts.why}))
+        self._office.start(None if isinstance(self._driver, RoomDevice) else self._driver.twin())
 
     def stop(self) -> None:
         """End what runs, hold, and let the driver go. May be called twice."""
@@ -218,7 +220,7 @@ class Device:
         self._loop.stop()
         self._reporter.stop()
         self._filmer.stop()
-        self._audit.note(Happened(EventKind.AGENT_STOPPED, "the agent was shut down"))
+        self._audit.note(EventRecord(EventKind.AGENT_STOPPED, "the agent was shut down"))
         self._office.stop()
         self._driver.close()
 
@@ -254,7 +256,7 @@ class Device:
     def _refuse(self, topic_kind: str, code: str, message: str) -> None:
         self.voice.count(code)
         kind = _REFUSED[topic_kind]
-        self._audit.refused(Happened(kind, message, "warning", {"code": code}), code=code, now_s=time.monotonic())
+        self._audit.refused(EventRecord(kind, message, "warning", {"code": code}), code=code, now_s=time.monotonic())
 
     def _take_setpoint(self, epoch: str, payload: bytes) -> None:
         setpoint = codec.decode(payload, Setpoint)

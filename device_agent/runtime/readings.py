@@ -47,7 +47,7 @@ class _Heard:
     sequence: int
 
 
-class Room:
+class ReadingCache:
     """The newest reading of each source. Thread-safe; memory is bounded by the sources, which never change.
 
     Args:

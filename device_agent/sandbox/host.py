@@ -20,7 +20,7 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
-from device_agent.ports.sandbox import Inmate, JailError, Limits, Standing
+from device_agent.ports.sandbox import JailError, Limits, SandboxProcess, SandboxStatus
 from device_agent.sandbox.constants import LAYERS, LONGEST_MESSAGE
 
 _MAIN = Path(__file__).with_name("__main__.py")
@@ -50,7 +50,7 @@ _Task = dict[str, Any]
 """What a parent is asked: a process with these layers and limits, or how one has ended."""
 
 
-class WarmJail:
+class SandboxHost:
     """``Jail``: forks from warm parents.
 
     Args:
@@ -73,12 +73,12 @@ class WarmJail:
         if standing.how != "refused":
             self._prepare(self._own, self._task(self._own, Limits()))
 
-    def standing(self) -> Standing:
+    def standing(self) -> SandboxStatus:
         """See ``Jail``."""
         refusal = self.refusal(stranger=False)
         if refusal is not None:
-            return Standing("refused", refusal)
-        return Standing("trusted", self._lack(self._own)) if self._own.missing else Standing("jailed")
+            return SandboxStatus("refused", refusal)
+        return SandboxStatus("trusted", self._lack(self._own)) if self._own.missing else SandboxStatus("jailed")
 
     def refusal(self, *, stranger: bool) -> str | None:
         """See ``Jail``."""
@@ -103,7 +103,7 @@ class WarmJail:
         """Layer → why this machine has it not; known after ``start``."""
         return dict(self._own.missing)
 
-    def open(self, limits: Limits, *, stranger: bool) -> Inmate:
+    def open(self, limits: Limits, *, stranger: bool) -> SandboxProcess:
         """See ``Jail``."""
         refusal = self.refusal(stranger=stranger)
         if refusal is not None:
@@ -271,7 +271,7 @@ class _WarmParent:
 
 
 class _Inmate:
-    """``Inmate``: known by a descriptor of its process, so that no other can be killed in its place."""
+    """``SandboxProcess``: known by a descriptor of its process, so that no other can be killed in its place."""
 
     def __init__(
         self, parent: _WarmParent, lock: threading.Lock, link: socket.socket, pid: int, descriptor: int
@@ -285,7 +285,7 @@ class _Inmate:
         self._killed = False
 
     def kill(self) -> None:
-        """See ``Inmate``."""
+        """See ``SandboxProcess``."""
         with self._lock:
             self._killed = True
             if self._descriptor >= 0:
@@ -293,13 +293,13 @@ class _Inmate:
                     signal.pidfd_send_signal(self._descriptor, signal.SIGKILL)
 
     def wait(self, timeout_s: float) -> bool:
-        """See ``Inmate``."""
+        """See ``SandboxProcess``."""
         waiting = select.poll()
         waiting.register(self._descriptor, select.POLLIN)
         return bool(waiting.poll(timeout_s * 1000))
 
     def ending(self) -> str:
-        """See ``Inmate``."""
+        """See ``SandboxProcess``."""
         if self._killed:
             return ""
         try:
@@ -310,7 +310,7 @@ class _Inmate:
         return _ENDINGS.get(status, "" if status in {0, 1, None} else f"it ended with {status}")
 
     def close(self) -> None:
-        """See ``Inmate``."""
+        """See ``SandboxProcess``."""
         self.kill()
         self.link.close()
         if self._descriptor >= 0 and not self.wait(_DEAD_S):

@@ -10,7 +10,7 @@ from typing import Protocol
 
 from device_agent.ports.plugins import PlugIns
 from device_agent.ports.sensor import RoomDriver, SensorError, Surroundings
-from device_agent.protocol.manifests.room import RoomDevice
+from device_agent.protocol.manifests.room import RoomDeviceManifest
 
 __all__ = ["GROUP", "Factory", "load", "names"]
 
@@ -25,7 +25,7 @@ _BUILT_IN: Mapping[str, str] = {
 class Factory(Protocol):
     """Makes the driver of one room device. Opens nothing: that is ``RoomDriver.connect``."""
 
-    def __call__(self, device: RoomDevice, folder: Path, surroundings: Surroundings) -> RoomDriver:
+    def __call__(self, device: RoomDeviceManifest, folder: Path, surroundings: Surroundings) -> RoomDriver:
         """The driver of one room device.
 
         Args:

@@ -41,7 +41,7 @@ _SMALLEST_PX = 1.0
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Shot:
+class RenderRequest:
     """One rendered picture.
 
     Attributes:
@@ -62,10 +62,10 @@ class _Wish:
     camera: int
     size: tuple[int, int]
     depth: bool
-    future: "Future[Shot]"
+    future: "Future[RenderRequest]"
 
 
-class Studio:
+class Renderer:
     """The renderers of one world. ``shoot`` is thread-safe.
 
     The thread begins with the first user and ends, with its renderers, when the last has left.
@@ -93,7 +93,7 @@ class Studio:
             self._wishes.put(None)
         thread.join(timeout=WITHIN_S)
 
-    def shoot(self, camera: int, *, width: int, height: int, depth: bool = False) -> Shot:
+    def shoot(self, camera: int, *, width: int, height: int, depth: bool = False) -> RenderRequest:
         """What a camera sees now.
 
         Args:
@@ -105,7 +105,7 @@ class Studio:
         Raises:
             SensorError: Nothing here can draw, or it took too long.
         """
-        future: Future[Shot] = Future()
+        future: Future[RenderRequest] = Future()
         with self._life:
             if not self._users:
                 raise SensorError("the camera is not connected")
@@ -129,12 +129,12 @@ def _draw(world: SimulatedWorld, wishes: "queue.SimpleQueue[_Wish | None]") -> N
         sys.platform == "linux"
     ):  # elsewhere a thread has no priority of its own; the renderer's threads inherit this one's
         os.setpriority(os.PRIO_PROCESS, threading.get_native_id(), _NICE)
-    booth: _Booth | None = None
+    booth: _View | None = None
     while (wish := wishes.get()) is not None:
         if not wish.future.set_running_or_notify_cancel():
             continue
         try:
-            booth = booth or _Booth(world)
+            booth = booth or _View(world)
             wish.future.set_result(booth.draw(wish))
         except Exception as error:  # noqa: BLE001 (whatever it is, who waits must hear of it, and the next may go well)
             wish.future.set_exception(
@@ -144,7 +144,7 @@ def _draw(world: SimulatedWorld, wishes: "queue.SimpleQueue[_Wish | None]") -> N
         booth.close()
 
 
-class _Booth:
+class _View:
     """What belongs to the thread alone: a copy of model and state, and the canvases."""
 
     def __init__(self, world: SimulatedWorld) -> None:
@@ -156,9 +156,9 @@ class _Booth:
         quality.numslices, quality.numstacks = 12, 7
         self._data = mujoco.MjData(self._model)
         self._groups = self._model.geom_group.copy()
-        self._canvases: dict[tuple[int, int], _Canvas] = {}
+        self._canvases: dict[tuple[int, int], _FrameBuffer] = {}
 
-    def draw(self, wish: _Wish) -> Shot:
+    def draw(self, wish: _Wish) -> RenderRequest:
         """One picture."""
         # Lamps and blinds change lights and colours of the world's model.
         for changing in _CHANGING:
@@ -166,10 +166,10 @@ class _Booth:
         self._world.copy(self._data)
         taken_s = time.monotonic()
         if wish.size not in self._canvases:
-            self._canvases[wish.size] = _Canvas(self._model, *wish.size)
+            self._canvases[wish.size] = _FrameBuffer(self._model, *wish.size)
         seen = _in_view(self._model, self._data, wish.camera, *wish.size)
         self._model.geom_group[:] = np.where(seen, self._groups, _HIDDEN)
-        return Shot(
+        return RenderRequest(
             taken_s=taken_s,
             pixels=self._canvases[wish.size].draw(self._data, wish.camera, depth=wish.depth),
             position_m=self._data.cam_xpos[wish.camera].copy(),
@@ -200,7 +200,7 @@ def _in_view(model: Any, data: Any, camera: int, width: int, height: int) -> npt
     return seen
 
 
-class _Canvas:
+class _FrameBuffer:
     """A renderer of one size. Leaner than MuJoCo's own, which has to be chosen before MuJoCo is first imported."""
 
     def __init__(self, model: Any, width: int, height: int) -> None:
@@ -272,13 +272,13 @@ def _screen() -> Any:
     return GLContext
 
 
-_studios: "weakref.WeakKeyDictionary[SimulatedWorld, Studio]" = weakref.WeakKeyDictionary()
+_studios: "weakref.WeakKeyDictionary[SimulatedWorld, Renderer]" = weakref.WeakKeyDictionary()
 _making = threading.Lock()
 
 
-def studio_of(world: SimulatedWorld) -> Studio:
+def studio_of(world: SimulatedWorld) -> Renderer:
     """The one of this world."""
     with _making:
         if world not in _studios:
-            _studios[world] = Studio(weakref.proxy(world))
+            _studios[world] = Renderer(weakref.proxy(world))
         return _studios[world]

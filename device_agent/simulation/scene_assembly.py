@@ -8,7 +8,7 @@ from typing import Any
 import mujoco
 
 from device_agent.ports.driver import DriverError
-from device_agent.simulation.mjcf.equality_joints import Ties
+from device_agent.simulation.mjcf.equality_joints import EqualityJoints
 from device_agent.simulation.mjcf.options import agree
 
 TIMESTEP_S = 0.002
@@ -80,7 +80,7 @@ def at_home(model: Any, home: Mapping[str, float], settings: Mapping[str, float]
         actuator = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_ACTUATOR, name)
         if actuator >= 0:
             data.qpos[model.jnt_qposadr[model.actuator_trnid[actuator, 0]]] = position
-    Ties(model).settle(data.qpos)
+    EqualityJoints(model).settle(data.qpos)
     for actuator in range(model.nu):
         joint = model.actuator_trnid[actuator, 0]
         by_joint = model.actuator_trntype[actuator] == int(mujoco.mjtTrn.mjTRN_JOINT)

@@ -9,15 +9,15 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from device_agent.config.agent_config import Configuration, HomeError, Pairing
+from device_agent.config.agent_config import ConfigError, Configuration, Pairing
 from device_agent.config.client_certificate import OwnCertificate
 from device_agent.ports.transport import Transport
 from device_agent.protocol import topics
-from device_agent.runtime.commands.pinned_keys import Pins
+from device_agent.runtime.commands.pinned_keys import PinnedKeys
 from device_agent.runtime.errors import Refused
 from device_agent.transports import tls
 from device_agent.transports.http import responses
-from device_agent.transports.http.client import CloudApi, CloudError
+from device_agent.transports.http.client import CloudClient, CloudError
 
 _log = logging.getLogger(__name__)
 SOFTWARE = "telescope-agent 0.1.0"
@@ -41,8 +41,8 @@ class Wiring:
 
     configuration: Configuration
     pairing: Pairing
-    membership: "Membership"
-    open_api: Callable[[], CloudApi]
+    membership: "PairingMonitor"
+    open_api: Callable[[], CloudClient]
     next_session: Callable[[], int]
     quiet: Callable[[], bool]
     certificate: OwnCertificate
@@ -55,7 +55,7 @@ class Wiring:
         return topics.conn(self.pairing.space, self.pairing.agent)
 
 
-class Membership:
+class PairingMonitor:
     """Whether the agent still belongs to the space of its pairing.
 
     Args:
@@ -67,7 +67,7 @@ class Membership:
     """
 
     def __init__(
-        self, pairing: Pairing, configuration: Configuration, devices: list[dict[str, str]], pins: Pins
+        self, pairing: Pairing, configuration: Configuration, devices: list[dict[str, str]], pins: PinnedKeys
     ) -> None:
         self._pairing = pairing
         self._pins = pins
@@ -76,7 +76,7 @@ class Membership:
         self._introduced = False
         self.outdated = threading.Event()
 
-    def credentials(self, api: CloudApi) -> dict[str, Any]:
+    def credentials(self, api: CloudClient) -> dict[str, Any]:
         """Broker credentials for this space.
 
         Raises:
@@ -89,7 +89,7 @@ class Membership:
             raise self._gone("this agent belongs to another space now")
         return given
 
-    def xmpp_credentials(self, api: CloudApi) -> dict[str, Any]:
+    def xmpp_credentials(self, api: CloudClient) -> dict[str, Any]:
         """Credentials for the XMPP server.
 
         Raises:
@@ -101,7 +101,7 @@ class Membership:
             raise self._gone("this agent belongs to another space now")
         return given
 
-    def check(self, api: CloudApi, *, within_s: float = 10.0) -> None:
+    def check(self, api: CloudClient, *, within_s: float = 10.0) -> None:
         """Look whether the pairing holds, if the cloud answers within so long [s].
 
         Raises:
@@ -114,7 +114,7 @@ class Membership:
         if found.get("space") != self._pairing.space:
             raise self._gone("this agent belongs to another space now")
 
-    def _ask(self, api: CloudApi, call: Callable[[], dict[str, Any]]) -> dict[str, Any]:
+    def _ask(self, api: CloudClient, call: Callable[[], dict[str, Any]]) -> dict[str, Any]:
         try:
             self._introduce(api)
             given = call()
@@ -135,7 +135,7 @@ class Membership:
             _log.error("the cloud's new key is not followed: %s", refused.message)
         self._pins.check(news.signing_key)
 
-    def _introduce(self, api: CloudApi) -> None:
+    def _introduce(self, api: CloudClient) -> None:
         if self._introduced:
             return
         told = self._configuration
@@ -175,7 +175,7 @@ def make(wiring: Wiring) -> Transport:
     """
     name = wiring.configuration.transport
     if name not in _MAKERS:
-        raise HomeError(f"agent.toml: no transport '{name}'; there are: {', '.join(names())}")
+        raise ConfigError(f"agent.toml: no transport '{name}'; there are: {', '.join(names())}")
     return _MAKERS[name](wiring)
 
 
@@ -236,7 +236,7 @@ def _xmpp(wiring: Wiring) -> Transport:
     try:
         from device_agent.transports.xmpp import XmppAccess, XmppTransport  # noqa: PLC0415 (only where it is chosen)
     except ImportError as error:
-        raise HomeError("agent.toml: transport 'xmpp' needs slixmpp; run `pip install slixmpp`") from error
+        raise ConfigError("agent.toml: transport 'xmpp' needs slixmpp; run `pip install slixmpp`") from error
     from device_agent.protocol.xmpp.stream import Login  # noqa: PLC0415
 
     api = wiring.open_api()

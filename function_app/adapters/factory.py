@@ -126,7 +126,7 @@ def access(
 
 def _event_grid(settings: Settings, signing: RingKeys, tables: Tables) -> BrokerAccess:
     from function_app.adapters.azure.broker_access import EventGridBrokerAccess  # noqa: PLC0415 (only where in use)
-    from function_app.adapters.azure.session_takeover import SessionTaker  # noqa: PLC0415
+    from function_app.adapters.azure.session_takeover import SessionTakeover  # noqa: PLC0415
     from function_app.adapters.azure.webhook_auth import EntraCallers  # noqa: PLC0415
 
     grid = settings.bus
@@ -135,7 +135,7 @@ def _event_grid(settings: Settings, signing: RingKeys, tables: Tables) -> Broker
     webhook = grid.webhook
     callers = EntraCallers(tenant=webhook.tenant, audience=webhook.audience, identity=webhook.caller)
     # Its certificate is of an authority that every machine knows, whoever made ours.
-    taker = SessionTaker(host=settings.mqtt_host, port=settings.mqtt_port, tls=client_context(None))
+    taker = SessionTakeover(host=settings.mqtt_host, port=settings.mqtt_port, tls=client_context(None))
     return EventGridBrokerAccess(keys=signing, tables=tables, take=taker, known=callers.knows)
 
 

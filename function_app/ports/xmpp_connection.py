@@ -19,7 +19,7 @@ class Listener(Protocol):
         """The connection is gone: nobody is known to be there any more."""
 
 
-class XmppLine(Protocol):
+class XmppConnection(Protocol):
     """One connection at a time."""
 
     @property

@@ -17,7 +17,8 @@ from tests.harness.cloud.cloud import API, MOVE
 from tests.harness.cloud.people import Visitor, sign_in
 from tests.harness.cloud.polling import PollingRobot, Site
 from tests.harness.hosts import Host, start_host
-from tests.harness.network.brokers import ROOT, RunningBroker
+from tests.harness.network.brokers import RunningBroker
+from tests.harness.paths import ROOT
 
 CHECKS = (
     "not_a_server_error",

@@ -14,7 +14,8 @@ import httpx
 import pytest
 
 from tests.harness.browser.product import Machine, free_ports, moves, ready_link, start_machine
-from tests.harness.network.brokers import BROKERS, ROOT, wait_until
+from tests.harness.network.brokers import BROKERS, wait_until
+from tests.harness.paths import ROOT
 
 
 def clear_line(machine: Machine) -> str:

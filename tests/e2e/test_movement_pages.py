@@ -11,7 +11,8 @@ from playwright.sync_api import Browser, Locator, Page, expect
 from tests.harness.browser.browser import PATIENCE_MS, pages
 from tests.harness.browser.pages import assert_good_page
 from tests.harness.browser.product import Api, Machine, Trace
-from tests.harness.network.brokers import ROOT, wait_until
+from tests.harness.network.brokers import wait_until
+from tests.harness.paths import ROOT
 
 SECOND = "second"
 SCRIPT = '''"""Turn the last wrist."""

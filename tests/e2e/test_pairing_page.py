@@ -19,7 +19,8 @@ from device_agent.cli import claim_prompt
 from tests.harness.browser.browser import PATIENCE_MS, person
 from tests.harness.browser.pages import assert_good_page
 from tests.harness.browser.product import Machine
-from tests.harness.network.brokers import ROOT, wait_until
+from tests.harness.network.brokers import wait_until
+from tests.harness.paths import ROOT
 
 
 class Terminal:

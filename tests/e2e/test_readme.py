@@ -8,7 +8,8 @@ import time
 from pathlib import Path
 
 from tests.harness.browser.product import Machine
-from tests.harness.network.brokers import ROOT, wait_until
+from tests.harness.network.brokers import wait_until
+from tests.harness.paths import ROOT
 
 
 def block(name: str, machine: Machine, home: Path) -> str:

@@ -20,7 +20,8 @@ from device_agent.protocol.manifests import room as rooms
 from function_app.ports.broker_access import Credentials
 from infra.mosquitto.configuration import binary
 from tests.harness.browser.product import Api, Machine, moves
-from tests.harness.network.brokers import ROOT, Client, wait_until
+from tests.harness.network.brokers import Client, wait_until
+from tests.harness.paths import ROOT
 
 RATE_HZ, FOR_S = 20.0, 3.0
 

@@ -8,7 +8,8 @@ from device_agent.protocol.manifests import room as rooms
 from tests.harness.browser.browser import PATIENCE_MS, pages
 from tests.harness.browser.pages import assert_good_page
 from tests.harness.browser.product import Machine
-from tests.harness.network.brokers import ROOT, wait_until
+from tests.harness.network.brokers import wait_until
+from tests.harness.paths import ROOT
 
 ROBOTS = ("ur5", "nao", "qbo", "hanson")
 FIXED = ("ur5", "hanson")

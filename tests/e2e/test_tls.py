@@ -16,7 +16,8 @@ from function_app.ports.broker_access import Credentials
 from infra.local.__main__ import taken as taken_port
 from infra.mosquitto.configuration import binary
 from tests.harness.browser.product import Machine, start_machine
-from tests.harness.network.brokers import ROOT, Client, wait_until
+from tests.harness.network.brokers import Client, wait_until
+from tests.harness.paths import ROOT
 
 
 @contextlib.contextmanager

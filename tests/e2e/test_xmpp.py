@@ -16,7 +16,8 @@ import pytest
 from device_agent.protocol import JointTarget, JointTelemetry, Setpoint, codec, topics
 from function_app.ports.broker_access import Credentials
 from tests.harness.browser.product import Api, Machine, start_machine
-from tests.harness.network.brokers import ROOT, Client, wait_until
+from tests.harness.network.brokers import Client, wait_until
+from tests.harness.paths import ROOT
 
 NUDGE = {"kind": "move_joints", "speed": 1.0}
 LONG = {"kind": "move_joints", "speed": 0.05, "position_rad": {"shoulder_pan": 1.5}}

@@ -25,7 +25,7 @@ import pytest
 
 from function_app.adapters.azure.broker_access import EventGridBrokerAccess
 from function_app.adapters.azure.command_bus import EventGridCommandBus
-from function_app.adapters.azure.session_takeover import SessionTaker
+from function_app.adapters.azure.session_takeover import SessionTakeover
 from function_app.adapters.azure.topic_spaces import FUNCTIONS_SAY
 from function_app.entrypoints.broker_auth.event_grid import admit
 from function_app.ports.command_bus import BusUnavailable
@@ -223,7 +223,7 @@ def event_grid_cloud(home: Path) -> Iterator[tuple[Cloud, RunningBroker, EventGr
         with Cloud(chosen) as cloud:
             access = cloud.functions.access
             assert isinstance(access, EventGridBrokerAccess)
-            access._take = SessionTaker(host=HOST, port=ports[TCP], tls=None)
+            access._take = SessionTakeover(host=HOST, port=ports[TCP], tls=None)
             access.known = _known
             grid.webhook = lambda asked: _ask(cloud, asked)
             process: Any = None

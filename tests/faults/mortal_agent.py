@@ -29,9 +29,9 @@ from device_agent.protocol import Ack, Command, codec, topics
 from device_agent.protocol.security import signing
 from device_agent.runtime.control.controller import Controller
 from device_agent.runtime.device import Device
-from device_agent.runtime.readings import Room
+from device_agent.runtime.readings import ReadingCache
 from device_agent.runtime.storage.journal import Journal
-from device_agent.runtime.storage.outbox_store import Shelf
+from device_agent.runtime.storage.outbox_store import OutboxStore
 from device_agent.runtime.telemetry.outbox import Outbox
 from tests.fakes.drivers import ToyDriver, robot_type
 from tests.harness.agent.pinned_keys import pins_of
@@ -131,7 +131,7 @@ class Body:
                 name=DEVICE, label="Arm", space=SPACE, agent=AGENT, robot_type=swift(), driver=ToyDriver(),
                 journal=journal, cloud_clock=self.clock, publish=self._publish, jail=LateJail(),
                 keys=pins_of(key),
-                room=Room(space=SPACE, agent=AGENT, own=[DEVICE]), outbox=self._outbox(),
+                room=ReadingCache(space=SPACE, agent=AGENT, own=[DEVICE]), outbox=self._outbox(),
             )  # fmt: skip
             device.start()
             device.link_changed(True)
@@ -141,7 +141,7 @@ class Body:
 
     def _outbox(self) -> Outbox:
         own = f"ts/v1/{SPACE}/{AGENT}/"
-        shelf = Shelf(self.folder / "outbox.db", own=own, max_bytes=10**7, max_age_ms=3_600_000)
+        shelf = OutboxStore(self.folder / "outbox.db", own=own, max_bytes=10**7, max_age_ms=3_600_000)
         return Outbox(shelf, publish=self._publish, teller=own + DEVICE)
 
     def _deliver(self, device: Device, key: Ed25519PrivateKey) -> None:

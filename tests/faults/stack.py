@@ -23,8 +23,9 @@ import msgspec
 from infra.local.supervisor import Child
 from tests.faults.console import Seat
 from tests.harness.browser.product import free_ports
-from tests.harness.network.brokers import ROOT, BrokerKind, wait_until
+from tests.harness.network.brokers import BrokerKind, wait_until
 from tests.harness.network.proxy import HOST, Proxy
+from tests.harness.paths import ROOT
 
 PATIENCE_S = 60.0
 _AGENT_NICE = -10

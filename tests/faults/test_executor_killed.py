@@ -16,7 +16,7 @@ from device_agent.protocol import AckStatus, CancelAction, Command, GrantLease, 
 from device_agent.protocol.security import signing
 from tests.faults.mortal_agent import AGENT, DEVICE, SPACE, TARGET_RAD, Life
 from tests.harness.agent.device_harness import signed_movement
-from tests.harness.network.brokers import ROOT
+from tests.harness.paths import ROOT
 
 LIVES = 30
 """Lives on one journal, one after another; the last is not cut short."""

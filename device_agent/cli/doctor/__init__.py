@@ -10,7 +10,7 @@ from typing import Any
 
 from device_agent.cli.doctor import cloud, devices, machine
 from device_agent.cli.doctor.finding import Finding, problem
-from device_agent.config.agent_config import Configuration, Home, HomeError
+from device_agent.config.agent_config import ConfigError, Configuration, Home
 
 __all__ = ["Finding", "examine"]
 
@@ -24,7 +24,7 @@ def examine(home: Home) -> Iterator[Finding]:
     yield from _run("voice", machine.voice)
     try:
         configuration = home.configuration()
-    except HomeError as error:
+    except ConfigError as error:
         yield problem("agent", str(error), "Run `python -m device_agent enroll --server … --device NAME=TYPE`.")
         yield from _run("scripts", partial(machine.scripts, trusted=False))
         return

@@ -12,15 +12,15 @@ from urllib.parse import urlsplit
 from device_agent import bootstrap
 from device_agent.cli.doctor.finding import Finding, ok, problem, warning
 from device_agent.config import catalogue
-from device_agent.config.agent_config import Configuration, Home, HomeError, Pairing
+from device_agent.config.agent_config import ConfigError, Configuration, Home, Pairing
 from device_agent.config.client_certificate import OwnCertificate
 from device_agent.ports.clock import CloudClock, tick_ms, wall_ms
-from device_agent.runtime.commands.pinned_keys import ADVICE, Pins
+from device_agent.runtime.commands.pinned_keys import ADVICE, PinnedKeys
 from device_agent.runtime.errors import Refused
 from device_agent.runtime.storage.journal import Journal
 from device_agent.transports import factory, tls
 from device_agent.transports.http import responses
-from device_agent.transports.http.client import CloudApi, CloudError
+from device_agent.transports.http.client import CloudClient, CloudError
 
 _OFF_MS = 2000
 _LINK_S = 20.0
@@ -34,7 +34,7 @@ def look(home: Home, configuration: Configuration) -> Iterator[Finding]:
     try:
         pairing = home.pairing()
         api = bootstrap.api_of(home, configuration, clock)
-    except HomeError as error:
+    except ConfigError as error:
         yield problem("server", str(error), "Run `python -m device_agent enroll`.")
         return
     if api.server.startswith("https:"):
@@ -58,7 +58,7 @@ def look(home: Home, configuration: Configuration) -> Iterator[Finding]:
     yield from _link(home, configuration, pairing, clock)
 
 
-def _certificate(api: CloudApi) -> Finding:
+def _certificate(api: CloudClient) -> Finding:
     """Whether the server is who its address says, and for how long."""
     parts = urlsplit(api.server)
     host, port = parts.hostname or "", parts.port or 443
@@ -86,7 +86,7 @@ def _certificate(api: CloudApi) -> Finding:
 
 
 def _server(
-    api: CloudApi, configuration: Configuration, clock: CloudClock
+    api: CloudClient, configuration: Configuration, clock: CloudClock
 ) -> Generator[Finding, None, dict[str, Any] | None]:
     """Whether it answers, and knows this agent; what it says of it."""
     began_s = time.monotonic()
@@ -115,7 +115,7 @@ def _keys(found: dict[str, Any], pairing: Pairing, clock: CloudClock) -> Finding
     """Whether this agent obeys what the cloud signs now, or learns to by itself."""
     try:
         news = responses.read(found, responses.News)
-        pins = Pins(pairing, save=lambda _: None, now_ms=clock.now_ms)
+        pins = PinnedKeys(pairing, save=lambda _: None, now_ms=clock.now_ms)
         pins.follow(news.key_statements)
     except (CloudError, Refused) as error:
         return problem("keys", f"the cloud's new key is not followed: {error}", f"Then {ADVICE}.")
@@ -152,7 +152,7 @@ def _link(home: Home, configuration: Configuration, pairing: Pairing, clock: Clo
     try:
         with home.hold():
             yield from _connect(home, configuration, pairing, clock)
-    except HomeError as error:
+    except ConfigError as error:
         if "already" not in str(error):
             yield problem("link", str(error), "Correct agent.toml.")
             return
@@ -162,8 +162,8 @@ def _link(home: Home, configuration: Configuration, pairing: Pairing, clock: Clo
 def _connect(home: Home, configuration: Configuration, pairing: Pairing, clock: CloudClock) -> Iterator[Finding]:
     journal = Journal(home.journal)
     journal.open(now_ms=wall_ms())
-    pins = Pins(pairing, save=home.save_pairing, now_ms=clock.now_ms)
-    membership = factory.Membership(pairing, configuration, catalogue.enrolled_devices(configuration), pins)
+    pins = PinnedKeys(pairing, save=home.save_pairing, now_ms=clock.now_ms)
+    membership = factory.PairingMonitor(pairing, configuration, catalogue.enrolled_devices(configuration), pins)
     transport = factory.make(
         factory.Wiring(
             configuration=configuration,

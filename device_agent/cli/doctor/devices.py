@@ -9,11 +9,11 @@ from collections.abc import Iterator, Mapping
 from device_agent import bootstrap
 from device_agent.cli.doctor.finding import Finding, ok, problem, warning
 from device_agent.config import catalogue
-from device_agent.config.agent_config import Configuration, DeviceEntry, HomeError
+from device_agent.config.agent_config import ConfigError, Configuration, DeviceEntry
 from device_agent.ports.driver import DriverError
 from device_agent.ports.geometry import GeometryError
 from device_agent.ports.sensor import SensorError
-from device_agent.runtime.room.room_device import Instrument
+from device_agent.runtime.room.room_device import RoomDevice
 
 _RENDER_S = 60.0
 _RENDER = """
@@ -42,7 +42,7 @@ def device(entry: DeviceEntry) -> Iterator[Finding]:
         if driver.simulated:
             driver.connect()
             driver.close()
-    except HomeError as error:
+    except ConfigError as error:
         yield problem(name, str(error), "Correct the device's `type` or `room` in agent.toml.")
         return
     except (DriverError, GeometryError) as error:
@@ -53,7 +53,7 @@ def device(entry: DeviceEntry) -> Iterator[Finding]:
     yield ok(name, f"{entry.type}, driver '{entry.driver or kind.driver}': {seen}, {known}")
 
 
-def _instrument(name: str, kind: str, instrument: Instrument) -> Finding:
+def _instrument(name: str, kind: str, instrument: RoomDevice) -> Finding:
     """A room device; one that looks with others is only made, for here it is alone."""
     driver, said = instrument.driver, f"{kind}, driver '{instrument.manifest.driver}'"
     if not driver.simulated:
@@ -102,7 +102,7 @@ def renderer(configuration: Configuration) -> Iterator[Finding]:
 def _driver_of(entry: DeviceEntry) -> str:
     try:
         return catalogue.type_of(entry).driver
-    except HomeError:
+    except ConfigError:
         return ""
 
 

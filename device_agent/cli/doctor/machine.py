@@ -12,7 +12,7 @@ from pathlib import Path
 
 from device_agent.cli.doctor.finding import Finding, ok, problem, warning
 from device_agent.config.agent_config import Home
-from device_agent.sandbox.host import WarmJail
+from device_agent.sandbox.host import SandboxHost
 from device_agent.speech.espeak import PROGRAM
 
 _OLDEST = (3, 11)
@@ -114,7 +114,7 @@ def _readable(database: Path) -> Finding:
 
 def scripts(*, trusted: bool) -> Iterator[Finding]:
     """Whether movement scripts can be locked in, here and now: by doing it."""
-    jail = WarmJail()
+    jail = SandboxHost()
     try:
         jail.start()
         refusal = jail.refusal(stranger=False)

@@ -9,7 +9,7 @@ import simplejpeg
 from device_agent.ports.driver import DriverError
 from device_agent.ports.sensor import Frame, SensorError
 from device_agent.protocol import Stream
-from device_agent.simulation.renderer import Studio, studio_of
+from device_agent.simulation.renderer import Renderer, studio_of
 from device_agent.simulation.world import World
 
 _WIDTH, _HEIGHT = 320, 240
@@ -30,7 +30,7 @@ class Eyes:
         self._world = world
         self._prefix = prefix
         self._cameras: dict[str, int] = {}
-        self._studio: Studio | None = None
+        self._studio: Renderer | None = None
 
     def open(self, model: Any) -> None:
         """Find them in the model.

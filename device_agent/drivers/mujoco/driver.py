@@ -11,7 +11,7 @@ import mujoco
 import numpy as np
 
 from device_agent.drivers.mujoco.cameras import Eyes
-from device_agent.drivers.mujoco.fault_injection import WELL, Ailments, Infliction, Sickbed
+from device_agent.drivers.mujoco.fault_injection import WELL, FaultInjector, InjectedFaults, MotorFault
 from device_agent.drivers.mujoco.motor_model import HEALTH, Health
 from device_agent.drivers.mujoco.servo_gains import Stiffness
 from device_agent.ports import skills
@@ -83,8 +83,8 @@ class MujocoDriver:
         self._ramp_s = RAMP_PERIODS * robot_type.period_ms / 1000
         battery = None if robot_type.simulation is None else robot_type.simulation.battery
         self._health = Health(robot_type.joints, battery, seed=device)
-        self._sickbed = Sickbed(faults, [joint.name for joint in robot_type.joints])
-        self._infliction: Infliction | None = None
+        self._sickbed = FaultInjector(faults, [joint.name for joint in robot_type.joints])
+        self._infliction: MotorFault | None = None
         self._stiffness: Stiffness | None = None
         self._seeing = Eyes(robot_type.cameras, world, prefix=prefix)
         self._noted_s = math.inf
@@ -221,7 +221,7 @@ class MujocoDriver:
         del snapshot
         return 0.0
 
-    def _suffer(self, ailments: Ailments) -> None:
+    def _suffer(self, ailments: InjectedFaults) -> None:
         if ailments != WELL:
             log.warning("%s now suffers from %s", self._device, ailments)
         self._health.suffer(ailments)
@@ -298,7 +298,7 @@ class MujocoDriver:
         self._base = int(model.body_rootid[model.jnt_bodyid[joints[0]]]) if joints else 0
         self._resolve_frames(model)
         if self._infliction is None:
-            self._infliction = Infliction(model, dict(zip(names, self._actuators.tolist(), strict=True)))
+            self._infliction = MotorFault(model, dict(zip(names, self._actuators.tolist(), strict=True)))
             self._world.add(self._infliction)
         if self._stiffness is None:
             self._stiffness = Stiffness(model, dict(zip(names, self._actuators.tolist(), strict=True)))

@@ -28,7 +28,7 @@ _CREEP_RAD_S = 1e-4
 friction gives way in MuJoCo."""
 
 
-class Ailments(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+class InjectedFaults(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """What a robot suffers from.
 
     Attributes:
@@ -46,23 +46,23 @@ class Ailments(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     charging: bool | None = None
 
 
-WELL = Ailments()
+WELL = InjectedFaults()
 
 
-def read(text: str, joints: Sequence[str]) -> Ailments:
+def read(text: str, joints: Sequence[str]) -> InjectedFaults:
     """Read a file's text.
 
     Raises:
         ProtocolError: Not TOML, or a field or joint is unknown; the text lists those there are.
     """
-    ailments = fault_file.read(text, Ailments)
+    ailments = fault_file.read(text, InjectedFaults)
     for name in (*ailments.overheating, *ailments.weak, *ailments.stuck):
         if name not in joints:
             raise ProtocolError(f"no joint '{name}'; there are: {', '.join(joints)}")
     return ailments
 
 
-class Sickbed(fault_file.FaultFile[Ailments]):
+class FaultInjector(fault_file.FaultFile[InjectedFaults]):
     """The file of one robot.
 
     Args:
@@ -74,7 +74,7 @@ class Sickbed(fault_file.FaultFile[Ailments]):
         super().__init__(path, partial(read, joints=tuple(joints)))
 
 
-class Infliction:
+class MotorFault:
     """What ails joints, in the simulation's own terms: a ``Process``, so that nobody writes beside the world's thread.
 
     A joint that is stuck hardly moves for all its motor can do; a weak one has less torque, also to hold itself up.
@@ -91,7 +91,7 @@ class Infliction:
         self._torque = np.array(model.jnt_actfrcrange)
         self._wanted = self._done = WELL
 
-    def want(self, ailments: Ailments) -> None:
+    def want(self, ailments: InjectedFaults) -> None:
         """From the next group of steps on it is so. Any thread."""
         self._wanted = ailments
 

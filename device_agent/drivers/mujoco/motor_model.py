@@ -11,7 +11,7 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
-from device_agent.drivers.mujoco.fault_injection import Ailments
+from device_agent.drivers.mujoco.fault_injection import InjectedFaults
 from device_agent.protocol import Joint
 from device_agent.protocol.manifests.capabilities import Battery
 from device_agent.simulation.snapshot import Floats
@@ -122,7 +122,7 @@ class Health:
         self._battery = None if battery is None else BatteryModel(battery)
         self._noise = np.random.default_rng(zlib.crc32(seed.encode()))
 
-    def suffer(self, ailments: Ailments) -> None:
+    def suffer(self, ailments: InjectedFaults) -> None:
         """Put faults into it; those of before are healed."""
         self._ailing = np.array([ailments.overheating.get(name, 0.0) / 60 for name in self._names])
         if self._battery is not None:

@@ -69,7 +69,7 @@ class Watch(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     stuck_s: Annotated[float, Meta(gt=0, le=86_400)] | None = None
 
 
-class RoomDevice(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+class RoomDeviceManifest(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """One sensor or switch of the room.
 
     Attributes:
@@ -208,7 +208,7 @@ class Room(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     model: str = ""
     plan: Plan
     robots: Annotated[tuple[RoomRobot, ...], Meta(max_length=32)] = ()
-    devices: Annotated[tuple[RoomDevice, ...], Meta(max_length=128)] = ()
+    devices: Annotated[tuple[RoomDeviceManifest, ...], Meta(max_length=128)] = ()
     zones: Annotated[tuple[Zone, ...], Meta(max_length=32)] = ()
     people: Annotated[tuple[Person, ...], Meta(max_length=8)] = ()
     climate: Climate = Climate()
@@ -218,7 +218,7 @@ class Room(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
         """The robot of that name, if there is one."""
         return next((robot for robot in self.robots if robot.name == name), None)
 
-    def device(self, name: str) -> RoomDevice | None:
+    def device(self, name: str) -> RoomDeviceManifest | None:
         """The device of that name, if there is one."""
         return next((device for device in self.devices if device.name == name), None)
 
@@ -262,7 +262,7 @@ def parse(text: str) -> Room:
     return room
 
 
-def _check_device(device: RoomDevice) -> None:
+def _check_device(device: RoomDeviceManifest) -> None:
     where = f"device '{device.name}'"
     _check_finite(where, device.position_m)
     _check_names(f"streams of {where}", [stream.name for stream in device.streams])
@@ -282,7 +282,7 @@ def _check_device(device: RoomDevice) -> None:
     _check_judgements(device, where)
 
 
-def _check_judgements(device: RoomDevice, where: str) -> None:
+def _check_judgements(device: RoomDeviceManifest, where: str) -> None:
     """Refuse diagnostics and watches of what the device has not, or that contradict themselves."""
     try:
         check_diagnostics(device.diagnostics)

@@ -8,7 +8,7 @@ from msgspec import Struct, structs
 from device_agent import protocol
 from device_agent.ports import script_calls
 from device_agent.protocol import Task
-from device_agent.runtime.actions.robot_api import ScriptRobot
+from device_agent.runtime.actions.robot_api import RobotApi
 
 _CALLS: dict[type[Struct], type[script_calls.Call]] = {
     protocol.MoveJoints: script_calls.MoveJoints,
@@ -39,7 +39,7 @@ def _tag(kind: type[Struct]) -> str:
     return str(kind.__struct_config__.tag)
 
 
-class Deed:
+class CallAction:
     """An activity that is one call; losing the device ends it.
 
     Args:
@@ -47,7 +47,7 @@ class Deed:
         robot: Who does it.
     """
 
-    def __init__(self, order: Task, robot: ScriptRobot) -> None:
+    def __init__(self, order: Task, robot: RobotApi) -> None:
         self._call = call(order)
         self._robot = robot
 

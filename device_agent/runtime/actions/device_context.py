@@ -6,22 +6,22 @@ from typing import Any
 
 from device_agent.ports import skills
 from device_agent.ports.driver import Observation
-from device_agent.ports.floor_map import Ground
-from device_agent.ports.geometry import Geometry
+from device_agent.ports.floor_map import ObstacleMap
+from device_agent.ports.geometry import RobotGeometry
 from device_agent.ports.skills import Skills
 from device_agent.protocol.manifests.robot_type import RobotType
-from device_agent.runtime.actions.speech_output import Speaker
+from device_agent.runtime.actions.speech_output import SpeechOutput
 from device_agent.runtime.control.controller import Controller
 from device_agent.runtime.errors import Refused
-from device_agent.runtime.readings import Reading, Room
-from device_agent.runtime.room.room_device import Instrument
+from device_agent.runtime.readings import Reading, ReadingCache
+from device_agent.runtime.room.room_device import RoomDevice
 
 CARTESIAN = "cartesian"
 """A capability that a manifest may name, besides those of ``ports.skills``."""
 
 
 @dataclass(frozen=True, slots=True)
-class Body:
+class DeviceContext:
     """A device as its scripts meet it.
 
     Attributes:
@@ -42,14 +42,14 @@ class Body:
     robot_type: RobotType
     controller: Controller
     observe: Callable[[], Observation | None]
-    geometry: Geometry | None
+    geometry: RobotGeometry | None
     skills: Skills | None
-    room: Room
+    room: ReadingCache
     reported: Callable[[], Mapping[str, Reading]] = dict
-    instrument: Instrument | None = None
+    instrument: RoomDevice | None = None
     name: str = ""
-    ground: Callable[[], Ground | None] | None = None
-    speaker: Speaker = field(default_factory=Speaker)
+    ground: Callable[[], ObstacleMap | None] | None = None
+    speaker: SpeechOutput = field(default_factory=SpeechOutput)
     hurry: Callable[[], None] = lambda: None
 
     def seen(self) -> Observation:

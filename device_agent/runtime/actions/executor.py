@@ -6,13 +6,13 @@ import time
 from collections.abc import Callable
 from typing import Any, Protocol
 
-from device_agent.ports.sandbox import Jail
+from device_agent.ports.sandbox import Sandbox
 from device_agent.protocol import AckStatus, ActionState, Command, Reason, RoomTask, RunMovement, Task
 from device_agent.runtime.actions import call_action
-from device_agent.runtime.actions.device_context import Body
-from device_agent.runtime.actions.robot_api import ScriptRobot
+from device_agent.runtime.actions.device_context import DeviceContext
+from device_agent.runtime.actions.robot_api import RobotApi
 from device_agent.runtime.actions.script_action import MAX_OUTPUT, Cell, Script, ScriptFailed
-from device_agent.runtime.actions.script_policy import Trust
+from device_agent.runtime.actions.script_policy import ScriptPolicy
 from device_agent.runtime.errors import Refused
 from device_agent.runtime.room import room_actions
 
@@ -25,7 +25,7 @@ _TELL_EVERY_S = 0.2
 _log = logging.getLogger(__name__)
 
 
-class Executor:
+class ActionExecutor:
     """The one action of one device. Thread-safe.
 
     Args:
@@ -36,7 +36,9 @@ class Executor:
         settle: Sees to it that what was journalled is on the disk; raises where it cannot be.
     """
 
-    def __init__(self, body: Body, *, trust: Trust, jail: Jail, report: Report, settle: Callable[[], None]) -> None:
+    def __init__(
+        self, body: DeviceContext, *, trust: ScriptPolicy, jail: Sandbox, report: Report, settle: Callable[[], None]
+    ) -> None:
         self._settle = settle
         self._body = body
         self._trust = trust
@@ -63,7 +65,7 @@ class Executor:
             elif isinstance(order, RoomTask):
                 run.begin(room_actions.activity(order, self._body.instrument, run.tell))
             else:
-                run.begin(call_action.Deed(order, run.robot))
+                run.begin(call_action.CallAction(order, run.robot))
             self._run = run
         threading.Thread(target=self._follow, args=(run,), name=f"action-{command.id}", daemon=True).start()
         run.announce()
@@ -154,15 +156,15 @@ class _Run:
         command: What is to be done.
         body: The device.
         report: Journals and publishes an ack.
-        settle: See ``Executor``.
+        settle: See ``ActionExecutor``.
     """
 
-    def __init__(self, command: Command, body: Body, report: Report, settle: Callable[[], None]) -> None:
+    def __init__(self, command: Command, body: DeviceContext, report: Report, settle: Callable[[], None]) -> None:
         self._settle = settle
         self.command = command
         self.over = threading.Event()
         self._announced = threading.Event()
-        self.robot = ScriptRobot(body)
+        self.robot = RobotApi(body)
         self._body = body
         self._report = report
         self._ending: tuple[AckStatus, Refused] | None = None

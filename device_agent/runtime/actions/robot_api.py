@@ -6,21 +6,21 @@ from typing import Any
 
 from device_agent.ports import script_calls, skills
 from device_agent.ports.driver import REST, Twist
-from device_agent.ports.geometry import Geometry, GeometryError
+from device_agent.ports.geometry import GeometryError, RobotGeometry
 from device_agent.protocol import Vector3
-from device_agent.runtime.actions.device_context import Body, by_name
-from device_agent.runtime.actions.skill_runner import Performer, check_share
-from device_agent.runtime.authority.authority import Tenure
-from device_agent.runtime.control.goals import Course, Outcome
+from device_agent.runtime.actions.device_context import DeviceContext, by_name
+from device_agent.runtime.actions.skill_runner import SkillRunner, check_share
+from device_agent.runtime.authority.authority import Reservation
+from device_agent.runtime.control.goals import GoalResult, MotionGoal
 from device_agent.runtime.errors import Refused
 from device_agent.runtime.planning import gaze
 from device_agent.runtime.planning.keyframe_trajectory import FASTEST, Timeline
-from device_agent.runtime.planning.motion_planner import Routes, quaternion_of
-from device_agent.runtime.planning.navigator import EVERY_S, ODOMETRY, POSITIONS, Errand, Whereabouts
+from device_agent.runtime.planning.motion_planner import MotionPlanner, quaternion_of
+from device_agent.runtime.planning.navigator import ODOMETRY, POSITIONS, UPDATE_PERIOD_S, Navigator, PoseEstimator
 from device_agent.runtime.readings import Reading
 
 
-class ScriptRobot:
+class RobotApi:
     """``Reach`` of one action.
 
     Args:
@@ -33,15 +33,15 @@ class ScriptRobot:
         over: Set once the action is over, or has lost the device.
     """
 
-    def __init__(self, body: Body) -> None:
+    def __init__(self, body: DeviceContext) -> None:
         self._body = body
-        self.tenure = Tenure(epoch=-1, on_lost=_nobody)  # of nothing, until ``begin``
+        self.tenure = Reservation(epoch=-1, on_lost=_nobody)  # of nothing, until ``begin``
         self.over = threading.Event()
         self.joints = tuple(joint.name for joint in body.robot_type.joints)
         self.frames = () if body.geometry is None else tuple(body.geometry.frames)
         self.can = body.can()
         self.limited: tuple[str, ...] = ()
-        self.performer = Performer(body, self)
+        self.performer = SkillRunner(body, self)
 
     def begin(self, epoch: int, on_lost: Callable[[Refused], None]) -> None:
         """Take the device. ``on_lost`` is called when somebody takes it away, with the controller locked.
@@ -95,7 +95,7 @@ class ScriptRobot:
         check_share("speed", speed, above_zero=True)
         controller = self._body.controller
         if plan:
-            routes = Routes(self._body.robot_type, self._shape())
+            routes = MotionPlanner(self._body.robot_type, self._shape())
             goal_rad = controller.target(self.tenure, position_rad)
             way = routes.around(controller.commanded_rad, goal_rad, speed=speed, ended=self.over.is_set)
             self.follow(controller.go_along(self.tenure, way))
@@ -127,7 +127,7 @@ class ScriptRobot:
         w, x, y, z = quaternion_of(geometry.poses(start), frame, call.quaternion, call.rpy_rad)
         pose = (*call.position_m, w, x, y, z)
         if call.straight:
-            way = Routes(self._body.robot_type, geometry).straight(start, frame, pose, speed=call.speed)
+            way = MotionPlanner(self._body.robot_type, geometry).straight(start, frame, pose, speed=call.speed)
             self.follow(controller.go_along(self.tenure, way))
             return
         try:
@@ -143,7 +143,7 @@ class ScriptRobot:
     def _go_to(self, call: script_calls.GoTo) -> None:
         """A short drive after the other, each of which ends by itself: who stops deciding stands."""
         body, controller = self._body, self._body.controller
-        errand, where = Errand.of(call.x_m, call.y_m, call.yaw_rad, body.robot_type), Whereabouts(body.name)
+        errand, where = Navigator.of(call.x_m, call.y_m, call.yaw_rad, body.robot_type), PoseEstimator(body.name)
         waited_s = 0.0
         while not self.over.is_set():
             ground = None if body.ground is None else body.ground()
@@ -153,23 +153,23 @@ class ScriptRobot:
             try:
                 twist, waited_s = errand.twist(place, ground), 0.0
             except Refused as refused:
-                waited_s += EVERY_S
+                waited_s += UPDATE_PERIOD_S
                 if waited_s > errand.patience_s(refused):
                     raise
                 twist = REST
             if twist is None:
                 break
-            drive = controller.drive(self.tenure, twist, duration_s=3 * EVERY_S)
-            if drive.finished.wait(EVERY_S):
+            drive = controller.drive(self.tenure, twist, duration_s=3 * UPDATE_PERIOD_S)
+            if drive.finished.wait(UPDATE_PERIOD_S):
                 self.follow(drive)
-        self.follow(controller.drive(self.tenure, REST, duration_s=EVERY_S))
+        self.follow(controller.drive(self.tenure, REST, duration_s=UPDATE_PERIOD_S))
 
-    def follow(self, course: Course) -> None:
+    def follow(self, course: MotionGoal) -> None:
         """Have it begin, and wait for its end."""
         self._body.hurry()
         course.finished.wait()
         self.limited += tuple(one for one in course.limited if one not in self.limited)
-        if course.outcome is not Outcome.REACHED:
+        if course.outcome is not GoalResult.REACHED:
             raise course.why or Refused("interrupted", "the move was interrupted")
 
     def _look(self, position_m: Vector3, speed: float) -> None:
@@ -180,7 +180,7 @@ class ScriptRobot:
             start = self._body.seen().position_rad
             self.move_joints(gaze.aim(self._body.robot_type, self._shape(), start, position_m), speed)
 
-    def _shape(self) -> Geometry:
+    def _shape(self) -> RobotGeometry:
         if self._body.geometry is None:
             raise Refused("no_model", "this robot's type has no model")
         return self._body.geometry

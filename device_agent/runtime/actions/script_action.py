@@ -12,7 +12,7 @@ from typing import Any, Protocol
 import msgspec
 
 from device_agent.ports import script_calls
-from device_agent.ports.sandbox import Inmate, Jail, JailError, Limits
+from device_agent.ports.sandbox import JailError, Limits, Sandbox, SandboxProcess
 from device_agent.protocol import RunMovement
 from device_agent.protocol.errors import ProtocolError
 from device_agent.runtime.errors import Refused
@@ -30,7 +30,7 @@ _LOOK_S = 60.0
 _PIECE = 65_536
 
 
-class Reach(Protocol):
+class RobotApiProtocol(Protocol):
     """What a script's calls reach."""
 
     @property
@@ -61,7 +61,7 @@ class ScriptFailed(Exception):  # noqa: N818 (an outcome to report)
 class Cell:
     """Where a script runs: jail and limits, and whether it is a ``stranger``, a script of an unknown owner."""
 
-    jail: Jail
+    jail: Sandbox
     stranger: bool
     limits: Limits = field(default_factory=Limits)
 
@@ -80,7 +80,7 @@ class Script:
     def __init__(
         self,
         order: RunMovement,
-        reach: Reach,
+        reach: RobotApiProtocol,
         told: Callable[[str, float | None], None],
         *,
         cell: Cell,
@@ -93,7 +93,7 @@ class Script:
         self._died = died
         self._killed = threading.Event()
         self._over = threading.Event()
-        self._inmate: Inmate | None = None
+        self._inmate: SandboxProcess | None = None
 
     def run(self) -> None:
         """Run to the end.
@@ -124,14 +124,14 @@ class Script:
         if self._inmate is not None:
             self._inmate.kill()
 
-    def _watch(self, inmate: Inmate) -> None:
+    def _watch(self, inmate: SandboxProcess) -> None:
         """Whoever serves the script may be busy with its last call for as long as a move takes."""
         while not inmate.wait(_LOOK_S):
             if self._over.is_set():
                 return
         self._died()
 
-    def _serve(self, inmate: Inmate) -> None:
+    def _serve(self, inmate: SandboxProcess) -> None:
         lines = _Lines(inmate.link, self._killed)
         try:
             self._send_script(inmate.link, lines)
@@ -234,7 +234,7 @@ def _write(link: socket.socket, **message: Any) -> None:
         link.settimeout(None)
 
 
-def _because(inmate: Inmate) -> str:
+def _because(inmate: SandboxProcess) -> str:
     """Why it died, as far as that can be known."""
     inmate_died = inmate.wait(_WRITE_S)
     why = inmate.ending() if inmate_died else "it stopped making sense"

@@ -12,7 +12,7 @@ from device_agent.runtime.errors import Refused
 from device_agent.runtime.storage.journal import Journal
 
 
-class Trust:
+class ScriptPolicy:
     """The judgement of one device about scripts, besides that about the command they came with.
 
     Args:

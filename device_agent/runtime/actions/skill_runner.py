@@ -7,23 +7,23 @@ from typing import Protocol
 
 from device_agent.ports import script_calls, skills
 from device_agent.ports.skills import Skill, SkillError
-from device_agent.runtime.actions.device_context import Body
+from device_agent.runtime.actions.device_context import DeviceContext
 from device_agent.runtime.actions.speech_output import Utterance
-from device_agent.runtime.authority.authority import Tenure
-from device_agent.runtime.control.goals import Course
+from device_agent.runtime.authority.authority import Reservation
+from device_agent.runtime.control.goals import MotionGoal
 from device_agent.runtime.errors import Refused
 from device_agent.runtime.planning import named_poses
-from device_agent.runtime.planning.behaviour_trajectory import Line, Score
+from device_agent.runtime.planning.behaviour_trajectory import BehaviourTrajectory, Line
 
 _REST_WITHIN_S = 3.0
 _PERIODS = 4
 """Control periods after which the servos surely have what was commanded."""
 
 
-class Mover(Protocol):
+class JointMover(Protocol):
     """The action that shows something."""
 
-    tenure: Tenure
+    tenure: Reservation
     over: threading.Event
 
     def move_joints(self, position_rad: dict[str, float], speed: float) -> None:
@@ -33,7 +33,7 @@ class Mover(Protocol):
             Refused: It did not get there.
         """
 
-    def follow(self, course: Course) -> None:
+    def follow(self, course: MotionGoal) -> None:
         """Wait for the end of a course.
 
         Raises:
@@ -41,7 +41,7 @@ class Mover(Protocol):
         """
 
 
-class Performer:
+class SkillRunner:
     """Shows what one action asks for.
 
     Args:
@@ -49,7 +49,7 @@ class Performer:
         mover: The action.
     """
 
-    def __init__(self, body: Body, mover: Mover) -> None:
+    def __init__(self, body: DeviceContext, mover: JointMover) -> None:
         self._body = body
         self._mover = mover
 
@@ -86,7 +86,7 @@ class Performer:
             raise Refused("cannot", "this robot's driver has no skills")
         if not self._mover.over.is_set():
             try:
-                self._body.skills.perform(skill, _Stage(self._mover))
+                self._body.skills.perform(skill, _SkillContext(self._mover))
             except SkillError as error:
                 raise self._mover.tenure.why or Refused("skill_failed", str(error)) from error
         self._check()
@@ -102,7 +102,7 @@ class Performer:
             self._check()
             return
         self.come_to_rest()
-        score = Score(kind, self._body.controller.commanded_rad)
+        score = BehaviourTrajectory(kind, self._body.controller.commanded_rad)
         score.speak(Line(0.0, text, utterance.duration_s))
         course = self._body.controller.go_along(self._mover.tenure, score.way())
         self._body.speaker.begin(utterance)
@@ -113,7 +113,7 @@ class Performer:
         keyframes = named_poses.named("behaviour", name, kind.behaviours)
         said = {one.say: self._body.speaker.prepare(one.say, "") for one in keyframes if one.say}
         self.come_to_rest()
-        score = Score(kind, self._body.controller.commanded_rad)
+        score = BehaviourTrajectory(kind, self._body.controller.commanded_rad)
         lines = score.keyframes(keyframes, {text: utterance.duration_s for text, utterance in said.items()})
         course = self._body.controller.go_along(self._mover.tenure, score.way())
         begun_s = time.monotonic()
@@ -167,10 +167,10 @@ class Performer:
             raise self._mover.tenure.why or Refused("ended", "the action ended")
 
 
-class _Stage:
+class _SkillContext:
     """``Stage`` of one skill."""
 
-    def __init__(self, mover: Mover) -> None:
+    def __init__(self, mover: JointMover) -> None:
         self._mover = mover
 
     @property

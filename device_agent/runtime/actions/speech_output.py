@@ -11,9 +11,9 @@ from device_agent.ports.speech import Speech, SpeechError, Spoken
 from device_agent.ports.uploads import UploadError, Uploads
 from device_agent.protocol import LANGUAGE_PATTERN
 from device_agent.protocol.events import EventKind
-from device_agent.runtime.authority.event_recorder import Happened
+from device_agent.runtime.authority.event_recorder import EventRecord
 from device_agent.runtime.errors import Refused
-from device_agent.runtime.planning.visemes import guessed_s
+from device_agent.runtime.planning.visemes import estimate_duration_s
 
 STREAM = "speech"
 _UPLOAD_WITHIN_S = 2.0
@@ -41,7 +41,7 @@ class Utterance:
     stored: threading.Event = field(default_factory=threading.Event)
 
 
-class Speaker:
+class SpeechOutput:
     """Who says what one device is to say.
 
     Args:
@@ -58,7 +58,7 @@ class Speaker:
         *,
         speech: Speech | None = None,
         uploads: Uploads | None = None,
-        tell: Callable[[Happened], None] | None = None,
+        tell: Callable[[EventRecord], None] | None = None,
         heard: Callable[[float], None] | None = None,
     ) -> None:
         self._device = device
@@ -79,7 +79,7 @@ class Speaker:
             raise Refused("bad_language", f"'{language[:40]}' is no language; give one as en, sk, or none")
         spoken = self._spoken(text, language)
         if spoken is None:
-            return Utterance(text, language, guessed_s(text))
+            return Utterance(text, language, estimate_duration_s(text))
         utterance = Utterance(text, language, min(spoken.duration_s, _MOST_S), sound=True)
         threading.Thread(target=self._store, args=(utterance, spoken), name="speech", daemon=True).start()
         return utterance
@@ -98,7 +98,7 @@ class Speaker:
         if self._heard is not None:
             self._heard(utterance.duration_s)
         if self._tell is not None:
-            self._tell(Happened(EventKind.SAID, utterance.text, data=data))
+            self._tell(EventRecord(EventKind.SAID, utterance.text, data=data))
 
     def _spoken(self, text: str, language: str) -> Spoken | None:
         if self._speech is None:

@@ -9,14 +9,14 @@ from dataclasses import dataclass
 
 from device_agent.protocol import StopLatch
 from device_agent.protocol.events import EventKind
-from device_agent.runtime.authority.event_recorder import Happened, Severity, Tell
+from device_agent.runtime.authority.event_recorder import EventRecord, Severity, Tell
 from device_agent.runtime.authority.lease_gate import Lease, LeaseGate
 from device_agent.runtime.authority.speed_restrictions import Restrictions
 from device_agent.runtime.errors import Refused
 
 
 @dataclass(eq=False)
-class Tenure:
+class Reservation:
     """An action's hold on the device, from ``begin_action`` until the action ends or ``why`` says who took it away.
 
     ``on_lost`` is called once, with the controller locked: it must be quick and must not call back.
@@ -53,7 +53,7 @@ class Authority:
         self.changed = threading.Event()
         self.latch = latch
         self.fault: str | None = None
-        self.tenure: Tenure | None = None
+        self.tenure: Reservation | None = None
         self.restrictions = Restrictions()
 
     @property
@@ -149,7 +149,7 @@ class Authority:
         self._gate.burn()
         self.lose(why)
 
-    def begin(self, epoch: int, on_lost: Callable[[Refused], None]) -> Tenure:
+    def begin(self, epoch: int, on_lost: Callable[[Refused], None]) -> Reservation:
         """An action now has the device.
 
         Raises:
@@ -157,7 +157,7 @@ class Authority:
         """
         if self.tenure is not None:
             raise Refused("busy", "another action runs on this device")
-        self.tenure = Tenure(epoch, on_lost)
+        self.tenure = Reservation(epoch, on_lost)
         return self.tenure
 
     def check_free(self) -> None:
@@ -174,7 +174,7 @@ class Authority:
         if strictest is not None and strictest.speed <= 0:
             raise Refused("interlock", f"the room holds the device: {strictest.why}")
 
-    def check_tenure(self, tenure: Tenure) -> None:
+    def check_tenure(self, tenure: Reservation) -> None:
         """This action still has the device.
 
         Raises:
@@ -198,7 +198,7 @@ class Authority:
 
     def note(self, kind: EventKind, message: str, data: Mapping[str, object], severity: Severity = "info") -> None:
         """Tell what happened."""
-        self._tell(Happened(kind, message, severity, data))
+        self._tell(EventRecord(kind, message, severity, data))
 
     def _superseded(self, before: int, had: Lease | None) -> bool:
         if self._gate.epoch == before:

@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass
 
-from device_agent.protocol import AskLease
+from device_agent.protocol import RequestControl
 from device_agent.runtime.authority.lease_gate import Lease
 from device_agent.runtime.errors import Refused
 
@@ -17,14 +17,14 @@ class Asked:
     expires_s: float
 
 
-class Handover:
+class PendingControlRequest:
     """The one open request of one device. Not thread-safe: the office alone uses it."""
 
     def __init__(self) -> None:
         self._asked: Asked | None = None
         self._dropped = ""
 
-    def ask(self, order: AskLease, *, epoch: int, lease: Lease | None, now_s: float) -> None:
+    def ask(self, order: RequestControl, *, epoch: int, lease: Lease | None, now_s: float) -> None:
         """Show a request until it is dropped, its time is over, or the lease that it asks for has ended.
 
         Raises:

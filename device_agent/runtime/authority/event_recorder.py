@@ -25,7 +25,7 @@ _MOST_COUNTED = 64
 
 
 @dataclass(frozen=True, slots=True)
-class Happened:
+class EventRecord:
     """One fact, with its own time [ms since 1970]."""
 
     kind: EventKind
@@ -35,7 +35,7 @@ class Happened:
     at_ms: int = 0
 
 
-Tell = Callable[[Happened], None]
+Tell = Callable[[EventRecord], None]
 """Takes in a fact; quick, never blocks, never raises."""
 
 
@@ -44,29 +44,29 @@ class _Flood:
     """One refusal that comes again: how often since it was last told, and the newest of them."""
 
     told_s: float
-    newest: Happened
+    newest: EventRecord
     count: int = 0
 
 
-def to_nobody(_happened: Happened) -> None:
+def ignore_event(_happened: EventRecord) -> None:
     """For whoever is watched by nobody."""
 
 
-class Audit:
+class EventRecorder:
     """The facts of one device that wait to be told. Thread-safe."""
 
     def __init__(self) -> None:
         self._lock = threading.Lock()
-        self._waiting: deque[Happened] = deque()
+        self._waiting: deque[EventRecord] = deque()
         self._floods: dict[tuple[EventKind, str], _Flood] = {}
         self._lost = 0
 
-    def note(self, happened: Happened) -> None:
+    def note(self, happened: EventRecord) -> None:
         """Something happened now."""
         with self._lock:
             self._add(_stamped(happened))
 
-    def refused(self, happened: Happened, *, code: str, now_s: float) -> None:
+    def refused(self, happened: EventRecord, *, code: str, now_s: float) -> None:
         """Something was refused, perhaps not for the first time.
 
         Args:
@@ -86,7 +86,7 @@ class Audit:
             else:
                 self._lost += 1
 
-    def take(self, now_s: float) -> list[Happened]:
+    def take(self, now_s: float) -> list[EventRecord]:
         """What is to be told now, oldest first.
 
         Args:
@@ -103,22 +103,22 @@ class Audit:
                     continue
                 newest = flood.newest
                 data = {**newest.data, "count": flood.count}
-                found.append(Happened(newest.kind, newest.message, newest.severity, data, newest.at_ms))
+                found.append(EventRecord(newest.kind, newest.message, newest.severity, data, newest.at_ms))
                 flood.told_s, flood.count = now_s, 0
             if self._lost:
                 message = f"{self._lost} events are not told one by one: too much happened at once"
-                found.append(_stamped(Happened(EventKind.EVENTS_LOST, message, "warning", {"count": self._lost})))
+                found.append(_stamped(EventRecord(EventKind.EVENTS_LOST, message, "warning", {"count": self._lost})))
                 self._lost = 0
             return found
 
-    def _add(self, happened: Happened) -> None:
+    def _add(self, happened: EventRecord) -> None:
         if len(self._waiting) >= _MOST_WAITING:
             self._lost += 1
             return
         self._waiting.append(happened)
 
 
-def event_of(device: str, happened: Happened) -> Event:
+def event_of(device: str, happened: EventRecord) -> Event:
     """A fact as it is told.
 
     Args:
@@ -136,5 +136,5 @@ def event_of(device: str, happened: Happened) -> Event:
     )
 
 
-def _stamped(happened: Happened) -> Happened:
-    return Happened(happened.kind, happened.message, happened.severity, happened.data, happened.at_ms or wall_ms())
+def _stamped(happened: EventRecord) -> EventRecord:
+    return EventRecord(happened.kind, happened.message, happened.severity, happened.data, happened.at_ms or wall_ms())

@@ -12,8 +12,8 @@ from msgspec import Meta, Struct
 
 from device_agent.protocol import Field, Id, InterlockRule
 from device_agent.protocol.events import EventKind
-from device_agent.runtime.authority.event_recorder import Happened
-from device_agent.runtime.readings import Reading, Room
+from device_agent.runtime.authority.event_recorder import EventRecord
+from device_agent.runtime.readings import Reading, ReadingCache
 
 _HOLD = 0.0
 
@@ -128,11 +128,11 @@ class Interlocks:
     def __init__(
         self,
         rules: Sequence[Interlock],
-        room: Room,
+        room: ReadingCache,
         *,
         restrict: Restrict,
         lift: Callable[[str], None],
-        note: Callable[[Happened, str, float], None],
+        note: Callable[[EventRecord, str, float], None],
     ) -> None:
         self._watched = [_Watched(rule) for rule in rules]
         self._sources = [room.source(rule.device, rule.stream) for rule in rules]
@@ -158,11 +158,13 @@ class Interlocks:
             self._restrict(rule.name, rule.left, why)
             data = {"interlock": rule.name, "action": rule.action, "why": why}
             verb = "held" if rule.action == "hold" else "slowed"
-            happened = Happened(EventKind.INTERLOCK_ACTED, f"the room {verb} the device: {why}", "warning", data)
+            happened = EventRecord(EventKind.INTERLOCK_ACTED, f"the room {verb} the device: {why}", "warning", data)
             self._note(happened, f"{rule.name} {why}", now_s)
         else:
             self._lift(rule.name)
             if before:
                 data = {"interlock": rule.name}
-                self._note(Happened(EventKind.INTERLOCK_CLEARED, "the room is free again", data=data), rule.name, now_s)
+                self._note(
+                    EventRecord(EventKind.INTERLOCK_CLEARED, "the room is free again", data=data), rule.name, now_s
+                )
         watched.why = why

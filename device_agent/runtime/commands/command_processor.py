@@ -14,33 +14,33 @@ from functools import partial
 from device_agent.ports.clock import CloudClock, wall_ms
 from device_agent.protocol import (
     AckStatus,
-    AskLease,
     CancelAction,
     Command,
-    DropRequest,
     Fault,
-    FollowKey,
     GrantLease,
     Reason,
     ReleaseLease,
+    RequestControl,
     ResetStop,
     Restriction,
+    RotateKey,
     StopDevice,
     StopLatch,
     Twin,
+    WithdrawRequest,
     codec,
 )
 from device_agent.protocol.errors import ProtocolError, SignatureError
 from device_agent.protocol.events import EventKind
 from device_agent.protocol.security import signing
-from device_agent.runtime.actions.executor import Executor
-from device_agent.runtime.authority.control_request import Handover
-from device_agent.runtime.authority.event_recorder import Audit, Happened
-from device_agent.runtime.commands.pinned_keys import Pins
+from device_agent.runtime.actions.executor import ActionExecutor
+from device_agent.runtime.authority.control_request import PendingControlRequest
+from device_agent.runtime.authority.event_recorder import EventRecord, EventRecorder
+from device_agent.runtime.commands.pinned_keys import PinnedKeys
 from device_agent.runtime.control.controller import Controller
 from device_agent.runtime.errors import Refused
 from device_agent.runtime.storage.journal import Journal, JournalError
-from device_agent.runtime.telemetry.device_publisher import Condition, Voice
+from device_agent.runtime.telemetry.device_publisher import DevicePublisher, StateSnapshot
 
 _FUTURE_MS = 2000
 """A command may seem issued this much later than now: more than the error of the clock estimate ever is."""
@@ -48,7 +48,7 @@ _MOST_WAITING = 1000
 _log = logging.getLogger(__name__)
 
 
-class Office:
+class CommandProcessor:
     """Takes in commands, one after another.
 
     Args:
@@ -69,12 +69,12 @@ class Office:
         *,
         address: tuple[str, str, str],
         controller: Controller,
-        executor: Executor,
-        voice: Voice,
-        audit: Audit,
+        executor: ActionExecutor,
+        voice: DevicePublisher,
+        audit: EventRecorder,
         journal: Journal,
         cloud_clock: CloudClock,
-        keys: Pins,
+        keys: PinnedKeys,
         hurry: Callable[[], None],
         ailing: Callable[[], tuple[Fault, ...]] = tuple,
     ) -> None:
@@ -89,7 +89,7 @@ class Office:
         self._keys = keys
         self._hurry = hurry
         self._ailing = ailing
-        self._handover = Handover()
+        self._handover = PendingControlRequest()
         self._twin: Twin | None = None
         self._commands: queue.Queue[bytes] = queue.Queue(maxsize=_MOST_WAITING)
         self._introduce = threading.Event()
@@ -148,7 +148,7 @@ class Office:
             _log.exception("%s: office", self._name)
 
     def _journal_failed(self, error: JournalError) -> None:
-        happened = Happened(EventKind.JOURNAL_FAILED, str(error), "error")
+        happened = EventRecord(EventKind.JOURNAL_FAILED, str(error), "error")
         self._audit.refused(happened, code="journal", now_s=time.monotonic())
 
     def _show(self) -> None:
@@ -207,7 +207,7 @@ class Office:
         if command is not None:
             request = type(command.request).__struct_config__.tag
             data |= {"command": command.id, "request": request, "who": command.who, "epoch": command.epoch}
-        happened = Happened(EventKind.COMMAND_REFUSED, f"a command was refused: {message}", "warning", data)
+        happened = EventRecord(EventKind.COMMAND_REFUSED, f"a command was refused: {message}", "warning", data)
         self._audit.refused(happened, code=code, now_s=time.monotonic())
 
     def _check_time(self, command: Command) -> None:
@@ -235,9 +235,9 @@ class Office:
                 self._controller.grant(
                     epoch=command.epoch, holder=holder, lease_s=lease_ms / 1000, now_s=now_s, reason=reason
                 )
-            case AskLease() as asked:
+            case RequestControl() as asked:
                 self._handover.ask(asked, epoch=command.epoch, lease=self._controller.lease(now_s), now_s=now_s)
-            case DropRequest(request=request):
+            case WithdrawRequest(request=request):
                 self._handover.drop(request)
             case ReleaseLease():
                 self._controller.release(epoch=command.epoch)
@@ -249,9 +249,9 @@ class Office:
                 self._controller.reset_stop(epoch=command.epoch)
                 if latched:
                     message = f"Stop was reset by {command.who}"
-                    self._audit.note(Happened(EventKind.STOP_RESET, message, data={"by": command.who}))
+                    self._audit.note(EventRecord(EventKind.STOP_RESET, message, data={"by": command.who}))
                 _log.warning("%s: Stop reset by %s", self._name, command.who)
-            case FollowKey(statements=statements):
+            case RotateKey(statements=statements):
                 self._keys.follow(statements)
             case CancelAction(action=action):
                 self._executor.cancel(action, command.who)
@@ -286,11 +286,11 @@ class Office:
             return (Fault(code="driver", message=fault[:2000], since_ms=wall_ms()),)
         return self._ailing()
 
-    def _condition(self) -> Condition:
+    def _condition(self) -> StateSnapshot:
         now_s = time.monotonic()
         epoch, ended = self._controller.epochs
         lease = self._controller.lease(now_s)
-        return Condition(
+        return StateSnapshot(
             mode=self._controller.mode,
             epoch=epoch,
             ended=ended,

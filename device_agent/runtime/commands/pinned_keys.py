@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterable, Iterator, Mapping
 from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PublicKey
 from msgspec.structs import replace
 
-from device_agent.config.agent_config import HomeError, Pairing
+from device_agent.config.agent_config import ConfigError, Pairing
 from device_agent.protocol import codec
 from device_agent.protocol.errors import ProtocolError, SignatureError
 from device_agent.protocol.security import key_rotation, signing
@@ -18,7 +18,7 @@ _log = logging.getLogger(__name__)
 ADVICE = "run `python -m device_agent repin` on this machine, or un-pair the agent and claim it again"
 
 
-class Pins(Mapping[str, Ed25519PublicKey]):
+class PinnedKeys(Mapping[str, Ed25519PublicKey]):
     """Pinned keys that count now, by key id. Thread-safe: every device and the link look here.
 
     Args:
@@ -113,7 +113,7 @@ class Pins(Mapping[str, Ed25519PublicKey]):
         )
         try:
             self._save(pairing)
-        except HomeError as error:
+        except ConfigError as error:
             raise Refused("journal", f"the new key could not be written down: {error}") from error
         self._pairing, self._keys = pairing, pairing.public_keys()
         _log.info("the cloud has a new key, %s (number %d)", name, new.serial)

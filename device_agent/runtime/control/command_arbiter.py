@@ -9,18 +9,18 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 from device_agent.ports.driver import REST, Twist
-from device_agent.ports.geometry import Clearance, Geometry
+from device_agent.ports.geometry import Clearance, RobotGeometry
 from device_agent.protocol import Mode, StopLatch
 from device_agent.protocol.events import EventKind
 from device_agent.protocol.manifests.robot_type import RobotType
 from device_agent.runtime.authority.authority import Authority
 from device_agent.runtime.authority.event_recorder import Tell
 from device_agent.runtime.authority.lease_gate import LeaseGate
-from device_agent.runtime.control.goal_executor import Helm
+from device_agent.runtime.control.goal_executor import GoalExecutor
 from device_agent.runtime.control.joint_motion import MotionError
-from device_agent.runtime.control.joint_stiffness import Slack
-from device_agent.runtime.control.limits import Envelope
-from device_agent.runtime.control.setpoint_stream import Stream
+from device_agent.runtime.control.joint_stiffness import JointStiffness
+from device_agent.runtime.control.limits import MotionLimits
+from device_agent.runtime.control.setpoint_stream import SetpointStream
 from device_agent.runtime.errors import Refused
 
 _CREEP_RAD_S = 0.02
@@ -32,7 +32,7 @@ _SAME_TWIST = 1e-3
 
 
 @dataclass(frozen=True, slots=True)
-class Tick:
+class ControlOutput:
     """What one ``step`` decided. ``position_rad`` and ``twist`` are for the motors; the rest is for telemetry."""
 
     position_rad: list[float]
@@ -45,7 +45,7 @@ class Tick:
     twist: Twist = REST
 
 
-class Pilot:
+class CommandArbiter:
     """Follows setpoints or an action's course while whoever asked may move it. Not thread-safe: its owner locks.
 
     Args:
@@ -70,16 +70,16 @@ class Pilot:
         gate: LeaseGate,
         *,
         latch: StopLatch | None,
-        geometry: Geometry | None,
+        geometry: RobotGeometry | None,
         tell: Tell,
     ) -> None:
         self._joints = robot_type.joints
         self._period_s = robot_type.period_ms / 1000
-        self.envelope = Envelope(robot_type, geometry)
-        self.helm = Helm(robot_type, self.envelope)
+        self.envelope = MotionLimits(robot_type, geometry)
+        self.helm = GoalExecutor(robot_type, self.envelope)
         self._motion = self.helm.motion
-        self.stream = Stream(robot_type, self.envelope, geometry)
-        self.slack = Slack(robot_type)
+        self.stream = SetpointStream(robot_type, self.envelope, geometry)
+        self.slack = JointStiffness(robot_type)
         self.authority = Authority(gate, latch, hold=self._hold, tell=tell)
         self.mode = Mode.IDLE
         self._due_s = math.inf
@@ -87,7 +87,9 @@ class Pilot:
         self._driver_limits: tuple[str, ...] = ()
         self._base_limits: tuple[str, ...] = ()
 
-    def step(self, now_s: float, measured_rad: Sequence[float] | None = None, *, passed_s: float | None = None) -> Tick:
+    def step(
+        self, now_s: float, measured_rad: Sequence[float] | None = None, *, passed_s: float | None = None
+    ) -> ControlOutput:
         """Decide this period's command.
 
         Args:
@@ -113,7 +115,7 @@ class Pilot:
         limited = self._limits()
         self.helm.settle(limited, measured_rad=measured_rad, soft=self.slack.soft)
         lease = self.authority.lease(now_s)
-        return Tick(
+        return ControlOutput(
             list(self._motion.position_rad),
             self.mode,
             lease.epoch if lease else 0,

@@ -14,10 +14,10 @@ from typing import Any
 import numpy as np
 
 from device_agent.ports.clock import tick_ms, wall_ms
-from device_agent.ports.driver import Driver, DriverError, MobileDriver, Observation, Prompt
+from device_agent.ports.driver import Driver, DriverError, MobileDriver, Observation, RunsInline
 from device_agent.protocol import JointTelemetry, Mode
 from device_agent.protocol.manifests.robot_type import RobotType
-from device_agent.runtime.control.command_arbiter import Tick
+from device_agent.runtime.control.command_arbiter import ControlOutput
 from device_agent.runtime.control.controller import Controller
 
 IDLE_RATE_HZ = 20.0
@@ -71,7 +71,7 @@ class ControlLoop:
         self._next_s = 0.0
         self._early = False
         self._trouble = ""
-        self._prompt = isinstance(driver, Prompt) and driver.prompt
+        self._prompt = isinstance(driver, RunsInline) and driver.prompt
         self._asked = threading.Event()
         self._turn = threading.Lock()  # of whoever runs a period
         self._stopping = threading.Event()
@@ -104,9 +104,9 @@ class ControlLoop:
             self._thread.join(timeout=2)
 
     def hurry(self) -> None:
-        """Something is asked of a device: while it rests its period begins now, here if the driver is ``Prompt``.
+        """Something is asked of a device: while it rests its period begins now, here if the driver is ``RunsInline``.
 
-        So does a Stop's while it moves, where the driver is ``Prompt``; else a Stop waits for the period that comes.
+        So does a Stop's while it moves, where the driver is ``RunsInline``; else a Stop waits for the period that comes.
         """
         # A period that runs may have decided before the Stop was there.
         if self._prompt and self._turn.acquire(timeout=self._period_s if self._controller.stops else 0):
@@ -187,7 +187,7 @@ class ControlLoop:
                 self._trouble = ""
                 return
 
-    def _measure(self, now_s: float, seen: Observation, tick: Tick, applied: tuple[float, ...]) -> None:
+    def _measure(self, now_s: float, seen: Observation, tick: ControlOutput, applied: tuple[float, ...]) -> None:
         if not self._due(now_s, tick):
             if tick.mode is Mode.STREAMING:
                 self._show(seen)  # so that the next setpoint finds it done
@@ -225,7 +225,7 @@ class ControlLoop:
             self._shown = seen, shown
         return self._shown[1]
 
-    def _due(self, now_s: float, tick: Tick) -> bool:
+    def _due(self, now_s: float, tick: ControlOutput) -> bool:
         """Whether telemetry is to be told: a regular word, or news of a setpoint. Two may be close, many may not."""
         gap_s = 1 / MOVING_RATE_HZ
         news = tick.setpoint_sequence != self._told_setpoint and now_s >= self._spent_s - gap_s

@@ -10,17 +10,17 @@ from collections.abc import Callable, Mapping, Sequence
 import numpy as np
 
 from device_agent.ports.driver import Twist
-from device_agent.ports.geometry import Geometry
+from device_agent.ports.geometry import RobotGeometry
 from device_agent.protocol import Mode, Setpoint, StopLatch
 from device_agent.protocol.manifests.robot_type import RobotType
-from device_agent.runtime.authority.authority import Tenure
-from device_agent.runtime.authority.event_recorder import Tell, to_nobody
+from device_agent.runtime.authority.authority import Reservation
+from device_agent.runtime.authority.event_recorder import Tell, ignore_event
 from device_agent.runtime.authority.lease_gate import Lease, LeaseGate
 from device_agent.runtime.authority.speed_restrictions import Restriction
-from device_agent.runtime.control.command_arbiter import Pilot, Tick
-from device_agent.runtime.control.goals import Drive, Move, Passage
+from device_agent.runtime.control.command_arbiter import CommandArbiter, ControlOutput
+from device_agent.runtime.control.goals import DriveGoal, JointGoal, TrajectoryGoal
 from device_agent.runtime.errors import Refused
-from device_agent.runtime.planning.trajectory import Way
+from device_agent.runtime.planning.trajectory import Trajectory
 
 
 class Controller:
@@ -43,11 +43,11 @@ class Controller:
         gate: LeaseGate,
         *,
         latch: StopLatch | None = None,
-        geometry: Geometry | None = None,
-        tell: Tell = to_nobody,
+        geometry: RobotGeometry | None = None,
+        tell: Tell = ignore_event,
     ) -> None:
         self._joints = robot_type.joints
-        self._pilot = Pilot(robot_type, gate, latch=latch, geometry=geometry, tell=tell)
+        self._pilot = CommandArbiter(robot_type, gate, latch=latch, geometry=geometry, tell=tell)
         self._envelope, self._helm, self._stream = self._pilot.envelope, self._pilot.helm, self._pilot.stream
         self._motion, self._slack, self._authority = self._helm.motion, self._pilot.slack, self._pilot.authority
         self.changed = self._authority.changed
@@ -107,7 +107,7 @@ class Controller:
                 raise Refused("busy", "an action runs; cancel it first")
             self._stream.take(setpoint, now_s=now_s, tick_ms=tick_ms)
 
-    def begin_action(self, *, epoch: int, on_lost: Callable[[Refused], None]) -> Tenure:
+    def begin_action(self, *, epoch: int, on_lost: Callable[[Refused], None]) -> Reservation:
         """An action now has the device, until ``end_action`` or until its lease ends.
 
         Raises:
@@ -120,7 +120,7 @@ class Controller:
             self._stream.drop()
             return tenure
 
-    def end_action(self, tenure: Tenure) -> None:
+    def end_action(self, tenure: Reservation) -> None:
         """The action is over; what still moves is held."""
         with self._lock:
             if self._authority.tenure is tenure:
@@ -128,7 +128,7 @@ class Controller:
                 self._authority.tenure = None
                 self._stream.stand(self._motion.position_rad)
 
-    def move(self, tenure: Tenure, position_rad: Mapping[str, float], *, speed: float) -> Move:
+    def move(self, tenure: Reservation, position_rad: Mapping[str, float], *, speed: float) -> JointGoal:
         """Start a move to joint positions [rad] as part of an action; joints not named stay.
 
         Raises:
@@ -154,7 +154,7 @@ class Controller:
         with self._lock:
             self._slack.set(values)
 
-    def stiffen(self, tenure: Tenure, values: Mapping[str, float]) -> None:
+    def stiffen(self, tenure: Reservation, values: Mapping[str, float]) -> None:
         """As part of an action, take in how firmly joints are to hold, 0…1; who calls tells the driver.
 
         Raises:
@@ -164,7 +164,7 @@ class Controller:
             self._check_course(tenure)
             self._slack.set(values)
 
-    def target(self, tenure: Tenure, position_rad: Mapping[str, float]) -> list[float]:
+    def target(self, tenure: Reservation, position_rad: Mapping[str, float]) -> list[float]:
         """Where a move to these positions would end, shape (n,) [rad].
 
         Raises:
@@ -174,7 +174,7 @@ class Controller:
             self._check_course(tenure)
             return self._envelope.target(position_rad, self._motion.position_rad)
 
-    def go_along(self, tenure: Tenure, way: Way) -> Passage:
+    def go_along(self, tenure: Reservation, way: Trajectory) -> TrajectoryGoal:
         """Start along a way that was planned, as part of an action. It begins where the device rests.
 
         Raises:
@@ -187,7 +187,7 @@ class Controller:
             self._slack.check(joint.name for joint, moves in zip(self._joints, moved, strict=True) if moves)
             return self._helm.go_along(way)
 
-    def drive(self, tenure: Tenure, twist: Twist, *, duration_s: float) -> Drive:
+    def drive(self, tenure: Reservation, twist: Twist, *, duration_s: float) -> DriveGoal:
         """Move the base as part of an action, for ``duration_s`` [s]; then it brakes by itself.
 
         Raises:
@@ -323,7 +323,9 @@ class Controller:
 
     # ------------------------------------------------------------ the control loop
 
-    def step(self, now_s: float, measured_rad: Sequence[float] | None = None, *, passed_s: float | None = None) -> Tick:
+    def step(
+        self, now_s: float, measured_rad: Sequence[float] | None = None, *, passed_s: float | None = None
+    ) -> ControlOutput:
         """Decide this period's command.
 
         Args:
@@ -338,6 +340,6 @@ class Controller:
         if self._authority.fence(epoch):
             self._stream.begin(self._motion.position_rad)
 
-    def _check_course(self, tenure: Tenure) -> None:
+    def _check_course(self, tenure: Reservation) -> None:
         self._authority.check_free()
         self._authority.check_tenure(tenure)

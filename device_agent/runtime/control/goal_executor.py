@@ -9,18 +9,18 @@ from device_agent.ports.driver import REST, Twist
 from device_agent.ports.geometry import Clearance
 from device_agent.protocol.manifests.robot_type import RobotType
 from device_agent.runtime.control.base_motion import BaseMotion
-from device_agent.runtime.control.goal_tolerance import Arrival
-from device_agent.runtime.control.goals import Course, Drive, Move, Outcome, Passage
-from device_agent.runtime.control.joint_motion import Motion, MotionError
-from device_agent.runtime.control.limits import Envelope
+from device_agent.runtime.control.goal_tolerance import GoalTolerance
+from device_agent.runtime.control.goals import DriveGoal, GoalResult, JointGoal, MotionGoal, TrajectoryGoal
+from device_agent.runtime.control.joint_motion import JointMotion, MotionError
+from device_agent.runtime.control.limits import MotionLimits
 from device_agent.runtime.errors import Refused
-from device_agent.runtime.planning.trajectory import Way
+from device_agent.runtime.planning.trajectory import Trajectory
 
 _LONGEST_DRIVE_S = 60.0
 _SAME_RAD = 1e-4
 
 
-class Helm:
+class GoalExecutor:
     """Joints and base of one device, and the course that they are on. Not thread-safe: its owner locks.
 
     Args:
@@ -33,17 +33,17 @@ class Helm:
         course: What an action has asked, until it has ended.
     """
 
-    def __init__(self, robot_type: RobotType, envelope: Envelope) -> None:
+    def __init__(self, robot_type: RobotType, envelope: MotionLimits) -> None:
         self._period_s = robot_type.period_ms / 1000
         self._envelope = envelope
-        self.motion = Motion(robot_type)
+        self.motion = JointMotion(robot_type)
         self.base = None if robot_type.base is None else BaseMotion(robot_type.base, self._period_s)
-        self.course: Course | None = None
-        self._arrival = Arrival([joint.name for joint in robot_type.joints], self._period_s)
+        self.course: MotionGoal | None = None
+        self._arrival = GoalTolerance([joint.name for joint in robot_type.joints], self._period_s)
 
     # ------------------------------------------------------------ what actions ask
 
-    def move(self, position_rad: Mapping[str, float], speed: float) -> Move:
+    def move(self, position_rad: Mapping[str, float], speed: float) -> JointGoal:
         """See ``Controller.move``.
 
         Raises:
@@ -54,10 +54,10 @@ class Helm:
         target = self._envelope.target(position_rad, self.motion.position_rad)
         self._replace()
         self._arrival.begin(_differ(target, self.motion.position_rad))
-        self.course = move = Move(target_rad=target, speed=speed)
+        self.course = move = JointGoal(target_rad=target, speed=speed)
         return move
 
-    def go_along(self, way: Way) -> Passage:
+    def go_along(self, way: Trajectory) -> TrajectoryGoal:
         """See ``Controller.go_along``.
 
         Raises:
@@ -69,10 +69,10 @@ class Helm:
         self._envelope.check_way(way.position_rad)
         self._replace()
         self._arrival.begin(np.flatnonzero(np.any(way.position_rad != way.position_rad[0], axis=0)).tolist())
-        self.course = passage = Passage(way=way)
+        self.course = passage = TrajectoryGoal(way=way)
         return passage
 
-    def drive(self, twist: Twist, duration_s: float) -> Drive:
+    def drive(self, twist: Twist, duration_s: float) -> DriveGoal:
         """See ``Controller.drive``.
 
         Raises:
@@ -88,7 +88,7 @@ class Helm:
             if not abs(asked) <= limit:
                 raise Refused("out_of_range", f"{name} can be up to {limit:.3f}, not {asked}")
         self._replace()
-        self.course = drive = Drive(twist=twist, periods=math.ceil(duration_s / self._period_s))
+        self.course = drive = DriveGoal(twist=twist, periods=math.ceil(duration_s / self._period_s))
         return drive
 
     # ------------------------------------------------------------ tick by tick
@@ -100,11 +100,11 @@ class Helm:
             allowed: Share of the speed that the room leaves, above 0.
         """
         match self.course:
-            case Move(target_rad=target, speed=speed):
+            case JointGoal(target_rad=target, speed=speed):
                 self.motion.follow(target, speed=speed * allowed, together=True)
-            case Passage(way=way):
+            case TrajectoryGoal(way=way):
                 self.motion.ride(way, share=allowed)
-            case Drive() as drive if self.base is not None:
+            case DriveGoal() as drive if self.base is not None:
                 if drive.periods > 0:
                     self.base.follow(Twist(*(part * allowed for part in drive.twist)))
                 else:
@@ -151,15 +151,15 @@ class Helm:
             return
         course.note(limited)
         try:
-            done = self._drove(course) if isinstance(course, Drive) else self._arrived(measured_rad, soft)
+            done = self._drove(course) if isinstance(course, DriveGoal) else self._arrived(measured_rad, soft)
         except Refused as short:
             self.interrupt(short)
             return
         if done:
             self.course = None
-            course.end(Outcome.REACHED)
+            course.end(GoalResult.REACHED)
 
-    def _drove(self, drive: Drive) -> bool:
+    def _drove(self, drive: DriveGoal) -> bool:
         return drive.periods <= 0 and not self.moving
 
     def _arrived(self, measured_rad: Sequence[float] | None, soft: Collection[int]) -> bool:
@@ -176,7 +176,7 @@ class Helm:
         """End the course, if there is one, and brake."""
         if self.course is not None:
             interrupted, self.course = self.course, None
-            interrupted.end(Outcome.INTERRUPTED, why)
+            interrupted.end(GoalResult.INTERRUPTED, why)
             self.brake()
 
     def start_at(self, position_rad: Sequence[float]) -> None:

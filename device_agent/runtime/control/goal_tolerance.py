@@ -9,11 +9,11 @@ NEAR_RAD = 0.03
 """As near is there: many times what position servos leave under their own weight, and less than anybody calls short."""
 DWELL_S = 0.04
 """So long in a row, so that who only comes through has not arrived."""
-PATIENCE_S = 2.0
+SETTLE_TIMEOUT_S = 2.0
 """So long after the command has arrived it may take: any servo that can still come has come."""
 
 
-class Arrival:
+class GoalTolerance:
     """One device's. Not thread-safe: its owner locks.
 
     Args:
@@ -24,7 +24,7 @@ class Arrival:
     def __init__(self, names: Sequence[str], period_s: float) -> None:
         self._names = names
         self._dwell = math.ceil(DWELL_S / period_s)
-        self._patience = math.ceil(PATIENCE_S / period_s)
+        self._patience = math.ceil(SETTLE_TIMEOUT_S / period_s)
         self.begin(())
 
     def begin(self, moved: Collection[int]) -> None:

@@ -6,10 +6,10 @@ from enum import Enum
 
 from device_agent.ports.driver import Twist
 from device_agent.runtime.errors import Refused
-from device_agent.runtime.planning.trajectory import Way
+from device_agent.runtime.planning.trajectory import Trajectory
 
 
-class Outcome(Enum):
+class GoalResult(Enum):
     """How a course ended."""
 
     REACHED = "reached"
@@ -17,7 +17,7 @@ class Outcome(Enum):
 
 
 @dataclass(eq=False, kw_only=True)
-class Course:
+class MotionGoal:
     """On its way until ``finished`` is set, once, after ``outcome`` and ``why`` are.
 
     Attributes:
@@ -25,7 +25,7 @@ class Course:
     """
 
     finished: threading.Event = field(default_factory=threading.Event)
-    outcome: Outcome | None = None
+    outcome: GoalResult | None = None
     why: Refused | None = None
     limited: tuple[str, ...] = ()
 
@@ -33,14 +33,14 @@ class Course:
         """Remember what limits it now."""
         self.limited += tuple(one for one in limited if one not in self.limited)
 
-    def end(self, outcome: Outcome, why: Refused | None = None) -> None:
+    def end(self, outcome: GoalResult, why: Refused | None = None) -> None:
         """Wake whoever waits."""
         self.outcome, self.why = outcome, why
         self.finished.set()
 
 
 @dataclass(eq=False, kw_only=True)
-class Move(Course):
+class JointGoal(MotionGoal):
     """Joints to positions, shape (n,) [rad], at a share of their speed; then at rest."""
 
     target_rad: list[float]
@@ -48,14 +48,14 @@ class Move(Course):
 
 
 @dataclass(eq=False, kw_only=True)
-class Passage(Course):
+class TrajectoryGoal(MotionGoal):
     """Along a way that was planned; then at rest at its end."""
 
-    way: Way
+    way: Trajectory
 
 
 @dataclass(eq=False, kw_only=True)
-class Drive(Course):
+class DriveGoal(MotionGoal):
     """The base at a twist, for some control periods; then at rest."""
 
     twist: Twist

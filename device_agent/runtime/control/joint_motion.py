@@ -12,13 +12,15 @@ from ruckig import (
     Ruckig,
     RuckigError,
     Synchronization,
-    Trajectory,
+)
+from ruckig import (
+    Trajectory as RuckigTrajectory,
 )
 
 from device_agent.protocol.manifests.robot_type import RobotType
-from device_agent.runtime.control.trajectory_follower import Ride
+from device_agent.runtime.control.trajectory_follower import TrajectoryFollower
 from device_agent.runtime.planning.joint_couplings import Couplings
-from device_agent.runtime.planning.trajectory import Way
+from device_agent.runtime.planning.trajectory import Trajectory
 
 _BRAKING_RAMP_S = 0.01
 """Time in which braking reaches its full deceleration: short against the 50 ms in which a hold must be complete."""
@@ -61,7 +63,7 @@ def plan(generate: Callable[[Any, Any], Result], order: InputParameter, answer: 
         raise MotionError(f"no way to go on from here ({result})")
 
 
-class Motion:
+class JointMotion:
     """The commanded position and velocity of each joint, moved towards a target or to rest.
 
     Args:
@@ -84,10 +86,10 @@ class Motion:
         self._target: list[float] = [0.0] * len(joints)
         self._zeros = [0.0] * len(joints)
         self._planner = Ruckig(len(joints))
-        self._plan = Trajectory(len(joints))
+        self._plan = RuckigTrajectory(len(joints))
         self._plan_input = InputParameter(len(joints))
         self._proposed = False
-        self._ride: Ride | None = None
+        self._ride: TrajectoryFollower | None = None
         self._couplings = Couplings(robot_type)
         self._limp: dict[int, float] = {}
         self.waits: tuple[str, ...] = ()
@@ -163,7 +165,7 @@ class Motion:
             )
         )
 
-    def ride(self, way: Way, *, share: float) -> None:
+    def ride(self, way: Trajectory, *, share: float) -> None:
         """Go along a way that begins where the device rests.
 
         Args:
@@ -172,7 +174,7 @@ class Motion:
         """
         self._target = way.position_rad[-1].tolist()
         if self._ride is None and not self.moving and self._rests_at(way.position_rad[0].tolist()):
-            self._ride = Ride(
+            self._ride = TrajectoryFollower(
                 way,
                 period_s=self._period_s,
                 acceleration_rad_s2=self._acceleration_limits,
@@ -287,7 +289,7 @@ class Motion:
         self._hold_together(before)
         return self.position_rad
 
-    def _update_ride(self, ride: Ride, passed_s: float | None) -> list[float]:
+    def _update_ride(self, ride: TrajectoryFollower, passed_s: float | None) -> list[float]:
         ride.update(passed_s)
         before = self.position_rad
         self.position_rad, self.velocity_rad_s = ride.position_rad.tolist(), ride.velocity_rad_s.tolist()

@@ -6,7 +6,7 @@ from device_agent.protocol.manifests.robot_type import RobotType
 from device_agent.runtime.errors import Refused
 
 
-class Slack:
+class JointStiffness:
     """The stiffness of each joint of one device. Not thread-safe: its owner locks.
 
     Args:

@@ -7,7 +7,7 @@ What it would do in that time, going on as it goes now, must be clear.
 import math
 from collections.abc import Sequence
 
-from device_agent.ports.geometry import Geometry
+from device_agent.ports.geometry import RobotGeometry
 
 LIMITED = "speed: loop age"
 """As ``limited`` names it."""
@@ -26,7 +26,7 @@ _EASY_S = 0.1
 _LEAST_SHARE = 0.1
 
 
-class Pace:
+class LatencyLimiter:
     """The speed limit of streamed motion. Not thread-safe: its owner locks.
 
     Args:
@@ -35,7 +35,7 @@ class Pace:
         oldest_s: A setpoint of this age is refused [s].
     """
 
-    def __init__(self, geometry: Geometry | None, *, watchdog_s: float, oldest_s: float) -> None:
+    def __init__(self, geometry: RobotGeometry | None, *, watchdog_s: float, oldest_s: float) -> None:
         self._geometry = geometry
         self._watchdog_s = watchdog_s
         self._oldest_s = oldest_s

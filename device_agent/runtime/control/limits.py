@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 import numpy.typing as npt
 
-from device_agent.ports.geometry import Clearance, Geometry
+from device_agent.ports.geometry import Clearance, RobotGeometry
 from device_agent.protocol.manifests.robot_type import RobotType
 from device_agent.runtime.errors import Refused
 from device_agent.runtime.planning.joint_couplings import Couplings
@@ -16,7 +16,7 @@ Floats = npt.NDArray[np.float64]
 _SAME_RAD = 1e-9
 
 
-class Envelope:
+class MotionLimits:
     """The limits of one device's positions. Keeps nothing, moves nothing.
 
     Args:
@@ -27,7 +27,7 @@ class Envelope:
         limits: What is held, by name.
     """
 
-    def __init__(self, robot_type: RobotType, geometry: Geometry | None) -> None:
+    def __init__(self, robot_type: RobotType, geometry: RobotGeometry | None) -> None:
         self._joints = robot_type.joints
         self._index = {joint.name: index for index, joint in enumerate(robot_type.joints)}
         self._couplings = Couplings(robot_type)

@@ -4,13 +4,13 @@ import math
 from collections.abc import Sequence
 
 from device_agent.ports.driver import REST, Twist
-from device_agent.ports.geometry import Clearance, Geometry
+from device_agent.ports.geometry import Clearance, RobotGeometry
 from device_agent.protocol import DriveTarget, JogTarget, JointTarget, Setpoint
 from device_agent.protocol.manifests.robot_type import RobotType
 from device_agent.runtime.control.base_motion import BaseMotion
-from device_agent.runtime.control.joint_motion import Motion
-from device_agent.runtime.control.latency_limiter import LIMITED, Pace
-from device_agent.runtime.control.limits import Envelope
+from device_agent.runtime.control.joint_motion import JointMotion
+from device_agent.runtime.control.latency_limiter import LIMITED, LatencyLimiter
+from device_agent.runtime.control.limits import MotionLimits
 from device_agent.runtime.errors import Refused
 
 WATCHDOG_S = 0.3
@@ -31,7 +31,7 @@ JOINT_SPEED = "speed: joints"
 """As ``limited`` names a jog that joints are too slow for, as near a singularity."""
 
 
-class Stream:
+class SetpointStream:
     """What the newest setpoint asks of the joints. Not thread-safe: its owner locks.
 
     Args:
@@ -45,14 +45,14 @@ class Stream:
         loop_age_ms: Its loop age.
     """
 
-    def __init__(self, robot_type: RobotType, envelope: Envelope, geometry: Geometry | None) -> None:
+    def __init__(self, robot_type: RobotType, envelope: MotionLimits, geometry: RobotGeometry | None) -> None:
         self._envelope = envelope
         self._geometry = geometry
         self._limits = [joint.max_velocity_rad_s for joint in robot_type.joints]
         led = {mirror.joint for mirror in robot_type.mirrors}
         self._leading = {i: joint.name for i, joint in enumerate(robot_type.joints) if joint.name not in led}
         self._drives = robot_type.base is not None
-        self._pace = Pace(geometry, watchdog_s=WATCHDOG_S, oldest_s=MAX_LOOP_AGE_S)
+        self._pace = LatencyLimiter(geometry, watchdog_s=WATCHDOG_S, oldest_s=MAX_LOOP_AGE_S)
         self._speed = robot_type.streaming_speed
         self.begin([0.0] * len(robot_type.joints))
 
@@ -169,7 +169,7 @@ class Stream:
         self._driven = ranged + ((LIMITED,) if share < 1.0 else ())
         base.follow(Twist(*(part * share * allowed for part in twist)))
 
-    def follow(self, motion: Motion, *, allowed: float) -> None:
+    def follow(self, motion: JointMotion, *, allowed: float) -> None:
         """Set the joints in motion towards the newest setpoint.
 
         Args:
@@ -193,7 +193,7 @@ class Stream:
         else:
             motion.follow(self._target, speed=speed, cap_rad_s=cap)
 
-    def _take_up(self, target: JointTarget | JogTarget | DriveTarget, motion: Motion) -> None:
+    def _take_up(self, target: JointTarget | JogTarget | DriveTarget, motion: JointMotion) -> None:
         """A setpoint is new: for joints, for a frame or for the base, which leaves the others to what they do."""
         if isinstance(target, DriveTarget):
             return
@@ -209,7 +209,7 @@ class Stream:
             return [*self._hand.linear_m_s, *self._hand.angular_rad_s]
         return list(self._target)
 
-    def _jog(self, jog: JogTarget, motion: Motion, *, speed: float, cap_rad_s: float) -> None:
+    def _jog(self, jog: JogTarget, motion: JointMotion, *, speed: float, cap_rad_s: float) -> None:
         """Head for where the joints would be in a moment at the velocities that move the frame, at no more than those.
 
         All of them are slower when one would be too fast, so that the frame keeps its direction.

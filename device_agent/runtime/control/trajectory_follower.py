@@ -5,7 +5,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from device_agent.runtime.planning.trajectory import Floats, Way
+from device_agent.runtime.planning.trajectory import Floats, Trajectory
 
 _EASE_S = 0.25
 """Time constant of a change of the share, where nothing has to brake."""
@@ -19,7 +19,7 @@ _REST = 1e-6
 _NOTHING = 1e-9
 
 
-class Ride:
+class TrajectoryFollower:
     """How far a device has come on a way. Not thread-safe.
 
     Args:
@@ -32,7 +32,7 @@ class Ride:
 
     def __init__(
         self,
-        way: Way,
+        way: Trajectory,
         *,
         period_s: float,
         acceleration_rad_s2: Sequence[float],

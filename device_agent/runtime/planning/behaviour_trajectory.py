@@ -12,7 +12,7 @@ from device_agent.protocol.manifests.capabilities import Keyframe
 from device_agent.protocol.manifests.robot_type import RobotType
 from device_agent.runtime.planning import visemes as mouth
 from device_agent.runtime.planning.joint_couplings import Couplings
-from device_agent.runtime.planning.trajectory import Floats, Way
+from device_agent.runtime.planning.trajectory import Floats, Trajectory
 
 _SYLLABLE_S = 0.12
 """Mouth shapes nearer to each other than this run into one, as they do in people."""
@@ -29,7 +29,7 @@ class Line:
     duration_s: float
 
 
-class Score:
+class BehaviourTrajectory:
     """Where joints are to be when. Each goes from rest to rest, within its limits, and so never beyond its places.
 
     Args:
@@ -72,7 +72,7 @@ class Score:
         """Add the mouth shapes of what is said: as wide as there is time for, while nothing else moves the joint."""
         visemes = self._type.visemes
         self._end_s = max(self._end_s, line.begin_s + line.duration_s)
-        shapes = _spread(mouth.shapes(line.text, line.duration_s, visemes))
+        shapes = _spread(mouth.visemes_of(line.text, line.duration_s, visemes))
         for name in dict.fromkeys(joint for shape in visemes.values() for joint in shape):
             index = self._index[name]
             joint, home_rad = self._type.joints[index], self._type.home_rad[name]
@@ -101,14 +101,14 @@ class Score:
                 return from_s, begin_s
         return from_s, math.inf
 
-    def way(self) -> Way:
+    def way(self) -> Trajectory:
         """All of it, from rest to rest."""
         step_s = self._type.period_ms / 1000
         times = np.arange(max(2, math.ceil(self._end_s / step_s) + 1), dtype=np.float64) * step_s
         moved = [_through(points, times) for points in self._points]
         shape = (len(moved), 3, len(times))
         position, velocity, acceleration = np.array(moved).reshape(shape).transpose(1, 2, 0)
-        return confined(self._couplings, Way(step_s, position, velocity, acceleration))
+        return confined(self._couplings, Trajectory(step_s, position, velocity, acceleration))
 
     def _needs_s(self, index: int, place: float) -> float:
         return _needs_s(self._type.joints[index], abs(place - self._points[index][-1][1]))
@@ -123,7 +123,7 @@ class Score:
         return float(_through(self._points[index], np.array([time_s]))[0][0])
 
 
-def confined(couplings: Couplings, way: Way) -> Way:
+def confined(couplings: Couplings, way: Trajectory) -> Trajectory:
     """A way on which joints that hang together stay together; ``way`` is changed."""
     position, velocity, acceleration = way.position_rad, way.velocity_rad_s, way.acceleration_rad_s2
     before = position.copy()

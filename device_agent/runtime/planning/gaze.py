@@ -5,7 +5,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from device_agent.ports.geometry import Geometry
+from device_agent.ports.geometry import RobotGeometry
 from device_agent.protocol import Pose, Vector3
 from device_agent.protocol.manifests.robot_type import RobotType
 from device_agent.runtime.errors import Refused
@@ -20,7 +20,9 @@ _NEAREST_M = 1e-3
 Array = NDArray[np.float64]
 
 
-def aim(robot_type: RobotType, geometry: Geometry, start_rad: Sequence[float], point_m: Vector3) -> dict[str, float]:
+def aim(
+    robot_type: RobotType, geometry: RobotGeometry, start_rad: Sequence[float], point_m: Vector3
+) -> dict[str, float]:
     """Where the joints of the gaze have to be [rad].
 
     Args:

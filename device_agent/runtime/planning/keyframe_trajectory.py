@@ -17,7 +17,7 @@ from device_agent.protocol.manifests.robot_type import RobotType
 from device_agent.runtime.errors import Refused
 from device_agent.runtime.planning.behaviour_trajectory import confined
 from device_agent.runtime.planning.joint_couplings import Couplings
-from device_agent.runtime.planning.trajectory import Floats, Way
+from device_agent.runtime.planning.trajectory import Floats, Trajectory
 
 FASTEST = 2.0
 """How much faster than their times keyframes can be played."""
@@ -93,7 +93,7 @@ class Timeline:
             for number in range(len(moments))
         ]
 
-    def way(self) -> Way:
+    def way(self) -> Trajectory:
         """All of it."""
         step_s = self._type.period_ms / 1000
         lasts_s = float(self._gaps_s.sum())
@@ -101,7 +101,7 @@ class Timeline:
         moved = [_through(self._curve(index), times) for index in range(len(self._names))]
         position, velocity, acceleration = np.array(moved).reshape(len(moved), 3, len(times)).transpose(1, 2, 0)
         velocity[[0, -1]] = acceleration[[0, -1]] = 0.0
-        return confined(self._couplings, Way(step_s, position.copy(), velocity, acceleration))
+        return confined(self._couplings, Trajectory(step_s, position.copy(), velocity, acceleration))
 
     def _led(self, number: int, keyframe: Moment) -> dict[str, float]:
         unknown = sorted(set(keyframe.position_rad) - set(self._names))

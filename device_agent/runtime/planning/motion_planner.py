@@ -5,13 +5,13 @@ from collections.abc import Callable, Mapping, Sequence
 
 import numpy as np
 
-from device_agent.ports.geometry import Geometry, GeometryError, PlannerLostError
+from device_agent.ports.geometry import GeometryError, PlannerLostError, RobotGeometry
 from device_agent.protocol import Pose, Quaternion, Vector3
 from device_agent.protocol.manifests.robot_type import RobotType
 from device_agent.runtime.errors import Refused
 from device_agent.runtime.planning import trajectory
 from device_agent.runtime.planning.joint_couplings import Couplings
-from device_agent.runtime.planning.trajectory import Floats, Way
+from device_agent.runtime.planning.trajectory import Floats, Trajectory
 
 _SEARCH_S = 5.0
 _SEEDS = 3
@@ -24,7 +24,7 @@ _APART_RAD = 0.03
 _SHORTEST = 1e-6
 
 
-class Routes:
+class MotionPlanner:
     """Ways of one robot.
 
     Args:
@@ -33,7 +33,7 @@ class Routes:
         seed: Of the search for a way: the same finds the same.
     """
 
-    def __init__(self, robot_type: RobotType, geometry: Geometry, *, seed: int = 0) -> None:
+    def __init__(self, robot_type: RobotType, geometry: RobotGeometry, *, seed: int = 0) -> None:
         self._seed = seed
         self._type = robot_type
         self._geometry = geometry
@@ -41,7 +41,7 @@ class Routes:
 
     def around(
         self, start_rad: Sequence[float], goal_rad: Sequence[float], *, speed: float, ended: Callable[[], bool]
-    ) -> Way:
+    ) -> Trajectory:
         """A way around what is near, rounded off where there is room for it.
 
         Args:
@@ -62,12 +62,12 @@ class Routes:
                 raise Refused("planner_lost", str(error)) from error
             except GeometryError as error:
                 raise Refused("no_way", str(error)) from error
-            points = trajectory.smooth(corners, self._clear)
+            points = trajectory.blend_corners(corners, self._clear)
             if points is not None:
                 return self._timed(points, speed)
         raise Refused("no_way", "what was found is too narrow to go along; move to a place with more room first")
 
-    def straight(self, start_rad: Sequence[float], frame: str, pose: Pose, *, speed: float) -> Way:
+    def straight(self, start_rad: Sequence[float], frame: str, pose: Pose, *, speed: float) -> Trajectory:
         """A way on which a frame goes straight to a pose, and turns evenly.
 
         Args:
@@ -105,10 +105,10 @@ class Routes:
         swept = self._geometry.sweep([point.tolist() for point in points])
         if swept.clearance is not None:
             raise Refused("no_room", f"something is in the way: {swept.clearance.text}; go with plan")
-        return self._timed(trajectory.even(np.array(points), _APART_RAD), speed)
+        return self._timed(trajectory.resample(np.array(points), _APART_RAD), speed)
 
-    def _timed(self, points: Floats, speed: float) -> Way:
-        return trajectory.timed(points, self._type.joints, speed=speed, step_s=self._type.period_ms / 1000)
+    def _timed(self, points: Floats, speed: float) -> Trajectory:
+        return trajectory.time_parameterize(points, self._type.joints, speed=speed, step_s=self._type.period_ms / 1000)
 
     def _clear(self, path_rad: Floats) -> bool:
         return not self._couplings.parted(path_rad) and self._geometry.sweep(path_rad.tolist()).clearance is None

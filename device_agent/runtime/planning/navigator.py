@@ -9,16 +9,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from device_agent.ports.driver import REST, Twist
-from device_agent.ports.floor_map import Floor, Ground
+from device_agent.ports.floor_map import FloorMap, ObstacleMap
 from device_agent.protocol.manifests.robot_type import RobotType
 from device_agent.runtime.errors import Refused
 from device_agent.runtime.readings import Reading
 
-EVERY_S = 0.1
+UPDATE_PERIOD_S = 0.1
 """How often it looks where it is; a twist that nobody renews ends by itself soon after."""
 STALE_S = 1.0
 """A position that is older is none: the robot stands."""
-PATIENCE_S = 15.0
+BLOCKED_TIMEOUT_S = 15.0
 """How long it waits for somebody to go out of the way."""
 SHORT_PATIENCE_S = 6.0
 """The same before it has set out: a place that is taken then is likelier to be furniture than somebody who goes on."""
@@ -45,7 +45,7 @@ _STEPS = [(row, column, math.hypot(row, column)) for row in (-1, 0, 1) for colum
 
 
 @dataclass(frozen=True, slots=True)
-class Place:
+class Pose2D:
     """Where a robot is in the room [m], [rad]."""
 
     x_m: float
@@ -53,7 +53,7 @@ class Place:
     yaw_rad: float
 
 
-class Whereabouts:
+class PoseEstimator:
     """Where a robot is: its wheels tell at once and drift, the room sees it late and does not.
 
     Args:
@@ -64,7 +64,7 @@ class Whereabouts:
         self._name = name
         self._offset: tuple[float, float] | None = None
 
-    def place(self, odometry: Reading | None, seen: Reading | None) -> Place:
+    def place(self, odometry: Reading | None, seen: Reading | None) -> Pose2D:
         """Where it is now.
 
         Raises:
@@ -75,17 +75,17 @@ class Whereabouts:
         if own is None:
             if room is None or "yaw_rad" not in room:
                 raise Refused("no_position", "nobody knows where the robot is; it stands")
-            return Place(room["x_m"], room["y_m"], room["yaw_rad"])
+            return Pose2D(room["x_m"], room["y_m"], room["yaw_rad"])
         if room is not None:
             x, y = room["x_m"] - own["x_m"], room["y_m"] - own["y_m"]
             before = self._offset or (x, y)
             self._offset = before[0] + _TRUST * (x - before[0]), before[1] + _TRUST * (y - before[1])
         x, y = self._offset or (0.0, 0.0)
-        return Place(own["x_m"] + x, own["y_m"] + y, own["yaw_rad"])
+        return Pose2D(own["x_m"] + x, own["y_m"] + y, own["yaw_rad"])
 
 
 def _read(reading: Reading | None, of: str) -> Mapping[str, float] | None:
-    """Place by quantity, if it is all there, finite and fresh."""
+    """Pose2D by quantity, if it is all there, finite and fresh."""
     if reading is None:
         return None
     names = ("x_m", "y_m", "yaw_rad", "age_s")
@@ -95,7 +95,7 @@ def _read(reading: Reading | None, of: str) -> Mapping[str, float] | None:
     return found if fresh and whole else None
 
 
-class Errand:
+class Navigator:
     """One way to one place.
 
     Args:
@@ -116,7 +116,7 @@ class Errand:
         self._path: list[tuple[float, float]] = []
 
     @classmethod
-    def of(cls, x_m: float, y_m: float, yaw_rad: float | None, robot_type: RobotType) -> "Errand":
+    def of(cls, x_m: float, y_m: float, yaw_rad: float | None, robot_type: RobotType) -> "Navigator":
         """An errand of a robot of this type.
 
         Raises:
@@ -134,9 +134,9 @@ class Errand:
         """How long to wait for what is refused to become possible [s]."""
         if refused.code not in _WAITS_FOR:
             return 0.0
-        return SHORT_PATIENCE_S if refused.code == "taken" and not self._set_out else PATIENCE_S
+        return SHORT_PATIENCE_S if refused.code == "taken" and not self._set_out else BLOCKED_TIMEOUT_S
 
-    def twist(self, place: Place, ground: Ground) -> Twist | None:
+    def twist(self, place: Pose2D, ground: ObstacleMap) -> Twist | None:
         """How to go on from here; ``None`` when it is there.
 
         Raises:
@@ -169,7 +169,7 @@ class Errand:
         return min(max(_EASE_1_S * off_rad, -most), most)
 
 
-def way(floor: Floor, start: tuple[float, float], goal: tuple[float, float]) -> list[tuple[float, float]]:
+def way(floor: FloorMap, start: tuple[float, float], goal: tuple[float, float]) -> list[tuple[float, float]]:
     """The shortest way over free cells (A*), as places in the room; the last is the goal.
 
     Raises:
@@ -208,7 +208,7 @@ def way(floor: Floor, start: tuple[float, float], goal: tuple[float, float]) -> 
 
 
 def _freed(
-    floor: Floor, free: NDArray[np.bool_], begin: tuple[int, int], start: tuple[float, float]
+    floor: FloorMap, free: NDArray[np.bool_], begin: tuple[int, int], start: tuple[float, float]
 ) -> tuple[int, int]:
     """Where a way begins: where the robot is, or the nearest free place where it stands too near to something."""
     if free[begin] or not free.any():
@@ -217,7 +217,7 @@ def _freed(
     return nearest if math.dist(floor.centre(*nearest), start) <= _FREE_M else begin
 
 
-def _nearest(floor: Floor, cells: NDArray[np.bool_], place: tuple[float, float]) -> tuple[int, int]:
+def _nearest(floor: FloorMap, cells: NDArray[np.bool_], place: tuple[float, float]) -> tuple[int, int]:
     """Which of some cells is nearest to a place."""
     rows, columns = np.nonzero(cells)
     row, column = floor.cell(*place)
@@ -250,7 +250,7 @@ def _free(free: NDArray[np.bool_], cell: tuple[int, int]) -> bool:
 
 
 def _back(
-    floor: Floor, came: Mapping[tuple[int, int], tuple[int, int]], end: tuple[int, int]
+    floor: FloorMap, came: Mapping[tuple[int, int], tuple[int, int]], end: tuple[int, int]
 ) -> list[tuple[float, float]]:
     cells = [end]
     while came[cells[-1]] != cells[-1]:

@@ -29,7 +29,7 @@ _SPLINE = np.array([[1, 4, 1, 0], [-3, 0, 3, 0], [3, -6, 3, 0], [-1, 3, -3, 1]])
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Way:
+class Trajectory:
     """Where all joints are at each moment of a motion from rest to rest.
 
     Attributes:
@@ -62,7 +62,7 @@ class Way:
         return position, rise + u * (fall - rise), acceleration
 
 
-def smooth(corners: Sequence[Sequence[float]], clear: Callable[[Floats], bool]) -> Floats | None:
+def blend_corners(corners: Sequence[Sequence[float]], clear: Callable[[Floats], bool]) -> Floats | None:
     """The points of a spline that goes from corner to corner, and rounds off those between as widely as there is room.
 
     Args:
@@ -74,14 +74,14 @@ def smooth(corners: Sequence[Sequence[float]], clear: Callable[[Floats], bool]) 
     """
     path = np.array(corners, dtype=np.float64)
     for rounding_rad in _ROUNDING_RAD:
-        points = even(path, rounding_rad)
+        points = resample(path, rounding_rad)
         places = _along(points, _LOOKS)[0]
         if all(clear(places[index : index + _LEGS + 1]) for index in range(0, len(places) - 1, _LEGS)):
             return points
     return None
 
 
-def even(path: Floats, apart_rad: float) -> Floats:
+def resample(path: Floats, apart_rad: float) -> Floats:
     """Points on a path from corner to corner that are equally far apart, no further than ``apart_rad``.
 
     A spline through points that are here near and there far apart would hurry and hesitate.
@@ -94,7 +94,7 @@ def even(path: Floats, apart_rad: float) -> Floats:
     return points
 
 
-def timed(points: Floats, joints: Sequence[Joint], *, speed: float, step_s: float) -> Way:
+def time_parameterize(points: Floats, joints: Sequence[Joint], *, speed: float, step_s: float) -> Trajectory:
     """When to be where on a spline: as fast as each joint's velocity, acceleration and jerk allow.
 
     The speed along the spline is the highest that its bends allow, reached and left at the acceleration that is left,
@@ -125,7 +125,7 @@ def timed(points: Floats, joints: Sequence[Joint], *, speed: float, step_s: floa
     velocity = np.gradient(places, _STEP_S, axis=0)
     acceleration = np.gradient(velocity, _STEP_S, axis=0)
     velocity[[0, -1]] = acceleration[[0, -1]] = 0.0
-    return Way(every * _STEP_S, places[::every], velocity[::every], acceleration[::every])
+    return Trajectory(every * _STEP_S, places[::every], velocity[::every], acceleration[::every])
 
 
 def _along(points: Floats, parts: int) -> tuple[Floats, Floats, Floats, Floats]:
@@ -172,8 +172,10 @@ def _spread(points: Floats, law: tuple[Floats, Floats], ramp_s: float) -> Floats
     width = max(1, round(ramp_s / _STEP_S))
     moments: Floats = np.arange(-width, int(times[-1] / _STEP_S) + 2 * width, dtype=np.float64) * _STEP_S
     # Between two places the acceleration is constant: the place is a parabola of time there, not a line.
-    even = np.convolve(_parabolas(places, times, moments), np.full(width, 1 / width, dtype=np.float64), mode="valid")
-    return _spline(points, np.clip(even, 0.0, places[-1]))[0]
+    resample = np.convolve(
+        _parabolas(places, times, moments), np.full(width, 1 / width, dtype=np.float64), mode="valid"
+    )
+    return _spline(points, np.clip(resample, 0.0, places[-1]))[0]
 
 
 def _parabolas(places: Floats, times: Floats, moments: Floats) -> Floats:

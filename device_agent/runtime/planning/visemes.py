@@ -52,12 +52,12 @@ CHARACTERS_PER_S = 14.0
 _SHORTEST_S = 0.4
 
 
-def guessed_s(text: str) -> float:
+def estimate_duration_s(text: str) -> float:
     """How long a text takes to say where there is no sound [s]."""
     return max(_SHORTEST_S, len(text) / CHARACTERS_PER_S)
 
 
-def shapes(text: str, duration_s: float, there: Collection[str]) -> list[tuple[float, str]]:
+def visemes_of(text: str, duration_s: float, there: Collection[str]) -> list[tuple[float, str]]:
     """When the mouth is to have which shape: time from the beginning [s] and the name of a viseme, times rising.
 
     Args:

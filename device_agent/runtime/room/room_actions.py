@@ -5,9 +5,9 @@ import time
 from collections.abc import Callable
 from typing import Any
 
-from device_agent.protocol import CaptureRaw, Gather, RoomTask, Shoot
+from device_agent.protocol import CaptureRaw, CollectData, RoomTask, TakePicture
 from device_agent.runtime.errors import Refused
-from device_agent.runtime.room.room_device import Instrument
+from device_agent.runtime.room.room_device import RoomDevice
 
 _TELL_EVERY_S = 1.0
 _STEPS = 100
@@ -20,7 +20,7 @@ Tell = Callable[[str, float | None], None]
 class Gathering:
     """Reads some streams at another rate for a while, and then again as before. Whoever listens hears of it."""
 
-    def __init__(self, order: Gather, instrument: Instrument, tell: Tell) -> None:
+    def __init__(self, order: CollectData, instrument: RoomDevice, tell: Tell) -> None:
         self._order = order
         self._instrument = instrument
         self._tell = tell
@@ -61,7 +61,7 @@ class Once:
         """It is not broken off: a measurement or upload ends by itself, and a Stop reaches what moves by the loop."""
 
 
-def activity(order: RoomTask, instrument: Instrument | None, tell: Tell) -> Gathering | Once:
+def activity(order: RoomTask, instrument: RoomDevice | None, tell: Tell) -> Gathering | Once:
     """What does this order.
 
     Raises:
@@ -70,9 +70,9 @@ def activity(order: RoomTask, instrument: Instrument | None, tell: Tell) -> Gath
     if instrument is None:
         raise Refused("cannot", "this is no device of a room: it gathers, captures and sets nothing")
     match order:
-        case Gather():
+        case CollectData():
             return Gathering(order, instrument, tell)
-        case Shoot(streams=streams):
+        case TakePicture(streams=streams):
             return Once(lambda: {"values": instrument.shoot(streams)})
         case CaptureRaw(name=name):
             return Once(lambda: instrument.capture(name))

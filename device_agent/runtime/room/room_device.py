@@ -9,16 +9,16 @@ from collections.abc import Collection, Iterable, Mapping
 from device_agent.ports.clock import wall_ms
 from device_agent.ports.sensor import Camera, Capture, Movable, RoomDriver, SensorError, Values
 from device_agent.ports.uploads import UploadError, Uploads
-from device_agent.protocol.commands import CaptureRaw, Gather, SetControl, Shoot
-from device_agent.protocol.manifests.room import Control, RoomDevice
+from device_agent.protocol.commands import CaptureRaw, CollectData, SetControl, TakePicture
+from device_agent.protocol.manifests.room import Control, RoomDeviceManifest
 from device_agent.runtime.errors import Refused
-from device_agent.runtime.room.stream_watchdog import Vigil
+from device_agent.runtime.room.stream_watchdog import StreamWatchdog
 
 _SUFFIXES = {"image/png": "png", "image/jpeg": "jpg", "application/json": "json"}
 _LEAST_RATE_HZ = 0.001
 
 
-class Instrument:
+class RoomDevice:
     """One room device. Thread-safe as far as its driver is.
 
     Args:
@@ -34,13 +34,13 @@ class Instrument:
         changed: Set whenever a rate has changed; whoever heeds it clears it.
     """
 
-    def __init__(self, driver: RoomDriver, manifest: RoomDevice, uploads: Uploads | None) -> None:
+    def __init__(self, driver: RoomDriver, manifest: RoomDeviceManifest, uploads: Uploads | None) -> None:
         self.driver = driver
         self.manifest = manifest
         self._uploads = uploads
         self._gathering: Mapping[str, float] = {}
         self._counts: Counter[str] = Counter()
-        self.vigil = Vigil(manifest.watch, self.rate_hz)
+        self.vigil = StreamWatchdog(manifest.watch, self.rate_hz)
         self.changed = threading.Event()
         self.streams = tuple(stream.name for stream in manifest.streams)
         self.cameras = tuple(camera.name for camera in manifest.cameras) if isinstance(driver, Camera) else ()
@@ -58,8 +58,8 @@ class Instrument:
     def actions(self) -> tuple[str, ...]:
         """The kinds of action that it takes."""
         takes = (
-            (Gather, self.streams),
-            (Shoot, self.streams),
+            (CollectData, self.streams),
+            (TakePicture, self.streams),
             (CaptureRaw, self.manifest.captures),
             (SetControl, self.manifest.controls),
         )

@@ -17,7 +17,7 @@ from device_agent.protocol import MAX_VALUES, Measurements, Mode
 from device_agent.protocol.camera_frames import CameraFrame
 from device_agent.protocol.errors import ProtocolError
 from device_agent.runtime.control.controller import Controller
-from device_agent.runtime.room.room_device import Instrument
+from device_agent.runtime.room.room_device import RoomDevice
 
 _LOOK_S = 0.05
 """How often it looks whether the device is stopped or held."""
@@ -52,7 +52,7 @@ class SensorLoop:
 
     def __init__(
         self,
-        instrument: Instrument,
+        instrument: RoomDevice,
         controller: Controller,
         *,
         name: str,

@@ -29,7 +29,7 @@ class _Heard:
     at_s: float = 0.0
 
 
-class Vigil:
+class StreamWatchdog:
     """Watches over the sources of one device. Thread-safe.
 
     Args:

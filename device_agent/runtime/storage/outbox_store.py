@@ -31,7 +31,7 @@ class ShelfError(Exception):
 
 
 @dataclass(frozen=True, slots=True)
-class Item:
+class OutboxItem:
     """One message to be sent when it can be. ``late``: a measurement, else an event. ``at_ms``: its own time."""
 
     topic: str
@@ -41,7 +41,7 @@ class Item:
 
 
 @dataclass(frozen=True, slots=True)
-class Dropped:
+class DroppedCount:
     """How much of one device was dropped and not yet told."""
 
     device: str
@@ -49,7 +49,7 @@ class Dropped:
     events: int
 
 
-class Shelf:
+class OutboxStore:
     """The file. The constructor touches nothing.
 
     Args:
@@ -104,7 +104,7 @@ class Shelf:
             self._database.close()
             self._database = None
 
-    def put(self, items: Iterable[Item], *, now_ms: int) -> None:
+    def put(self, items: Iterable[OutboxItem], *, now_ms: int) -> None:
         """Keep items, all or none, within the bound.
 
         Args:
@@ -183,7 +183,7 @@ class Shelf:
 
         self._change(write)
 
-    def after(self, last: int, *, late: bool, limit: int) -> list[tuple[int, Item]]:
+    def after(self, last: int, *, late: bool, limit: int) -> list[tuple[int, OutboxItem]]:
         """The oldest items that came after one, with their ids.
 
         Raises:
@@ -193,7 +193,7 @@ class Shelf:
             "SELECT id, topic, payload, at_ms FROM kept WHERE late = ? AND id > ? ORDER BY id LIMIT ?",
             (late, last, limit),
         )
-        return [(row[0], Item(row[1], row[2], row[3], late)) for row in rows]
+        return [(row[0], OutboxItem(row[1], row[2], row[3], late)) for row in rows]
 
     def remove(self, ids: Sequence[int]) -> None:
         """Delete what has arrived.
@@ -211,7 +211,7 @@ class Shelf:
 
         self._change(write)
 
-    def tell_dropped(self, event: Callable[[Dropped], Item]) -> None:
+    def tell_dropped(self, event: Callable[[DroppedCount], OutboxItem]) -> None:
         """Keep an event for each device of which something was dropped, and begin to count anew.
 
         Raises:
@@ -222,7 +222,7 @@ class Shelf:
             rows = database.execute(
                 "SELECT device, sum(count * late), sum(count * (1 - late)) FROM dropped GROUP BY device"
             ).fetchall()
-            items = [event(Dropped(*row)) for row in rows]
+            items = [event(DroppedCount(*row)) for row in rows]
             database.execute("DELETE FROM dropped")
             for item in items:
                 database.execute(
@@ -265,7 +265,7 @@ def device_of(topic: str) -> str:
     return "/".join(topic.split("/")[:_DEVICE_LEVELS])
 
 
-def _size(item: Item) -> int:
+def _size(item: OutboxItem) -> int:
     return len(item.payload) + len(item.topic) + _ROW_BYTES
 
 

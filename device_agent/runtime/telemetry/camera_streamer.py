@@ -10,11 +10,11 @@ import time
 from collections import Counter
 from collections.abc import Callable, Sequence
 
-from device_agent.ports.driver import DriverError, Filming
+from device_agent.ports.driver import DriverError, HasCameras
 from device_agent.protocol import Stream
 from device_agent.protocol.camera_frames import CameraFrame
 from device_agent.protocol.errors import ProtocolError
-from device_agent.runtime.telemetry.periodic_poller import Rounds
+from device_agent.runtime.telemetry.periodic_poller import PeriodicPoller
 
 IDLE_PERIOD_S = 1.0
 """From one picture to the next of a robot that nobody controls."""
@@ -22,7 +22,7 @@ LINGER_S = 60.0
 """After the end of control pictures go on as before for so long: who has just let go still looks."""
 
 
-class Filmer:
+class CameraStreamer:
     """Asks a driver for pictures, and tells them.
 
     Args:
@@ -37,7 +37,7 @@ class Filmer:
     def __init__(
         self,
         cameras: Sequence[Stream],
-        driver: Filming | None,
+        driver: HasCameras | None,
         *,
         name: str,
         film: Callable[[str, CameraFrame], None],
@@ -52,7 +52,7 @@ class Filmer:
         self._filmed_s: dict[str, float] = {}
         self._driver = driver
         self._taken: Counter[str] = Counter()
-        self._rounds = Rounds(() if driver is None else cameras, self._shoot, device=name, what="camera")
+        self._rounds = PeriodicPoller(() if driver is None else cameras, self._shoot, device=name, what="camera")
 
     def start(self) -> None:
         """Begin, where there is something to film."""

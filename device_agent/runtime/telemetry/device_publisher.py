@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from functools import partial
 
 from device_agent.ports.clock import tick_ms, wall_ms
-from device_agent.ports.sandbox import Standing
+from device_agent.ports.sandbox import SandboxStatus
 from device_agent.protocol import (
     Ack,
     AckStatus,
@@ -32,9 +32,9 @@ from device_agent.protocol import (
 )
 from device_agent.protocol.camera_frames import CameraFrame
 from device_agent.protocol.manifests.robot_type import RobotType
-from device_agent.protocol.manifests.room import RoomDevice
+from device_agent.protocol.manifests.room import RoomDeviceManifest
 from device_agent.runtime.authority.control_request import Asked
-from device_agent.runtime.authority.event_recorder import Happened, event_of
+from device_agent.runtime.authority.event_recorder import EventRecord, event_of
 from device_agent.runtime.authority.lease_gate import Lease
 from device_agent.runtime.control.base_motion import limits_of
 from device_agent.runtime.control.setpoint_stream import MAX_LOOP_AGE_S, WATCHDOG_S
@@ -46,7 +46,7 @@ STATE_GAP_S = 1.0
 
 
 @dataclass(frozen=True, slots=True)
-class Condition:
+class StateSnapshot:
     """What ``state`` shows; two that are equal need not be told twice."""
 
     mode: Mode
@@ -76,7 +76,7 @@ class Condition:
         )
 
 
-class Voice:
+class DevicePublisher:
     """Publishes for one device. Thread-safe but for ``introduce``, ``show`` and ``keep``, which are its office's.
 
     Args:
@@ -103,7 +103,7 @@ class Voice:
         address: tuple[str, str, str],
         label: str,
         robot_type: RobotType,
-        room_device: RoomDevice | None = None,
+        room_device: RoomDeviceManifest | None = None,
         simulated: bool,
         limits: Sequence[str],
         actions: Sequence[str],
@@ -132,7 +132,7 @@ class Voice:
         self._shown: tuple[object, ...] = ()
         self._shown_at_s = float("-inf")
         self.refusals: dict[str, int] = {}
-        self.scripts = Standing("refused", "the agent has not looked yet what this machine has")
+        self.scripts = SandboxStatus("refused", "the agent has not looked yet what this machine has")
 
     # ------------------------------------------------------------ answers to commands
 
@@ -188,7 +188,7 @@ class Voice:
         for ack in self._journal.undelivered(self._name):
             self.send_ack(ack)
 
-    def show(self, now: Condition) -> None:
+    def show(self, now: StateSnapshot) -> None:
         """Publish ``state`` on change, at most once a second, and every 30 s."""
         now_s = time.monotonic()
         if self._answer_again and now_s >= self._believed_from_s:
@@ -227,7 +227,7 @@ class Voice:
         """Publish a picture; one that cannot go out at once is let go."""
         self._publish(self._topic(topics.CAM, camera), camera_frames.encode(frame), qos=0)
 
-    def event(self, happened: Happened) -> None:
+    def event(self, happened: EventRecord) -> None:
         """Tell a fact that happened, as soon as it can be."""
         event = event_of(self._name, happened)
         self._outbox.happened(self._topic(topics.EVENT), codec.encode(event), at_ms=event.at_ms)

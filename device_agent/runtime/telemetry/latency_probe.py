@@ -33,7 +33,7 @@ _TIMED = frozenset({topics.STATE, topics.ACK})
 _log = logging.getLogger(__name__)
 
 
-class RoundTrips:
+class LatencyProbe:
     """A transport, as the one that it is given, whose messages are timed.
 
     Args:

@@ -16,8 +16,8 @@ from functools import partial
 from device_agent.ports.clock import wall_ms
 from device_agent.protocol import codec, topics
 from device_agent.protocol.events import EventKind
-from device_agent.runtime.authority.event_recorder import Happened, event_of
-from device_agent.runtime.storage.outbox_store import Dropped, Item, Shelf, ShelfError, device_of
+from device_agent.runtime.authority.event_recorder import EventRecord, event_of
+from device_agent.runtime.storage.outbox_store import DroppedCount, OutboxItem, OutboxStore, ShelfError, device_of
 
 Publish = Callable[..., bool]
 """``Transport.publish``."""
@@ -47,7 +47,7 @@ class _Unsure:
     """Thinned measurements of one topic: when the next one is due, and those that were sent lately [s]."""
 
     due_s: float
-    sent: deque[tuple[float, Item]]
+    sent: deque[tuple[float, OutboxItem]]
 
 
 class Outbox:
@@ -65,7 +65,7 @@ class Outbox:
 
     def __init__(
         self,
-        shelf: Shelf,
+        shelf: OutboxStore,
         *,
         publish: Publish,
         teller: str,
@@ -83,7 +83,7 @@ class Outbox:
         # What other threads touch; the rest is the own thread's.
         self._lock = threading.Lock()
         self._streams: dict[str, _Unsure] = {}
-        self._incoming: deque[Item] = deque()
+        self._incoming: deque[OutboxItem] = deque()
         self._lost: Counter[tuple[str, bool]] = Counter()
         self._confirmed: queue.SimpleQueue[int] = queue.SimpleQueue()
         self._wake = threading.Event()
@@ -95,7 +95,7 @@ class Outbox:
         self._open = False
         self._trouble = ""
         self._save_again_s = float("-inf")
-        self._unsaved: dict[int, Item] = {}
+        self._unsaved: dict[int, OutboxItem] = {}
         self._number = 0
         self._under_way: dict[int, float] = {}
         self._tries: Counter[int] = Counter()
@@ -119,7 +119,7 @@ class Outbox:
     def happened(self, topic: str, payload: bytes, *, at_ms: int) -> None:
         """Send an event, now or as soon as it can be; it is on disk before."""
         with self._lock:
-            self._add(Item(topic, payload, at_ms, late=False))
+            self._add(OutboxItem(topic, payload, at_ms, late=False))
         self._wake.set()
 
     def measured(self, topic: str, payload: bytes, *, at_ms: int, sent: bool, now_s: float) -> None:
@@ -137,7 +137,7 @@ class Outbox:
             if now_s < unsure.due_s:
                 return
             unsure.due_s = now_s + self._period_s
-            item = Item(topic, payload, at_ms, late=True)
+            item = OutboxItem(topic, payload, at_ms, late=True)
             if not sent:
                 self._add(item)
                 return
@@ -159,12 +159,12 @@ class Outbox:
                     unsure.sent.clear()
         self._wake.set()
 
-    def _add(self, item: Item) -> None:
+    def _add(self, item: OutboxItem) -> None:
         if len(self._incoming) >= _MOST_INCOMING:
             self._lose(self._incoming.popleft())
         self._incoming.append(item)
 
-    def _lose(self, item: Item) -> None:
+    def _lose(self, item: OutboxItem) -> None:
         self._lost[device_of(item.topic), item.late] += 1
 
     # ------------------------------------------------------------ its own thread
@@ -236,7 +236,7 @@ class Outbox:
         if lost:
             self._shelf.count(lost)
 
-    def _remember(self, items: Iterable[Item]) -> None:
+    def _remember(self, items: Iterable[OutboxItem]) -> None:
         """Without a disk: events stay in memory, a bounded number; measurements are let go and counted."""
         for item in items:
             if not item.late and len(self._unsaved) < _MOST_UNSAVED:
@@ -252,7 +252,7 @@ class Outbox:
             return
         self._trouble = str(error)
         _log.error("what cannot be sent is not kept on disk: %s", error)
-        happened = Happened(EventKind.BUFFER_FAILED, self._trouble, "error", {"code": "disk"}, wall_ms())
+        happened = EventRecord(EventKind.BUFFER_FAILED, self._trouble, "error", {"code": "disk"}, wall_ms())
         self._remember([_item(self._teller, happened)])
 
     # ------------------------------------------------------------ sending
@@ -279,7 +279,7 @@ class Outbox:
             if number > 0:
                 self._sent[item.late] = number
 
-    def _next(self, most: int) -> list[tuple[int, Item]]:
+    def _next(self, most: int) -> list[tuple[int, OutboxItem]]:
         """What is to go out next: events before measurements, each oldest first."""
         found = [each for each in self._unsaved.items() if each[0] not in self._under_way][: max(0, most)]
         for late in (False, True):
@@ -310,13 +310,13 @@ class Outbox:
             self._shelf.drop(number for number in refused if number > 0)
 
 
-def _dropped(dropped: Dropped) -> Item:
+def _dropped(dropped: DroppedCount) -> OutboxItem:
     """The event that tells what was dropped."""
     counts = {"measurements": dropped.measurements, "events": dropped.events}
     message = f"dropped, unsent: {dropped.measurements} measurements, {dropped.events} events"
-    return _item(dropped.device, Happened(EventKind.BUFFER_DROPPED, message, "warning", counts, wall_ms()))
+    return _item(dropped.device, EventRecord(EventKind.BUFFER_DROPPED, message, "warning", counts, wall_ms()))
 
 
-def _item(device: str, happened: Happened) -> Item:
+def _item(device: str, happened: EventRecord) -> OutboxItem:
     event = event_of(device.rpartition("/")[2], happened)
-    return Item(f"{device}/{topics.EVENT}", codec.encode(event), event.at_ms, late=False)
+    return OutboxItem(f"{device}/{topics.EVENT}", codec.encode(event), event.at_ms, late=False)

@@ -22,7 +22,7 @@ class _Due:
     trouble: str = ""
 
 
-class Rounds:
+class PeriodicPoller:
     """Asks, at each one's rate, until it is stopped. What was missed is not made up for.
 
     Args:

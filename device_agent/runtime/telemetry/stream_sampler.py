@@ -9,13 +9,13 @@ from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 
 from device_agent.ports.clock import tick_ms, wall_ms
-from device_agent.ports.driver import Reporting
+from device_agent.ports.driver import ReportsStreams
 from device_agent.protocol import Measurements, Stream, topics
 from device_agent.runtime.readings import Reading, Values
-from device_agent.runtime.telemetry.periodic_poller import Rounds
+from device_agent.runtime.telemetry.periodic_poller import PeriodicPoller
 
 
-class Reporter:
+class StreamSampler:
     """Asks a driver for its streams, and tells them.
 
     Args:
@@ -28,7 +28,7 @@ class Reporter:
     def __init__(
         self,
         streams: Sequence[Stream],
-        driver: Reporting | None,
+        driver: ReportsStreams | None,
         *,
         name: str,
         tell: Callable[[str, Measurements], None],
@@ -38,7 +38,7 @@ class Reporter:
         self._latest: Mapping[str, tuple[Values, float]] = {}
         asked = [] if driver is None else [stream for stream in streams if stream.name != topics.JOINTS]
         self._driver = driver
-        self._rounds = Rounds(asked, self._ask, device=name, what="stream")
+        self._rounds = PeriodicPoller(asked, self._ask, device=name, what="stream")
 
     def start(self) -> None:
         """Begin, where there is something to ask for."""

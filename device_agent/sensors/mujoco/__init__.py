@@ -8,7 +8,7 @@ import msgspec
 
 from device_agent.ports.sensor import RoomDriver, SensorError, Surroundings
 from device_agent.ports.simulation import SimulatedWorld
-from device_agent.protocol.manifests.room import RoomDevice
+from device_agent.protocol.manifests.room import RoomDeviceManifest
 from device_agent.sensors.mujoco.base import Part
 from device_agent.sensors.mujoco.cameras import ColourCamera, DepthCamera
 from device_agent.sensors.mujoco.fault_injection import patient
@@ -20,7 +20,7 @@ __all__ = ["FAULTS", "KINDS", "create"]
 
 FAULTS = "faults"
 
-KINDS: Mapping[str, Callable[[RoomDevice, SimulatedWorld], Part]] = {
+KINDS: Mapping[str, Callable[[RoomDeviceManifest, SimulatedWorld], Part]] = {
     "camera": ColourCamera,
     "depth_camera": DepthCamera,
     "lidar": Lidar,
@@ -39,7 +39,7 @@ KINDS: Mapping[str, Callable[[RoomDevice, SimulatedWorld], Part]] = {
 """What ``kind`` may be, and what does it."""
 
 
-def create(device: RoomDevice, folder: Path, surroundings: Surroundings) -> RoomDriver:
+def create(device: RoomDeviceManifest, folder: Path, surroundings: Surroundings) -> RoomDriver:
     """The driver of one device: the factory that ``sensors.load("mujoco")`` gives.
 
     Every kind has the option ``faults``: a file, relative to the room's folder, with faults to put into it, which may

@@ -10,7 +10,7 @@ import mujoco
 from device_agent.ports.driver import DriverError
 from device_agent.ports.sensor import Capture, Image, Scan, SensorError, Values
 from device_agent.ports.simulation import SimulatedWorld
-from device_agent.protocol.manifests.room import Control, RoomDevice
+from device_agent.protocol.manifests.room import Control, RoomDeviceManifest
 from device_agent.sensors.mujoco.shared_view import view_of
 
 _KINDS = {
@@ -37,7 +37,7 @@ class Part:
     OPTIONS: Mapping[str, type | tuple[type, ...]] = {}
     """Its own options besides: name → type."""
 
-    def __init__(self, device: RoomDevice, world: SimulatedWorld) -> None:
+    def __init__(self, device: RoomDeviceManifest, world: SimulatedWorld) -> None:
         self._device = device
         self._world = world
         self._life = threading.Lock()

@@ -10,11 +10,11 @@ import simplejpeg
 
 from device_agent.ports.sensor import Bytes, Capture, Frame, Image, SensorError
 from device_agent.ports.simulation import SimulatedWorld
-from device_agent.protocol.manifests.room import RoomDevice
+from device_agent.protocol.manifests.room import RoomDeviceManifest
 from device_agent.sensors import png
 from device_agent.sensors.mujoco.base import Part
 from device_agent.sensors.mujoco.noise import generator
-from device_agent.simulation.renderer import Shot, Studio, studio_of
+from device_agent.simulation.renderer import Renderer, RenderRequest, studio_of
 
 FRESH_S = 0.1
 """What ``raw`` gives is no older than this."""
@@ -38,7 +38,7 @@ class Camera(Part):
     OPTIONS: Mapping[str, type | tuple[type, ...]] = {"camera": str, "width": int, "height": int}
     DEPTH = False
 
-    def __init__(self, device: RoomDevice, world: SimulatedWorld) -> None:
+    def __init__(self, device: RoomDeviceManifest, world: SimulatedWorld) -> None:
         super().__init__(device, world)
         self._name: str = self.option("camera", device.name)
         self._width: int = self.option("width", _WIDTH)
@@ -48,7 +48,7 @@ class Camera(Part):
                 f"pictures of '{device.name}' are at most 1920 x 1080, not {self._width} x {self._height}"
             )
         self._chance = generator(device.name, self.option("seed", 0))
-        self._studio: Studio | None = None
+        self._studio: Renderer | None = None
         self._camera = 0
         self._fovy_rad = 0.0
         self._newest: Image | None = None
@@ -83,14 +83,14 @@ class Camera(Part):
         self._newest = image = self._image(shot)
         return image
 
-    def _image(self, shot: Shot) -> Image:
+    def _image(self, shot: RenderRequest) -> Image:
         raise NotImplementedError
 
 
 class ColourCamera(Camera):
     """Pictures at ``cam/{name}``; capture ``image``: a PNG without loss."""
 
-    def __init__(self, device: RoomDevice, world: SimulatedWorld) -> None:
+    def __init__(self, device: RoomDeviceManifest, world: SimulatedWorld) -> None:
         super().__init__(device, world)
         grain = self._chance.normal(0.0, _GRAIN, (self._height + _TILES, self._width + _TILES, 3))
         self._grain = np.rint(grain).astype(np.int16)
@@ -110,7 +110,7 @@ class ColourCamera(Camera):
             return super().capture(name)
         return Capture("image/png", png.encode(self._take().rgb))
 
-    def _image(self, shot: Shot) -> Image:
+    def _image(self, shot: RenderRequest) -> Image:
         down, right = self._chance.integers(0, _TILES, 2).tolist()
         noise = self._grain[down : down + self._height, right : right + self._width]
         rgb: Bytes = np.clip(shot.pixels.astype(np.int16) + noise, 0, 255).astype(np.uint8)
@@ -139,7 +139,7 @@ class DepthCamera(Camera):
     }
     DEPTH = True
 
-    def __init__(self, device: RoomDevice, world: SimulatedWorld) -> None:
+    def __init__(self, device: RoomDeviceManifest, world: SimulatedWorld) -> None:
         super().__init__(device, world)
         self._nearest_m = float(self.option("nearest_m", _NEAREST_M))
         self._furthest_m = float(self.option("furthest_m", _FURTHEST_M))
@@ -154,7 +154,7 @@ class DepthCamera(Camera):
         millimetres = np.rint(depth_m / _MILLIMETRE)
         return Capture("image/png", png.encode(np.clip(millimetres, 0, _FAR_MM).astype(np.uint16)))
 
-    def _image(self, shot: Shot) -> Image:
+    def _image(self, shot: RenderRequest) -> Image:
         down, right = self._chance.integers(0, _TILES, 2).tolist()
         noise = self._noise[down : down + self._height, right : right + self._width]
         true_m = shot.pixels

@@ -22,14 +22,14 @@ from msgspec import Struct
 
 from device_agent.ports.sensor import Camera, Capture, Frame, Image, Movable, RoomDriver, Scan, SensorError, Values
 from device_agent.protocol.errors import ProtocolError
-from device_agent.protocol.manifests.room import RoomDevice
+from device_agent.protocol.manifests.room import RoomDeviceManifest
 from device_agent.simulation import fault_file
 
 _MINUTE_S = 60.0
 _log = logging.getLogger(__name__)
 
 
-class Ailments(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+class InjectedFaults(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """What a room device suffers from.
 
     Attributes:
@@ -45,10 +45,10 @@ class Ailments(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     drift: dict[str, float] = {}
 
 
-WELL = Ailments()
+WELL = InjectedFaults()
 
 
-def read(text: str, sources: Sequence[str]) -> Ailments:
+def read(text: str, sources: Sequence[str]) -> InjectedFaults:
     """Read a file's text.
 
     Args:
@@ -58,14 +58,14 @@ def read(text: str, sources: Sequence[str]) -> Ailments:
     Raises:
         ProtocolError: Not TOML, or a field, stream or camera is unknown; the text lists those there are.
     """
-    ailments = fault_file.read(text, Ailments)
+    ailments = fault_file.read(text, InjectedFaults)
     for name in (*ailments.silent, *ailments.stuck):
         if name not in sources:
             raise ProtocolError(f"no stream or camera '{name}'; there are: {', '.join(sources)}")
     return ailments
 
 
-class Patient:
+class FaultySensor:
     """A room driver with what ails it; without a file it does as it always does.
 
     Args:
@@ -74,7 +74,7 @@ class Patient:
         path: Where the file may be.
     """
 
-    def __init__(self, driver: RoomDriver, device: RoomDevice, path: Path) -> None:
+    def __init__(self, driver: RoomDriver, device: RoomDeviceManifest, path: Path) -> None:
         self._driver = driver
         self._name = device.name
         sources = [stream.name for stream in (*device.streams, *device.cameras)]
@@ -138,7 +138,7 @@ class Patient:
         """See ``RoomDriver``."""
         self._driver.close()
 
-    def look(self) -> Ailments:
+    def look(self) -> InjectedFaults:
         """What ails it now.
 
         Raises:
@@ -154,10 +154,10 @@ class Patient:
         return self._ailments
 
 
-class CameraPatient(Patient):
+class CameraPatient(FaultySensor):
     """The same with a camera."""
 
-    def __init__(self, driver: Camera, device: RoomDevice, path: Path) -> None:
+    def __init__(self, driver: Camera, device: RoomDeviceManifest, path: Path) -> None:
         super().__init__(driver, device, path)
         self._camera = driver
         self._pictures: dict[str, Frame] = {}
@@ -174,6 +174,6 @@ class CameraPatient(Patient):
         return replace(self._pictures.setdefault(camera, taken), taken_s=taken.taken_s)
 
 
-def patient(driver: RoomDriver, device: RoomDevice, path: Path) -> Patient:
+def patient(driver: RoomDriver, device: RoomDeviceManifest, path: Path) -> FaultySensor:
     """The driver, with what the file may put into it."""
-    return CameraPatient(driver, device, path) if isinstance(driver, Camera) else Patient(driver, device, path)
+    return CameraPatient(driver, device, path) if isinstance(driver, Camera) else FaultySensor(driver, device, path)

@@ -11,7 +11,7 @@ import numpy as np
 from device_agent.ports.clock import wall_ms
 from device_agent.ports.sensor import Capture, Floats, Scan, Values
 from device_agent.ports.simulation import SimulatedWorld
-from device_agent.protocol.manifests.room import RoomDevice
+from device_agent.protocol.manifests.room import RoomDeviceManifest
 from device_agent.sensors.mujoco.base import Part
 from device_agent.sensors.mujoco.noise import generator
 
@@ -39,7 +39,7 @@ class Lidar(Part):
         "furthest_m": (int, float),
     }
 
-    def __init__(self, device: RoomDevice, world: SimulatedWorld) -> None:
+    def __init__(self, device: RoomDeviceManifest, world: SimulatedWorld) -> None:
         super().__init__(device, world)
         self._name: str = self.option("site", device.name)
         self._nearest_m = float(self.option("nearest_m", _NEAREST_M))

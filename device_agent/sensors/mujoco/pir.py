@@ -9,7 +9,7 @@ import numpy as np
 
 from device_agent.ports.sensor import Floats, Values
 from device_agent.ports.simulation import SimulatedWorld
-from device_agent.protocol.manifests.room import RoomDevice
+from device_agent.protocol.manifests.room import RoomDeviceManifest
 from device_agent.sensors.mujoco.base import Part
 
 STREAM = "motion"
@@ -42,7 +42,7 @@ class Pir(Part):
         "hold_s": (int, float),
     }
 
-    def __init__(self, device: RoomDevice, world: SimulatedWorld) -> None:
+    def __init__(self, device: RoomDeviceManifest, world: SimulatedWorld) -> None:
         super().__init__(device, world)
         self._name: str = self.option("site", device.name)
         self._warm: tuple[str, ...] = tuple(map(str, self.option("warm", ["person"])))

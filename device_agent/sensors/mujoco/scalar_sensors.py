@@ -7,7 +7,7 @@ from typing import Any
 
 from device_agent.ports.sensor import SensorError, Values
 from device_agent.ports.simulation import SimulatedWorld
-from device_agent.protocol.manifests.room import RoomDevice
+from device_agent.protocol.manifests.room import RoomDeviceManifest
 from device_agent.sensors.mujoco.base import Part
 from device_agent.sensors.mujoco.noise import ERRORS, Probe, generator
 
@@ -23,7 +23,7 @@ class Meter(Part):
         quantity: With its unit, as ``temperature_c``.
     """
 
-    def __init__(self, device: RoomDevice, world: SimulatedWorld, quantity: str) -> None:
+    def __init__(self, device: RoomDeviceManifest, world: SimulatedWorld, quantity: str) -> None:
         super().__init__(device, world)
         self._quantity = quantity
         self._probe = Probe(ERRORS[quantity], generator(device.name, self.option("seed", 0)))
@@ -48,7 +48,7 @@ class Contact(Part):
 
     OPTIONS: Mapping[str, type | tuple[type, ...]] = {"joint": str, "shut_rad": (int, float)}
 
-    def __init__(self, device: RoomDevice, world: SimulatedWorld) -> None:
+    def __init__(self, device: RoomDeviceManifest, world: SimulatedWorld) -> None:
         super().__init__(device, world)
         self._name: str = self.option("joint", device.name)
         self._shut_rad = float(self.option("shut_rad", _SHUT_RAD))

@@ -3,13 +3,13 @@
 from pathlib import Path
 
 from device_agent.ports.sensor import Surroundings
-from device_agent.protocol.manifests.room import RoomDevice
+from device_agent.protocol.manifests.room import RoomDeviceManifest
 from device_agent.sensors.perception.driver import PerceptionDriver
 
 __all__ = ["PerceptionDriver", "create"]
 
 
-def create(device: RoomDevice, folder: Path, surroundings: Surroundings) -> PerceptionDriver:
+def create(device: RoomDeviceManifest, folder: Path, surroundings: Surroundings) -> PerceptionDriver:
     """The driver of one device: the factory that ``sensors.load("perception")`` gives.
 
     Raises:

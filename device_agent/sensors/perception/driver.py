@@ -12,16 +12,16 @@ import numpy as np
 from msgspec import Struct, field
 
 from device_agent.perception import grid_image
-from device_agent.perception.background_model import Survey, SurveyError
+from device_agent.perception.background_model import BackgroundModel, SurveyError
 from device_agent.perception.grid_rows import rows
-from device_agent.perception.object_classes import Kind, Mount, Place
+from device_agent.perception.object_classes import Mount, ObjectClass, Place
 from device_agent.perception.occupancy_grid import OccupancyGrid
-from device_agent.perception.sensor_fusion import Sight, Zone
+from device_agent.perception.sensor_fusion import SensorFusion, Zone
 from device_agent.perception.tracker import Box
 from device_agent.ports.sensor import Capture, Image, RoomDriver, Scan, SensorError, Values
 from device_agent.protocol.errors import ProtocolError
 from device_agent.protocol.manifests import room as rooms
-from device_agent.protocol.manifests.room import Room, RoomDevice
+from device_agent.protocol.manifests.room import Room, RoomDeviceManifest
 from device_agent.sensors import png
 
 log = logging.getLogger(__name__)
@@ -45,7 +45,7 @@ _DIGITS = 3
 
 
 class _Kind(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """A ``Kind`` without the place where it begins, which is the robot's in the room's manifest."""
+    """A ``ObjectClass`` without the place where it begins, which is the robot's in the room's manifest."""
 
     name: str
     lowest_m: float
@@ -57,9 +57,9 @@ class _Kind(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     def __post_init__(self) -> None:
         self.begins(None)  # which says what is wrong
 
-    def begins(self, start_m: tuple[float, float] | None) -> Kind:
+    def begins(self, start_m: tuple[float, float] | None) -> ObjectClass:
         """It, where it begins."""
-        return Kind(**msgspec.structs.asdict(self), start_m=start_m)
+        return ObjectClass(**msgspec.structs.asdict(self), start_m=start_m)
 
 
 class _Mount(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -121,7 +121,7 @@ class PerceptionDriver:
     option of that name. Clear the room before.
     """
 
-    def __init__(self, device: RoomDevice, folder: Path, neighbours: Mapping[str, RoomDriver]) -> None:
+    def __init__(self, device: RoomDeviceManifest, folder: Path, neighbours: Mapping[str, RoomDriver]) -> None:
         self._device = device
         self._folder = folder
         self._neighbours = neighbours
@@ -130,7 +130,7 @@ class PerceptionDriver:
         except msgspec.ValidationError as error:
             known = ", ".join(Options.__struct_fields__)
             raise SensorError(f"options of '{device.name}': {error}; there are: {known}") from error
-        self._sight: Sight | None = None
+        self._sight: SensorFusion | None = None
         self._thread: threading.Thread | None = None
         self._stopping = threading.Event()
         self._life = threading.Lock()
@@ -213,7 +213,7 @@ class PerceptionDriver:
         """
         return self._require().grid
 
-    def make(self) -> Sight:
+    def make(self) -> SensorFusion:
         """What it will look with, before anything is seen: for its own thread, and for who drives time by hand.
 
         Raises:
@@ -224,7 +224,7 @@ class PerceptionDriver:
         except ProtocolError as error:
             raise SensorError(str(error)) from error
         (low_x, low_y), (high_x, high_y) = room.plan.lower_m, room.plan.upper_m
-        return Sight(
+        return SensorFusion(
             grid=OccupancyGrid(
                 (low_x - _EDGE_M, low_y - _EDGE_M),
                 (high_x + _EDGE_M, high_y + _EDGE_M),
@@ -245,7 +245,7 @@ class PerceptionDriver:
     def _eyes(self) -> tuple[str, ...]:
         return (*self._options.lidars, *self._options.cameras)
 
-    def _require(self) -> Sight:
+    def _require(self) -> SensorFusion:
         sight = self._sight
         if sight is None or self._thread is None:
             raise SensorError(f"'{self._device.name}' is not connected")
@@ -254,7 +254,7 @@ class PerceptionDriver:
             raise SensorError(f"'{self._device.name}' sees nothing: {why}")
         return sight
 
-    def _kinds(self, room: Room) -> list[Kind]:
+    def _kinds(self, room: Room) -> list[ObjectClass]:
         """Robots that move begin where the manifest puts them."""
         found = []
         for kind in self._options.kinds:
@@ -272,19 +272,19 @@ class PerceptionDriver:
             found.append(Mount(**msgspec.structs.asdict(mount), near_m=(robot.position_m[0], robot.position_m[1])))
         return found
 
-    def _survey(self) -> Survey:
+    def _survey(self) -> BackgroundModel:
         if not self._options.survey:
-            return Survey()
+            return BackgroundModel()
         path = self._folder / self._options.survey
         try:
-            return Survey.read(path.read_bytes())
+            return BackgroundModel.read(path.read_bytes())
         except (OSError, SurveyError) as error:
             raise SensorError(
                 f"{path}: {error}; clear the room, capture '{SURVEY}' of '{self._device.name}', and put it there"
             ) from error
 
-    def _take_survey(self) -> Survey:
-        found = Survey()
+    def _take_survey(self) -> BackgroundModel:
+        found = BackgroundModel()
         for _ in range(SURVEY_LOOKS):
             for name in self._eyes:
                 raw = self._neighbours[name].raw()
@@ -304,7 +304,7 @@ class PerceptionDriver:
         read = self._neighbours[self._options.light].read("light")
         return {name: float(value) for name, value in read.items() if name == "light_lux"}
 
-    def _run(self, sight: Sight) -> None:
+    def _run(self, sight: SensorFusion) -> None:
         period_s = 1.0 / self._options.look_hz
         due_s = time.monotonic()
         while not self._stopping.is_set():
@@ -316,7 +316,7 @@ class PerceptionDriver:
             due_s = max(due_s + period_s, now_s)
             self._stopping.wait(due_s - now_s)
 
-    def _look(self, sight: Sight, name: str) -> None:
+    def _look(self, sight: SensorFusion, name: str) -> None:
         now_s = time.monotonic()
         if now_s < self._next_s.get(name, -np.inf):
             return

@@ -17,7 +17,7 @@ _SCALAR = frozenset({int(mujoco.mjtJoint.mjJNT_HINGE), int(mujoco.mjtJoint.mjJNT
 
 
 @dataclass(frozen=True, slots=True)
-class Tie:
+class EqualityJoint:
     """One joint that goes with others: position = ``offset`` + sum of factor times position.
 
     Attributes:
@@ -31,7 +31,7 @@ class Tie:
     factors: Mapping[int, float]
 
 
-class Ties:
+class EqualityJoints:
     """All ties of a model, in an order in which each needs only what was worked out before.
 
     Curved ones (a polynomial of higher degree) are taken as their tangent at the model's reference position.
@@ -88,7 +88,7 @@ def _driven(model: Any) -> list[int]:
     return [int(joint) for joint in model.actuator_trnid[joints, 0]]
 
 
-def _tie(model: Any, index: int, driven: set[int]) -> Tie | None:
+def _tie(model: Any, index: int, driven: set[int]) -> EqualityJoint | None:
     if not model.eq_active0[index]:
         return None
     kind, first, second = int(model.eq_type[index]), int(model.eq_obj1id[index]), int(model.eq_obj2id[index])
@@ -97,13 +97,13 @@ def _tie(model: Any, index: int, driven: set[int]) -> Tie | None:
         if first in driven and second not in driven and slope:  # written the other way round
             first, second, constant, slope = second, first, -constant / slope, 1 / slope
         reference = model.qpos0[model.jnt_qposadr[[first, second]]]
-        return Tie(first, float(reference[0] + constant - slope * reference[1]), {second: slope})
+        return EqualityJoint(first, float(reference[0] + constant - slope * reference[1]), {second: slope})
     if kind == int(mujoco.mjtEq.mjEQ_TENDON) and second < 0:
         return _of_tendon(model, first, constant, driven)
     return None
 
 
-def _of_tendon(model: Any, tendon: int, constant: float, driven: set[int]) -> Tie | None:
+def _of_tendon(model: Any, tendon: int, constant: float, driven: set[int]) -> EqualityJoint | None:
     """Of a fixed tendon that keeps its length, with one joint in it that has no motor."""
     start = model.tendon_adr[tendon]
     wraps = range(start, start + model.tendon_num[tendon])
@@ -116,15 +116,15 @@ def _of_tendon(model: Any, tendon: int, constant: float, driven: set[int]) -> Ti
     own = parts.pop(loose[0])
     at = {joint: float(model.qpos0[model.jnt_qposadr[joint]]) for joint in (*parts, loose[0])}
     pulled = sum(part * at[joint] for joint, part in parts.items())
-    return Tie(
+    return EqualityJoint(
         loose[0], at[loose[0]] + (constant + pulled) / own, {joint: -part / own for joint, part in parts.items()}
     )
 
 
-def _in_order(found: list[Tie]) -> tuple[Tie, ...]:
+def _in_order(found: list[EqualityJoint]) -> tuple[EqualityJoint, ...]:
     """Each after those that it needs; one that would need itself is left out."""
     tied = {tie.joint for tie in found}
-    done: list[Tie] = []
+    done: list[EqualityJoint] = []
     while True:
         known = {tie.joint for tie in done}
         free = [

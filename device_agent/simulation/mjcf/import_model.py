@@ -15,7 +15,7 @@ import mujoco
 import numpy as np
 
 from device_agent.protocol.topics import is_id
-from device_agent.simulation.mjcf.equality_joints import Ties
+from device_agent.simulation.mjcf.equality_joints import EqualityJoints
 
 GUESSED = "  # guessed"
 _SPEED_RAD_S, _SPEED_M_S = 0.5, 0.05
@@ -239,7 +239,7 @@ def _servo(model: Any, actuator: int) -> _Servo:
 def _holding(model: Any, joint: int) -> float:
     """The most that a joint needs against gravity, in random positions [N m or N]."""
     data, random = mujoco.MjData(model), np.random.default_rng(0)
-    ties, most = Ties(model), 0.0
+    ties, most = EqualityJoints(model), 0.0
     dof = int(model.jnt_dofadr[joint])
     scalar = model.jnt_type >= int(mujoco.mjtJoint.mjJNT_SLIDE)
     addresses = model.jnt_qposadr[scalar]
@@ -282,7 +282,7 @@ def _write_texts(folder: Path, source: Path, model: Any, servos: Sequence[_Servo
     data = mujoco.MjData(model)
     for joint, position in home.items():
         data.joint(joint).qpos[0] = position
-    Ties(model).settle(data.qpos)
+    EqualityJoints(model).settle(data.qpos)
     mujoco.mj_forward(model, data)
     (folder / "scene.xml").write_text(_scene(name, model, data), encoding="utf-8")
     (folder / "robot.toml").write_text(_manifest(name, model, servos, home), encoding="utf-8")

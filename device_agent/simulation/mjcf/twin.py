@@ -10,7 +10,7 @@ import numpy as np
 
 from device_agent.ports.driver import DriverError
 from device_agent.protocol import Body, Geometry, Quaternion, Twin, TwinJoint, Vector3
-from device_agent.simulation.mjcf.equality_joints import Ties
+from device_agent.simulation.mjcf.equality_joints import EqualityJoints
 
 _LAST_VISIBLE_GROUP = 2
 _DIGITS = 12
@@ -49,7 +49,7 @@ def draw(model: Any, *, base: int, device: str, prefix: str = "", scenery_m: flo
     """
     bodies: list[Body] = []
     index_of: dict[int, int] = {}
-    ties = Ties(model)
+    ties = EqualityJoints(model)
     if scenery_m > 0 and model.body_weldid[base] == 0:
         bodies.append(_scene(model, base, scenery_m))
     for body in range(base, model.nbody):
@@ -64,7 +64,7 @@ def draw(model: Any, *, base: int, device: str, prefix: str = "", scenery_m: flo
     return Twin(device=device, bodies=tuple(bodies))
 
 
-def _moving(model: Any, body: int, parent: int, first: int, prefix: str, *, ties: Ties) -> list[Body]:
+def _moving(model: Any, body: int, parent: int, first: int, prefix: str, *, ties: EqualityJoints) -> list[Body]:
     """One body of the model: one in the drawing, or a chain of them where it has several joints."""
     joints = range(model.body_jntadr[body], model.body_jntadr[body] + model.body_jntnum[body])
     name = _name(model, body, prefix)
@@ -86,7 +86,7 @@ def _moving(model: Any, body: int, parent: int, first: int, prefix: str, *, ties
     ]
 
 
-def _joint(model: Any, joint: int, prefix: str, ties: Ties) -> TwinJoint:
+def _joint(model: Any, joint: int, prefix: str, ties: EqualityJoints) -> TwinJoint:
     kinds: dict[int, Literal["hinge", "slide"]] = {
         int(mujoco.mjtJoint.mjJNT_HINGE): "hinge",
         int(mujoco.mjtJoint.mjJNT_SLIDE): "slide",

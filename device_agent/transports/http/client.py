@@ -51,7 +51,7 @@ class Claim(msgspec.Struct, frozen=True, kw_only=True):
 
 
 @dataclass(frozen=True, slots=True)
-class Letter:
+class QueuedCommand:
     """A command as it would have come on ``topic`` over MQTT, byte for byte."""
 
     command: str
@@ -59,7 +59,7 @@ class Letter:
     payload: bytes
 
 
-class CloudApi:
+class CloudClient:
     """One agent's view of the HTTP API. One call at a time; ``break_off`` at any.
 
     Args:
@@ -123,7 +123,7 @@ class CloudApi:
         """
         return self._call("POST", "/mqtt/credentials", json={"purpose": "agent"})
 
-    def commands(self, agent: str, *, wait_s: float, limit: int, have: Collection[str]) -> list[Letter]:
+    def commands(self, agent: str, *, wait_s: float, limit: int, have: Collection[str]) -> list[QueuedCommand]:
         """Commands that wait for an answer: Stop first, then the oldest first.
 
         Args:
@@ -141,7 +141,7 @@ class CloudApi:
         asked = {"limit": limit, "have": list(have), **wait}
         answer = self._call("GET", f"/agents/{agent}/commands", params=asked, timeout=ANSWER_WITHIN_S + wait_s)
         try:
-            return [Letter(item["id"], item["topic"], item["payload"].encode()) for item in answer["items"]]
+            return [QueuedCommand(item["id"], item["topic"], item["payload"].encode()) for item in answer["items"]]
         except (KeyError, TypeError, AttributeError) as error:
             raise CloudError(f"the cloud's commands lack {error}") from error
 

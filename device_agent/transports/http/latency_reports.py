@@ -2,7 +2,7 @@
 
 from collections.abc import Callable, Sequence
 
-from device_agent.transports.http.client import CloudApi
+from device_agent.transports.http.client import CloudClient
 
 
 class HttpLatencies:
@@ -14,11 +14,11 @@ class HttpLatencies:
         open_api: A view of the HTTP API, with which nobody else calls.
     """
 
-    def __init__(self, agent: str, transport: str, open_api: Callable[[], CloudApi]) -> None:
+    def __init__(self, agent: str, transport: str, open_api: Callable[[], CloudClient]) -> None:
         self._agent = agent
         self._transport = transport
         self._open_api = open_api
-        self._api: CloudApi | None = None
+        self._api: CloudClient | None = None
 
     def tell(self, device: str, samples: Sequence[tuple[int, float]]) -> None:
         """Tell samples of a device: when [ms since 1970], and how long [ms].

@@ -33,7 +33,7 @@ class Message:
         return self.topic.endswith(f"/{topics.ACK}")
 
 
-class OutTray:
+class SendQueue:
     """Two queues, each in order. Acks, state and events go first and at once; of measurements the newest win."""
 
     def __init__(self) -> None:

@@ -21,8 +21,8 @@ from device_agent.ports.transport import LinkChanged, Receive
 from device_agent.protocol import Ack, Presence, codec, topics
 from device_agent.protocol.errors import ProtocolError
 from device_agent.transports.backoff import BackOff
-from device_agent.transports.http.client import ANSWER_WITHIN_S, CloudApi, CloudError, Letter
-from device_agent.transports.http.send_queue import Message, OutTray
+from device_agent.transports.http.client import ANSWER_WITHIN_S, CloudClient, CloudError, QueuedCommand
+from device_agent.transports.http.send_queue import Message, SendQueue
 
 LONG_POLL_S = 25.0
 """Below what proxies and hosts cut as idle."""
@@ -59,7 +59,7 @@ class HttpTransport:
     def __init__(
         self,
         *,
-        open_api: Callable[[], CloudApi],
+        open_api: Callable[[], CloudClient],
         check: Callable[..., None],
         presence_topic: str,
         next_session: Callable[[], int],
@@ -79,7 +79,7 @@ class HttpTransport:
         self._quiet = quiet
         self._wait_s = wait_s
         self._pause_s = pause_s
-        self._tray = OutTray()
+        self._tray = SendQueue()
         self._have: dict[str, float] = {}
         self._have_lock = threading.Lock()
         self._session = 0
@@ -202,7 +202,7 @@ class HttpTransport:
         """Until the next poll [s]."""
         return max(0.0, last_s + self._pause_s - time.monotonic())
 
-    def _ask(self, *, wait_s: float) -> list[Letter]:
+    def _ask(self, *, wait_s: float) -> list[QueuedCommand]:
         long_ago_s = time.monotonic() - _AGAIN_S
         with self._have_lock:
             for command in [command for command, came_s in self._have.items() if came_s < long_ago_s]:
@@ -210,7 +210,7 @@ class HttpTransport:
             have = list(self._have)[:_LIMIT]
         return self._poll_api.commands(self._agent, wait_s=wait_s, limit=_LIMIT, have=have)
 
-    def _hand_on(self, letters: Sequence[Letter]) -> None:
+    def _hand_on(self, letters: Sequence[QueuedCommand]) -> None:
         for letter in letters:
             if self._interrupt.is_set():
                 return

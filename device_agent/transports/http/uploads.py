@@ -8,7 +8,7 @@ from urllib.parse import urljoin
 import requests
 
 from device_agent.ports.uploads import UploadError
-from device_agent.transports.http.client import CloudApi, CloudError
+from device_agent.transports.http.client import CloudClient, CloudError
 
 _WITHIN_S = 60.0
 
@@ -21,10 +21,10 @@ class HttpUploads:
         open_api: A view of the HTTP API, with which nobody else calls.
     """
 
-    def __init__(self, agent: str, open_api: Callable[[], CloudApi]) -> None:
+    def __init__(self, agent: str, open_api: Callable[[], CloudClient]) -> None:
         self._agent = agent
         self._open_api = open_api
-        self._api: CloudApi | None = None
+        self._api: CloudClient | None = None
         self._turn = threading.Lock()
 
     def store(self, device: str, *, stream: str, name: str, media_type: str, content: bytes, at_ms: int) -> str:

@@ -11,7 +11,7 @@ from typing import Any
 from device_agent.protocol.security.grants import Grant
 from function_app.adapters.aws import iot_policies
 from function_app.adapters.aws.client import Client, Refused
-from function_app.adapters.shared.grant_registry import BrokerRights, each
+from function_app.adapters.shared.grant_registry import GrantRegistry, each
 from function_app.ports.broker_access import BrokerAccessError, Credentials, ServiceCredentials
 from function_app.ports.signing_keys import Keys
 from function_app.ports.tables import StoreError, Tables
@@ -32,7 +32,7 @@ class IotBrokerAccess:
     """
 
     def __init__(self, *, keys: Keys, tables: Tables, region: str, endpoint: str) -> None:
-        self._rights = BrokerRights(keys=keys, tables=tables)
+        self._rights = GrantRegistry(keys=keys, tables=tables)
         self._client = Client(
             "iot-data",
             what="AWS IoT Core",

@@ -22,7 +22,7 @@ from typing import Any
 
 from device_agent.protocol.security.grants import Grant
 from function_app.adapters.azure import topic_spaces
-from function_app.adapters.shared.grant_registry import BrokerRights, each
+from function_app.adapters.shared.grant_registry import GrantRegistry, each
 from function_app.ports.broker_access import BrokerAccessError, Credentials, ServiceCredentials
 from function_app.ports.signing_keys import Keys
 from function_app.ports.tables import StoreError, Tables
@@ -49,7 +49,7 @@ class EventGridBrokerAccess:
 
     def __init__(self, *, keys: Keys, tables: Tables, take: Take, known: Callable[[str], Awaitable[bool]]) -> None:
         self.known = known
-        self._rights = BrokerRights(keys=keys, tables=tables)
+        self._rights = GrantRegistry(keys=keys, tables=tables)
         self._take = take
         self._cuts = asyncio.Semaphore(CUTS_AT_ONCE)
 

@@ -14,7 +14,7 @@ WITHIN_S = 10.0
 _KEEP_ALIVE_S = 30
 
 
-class SessionTaker:
+class SessionTakeover:
     """Connects and goes, each time anew.
 
     Args:

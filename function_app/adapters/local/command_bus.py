@@ -8,7 +8,7 @@ from paho.mqtt.client import MQTTMessage
 
 from device_agent.protocol import Ack, codec, topics
 from device_agent.protocol.errors import ProtocolError
-from function_app.adapters.mqtt.connection import Broker, MqttLink
+from function_app.adapters.mqtt.connection import Broker, MqttConnection
 
 _READY_S = 2.0
 
@@ -17,7 +17,7 @@ class MqttCommandBus:
     """``CommandBus`` over MQTT. Every instance hears all acks and hands on those that somebody here waits for."""
 
     def __init__(self, broker: Broker) -> None:
-        self._link = MqttLink(
+        self._link = MqttConnection(
             broker,
             subscriptions=(topics.device(topics.ANY, topics.ANY, topics.ANY, topics.ACK),),
             receive=self._dispatch,

@@ -10,7 +10,7 @@ from paho.mqtt.client import MQTTMessage
 from device_agent.protocol import topics
 from device_agent.protocol.security import grants
 from device_agent.protocol.topics import ANY
-from function_app.adapters.mqtt.connection import Broker, MqttLink
+from function_app.adapters.mqtt.connection import Broker, MqttConnection
 from function_app.ports.broker_access import BrokerAccess, ServiceCredentials
 from function_app.ports.command_feed import Hear
 
@@ -23,7 +23,7 @@ class MqttOrders:
     def __init__(self, *, host: str, port: int, access: BrokerAccess, tls: ssl.SSLContext | None = None) -> None:
         self._hear: Hear | None = None
         self._wanted: dict[tuple[str, str], tuple[str, ...]] = {}
-        self._link = MqttLink(
+        self._link = MqttConnection(
             Broker(host=host, port=port, credentials=_credentials(access), tls=tls), receive=self._arrived
         )
 

@@ -8,7 +8,7 @@ from paho.mqtt.client import MQTTMessage
 
 from device_agent.protocol import topics
 from device_agent.protocol.topics import ANY
-from function_app.adapters.mqtt.connection import Broker, MqttLink
+from function_app.adapters.mqtt.connection import Broker, MqttConnection
 from function_app.domain.common.problems import Problem
 from function_app.ports.device_feed import BatchHandler, Handler
 from function_app.ports.tables import StoreError
@@ -51,7 +51,7 @@ class MqttFeed:
 
     def __init__(self, broker: Broker) -> None:
         self._waiting: asyncio.Queue[_Arrived] = asyncio.Queue(MAX_WAITING)
-        self._link = MqttLink(
+        self._link = MqttConnection(
             broker,
             subscriptions=FILTERS,
             receive=self._arrived,
@@ -107,7 +107,7 @@ class MqttLate:
     def __init__(self, broker: Broker) -> None:
         self._collected: list[_Arrived] = []
         self._some = asyncio.Event()
-        self._link = MqttLink(
+        self._link = MqttConnection(
             broker,
             subscriptions=(topics.device(ANY, ANY, ANY, topics.LATE, ANY),),
             receive=self._arrived,
@@ -158,7 +158,7 @@ class MqttTelemetry:
         self._bytes = 0
         self._dropped = 0
         self._some = asyncio.Event()
-        self._link = MqttLink(
+        self._link = MqttConnection(
             broker,
             subscriptions=(topics.device(ANY, ANY, ANY, topics.TELE, ANY),),
             receive=self._arrived,

@@ -22,7 +22,7 @@ WALL_S = 30
 MEMORY_MB = 1024
 _NO_MUJOCO = 3
 """The child's exit code; importing it for this would cost a cold start."""
-_CHILD = Path(__file__).with_name("model_compiler_child.py")
+_CHILD = Path(__file__).with_name("worker.py")
 _MISSING = "MuJoCo is not installed here; install the packages of requirements/local.txt, or run the checker elsewhere"
 _TOO_LONG = f"The model takes MuJoCo more than {CPU_S} s. Simplify it."
 _CRASHED = f"MuJoCo ended while it read the model, or needed more than {MEMORY_MB} MB of memory. Simplify it."

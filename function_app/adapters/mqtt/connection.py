@@ -55,7 +55,7 @@ class Broker:
     tls: ssl.SSLContext | None = None
 
 
-class MqttLink:
+class MqttConnection:
     """Connects at ``start`` and stays connected until ``close``."""
 
     def __init__(

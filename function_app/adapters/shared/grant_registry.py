@@ -19,7 +19,7 @@ from function_app.ports.broker_access import BrokerAccessError, Credentials
 from function_app.ports.signing_keys import Keys
 from function_app.ports.tables import Conflict, Row, StoreError, Tables
 
-TABLE = "BrokerRights"
+TABLE = "GrantRegistry"
 """Partition ``revoked``: who, and when; partition ``issued``: ``<first two parts of the principal>|<client id>``."""
 SETTLE_S = 10.0
 """A connection that was being let in when it was taken back is there by then: brokers wait 5 s for our answer."""
@@ -48,7 +48,7 @@ class _Issued(msgspec.Struct, frozen=True):
     issued_s: float = 0.0
 
 
-class BrokerRights:
+class GrantRegistry:
     """What was given and taken, in the tables.
 
     Args:

@@ -33,7 +33,7 @@ class Fact(StrEnum):
 
 
 @dataclass(frozen=True, slots=True)
-class Happened:
+class ControlEvent:
     """One fact. ``id`` is unique for the device; ``data`` is for programs, ``message`` for people."""
 
     id: str
@@ -56,7 +56,7 @@ class Happened:
         }
 
 
-def overdue(lease: Lease | None, now_ms: int) -> Iterator[Happened]:
+def overdue(lease: Lease | None, now_ms: int) -> Iterator[ControlEvent]:
     """What time alone has brought: a lease that ran out, a request that nobody answered."""
     if lease is None:
         return
@@ -68,7 +68,7 @@ def overdue(lease: Lease | None, now_ms: int) -> Iterator[Happened]:
         yield _of_lease(lease, Fact.EXPIRED, lease.expires_ms, message, {"holder": lease.holder})
 
 
-def changed(before: Lease | None, after: Lease, *, by: str, now_ms: int) -> Iterator[Happened]:
+def changed(before: Lease | None, after: Lease, *, by: str, now_ms: int) -> Iterator[ControlEvent]:
     """What one write has changed.
 
     Args:
@@ -85,14 +85,14 @@ def changed(before: Lease | None, after: Lease, *, by: str, now_ms: int) -> Iter
     yield from _of_asking(before, after, by=by, now_ms=now_ms)
 
 
-def ended(before: Lease, after: Lease, *, why: str, now_ms: int) -> Happened:
+def ended(before: Lease, after: Lease, *, why: str, now_ms: int) -> ControlEvent:
     """Control has ended because the device was ``unpaired``, ``moved``, ``removed``, or is ``unshared``."""
     how = "is shared with them no longer" if why == "unshared" else f"was {why}"
     message = f"Control of {before.holder} ended: the device {how}."
     return _of_lease(after, Fact.ENDED, now_ms, message, {"holder": before.holder, "why": why})
 
 
-def _of_change(before: Lease | None, after: Lease, *, by: str, now_ms: int) -> Iterator[Happened]:
+def _of_change(before: Lease | None, after: Lease, *, by: str, now_ms: int) -> Iterator[ControlEvent]:
     had = before.holder if before is not None and before.live(now_ms) else ""
     if before is not None and after.epoch == before.epoch:
         if had and not after.account and not before.action:
@@ -114,7 +114,7 @@ def _of_change(before: Lease | None, after: Lease, *, by: str, now_ms: int) -> I
         yield _of_lease(after, Fact.TAKEN, now_ms, f"{after.holder} took control.", data)
 
 
-def _of_asking(before: Lease | None, after: Lease, *, by: str, now_ms: int) -> Iterator[Happened]:
+def _of_asking(before: Lease | None, after: Lease, *, by: str, now_ms: int) -> Iterator[ControlEvent]:
     asked, known = after.asked, before.asked if before is not None else None
     if asked is None or asked == known:
         return
@@ -135,10 +135,10 @@ def _of_lease(
     data: Mapping[str, str],
     *,
     severity: Literal["info", "warning"] = "info",
-) -> Happened:
-    return Happened(f"{fact}-{lease.epoch}", fact, at_ms, message, {"epoch": lease.epoch, **data}, severity)
+) -> ControlEvent:
+    return ControlEvent(f"{fact}-{lease.epoch}", fact, at_ms, message, {"epoch": lease.epoch, **data}, severity)
 
 
-def _of_request(asked: Asked, fact: Fact, at_ms: int, message: str) -> Happened:
+def _of_request(asked: Asked, fact: Fact, at_ms: int, message: str) -> ControlEvent:
     data = {"request": asked.id, "by": asked.by, "epoch": asked.epoch}
-    return Happened(f"{fact}-{asked.id}", fact, at_ms, message, data)
+    return ControlEvent(f"{fact}-{asked.id}", fact, at_ms, message, data)

@@ -21,7 +21,7 @@ from function_app.entrypoints.http.robot_types import schemas_movements
 from function_app.services.devices.device_access import DeviceView
 from function_app.services.robot_types.catalogue import KnownType, Model
 from function_app.services.robot_types.parameter_schema import ObjectSchema
-from function_app.services.robot_types.preview import Look
+from function_app.services.robot_types.preview import Preview
 from function_app.services.robot_types.script_store import signed_text
 
 
@@ -143,11 +143,11 @@ def twin(found: Model) -> robot_types.RobotTypeTwin:
     )
 
 
-def look(found: Look) -> robot_types.TypeLookOut:
+def look(found: Preview) -> robot_types.TypePreviewOut:
     """An upload that is looked at."""
     upload = found.upload
     known = KnownType(found.manifest, upload.version, upload.files, usable=upload.state == "ready", upload=upload)
-    return robot_types.TypeLookOut(id=found.id, expires_at=rfc3339(found.expires_ms), robot_type=robot_type(known))
+    return robot_types.TypePreviewOut(id=found.id, expires_at=rfc3339(found.expires_ms), robot_type=robot_type(known))
 
 
 def _upload(upload: TypeVersion) -> robot_types.TypeUploadOut:

@@ -9,7 +9,7 @@ from function_app.bootstrap import Functions
 from function_app.domain.devices.devices import Agent, Transport
 from function_app.entrypoints.ingest.router import take_in
 from function_app.services.devices.device_access import require_claimed
-from function_app.services.telemetry.ingest import Arrived
+from function_app.services.telemetry.ingest import InboundMessage
 
 SAID = frozenset({topics.CONN, topics.DESC, topics.STATE, topics.EVENT, topics.ACK}) | topics.MEASURED
 """Classes of topics that agents speak on, and that are JSON."""
@@ -32,11 +32,11 @@ async def tell(
     Raises:
         Problem, StoreError: Not all are stored; to be told again.
     """
-    taken: dict[int, Arrived] = {}
+    taken: dict[int, InboundMessage] = {}
     refused: dict[int, str] = {}
     for place, (topic, payload) in enumerate(messages):
         try:
-            arrived = Arrived(own_topic(topic, agent), payload)
+            arrived = InboundMessage(own_topic(topic, agent), payload)
             if arrived.topic.kind not in topics.MEASURED:
                 await take_in(functions, arrived.topic, arrived.payload, by=by)
             taken[place] = arrived

@@ -8,7 +8,7 @@ from device_agent.protocol.errors import ProtocolError
 from device_agent.protocol.topics import Topic
 from function_app.bootstrap import Functions
 from function_app.domain.devices.devices import Transport
-from function_app.services.telemetry.ingest import Arrived
+from function_app.services.telemetry.ingest import InboundMessage
 
 _SHOWN = 200
 
@@ -37,7 +37,7 @@ async def take_in(functions: Functions, topic: Topic, payload: bytes, *, by: Tra
     if topic.kind == topics.ACK:
         await functions.action_acks.ingest(topic, payload, by=by)
     elif topic.kind in topics.MEASURED:
-        await functions.intake.take([Arrived(topic, payload)])
+        await functions.intake.take([InboundMessage(topic, payload)])
     elif topic.kind in {topics.CONN, topics.DESC, topics.STATE, topics.EVENT}:
         await functions.presence.ingest(topic, payload, by=by)
 
@@ -61,6 +61,6 @@ async def ingest_telemetry(functions: Functions, messages: Sequence[tuple[str, b
             _log.warning("%s", error)
             continue
         if parsed.kind in topics.MEASURED:
-            arrived.append(Arrived(parsed, payload))
+            arrived.append(InboundMessage(parsed, payload))
     if arrived:
         await functions.intake.take(arrived)

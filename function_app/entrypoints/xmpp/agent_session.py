@@ -14,9 +14,9 @@ from function_app.domain.common.problems import Problem
 from function_app.domain.devices.devices import Agent, Link
 from function_app.entrypoints.ingest.agent_messages import own_topic, tell
 from function_app.ports.tables import StoreError
-from function_app.ports.xmpp_connection import XmppLine
+from function_app.ports.xmpp_connection import XmppConnection
 from function_app.services.storage import records
-from function_app.services.telemetry.ingest import Arrived
+from function_app.services.telemetry.ingest import InboundMessage
 
 MOST_WAITING = 1000
 MOST_WAITING_BYTES = 4 * 1024 * 1024
@@ -36,7 +36,7 @@ CHECK_S = 5.0
 _log = logging.getLogger(__name__)
 
 
-class Served:
+class AgentSession:
     """An agent at its place.
 
     Args:
@@ -55,7 +55,7 @@ class Served:
     def __init__(
         self,
         functions: Functions,
-        line: XmppLine,
+        line: XmppConnection,
         *,
         agent: Agent,
         jid: str,
@@ -63,7 +63,7 @@ class Served:
         greeted: Told,
         listen: Sequence[str],
         broker_up: Callable[[], bool],
-        measured: Callable[[Arrived], None],
+        measured: Callable[[InboundMessage], None],
         told: Callable[[Agent, Told], None],
     ) -> None:
         self.agent = agent
@@ -195,7 +195,7 @@ class Served:
                     _log.warning("a measurement of %s was dropped: %s", self.agent.id, error)
                     continue
                 passed.append((told.topic, topic, told.payload))
-                self._measured(Arrived(topic, told.payload))
+                self._measured(InboundMessage(topic, told.payload))
             await self._functions.relay.pass_on(passed)
 
     async def _bring(self) -> bool:

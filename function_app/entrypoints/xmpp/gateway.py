@@ -17,12 +17,12 @@ from function_app.bootstrap import Functions
 from function_app.domain.common.ids import AGENT_LENGTH
 from function_app.domain.common.problems import Problem
 from function_app.domain.devices.devices import Agent
-from function_app.entrypoints.xmpp.agent_session import Served
+from function_app.entrypoints.xmpp.agent_session import AgentSession
 from function_app.ports.command_feed import Orders
 from function_app.ports.tables import StoreError
-from function_app.ports.xmpp_connection import XmppLine
+from function_app.ports.xmpp_connection import XmppConnection
 from function_app.services.storage import records
-from function_app.services.telemetry.ingest import Arrived
+from function_app.services.telemetry.ingest import InboundMessage
 
 COLLECT_S = 2.0
 MAX_COLLECTED = 20_000
@@ -32,8 +32,8 @@ GREET_TRIES = 3
 _log = logging.getLogger(__name__)
 
 
-class Speaker:
-    """``XmppLine``'s listener.
+class XmppGateway:
+    """``XmppConnection``'s listener.
 
     Args:
         functions: The cloud.
@@ -41,14 +41,14 @@ class Speaker:
         orders: What the broker brings.
     """
 
-    def __init__(self, functions: Functions, line: XmppLine, orders: Orders) -> None:
+    def __init__(self, functions: Functions, line: XmppConnection, orders: Orders) -> None:
         self._functions = functions
         self._line = line
         self._orders = orders
-        self._served: dict[str, Served] = {}
+        self._served: dict[str, AgentSession] = {}
         self._people: dict[str, set[str]] = {}
         self._tasks: set[asyncio.Task[None]] = set()
-        self._collected: list[Arrived] = []
+        self._collected: list[InboundMessage] = []
         self._dropped = 0
 
     async def run(self) -> None:
@@ -138,7 +138,7 @@ class Speaker:
             self._contradict(served, payload)
 
     @staticmethod
-    def _contradict(served: Served, payload: bytes) -> None:
+    def _contradict(served: AgentSession, payload: bytes) -> None:
         """An older connection was declared gone after this one had come, and that is what the broker keeps now."""
         try:
             said = codec.decode(payload, Presence)
@@ -171,7 +171,7 @@ class Speaker:
         if before is not None:
             before.leave(replaced=True)
         listen = [topic for topic in wanted if _may_hear(agent, topic)]
-        served = self._served[user] = Served(
+        served = self._served[user] = AgentSession(
             self._functions,
             self._line,
             agent=agent,
@@ -199,7 +199,7 @@ class Speaker:
             return None if row is None else records.read(row, Agent)
         return None
 
-    async def _serve(self, served: Served) -> None:
+    async def _serve(self, served: AgentSession) -> None:
         agent = served.agent
         _log.info("%s is there, session %d", agent.id, served.greeting.session)
         try:
@@ -235,7 +235,7 @@ class Speaker:
         for jid in places:
             self._line.send(stanzas.message(jid, told.topic, told.payload, body=body))
 
-    def _measured(self, arrived: Arrived) -> None:
+    def _measured(self, arrived: InboundMessage) -> None:
         if len(self._collected) >= MAX_COLLECTED:
             self._dropped += 1
         else:

@@ -5,7 +5,7 @@ import signal
 
 from function_app import bootstrap
 from function_app.bootstrap import Functions
-from function_app.entrypoints.xmpp.gateway import Speaker
+from function_app.entrypoints.xmpp.gateway import XmppGateway
 
 
 async def speak(functions: Functions) -> None:
@@ -20,7 +20,7 @@ async def speak(functions: Functions) -> None:
     for number in (signal.SIGINT, signal.SIGTERM):
         loop.add_signal_handler(number, ending.set)
     await functions.health.require_tables()
-    speaker = Speaker(functions, bootstrap.xmpp_line(functions), bootstrap.orders(functions))
+    speaker = XmppGateway(functions, bootstrap.xmpp_line(functions), bootstrap.orders(functions))
     speaking = asyncio.create_task(speaker.run())
     waiting = asyncio.create_task(ending.wait())
     done, _ = await asyncio.wait((speaking, waiting), return_when=asyncio.FIRST_COMPLETED)

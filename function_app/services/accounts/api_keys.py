@@ -15,14 +15,14 @@ from function_app.domain.identity.api_keys import ApiKey
 from function_app.ports.clock import Clock
 from function_app.ports.tables import Conflict, Row, StoreError, Tables
 from function_app.services.accounts.sign_out import SignOut
-from function_app.services.audit.audit_log import AuditChain
+from function_app.services.audit.audit_log import AuditLog
 from function_app.services.devices.device_access import Devices
 from function_app.services.identity.authenticator import RECHECK_MS, new_secret
 from function_app.services.identity.session_status import API_KEY
 from function_app.services.identity.sign_in import SignIn
 from function_app.services.storage import records
-from function_app.services.storage.reminders import Pending
-from function_app.services.storage.retention import DAY_MS, Forget
+from function_app.services.storage.reminders import Reminders
+from function_app.services.storage.retention import DAY_MS, Retention
 
 MOST: Final = 50
 """Of one account, more or less: two that are made at once may both be the last."""
@@ -63,9 +63,9 @@ class ApiKeys:
         devices: Devices,
         sign_in: SignIn,
         sign_out: SignOut,
-        chain: AuditChain,
-        forget: Forget,
-        pending: Pending,
+        chain: AuditLog,
+        forget: Retention,
+        pending: Reminders,
         clock: Clock,
     ) -> None:
         self._tables = tables

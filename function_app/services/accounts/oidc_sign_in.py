@@ -17,7 +17,7 @@ from function_app.domain.identity.accounts import Identity
 from function_app.ports.clock import Clock
 from function_app.ports.oidc_provider import OpenId, OpenIdError, Subject
 from function_app.ports.tables import Conflict, Row, Tables
-from function_app.services.audit.audit_log import AuditChain
+from function_app.services.audit.audit_log import AuditLog
 from function_app.services.identity.authenticator import new_secret
 from function_app.services.identity.sessions import From, Sessions, SignedIn
 from function_app.services.identity.sign_in import SignIn
@@ -71,7 +71,7 @@ class OpenIdSignIn:
         sign_in: SignIn,
         sessions: Sessions,
         invitations: Invitations,
-        chain: AuditChain,
+        chain: AuditLog,
         clock: Clock,
     ) -> None:
         self._tables = tables

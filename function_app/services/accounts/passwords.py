@@ -12,7 +12,7 @@ from function_app.ports.clock import Clock
 from function_app.ports.password_hasher import PasswordHashes
 from function_app.ports.tables import Conflict, Row, Tables
 from function_app.services.accounts.sign_out import SignOut
-from function_app.services.audit.audit_log import AuditChain
+from function_app.services.audit.audit_log import AuditLog
 from function_app.services.identity.guess_limiter import Attempts, Guess, by_address
 from function_app.services.identity.sessions import From, Sessions, SignedIn
 from function_app.services.identity.sign_in import SignIn, named_partition, new_name
@@ -48,7 +48,7 @@ class Passwords:
         sign_in: SignIn,
         sessions: Sessions,
         sign_out: SignOut,
-        chain: AuditChain,
+        chain: AuditLog,
         clock: Clock,
     ) -> None:
         self._tables = tables

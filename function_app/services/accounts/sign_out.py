@@ -10,7 +10,7 @@ from function_app.domain.identity.accounts import Identity
 from function_app.ports.broker_access import BrokerAccess, BrokerAccessError
 from function_app.ports.clock import Clock
 from function_app.ports.tables import Tables
-from function_app.services.audit.audit_log import AuditChain
+from function_app.services.audit.audit_log import AuditLog
 from function_app.services.control.leases import Leases
 from function_app.services.devices.control_rows import read_lease
 from function_app.services.devices.device_access import Devices
@@ -35,7 +35,7 @@ class SignOut:
         access: BrokerAccess,
         devices: Devices,
         leases: Leases,
-        chain: AuditChain,
+        chain: AuditLog,
         clock: Clock,
     ) -> None:
         self._tables = tables

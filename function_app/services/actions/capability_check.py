@@ -4,14 +4,14 @@ from collections.abc import Iterable, Sequence
 
 from device_agent.protocol import (
     CaptureRaw,
+    CollectData,
     Description,
     Express,
-    Gather,
     MoveJoints,
     MovePose,
     RunBehaviour,
     SetControl,
-    Shoot,
+    TakePicture,
     TakePosture,
     Task,
 )
@@ -52,7 +52,7 @@ def _named(asked: Task, described: Description) -> Iterable[tuple[str, str, Sequ
             yield "posture", name, described.postures
         case RunBehaviour(name=name):
             yield "behaviour", name, described.behaviours
-        case Gather(streams=streams) | Shoot(streams=streams):
+        case CollectData(streams=streams) | TakePicture(streams=streams):
             for stream in streams:
                 yield "stream", stream, [each.name for each in described.streams]
         case CaptureRaw(name=name):

@@ -22,11 +22,11 @@ from function_app.ports.command_bus import BusUnavailable
 from function_app.ports.tables import Row, Tables, Write
 from function_app.services.actions.action_store import ActionRows, Found
 from function_app.services.actions.dispatcher import MovementChanged, NoLonger, SendAction
-from function_app.services.control.control_events import Audit, lease_change
+from function_app.services.control.control_events import ControlEvents, lease_change
 from function_app.services.devices.control_rows import heed_device, read_control, read_control_rows
 from function_app.services.devices.device_access import Devices
 from function_app.services.storage import records
-from function_app.services.storage.reminders import Pending
+from function_app.services.storage.reminders import Reminders
 
 LOOK_MS: Final = 2_000
 """A queue is looked at so often, for the case that whoever freed the slot was killed before it saw to the queue."""
@@ -45,9 +45,9 @@ class Queues:
         tables: Tables,
         devices: Devices,
         rows: ActionRows,
-        pending: Pending,
+        pending: Reminders,
         sending: SendAction,
-        audit: Audit,
+        audit: ControlEvents,
         clock: Clock,
     ) -> None:
         self._tables = tables

@@ -9,7 +9,7 @@ from typing import Any, Literal
 import msgspec
 from msgspec import Struct
 
-from device_agent.protocol import Ack, Gather, Id, RunMovement, Task
+from device_agent.protocol import Ack, CollectData, Id, RunMovement, Task
 from function_app.domain.actions.action import REPEAT_MS, Action, Status, end, reached
 from function_app.domain.actions.queue import DROPPED, KEY_ENDED, UNSHARED
 from function_app.domain.common.ids import command_id
@@ -25,7 +25,7 @@ from function_app.services.actions import capability_check
 from function_app.services.actions.acks import ActionAcks
 from function_app.services.actions.action_store import ActionRows, Found, new_row
 from function_app.services.actions.queue import Queues, run_lease
-from function_app.services.control.control_events import Audit, lease_change
+from function_app.services.control.control_events import ControlEvents, lease_change
 from function_app.services.devices.control_rows import Control, heed_device, read_control
 from function_app.services.devices.device_access import Devices, require_online, require_operator
 from function_app.services.messaging.command_sender import Commands
@@ -33,7 +33,7 @@ from function_app.services.messaging.delivery import Delivery, Signed
 from function_app.services.robot_types import parameter_schema as parameters
 from function_app.services.robot_types.movements import Movements
 from function_app.services.storage import records
-from function_app.services.storage.reminders import Pending
+from function_app.services.storage.reminders import Reminders
 
 ABANDON_MS = 30_000
 """A start that has not been written after this time is given up: the timer may already have forgotten its note."""
@@ -125,10 +125,10 @@ class StartAction:
         commands: Commands,
         rows: ActionRows,
         acks: ActionAcks,
-        pending: Pending,
+        pending: Reminders,
         queues: Queues,
         delivery: Delivery,
-        audit: Audit,
+        audit: ControlEvents,
         clock: Clock,
     ) -> None:
         self._tables = tables
@@ -234,7 +234,7 @@ class StartAction:
         request: dict[str, Any] = msgspec.to_builtins(asked)
         action = command_id(device.id, now_ms)
         if isinstance(asked, Task):
-            if isinstance(asked, Gather) and asked.duration_s * 1000 > start.timeout_ms:
+            if isinstance(asked, CollectData) and asked.duration_s * 1000 > start.timeout_ms:
                 raise invalid("A gathering cannot last longer than the action: raise timeout_ms, or lower duration_s.")
             await capability_check.check(self._tables, device, asked)
             plan = _Plan(device, action, now_ms, request, asked)

@@ -21,7 +21,7 @@ from function_app.domain.identity.accounts import Identity
 from function_app.ports.command_bus import BusUnavailable
 from function_app.ports.tables import StoreError
 from function_app.services.actions.queue import Queues
-from function_app.services.control.control_events import Audit
+from function_app.services.control.control_events import ControlEvents
 from function_app.services.control.lease_store import LeaseRows
 from function_app.services.devices.device_access import Devices, require_operator
 from function_app.services.devices.spaces import Spaces
@@ -57,7 +57,7 @@ class StopDevices:
         commands: Commands,
         queues: Queues,
         delivery: Delivery,
-        audit: Audit,
+        audit: ControlEvents,
     ) -> None:
         self._devices = devices
         self._spaces = spaces

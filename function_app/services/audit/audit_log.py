@@ -32,8 +32,8 @@ from function_app.ports.clock import Clock
 from function_app.ports.signing_keys import Keys
 from function_app.ports.tables import Conflict, Row, StoreError, Tables, Write
 from function_app.services.storage import records
-from function_app.services.storage.reminders import Pending
-from function_app.services.storage.retention import DAY_MS, Forget
+from function_app.services.storage.reminders import Reminders
+from function_app.services.storage.retention import DAY_MS, Retention
 from function_app.services.storage.write_batcher import Batches
 
 LOOK_MS: Final = 15_000
@@ -75,7 +75,7 @@ class _Job:
 class Change:
     """A change that is being made. Until it ends, ``data`` may be added to, and it may have ``came_to_nothing``."""
 
-    def __init__(self, chain: "AuditChain", owner: str, fields: Entry) -> None:
+    def __init__(self, chain: "AuditLog", owner: str, fields: Entry) -> None:
         self.data: dict[str, Any] = dict(fields.data)
         self._chain = chain
         self._owner = owner
@@ -101,11 +101,11 @@ class Change:
             await self._chain.close(self._owner, entry, self._row)
 
 
-class AuditChain:
+class AuditLog:
     """Writes the chains. Reading and verifying them: ``services/audit_trail.py``."""
 
     def __init__(
-        self, *, tables: Tables, blobs: Blobs, keys: Keys, forget: Forget, pending: Pending, clock: Clock
+        self, *, tables: Tables, blobs: Blobs, keys: Keys, forget: Retention, pending: Reminders, clock: Clock
     ) -> None:
         self._tables = tables
         self._blobs = blobs

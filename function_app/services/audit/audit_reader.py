@@ -56,7 +56,7 @@ class Verdict:
     anchors: int = 0
 
 
-class AuditTrail:
+class AuditReader:
     """Reads and verifies."""
 
     def __init__(self, *, tables: Tables, blobs: Blobs, keys: Keys) -> None:

@@ -2,7 +2,7 @@
 
 A change of a lease and the events that tell of it are one batch in the device's partition of ``Control``. From there
 they are moved to ``Events`` and to the chain (``services/audit_chain.py``) at once, by whoever makes the next change,
-or by the timer, which looks at a device with a lease by a note in ``Pending``. A refusal changes nothing, so it is
+or by the timer, which looks at a device with a lease by a note in ``Reminders``. A refusal changes nothing, so it is
 written straight there.
 """
 
@@ -15,16 +15,16 @@ from function_app.domain.audit.hash_chain import CLOUD, Entry, Outcome
 from function_app.domain.common.ids import new_id, split_device
 from function_app.domain.common.problems import Problem
 from function_app.domain.control import control_events
-from function_app.domain.control.control_events import Fact, Happened
+from function_app.domain.control.control_events import ControlEvent, Fact
 from function_app.domain.control.lease import Lease
 from function_app.domain.devices.devices import Agent, Device
 from function_app.domain.identity.accounts import Identity
 from function_app.ports.clock import Clock
 from function_app.ports.tables import Conflict, Row, StoreError, Tables, Write
-from function_app.services.audit.audit_log import AuditChain
+from function_app.services.audit.audit_log import AuditLog
 from function_app.services.devices.control_rows import read_control_rows
 from function_app.services.storage import records
-from function_app.services.storage.reminders import Pending
+from function_app.services.storage.reminders import Reminders
 from function_app.services.telemetry.event_log import Events
 
 LOOK_MS: Final = 15_000
@@ -40,10 +40,10 @@ _KNOWN: Final = 1_000
 _log = logging.getLogger(__name__)
 
 
-class Audit:
+class ControlEvents:
     """Tells what happened."""
 
-    def __init__(self, *, tables: Tables, events: Events, chain: AuditChain, pending: Pending, clock: Clock) -> None:
+    def __init__(self, *, tables: Tables, events: Events, chain: AuditLog, pending: Reminders, clock: Clock) -> None:
         self._tables = tables
         self._events = events
         self._chain = chain
@@ -139,7 +139,7 @@ class Audit:
         Raises:
             StoreError: The tables cannot be used.
         """
-        event = Happened(new_id(), fact, self._clock.now_ms(), message, data, severity).event(device.name)
+        event = ControlEvent(new_id(), fact, self._clock.now_ms(), message, data, severity).event(device.name)
         await self._events.add(device.id, device.pairing, event)
         return event
 
@@ -187,7 +187,7 @@ class Audit:
 
 
 def told(
-    device: str, pairing: str, facts: Iterable[Happened], *, owner: str = "", who: Identity | None = None
+    device: str, pairing: str, facts: Iterable[ControlEvent], *, owner: str = "", who: Identity | None = None
 ) -> list[Write]:
     """The writes that note facts, to go into one batch with the change that they tell of.
 

@@ -4,7 +4,7 @@ import asyncio
 import logging
 from collections.abc import Callable
 
-from device_agent.protocol import AskLease, DropRequest
+from device_agent.protocol import RequestControl, WithdrawRequest
 from function_app.domain.common.ids import new_id
 from function_app.domain.common.problems import Problem
 from function_app.domain.control import control_request as rules
@@ -15,7 +15,7 @@ from function_app.domain.identity.api_keys import key_of
 from function_app.ports.clock import Clock
 from function_app.ports.command_bus import BusUnavailable
 from function_app.ports.tables import Tables
-from function_app.services.control.control_events import Audit
+from function_app.services.control.control_events import ControlEvents
 from function_app.services.control.lease_store import LeaseRows
 from function_app.services.control.leases import Leases
 from function_app.services.devices.control_rows import read_lease
@@ -36,7 +36,7 @@ class Handovers:
         leases: Leases,
         rows: LeaseRows,
         commands: Commands,
-        audit: Audit,
+        audit: ControlEvents,
         clock: Clock,
     ) -> None:
         self._tables = tables
@@ -87,7 +87,7 @@ class Handovers:
         asked = lease.asked
         assert asked is not None  # noqa: S101 (the rule has just written it)
         left_ms = max(1, asked.expires_ms - self._clock.now_ms())
-        order = AskLease(request=asked.id, by=asked.by, answer_within_ms=left_ms)
+        order = RequestControl(request=asked.id, by=asked.by, answer_within_ms=left_ms)
         try:
             shown = await self._commands.confirmed(device, order, who=who.name, epoch=lease.epoch, wait_ms=wait_ms)
         except Problem as problem:
@@ -173,7 +173,7 @@ class Handovers:
     async def _drop(self, who: Identity, device: Device, lease: Lease, request: str) -> None:
         """Have the device show it no longer. Where that does not arrive, its time is over there soon by itself."""
         try:
-            await self._commands.send(device, DropRequest(request=request), who=who.name, epoch=lease.epoch)
+            await self._commands.send(device, WithdrawRequest(request=request), who=who.name, epoch=lease.epoch)
         except BusUnavailable as error:
             _log.warning("request for %s: %s", device.id, error)
 

@@ -20,7 +20,7 @@ from function_app.services.storage import records
 _log = logging.getLogger(__name__)
 
 
-class Fence:
+class ControlRevocation:
     """Ends leases from outside."""
 
     def __init__(self, *, tables: Tables, commands: Commands, access: BrokerAccess, clock: Clock) -> None:

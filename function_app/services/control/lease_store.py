@@ -7,7 +7,7 @@ from function_app.domain.devices.devices import Device
 from function_app.domain.identity.accounts import Identity
 from function_app.ports.clock import Clock
 from function_app.ports.tables import Tables
-from function_app.services.control.control_events import Audit, lease_change
+from function_app.services.control.control_events import ControlEvents, lease_change
 from function_app.services.devices.control_rows import heed_device, read_control
 from function_app.services.storage import records
 
@@ -15,7 +15,7 @@ from function_app.services.storage import records
 class LeaseRows:
     """Changes leases. An action that gets a lease of its own writes it in its own batch."""
 
-    def __init__(self, *, tables: Tables, audit: Audit, clock: Clock) -> None:
+    def __init__(self, *, tables: Tables, audit: ControlEvents, clock: Clock) -> None:
         self._tables = tables
         self._audit = audit
         self._clock = clock

@@ -13,8 +13,8 @@ from function_app.ports.broker_access import BrokerAccess, BrokerAccessError
 from function_app.ports.clock import Clock
 from function_app.ports.command_bus import BusUnavailable
 from function_app.ports.tables import Tables
-from function_app.services.control.control_events import Audit
-from function_app.services.control.fencing import Fence, control_client
+from function_app.services.control.control_events import ControlEvents
+from function_app.services.control.fencing import ControlRevocation, control_client
 from function_app.services.control.lease_store import LeaseRows
 from function_app.services.devices.control_rows import ended_at_device, read_lease
 from function_app.services.devices.device_access import Devices, require_operator, require_owner
@@ -32,10 +32,10 @@ class Leases:
         tables: Tables,
         devices: Devices,
         rows: LeaseRows,
-        fence: Fence,
+        fence: ControlRevocation,
         commands: Commands,
         access: BrokerAccess,
-        audit: Audit,
+        audit: ControlEvents,
         clock: Clock,
     ) -> None:
         self._tables = tables

@@ -14,7 +14,7 @@ from function_app.domain.identity.accounts import Identity
 from function_app.ports.broker_access import BrokerAccess, BrokerAccessError, Credentials
 from function_app.ports.clock import Clock
 from function_app.ports.tables import Tables
-from function_app.services.control.control_events import Audit
+from function_app.services.control.control_events import ControlEvents
 from function_app.services.control.fencing import control_client
 from function_app.services.devices.control_rows import read_lease
 from function_app.services.devices.device_access import Devices, require_claimed, require_operator
@@ -42,7 +42,9 @@ class Issued:
 class MqttCredentials:
     """Issues broker credentials."""
 
-    def __init__(self, *, tables: Tables, devices: Devices, access: BrokerAccess, audit: Audit, clock: Clock) -> None:
+    def __init__(
+        self, *, tables: Tables, devices: Devices, access: BrokerAccess, audit: ControlEvents, clock: Clock
+    ) -> None:
         self._audit = audit
         self._tables = tables
         self._devices = devices

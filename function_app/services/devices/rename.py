@@ -6,7 +6,7 @@ from function_app.domain.devices import devices as rules
 from function_app.domain.devices.devices import Agent
 from function_app.domain.identity.accounts import Identity
 from function_app.ports.tables import Row, Tables
-from function_app.services.audit.audit_log import AuditChain
+from function_app.services.audit.audit_log import AuditLog
 from function_app.services.devices.device_access import Devices, require_owner
 from function_app.services.storage import records
 
@@ -14,7 +14,7 @@ from function_app.services.storage import records
 class Rename:
     """Names devices. The agent is not told: the name is the owner's, and the agent's own stays as it is."""
 
-    def __init__(self, *, tables: Tables, devices: Devices, chain: AuditChain) -> None:
+    def __init__(self, *, tables: Tables, devices: Devices, chain: AuditLog) -> None:
         self._tables = tables
         self._devices = devices
         self._chain = chain

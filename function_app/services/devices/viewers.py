@@ -14,7 +14,7 @@ from function_app.ports.clock import Clock
 from function_app.ports.tables import MAX_BATCH, Conflict, Row, Tables, Write
 from function_app.services.devices.device_access import Devices
 from function_app.services.storage import records
-from function_app.services.storage.retention import Forget
+from function_app.services.storage.retention import Retention
 
 GOOD_MS: Final = 25_000
 """How long one word counts: pages say it every ten seconds."""
@@ -45,10 +45,10 @@ class Watcher:
     pairing: str
 
 
-class Watchers:
+class Viewers:
     """Remembers and tells who watches."""
 
-    def __init__(self, *, tables: Tables, devices: Devices, forget: Forget, clock: Clock) -> None:
+    def __init__(self, *, tables: Tables, devices: Devices, forget: Retention, clock: Clock) -> None:
         self._tables = tables
         self._devices = devices
         self._forget = forget

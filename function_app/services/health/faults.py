@@ -18,7 +18,7 @@ from function_app.domain.health.faults import Fault, Report, Severity
 from function_app.ports.clock import Clock
 from function_app.ports.tables import Conflict, Row, Tables, Write
 from function_app.services.storage import records
-from function_app.services.storage.retention import DAY_MS, Forget
+from function_app.services.storage.retention import DAY_MS, Retention
 from function_app.services.telemetry.event_log import Events
 
 KEEP_FAULTS_MS = 365 * DAY_MS
@@ -32,7 +32,7 @@ _CODE_SHOWN = 200
 class Faults:
     """Raises, acknowledges and clears."""
 
-    def __init__(self, *, tables: Tables, events: Events, forget: Forget, clock: Clock) -> None:
+    def __init__(self, *, tables: Tables, events: Events, forget: Retention, clock: Clock) -> None:
         self._tables = tables
         self._events = events
         self._forget = forget

@@ -25,7 +25,7 @@ _LOOKED_AT = 100
 _DEVICE, _CLOUD = "device", "cloud"
 
 
-class Conditions:
+class ReportedFaults:
     """Compares what an agent says with what it said last."""
 
     def __init__(self, *, tables: Tables, faults: Faults, clock: Clock) -> None:

@@ -21,7 +21,7 @@ from function_app.ports.signing_keys import Keys
 from function_app.ports.tables import Conflict, Row, Tables
 from function_app.services.identity.session_status import signed_out_key
 from function_app.services.storage import records
-from function_app.services.storage.retention import Forget
+from function_app.services.storage.retention import Retention
 
 ALGORITHM = "EdDSA"
 API: Final = "telescope/api"
@@ -51,7 +51,7 @@ class _Known:
 class Identify:
     """Issues and checks tokens. Verifying a signature costs 0.1 ms: what was verified is remembered until it ends."""
 
-    def __init__(self, *, tables: Tables, keys: Keys, forget: Forget, clock: Clock) -> None:
+    def __init__(self, *, tables: Tables, keys: Keys, forget: Retention, clock: Clock) -> None:
         self._tables = tables
         self._forget = forget
         self._keys = keys

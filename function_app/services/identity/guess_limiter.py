@@ -7,7 +7,7 @@ from function_app.domain.common.problems import Problem
 from function_app.ports.clock import Clock
 from function_app.ports.tables import Tables
 from function_app.services.storage import records
-from function_app.services.storage.retention import Forget
+from function_app.services.storage.retention import Retention
 
 
 @dataclass(frozen=True, slots=True)
@@ -35,7 +35,7 @@ class _Tries:
 class Attempts:
     """Counts tries by whom or whence they come. Right ones are taken back, so only wrong ones count."""
 
-    def __init__(self, *, tables: Tables, forget: Forget, clock: Clock) -> None:
+    def __init__(self, *, tables: Tables, forget: Retention, clock: Clock) -> None:
         self._tables = tables
         self._forget = forget
         self._clock = clock

@@ -7,7 +7,7 @@ from function_app.domain.audit.hash_chain import Deed
 from function_app.domain.identity.accounts import Account, Identity
 from function_app.ports.clock import Clock
 from function_app.ports.tables import Conflict, Row, Tables
-from function_app.services.audit.audit_log import AuditChain
+from function_app.services.audit.audit_log import AuditLog
 from function_app.services.identity.authenticator import (
     ACCESS_S,
     API,
@@ -18,7 +18,7 @@ from function_app.services.identity.authenticator import (
     new_session,
 )
 from function_app.services.storage import records
-from function_app.services.storage.retention import Forget
+from function_app.services.storage.retention import Retention
 
 How = Literal["link", "password", "open-id"]
 FRESH_MS: Final = 10 * 60 * 1000
@@ -77,7 +77,7 @@ class SignedIn:
 class Sessions:
     """Begins sessions, and knows those that an account has."""
 
-    def __init__(self, *, tables: Tables, identify: Identify, forget: Forget, chain: AuditChain, clock: Clock) -> None:
+    def __init__(self, *, tables: Tables, identify: Identify, forget: Retention, chain: AuditLog, clock: Clock) -> None:
         self._tables = tables
         self._identify = identify
         self._forget = forget

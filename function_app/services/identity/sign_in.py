@@ -8,7 +8,7 @@ from function_app.domain.common.problems import Problem, unauthorized
 from function_app.domain.identity.accounts import Account, Identity, Space, folded
 from function_app.ports.clock import Clock
 from function_app.ports.tables import Conflict, Row, Tables
-from function_app.services.audit.audit_log import AuditChain
+from function_app.services.audit.audit_log import AuditLog
 from function_app.services.identity.authenticator import new_secret
 from function_app.services.identity.sessions import From, Sessions, SignedIn
 from function_app.services.storage import records
@@ -23,7 +23,7 @@ MOST_SPACES = 100
 class SignIn:
     """Accounts and their one-time links."""
 
-    def __init__(self, *, tables: Tables, sessions: Sessions, chain: AuditChain, clock: Clock) -> None:
+    def __init__(self, *, tables: Tables, sessions: Sessions, chain: AuditLog, clock: Clock) -> None:
         self._tables = tables
         self._sessions = sessions
         self._chain = chain

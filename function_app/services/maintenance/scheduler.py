@@ -19,18 +19,18 @@ from function_app.services.actions.action_store import ActionRows, Found, place
 from function_app.services.actions.dispatcher import MovementChanged, NoLonger, SendAction
 from function_app.services.actions.queue import TIMEOUT, Queues, queue_of
 from function_app.services.actions.start import ABANDON_MS
-from function_app.services.audit.audit_log import AuditChain, anchor_of, chain_of
-from function_app.services.control.control_events import Audit, lease_of
-from function_app.services.health.reported_faults import Conditions
+from function_app.services.audit.audit_log import AuditLog, anchor_of, chain_of
+from function_app.services.control.control_events import ControlEvents, lease_of
+from function_app.services.health.reported_faults import ReportedFaults
 from function_app.services.messaging.command_sender import Commands
-from function_app.services.pairing.offboarding import Leave, leaver_of
-from function_app.services.robot_types.cleanup import TendRobotTypes
+from function_app.services.pairing.offboarding import Offboarding, offboarding_of
+from function_app.services.robot_types.cleanup import RobotTypeCleanup
 from function_app.services.sharing.invitations import Invitations, about_transfer
 from function_app.services.sharing.shares import Sharing, about_share
 from function_app.services.storage import records
-from function_app.services.storage.reminders import SHARDS, Pending
-from function_app.services.storage.retention import DAY_MS, Forget
-from function_app.services.telemetry.ingest import Intake
+from function_app.services.storage.reminders import SHARDS, Reminders
+from function_app.services.storage.retention import DAY_MS, Retention
+from function_app.services.telemetry.ingest import TelemetryIngest
 from function_app.services.telemetry.uploads import Uploads
 
 ORPHAN_MS = 2 * ABANDON_MS
@@ -43,7 +43,7 @@ _HEX = "0123456789abcdef"
 _log = logging.getLogger(__name__)
 
 
-class Sweep:
+class Scheduler:
     """The timer's work."""
 
     def __init__(
@@ -51,22 +51,22 @@ class Sweep:
         *,
         tables: Tables,
         rows: ActionRows,
-        pending: Pending,
+        pending: Reminders,
         commands: Commands,
         sending: SendAction,
         queues: Queues,
-        leave: Leave,
+        leave: Offboarding,
         sharing: Sharing,
         invitations: Invitations,
         api_keys: ApiKeys,
-        audit: Audit,
-        chain: AuditChain,
+        audit: ControlEvents,
+        chain: AuditLog,
         access: BrokerAccess,
-        forget: Forget,
-        conditions: Conditions,
-        intake: Intake,
+        forget: Retention,
+        conditions: ReportedFaults,
+        intake: TelemetryIngest,
         uploads: Uploads,
-        robot_types: TendRobotTypes,
+        robot_types: RobotTypeCleanup,
         keep_actions_ms: int,
         clock: Clock,
     ) -> None:
@@ -121,7 +121,7 @@ class Sweep:
     async def _look(self, what: str, note: Row) -> None:
         if device := queue_of(what):
             await self._look_at_queue(device, note)
-        elif agent := leaver_of(what):
+        elif agent := offboarding_of(what):
             await self._look_at_leaver(agent, note)
         elif about_share(what):
             await self._sharing.look(what, note)

@@ -18,7 +18,7 @@ _RETAINED = frozenset({topics.CONN, topics.DESC, topics.STATE})
 _log = logging.getLogger(__name__)
 
 
-class Relay:
+class BrokerRelay:
     """Publishes as well as it can: what is passed on is stored already."""
 
     def __init__(self, *, bus: CommandBus, clock: Clock) -> None:

@@ -15,7 +15,7 @@ from typing import NamedTuple
 from device_agent.protocol import Ack, AckStatus, topics
 from function_app.domain.devices.devices import Device
 from function_app.ports.command_bus import CommandBus
-from function_app.services.messaging.broker_relay import Relay
+from function_app.services.messaging.broker_relay import BrokerRelay
 from function_app.services.messaging.mailbox import Mailbox
 
 _POLL_S = 0.02
@@ -36,7 +36,7 @@ class Signed(NamedTuple):
 class Delivery:
     """Sends commands, and waits for the answers to them."""
 
-    def __init__(self, *, bus: CommandBus, mailbox: Mailbox, relay: Relay) -> None:
+    def __init__(self, *, bus: CommandBus, mailbox: Mailbox, relay: BrokerRelay) -> None:
         self._bus = bus
         self._relay = relay
         self._mailbox = mailbox

@@ -2,7 +2,7 @@
 
 import logging
 
-from device_agent.protocol import FollowKey
+from device_agent.protocol import RotateKey
 from function_app.domain.common.problems import Problem
 from function_app.domain.devices.devices import Agent
 from function_app.ports.command_bus import BusUnavailable
@@ -14,7 +14,7 @@ _WHO = "telescope"
 _log = logging.getLogger(__name__)
 
 
-class TellKeys:
+class KeyAnnouncer:
     """The word of mouth. Agents also ask by themselves, with every request for credentials."""
 
     def __init__(self, *, keys: Keys, commands: Commands) -> None:
@@ -42,7 +42,7 @@ class TellKeys:
         if found is None:
             return
         try:
-            await self._commands.send(found, FollowKey(statements=news.statements), who=_WHO, epoch=0)
+            await self._commands.send(found, RotateKey(statements=news.statements), who=_WHO, epoch=0)
         except (BusUnavailable, Problem) as error:
             _log.warning("agent %s could not be told of a new key: %s", agent.id, error)
             return

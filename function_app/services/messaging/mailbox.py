@@ -1,7 +1,7 @@
 """Commands for agents that ask for them, each until it is answered or its time is over; and answers somebody waits for.
 
 At least once: a command is given at every asking until an ack of it has come. The agent drops doubles by id. Rows are
-also deleted by ``Forget``, where an agent never asks again.
+also deleted by ``Retention``, where an agent never asks again.
 """
 
 import asyncio
@@ -15,18 +15,18 @@ from function_app.domain.devices.devices import Agent, Device
 from function_app.ports.clock import Clock
 from function_app.ports.tables import Conflict, Row, Tables
 from function_app.services.storage import records
-from function_app.services.storage.retention import Forget
+from function_app.services.storage.retention import Retention
 
 PAGE = 100
 ANSWER_BYTES = 1_000_000
 """Payloads in one answer hold at most this much, or are one."""
 _FIRST, _OTHERS, _BEHIND = "0", "1", "2"
 _TIDY_MS = 3_600_000
-"""One note an hour for each agent is enough: ``Forget`` keeps what has not expired."""
+"""One note an hour for each agent is enough: ``Retention`` keeps what has not expired."""
 
 
 @dataclass(frozen=True, slots=True)
-class Letter:
+class MailboxEntry:
     """One command on its way, exactly as it would travel over MQTT. In its row as base64: any payload fits."""
 
     command: str
@@ -47,7 +47,7 @@ class Awaited:
 class Mailbox:
     """The rows, and a bell for whoever waits in this process; others see the rows a moment later."""
 
-    def __init__(self, *, tables: Tables, forget: Forget, clock: Clock) -> None:
+    def __init__(self, *, tables: Tables, forget: Retention, clock: Clock) -> None:
         self._tables = tables
         self._forget = forget
         self._clock = clock
@@ -67,7 +67,7 @@ class Mailbox:
             expires_ms: From then on it is no longer given [ms since 1970].
             first: Before all others that wait: a Stop.
         """
-        letter = Letter(command, topic, payload, expires_ms, device.pairing)
+        letter = MailboxEntry(command, topic, payload, expires_ms, device.pairing)
         await self._tidy_later(device.agent, expires_ms)
         with contextlib.suppress(Conflict):
             await self._tables.create(
@@ -75,7 +75,7 @@ class Mailbox:
             )
         self._ring(device.agent)
 
-    async def waiting(self, agent: Agent, *, limit: int, have: Collection[str] = ()) -> list[Letter]:
+    async def waiting(self, agent: Agent, *, limit: int, have: Collection[str] = ()) -> list[MailboxEntry]:
         """Commands that nobody has answered, Stop first, then the oldest first.
 
         Args:
@@ -83,7 +83,7 @@ class Mailbox:
             limit: At most so many.
             have: Ids of commands that are not to be given again.
         """
-        found: list[Letter] = []
+        found: list[MailboxEntry] = []
         now_ms, size = self._clock.now_ms(), 0
         cursor: str | None = None
         while True:
@@ -91,7 +91,7 @@ class Mailbox:
                 records.MAILBOX, agent.id, first=_FIRST, last=_BEHIND, limit=PAGE, cursor=cursor
             )
             for row in page.rows:
-                letter = records.read(row, Letter)
+                letter = records.read(row, MailboxEntry)
                 if letter.pairing != agent.pairing or letter.expires_ms <= now_ms or letter.command in have:
                     continue
                 size += len(letter.payload)

@@ -8,7 +8,7 @@ from function_app.domain.devices.devices import Agent, Link, polled
 from function_app.ports.clock import Clock
 from function_app.ports.tables import Tables
 from function_app.services.devices.device_access import require_claimed
-from function_app.services.messaging.mailbox import Letter, Mailbox
+from function_app.services.messaging.mailbox import Mailbox, MailboxEntry
 from function_app.services.storage import records
 
 _LOOK_S = 0.05
@@ -24,7 +24,7 @@ class Polling:
         self._mailbox = mailbox
         self._clock = clock
 
-    async def commands(self, agent: Agent, *, wait_ms: int, limit: int, have: Collection[str]) -> list[Letter]:
+    async def commands(self, agent: Agent, *, wait_ms: int, limit: int, have: Collection[str]) -> list[MailboxEntry]:
         """Commands that wait for the agent, as soon as there is one, or none after ``wait_ms``.
 
         Raises:

@@ -13,8 +13,8 @@ from function_app.domain.common.timestamps import LAST_MS
 from function_app.domain.devices.devices import Agent, LastState, Link, Transport, newer_link
 from function_app.ports.clock import Clock
 from function_app.ports.tables import Tables
-from function_app.services.health.reported_faults import Conditions
-from function_app.services.messaging.key_announcer import TellKeys
+from function_app.services.health.reported_faults import ReportedFaults
+from function_app.services.messaging.key_announcer import KeyAnnouncer
 from function_app.services.storage import records
 from function_app.services.telemetry.event_log import Events
 
@@ -24,7 +24,9 @@ T = TypeVar("T")
 class PresenceIngest:
     """Writes down what arrives. Safe to repeat; what does not belong to a claimed agent is dropped."""
 
-    def __init__(self, *, tables: Tables, events: Events, conditions: Conditions, keys: TellKeys, clock: Clock) -> None:
+    def __init__(
+        self, *, tables: Tables, events: Events, conditions: ReportedFaults, keys: KeyAnnouncer, clock: Clock
+    ) -> None:
         self._tables = tables
         self._events = events
         self._conditions = conditions

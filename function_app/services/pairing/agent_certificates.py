@@ -7,7 +7,7 @@ from function_app.ports.certificates import CertificateRefused, Certificates, Is
 from function_app.services.devices.device_access import require_claimed
 
 
-class Certify:
+class AgentCertificates:
     """Gives an agent that is claimed a certificate of its own."""
 
     def __init__(self, *, certificates: Certificates) -> None:

@@ -11,10 +11,10 @@ from function_app.domain.devices.devices import Agent
 from function_app.domain.identity.accounts import Identity
 from function_app.ports.clock import Clock
 from function_app.ports.tables import Conflict, Row, Tables
-from function_app.services.audit.audit_log import AuditChain, Change
+from function_app.services.audit.audit_log import AuditLog, Change
 from function_app.services.identity.guess_limiter import Attempts, Guess, by_address
 from function_app.services.identity.sign_in import SignIn
-from function_app.services.pairing.offboarding import Leave
+from function_app.services.pairing.offboarding import Offboarding
 from function_app.services.storage import records
 
 WRONG_TRIES = 5
@@ -30,7 +30,7 @@ class Claim:
     """Pairing by claim code. What decides is one ETag write on the agent's row."""
 
     def __init__(
-        self, *, tables: Tables, sign_in: SignIn, attempts: Attempts, leave: Leave, chain: AuditChain, clock: Clock
+        self, *, tables: Tables, sign_in: SignIn, attempts: Attempts, leave: Offboarding, chain: AuditLog, clock: Clock
     ) -> None:
         self._tables = tables
         self._attempts = attempts

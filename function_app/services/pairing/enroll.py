@@ -8,9 +8,9 @@ from function_app.domain.common.problems import Problem
 from function_app.domain.devices.devices import Agent, DeviceSpec, Transport, introduced
 from function_app.ports.clock import Clock
 from function_app.ports.tables import Conflict, Row, Tables, Write
-from function_app.services.pairing.offboarding import Leave
+from function_app.services.pairing.offboarding import Offboarding
 from function_app.services.storage import records
-from function_app.services.storage.retention import DAY_MS, Forget
+from function_app.services.storage.retention import DAY_MS, Retention
 
 CLAIM_MS = 300_000
 KEEP_UNCLAIMED_MS = 7 * DAY_MS
@@ -32,7 +32,7 @@ class Enrollment:
 class Enroll:
     """Enrolment of agents."""
 
-    def __init__(self, *, tables: Tables, leave: Leave, forget: Forget, clock: Clock) -> None:
+    def __init__(self, *, tables: Tables, leave: Offboarding, forget: Retention, clock: Clock) -> None:
         self._tables = tables
         self._leave = leave
         self._forget = forget

@@ -24,14 +24,14 @@ from function_app.ports.command_bus import BusUnavailable, CommandBus
 from function_app.ports.tables import Conflict, Row, Tables
 from function_app.services.actions.action_store import ActionRows
 from function_app.services.actions.queue import Queues
-from function_app.services.control.control_events import Audit
-from function_app.services.control.fencing import Fence
+from function_app.services.control.control_events import ControlEvents
+from function_app.services.control.fencing import ControlRevocation
 from function_app.services.devices.control_rows import read_control_rows
 from function_app.services.devices.device_access import left_devices
 from function_app.services.identity.authenticator import watchers
 from function_app.services.storage import records
-from function_app.services.storage.reminders import Pending
-from function_app.services.storage.retention import Forget
+from function_app.services.storage.reminders import Reminders
+from function_app.services.storage.retention import Retention
 from function_app.services.telemetry.series_writer import MARGIN_MS, SeriesWriter
 
 LOOK_MS: Final = 5_000
@@ -42,7 +42,7 @@ _RETAINED: Final = ((topics.STATE, ""), (topics.DESC, ""), (topics.DESC, topics.
 _log = logging.getLogger(__name__)
 
 
-class Leave:
+class Offboarding:
     """Tidies up behind agents and devices."""
 
     def __init__(
@@ -51,14 +51,14 @@ class Leave:
         tables: Tables,
         rows: ActionRows,
         queues: Queues,
-        pending: Pending,
-        fence: Fence,
+        pending: Reminders,
+        fence: ControlRevocation,
         access: BrokerAccess,
         certificates: Certificates,
         bus: CommandBus,
         series: SeriesWriter,
-        forget: Forget,
-        audit: Audit,
+        forget: Retention,
+        audit: ControlEvents,
         clock: Clock,
     ) -> None:
         self._tables = tables
@@ -209,6 +209,6 @@ class Leave:
         await records.retry(once)
 
 
-def leaver_of(note: str) -> str | None:
+def offboarding_of(note: str) -> str | None:
     """The agent that a note of the timer is about; ``None`` where it is about something else."""
     return note.removeprefix(_NOTE) if note.startswith(_NOTE) else None

@@ -8,16 +8,16 @@ from function_app.domain.devices import devices as rules
 from function_app.domain.devices.devices import Agent
 from function_app.domain.identity.accounts import Identity
 from function_app.ports.tables import Row, Tables
-from function_app.services.audit.audit_log import AuditChain, Change
+from function_app.services.audit.audit_log import AuditLog, Change
 from function_app.services.identity.sign_in import SignIn
-from function_app.services.pairing.offboarding import Leave
+from function_app.services.pairing.offboarding import Offboarding
 from function_app.services.storage import records
 
 
 class Unpair:
     """Ends a pairing, or takes it to another space."""
 
-    def __init__(self, *, tables: Tables, sign_in: SignIn, leave: Leave, chain: AuditChain) -> None:
+    def __init__(self, *, tables: Tables, sign_in: SignIn, leave: Offboarding, chain: AuditLog) -> None:
         self._tables = tables
         self._sign_in = sign_in
         self._leave = leave

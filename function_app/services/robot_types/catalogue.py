@@ -19,7 +19,7 @@ from function_app.ports.blobs import Blobs
 from function_app.ports.model_compiler import Looked
 from function_app.ports.robot_catalogue import Catalogue
 from function_app.ports.tables import Tables
-from function_app.services.robot_types.integrity import Seals, require_whole
+from function_app.services.robot_types.integrity import IntegritySeals, require_intact
 from function_app.services.robot_types.rows import INDEX, LOOKED, Place, place, read_head, read_version
 from function_app.services.storage import records
 
@@ -62,7 +62,7 @@ class Model:
 class RobotTypes:
     """All robot types that an account may use."""
 
-    def __init__(self, *, tables: Tables, blobs: Blobs, catalogue: Catalogue, seals: Seals) -> None:
+    def __init__(self, *, tables: Tables, blobs: Blobs, catalogue: Catalogue, seals: IntegritySeals) -> None:
         self._seals = seals
         self._tables = tables
         self._blobs = blobs
@@ -131,7 +131,7 @@ class RobotTypes:
             known = version is not None and name in version.files
             content = await self._blobs.get(where.prefix(head.ready) + name) if known else None
             if content is not None:
-                require_whole(robot_type, head.seal, name, content)
+                require_intact(robot_type, head.seal, name, content)
         if content is None:
             raise not_found("file", name)
         return content

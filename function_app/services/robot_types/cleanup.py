@@ -37,7 +37,7 @@ CUT_OFF = "The upload was cut off. Upload it again."
 _log = logging.getLogger(__name__)
 
 
-class TendRobotTypes:
+class RobotTypeCleanup:
     """The timer's part."""
 
     def __init__(self, *, tables: Tables, blobs: Blobs, clock: Clock) -> None:

@@ -9,7 +9,7 @@ from function_app.domain.identity.accounts import Identity
 from function_app.ports.clock import Clock
 from function_app.ports.robot_catalogue import Catalogue
 from function_app.ports.tables import Conflict, Row, Tables
-from function_app.services.audit.audit_log import AuditChain
+from function_app.services.audit.audit_log import AuditLog
 from function_app.services.devices.device_access import Devices
 from function_app.services.robot_types.movements import Movements
 from function_app.services.robot_types.rows import INDEX, note_look, place, read_head
@@ -30,7 +30,7 @@ class DeleteRobotType:
         catalogue: Catalogue,
         devices: Devices,
         movements: Movements,
-        chain: AuditChain,
+        chain: AuditLog,
         clock: Clock,
     ) -> None:
         self._tables = tables

@@ -15,7 +15,7 @@ from function_app.ports.signing_keys import Keys
 _CONTEXT = b"telescope/v1/robot-type\n"
 
 
-class Seals:
+class IntegritySeals:
     """Signs uploads, and checks what is read again."""
 
     def __init__(self, *, keys: Keys) -> None:
@@ -50,7 +50,7 @@ class Seals:
         return seal
 
 
-def require_whole(robot_type: str, seal: Seal, name: str, content: bytes) -> None:
+def require_intact(robot_type: str, seal: Seal, name: str, content: bytes) -> None:
     """A file is the one that was uploaded.
 
     Raises:

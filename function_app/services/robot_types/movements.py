@@ -22,12 +22,12 @@ from function_app.ports.clock import Clock
 from function_app.ports.robot_catalogue import BuiltIn, Catalogue
 from function_app.ports.signing_keys import Keys
 from function_app.ports.tables import Row, Tables, Write
-from function_app.services.audit.audit_log import AuditChain
+from function_app.services.audit.audit_log import AuditLog
 from function_app.services.robot_types.catalogue import RobotTypes
 from function_app.services.robot_types.script_metadata import Script, read_script
 from function_app.services.robot_types.script_store import ScriptStore, blob_name
 from function_app.services.storage import records
-from function_app.services.storage.retention import DAY_MS, Forget
+from function_app.services.storage.retention import DAY_MS, Retention
 
 MAX_OWN = 1_000
 """Movements an account may keep for one robot type."""
@@ -63,8 +63,8 @@ class Movements:
         catalogue: Catalogue,
         robot_types: RobotTypes,
         keys: Keys,
-        forget: Forget,
-        chain: AuditChain,
+        forget: Retention,
+        chain: AuditLog,
         clock: Clock,
     ) -> None:
         self._tables = tables

@@ -16,7 +16,7 @@ from function_app.ports.clock import Clock
 from function_app.ports.robot_catalogue import Catalogue
 from function_app.ports.tables import Row, Tables, Write
 from function_app.services.robot_types.catalogue import KnownType, Model, RobotTypes
-from function_app.services.robot_types.integrity import Seals, require_whole
+from function_app.services.robot_types.integrity import IntegritySeals, require_intact
 from function_app.services.robot_types.package_reader import MAX_TOLD, Upload, read_upload
 from function_app.services.robot_types.rows import (
     HEAD,
@@ -40,7 +40,7 @@ _ONLY = 1
 
 
 @dataclass(frozen=True, slots=True)
-class Look:
+class Preview:
     """An upload that is looked at."""
 
     id: str
@@ -53,7 +53,7 @@ class Look:
         return self.upload.created_ms + KEEP_LOOK_MS
 
 
-class LookAtRobotType:
+class RobotTypePreview:
     """Every look is a place of its own with one version, which the checkers and the timer treat as any other."""
 
     def __init__(
@@ -65,7 +65,7 @@ class LookAtRobotType:
         catalogue: Catalogue,
         robot_types: RobotTypes,
         upload: UploadRobotType,
-        seals: Seals,
+        seals: IntegritySeals,
         clock: Clock,
     ) -> None:
         self._tables = tables
@@ -79,7 +79,7 @@ class LookAtRobotType:
 
     async def begin(
         self, who: Identity, manifest: str, files: Mapping[str, str], scripts: Mapping[str, str], *, wait_ms: int
-    ) -> Look:
+    ) -> Preview:
         """Store an upload for a look. The notes for the timer come first: whatever a stop cuts off goes by itself.
 
         Raises:
@@ -106,9 +106,9 @@ class LookAtRobotType:
         await self._tables.batch(records.ROBOT_TYPES, [Write("create", head), Write("create", version)])
         await self._versions.store(where, _ONLY, given.files)
         done = await self._versions.verdict(where, _ONLY, wait_ms)
-        return Look(where.type[1:], done or upload, given.robot_type)
+        return Preview(where.type[1:], done or upload, given.robot_type)
 
-    async def get(self, who: Identity, look: str, *, wait_ms: int = 0) -> Look:
+    async def get(self, who: Identity, look: str, *, wait_ms: int = 0) -> Preview:
         """How it fares.
 
         Raises:
@@ -117,7 +117,7 @@ class LookAtRobotType:
         where, upload = await self._find(who, look)
         if upload.open and wait_ms:
             upload = await self._versions.verdict(where, _ONLY, wait_ms) or upload
-        return Look(look, upload, msgspec.convert(upload.manifest, RobotType))
+        return Preview(look, upload, msgspec.convert(upload.manifest, RobotType))
 
     async def model(self, who: Identity, look: str) -> Model:
         """What it was found to be.
@@ -142,7 +142,7 @@ class LookAtRobotType:
         contents = await asyncio.gather(*(self._blobs.get(where.prefix(_ONLY) + name) for name in names))
         files = {name: content or b"" for name, content in zip(names, contents, strict=True)}
         for name, content in files.items():
-            require_whole(where.type, seal, name, content)
+            require_intact(where.type, seal, name, content)
         found = await self._upload.add(who, Upload(msgspec.convert(upload.manifest, RobotType), files), wait_ms=wait_ms)
         await self.drop(who, look)
         return found

@@ -12,9 +12,9 @@ from function_app.domain.robot_types.robot_types import TypeHead, TypeVersion, n
 from function_app.ports.clock import Clock
 from function_app.ports.robot_catalogue import Catalogue
 from function_app.ports.tables import Conflict, Row, Tables, Write
-from function_app.services.audit.audit_log import AuditChain, Change
+from function_app.services.audit.audit_log import AuditLog, Change
 from function_app.services.robot_types.catalogue import KnownType, RobotTypes
-from function_app.services.robot_types.integrity import Seals
+from function_app.services.robot_types.integrity import IntegritySeals
 from function_app.services.robot_types.package_reader import Upload, read_upload
 from function_app.services.robot_types.rows import HEAD, INDEX, Place, note_look, read_head, read_version, version_key
 from function_app.services.robot_types.versions import GIVE_UP_MS, TypeVersions, refused
@@ -34,8 +34,8 @@ class UploadRobotType:
         versions: TypeVersions,
         catalogue: Catalogue,
         robot_types: RobotTypes,
-        seals: Seals,
-        chain: AuditChain,
+        seals: IntegritySeals,
+        chain: AuditLog,
         clock: Clock,
     ) -> None:
         self._tables = tables

@@ -28,7 +28,7 @@ from function_app.ports.command_bus import BusUnavailable
 from function_app.ports.tables import Conflict, Tables
 from function_app.services.actions.action_store import ActionRows
 from function_app.services.actions.queue import Queues
-from function_app.services.control.fencing import Fence
+from function_app.services.control.fencing import ControlRevocation
 from function_app.services.devices.control_rows import read_control_rows
 from function_app.services.devices.device_access import Devices, share_key
 from function_app.services.identity.authenticator import watchers
@@ -45,7 +45,7 @@ INDEX: Final = "share:"
 _log = logging.getLogger(__name__)
 
 
-class Unshare:
+class AccessRevocation:
     """Takes from an account what it may no longer have."""
 
     def __init__(
@@ -56,7 +56,7 @@ class Unshare:
         rows: ActionRows,
         queues: Queues,
         commands: Commands,
-        fence: Fence,
+        fence: ControlRevocation,
         access: BrokerAccess,
         clock: Clock,
     ) -> None:

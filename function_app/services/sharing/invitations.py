@@ -19,14 +19,14 @@ from function_app.domain.devices.invitations import Invitation
 from function_app.domain.identity.accounts import Account, Identity, Role
 from function_app.ports.clock import Clock
 from function_app.ports.tables import Conflict, Row, Tables
-from function_app.services.audit.audit_log import AuditChain
+from function_app.services.audit.audit_log import AuditLog
 from function_app.services.identity.authenticator import new_secret
 from function_app.services.identity.sign_in import SignIn
 from function_app.services.sharing.ownership_transfer import Transfer, void
 from function_app.services.sharing.shares import Shared, Sharing, require_person, yours
 from function_app.services.storage import records
-from function_app.services.storage.reminders import Pending
-from function_app.services.storage.retention import Forget
+from function_app.services.storage.reminders import Reminders
+from function_app.services.storage.retention import Retention
 
 LOOK_MS: Final = 10_000
 """The timer goes on with a transfer that was accepted so long ago and is not done."""
@@ -71,9 +71,9 @@ class Invitations:
         sharing: Sharing,
         transfer: Transfer,
         sign_in: SignIn,
-        pending: Pending,
-        forget: Forget,
-        chain: AuditChain,
+        pending: Reminders,
+        forget: Retention,
+        chain: AuditLog,
         clock: Clock,
     ) -> None:
         self._tables = tables

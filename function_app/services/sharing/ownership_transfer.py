@@ -21,7 +21,7 @@ from function_app.domain.identity.accounts import Space
 from function_app.ports.clock import Clock
 from function_app.ports.tables import Conflict, Row, Tables
 from function_app.services.devices.device_access import Devices
-from function_app.services.pairing.offboarding import Leave
+from function_app.services.pairing.offboarding import Offboarding
 from function_app.services.sharing.shares import Sharing
 from function_app.services.storage import records
 
@@ -34,7 +34,7 @@ class _Member:
 class Transfer:
     """Carries out transfers that were accepted. Every step is safe to repeat."""
 
-    def __init__(self, *, tables: Tables, devices: Devices, sharing: Sharing, leave: Leave, clock: Clock) -> None:
+    def __init__(self, *, tables: Tables, devices: Devices, sharing: Sharing, leave: Offboarding, clock: Clock) -> None:
         self._tables = tables
         self._devices = devices
         self._sharing = sharing

@@ -26,14 +26,14 @@ from function_app.domain.devices.access import (
 from function_app.domain.identity.accounts import Account, Identity, Role
 from function_app.ports.clock import Clock
 from function_app.ports.tables import Conflict, Row, Tables
-from function_app.services.audit.audit_log import AuditChain
-from function_app.services.control.control_events import Audit
+from function_app.services.audit.audit_log import AuditLog
+from function_app.services.control.control_events import ControlEvents
 from function_app.services.devices.device_access import Devices, require_owner, share_key
 from function_app.services.devices.spaces import Spaces
 from function_app.services.identity.sign_in import SignIn
-from function_app.services.sharing.access_revocation import Unshare, index
+from function_app.services.sharing.access_revocation import AccessRevocation, index
 from function_app.services.storage import records
-from function_app.services.storage.reminders import Pending
+from function_app.services.storage.reminders import Reminders
 
 LOOK_MS: Final = 10_000
 """The timer sees to what a change has left undone after so long, where whoever made it was killed."""
@@ -65,10 +65,10 @@ class Sharing:
         devices: Devices,
         spaces: Spaces,
         sign_in: SignIn,
-        unshare: Unshare,
-        pending: Pending,
-        audit: Audit,
-        chain: AuditChain,
+        unshare: AccessRevocation,
+        pending: Reminders,
+        audit: ControlEvents,
+        chain: AuditLog,
         clock: Clock,
     ) -> None:
         self._tables = tables

@@ -12,7 +12,7 @@ from function_app.services.storage import records
 SHARDS = 8
 
 
-class Pending:
+class Reminders:
     """The notes."""
 
     def __init__(self, *, tables: Tables) -> None:

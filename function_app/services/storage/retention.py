@@ -26,7 +26,7 @@ _BATCH_BYTES = 1_000_000
 _log = logging.getLogger(__name__)
 
 
-class Forget:
+class Retention:
     """The notes, and the deleting."""
 
     def __init__(self, *, tables: Tables, blobs: Blobs) -> None:

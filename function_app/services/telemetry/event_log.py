@@ -9,7 +9,7 @@ from function_app.domain.devices.devices import Device
 from function_app.ports.clock import Clock
 from function_app.ports.tables import Conflict, Row, Tables
 from function_app.services.storage import records
-from function_app.services.storage.retention import DAY_MS, Forget
+from function_app.services.storage.retention import DAY_MS, Retention
 
 KEEP_EVENTS_MS = 90 * DAY_MS
 _NOTED = 4096
@@ -19,7 +19,7 @@ _NOTED = 4096
 class Events:
     """The events of all devices."""
 
-    def __init__(self, *, tables: Tables, forget: Forget, clock: Clock) -> None:
+    def __init__(self, *, tables: Tables, forget: Retention, clock: Clock) -> None:
         self._tables = tables
         self._forget = forget
         self._clock = clock

@@ -51,7 +51,7 @@ Observer = Callable[[Device, str, Sequence[tuple[int, Values]]], Awaitable[None]
 _log = logging.getLogger(__name__)
 
 
-class Arrived(NamedTuple):
+class InboundMessage(NamedTuple):
     """One message, as it came."""
 
     topic: Topic
@@ -68,7 +68,7 @@ class _Agent:
     read_ms: int
 
 
-class Intake:
+class TelemetryIngest:
     """Takes telemetry in. Safe to repeat; what does not belong to a claimed agent's device is dropped."""
 
     def __init__(
@@ -81,7 +81,7 @@ class Intake:
         self._agents: dict[str, _Agent] = {}
         self._turn = 0
 
-    async def take(self, messages: Iterable[Arrived]) -> dict[int, str]:
+    async def take(self, messages: Iterable[InboundMessage]) -> dict[int, str]:
         """Take messages in: once this returns they are in their series.
 
         Returns:
@@ -230,7 +230,7 @@ def _joints(description: Description) -> Sequence[str]:
     return [joint.name if _JOINT.match(joint.name) else str(index) for index, joint in enumerate(description.joints)]
 
 
-def _sample(message: Arrived, joints: Sequence[str]) -> tuple[int, Values]:
+def _sample(message: InboundMessage, joints: Sequence[str]) -> tuple[int, Values]:
     """Time and values of a message.
 
     Raises:

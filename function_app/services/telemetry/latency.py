@@ -21,7 +21,7 @@ from function_app.domain.telemetry.histogram import Histogram
 from function_app.ports.clock import Clock
 from function_app.ports.tables import Row, StoreError, Tables, Write
 from function_app.services.storage import records
-from function_app.services.storage.retention import DAY_MS, Forget
+from function_app.services.storage.retention import DAY_MS, Retention
 
 Transport = Literal["mqtt", "websocket", "http", "http-poll", "xmpp"]
 """What carried it: ``http`` is long polling, ``http-poll`` plain polling at an interval, as in the paper."""
@@ -96,7 +96,7 @@ class _Recent:
 class Latencies:
     """The latency store."""
 
-    def __init__(self, *, tables: Tables, forget: Forget, clock: Clock) -> None:
+    def __init__(self, *, tables: Tables, forget: Retention, clock: Clock) -> None:
         self._tables = tables
         self._forget = forget
         self._clock = clock

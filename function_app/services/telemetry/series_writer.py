@@ -15,7 +15,7 @@ from function_app.ports.clock import Clock
 from function_app.ports.tables import MAX_BATCH, MAX_BATCH_BYTES, Conflict, Row, Tables, Write
 from function_app.services.storage import records
 from function_app.services.storage.records import retry
-from function_app.services.storage.retention import Forget
+from function_app.services.storage.retention import Retention
 
 ABOUT = "about"
 """Key of what is known of a whole stream."""
@@ -86,7 +86,7 @@ _Windows = Sequence[tuple[int, Samples]]
 class SeriesWriter:
     """Adds samples. Safe to repeat, by any number at once, in any order."""
 
-    def __init__(self, *, tables: Tables, forget: Forget, keep: Keep, clock: Clock) -> None:
+    def __init__(self, *, tables: Tables, forget: Retention, keep: Keep, clock: Clock) -> None:
         self._tables = tables
         self._forget = forget
         self._keep = keep
@@ -113,7 +113,7 @@ class SeriesWriter:
         return new
 
     async def forget(self, device: str, pairing: str) -> None:
-        """Forget all streams of a pairing that has ended, once those who do not know yet have stopped to write."""
+        """Retention all streams of a pairing that has ended, once those who do not know yet have stopped to write."""
         due_ms = self._clock.now_ms() + MARGIN_MS
         place = Place(device, pairing, "")
         listed = await self._tables.query(records.SERIES, place.streams, limit=MAX_STREAMS)

@@ -11,7 +11,8 @@ from pathlib import Path
 
 import pytest
 
-from tests.harness.network.brokers import HOST, PATIENCE_S, ROOT, BrokerKind, start_broker, wait_until
+from tests.harness.network.brokers import HOST, PATIENCE_S, BrokerKind, start_broker, wait_until
+from tests.harness.paths import ROOT
 
 
 def run(*arguments: str) -> "subprocess.CompletedProcess[str]":

@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from device_agent.protocol import topics
-from function_app.adapters.mqtt.connection import Broker, MqttLink
+from function_app.adapters.mqtt.connection import Broker, MqttConnection
 from function_app.adapters.mqtt.tls import client_context
 from function_app.ports.broker_access import Credentials
 from infra.tls import server_ca
@@ -108,7 +108,7 @@ def test_nothing_is_left_lying_in_what_was_decrypted(
 ) -> None:
     """Several messages come in one record of TLS: the socket tells of the first alone."""
     heard: list[object] = []
-    link = MqttLink(
+    link = MqttConnection(
         Broker(host=HOST, port=broker.tcp_port, credentials=broker.access.service_credentials, tls=trusting),
         subscriptions=(topics.conn(space, "+"),),
         receive=lambda message: heard.append(message.payload),

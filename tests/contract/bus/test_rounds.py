@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from function_app.adapters.mqtt import event_loop
-from function_app.adapters.mqtt.connection import Broker, MqttLink
+from function_app.adapters.mqtt.connection import Broker, MqttConnection
 from tests.harness.network.brokers import HOST, PATIENCE_S, RunningBroker, start_broker
 
 EVERY_S = 0.2
@@ -35,7 +35,7 @@ def begun(monkeypatch: pytest.MonkeyPatch) -> list[float]:
 async def test_all_of_it_comes_in_order_and_in_few_rounds(broker: RunningBroker, begun: list[float]) -> None:
     heard: list[int] = []
     at = Broker(host=HOST, port=broker.tcp_port, credentials=broker.access.service_credentials)
-    link = MqttLink(
+    link = MqttConnection(
         at, subscriptions=(TOPIC,), receive=lambda message: heard.append(int(message.payload)), every_s=EVERY_S
     )
     try:
@@ -68,7 +68,7 @@ async def test_between_messages_it_sleeps_and_a_lost_broker_is_noticed(
     mortal: RunningBroker, begun: list[float]
 ) -> None:
     at = Broker(host=HOST, port=mortal.tcp_port, credentials=mortal.access.service_credentials)
-    link = MqttLink(at, subscriptions=(TOPIC,), every_s=EVERY_S)
+    link = MqttConnection(at, subscriptions=(TOPIC,), every_s=EVERY_S)
     try:
         assert await link.ready(PATIENCE_S), link.trouble
         await asyncio.sleep(3 * EVERY_S)

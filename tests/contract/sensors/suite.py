@@ -13,7 +13,7 @@ import simplejpeg
 from device_agent.ports.sensor import Camera, Image, Movable, RoomDriver, Scan, SensorError
 from device_agent.protocol import FIELD_PATTERN, MAX_VALUES, Measurements, camera_frames, codec
 from device_agent.protocol.camera_frames import CameraFrame
-from device_agent.protocol.manifests.room import RoomDevice
+from device_agent.protocol.manifests.room import RoomDeviceManifest
 
 PNG = b"\x89PNG\r\n\x1a\n"
 
@@ -22,11 +22,11 @@ class RoomDriverContract:
     """The suite. ``driver`` gives one that is not connected, and closes it afterwards."""
 
     @pytest.fixture
-    def entry(self) -> RoomDevice:
+    def entry(self) -> RoomDeviceManifest:
         raise NotImplementedError
 
     @pytest.fixture
-    def driver(self, entry: RoomDevice) -> RoomDriver:
+    def driver(self, entry: RoomDeviceManifest) -> RoomDriver:
         raise NotImplementedError
 
     @pytest.fixture
@@ -38,13 +38,13 @@ class RoomDriverContract:
         assert isinstance(driver, RoomDriver)
         assert isinstance(driver.simulated, bool)
 
-    def test_nothing_works_before_connect(self, driver: RoomDriver, entry: RoomDevice) -> None:
+    def test_nothing_works_before_connect(self, driver: RoomDriver, entry: RoomDeviceManifest) -> None:
         for call in everything(driver, entry):
             with pytest.raises(SensorError):
                 call()
 
     def test_each_stream_gives_finite_values_with_names_that_may_travel(
-        self, connected: RoomDriver, entry: RoomDevice
+        self, connected: RoomDriver, entry: RoomDeviceManifest
     ) -> None:
         for stream in entry.streams:
             values = connected.read(stream.name)
@@ -54,7 +54,9 @@ class RoomDriverContract:
             if values:
                 codec.encode(Measurements(tick_ms=1, at_ms=1, sequence=1, values=dict(values)))
 
-    def test_each_capture_is_a_file_of_the_type_that_it_says(self, connected: RoomDriver, entry: RoomDevice) -> None:
+    def test_each_capture_is_a_file_of_the_type_that_it_says(
+        self, connected: RoomDriver, entry: RoomDeviceManifest
+    ) -> None:
         for name in entry.captures:
             taken = connected.capture(name)
             assert taken.content
@@ -65,7 +67,7 @@ class RoomDriverContract:
                     json.loads(taken.content)
 
     def test_each_camera_gives_a_jpeg_of_the_size_that_it_says_and_small_enough_to_travel(
-        self, connected: RoomDriver, entry: RoomDevice
+        self, connected: RoomDriver, entry: RoomDeviceManifest
     ) -> None:
         if entry.cameras:
             assert isinstance(connected, Camera)
@@ -76,7 +78,7 @@ class RoomDriverContract:
                 camera_frames.encode(CameraFrame(1, 1, frame.width, frame.height, frame.content))
 
     def test_each_control_applies_what_it_says_within_its_limits(
-        self, connected: RoomDriver, entry: RoomDevice
+        self, connected: RoomDriver, entry: RoomDeviceManifest
     ) -> None:
         for control in entry.controls:
             middle = (control.lower + control.upper) / 2
@@ -106,7 +108,7 @@ class RoomDriverContract:
                 assert (raw.depth_m > 0).all()
 
     def test_what_it_has_not_is_refused_by_name_with_a_list_of_what_there_is(
-        self, connected: RoomDriver, entry: RoomDevice
+        self, connected: RoomDriver, entry: RoomDeviceManifest
     ) -> None:
         asked: list[tuple[Callable[[], object], list[str]]] = [
             (partial(connected.read, "nonsense"), [stream.name for stream in entry.streams]),
@@ -118,7 +120,7 @@ class RoomDriverContract:
                 call()
             assert all(name in str(refused.value) for name in there)
 
-    def test_it_may_be_connected_and_closed_twice(self, connected: RoomDriver, entry: RoomDevice) -> None:
+    def test_it_may_be_connected_and_closed_twice(self, connected: RoomDriver, entry: RoomDeviceManifest) -> None:
         connected.connect()
         connected.close()
         connected.close()
@@ -127,7 +129,7 @@ class RoomDriverContract:
                 call()
 
 
-def everything(driver: RoomDriver, entry: RoomDevice) -> list[Callable[[], object]]:
+def everything(driver: RoomDriver, entry: RoomDeviceManifest) -> list[Callable[[], object]]:
     """All that may be asked of it."""
     calls: list[Callable[[], object]] = [partial(driver.read, each.name) for each in entry.streams]
     calls += [partial(driver.capture, each) for each in entry.captures]

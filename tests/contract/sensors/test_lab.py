@@ -6,7 +6,7 @@ import pytest
 
 from device_agent.ports.sensor import RoomDriver
 from device_agent.protocol.manifests import room
-from device_agent.protocol.manifests.room import RoomDevice
+from device_agent.protocol.manifests.room import RoomDeviceManifest
 from device_agent.sensors.perception import driver as perception
 from tests.contract.sensors.suite import RoomDriverContract
 from tests.harness.agent.rooms import LAB, StillWorld
@@ -33,13 +33,13 @@ def neighbours(world: StillWorld) -> Iterator[dict[str, RoomDriver]]:
 @pytest.mark.parametrize("name", DEVICES)
 class TestLab(RoomDriverContract):
     @pytest.fixture
-    def entry(self, name: str) -> RoomDevice:
+    def entry(self, name: str) -> RoomDeviceManifest:
         return DEVICES[name]
 
     @pytest.fixture
     def driver(
         self,
-        entry: RoomDevice,
+        entry: RoomDeviceManifest,
         world: StillWorld,
         neighbours: dict[str, RoomDriver],
         monkeypatch: pytest.MonkeyPatch,

@@ -17,7 +17,7 @@ from device_agent.config.agent_config import Configuration, DeviceEntry, Home, H
 from device_agent.ports.clock import CloudClock
 from device_agent.protocol import Ack, AckStatus, MoveJoints, State, codec, topics
 from device_agent.transports.factory import SOFTWARE
-from device_agent.transports.http.client import CloudApi
+from device_agent.transports.http.client import CloudClient
 from tests.contract.transports.suite import Spoken
 from tests.harness.cloud.cloud_processes import Ground
 from tests.harness.network.brokers import wait_until
@@ -40,7 +40,7 @@ class Resident:
             server=ground.url, name="lab", devices=(DeviceEntry(name="arm", type="ur5"),), **spoken.configuration
         )
         self.home.save_configuration(told)
-        api = CloudApi(ground.url, key, CloudClock())
+        api = CloudClient(ground.url, key, CloudClock())
         claim = api.enroll(
             name="lab", software=SOFTWARE, transport=told.transport, devices=catalogue.enrolled_devices(told)
         )

@@ -5,7 +5,7 @@ from itertools import pairwise
 
 import pytest
 
-from device_agent.ports.geometry import Clearance, Geometry, Sweep, never
+from device_agent.ports.geometry import Clearance, RobotGeometry, Sweep, never
 from device_agent.protocol import JointTarget, Mode, Pose, Setpoint, StopLatch
 from device_agent.protocol.manifests.robot_type import Base
 from device_agent.runtime.authority.lease_gate import LeaseGate
@@ -19,7 +19,7 @@ WALL_RAD = 1.0
 class Rig:
     """A controller with a clock of its own and an operator who answers the newest telemetry."""
 
-    def __init__(self, *, geometry: Geometry | None = None, base: Base | None = None, **gate: int) -> None:
+    def __init__(self, *, geometry: RobotGeometry | None = None, base: Base | None = None, **gate: int) -> None:
         self.controller = Controller(robot_type(base), LeaseGate(**gate), geometry=geometry)
         self.controller.start_at([0.0, 0.0])
         self.limited: set[str] = set()

@@ -33,7 +33,8 @@ from device_agent.protocol import (
     topics,
 )
 from device_agent.protocol.security import grants, signing
-from tests.harness.network.brokers import HOST, ROOT, Client, RunningBroker, wait_until
+from tests.harness.network.brokers import HOST, Client, RunningBroker, wait_until
+from tests.harness.paths import ROOT
 
 SPACE, AGENT, DEVICE = "lab", "arm1", "arm"
 _ACCESS = "access.json"

@@ -11,8 +11,8 @@ import pytest
 from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
 
 from device_agent.ports.clock import CloudClock, tick_ms, wall_ms
-from device_agent.ports.geometry import Geometry
-from device_agent.ports.sandbox import Jail
+from device_agent.ports.geometry import RobotGeometry
+from device_agent.ports.sandbox import Sandbox
 from device_agent.ports.speech import Speech
 from device_agent.ports.uploads import Uploads
 from device_agent.protocol import (
@@ -31,9 +31,9 @@ from device_agent.protocol.manifests.robot_type import RobotType
 from device_agent.protocol.security import signing
 from device_agent.runtime.authority.interlocks import Interlock
 from device_agent.runtime.device import Device
-from device_agent.runtime.readings import Room
+from device_agent.runtime.readings import ReadingCache
 from device_agent.runtime.storage.journal import Journal
-from device_agent.runtime.storage.outbox_store import Shelf
+from device_agent.runtime.storage.outbox_store import OutboxStore
 from device_agent.runtime.telemetry.outbox import Outbox
 from tests.fakes.drivers import ToyDriver, robot_type
 from tests.harness.agent.pinned_keys import pins_of
@@ -53,8 +53,8 @@ class Bench:
         interlocks: Sequence[Interlock] = (),
         driver: ToyDriver | None = None,
         kind: RobotType | None = None,
-        geometry: Geometry | None = None,
-        jail: Jail | None = None,
+        geometry: RobotGeometry | None = None,
+        jail: Sandbox | None = None,
         speech: Speech | None = None,
         uploads: Uploads | None = None,
     ) -> None:
@@ -68,7 +68,7 @@ class Bench:
         self.clock = CloudClock()
         self.clock.observe(server_ms=wall_ms(), sent_tick_ms=tick_ms(), received_tick_ms=tick_ms())
         self.number = 0
-        shelf = Shelf(folder / "outbox.db", own="ts/v1/s/a/", max_bytes=10**6, max_age_ms=3_600_000)
+        shelf = OutboxStore(folder / "outbox.db", own="ts/v1/s/a/", max_bytes=10**6, max_age_ms=3_600_000)
         self.outbox = Outbox(shelf, publish=self.publish, teller="ts/v1/s/a/arm")
         self.outbox.link_changed(True)
         self.outbox.start()
@@ -84,7 +84,9 @@ class Bench:
             keys=pins_of(self.key),
             publish=self.publish,
             outbox=self.outbox,
-            room=Room(space="s", agent="a", own=["arm"], named=[(rule.device, rule.stream) for rule in interlocks]),
+            room=ReadingCache(
+                space="s", agent="a", own=["arm"], named=[(rule.device, rule.stream) for rule in interlocks]
+            ),
             interlocks=interlocks,
             geometry=geometry,
             jail=jail or warm_jail(),

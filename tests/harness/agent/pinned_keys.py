@@ -4,15 +4,15 @@ from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
 
 from device_agent.config.agent_config import Pairing
 from device_agent.protocol.security import signing
-from device_agent.runtime.commands.pinned_keys import Pins
+from device_agent.runtime.commands.pinned_keys import PinnedKeys
 
 
-def pinned(pairing: Pairing) -> Pins:
+def pinned(pairing: Pairing) -> PinnedKeys:
     """The pins of a pairing that is written nowhere."""
-    return Pins(pairing, save=lambda _: None, now_ms=lambda: None)
+    return PinnedKeys(pairing, save=lambda _: None, now_ms=lambda: None)
 
 
-def pins_of(*keys: Ed25519PrivateKey) -> Pins:
-    """Pins of the public halves of some keys."""
+def pins_of(*keys: Ed25519PrivateKey) -> PinnedKeys:
+    """PinnedKeys of the public halves of some keys."""
     halves = {signing.key_id(key.public_key()): signing.public_text(key.public_key()) for key in keys}
     return pinned(Pairing(agent="a", space="s", account="ann", keys=halves))

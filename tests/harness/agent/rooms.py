@@ -9,9 +9,9 @@ from device_agent.drivers.mujoco import World
 from device_agent.ports.sensor import RoomDriver, Surroundings
 from device_agent.ports.simulation import Process
 from device_agent.protocol.manifests import robot_type, room
-from device_agent.protocol.manifests.room import Room, RoomDevice
+from device_agent.protocol.manifests.room import Room, RoomDeviceManifest
 from device_agent.simulation import world_registry
-from tests.harness.network.brokers import ROOT
+from tests.harness.paths import ROOT
 
 ROBOTS = Path(ROOT) / "robots"
 LAB = ROBOTS / "rooms" / "lab"
@@ -68,12 +68,14 @@ class StillWorld:
 
     # ------------------------------------------------------------ devices
 
-    def entry(self, name: str) -> RoomDevice:
+    def entry(self, name: str) -> RoomDeviceManifest:
         found = self.manifest.device(name)
         assert found is not None
         return found
 
-    def driver(self, device: RoomDevice | str, neighbours: Mapping[str, RoomDriver] | None = None) -> RoomDriver:
+    def driver(
+        self, device: RoomDeviceManifest | str, neighbours: Mapping[str, RoomDriver] | None = None
+    ) -> RoomDriver:
         """The driver of one of its devices, not connected."""
         entry = self.entry(device) if isinstance(device, str) else device
         surroundings = Surroundings(neighbours=neighbours or {}, world=self)

@@ -4,26 +4,26 @@ import atexit
 from functools import cache
 from typing import Literal
 
-from device_agent.ports.sandbox import Inmate, JailError, Limits, Standing
-from device_agent.sandbox.host import WarmJail
+from device_agent.ports.sandbox import JailError, Limits, SandboxProcess, SandboxStatus
+from device_agent.sandbox.host import SandboxHost
 
 LACK = "no seccomp; install libseccomp2"
 
 
 @cache
-def warm_jail() -> WarmJail:
+def warm_jail() -> SandboxHost:
     """The real one, with every layer."""
-    jail = WarmJail()
+    jail = SandboxHost()
     jail.start()
     atexit.register(jail.close)
     return jail
 
 
-class LateJail(WarmJail):
+class LateJail(SandboxHost):
     """The real one, which starts its first process for the first script only: for agents that live a moment."""
 
-    def standing(self) -> Standing:
-        return Standing("jailed")
+    def standing(self) -> SandboxStatus:
+        return SandboxStatus("jailed")
 
 
 class NoJail:
@@ -35,14 +35,14 @@ class NoJail:
     def start(self) -> None:
         pass
 
-    def standing(self) -> Standing:
-        return Standing(self._how, LACK)
+    def standing(self) -> SandboxStatus:
+        return SandboxStatus(self._how, LACK)
 
     def refusal(self, *, stranger: bool) -> str | None:
         del stranger
         return LACK
 
-    def open(self, limits: Limits, *, stranger: bool) -> Inmate:
+    def open(self, limits: Limits, *, stranger: bool) -> SandboxProcess:
         del limits, stranger
         raise JailError(LACK)
 

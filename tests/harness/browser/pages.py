@@ -6,7 +6,7 @@ from typing import Final
 
 from playwright.sync_api import Page, ViewportSize
 
-from tests.harness.network.brokers import ROOT
+from tests.harness.paths import ROOT
 
 _AXE: Final = ROOT / "web" / "node_modules" / "axe-core" / "axe.min.js"
 _PICTURES: Final = ROOT / "docs" / "pictures"

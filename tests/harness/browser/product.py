@@ -19,7 +19,8 @@ from typing import Any, Self
 import httpx
 
 from tests.harness.cloud.people import sign_in_link
-from tests.harness.network.brokers import ROOT, wait_until
+from tests.harness.network.brokers import wait_until
+from tests.harness.paths import ROOT
 
 START_WITHIN_S = 90.0
 _ROW_BYTES = 500

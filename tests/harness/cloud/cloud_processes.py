@@ -23,7 +23,7 @@ from device_agent.ports.clock import CloudClock
 from device_agent.protocol import Command, Presence, Request, codec, topics
 from device_agent.protocol.security import signing
 from device_agent.transports import factory
-from device_agent.transports.http.client import CloudApi
+from device_agent.transports.http.client import CloudClient
 from function_app.adapters.local.signing_keys import FileKeys
 from function_app.domain.common.ids import command_id
 from function_app.domain.devices.devices import Agent, Device
@@ -217,7 +217,7 @@ class Link:
         )
         pairing = Pairing(agent=self.robot.id, space=self.robot.space, account="anna", keys={})
         entry = {"name": "arm", "kind": "arm", "robot_type": "ur5", "label": "Arm"}
-        self.membership = factory.Membership(pairing, told, [entry], pinned(pairing))
+        self.membership = factory.PairingMonitor(pairing, told, [entry], pinned(pairing))
         if through:
             self.proxy = self._stack.enter_context(start_proxy(ground.endpoints[through].port))
         self.transport = factory.make(
@@ -268,12 +268,12 @@ class Link:
         self.sessions += 1
         return self.sessions
 
-    def _open_api(self) -> CloudApi:
+    def _open_api(self) -> CloudClient:
         ends = self.ground.endpoints
         if self.proxy is None:
-            return CloudApi(self.ground.url, self.robot.key, CloudClock())
+            return CloudClient(self.ground.url, self.robot.key, CloudClock())
         if self._through == "server":
-            return CloudApi(f"http://{HOST}:{self.proxy.port}", self.robot.key, CloudClock())
+            return CloudClient(f"http://{HOST}:{self.proxy.port}", self.robot.key, CloudClock())
         return _Rerouted(self.ground.url, self.robot.key, {ends[self._through].port: self.proxy.port})
 
     def __enter__(self) -> Self:
@@ -284,7 +284,7 @@ class Link:
         self._stack.close()
 
 
-class _Rerouted(CloudApi):
+class _Rerouted(CloudClient):
     """The API of a cloud whose other addresses are behind proxies."""
 
     def __init__(self, server: str, key: Any, ports: Mapping[int, int]) -> None:

@@ -22,7 +22,7 @@ import httpx
 import jwt
 from cryptography.hazmat.primitives.asymmetric import rsa
 
-FOLDER = Path(__file__).resolve().parents[1] / "oidc"
+FOLDER = Path(__file__).resolve().parents[1] / "identity_provider"
 CLIENT_ID, CLIENT_SECRET = "telescope", "a secret of + and % and 32 letters"
 REDIRECT = "http://telescope.test/api/v1/auth/oidc/callback"
 START_WITHIN_S = 60

@@ -24,13 +24,13 @@ from urllib.parse import unquote_to_bytes
 from tests.harness.hosts.host import (
     LOOPBACK,
     PATIENCE_S,
-    ROOT,
     HostFailed,
     Program,
     environment_of,
     only,
     start_program,
 )
+from tests.harness.paths import ROOT
 
 MAX_INSTANCES = 8
 MAX_EVENT_BYTES = 6 * 1024 * 1024

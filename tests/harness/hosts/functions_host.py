@@ -23,7 +23,8 @@ from urllib.parse import quote, unquote_to_bytes
 import uvicorn
 
 from tests.harness.hosts import rpc
-from tests.harness.hosts.host import LOOPBACK, ROOT
+from tests.harness.hosts.host import LOOPBACK
+from tests.harness.paths import ROOT
 
 _ADMIN = "/admin/functions/"
 _EVENTS = "/runtime/webhooks/eventgrid"

@@ -11,7 +11,8 @@ from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import IO, Protocol
 
-ROOT = Path(__file__).resolve().parents[3]
+from tests.harness.paths import ROOT
+
 LOOPBACK = "127.0.0.1"
 PATIENCE_S = 60.0
 """How long a test waits for a host [s]: the machine may be busy."""

@@ -29,6 +29,7 @@ from device_agent.protocol.security import signing
 from device_agent.protocol.security.grants import Grant
 from function_app.adapters.local.broker_access import MosquittoBrokerAccess, TokenBrokerAccess
 from function_app.ports.broker_access import BrokerAccess, Credentials
+from tests.harness.paths import ROOT
 
 BrokerKind = Literal["amqtt", "mosquitto"]
 Transport = Literal["tcp", "websockets"]
@@ -41,7 +42,6 @@ SILENCE_S = 0.4
 """How long a test waits for what must not happen [s], after something later on the same way has happened."""
 
 T = TypeVar("T")
-ROOT = Path(__file__).parents[2]
 
 
 def wait_until(condition: Callable[[], object], what: str, timeout_s: float = PATIENCE_S) -> None:

@@ -29,7 +29,8 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from typing import Any, cast
 
-from tests.harness.network.brokers import HOST, ROOT
+from tests.harness.network.brokers import HOST
+from tests.harness.paths import ROOT
 
 RTO_MIN_S = 0.2
 """Linux: the least that a retransmission waits beyond the round trip."""

@@ -22,14 +22,15 @@ import uvicorn
 from device_agent.protocol.xmpp.stream import Login, Stream
 from device_agent.transports.xmpp import XmppAccess, XmppTransport
 from function_app import bootstrap
-from function_app.entrypoints.xmpp.gateway import Speaker
+from function_app.entrypoints.xmpp.gateway import XmppGateway
 from function_app.ports.broker_access import Credentials
 from function_app.settings import Settings
 from tests.fakes.agent import Robot
 from tests.harness.cloud.cloud import Cloud, Person
 from tests.harness.cloud.cloud_processes import Ground, start_ground
 from tests.harness.hosts.host import environment_of, start_program
-from tests.harness.network.brokers import HOST, PATIENCE_S, ROOT, Client, Message, RunningBroker, wait_until
+from tests.harness.network.brokers import HOST, PATIENCE_S, Client, Message, RunningBroker, wait_until
+from tests.harness.paths import ROOT
 
 if TYPE_CHECKING:
     from xml.etree.ElementTree import Element
@@ -123,8 +124,10 @@ class Speaking:
     def __init__(self, cloud: Cloud) -> None:
         self.cloud = cloud
 
-        async def start() -> "tuple[Speaker, asyncio.Task[None]]":
-            speaker = Speaker(cloud.functions, bootstrap.xmpp_line(cloud.functions), bootstrap.orders(cloud.functions))
+        async def start() -> "tuple[XmppGateway, asyncio.Task[None]]":
+            speaker = XmppGateway(
+                cloud.functions, bootstrap.xmpp_line(cloud.functions), bootstrap.orders(cloud.functions)
+            )
             return speaker, asyncio.create_task(speaker.run())
 
         self.speaker, self._task = cloud.run(start())

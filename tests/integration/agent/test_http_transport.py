@@ -16,8 +16,8 @@ from device_agent.ports.clock import CloudClock
 from device_agent.protocol import Ack, AckStatus, Presence, codec, topics
 from device_agent.protocol.security import signing
 from device_agent.transports.http import transport as http
-from device_agent.transports.http.client import CloudApi, CloudError
-from device_agent.transports.http.send_queue import Message, OutTray
+from device_agent.transports.http.client import CloudClient, CloudError
+from device_agent.transports.http.send_queue import Message, SendQueue
 from device_agent.transports.http.transport import HttpTransport
 from tests.harness.network.brokers import PATIENCE_S, wait_until
 
@@ -118,7 +118,7 @@ class Agent:
         self.belongs = True
         self.on_receive: Callable[[str], object] = lambda _: None
         self.transport = HttpTransport(
-            open_api=lambda: CloudApi(server.url, key, CloudClock()),
+            open_api=lambda: CloudClient(server.url, key, CloudClock()),
             check=self._check,
             presence_topic=CONN,
             next_session=lambda: 1,
@@ -140,7 +140,7 @@ class Agent:
         self.received.append(command)
         self.on_receive(command)
 
-    def _check(self, _: CloudApi, **__: Any) -> None:
+    def _check(self, _: CloudClient, **__: Any) -> None:
         self.checks += 1
         if not self.belongs:
             raise CloudError("this agent was un-paired")
@@ -296,7 +296,7 @@ def test_its_goodbye_comes_last_and_with_what_was_still_to_be_told(server: Serve
 
 class TestOutTray:
     def test_what_must_be_told_goes_at_once_and_alone(self) -> None:
-        tray = OutTray()
+        tray = SendQueue()
         tray.take(0)
         tray.put(Message(TELE, b"{}", kept=False))
         tray.take(1)
@@ -306,14 +306,14 @@ class TestOutTray:
         assert [message.topic for message in tray.take(1)] == [TELE]
 
     def test_of_measurements_the_newest_are_kept(self) -> None:
-        tray = OutTray()
+        tray = SendQueue()
         for number in range(2000):
             assert tray.put(Message(TELE, b"%d" % number, kept=False))
         told = [int(message.payload) for _ in range(3) for message in tray.take(1)]
         assert told == list(range(1500, 2000))
 
     def test_measurements_are_told_even_when_there_is_always_something_better(self) -> None:
-        tray = OutTray()
+        tray = SendQueue()
         tray.put(Message(TELE, b"{}", kept=False))
         tray.take(1)
         tray.put(Message(TELE, b"{}", kept=False))
@@ -326,7 +326,7 @@ class TestOutTray:
         pytest.fail("they starve")
 
     def test_a_request_never_grows_beyond_what_the_cloud_takes(self) -> None:
-        tray = OutTray()
+        tray = SendQueue()
         for _ in range(20):
             tray.put(Message(EVENT, b"x" * 120_000, kept=True))
         sizes = []
@@ -336,7 +336,7 @@ class TestOutTray:
         assert max(sizes) <= 500_000
 
     def test_what_is_put_back_comes_before_what_came_since(self) -> None:
-        tray = OutTray()
+        tray = SendQueue()
         for number in range(3):
             tray.put(Message(EVENT, b"%d" % number, kept=True))
         batch = tray.take(0)
@@ -345,7 +345,7 @@ class TestOutTray:
         assert [message.payload for message in tray.take(0)] == [b"0", b"1", b"2", b"3"]
 
     def test_a_full_tray_says_so(self) -> None:
-        tray = OutTray()
+        tray = SendQueue()
         while tray.put(Message(EVENT, b"{}", kept=True)):
             pass
         tray.take(0)

@@ -15,8 +15,9 @@ import pytest
 from device_agent.protocol import Presence, codec, topics
 from device_agent.protocol.security import grants
 from device_agent.transports.mqtt import BrokerAccess, MqttTransport
-from tests.harness.network.brokers import BROKERS, HOST, ROOT, Client, RunningBroker, start_broker, wait_until
+from tests.harness.network.brokers import BROKERS, HOST, Client, RunningBroker, start_broker, wait_until
 from tests.harness.network.proxy import start_proxy
+from tests.harness.paths import ROOT
 
 CONN = topics.conn("lab", "arm1")
 ACK = topics.device("lab", "arm1", "arm", topics.ACK)

@@ -22,7 +22,8 @@ from typing import Any
 import pytest
 
 from tests.harness.cloud.cloud_processes import Ground, start_ground
-from tests.harness.network.brokers import ROOT, wait_until
+from tests.harness.network.brokers import wait_until
+from tests.harness.paths import ROOT
 
 NOBODY = 65_534
 PATIENCE_S = 60.0

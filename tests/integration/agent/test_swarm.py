@@ -10,7 +10,8 @@ from typing import Any
 import pytest
 
 from tests.harness.cloud.cloud_processes import Ground, start_ground
-from tests.harness.network.brokers import ROOT, BrokerKind, wait_until
+from tests.harness.network.brokers import BrokerKind, wait_until
+from tests.harness.paths import ROOT
 
 COUNT = 20
 

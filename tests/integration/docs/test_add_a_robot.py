@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from tests.harness.cloud.cloud_processes import Ground, start_ground
-from tests.harness.network.brokers import ROOT
+from tests.harness.paths import ROOT
 
 PAGE = ROOT / "docs" / "add-a-robot.md"
 BLOCK = re.compile(r"^```(\w+)(?: (\S+))?\n(.*?)^```$", re.MULTILINE | re.DOTALL)

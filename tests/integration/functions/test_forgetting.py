@@ -9,7 +9,7 @@ import pytest
 from device_agent.protocol import AckStatus, Event, topics
 from function_app.ports.tables import Row
 from function_app.services.storage import records
-from function_app.services.storage.retention import DAY_MS, NOTES, ROWS, SHARDS, Forget
+from function_app.services.storage.retention import DAY_MS, NOTES, ROWS, SHARDS, Retention
 from function_app.services.telemetry.event_log import KEEP_EVENTS_MS
 from tests.fakes.agent import Robot
 from tests.harness.cloud.cloud import Cloud, MovingClock, Person, settings
@@ -132,7 +132,7 @@ class TestRows:
                 return await inner(*arguments)
 
         alone.run(alone.functions.forget.rows("Things", "p", first="", last=None, due_ms=NOW_MS))
-        alone.run(Forget(tables=Changing(), blobs=alone.functions.blobs).run(NOW_MS))
+        alone.run(Retention(tables=Changing(), blobs=alone.functions.blobs).run(NOW_MS))
         assert left(alone) == ["a", "b"]
         assert len(notes(alone)) == 1
         run(alone, NOW_MS)

@@ -5,7 +5,7 @@ from typing import Any
 
 import pytest
 
-from device_agent.protocol import AskLease, DropRequest, GrantLease, Mode, ReleaseLease, State
+from device_agent.protocol import GrantLease, Mode, ReleaseLease, RequestControl, State, WithdrawRequest
 from function_app.domain.identity.accounts import Role
 from function_app.ports.broker_access import BrokerAccessError, Credentials
 from function_app.ports.command_bus import BusUnavailable
@@ -69,9 +69,9 @@ def test_what_is_asked_for_and_accepted_is_the_askers_with_the_next_epoch(held: 
         assert answer.json()["confirmed"] is True
         shown = answer.json()["request"]
         assert answer.headers["location"] == "/api/v1" + at(robot, shown["id"])
-        (order,) = robot.heard(AskLease)
+        (order,) = robot.heard(RequestControl)
         assert order.epoch == 1
-        assert isinstance(order.request, AskLease)
+        assert isinstance(order.request, RequestControl)
         assert (order.request.request, order.request.by) == (shown["id"], "anna")
         assert 0 < order.request.answer_within_ms <= WITHIN_MS
         assert lease(anna, robot)["request"] == shown | {"mine": False}
@@ -94,8 +94,8 @@ def test_what_is_refused_stays_where_it_is_and_may_be_asked_for_again(held: Thre
     anna, other, robot = held
     request = asked(other, robot)
     assert anna.post(at(robot, request, "refuse")).json()["outcome"] == "refused"
-    wait_until(lambda: robot.heard(DropRequest), "the end of the request")
-    assert robot.heard(DropRequest)[0].request == DropRequest(request=request)
+    wait_until(lambda: robot.heard(WithdrawRequest), "the end of the request")
+    assert robot.heard(WithdrawRequest)[0].request == WithdrawRequest(request=request)
     assert lease(other, robot)["request"] is None
     assert lease(anna, robot)["mine"] is True
     assert asked(other, robot) != request
@@ -108,7 +108,7 @@ def test_what_is_withdrawn_is_over(held: Three) -> None:
     problem(anna.delete(at(robot, request)), 403, "forbidden")
     assert other.delete(at(robot, request)).status_code == 204
     assert other.delete(at(robot, request)).status_code == 204
-    wait_until(lambda: robot.heard(DropRequest), "the end of the request")
+    wait_until(lambda: robot.heard(WithdrawRequest), "the end of the request")
     assert outcome(anna, robot, request) == "withdrawn"
     over = problem(anna.post(at(robot, request, "accept")), 409, "request-over")
     assert over["outcome"] == "withdrawn"

@@ -8,7 +8,7 @@ import pytest
 
 from device_agent.drivers import load
 from device_agent.drivers.mujoco import MujocoDriver
-from device_agent.drivers.mujoco.fault_injection import Sickbed
+from device_agent.drivers.mujoco.fault_injection import FaultInjector
 from device_agent.drivers.mujoco.motor_model import Health
 from device_agent.protocol import AckStatus, Measurements, Mode, MoveJoints, State, codec, topics
 from device_agent.protocol.manifests import robot_type
@@ -31,7 +31,7 @@ class Ageing:
     def __init__(self, cloud: Cloud, robot: Robot, faults: Path) -> None:
         self.cloud = cloud
         self.health = Health(UR5.joints, None, seed="arm")
-        self.bed = Sickbed(faults, NAMES)
+        self.bed = FaultInjector(faults, NAMES)
         self.topic = topics.device(robot.space, robot.id, robot.names[0], topics.TELE, "health")
         self.now_ms = cloud.clock.now_ms()
         self.windows = 0

@@ -9,7 +9,7 @@ import jwt
 import pytest
 from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
 
-from device_agent.protocol import AckStatus, FollowKey, Mode, RunMovement, State, codec
+from device_agent.protocol import AckStatus, Mode, RotateKey, RunMovement, State, codec
 from device_agent.protocol.security import signing
 from device_agent.protocol.security.key_rotation import KEYS_CONTEXT, NewKey
 from function_app.adapters.local.signing_keys import FileKeys
@@ -124,11 +124,11 @@ def test_an_agent_is_told_by_an_order_that_the_old_key_signed(pair: tuple[Person
     new = rotate(cloud)
     for tick in range(3):
         robot.say_state(State(device="arm", mode=Mode.IDLE, epoch=0, at_ms=tick, tick_ms=tick))
-    wait_until(lambda: robot.heard(FollowKey) != [], "the order")
+    wait_until(lambda: robot.heard(RotateKey) != [], "the order")
     anna.take(robot.device)  # comes after whatever else had been sent
-    assert len(robot.heard(FollowKey)) == 1
-    order = robot.heard(FollowKey)[0].request
-    assert isinstance(order, FollowKey)
+    assert len(robot.heard(RotateKey)) == 1
+    order = robot.heard(RotateKey)[0].request
+    assert isinstance(order, RotateKey)
     (statement,) = order.statements
     told = codec.decode(signing.verify(statement.encode(), robot._keys, context=KEYS_CONTEXT), NewKey)
     assert signing.key_id(signing.public_key(told.key)) == new

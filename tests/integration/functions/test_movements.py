@@ -11,7 +11,7 @@ from cryptography.exceptions import InvalidSignature
 
 from device_agent.protocol import SHIPPED, AckStatus, RunMovement
 from device_agent.protocol.security import signing
-from device_agent.runtime.actions.script_policy import Trust
+from device_agent.runtime.actions.script_policy import ScriptPolicy
 from device_agent.runtime.errors import Refused
 from device_agent.runtime.storage.journal import Journal
 from function_app.ports.tables import Row
@@ -225,7 +225,7 @@ def test_no_version_that_may_run_is_older_for_the_device_than_one_that_ran(
     orders = [command.request for command in robot.heard(RunMovement)]
     journal = Journal(tmp_path / "journal.db")
     journal.open(now_ms=0)
-    trust = Trust(device="arm", robot_type="ur5", owner=anna.account, keys=robot._keys, journal=journal)
+    trust = ScriptPolicy(device="arm", robot_type="ur5", owner=anna.account, keys=robot._keys, journal=journal)
     for order in orders:
         assert isinstance(order, RunMovement)
         trust.check(order)

@@ -13,8 +13,8 @@ import uvicorn
 
 from tests.harness.cloud.cloud import Cloud, Person
 from tests.harness.network.brokers import wait_until
+from tests.harness.paths import ROOT
 
-ROOT = Path(__file__).resolve().parents[3]
 NUDGE = {"kind": "move_joints", "position_rad": {"wrist_3": 0.1}, "speed": 1.0}
 MOST_S = 120.0
 CODE = re.compile(r"claim code (\S+)  ")

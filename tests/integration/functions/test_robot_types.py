@@ -33,8 +33,8 @@ from function_app.services.storage import records
 from function_app.services.storage.retention import DAY_MS
 from tests.harness.cloud.cloud import Cloud, MovingClock, Person, problem, settings
 from tests.harness.network.brokers import PATIENCE_S, wait_until
+from tests.harness.paths import UR5
 
-UR5 = Path(__file__).parents[3] / "robots" / "ur5"
 MANIFEST = """
 type = "TYPE"
 version = 1

@@ -8,8 +8,8 @@ import pytest
 
 from device_agent.protocol import Description, Measurements, Mode, State, codec, topics
 from device_agent.protocol.manifests import room
-from device_agent.protocol.manifests.room import RoomDevice, Watch
-from device_agent.runtime.room.room_device import Instrument
+from device_agent.protocol.manifests.room import RoomDeviceManifest, Watch
+from device_agent.runtime.room.room_device import RoomDevice
 from device_agent.sensors.mujoco import scalar_sensors
 from device_agent.simulation.room.climate import Climate
 from device_agent.simulation.room.pedestrian import Walker
@@ -60,13 +60,13 @@ class Air:
         self.cloud.run(ingest_telemetry(self.cloud.functions, messages))
 
 
-def claim(who: Person, robot: Robot, entry: RoomDevice) -> None:
+def claim(who: Person, robot: Robot, entry: RoomDeviceManifest) -> None:
     devices = [{"name": entry.name, "kind": entry.kind, "robot_type": entry.kind, "label": entry.label}]
     who.post("/agents/claim", {"code": robot.enroll(devices=devices).json()["claim_code"]})
     robot.space = robot.enrollment()["space"]
 
 
-def described(cloud: Cloud, robot: Robot, entry: RoomDevice) -> None:
+def described(cloud: Cloud, robot: Robot, entry: RoomDeviceManifest) -> None:
     said = Description(
         device=entry.name, kind=entry.kind, robot_type=entry.kind, label=entry.label, diagnostics=entry.diagnostics
     )
@@ -120,7 +120,7 @@ def meter(tmp_path: Path) -> Iterator[Bench]:
         watch=(Watch(source="co2", silent_s=0.5, stuck_s=0.5),),
         options={"faults": str(tmp_path / "co2.toml")},
     )
-    instrument = Instrument(world.driver(entry), entry, None)
+    instrument = RoomDevice(world.driver(entry), entry, None)
     bench = Bench(tmp_path, driver=instrument, kind=entry.robot_type())  # type: ignore[arg-type]  # no toy
     bench.device.start()
     bench.device.link_changed(True)

@@ -20,8 +20,16 @@ from function_app.domain.telemetry.series import DAY, FINEST, LEVELS, RAW, Keep,
 from function_app.ports.tables import Row, StoreError, Tables
 from function_app.services.devices.device_access import Devices
 from function_app.services.storage import records
-from function_app.services.storage.retention import Forget
-from function_app.services.telemetry.ingest import GIVE_UP_MS, LEFT_MS, SHARDS, Arrived, Intake, Values, _Part
+from function_app.services.storage.retention import Retention
+from function_app.services.telemetry.ingest import (
+    GIVE_UP_MS,
+    LEFT_MS,
+    SHARDS,
+    InboundMessage,
+    TelemetryIngest,
+    Values,
+    _Part,
+)
 from function_app.services.telemetry.series_reader import Part, Range, SeriesReader
 from function_app.services.telemetry.series_writer import ABOUT, MAX_STREAMS, Place, SeriesWriter
 
@@ -90,12 +98,12 @@ class House:
         self.blobs = blobs
         self.reader, self.intake, self.writer, self.forget = self.instance()
 
-    def instance(self) -> tuple[SeriesReader, Intake, SeriesWriter, Forget]:
+    def instance(self) -> tuple[SeriesReader, TelemetryIngest, SeriesWriter, Retention]:
         tables: Any = self.tables
-        forget = Forget(tables=tables, blobs=self.blobs)
+        forget = Retention(tables=tables, blobs=self.blobs)
         writer = SeriesWriter(tables=tables, forget=forget, keep=self.keep, clock=self.clock)
         devices = Devices(tables=tables, clock=self.clock)
-        intake = Intake(tables=tables, writer=writer, clock=self.clock, observers=[self.observe])
+        intake = TelemetryIngest(tables=tables, writer=writer, clock=self.clock, observers=[self.observe])
         return SeriesReader(tables=tables, devices=devices, keep=self.keep, clock=self.clock), intake, writer, forget
 
     async def observe(self, device: Device, stream: str, means: Sequence[tuple[int, Values]]) -> None:
@@ -128,9 +136,9 @@ async def house(tmp_path: Any) -> AsyncIterator[House]:
     await tables.close()
 
 
-def message(at_ms: int, stream: str = "health", /, **values: float) -> Arrived:
+def message(at_ms: int, stream: str = "health", /, **values: float) -> InboundMessage:
     body = Measurements(tick_ms=at_ms, at_ms=at_ms, sequence=0, values=dict(values))
-    return Arrived(Topic("space", AGENT, "arm", topics.TELE, stream), codec.encode(body))
+    return InboundMessage(Topic("space", AGENT, "arm", topics.TELE, stream), codec.encode(body))
 
 
 def values_of(part: Part, name: str) -> dict[int, float | None]:
@@ -360,7 +368,9 @@ async def test_joints_are_stored_under_their_names(house: House) -> None:
         tick_ms=1, at_ms=NOW_MS, sequence=1, mode=Mode.STREAMING, position_rad=(0.1, 0.2, 0.3, 0.4),
         velocity_rad_s=(1.0, 2.0, 3.0, 4.0), effort_nm=(5.0,), commanded_rad=(), loop_age_ms=12.0,
     )  # fmt: skip
-    await house.intake.take([Arrived(Topic("space", AGENT, "arm", topics.TELE, "joints"), codec.encode(telemetry))])
+    await house.intake.take(
+        [InboundMessage(Topic("space", AGENT, "arm", topics.TELE, "joints"), codec.encode(telemetry))]
+    )
     expected = {"loop_age_ms": 12.0, "effort_nm.shoulder": 5.0}
     for index, name in enumerate(("shoulder", "1", "wrist", "3")):
         expected[f"position_rad.{name}"] = (0.1, 0.2, 0.3, 0.4)[index]
@@ -377,7 +387,7 @@ async def test_joints_are_stored_under_their_names(house: House) -> None:
     ],
 )
 async def test_what_does_not_belong_to_a_claimed_device_is_dropped(house: House, topic: Topic) -> None:
-    await house.intake.take([Arrived(topic, message(NOW_MS, a=1.0).payload)])
+    await house.intake.take([InboundMessage(topic, message(NOW_MS, a=1.0).payload)])
     assert await house.reader.streams(ANNA, DEVICE) == []
 
 
@@ -396,7 +406,7 @@ async def test_what_does_not_belong_to_a_claimed_device_is_dropped(house: House,
     ],
 )
 async def test_one_bad_message_does_not_hold_up_the_others(house: House, payload: bytes) -> None:
-    bad = Arrived(Topic("space", AGENT, "arm", topics.TELE, "health"), payload)
+    bad = InboundMessage(Topic("space", AGENT, "arm", topics.TELE, "health"), payload)
     await house.intake.take([bad, message(NOW_MS, a=1.0), bad])
     await assert_whole(house, {NOW_MS: {"a": 1.0}})
 

@@ -13,7 +13,8 @@ import pytest
 
 from function_app.entrypoints.http.framework.responses import MAX_BODY
 from tests.harness.cloud.cloud import API, problem
-from tests.harness.network.brokers import PATIENCE_S, ROOT, wait_until
+from tests.harness.network.brokers import PATIENCE_S, wait_until
+from tests.harness.paths import ROOT
 
 
 def environment(home: Path, port: int) -> dict[str, str]:

@@ -19,10 +19,10 @@ from function_app.settings import AwsStore, AzureStore
 from tests.harness.cloud.cloud import MOVE, Cloud, Person, paired, problem, settings
 from tests.harness.cloud.polling import PollingRobot
 from tests.harness.network.brokers import RunningBroker, wait_until
+from tests.harness.paths import UR5
 from tests.harness.stores.aws import REGION, start_moto, use_credentials
 from tests.harness.stores.azure import start_azurite
 
-UR5 = Path(__file__).parents[3] / "robots" / "ur5"
 MINE = "/robot-types/ur5/movements/mine"
 SOURCE = '"""Wave."""\nrobot.home()\n'
 STORES = ("local", "azure", "aws")

@@ -14,7 +14,7 @@ import pytest
 from device_agent.protocol.security import grants, signing
 from device_agent.protocol.security.grants import Grant, agent_grant
 from function_app.adapters.azure import topic_spaces
-from function_app.adapters.azure.session_takeover import SessionTaker
+from function_app.adapters.azure.session_takeover import SessionTakeover
 from function_app.adapters.shared.grant_registry import SETTLE_S
 from function_app.domain.common.ids import new_id
 from function_app.entrypoints.broker_auth.event_grid import admit
@@ -208,7 +208,7 @@ def test_who_was_being_let_in_at_the_moment_of_a_revocation_is_cut_soon_after(th
 
 def test_a_namespace_that_is_away_is_one_clear_error_and_nobody_is_let_in(there: There, account: str) -> None:
     access: Any = there.cloud.functions.access
-    take, access._take = access._take, SessionTaker(host=HOST, port=1, tls=None)
+    take, access._take = access._take, SessionTakeover(host=HOST, port=1, tls=None)
     client, credentials = enter(there, grant(account))
     try:
         with pytest.raises(BrokerAccessError, match="cannot be reached"):

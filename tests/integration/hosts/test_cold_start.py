@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.harness.hosts.host import ROOT
+from tests.harness.paths import ROOT
 
 LIMIT = 600 / 330
 """Of the time that importing FastAPI takes."""

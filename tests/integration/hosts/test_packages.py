@@ -16,7 +16,8 @@ from infra.aws.__main__ import main as package_for_aws
 from tests.harness.cloud.cloud import API
 from tests.harness.hosts.aws import start_lambda
 from tests.harness.hosts.azure import start_azure
-from tests.harness.hosts.host import PATIENCE_S, ROOT
+from tests.harness.hosts.host import PATIENCE_S
+from tests.harness.paths import ROOT
 from tests.harness.stores.aws import REGION, start_moto, use_credentials
 from tests.harness.stores.azure import start_azurite
 

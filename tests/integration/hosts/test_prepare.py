@@ -7,7 +7,8 @@ from pathlib import Path
 
 import pytest
 
-from tests.harness.hosts.host import PATIENCE_S, ROOT
+from tests.harness.hosts.host import PATIENCE_S
+from tests.harness.paths import ROOT
 from tests.harness.stores.aws import REGION, reset, start_moto, use_credentials
 
 

@@ -8,7 +8,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from tests.harness.network.brokers import ROOT
+from tests.harness.paths import ROOT
 
 HEAD = """| parser | inputs tried | edges: an empty input | the examples | in the end |
 | --- | ---: | ---: | ---: | ---: |"""

@@ -20,7 +20,7 @@ import msgspec
 import requests
 from amqtt.mqtt.packet import CONNECT, PUBACK, PUBLISH, SUBSCRIBE, UNSUBSCRIBE
 
-from device_agent.config.agent_config import Home, HomeError
+from device_agent.config.agent_config import ConfigError, Home
 from device_agent.config.catalogue import ROBOTS
 from device_agent.ports import script_calls
 from device_agent.ports.clock import CloudClock
@@ -30,7 +30,7 @@ from device_agent.protocol.manifests import robot_type
 from device_agent.protocol.security import grants, signing
 from device_agent.protocol.xmpp import stanzas
 from device_agent.transports.http import responses
-from device_agent.transports.http.client import CloudApi, CloudError
+from device_agent.transports.http.client import CloudClient, CloudError
 from function_app.domain.common.problems import Problem
 from function_app.entrypoints.http.framework.responses import read
 from infra.embedded_broker import packets
@@ -154,7 +154,7 @@ def _answer(data: bytes) -> None:
     if len(data) < 2:
         return
     clock = CloudClock()
-    api = CloudApi("http://server", _KEY, clock)
+    api = CloudClient("http://server", _KEY, clock)
     answer = requests.Response()
     answer.status_code = (200, 201, 202, 204, 302, 400, 404, 409, 429, 500, 503)[data[0] % 11]
     answer._content = data[2:]
@@ -206,11 +206,11 @@ def _home(data: bytes) -> None:
     home = Home(_FOLDER)
     (_FOLDER / "agent.toml").write_bytes(data)
     (_FOLDER / "pairing.json").write_bytes(data)
-    with contextlib.suppress(HomeError):
+    with contextlib.suppress(ConfigError):
         _check_finite(home.pairing())
     try:
         found = home.configuration()
-    except HomeError:
+    except ConfigError:
         return
     _check_finite(found)
     home.save_configuration(found)

@@ -24,11 +24,11 @@ from typing import Any
 import msgspec
 
 from device_agent.ports import script_calls
-from device_agent.ports.sandbox import Inmate, Limits
+from device_agent.ports.sandbox import Limits, SandboxProcess
 from device_agent.protocol import RunMovement
 from device_agent.runtime.actions.script_action import Cell, Script, ScriptFailed
 from device_agent.runtime.errors import Refused
-from device_agent.sandbox.host import WarmJail
+from device_agent.sandbox.host import SandboxHost
 from tests.security.sandbox.attacks import ATTACKS
 
 SECRET = "the-agents-secret-7e1e5c09e"
@@ -182,7 +182,7 @@ class Surroundings:
         shutil.rmtree(self.home, ignore_errors=True)
 
 
-def strays(jail: WarmJail, session: int) -> int:
+def strays(jail: SandboxHost, session: int) -> int:
     """What is alive of a script: of its session, or a child of a warm parent of this process but for the ready ones."""
     count = 0
     with jail._lock:  # so that meanwhile none is made ready
@@ -196,7 +196,7 @@ def strays(jail: WarmJail, session: int) -> int:
     return count
 
 
-def process_of(inmate: Inmate) -> int:
+def process_of(inmate: SandboxProcess) -> int:
     """Its process id in this world; behind bubblewrap it has another."""
     known = Path(f"/proc/self/fdinfo/{inmate._descriptor}").read_text(encoding="ascii")  # type: ignore[attr-defined]
     return next(int(line.split()[1]) for line in known.splitlines() if line.startswith("Pid:"))
@@ -219,7 +219,7 @@ def warm_parents() -> list[int]:
     return found
 
 
-def attack(jail: WarmJail, around: Surroundings, name: str, source: str, *, stranger: bool) -> Result:
+def attack(jail: SandboxHost, around: Surroundings, name: str, source: str, *, stranger: bool) -> Result:
     """Run one script, kill it in time, and see what it has done."""
     puppet, printed = Puppet(), [""]
 
@@ -269,7 +269,7 @@ def attack(jail: WarmJail, around: Surroundings, name: str, source: str, *, stra
 
 def main(layers: str) -> None:
     os.environ["TELESCOPE_SECRET"] = SECRET
-    jail = WarmJail(layers=[layer for layer in layers.split(",") if layer])
+    jail = SandboxHost(layers=[layer for layer in layers.split(",") if layer])
     jail.start()
     around = Surroundings()
     try:

@@ -10,10 +10,11 @@ from pathlib import Path
 import msgspec
 
 from device_agent.sandbox.constants import LAYERS
+from tests.harness.paths import ROOT
 from tests.security.sandbox.attacks import ATTACKS, PRELUDE
 from tests.security.sandbox.captor import Result
 
-REPOSITORY = Path(__file__).resolve().parents[3]
+REPOSITORY = ROOT
 NOBODY = 65534
 
 

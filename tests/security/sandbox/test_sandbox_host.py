@@ -13,9 +13,9 @@ from pathlib import Path
 
 import pytest
 
-from device_agent.ports.sandbox import Inmate, JailError, Limits
+from device_agent.ports.sandbox import JailError, Limits, SandboxProcess
 from device_agent.sandbox import host
-from device_agent.sandbox.host import WarmJail
+from device_agent.sandbox.host import SandboxHost
 from tests.security.sandbox.captor import warm_parents
 from tests.security.sandbox.halves import REPOSITORY
 
@@ -23,14 +23,14 @@ WITHIN_S = 60.0
 
 
 @pytest.fixture
-def jail() -> Iterator[WarmJail]:
-    jail = WarmJail()
+def jail() -> Iterator[SandboxHost]:
+    jail = SandboxHost()
     jail.start()
     yield jail
     jail.close()
 
 
-def play(inmate: Inmate, source: str) -> str:
+def play(inmate: SandboxProcess, source: str) -> str:
     """What a script prints, and its end."""
     with contextlib.closing(inmate), inmate.link.makefile("rwb") as lines:
         assert json.loads(lines.readline()) == {"kind": "ready"}
@@ -51,12 +51,12 @@ def eventually(probe: Callable[[], bool]) -> None:
         time.sleep(0.01)
 
 
-def parent_of(jail: WarmJail) -> int:
+def parent_of(jail: SandboxHost) -> int:
     (found,) = [pid for pid in warm_parents() if pid == _process(jail).pid]
     return found
 
 
-def _process(jail: WarmJail) -> "subprocess.Popen[bytes]":
+def _process(jail: SandboxHost) -> "subprocess.Popen[bytes]":
     process = jail._own._process
     assert process is not None
     return process
@@ -72,7 +72,7 @@ def test_the_warm_parent_holds_nothing_of_the_agents(monkeypatch: pytest.MonkeyP
     monkeypatch.setenv("TELESCOPE_SECRET", "x")
     with open("/proc/self/cmdline", "rb") as inherited:  # noqa: PTH123 (a descriptor that could be inherited)
         os.set_inheritable(inherited.fileno(), True)
-        jail = WarmJail()
+        jail = SandboxHost()
         assert jail.refusal(stranger=False) is None
     parent = parent_of(jail)
     environment = Path(f"/proc/{parent}/environ").read_bytes()
@@ -83,7 +83,7 @@ def test_the_warm_parent_holds_nothing_of_the_agents(monkeypatch: pytest.MonkeyP
     jail.close()
 
 
-def test_a_parent_that_was_killed_is_replaced(jail: WarmJail) -> None:
+def test_a_parent_that_was_killed_is_replaced(jail: SandboxHost) -> None:
     running = jail.open(Limits(), stranger=False)
     os.kill(parent_of(jail), signal.SIGKILL)
     assert running.wait(WITHIN_S), "its children die with it"
@@ -93,7 +93,7 @@ def test_a_parent_that_was_killed_is_replaced(jail: WarmJail) -> None:
 
 
 def test_a_parent_that_no_longer_answers_is_given_up_and_replaced(
-    jail: WarmJail, monkeypatch: pytest.MonkeyPatch
+    jail: SandboxHost, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(host, "_ANSWER_S", 0.1)
     monkeypatch.setattr(host, "_PREPARE_AFTER_S", 2 * WITHIN_S)
@@ -110,13 +110,13 @@ def test_a_parent_that_no_longer_answers_is_given_up_and_replaced(
     assert "7" in play(jail.open(Limits(), stranger=False), "print(3 + 4)")
 
 
-def ready(jail: WarmJail) -> host._Inmate:
+def ready(jail: SandboxHost) -> host._Inmate:
     eventually(lambda: jail._own.ready is not None)
     assert jail._own.ready is not None
     return jail._own.ready[1]
 
 
-def test_a_process_is_ready_for_each_script(jail: WarmJail) -> None:
+def test_a_process_is_ready_for_each_script(jail: SandboxHost) -> None:
     seen = set()
     for number in range(3):
         waiting = ready(jail)
@@ -127,7 +127,7 @@ def test_a_process_is_ready_for_each_script(jail: WarmJail) -> None:
     assert len(seen) == 3, "none runs a second script"
 
 
-def test_one_that_is_ready_for_other_limits_is_not_taken(jail: WarmJail) -> None:
+def test_one_that_is_ready_for_other_limits_is_not_taken(jail: SandboxHost) -> None:
     waiting = ready(jail)
     with contextlib.closing(jail.open(Limits(cpu_s=7), stranger=False)) as inmate:
         assert isinstance(inmate, host._Inmate)
@@ -137,14 +137,14 @@ def test_one_that_is_ready_for_other_limits_is_not_taken(jail: WarmJail) -> None
     assert dead(waiting.pid)
 
 
-def test_one_that_died_while_it_was_ready_is_replaced(jail: WarmJail) -> None:
+def test_one_that_died_while_it_was_ready_is_replaced(jail: SandboxHost) -> None:
     waiting = ready(jail)
     os.kill(waiting.pid, signal.SIGKILL)
     assert waiting.wait(WITHIN_S)
     assert "7" in play(jail.open(Limits(), stranger=False), "print(3 + 4)")
 
 
-def test_the_one_that_is_ready_ends_with_the_jail(jail: WarmJail) -> None:
+def test_the_one_that_is_ready_ends_with_the_jail(jail: SandboxHost) -> None:
     waiting = ready(jail)
     jail.close()
     assert dead(waiting.pid)
@@ -172,18 +172,20 @@ def test_all_of_it_dies_with_an_agent_that_is_killed() -> None:
             eventually(lambda pid=pid: dead(pid))  # type: ignore[misc]
 
 
-def test_processor_time_is_limited(jail: WarmJail) -> None:
+def test_processor_time_is_limited(jail: SandboxHost) -> None:
     said = play(jail.open(Limits(cpu_s=1), stranger=False), "while True: pass")
     assert said.endswith("it used up its processor time, or the machine's memory")
 
 
-def test_a_closed_jail_may_be_closed_again_and_opened(jail: WarmJail) -> None:
+def test_a_closed_jail_may_be_closed_again_and_opened(jail: SandboxHost) -> None:
     jail.close()
     jail.close()
     assert "1" in play(jail.open(Limits(), stranger=False), "print(1)")
 
 
-def test_scripts_of_strangers_are_refused_without_bubblewrap(jail: WarmJail, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_scripts_of_strangers_are_refused_without_bubblewrap(
+    jail: SandboxHost, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setenv("PATH", "/nowhere")
     refusal = jail.refusal(stranger=True)
     assert refusal is not None
@@ -195,14 +197,14 @@ def test_scripts_of_strangers_are_refused_without_bubblewrap(jail: WarmJail, mon
 
 def test_other_systems_than_linux_refuse_scripts(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(sys, "platform", "win32")
-    refusal = WarmJail().refusal(stranger=False)
+    refusal = SandboxHost().refusal(stranger=False)
     assert refusal is not None
     assert "Linux only" in refusal
 
 
 def test_a_python_that_cannot_start_is_a_refusal(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(sys, "executable", "/nowhere/python")
-    jail = WarmJail()
+    jail = SandboxHost()
     jail.start()
     refusal = jail.refusal(stranger=False)
     assert refusal is not None
@@ -250,7 +252,7 @@ def test_where_the_kernel_lacks_a_layer_scripts_are_refused_unless_they_are_trus
     assert "JailError" in error
 
 
-def started_ms(jail: WarmJail) -> float:
+def started_ms(jail: SandboxHost) -> float:
     begun_s = time.perf_counter()
     with contextlib.closing(jail.open(Limits(), stranger=False)) as inmate, inmate.link.makefile("rb") as lines:
         assert json.loads(lines.readline()) == {"kind": "ready"}
@@ -260,7 +262,7 @@ def started_ms(jail: WarmJail) -> float:
 def test_a_warm_start_takes_a_small_part_of_a_cold_one() -> None:
     cold, warm_ = [], []
     for _ in range(12):  # as a rule three are enough; what else the machine does may fall on any of them
-        with contextlib.closing(WarmJail()) as jail:
+        with contextlib.closing(SandboxHost()) as jail:
             cold.append(started_ms(jail))
             warm_ += [started_ms(jail) for _ in range(5)]
         if len(cold) > 2 and statistics.median(warm_) < 0.5 * statistics.median(cold):
@@ -268,7 +270,7 @@ def test_a_warm_start_takes_a_small_part_of_a_cold_one() -> None:
     pytest.fail(f"cold starts take {cold} ms, warm ones {warm_} ms")
 
 
-def stopped_ms(jail: WarmJail, source: str) -> float:
+def stopped_ms(jail: SandboxHost, source: str) -> float:
     with contextlib.closing(jail.open(Limits(), stranger=False)) as inmate, inmate.link.makefile("rwb") as lines:
         lines.readline()
         task = {"source": source, "name": "x", "parameters": {}, "joints": [], "frames": [], "can": []}
@@ -281,7 +283,7 @@ def stopped_ms(jail: WarmJail, source: str) -> float:
         return (time.perf_counter() - begun_s) * 1000
 
 
-def test_a_script_that_ignores_signals_dies_as_soon_as_one_that_sleeps(jail: WarmJail) -> None:
+def test_a_script_that_ignores_signals_dies_as_soon_as_one_that_sleeps(jail: SandboxHost) -> None:
     stubborn = (
         "import signal\nfor number in (1, 2, 15): signal.signal(number, signal.SIG_IGN)\nprint(1)\nwhile True: pass"
     )

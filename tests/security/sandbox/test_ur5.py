@@ -13,7 +13,7 @@ from device_agent.config.catalogue import ROBOTS, TYPES
 from device_agent.protocol import AckStatus
 from function_app.services.robot_types.script_linter import check_script
 from tests.harness.agent.device_harness import Bench
-from tests.harness.network.brokers import ROOT
+from tests.harness.paths import ROOT
 
 UR5 = ROBOTS / "ur5"
 WRITTEN = ROOT / "web" / "tests" / "fixtures" / "keyframes.py"

@@ -21,7 +21,8 @@ from cryptography.hazmat.primitives.serialization import load_pem_private_key
 from device_agent.protocol import topics
 from function_app.ports.broker_access import Credentials
 from tests.harness.browser.product import Machine, start_machine
-from tests.harness.network.brokers import ROOT, Client
+from tests.harness.network.brokers import Client
+from tests.harness.paths import ROOT
 
 PASSWORD, WRONG, NEWER = "correct horse battery", "wrong wrong wrong wrong", "staple correct horse"
 CLIENT_SECRET = "of the provider, 32 letters long"

@@ -19,7 +19,6 @@ from tests.fakes.event_grid import event_grid_cloud
 from tests.harness.cloud.cloud import Cloud, settings
 from tests.harness.network.brokers import (
     BROKERS,
-    ROOT,
     BrokerKind,
     Client,
     Message,
@@ -27,6 +26,7 @@ from tests.harness.network.brokers import (
     start_broker,
     wait_until,
 )
+from tests.harness.paths import ROOT
 
 TABLE = Path(__file__).with_name("topics.txt")
 RETAINED = ("presence", "description", "twin", "state")

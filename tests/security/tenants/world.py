@@ -16,7 +16,7 @@ from device_agent.protocol import Fault, Measurements, Mode, Presence, State, co
 from function_app.services.storage import records
 from tests.fakes.agent import Robot
 from tests.harness.cloud.cloud import API, BASE, Cloud, Person, settings
-from tests.harness.network.brokers import ROOT
+from tests.harness.paths import ROOT
 
 OWNER = "Anneliese Musterfrau"
 LABEL = "Kronjuwel"

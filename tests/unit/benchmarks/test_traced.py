@@ -9,7 +9,7 @@ import pytest
 
 from benchmarks import traced
 from benchmarks.marks import VARIABLE
-from tests.harness.network.brokers import ROOT
+from tests.harness.paths import ROOT
 
 
 @pytest.mark.parametrize("program", ["functions", "agent"])

@@ -2,7 +2,7 @@
 
 import re
 
-from tests.harness.network.brokers import ROOT
+from tests.harness.paths import ROOT
 
 NAMED = re.compile(r"`(tests/[\w/]+\.py)::(test_\w+)`")
 

@@ -10,7 +10,7 @@ from typing import Any
 
 import pytest
 
-from tests.harness.network.brokers import ROOT
+from tests.harness.paths import ROOT
 
 Answer = Callable[[list[Any]], bytes]
 

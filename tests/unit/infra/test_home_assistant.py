@@ -13,7 +13,7 @@ from device_agent.protocol.camera_frames import CameraFrame
 from device_agent.protocol.manifests import room
 from infra.home_assistant import discovery
 from infra.home_assistant.bridge import Bridge
-from tests.harness.network.brokers import ROOT
+from tests.harness.paths import ROOT
 
 OWN: dict[str, Any] = json.loads((Path(__file__).parent / "home_assistant.json").read_text())
 LAB = room.load(Path(ROOT) / "robots" / "rooms" / "lab")
@@ -32,7 +32,7 @@ VALUES: dict[str, float | bool] = {
 }
 
 
-def described(device: room.RoomDevice) -> Description:
+def described(device: room.RoomDeviceManifest) -> Description:
     return Description(
         device=device.name,
         kind=device.kind,

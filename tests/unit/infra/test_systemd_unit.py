@@ -4,7 +4,8 @@ import re
 import subprocess
 from pathlib import Path
 
-ROOT = Path(__file__).parents[3]
+from tests.harness.paths import ROOT
+
 UNIT = ROOT / "infra/systemd/telescope-agent.service"
 JAIL = {"clone", "clone3", "unshare", "mount", "umount2", "pivot_root", "prctl", "seccomp", "landlock_create_ruleset",
         "landlock_add_rule", "landlock_restrict_self", "setrlimit", "prlimit64", "pidfd_open", "pidfd_send_signal",

@@ -15,7 +15,7 @@ from cryptography.hazmat.primitives.serialization import load_pem_private_key
 
 from infra.tls import server_ca
 from infra.tls.server_ca import TlsError
-from tests.harness.network.brokers import ROOT
+from tests.harness.paths import ROOT
 
 NOW = dt.datetime.now(dt.UTC)
 SITE = server_ca.names(("site.example",), ("192.0.2.1",))

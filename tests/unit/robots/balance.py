@@ -14,7 +14,7 @@ from device_agent.ports.driver import REST, Twist
 from device_agent.protocol.manifests import robot_type
 from device_agent.runtime.authority.lease_gate import LeaseGate
 from device_agent.runtime.control.controller import Controller
-from device_agent.runtime.control.goals import Course, Outcome
+from device_agent.runtime.control.goals import GoalResult, MotionGoal
 
 STEP_S = 0.002
 LONGEST_S = 30.0
@@ -123,13 +123,13 @@ class Walking:
         """As an action does, to its end."""
         self.follow(self.controller.drive(self.tenure, twist, duration_s=duration_s))
 
-    def follow(self, course: Course) -> None:
+    def follow(self, course: MotionGoal) -> None:
         """Wait for its end."""
         end_s = self.now_s + LONGEST_S
         while not course.finished.is_set():
             self.period()
             assert self.now_s < end_s, "did not arrive"
-        assert course.outcome is Outcome.REACHED, course.why
+        assert course.outcome is GoalResult.REACHED, course.why
 
     @property
     def torso_m(self) -> npt.NDArray[Any]:
@@ -213,10 +213,10 @@ class WalkedRobot:
         """Whether MuJoCo had something to warn of."""
         return bool(self._walking.world._data.warning.number.any())
 
-    def _follow(self, course: Course) -> None:
+    def _follow(self, course: MotionGoal) -> None:
         while not course.finished.is_set():
             self._period()
-        assert course.outcome is Outcome.REACHED, course.why
+        assert course.outcome is GoalResult.REACHED, course.why
         self.moves += 1
 
     def _period(self) -> None:

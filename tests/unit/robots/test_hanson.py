@@ -10,8 +10,8 @@ import pytest
 from device_agent import geometry
 from device_agent.runtime.planning import gaze
 from device_agent.runtime.planning import visemes as mouth
-from device_agent.runtime.planning.behaviour_trajectory import Line, Score
-from device_agent.simulation.mjcf.equality_joints import Ties
+from device_agent.runtime.planning.behaviour_trajectory import BehaviourTrajectory, Line
+from device_agent.simulation.mjcf.equality_joints import EqualityJoints
 from tests.unit.robots.folders import ROBOTS, Bench
 
 FOLDER = ROBOTS / "hanson"
@@ -25,7 +25,7 @@ def bench() -> Bench:
 
 
 def test_rods_and_threads_pull_the_skin_where_the_ties_say(bench: Bench):
-    ties = Ties(bench.model)
+    ties = EqualityJoints(bench.model)
     assert len(ties.all) == 21
     random = np.random.default_rng(2)
     bench.data.ctrl[bench.ctrl] = random.uniform(bench.lower, bench.upper)
@@ -94,8 +94,8 @@ def test_its_mouth_has_a_dozen_shapes(bench: Bench):
 
 def test_it_opens_its_mouth_for_a_vowel_as_wide_as_its_shape_says_at_a_calm_pace(bench: Bench):
     text = "Hello, I am a robot, and I am glad to see all of you at the table today."
-    score = Score(bench.type, bench.home.tolist())
-    score.speak(Line(0.0, text, mouth.guessed_s(text)))
+    score = BehaviourTrajectory(bench.type, bench.home.tolist())
+    score.speak(Line(0.0, text, mouth.estimate_duration_s(text)))
     way, jaw = score.way(), bench.names.index("Jaw")
     assert way.position_rad[:, jaw].max() == pytest.approx(bench.type.visemes["aa"]["Jaw"], abs=1e-3)
     follows = []

@@ -13,7 +13,7 @@ from device_agent.ports.driver import Twist
 from device_agent.protocol.manifests import robot_type
 from device_agent.runtime.authority.lease_gate import LeaseGate
 from device_agent.runtime.control.controller import Controller
-from device_agent.runtime.control.goals import Course, Outcome
+from device_agent.runtime.control.goals import GoalResult, MotionGoal
 from device_agent.runtime.errors import Refused
 from device_agent.runtime.planning import gaze, named_poses
 from tests.unit.robots.folders import MOVEMENTS, ROBOTS, heard, whereabouts
@@ -71,7 +71,7 @@ class LimitedRobot:
         assert text
         assert len(language) <= 5
 
-    def follow(self, move: Course) -> None:
+    def follow(self, move: MotionGoal) -> None:
         end_s = self.now_s + LONGEST_S
         while not move.finished.is_set():
             self.now_s += self.type.period_ms / 1000
@@ -82,7 +82,7 @@ class LimitedRobot:
             if self.shape is not None and round(self.now_s * 1000) % 40 == 0:
                 self.tightest_m = min(self.tightest_m, self.shape.clearance(self.position).room_m)
         self.limited |= set(move.limited)
-        if move.outcome is not Outcome.REACHED:
+        if move.outcome is not GoalResult.REACHED:
             raise move.why or AssertionError("no reason")
 
     def go(self, twist: Twist) -> None:

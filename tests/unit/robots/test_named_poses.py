@@ -8,10 +8,10 @@ from device_agent import geometry
 from device_agent.protocol.manifests import robot_type
 from device_agent.runtime.authority.lease_gate import LeaseGate
 from device_agent.runtime.control.controller import Controller
-from device_agent.runtime.control.goals import Course, Outcome
+from device_agent.runtime.control.goals import GoalResult, MotionGoal
 from device_agent.runtime.planning import named_poses
-from device_agent.runtime.planning.behaviour_trajectory import Line, Score
-from device_agent.runtime.planning.visemes import guessed_s
+from device_agent.runtime.planning.behaviour_trajectory import BehaviourTrajectory, Line
+from device_agent.runtime.planning.visemes import estimate_duration_s
 from tests.unit.robots.folders import FOLDERS
 
 LONGEST_S = 120.0
@@ -37,15 +37,15 @@ class Shower:
     def move(self, position_rad: dict[str, float], what: str) -> None:
         self.follow(self.controller.move(self.tenure, position_rad, speed=named_poses.EXPRESSION_SPEED), what)
 
-    def go(self, score: Score, what: str) -> None:
+    def go(self, score: BehaviourTrajectory, what: str) -> None:
         self.follow(self.controller.go_along(self.tenure, score.way()), what)
 
-    def follow(self, course: Course, what: str) -> None:
+    def follow(self, course: MotionGoal, what: str) -> None:
         until_s = self.now_s + LONGEST_S
         while not course.finished.is_set() and self.now_s < until_s:
             self.now_s += self.kind.period_ms / 1000
             self.controller.step(self.now_s)
-        assert course.outcome is Outcome.REACHED, f"{what}: {course.why and course.why.message}"
+        assert course.outcome is GoalResult.REACHED, f"{what}: {course.why and course.why.message}"
 
 
 @pytest.mark.parametrize("folder", kinds("postures", "expressions"), ids=lambda folder: folder.name)
@@ -62,8 +62,8 @@ def test_every_posture_and_expression_is_taken_from_every_one_before(folder: Pat
 def test_every_behaviour_is_played_from_home(folder: Path) -> None:
     shower = Shower(folder)
     for name, keyframes in shower.kind.behaviours.items():
-        score = Score(shower.kind, shower.controller.commanded_rad)
-        score.keyframes(keyframes, {frame.say: guessed_s(frame.say) for frame in keyframes})
+        score = BehaviourTrajectory(shower.kind, shower.controller.commanded_rad)
+        score.keyframes(keyframes, {frame.say: estimate_duration_s(frame.say) for frame in keyframes})
         shower.go(score, name)
         shower.move(shower.kind.home_rad, f"home after {name}")
 
@@ -71,8 +71,8 @@ def test_every_behaviour_is_played_from_home(folder: Path) -> None:
 @pytest.mark.parametrize("folder", kinds("visemes"), ids=lambda folder: folder.name)
 def test_a_mouth_forms_every_sound(folder: Path) -> None:
     shower = Shower(folder)
-    score = Score(shower.kind, shower.controller.commanded_rad)
-    score.speak(Line(0.0, TEXT, guessed_s(TEXT)))
+    score = BehaviourTrajectory(shower.kind, shower.controller.commanded_rad)
+    score.speak(Line(0.0, TEXT, estimate_duration_s(TEXT)))
     jaws = [place for place in score.way().position_rad.T if place.max() - place.min() > 0.05]
     assert jaws, "nobody would see that it speaks"
     shower.go(score, TEXT)

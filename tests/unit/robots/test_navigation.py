@@ -14,13 +14,13 @@ from device_agent.drivers.mujoco import WheeledDriver
 from device_agent.ports import script_calls
 from device_agent.protocol import Measurements
 from device_agent.protocol.manifests import robot_type
-from device_agent.runtime.actions.device_context import Body
-from device_agent.runtime.actions.robot_api import ScriptRobot
+from device_agent.runtime.actions.device_context import DeviceContext
+from device_agent.runtime.actions.robot_api import RobotApi
 from device_agent.runtime.authority.lease_gate import LeaseGate
 from device_agent.runtime.control.controller import Controller
-from device_agent.runtime.control.goals import Course
+from device_agent.runtime.control.goals import MotionGoal
 from device_agent.runtime.errors import Refused
-from device_agent.runtime.readings import Reading, Room
+from device_agent.runtime.readings import Reading, ReadingCache
 from device_agent.sandbox import api
 from device_agent.sensors.perception.driver import _flat
 from device_agent.simulation import world_registry
@@ -67,7 +67,7 @@ class Steered(Controller):
     def move(self, *order: Any, **more: Any) -> Any:
         return self._waited(super().move(*order, **more))
 
-    def _waited(self, course: Course) -> Course:
+    def _waited(self, course: MotionGoal) -> MotionGoal:
         course.finished = Meanwhile(self._laboratory)
         return course
 
@@ -83,12 +83,12 @@ class Laboratory:
         self.driver._connected = True
         self.controller = Steered(self)
         self.controller.start_at(self.driver.observe().position_rad)
-        self.room = Room(
+        self.room = ReadingCache(
             space="s", agent="a", own=["perception"], named=[("perception", "positions")], clock_s=lambda: self.now_s
         )
         self.looked_s = -math.inf
         self.touched: set[str] = set()
-        self.body = Body(
+        self.body = DeviceContext(
             robot_type=QBO,
             controller=self.controller,
             observe=self.driver.observe,
@@ -99,7 +99,7 @@ class Laboratory:
             name="qbo",
             ground=lambda: self.watched.sight.grid,
         )
-        self.robot = ScriptRobot(self.body)
+        self.robot = RobotApi(self.body)
         self.go_on(settle_s)
         self.robot.begin(1, lambda _: None)
 

@@ -10,7 +10,7 @@ import pytest
 
 from device_agent.drivers import load
 from device_agent.drivers.mujoco import WheeledDriver
-from device_agent.ports.driver import REST, DriverError, MobileDriver, Reporting, Twist
+from device_agent.ports.driver import REST, DriverError, MobileDriver, ReportsStreams, Twist
 from device_agent.protocol.manifests import robot_type
 from device_agent.runtime.control.base_motion import BaseMotion
 from device_agent.simulation import world_registry
@@ -229,7 +229,7 @@ def connected(tmp_path: Path) -> Iterator[WheeledDriver]:
     driver = load("mujoco")(robot_type.load(FOLDER), FOLDER, {"faults": str(tmp_path / "qbo.toml")}, "qbo")
     assert isinstance(driver, WheeledDriver)
     assert isinstance(driver, MobileDriver)
-    assert isinstance(driver, Reporting)
+    assert isinstance(driver, ReportsStreams)
     yield driver
     driver.close()
 

@@ -21,7 +21,7 @@ def router(functions: Functions, caller: Caller) -> Routes:
         "/robot-type-looks",
         summary="Look at a robot type before it is saved",
         body=contract.TypeLookRequest,
-        answers={201: contract.TypeLookOut, 202: contract.TypeLookOut},
+        answers={201: contract.TypePreviewOut, 202: contract.TypePreviewOut},
         problems=(409,),
     )
     async def add_robot_type_look(request: Request) -> Response:
@@ -37,7 +37,7 @@ def router(functions: Functions, caller: Caller) -> Routes:
         status = 202 if found.upload.open else 201
         return answer(serializers.look(found), status, {"Location": f"{PREFIX}/robot-type-looks/{found.id}"})
 
-    @routes.add("GET", _ONE, summary="How a look fares", answers={200: contract.TypeLookOut}, problems=(404,))
+    @routes.add("GET", _ONE, summary="How a look fares", answers={200: contract.TypePreviewOut}, problems=(404,))
     async def get_robot_type_look(request: Request, look: str) -> Response:
         """One's own."""
         return answer(serializers.look(await functions.look_at_robot_type.get(await caller.account(request), look)))

@@ -97,7 +97,7 @@ class TypeLookRequest(Request, frozen=True, kw_only=True):
     wait_ms: WaitMs = 10_000
 
 
-class TypeLookOut(Answer, frozen=True, kw_only=True):
+class TypePreviewOut(Answer, frozen=True, kw_only=True):
     """An upload that is looked at before it is saved; nobody else sees it, and it goes by itself.
 
     ``robot_type`` is as it would be; its ``upload`` says whether it is good.

@@ -19,7 +19,7 @@ from device_agent import __main__ as program
 from device_agent.cli import doctor
 from device_agent.cli.doctor import cloud, devices, machine
 from device_agent.cli.doctor.finding import Finding, warning
-from device_agent.config.agent_config import Configuration, DeviceEntry, Home, HomeError, Pairing
+from device_agent.config.agent_config import ConfigError, Configuration, DeviceEntry, Home, Pairing
 from device_agent.ports.clock import CloudClock
 from device_agent.runtime.authority.interlocks import Interlock
 
@@ -216,13 +216,13 @@ class TestReport:
 
 class TestSoleUse:
     def test_two_processes_cannot_run_one_robot(self, home: Home) -> None:
-        with home.hold(), pytest.raises(HomeError, match="already"), home.hold():
+        with home.hold(), pytest.raises(ConfigError, match="already"), home.hold():
             pytest.fail("two hold it")
         with home.hold():
             pass
 
     def test_a_folder_without_an_agent_cannot_be_run(self, tmp_path: Path) -> None:
-        with pytest.raises(HomeError, match="enroll"), Home(tmp_path / "none").hold():
+        with pytest.raises(ConfigError, match="enroll"), Home(tmp_path / "none").hold():
             pytest.fail("there is nothing to hold")
 
 

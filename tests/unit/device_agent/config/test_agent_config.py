@@ -14,10 +14,10 @@ from msgspec.structs import replace
 
 from device_agent.config.agent_config import (
     Buffer,
+    ConfigError,
     Configuration,
     DeviceEntry,
     Home,
-    HomeError,
     HttpPolling,
     Pairing,
     RoomStream,
@@ -95,7 +95,7 @@ def test_a_folder_written_before_there_was_a_choice_speaks_mqtt(tmp_path: Path) 
 )
 def test_what_is_wrong_is_named(tmp_path: Path, text: str, named: str) -> None:
     (tmp_path / "agent.toml").write_text(MINIMAL + text)
-    with pytest.raises(HomeError, match=named):
+    with pytest.raises(ConfigError, match=named):
         Home(tmp_path).configuration()
 
 
@@ -147,30 +147,30 @@ def test_what_was_written_of_identity_and_pairing_is_read_again(tmp_path: Path) 
 
 def test_what_is_missing_or_damaged_says_what_to_do(tmp_path: Path) -> None:
     home = Home(tmp_path)
-    with pytest.raises(HomeError, match="enroll` first"):
+    with pytest.raises(ConfigError, match="enroll` first"):
         home.identity()
-    with pytest.raises(HomeError, match="enroll` first"):
+    with pytest.raises(ConfigError, match="enroll` first"):
         home.configuration()
     (tmp_path / "identity.pem").write_bytes(b"nonsense")
-    with pytest.raises(HomeError, match="cannot be read as a private key"):
+    with pytest.raises(ConfigError, match="cannot be read as a private key"):
         home.identity()
     pem = ec.generate_private_key(ec.SECP256R1()).private_bytes(
         serialization.Encoding.PEM, serialization.PrivateFormat.PKCS8, serialization.NoEncryption()
     )
     (tmp_path / "identity.pem").write_bytes(pem)
-    with pytest.raises(HomeError, match="not an Ed25519 key"):
+    with pytest.raises(ConfigError, match="not an Ed25519 key"):
         home.identity()
     (tmp_path / "pairing.json").write_bytes(b"{")
-    with pytest.raises(HomeError, match="delete it and enroll again"):
+    with pytest.raises(ConfigError, match="delete it and enroll again"):
         home.pairing()
     (tmp_path / "agent.toml").write_text('server = "s"\nname = "n"\ndevices = []\n')
-    with pytest.raises(HomeError, match="at least one device"):
+    with pytest.raises(ConfigError, match="at least one device"):
         home.configuration()
 
 
 def test_a_folder_that_cannot_be_written_is_named(tmp_path: Path) -> None:
     (tmp_path / "file").write_text("no folder")
-    with pytest.raises(HomeError, match="cannot be written"):
+    with pytest.raises(ConfigError, match="cannot be written"):
         Home(tmp_path / "file").save_pairing(Pairing(agent="a", space="s", account="ann", keys={}))
 
 
@@ -185,7 +185,7 @@ def test_a_pinned_authority_is_kept_and_found(tmp_path: Path) -> None:
     assert kept is not None
     assert kept.read_bytes() == given.read_bytes()
     kept.unlink()
-    with pytest.raises(HomeError, match="enroll --ca"):
+    with pytest.raises(ConfigError, match="enroll --ca"):
         home.authority(pinned)
 
 
@@ -194,13 +194,13 @@ def test_what_is_no_authoritys_certificate_is_not_pinned(tmp_path: Path, content
     home, given = Home(tmp_path / "agent"), tmp_path / "given.pem"
     if content is not None:
         given.write_bytes(content)
-    with pytest.raises(HomeError, match=r"--ca: .*given\.pem cannot be read as a certificate"):
+    with pytest.raises(ConfigError, match=r"--ca: .*given\.pem cannot be read as a certificate"):
         home.pin_authority(given)
 
 
 def test_a_lock_that_cannot_be_written_is_named(tmp_path: Path) -> None:
     (tmp_path / "running.lock").mkdir()
-    with pytest.raises(HomeError, match=r"running\.lock cannot be written"), Home(tmp_path).hold():
+    with pytest.raises(ConfigError, match=r"running\.lock cannot be written"), Home(tmp_path).hold():
         pass
 
 

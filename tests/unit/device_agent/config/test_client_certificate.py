@@ -11,7 +11,7 @@ from cryptography.hazmat.primitives.asymmetric import ec
 from cryptography.hazmat.primitives.serialization import Encoding
 from cryptography.x509.oid import NameOID
 
-from device_agent.config.agent_config import HomeError
+from device_agent.config.agent_config import ConfigError
 from device_agent.config.client_certificate import OwnCertificate
 
 DAY_MS = 86_400_000
@@ -106,5 +106,5 @@ def test_a_certificate_for_another_key_is_refused_and_nothing_written(
 
 def test_a_folder_that_cannot_be_written_is_named(tmp_path: Path, signer: Signer) -> None:
     (tmp_path / "file").touch()
-    with pytest.raises(HomeError, match="cannot be written"):
+    with pytest.raises(ConfigError, match="cannot be written"):
         ready(OwnCertificate(tmp_path / "file"), signer)

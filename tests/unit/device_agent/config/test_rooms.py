@@ -8,7 +8,7 @@ from device_agent import bootstrap
 from device_agent.__main__ import main
 from device_agent.cli.doctor import devices
 from device_agent.config import catalogue
-from device_agent.config.agent_config import Configuration, DeviceEntry, Home, HomeError
+from device_agent.config.agent_config import ConfigError, Configuration, DeviceEntry, Home
 
 ARM = DeviceEntry(name="ur5", type="ur5", room="lab")
 
@@ -36,7 +36,7 @@ def test_the_room_of_a_device_is_kept_in_its_file(tmp_path: Path):
     ],
 )
 def test_what_the_room_does_not_have_is_named_with_what_it_has(entry: DeviceEntry, says: str):
-    with pytest.raises(HomeError, match=says):
+    with pytest.raises(ConfigError, match=says):
         catalogue.type_of(entry)
 
 

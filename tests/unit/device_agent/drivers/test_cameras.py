@@ -6,11 +6,12 @@ import pytest
 import simplejpeg
 
 from device_agent.drivers import mujoco as simulation
-from device_agent.ports.driver import DriverError, Filming
+from device_agent.ports.driver import DriverError, HasCameras
 from device_agent.protocol import Stream
 from device_agent.protocol.manifests import robot_type
 from device_agent.simulation import renderer
-from tests.harness.network.brokers import PATIENCE_S, ROOT
+from tests.harness.network.brokers import PATIENCE_S
+from tests.harness.paths import ROOT
 
 QBO = ROOT / "robots" / "qbo"
 TYPE = robot_type.load(QBO)
@@ -19,7 +20,7 @@ TYPE = robot_type.load(QBO)
 def test_the_eyes_see_the_world_that_the_robot_stands_in(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(renderer, "WITHIN_S", PATIENCE_S)
     driver = simulation.create(TYPE, QBO, {}, "qbo")
-    assert isinstance(driver, Filming)
+    assert isinstance(driver, HasCameras)
     assert driver.frame("eyes") is None
     driver.connect()
     try:

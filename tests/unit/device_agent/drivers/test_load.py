@@ -12,9 +12,9 @@ from device_agent.drivers import mujoco as mujoco_driver
 from device_agent.ports import plugins
 from device_agent.ports.driver import DriverError
 from device_agent.protocol.manifests import robot_type
+from tests.harness.paths import ROBOTS
 
 CREATE: object = mujoco_driver.create
-ROBOTS = Path(__file__).parents[3] / "robots"
 
 
 def third_party(monkeypatch: pytest.MonkeyPatch, **points: str) -> None:
@@ -84,7 +84,8 @@ def test_missing_scene_is_one_clear_error_at_connect(tmp_path: Path):
 def test_importing_a_driver_needs_no_display_and_listing_needs_no_simulator():
     script = """
 import sys
-from device_agent import drivers, plug_ins
+from device_agent import drivers
+from device_agent.ports import plugins as plug_ins
 assert "mujoco" in drivers.names() and "mujoco" not in sys.modules
 drivers.load("mujoco")
 assert "mujoco" in sys.modules

@@ -10,7 +10,7 @@ import pytest
 
 from device_agent.drivers import load
 from device_agent.drivers.mujoco import MujocoDriver
-from device_agent.drivers.mujoco.fault_injection import WELL, Ailments, Sickbed, read
+from device_agent.drivers.mujoco.fault_injection import WELL, FaultInjector, InjectedFaults, read
 from device_agent.drivers.mujoco.motor_model import (
     AMBIENT_C,
     FULL_RISE_C,
@@ -82,7 +82,7 @@ def test_a_world_that_stood_still_has_aged_nothing() -> None:
 
 def test_a_joint_that_overheats_warms_without_end_and_cools_when_it_is_well() -> None:
     life = Life()
-    life.health.suffer(Ailments(overheating={"elbow": 2.0}))
+    life.health.suffer(InjectedFaults(overheating={"elbow": 2.0}))
     values = life.live(1200)
     assert values["temperature_c.elbow"] == pytest.approx(
         AMBIENT_C + IDLE_RISE_C + 40 + IDLE_RISE_C * 1200 / WARMING_S, abs=1
@@ -115,10 +115,10 @@ def test_a_battery_empties_sooner_under_load() -> None:
 
 def test_a_battery_can_be_set_and_kept_from_its_charger() -> None:
     life = Life(BATTERY)
-    life.health.suffer(Ailments(battery_percent=4.0, charging=False))
+    life.health.suffer(InjectedFaults(battery_percent=4.0, charging=False))
     assert life.live(10)["battery_percent"] < 4.0
     assert life.live(7200)["battery_percent"] == 0.0
-    life.health.suffer(Ailments(charging=True))
+    life.health.suffer(InjectedFaults(charging=True))
     assert life.live(720)["battery_percent"] == pytest.approx(10.0, abs=0.5)
 
 
@@ -144,7 +144,7 @@ def test_a_motor_that_strains_and_does_not_move_is_stuck_after_half_a_second() -
 
 def test_a_file_says_what_ails_a_robot() -> None:
     text = 'overheating = { elbow = 2.0 }\nweak = { wrist_1 = 0.3 }\nstuck = ["shoulder_pan"]\nbattery_percent = 25.0\n'
-    assert read(text, NAMES) == Ailments(
+    assert read(text, NAMES) == InjectedFaults(
         overheating={"elbow": 2.0}, weak={"wrist_1": 0.3}, stuck=("shoulder_pan",), battery_percent=25.0
     )
     assert read("", NAMES) == WELL
@@ -168,10 +168,10 @@ def test_a_wrong_file_says_what_there_is(text: str, says: str) -> None:
 
 def test_the_file_may_come_change_and_go(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     path = tmp_path / "arm.toml"
-    bed = Sickbed(path, NAMES)
+    bed = FaultInjector(path, NAMES)
     assert bed.news() is None
     path.write_text('stuck = ["elbow"]')
-    assert bed.news() == Ailments(stuck=("elbow",))
+    assert bed.news() == InjectedFaults(stuck=("elbow",))
     assert bed.news() is None
     with caplog.at_level(logging.WARNING):
         path.write_text('stuck = ["nose"]  # no such joint')
@@ -182,7 +182,7 @@ def test_the_file_may_come_change_and_go(tmp_path: Path, caplog: pytest.LogCaptu
     assert bed.news() == WELL
     path.mkdir()
     assert bed.news() is None
-    assert Sickbed(None, NAMES).news() is None
+    assert FaultInjector(None, NAMES).news() is None
 
 
 # ------------------------------------------------------------ in the simulation

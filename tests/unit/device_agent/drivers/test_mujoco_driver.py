@@ -14,8 +14,8 @@ from device_agent.drivers.mujoco import driver as driver_module
 from device_agent.ports.driver import DriverError
 from device_agent.protocol.manifests import robot_type
 from device_agent.protocol.manifests.robot_type import RobotType
+from tests.harness.paths import UR5
 
-UR5 = Path(__file__).parents[3] / "robots" / "ur5"
 TYPE = robot_type.load(UR5)
 
 

@@ -1,7 +1,5 @@
 """Servos that hold less: a limp arm hangs, holds others still, and is caught where it is."""
 
-from pathlib import Path
-
 import mujoco
 import numpy as np
 import pytest
@@ -10,8 +8,9 @@ from device_agent.drivers.mujoco import MujocoDriver, World
 from device_agent.ports import skills
 from device_agent.ports.skills import SkillError, Stage
 from device_agent.protocol.manifests import robot_type
+from tests.harness.paths import ROOT
 
-ROBOT = Path(__file__).parents[3] / "robots" / "ur5"
+ROBOT = ROOT / "robots" / "ur5"
 KIND = robot_type.load(ROBOT)
 STAGE: Stage = None  # type: ignore[assignment]
 

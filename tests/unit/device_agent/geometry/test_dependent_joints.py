@@ -1,7 +1,6 @@
 """Poses and jogs of frames that hang on rods, or on joints of one motor: what the motors can do, or a clear no."""
 
 import math
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -11,8 +10,8 @@ from device_agent.geometry.mujoco_geometry import MujocoGeometry
 from device_agent.ports.geometry import GeometryError
 from device_agent.protocol.manifests import robot_type
 from device_agent.protocol.manifests.robot_type import RobotType
+from tests.harness.paths import ROBOTS
 
-ROBOTS = Path(__file__).parents[3] / "robots"
 STEP_S = 1e-4
 
 

@@ -18,8 +18,8 @@ from device_agent.geometry.mujoco_geometry import MujocoGeometry
 from device_agent.ports.geometry import GeometryError
 from device_agent.protocol.manifests import robot_type
 from device_agent.protocol.manifests.robot_type import Base, RobotType
+from tests.harness.paths import UR5
 
-UR5 = Path(__file__).parents[3] / "robots" / "ur5"
 KIND = robot_type.load(UR5)
 HOME = [KIND.home_rad[joint.name] for joint in KIND.joints]
 LOWER = np.array([joint.lower_rad for joint in KIND.joints])
@@ -345,7 +345,7 @@ def room_with(tmp_path: Path, *things: str) -> Path:
 
 
 def standing(room: Path, yaw_rad: float = 0.7) -> MujocoGeometry:
-    there = geometry.Standing(room=room, position_m=(2.0, -1.0, 0.75), yaw_rad=yaw_rad)
+    there = geometry.BasePose(room=room, position_m=(2.0, -1.0, 0.75), yaw_rad=yaw_rad)
     return MujocoGeometry(KIND, UR5 / KIND.model, standing=there)
 
 

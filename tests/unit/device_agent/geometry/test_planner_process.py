@@ -20,18 +20,18 @@ from device_agent.ports import script_calls
 from device_agent.ports.geometry import GeometryError, PlannerLostError
 from device_agent.protocol import StopLatch
 from device_agent.protocol.manifests import robot_type
-from device_agent.runtime.actions.device_context import Body
-from device_agent.runtime.actions.robot_api import ScriptRobot
+from device_agent.runtime.actions.device_context import DeviceContext
+from device_agent.runtime.actions.robot_api import RobotApi
 from device_agent.runtime.authority.lease_gate import LeaseGate
 from device_agent.runtime.control.controller import Controller
-from device_agent.runtime.control.goals import Outcome
+from device_agent.runtime.control.goals import GoalResult
 from device_agent.runtime.errors import Refused
 from device_agent.runtime.planning.joint_couplings import Couplings
-from device_agent.runtime.planning.motion_planner import Routes
-from device_agent.runtime.readings import Room
+from device_agent.runtime.planning.motion_planner import MotionPlanner
+from device_agent.runtime.readings import ReadingCache
+from tests.harness.paths import ROBOTS, ROOT, UR5
 
-ROBOTS = Path(__file__).parents[3] / "robots"
-UR5, NAO = ROBOTS / "ur5", ROBOTS / "nao"
+NAO = ROBOTS / "nao"
 KIND = robot_type.load(UR5)
 HOME = [KIND.home_rad[joint.name] for joint in KIND.joints]
 BEYOND = [1.6, *HOME[1:]]
@@ -118,15 +118,15 @@ class Arm:
     def __init__(self, shape: MujocoGeometry) -> None:
         self.controller = Controller(KIND, LeaseGate(), geometry=shape)
         self.controller.start_at(HOME)
-        body = Body(
+        body = DeviceContext(
             robot_type=KIND,
             controller=self.controller,
             observe=lambda: None,
             geometry=shape,
             skills=None,
-            room=Room(space="s", agent="a", own=[]),
+            room=ReadingCache(space="s", agent="a", own=[]),
         )
-        self.robot = ScriptRobot(body)
+        self.robot = RobotApi(body)
         self.robot.begin(1, lambda _: self.robot.end())
 
     def cross(self) -> Refused:
@@ -206,7 +206,7 @@ shape.plan(t.HOME, t.BEYOND, within_s=600.0)
 
 
 def test_it_ends_with_an_agent_that_is_killed_in_the_middle_of_a_search(divided: Path) -> None:
-    root = Path(__file__).parents[3]
+    root = ROOT
     with subprocess.Popen(
         [sys.executable, "-c", AGENT, str(divided)],
         stdout=subprocess.PIPE,
@@ -238,13 +238,13 @@ def test_a_planned_way_keeps_to_what_a_yaw_leaves_the_head_and_moves_both_hips_a
     now_s, orders = 0.0, ({"HeadPitch": 0.45}, {"HeadYaw": 2.05, "HeadPitch": 0.25, "LHipYawPitch": -0.1})
     for order in orders:
         start, goal = controller.commanded_rad, controller.target(tenure, order)
-        way = Routes(kind, shape).around(start, goal, speed=1.0, ended=lambda: False)
+        way = MotionPlanner(kind, shape).around(start, goal, speed=1.0, ended=lambda: False)
         passage = controller.go_along(tenure, way)
         for _ in range(round(way.duration_s / (kind.period_ms / 1000)) + 50):
             now_s += kind.period_ms / 1000
             tick = controller.step(now_s)
             assert couplings.parted(np.array([tick.position_rad])) == ""
-        assert passage.outcome is Outcome.REACHED, passage.why
+        assert passage.outcome is GoalResult.REACHED, passage.why
         assert controller.commanded_rad == pytest.approx(goal, abs=1e-4)
     assert couplings.parted(np.linspace(start, goal, 50)) != "", "straight there it would not"
     assert goal[names.index("RHipYawPitch")] == pytest.approx(-0.1)

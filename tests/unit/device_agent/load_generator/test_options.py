@@ -8,10 +8,10 @@ import pytest
 from cryptography.hazmat.primitives.serialization import Encoding, PublicFormat
 
 from device_agent.load_generator.enrollment import FILE, Keys
-from device_agent.load_generator.metrics import Figures, percentile
-from device_agent.load_generator.options import Plan, SwarmError
+from device_agent.load_generator.metrics import Metrics, percentile
+from device_agent.load_generator.options import LoadOptions, SwarmError
 
-PLAN = Plan(cloud="https://telescope.example:8443")
+PLAN = LoadOptions(cloud="https://telescope.example:8443")
 
 
 @pytest.mark.parametrize(
@@ -70,7 +70,7 @@ def test_percentiles_are_values_that_were_seen() -> None:
 
 
 def test_rates_are_those_since_all_were_there_and_a_line_those_since_the_last() -> None:
-    figures = Figures(2)
+    figures = Metrics(2)
     figures.up()
     figures.counts.out = 1000
     figures.lag_ms.append(500.0)

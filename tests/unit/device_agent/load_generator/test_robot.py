@@ -11,11 +11,9 @@ from device_agent.ports.clock import wall_ms
 from device_agent.protocol import (
     Ack,
     AckStatus,
-    AskLease,
     CancelAction,
     Command,
     Description,
-    DropRequest,
     Event,
     GrantLease,
     JogTarget,
@@ -24,12 +22,14 @@ from device_agent.protocol import (
     Mode,
     MoveJoints,
     ReleaseLease,
+    RequestControl,
     ResetStop,
     Say,
     Setpoint,
     State,
     Stop,
     StopDevice,
+    WithdrawRequest,
     codec,
     topics,
 )
@@ -178,7 +178,7 @@ def test_the_same_command_runs_once_and_is_answered_again(bench: Bench) -> None:
         (MoveJoints(position_rad={"tail": 1.0}), 1, "unknown_joint"),
         (Say(text="hello"), 1, "unsupported"),
         (CancelAction(action="nothing"), 1, "not_running"),
-        (AskLease(request="r", by="bob", answer_within_ms=1000), 5, "no_lease"),
+        (RequestControl(request="r", by="bob", answer_within_ms=1000), 5, "no_lease"),
     ],
 )
 def test_what_it_may_not_or_cannot_do_it_says(bench: Bench, request_: Any, epoch: int, code: str) -> None:
@@ -298,10 +298,10 @@ def test_a_lease_that_runs_out_and_a_link_that_is_lost_end_what_moves(bench: Ben
 
 def test_who_asks_for_control_is_shown_until_the_request_is_dropped(bench: Bench) -> None:
     bench.take()
-    bench.command(AskLease(request="r1", by="bob", answer_within_ms=60_000), epoch=1)
+    bench.command(RequestControl(request="r1", by="bob", answer_within_ms=60_000), epoch=1)
     bench.after(2)
     assert bench.told(topics.STATE, State)[-1].lease.request.by == "bob"
-    bench.command(DropRequest(request="r1"))
+    bench.command(WithdrawRequest(request="r1"))
     bench.after(2)
     assert bench.told(topics.STATE, State)[-1].lease.request is None
     bench.command(ReleaseLease(), epoch=1)

@@ -8,17 +8,17 @@ from dataclasses import dataclass, field
 import mujoco
 import numpy as np
 
-from device_agent.perception.background_model import Survey
-from device_agent.perception.object_classes import Kind, Mount
+from device_agent.perception.background_model import BackgroundModel
+from device_agent.perception.object_classes import Mount, ObjectClass
 from device_agent.perception.occupancy_grid import OccupancyGrid
-from device_agent.perception.sensor_fusion import Sight, Zone
+from device_agent.perception.sensor_fusion import SensorFusion, Zone
 from device_agent.ports.sensor import Image, Scan
 
 LOWER_M, UPPER_M = (-3.0, -2.5), (3.0, 2.5)
 KINDS = (
-    Kind(name="person", lowest_m=1.3, highest_m=2.1, radius_m=0.1, several=True),
-    Kind(name="nao", lowest_m=0.51, highest_m=0.64, radius_m=0.07, fastest_m_s=0.3),
-    Kind(name="qbo", lowest_m=0.38, highest_m=0.51, radius_m=0.13, fastest_m_s=0.6),
+    ObjectClass(name="person", lowest_m=1.3, highest_m=2.1, radius_m=0.1, several=True),
+    ObjectClass(name="nao", lowest_m=0.51, highest_m=0.64, radius_m=0.07, fastest_m_s=0.3),
+    ObjectClass(name="qbo", lowest_m=0.38, highest_m=0.51, radius_m=0.13, fastest_m_s=0.6),
 )
 MOUNTS = (Mount(name="arm", lowest_m=0.78, highest_m=0.95, radius_m=0.05, near_m=(1.9, 1.6), reach_m=1.0),)
 ARM_M = (1.95, 1.5)
@@ -192,9 +192,9 @@ class Playground:
         return bool(across < WIDTH / 2 and up < HEIGHT / 2)
 
 
-def survey(seed: int = 7) -> Survey:
+def survey(seed: int = 7) -> BackgroundModel:
     """The empty room, as its own sensors see it."""
-    empty, found = Playground(seed), Survey()
+    empty, found = Playground(seed), BackgroundModel()
     empty.clear()
     for _ in range(10):
         found.look("lidar", empty.scan())
@@ -203,8 +203,8 @@ def survey(seed: int = 7) -> Survey:
     return found
 
 
-def sight(found: Survey) -> Sight:
-    return Sight(
+def sight(found: BackgroundModel) -> SensorFusion:
+    return SensorFusion(
         grid=OccupancyGrid((-3.2, -2.7), (3.2, 2.7)),
         survey=found,
         kinds=KINDS,
@@ -214,7 +214,7 @@ def sight(found: Survey) -> Sight:
     )
 
 
-def watch(ground: Playground, eyes: Sight, seconds: float, *, period_s: float = 0.2, each=None) -> None:
+def watch(ground: Playground, eyes: SensorFusion, seconds: float, *, period_s: float = 0.2, each=None) -> None:
     """Let it go on, and look at it every ``period_s``; ``each(ground, eyes)`` is asked half a period later."""
     for _ in range(round(seconds / period_s)):
         ground.step(period_s / 2)

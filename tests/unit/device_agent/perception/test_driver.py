@@ -9,7 +9,7 @@ import pytest
 from device_agent import sensors
 from device_agent.ports.sensor import RoomDriver, SensorError, Surroundings
 from device_agent.protocol import Stream
-from device_agent.protocol.manifests.room import RoomDevice
+from device_agent.protocol.manifests.room import RoomDeviceManifest
 from device_agent.sensors.perception import PerceptionDriver, create
 from tests.unit.device_agent.perception.playground import KINDS, Playground, survey
 
@@ -64,7 +64,7 @@ def options(**more):
 
 
 def device(**more):
-    return RoomDevice(
+    return RoomDeviceManifest(
         name="perception",
         kind="perception",
         label="What the room knows",

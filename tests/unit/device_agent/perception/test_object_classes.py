@@ -5,12 +5,12 @@ import math
 import numpy as np
 import pytest
 
-from device_agent.perception.fixed_robots import Mounted
-from device_agent.perception.object_classes import Kind, Mount
+from device_agent.perception.fixed_robots import FixedRobots
+from device_agent.perception.object_classes import Mount, ObjectClass
 from device_agent.perception.tracker import Tracks
 
-NAO = Kind(name="nao", lowest_m=0.42, highest_m=0.68, radius_m=0.07, fastest_m_s=0.3, start_m=(0.0, 0.0))
-QBO = Kind(name="qbo", lowest_m=0.3, highest_m=0.56, radius_m=0.12, fastest_m_s=0.6, start_m=(-0.9, 0.4))
+NAO = ObjectClass(name="nao", lowest_m=0.42, highest_m=0.68, radius_m=0.07, fastest_m_s=0.3, start_m=(0.0, 0.0))
+QBO = ObjectClass(name="qbo", lowest_m=0.3, highest_m=0.56, radius_m=0.12, fastest_m_s=0.6, start_m=(-0.9, 0.4))
 LOW_M = 0.49
 """As high is Qbo, and NAO that sits."""
 CAMERA_M = np.array([3.0, 0.0])
@@ -27,7 +27,7 @@ def somebody(x_m: float, y_m: float, height_m: float = LOW_M) -> np.ndarray:
 class Floor:
     """Those on the floor, watched."""
 
-    def __init__(self, *kinds: Kind) -> None:
+    def __init__(self, *kinds: ObjectClass) -> None:
         self.tracks = Tracks(kinds or (NAO, QBO))
         self.now_s = 0.0
 
@@ -45,7 +45,7 @@ class Floor:
 
 
 @pytest.mark.parametrize("kinds", [(NAO, QBO), (QBO, NAO)])
-def test_two_of_one_height_are_told_apart_by_where_they_began(kinds: tuple[Kind, Kind]) -> None:
+def test_two_of_one_height_are_told_apart_by_where_they_began(kinds: tuple[ObjectClass, ObjectClass]) -> None:
     floor = Floor(*kinds)
     floor.watch((0.2, 0.1), (-0.8, 0.2))
     assert floor.holds(nao=(0.2, 0.1), qbo=(-0.8, 0.2))
@@ -92,7 +92,7 @@ def on_table(x_m: float, y_m: float, low_m: float = 0.8) -> np.ndarray:
     return np.column_stack((x_m + across.ravel(), y_m + up.ravel(), np.full(across.size, low_m)))
 
 
-def look(robot: Mounted, points_m: np.ndarray, *, from_s: float, for_s: float = 4.0, camera: str = "one") -> float:
+def look(robot: FixedRobots, points_m: np.ndarray, *, from_s: float, for_s: float = 4.0, camera: str = "one") -> float:
     now_s = from_s
     for _ in range(round(for_s / PERIOD_S)):
         now_s += PERIOD_S
@@ -102,7 +102,7 @@ def look(robot: Mounted, points_m: np.ndarray, *, from_s: float, for_s: float = 
 
 
 def test_a_robot_on_a_table_is_told_of_only_when_something_stands_where_it_belongs() -> None:
-    robot = Mounted(ARM)
+    robot = FixedRobots(ARM)
     now_s = look(robot, on_table(3.0, -1.0), from_s=0.0)
     now_s = look(robot, on_table(1.7, 1.0), from_s=now_s)  # within reach of its arm, but no place for its base
     assert robot.place(now_s) is None
@@ -114,7 +114,7 @@ def test_a_robot_on_a_table_is_told_of_only_when_something_stands_where_it_belon
 
 
 def test_one_that_is_hidden_or_gone_is_told_with_when_it_was_seen_last() -> None:
-    robot = Mounted(ARM)
+    robot = FixedRobots(ARM)
     now_s = look(robot, on_table(1.0, 1.0), from_s=0.0)
     before = robot.place(now_s)
     # Somebody's hand within its reach is not its base.
@@ -127,7 +127,7 @@ def test_one_that_is_hidden_or_gone_is_told_with_when_it_was_seen_last() -> None
 
 
 def test_one_of_two_cameras_is_enough_to_see_it() -> None:
-    robot = Mounted(ARM)
+    robot = FixedRobots(ARM)
     now_s = 0.0
     for _ in range(4):
         look(robot, on_table(1.0, 1.0), from_s=now_s, for_s=1.0)

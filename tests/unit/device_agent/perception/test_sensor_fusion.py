@@ -6,7 +6,7 @@ import statistics
 import numpy as np
 import pytest
 
-from device_agent.perception.background_model import Survey, SurveyError
+from device_agent.perception.background_model import BackgroundModel, SurveyError
 from tests.unit.device_agent.perception.playground import (
     ARM_M,
     FURNITURE,
@@ -24,7 +24,7 @@ MEDIAN_M = 0.15
 
 @pytest.fixture(scope="module")
 def empty():
-    return Survey.read(survey().content())
+    return BackgroundModel.read(survey().content())
 
 
 def errors(empty, seed, seconds):
@@ -187,7 +187,7 @@ def test_the_grid_shows_walls_and_furniture_and_not_who_walks(empty):
 
 def test_a_survey_that_is_none_is_refused():
     with pytest.raises(SurveyError, match="take a new one"):
-        Survey.read(b"PK nonsense")
+        BackgroundModel.read(b"PK nonsense")
 
 
 def test_a_sensor_that_was_moved_has_no_survey(empty):
@@ -196,7 +196,7 @@ def test_a_sensor_that_was_moved_has_no_survey(empty):
     assert empty.nearer("lidar", scan) is not None
     scan.position_m[0] += 0.1
     assert empty.nearer("lidar", scan) is None
-    found = Survey()
+    found = BackgroundModel()
     found.look("lidar", ground.scan())
     found.look("lidar", scan)
     with pytest.raises(SurveyError, match="moved"):
@@ -204,7 +204,7 @@ def test_a_sensor_that_was_moved_has_no_survey(empty):
 
 
 def test_who_passes_while_the_room_is_surveyed_is_no_furniture():
-    ground, found = Playground(2), Survey()
+    ground, found = Playground(2), BackgroundModel()
     for _ in range(60):
         ground.step(1.0)
         found.look("depth", ground.depth())

@@ -1,12 +1,11 @@
 """What a manifest says beside limits: read as it stands, refused with what is wrong where it contradicts itself."""
 
-from pathlib import Path
-
 import pytest
 
 from device_agent.protocol.errors import ProtocolError
 from device_agent.protocol.manifests.capabilities import Narrowing
 from device_agent.protocol.manifests.robot_type import RobotType, parse
+from tests.harness.paths import ROOT
 
 JOINT = """
 [[joints]]
@@ -182,7 +181,7 @@ def test_a_mirror_that_is_too_slow_is_refused() -> None:
     ],
 )
 def test_a_walk_on_legs_that_are_not_there_is_refused(was: str, now: str, says: str) -> None:
-    text = (Path(__file__).parents[3] / "robots" / "nao" / "robot.toml").read_text(encoding="utf-8")
+    text = (ROOT / "robots" / "nao" / "robot.toml").read_text(encoding="utf-8")
     assert was in text
     with pytest.raises(ProtocolError, match=says):
         read(text.replace(was, now, 1))

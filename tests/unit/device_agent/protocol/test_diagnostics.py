@@ -1,13 +1,12 @@
 """What a manifest says about measurements is checked when it is read."""
 
-from pathlib import Path
-
 import pytest
 
 from device_agent.protocol.errors import ProtocolError
 from device_agent.protocol.manifests import robot_type
+from tests.harness.paths import ROOT
 
-UR5 = Path(__file__).parents[3] / "robots" / "ur5" / "robot.toml"
+UR5 = ROOT / "robots" / "ur5" / "robot.toml"
 
 
 def given(lines: str) -> str:

@@ -1,13 +1,12 @@
 """Limits in a manifest that nothing could be controlled with are refused, with the field's name."""
 
-from pathlib import Path
-
 import pytest
 
 from device_agent.protocol.errors import ProtocolError
 from device_agent.protocol.manifests.robot_type import Base, Workspace, parse
+from tests.harness.paths import ROOT
 
-UR5 = (Path(__file__).parents[3] / "robots" / "ur5" / "robot.toml").read_text(encoding="utf-8")
+UR5 = (ROOT / "robots" / "ur5" / "robot.toml").read_text(encoding="utf-8")
 BASE = """
 [base]
 max_linear_m_s = 0.5

@@ -6,8 +6,9 @@ import pytest
 
 from device_agent.protocol.errors import ProtocolError
 from device_agent.protocol.manifests import room
+from tests.harness.paths import ROOT
 
-ROOMS = Path(__file__).parents[3] / "robots" / "rooms"
+ROOMS = ROOT / "robots" / "rooms"
 
 ROOM = """
 room = "attic"

@@ -8,8 +8,8 @@ import pytest
 from device_agent.ports.transport import LinkChanged, Receive
 from device_agent.protocol import Measurements, Mode, Stop, codec, topics
 from device_agent.runtime.agent import Agent
-from device_agent.runtime.readings import Room
-from device_agent.runtime.storage.outbox_store import Shelf
+from device_agent.runtime.readings import ReadingCache
+from device_agent.runtime.storage.outbox_store import OutboxStore
 from device_agent.runtime.telemetry.outbox import Outbox
 from tests.harness.agent.device_harness import Bench, eventually
 
@@ -37,8 +37,8 @@ class Whole:
     def __init__(self, bench: Bench, folder: Path) -> None:
         self.bench = bench
         self.link = ToyLink(bench)
-        self.room = Room(space="s", agent="a", own=["arm"], named=[("other-pir", "presence")])
-        shelf = Shelf(folder / "whole.db", own="ts/v1/s/a/", max_bytes=10**6, max_age_ms=3_600_000)
+        self.room = ReadingCache(space="s", agent="a", own=["arm"], named=[("other-pir", "presence")])
+        shelf = OutboxStore(folder / "whole.db", own="ts/v1/s/a/", max_bytes=10**6, max_age_ms=3_600_000)
         self.outbox = Outbox(shelf, publish=bench.publish, teller="ts/v1/s/a/arm")
         self.agent = Agent({"arm": bench.device}, self.link, outbox=self.outbox, room=self.room, address=("s", "a"))
 

@@ -13,21 +13,21 @@ from device_agent.ports.clock import tick_ms, wall_ms
 from device_agent.protocol import (
     Ack,
     AckStatus,
-    AskLease,
     CancelAction,
     Description,
-    DropRequest,
-    FollowKey,
     GrantLease,
     JointTarget,
     Mode,
     MoveJoints,
     ReleaseLease,
+    RequestControl,
     ResetStop,
+    RotateKey,
     Setpoint,
     State,
     Stop,
     StopDevice,
+    WithdrawRequest,
     codec,
     topics,
 )
@@ -172,15 +172,15 @@ def test_it_follows_to_the_clouds_new_key_when_told_by_the_one_it_has_pinned(ben
         told = NewKey(serial=serial, key=key, former_until_ms=wall_ms() + 60_000)
         return signing.sign(codec.encode(told), by, context=KEYS_CONTEXT).decode()
 
-    refused = bench.end(bench.command(FollowKey(statements=(statement(new),))))
+    refused = bench.end(bench.command(RotateKey(statements=(statement(new),))))
     assert refused.reason is not None
     assert refused.reason.code == "bad_signature"
     # The bench's pins know no time of the cloud, and without it no key is taken up.
-    later = bench.end(bench.command(FollowKey(statements=(statement(bench.key),))))
+    later = bench.end(bench.command(RotateKey(statements=(statement(bench.key),))))
     assert later.reason is not None
     assert later.reason.code == "no_clock"
     known = statement(bench.key, of=bench.key, serial=1)
-    assert bench.end(bench.command(FollowKey(statements=(known,)))).status is AckStatus.DONE
+    assert bench.end(bench.command(RotateKey(statements=(known,)))).status is AckStatus.DONE
 
 
 def test_a_second_action_is_refused_while_one_runs_and_the_first_can_be_cancelled(bench: Bench) -> None:
@@ -270,18 +270,18 @@ def test_garbage_is_counted_and_harms_nothing(bench: Bench) -> None:
 
 
 def test_state_shows_who_asks_for_control_until_that_is_dropped(bench: Bench) -> None:
-    early = bench.end(bench.command(AskLease(request="r1", by="bob", answer_within_ms=30_000), epoch=1))
+    early = bench.end(bench.command(RequestControl(request="r1", by="bob", answer_within_ms=30_000), epoch=1))
     assert early.reason is not None
     assert early.reason.code == "no_lease"
     bench.end(bench.command(GrantLease(holder="ann", lease_ms=60_000, reason="needed in the lab"), epoch=1))
-    bench.end(bench.command(AskLease(request="r1", by="bob", answer_within_ms=30_000), epoch=1))
+    bench.end(bench.command(RequestControl(request="r1", by="bob", answer_within_ms=30_000), epoch=1))
     lease = shown(bench, lambda state: state.lease and state.lease.request).lease
     assert lease is not None
     assert lease.request is not None
     assert (lease.holder, lease.reason, lease.request.id, lease.request.by) == ("ann", "needed in the lab", "r1", "bob")
     assert 0 < lease.request.expires_in_ms <= 30_000
     bench.end(bench.command(GrantLease(holder="ann", lease_ms=60_000), epoch=1))
-    bench.end(bench.command(DropRequest(request="r1"), epoch=1))
+    bench.end(bench.command(WithdrawRequest(request="r1"), epoch=1))
     lease = shown(bench, lambda state: state.lease and not state.lease.request).lease
     assert lease is not None
     assert lease.reason == "needed in the lab", "a renewal does not wipe it out"

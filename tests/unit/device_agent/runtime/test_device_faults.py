@@ -10,9 +10,9 @@ import pytest
 
 from device_agent.ports.driver import DriverError, Observation
 from device_agent.protocol import Ack, AckStatus, Event, GrantLease, Mode, MoveJoints, Twin, topics
-from device_agent.runtime.actions.robot_api import ScriptRobot
+from device_agent.runtime.actions.robot_api import RobotApi
 from device_agent.runtime.commands import command_processor
-from device_agent.runtime.commands.command_processor import Office
+from device_agent.runtime.commands.command_processor import CommandProcessor
 from device_agent.runtime.storage.journal import Journal, JournalError
 from tests.fakes.drivers import ToyDriver
 from tests.harness.agent.device_harness import Bench, eventually
@@ -45,14 +45,14 @@ def code(bench: Bench, command: str) -> str:
 def test_an_action_that_meets_a_bug_has_failed_and_the_next_one_runs(
     bench: Bench, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(ScriptRobot, "move_joints", broken)
+    monkeypatch.setattr(RobotApi, "move_joints", broken)
     assert code(bench, bench.command(MOVE, epoch=1)) == "internal"
     monkeypatch.undo()
     assert bench.end(bench.command(MOVE, epoch=1)).status is AckStatus.DONE
 
 
 def test_a_command_that_meets_a_bug_has_failed(bench: Bench, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(Office, "_carry_out", broken)
+    monkeypatch.setattr(CommandProcessor, "_carry_out", broken)
     assert code(bench, bench.command(GrantLease(holder="ann", lease_ms=1000), epoch=1)) == "internal"
 
 
@@ -99,7 +99,7 @@ def test_what_else_goes_wrong_does_not_end_the_office(bench: Bench, monkeypatch:
         met.set()
         raise ZeroDivisionError("a bug")
 
-    monkeypatch.setattr(Office, "_condition", fail)
+    monkeypatch.setattr(CommandProcessor, "_condition", fail)
     assert met.wait(10)
     monkeypatch.undo()
     assert bench.end(bench.command(MOVE, epoch=1)).status is AckStatus.DONE
@@ -120,7 +120,7 @@ def test_of_too_many_commands_the_last_are_refused(bench: Bench, monkeypatch: py
         busy.set()
         go_on.wait(20)
 
-    monkeypatch.setattr(Office, "_obey", wait)
+    monkeypatch.setattr(CommandProcessor, "_obey", wait)
     bench.receive(topics.CMD, b"{}")
     assert busy.wait(10)
     for _ in range(command_processor._MOST_WAITING + 3):

@@ -5,7 +5,7 @@ import pytest
 from device_agent.protocol import JointTelemetry, Measurements, Mode, codec, topics
 from device_agent.protocol.errors import ProtocolError
 from device_agent.runtime.errors import Refused
-from device_agent.runtime.readings import OVERTAKEN_S, Reading, Room
+from device_agent.runtime.readings import OVERTAKEN_S, Reading, ReadingCache
 
 
 class Clock:
@@ -21,9 +21,9 @@ def clock() -> Clock:
 
 
 @pytest.fixture
-def room(clock: Clock) -> Room:
+def room(clock: Clock) -> ReadingCache:
     named = [("sensors-pir", "presence"), ("lamp", "light"), ("sensors-arm", "joints")]
-    return Room(space="lab", agent="own", own=["arm", "lamp"], named=named, clock_s=clock)
+    return ReadingCache(space="lab", agent="own", own=["arm", "lamp"], named=named, clock_s=clock)
 
 
 def measured(sequence: int = 1, *, tick_ms: int = 1, at_ms: int = 1, **values: float) -> Measurements:
@@ -34,20 +34,20 @@ def topic(device: str = "pir", stream: str = "presence", *, agent: str = "sensor
     return topics.Topic(space, agent, device, topics.TELE, stream)
 
 
-def hear(room: Room, message: Measurements | JointTelemetry, where: topics.Topic | None = None) -> None:
+def hear(room: ReadingCache, message: Measurements | JointTelemetry, where: topics.Topic | None = None) -> None:
     room.receive(where or topic(), codec.encode(message))
 
 
-def value(room: Room) -> float | None:
+def value(room: ReadingCache) -> float | None:
     reading = room.latest("sensors-pir", "presence")
     return None if reading is None else reading.values["present"]
 
 
-def test_it_subscribes_to_what_is_named_of_others_by_exact_name(room: Room) -> None:
+def test_it_subscribes_to_what_is_named_of_others_by_exact_name(room: ReadingCache) -> None:
     assert room.topics() == ("ts/v1/lab/sensors/arm/tele/joints", "ts/v1/lab/sensors/pir/tele/presence")
 
 
-def test_the_newest_reading_is_given_with_its_age_since_it_arrived(room: Room, clock: Clock) -> None:
+def test_the_newest_reading_is_given_with_its_age_since_it_arrived(room: ReadingCache, clock: Clock) -> None:
     assert room.latest("sensors-pir", "presence") is None
     hear(room, measured(present=1.0, at_ms=2**50))
     clock.now_s += 1.5
@@ -56,7 +56,7 @@ def test_the_newest_reading_is_given_with_its_age_since_it_arrived(room: Room, c
     assert room.latest("sensors-pir", "presence") == Reading({"present": 0.0}, 0.0)
 
 
-def test_an_own_device_is_named_by_its_name_or_its_id(room: Room) -> None:
+def test_an_own_device_is_named_by_its_name_or_its_id(room: ReadingCache) -> None:
     room.note("lamp", "light", measured(lux=80.0))
     assert room.latest("lamp", "light") == room.latest("own-lamp", "light") == Reading({"lux": 80.0}, 0.0)
     room.note("arm", "heat", measured(t_c=20.0))
@@ -64,7 +64,7 @@ def test_an_own_device_is_named_by_its_name_or_its_id(room: Room) -> None:
         room.latest("arm", "heat")
 
 
-def test_joints_are_read_by_their_place(room: Room) -> None:
+def test_joints_are_read_by_their_place(room: ReadingCache) -> None:
     telemetry = JointTelemetry(
         tick_ms=1,
         at_ms=1,
@@ -81,15 +81,15 @@ def test_joints_are_read_by_their_place(room: Room) -> None:
     assert (reading.values["position_rad.1"], reading.values["effort_nm.0"]) == (1.0, 1.0)
 
 
-def test_what_is_not_listened_to_is_refused_and_says_what_is(room: Room) -> None:
+def test_what_is_not_listened_to_is_refused_and_says_what_is(room: ReadingCache) -> None:
     with pytest.raises(Refused, match=r"name it under \[\[room\]\].*own-lamp/light, sensors-arm/joints") as refused:
         room.latest("sensors-door", "open")
     assert refused.value.code == "unknown_stream"
     with pytest.raises(Refused, match="There is: none"):
-        Room(space="lab", agent="own", own=["arm"]).latest("x-y", "z")
+        ReadingCache(space="lab", agent="own", own=["arm"]).latest("x-y", "z")
 
 
-def test_what_was_not_asked_for_costs_no_memory(room: Room) -> None:
+def test_what_was_not_asked_for_costs_no_memory(room: ReadingCache) -> None:
     for number in range(1000):
         hear(room, measured(present=1.0), topic(f"d{number}"))
     hear(room, measured(present=1.0), topic(space="elsewhere"))
@@ -98,7 +98,7 @@ def test_what_was_not_asked_for_costs_no_memory(room: Room) -> None:
 
 
 @pytest.mark.parametrize("payload", [b"", b"{}", b'{"tick_ms":1,"at_ms":1,"sequence":1,"values":{"present":NaN}}'])
-def test_what_cannot_be_read_changes_nothing(room: Room, payload: bytes) -> None:
+def test_what_cannot_be_read_changes_nothing(room: ReadingCache, payload: bytes) -> None:
     hear(room, measured(present=0.0))
     with pytest.raises(ProtocolError):
         room.receive(topic(), payload)
@@ -106,7 +106,7 @@ def test_what_cannot_be_read_changes_nothing(room: Room, payload: bytes) -> None
 
 
 def test_a_message_that_was_overtaken_is_left_out_but_a_sender_that_began_anew_is_heard(
-    room: Room, clock: Clock
+    room: ReadingCache, clock: Clock
 ) -> None:
     hear(room, measured(7, tick_ms=700, present=1.0))
     hear(room, measured(6, tick_ms=600, present=0.0))

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.harness.network.brokers import ROOT
+from tests.harness.paths import ROOT
 
 PAGE = (Path(ROOT) / "docs" / "add-a-sensor.md").read_text()
 FILES = dict(re.findall(r"<!-- file: (\S+) -->\n```\w+\n(.*?)```", PAGE, re.DOTALL))

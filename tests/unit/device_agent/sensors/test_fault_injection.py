@@ -11,7 +11,7 @@ from device_agent.ports.sensor import Camera, Image, Movable, RoomDriver, Sensor
 from device_agent.protocol.errors import ProtocolError
 from device_agent.protocol.manifests import room
 from device_agent.sensors.mujoco import fault_injection, scalar_sensors
-from device_agent.sensors.mujoco.fault_injection import WELL, Ailments, read
+from device_agent.sensors.mujoco.fault_injection import WELL, InjectedFaults, read
 from tests.harness.agent.rooms import LAB, StillWorld
 
 
@@ -136,7 +136,7 @@ def test_a_wrong_file_says_what_there_is(text: str, says: str) -> None:
     with pytest.raises(ProtocolError) as refused:
         read(text, ["co2", "image"])
     assert says in str(refused.value)
-    assert read("", []) == WELL == Ailments()
+    assert read("", []) == WELL == InjectedFaults()
 
 
 def test_a_path_of_faults_that_is_none_is_refused(world: StillWorld) -> None:

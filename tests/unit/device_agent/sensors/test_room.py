@@ -11,7 +11,7 @@ import pytest
 from device_agent.ports.sensor import Image, RoomDriver, Scan, SensorError, Surroundings
 from device_agent.protocol import Stream
 from device_agent.protocol.manifests import room
-from device_agent.protocol.manifests.room import RoomDevice
+from device_agent.protocol.manifests.room import RoomDeviceManifest
 from device_agent.sensors import load, names
 from device_agent.sensors import mujoco as simulated
 from device_agent.sensors.mujoco import cameras, shared_view
@@ -42,13 +42,13 @@ def lab() -> StillWorld:
     return StillWorld()
 
 
-def connected(world: StillWorld, device: RoomDevice | str) -> RoomDriver:
+def connected(world: StillWorld, device: RoomDeviceManifest | str) -> RoomDriver:
     driver = world.driver(device)
     driver.connect()
     return driver
 
 
-def changed(device: RoomDevice, **fields: object) -> RoomDevice:
+def changed(device: RoomDeviceManifest, **fields: object) -> RoomDeviceManifest:
     return msgspec.structs.replace(device, **fields)
 
 

@@ -4,7 +4,7 @@ import mujoco
 import numpy as np
 import pytest
 
-from device_agent.simulation.mjcf.equality_joints import Ties
+from device_agent.simulation.mjcf.equality_joints import EqualityJoints
 
 HAND = """
 <mujoco><compiler angle="radian"/>
@@ -45,13 +45,13 @@ def test_tied_joints_are_settled_where_the_physics_takes_them():
         mujoco.mj_step(model, data, nstep=4000)
         settled = data.qpos.copy()
         settled[[2, 3, 4]] = 9.0
-        Ties(model).settle(settled)
+        EqualityJoints(model).settle(settled)
         assert settled == pytest.approx(data.qpos, abs=2e-3)
 
 
 def test_each_is_told_by_what_is_not_tied_itself():
     model = model_of()
-    ties = Ties(model)
+    ties = EqualityJoints(model)
     assert [model.joint(tie.joint).name for tie in ties.all] == ["twice_a", "chained", "mixed"]
     assert ties.of(model.joint("chained").id) == pytest.approx({model.joint("a").id: 0.1})
     assert ties.of(model.joint("mixed").id) == pytest.approx({model.joint("a").id: 0.5, model.joint("b").id: -0.25})
@@ -65,11 +65,11 @@ def test_a_ring_of_ties_and_one_that_is_switched_off_are_left_alone():
         '<joint joint1="free_one" joint2="mixed"/><joint joint1="mixed" joint2="free_one"/></equality>',
     ).replace('<tendon tendon1="mix"', '<tendon active="false" tendon1="mix"')
     model = model_of(ring)
-    assert [model.joint(tie.joint).name for tie in Ties(model).all] == ["twice_a", "chained"]
+    assert [model.joint(tie.joint).name for tie in EqualityJoints(model).all] == ["twice_a", "chained"]
 
 
 def test_a_model_without_ties_is_left_as_it_is():
     model = model_of("<mujoco><worldbody><body><joint/><geom size='.1'/></body></worldbody></mujoco>")
     qpos = np.array([0.7])
-    Ties(model).settle(qpos)
+    EqualityJoints(model).settle(qpos)
     assert qpos.tolist() == [0.7]

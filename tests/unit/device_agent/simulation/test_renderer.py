@@ -16,10 +16,12 @@ def lab() -> StillWorld:
     return StillWorld()
 
 
-def drawn(lab: StillWorld, camera: str, monkeypatch: pytest.MonkeyPatch, *, depth: bool) -> tuple[renderer.Shot, ...]:
+def drawn(
+    lab: StillWorld, camera: str, monkeypatch: pytest.MonkeyPatch, *, depth: bool
+) -> tuple[renderer.RenderRequest, ...]:
     """A picture as it is, and one with everything in it, by the same lamps."""
     wish = (mujoco.mj_name2id(lab.model, mujoco.mjtObj.mjOBJ_CAMERA, camera), SIZE[0], SIZE[1])
-    seen = renderer.Studio(lab)
+    seen = renderer.Renderer(lab)
     seen.open()
     try:
         quick = seen.shoot(wish[0], width=wish[1], height=wish[2], depth=depth)

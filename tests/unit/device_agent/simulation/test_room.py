@@ -18,8 +18,8 @@ from device_agent.simulation import world_registry
 from device_agent.simulation.room.climate import Climate, water_g_m3
 from device_agent.simulation.room.pedestrian import Walker
 from device_agent.simulation.room.sound import heard_db
+from tests.harness.paths import ROBOTS
 
-ROBOTS = Path(__file__).parents[3] / "robots"
 LAB = ROBOTS / "rooms" / "lab"
 MANIFEST = room.load(LAB)
 

@@ -15,9 +15,9 @@ from device_agent.drivers.mujoco import draw
 from device_agent.ports.driver import DriverError
 from device_agent.protocol import Twin, codec
 from device_agent.protocol.manifests import robot_type
-from device_agent.simulation.mjcf.equality_joints import Ties
+from device_agent.simulation.mjcf.equality_joints import EqualityJoints
+from tests.harness.paths import ROBOTS
 
-ROBOTS = Path(__file__).parents[3] / "robots"
 FOLDERS = sorted(path.parent for path in ROBOTS.glob("*/robot.toml"))
 Matrix = npt.NDArray[np.float64]
 
@@ -76,7 +76,7 @@ def drawn_geoms(model: Any, base: int, *, scenery: bool) -> list[int]:
 
 def assert_same_poses(model: Any, twin: Twin, base: int, *, scenery: bool) -> None:
     data = mujoco.MjData(model)
-    random, ties = np.random.default_rng(11), Ties(model)
+    random, ties = np.random.default_rng(11), EqualityJoints(model)
     for _ in range(100):
         position = {}
         for joint in range(model.njnt):

@@ -17,8 +17,8 @@ from device_agent.ports.driver import DriverError
 from device_agent.protocol.manifests import robot_type
 from device_agent.simulation.scene_assembly import TIMESTEP_S
 from device_agent.simulation.world import LATE_STEPS, MAX_CATCH_UP_S
+from tests.harness.paths import UR5
 
-UR5 = Path(__file__).parents[3] / "robots" / "ur5"
 HOME = robot_type.load(UR5).home_rad
 ALL = np.arange(6)
 

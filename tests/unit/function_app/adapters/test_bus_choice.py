@@ -8,8 +8,8 @@ import pytest
 
 from function_app import bootstrap, settings
 from function_app.settings import EventGridBus, EventGridWebhook, IotBus, Settings, SettingsError
+from tests.harness.paths import ROOT
 
-ROOT = Path(__file__).resolve().parents[3]
 IOT = {
     "TELESCOPE_BUS": "iot",
     "TELESCOPE_AWS_REGION": "eu-west-1",

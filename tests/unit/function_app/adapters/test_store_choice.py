@@ -8,8 +8,8 @@ import pytest
 
 from function_app import bootstrap, settings
 from function_app.settings import AwsStore, AzureStore, Settings, SettingsError
+from tests.harness.paths import ROOT
 
-ROOT = Path(__file__).resolve().parents[3]
 CONNECTION = "DefaultEndpointsProtocol=https;AccountName=a;AccountKey=c2VjcmV0;EndpointSuffix=core.windows.net"
 AZURE = {"TELESCOPE_STORE": "azure", "TELESCOPE_STORAGE_CONNECTION": CONNECTION}
 IDENTITY = {

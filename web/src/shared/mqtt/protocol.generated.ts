@@ -385,7 +385,7 @@ export interface Command {
   ttl_ms: number;
   who: string;
   epoch: number;
-  request: GrantLease | ReleaseLease | AskLease | DropRequest | RunMovement | MoveJoints | MovePose | Say | Express | TakePosture | RunBehaviour | SetStiffness | LookAt | Drive | GoTo | Gather | Shoot | CaptureRaw | SetControl | CancelAction | StopDevice | ResetStop | FollowKey;
+  request: GrantLease | ReleaseLease | RequestControl | WithdrawRequest | RunMovement | MoveJoints | MovePose | Say | Express | TakePosture | RunBehaviour | SetStiffness | LookAt | Drive | GoTo | CollectData | TakePicture | CaptureRaw | SetControl | CancelAction | StopDevice | ResetStop | RotateKey;
 }
 
 /**
@@ -406,7 +406,7 @@ export interface ReleaseLease {
 }
 
 /** Show the holder, and everybody, that somebody asks for control. Changes nothing else; lapses by itself. */
-export interface AskLease {
+export interface RequestControl {
   kind: "ask_lease";
   /** letters, digits, _ and -, 1 to 64 of them */
   request: string;
@@ -415,7 +415,7 @@ export interface AskLease {
 }
 
 /** Nobody asks any more: refused, or withdrawn. */
-export interface DropRequest {
+export interface WithdrawRequest {
   kind: "drop_request";
   /** letters, digits, _ and -, 1 to 64 of them */
   request: string;
@@ -536,7 +536,7 @@ export interface GoTo {
 }
 
 /** Measure these streams of a room device at this rate for a time, then again as before; no streams: all. */
-export interface Gather {
+export interface CollectData {
   kind: "gather";
   streams?: string[];
   rate_hz: number;
@@ -544,7 +544,7 @@ export interface Gather {
 }
 
 /** Measure these streams of a room device once, now; no streams: all. The result has the `values`. */
-export interface Shoot {
+export interface TakePicture {
   kind: "shoot";
   streams?: string[];
 }
@@ -592,7 +592,7 @@ export interface ResetStop {
  *
  * Changes nothing else, and takes the device from nobody.
  */
-export interface FollowKey {
+export interface RotateKey {
   kind: "follow_key";
   statements: string[];
 }

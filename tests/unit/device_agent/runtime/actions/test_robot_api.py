@@ -37,13 +37,13 @@ from device_agent.protocol import (
     topics,
 )
 from device_agent.protocol.manifests.robot_type import Base, Gaze, RobotType
-from device_agent.runtime.actions.device_context import Body
-from device_agent.runtime.actions.robot_api import ScriptRobot
+from device_agent.runtime.actions.device_context import DeviceContext
+from device_agent.runtime.actions.robot_api import RobotApi
 from device_agent.runtime.authority.lease_gate import LeaseGate
 from device_agent.runtime.control.controller import Controller
 from device_agent.runtime.errors import Refused
 from device_agent.runtime.planning import gaze
-from device_agent.runtime.readings import Room
+from device_agent.runtime.readings import ReadingCache
 from tests.fakes.drivers import ToyDriver, robot_type
 from tests.harness.agent.device_harness import Bench, eventually
 from tests.harness.agent.sandbox import LACK, NoJail
@@ -376,9 +376,9 @@ def test_an_agent_that_is_shut_down_ends_the_script(bench: Bench) -> None:
 
 
 def test_a_script_reads_what_the_room_measured() -> None:
-    room = Room(space="s", agent="a", own=["arm"], named=[("b-pir", "presence")])
+    room = ReadingCache(space="s", agent="a", own=["arm"], named=[("b-pir", "presence")])
     body = replace(body_of(robot_type()), room=room)
-    robot = ScriptRobot(body)
+    robot = RobotApi(body)
     asked = script_calls.AskLatest(device="b-pir", stream="presence")
     assert robot.do(asked) is None
     measured = Measurements(tick_ms=1, at_ms=1, sequence=1, values={"present": True, "distance_m": 1.5})
@@ -391,17 +391,19 @@ def test_a_script_reads_what_the_room_measured() -> None:
 # ---------------------------------------------------------------- without a device around it
 
 
-def body_of(kind: RobotType, *, seen: bool = True, able: AbleDriver | None = None, head: Head | None = None) -> Body:
+def body_of(
+    kind: RobotType, *, seen: bool = True, able: AbleDriver | None = None, head: Head | None = None
+) -> DeviceContext:
     observation = Observation((0.0, 0.0), (0.0, 0.0), (0.0, 0.0), ())
     controller = Controller(kind, LeaseGate())
     controller.start_at((0.0, 0.0))
-    return Body(
+    return DeviceContext(
         robot_type=kind,
         controller=controller,
         observe=lambda: observation if seen else None,
         geometry=head,
         skills=able,
-        room=Room(space="s", agent="a", own=["arm"]),
+        room=ReadingCache(space="s", agent="a", own=["arm"]),
     )
 
 
@@ -415,7 +417,7 @@ def test_before_the_first_measurement_there_is_no_state() -> None:
 def test_a_robot_that_has_ended_performs_nothing_more() -> None:
     able = AbleDriver()
     kind = msgspec.structs.replace(able_type(), gaze=None, capabilities=("gaze", "speech"))
-    robot = ScriptRobot(body_of(kind, able=able))
+    robot = RobotApi(body_of(kind, able=able))
     robot._look((1.0, 0.0, 0.0), 0.5)
     assert able.performed == [skills.LookAt((1.0, 0.0, 0.0), 0.5)]
     robot.end()
@@ -425,7 +427,7 @@ def test_a_robot_that_has_ended_performs_nothing_more() -> None:
 
 
 def test_without_model_or_skills_nothing_is_guessed() -> None:
-    robot = ScriptRobot(body_of(robot_type()))
+    robot = RobotApi(body_of(robot_type()))
     with pytest.raises(Refused, match="no model"):
         robot._shape()
     with pytest.raises(Refused, match="no skills"):
@@ -450,7 +452,7 @@ def test_a_gaze_that_cannot_turn_far_enough_says_so() -> None:
 
 
 def test_nothing_is_left_of_a_tenure_that_nobody_has() -> None:
-    robot = ScriptRobot(body_of(robot_type()))
+    robot = RobotApi(body_of(robot_type()))
     robot.tenure.on_lost(Refused("x", "y"))
     robot.give_back()
     assert robot.over.is_set()

@@ -12,7 +12,7 @@ from typing import Any
 import pytest
 
 from device_agent.ports import script_calls
-from device_agent.ports.sandbox import JailError, Limits, Standing
+from device_agent.ports.sandbox import JailError, Limits, SandboxStatus
 from device_agent.protocol import RunMovement
 from device_agent.runtime.actions import script_action
 from device_agent.runtime.actions.script_action import Cell, Script, ScriptFailed
@@ -89,8 +89,8 @@ class FakeJail:
     def start(self) -> None:
         pass
 
-    def standing(self) -> Standing:
-        return Standing("jailed")
+    def standing(self) -> SandboxStatus:
+        return SandboxStatus("jailed")
 
     def refusal(self, *, stranger: bool) -> str | None:
         del stranger

@@ -8,7 +8,7 @@ import pytest
 
 from device_agent.protocol import SHIPPED, RunMovement
 from device_agent.protocol.security import signing
-from device_agent.runtime.actions.script_policy import Trust
+from device_agent.runtime.actions.script_policy import ScriptPolicy
 from device_agent.runtime.errors import Refused
 from device_agent.runtime.storage.journal import Journal
 from tests.harness.agent.device_harness import signed_movement
@@ -25,16 +25,16 @@ def journal(tmp_path: Path) -> Iterator[Journal]:
     journal.close()
 
 
-def trust_of(journal: Journal, *, device: str = "arm", owner: str = OWNER) -> Trust:
+def trust_of(journal: Journal, *, device: str = "arm", owner: str = OWNER) -> ScriptPolicy:
     keys = {signing.key_id(KEY.public_key()): KEY.public_key()}
-    return Trust(device=device, robot_type="toy", owner=owner, keys=keys, journal=journal)
+    return ScriptPolicy(device=device, robot_type="toy", owner=owner, keys=keys, journal=journal)
 
 
 def movement(version: int = 1, author: str = OWNER) -> RunMovement:
     return signed_movement("print(1)", KEY, version=version, author=author)
 
 
-def refusal(trust: Trust, order: RunMovement) -> str:
+def refusal(trust: ScriptPolicy, order: RunMovement) -> str:
     with pytest.raises(Refused) as refused:
         trust.check(order)
     return refused.value.code

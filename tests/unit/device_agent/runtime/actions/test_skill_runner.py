@@ -28,10 +28,10 @@ from device_agent.protocol import (
 )
 from device_agent.protocol.manifests.capabilities import Keyframe
 from device_agent.protocol.manifests.robot_type import RobotType
-from device_agent.runtime.actions.device_context import Body
-from device_agent.runtime.actions.skill_runner import Performer
-from device_agent.runtime.actions.speech_output import Speaker
-from device_agent.runtime.control.joint_stiffness import Slack
+from device_agent.runtime.actions.device_context import DeviceContext
+from device_agent.runtime.actions.skill_runner import SkillRunner
+from device_agent.runtime.actions.speech_output import SpeechOutput
+from device_agent.runtime.control.joint_stiffness import JointStiffness
 from device_agent.runtime.errors import Refused
 from tests.fakes.drivers import ToyDriver, robot_type
 from tests.harness.agent.device_harness import Bench, eventually
@@ -214,17 +214,17 @@ def test_stop_ends_speech_without_a_mouth(tmp_path: Path) -> None:
 @pytest.mark.parametrize(("text", "language", "says"), [("  ", "", "nothing to say"), ("a", "-v x", "no language")])
 def test_what_cannot_be_said_is_refused(text: str, language: str, says: str) -> None:
     with pytest.raises(Refused, match=says):
-        Speaker().prepare(text, language)
+        SpeechOutput().prepare(text, language)
 
 
 def test_a_speaker_whom_nobody_hears_begins_all_the_same() -> None:
-    speaker = Speaker()
+    speaker = SpeechOutput()
     speaker.begin(speaker.prepare("hello", ""))
 
 
 def test_who_stands_around_hears_for_how_long_something_is_said() -> None:
     heard: list[float] = []
-    speaker = Speaker(heard=heard.append)
+    speaker = SpeechOutput(heard=heard.append)
     said = speaker.prepare("hello, how are you today", "")
     assert heard == []
     speaker.begin(said)
@@ -332,7 +332,7 @@ def test_a_stiffness_that_is_none_is_refused(bench: Bench, request_: Any, says: 
 
 
 def test_a_limp_joint_beyond_its_range_is_commanded_to_its_end() -> None:
-    slack = Slack(robot_type())
+    slack = JointStiffness(robot_type())
     slack.set({"elbow": 0.0})
     assert slack.feel((0.5, 3.3)) == {1: 3.0}
 
@@ -357,7 +357,7 @@ class Restless:
 def test_what_still_moves_is_waited_for_and_a_lost_action_does_not_wait() -> None:
     mover: Any = Late()
     controller: Any = Restless()
-    body = Body(
+    body = DeviceContext(
         robot_type=actor(),
         controller=controller,
         observe=lambda: None,
@@ -367,4 +367,4 @@ def test_what_still_moves_is_waited_for_and_a_lost_action_does_not_wait() -> Non
     )
     threading.Timer(0.1, mover.over.set).start()
     with pytest.raises(Refused, match="the action ended"):
-        Performer(body, mover).come_to_rest()
+        SkillRunner(body, mover).come_to_rest()

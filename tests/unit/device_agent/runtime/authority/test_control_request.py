@@ -2,22 +2,22 @@
 
 import pytest
 
-from device_agent.protocol import AskLease
-from device_agent.runtime.authority.control_request import Handover
+from device_agent.protocol import RequestControl
+from device_agent.runtime.authority.control_request import PendingControlRequest
 from device_agent.runtime.authority.lease_gate import Lease
 from device_agent.runtime.errors import Refused
 
 LEASE = Lease("ann", 5, 1_000.0)
-ASKED = AskLease(request="r1", by="bob", answer_within_ms=30_000)
+ASKED = RequestControl(request="r1", by="bob", answer_within_ms=30_000)
 
 
-def asked(handover: Handover, lease: Lease | None = LEASE, now_s: float = 100.0) -> str | None:
+def asked(handover: PendingControlRequest, lease: Lease | None = LEASE, now_s: float = 100.0) -> str | None:
     found = handover.current(lease, now_s)
     return None if found is None else found.id
 
 
 def test_a_request_is_shown_until_its_time_is_over() -> None:
-    handover = Handover()
+    handover = PendingControlRequest()
     assert asked(handover) is None
     handover.ask(ASKED, epoch=5, lease=LEASE, now_s=100.0)
     shown = handover.current(LEASE, 129.9)
@@ -29,7 +29,7 @@ def test_a_request_is_shown_until_its_time_is_over() -> None:
 
 @pytest.mark.parametrize("lease", [None, Lease("ann", 6, 1_000.0)])
 def test_it_ends_with_the_lease_that_it_asks_for(lease: Lease | None) -> None:
-    handover = Handover()
+    handover = PendingControlRequest()
     handover.ask(ASKED, epoch=5, lease=LEASE, now_s=100.0)
     assert asked(handover, lease) is None
     assert asked(handover) is None
@@ -37,7 +37,7 @@ def test_it_ends_with_the_lease_that_it_asks_for(lease: Lease | None) -> None:
 
 @pytest.mark.parametrize(("epoch", "lease"), [(4, LEASE), (6, LEASE), (5, None)])
 def test_a_lease_that_is_not_in_force_cannot_be_asked_for(epoch: int, lease: Lease | None) -> None:
-    handover = Handover()
+    handover = PendingControlRequest()
     with pytest.raises(Refused) as refused:
         handover.ask(ASKED, epoch=epoch, lease=lease, now_s=100.0)
     assert refused.value.code == "no_lease"
@@ -45,11 +45,11 @@ def test_a_lease_that_is_not_in_force_cannot_be_asked_for(epoch: int, lease: Lea
 
 
 def test_the_end_of_a_request_counts_even_before_the_request_itself_and_for_no_other() -> None:
-    handover = Handover()
+    handover = PendingControlRequest()
     handover.drop("r1")
     handover.ask(ASKED, epoch=5, lease=LEASE, now_s=100.0)
     assert asked(handover) is None
-    handover.ask(AskLease(request="r2", by="cid", answer_within_ms=1_000), epoch=5, lease=LEASE, now_s=100.0)
+    handover.ask(RequestControl(request="r2", by="cid", answer_within_ms=1_000), epoch=5, lease=LEASE, now_s=100.0)
     handover.drop("r1")
     assert asked(handover) == "r2"
     handover.drop("r2")

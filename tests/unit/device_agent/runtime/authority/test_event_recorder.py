@@ -2,17 +2,17 @@
 
 from device_agent.protocol.events import EventKind
 from device_agent.runtime.authority import event_recorder as module
-from device_agent.runtime.authority.event_recorder import GAP_S, Audit, Happened, to_nobody
+from device_agent.runtime.authority.event_recorder import GAP_S, EventRecord, EventRecorder, ignore_event
 
 
-def refusal(message: str = "too late") -> Happened:
-    return Happened(EventKind.SETPOINTS_REFUSED, message, "warning", {"code": "too_old"})
+def refusal(message: str = "too late") -> EventRecord:
+    return EventRecord(EventKind.SETPOINTS_REFUSED, message, "warning", {"code": "too_old"})
 
 
 def test_facts_come_out_once_in_their_order_with_their_own_time() -> None:
-    audit = Audit()
-    audit.note(Happened(EventKind.LEASE_GRANTED, "ann took control", at_ms=5))
-    audit.note(Happened(EventKind.LEASE_ENDED, "ann let go"))
+    audit = EventRecorder()
+    audit.note(EventRecord(EventKind.LEASE_GRANTED, "ann took control", at_ms=5))
+    audit.note(EventRecord(EventKind.LEASE_ENDED, "ann let go"))
     first, second = audit.take(0.0)
     assert (first.kind, first.at_ms) == (EventKind.LEASE_GRANTED, 5)
     assert second.kind is EventKind.LEASE_ENDED
@@ -21,7 +21,7 @@ def test_facts_come_out_once_in_their_order_with_their_own_time() -> None:
 
 
 def test_a_flood_of_refusals_is_told_at_once_and_then_with_its_count() -> None:
-    audit = Audit()
+    audit = EventRecorder()
     for _ in range(1000):
         audit.refused(refusal(), code="too_old", now_s=10.0)
     (first,) = audit.take(10.0)
@@ -35,7 +35,7 @@ def test_a_flood_of_refusals_is_told_at_once_and_then_with_its_count() -> None:
 
 
 def test_at_the_end_a_flood_is_told_however_young_it_is() -> None:
-    audit = Audit()
+    audit = EventRecorder()
     audit.refused(refusal(), code="too_old", now_s=10.0)
     audit.refused(refusal("later"), code="too_old", now_s=10.1)
     first, last = audit.take(float("inf"))
@@ -43,7 +43,7 @@ def test_at_the_end_a_flood_is_told_however_young_it_is() -> None:
 
 
 def test_different_codes_are_told_by_themselves_up_to_a_bound_and_the_rest_is_counted() -> None:
-    audit = Audit()
+    audit = EventRecorder()
     for number in range(module._MOST_COUNTED + 3):
         audit.refused(refusal(), code=f"code{number}", now_s=0.0)
     told = audit.take(0.0)
@@ -53,13 +53,13 @@ def test_different_codes_are_told_by_themselves_up_to_a_bound_and_the_rest_is_co
 
 
 def test_an_office_that_is_stuck_costs_no_memory() -> None:
-    audit = Audit()
+    audit = EventRecorder()
     for _ in range(module._MOST_WAITING + 7):
-        audit.note(Happened(EventKind.HELD, "held"))
+        audit.note(EventRecord(EventKind.HELD, "held"))
     told = audit.take(0.0)
     assert len(told) == module._MOST_WAITING + 1
     assert told[-1].data == {"count": 7}
 
 
 def test_nobody_needs_to_listen() -> None:
-    to_nobody(refusal())
+    ignore_event(refusal())

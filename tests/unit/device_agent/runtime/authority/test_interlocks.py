@@ -8,7 +8,7 @@ import pytest
 from device_agent.protocol import Measurements
 from device_agent.protocol.events import EventKind
 from device_agent.runtime.authority.interlocks import Interlock, Interlocks
-from device_agent.runtime.readings import Reading, Room
+from device_agent.runtime.readings import Reading, ReadingCache
 
 
 def rule(**fields: Any) -> Interlock:
@@ -83,7 +83,7 @@ class Bench:
         self.told: list[Any] = []
         self.sequence = 0
         named = [(each.device, each.stream) for each in rules]
-        self.room = Room(space="lab", agent="own", own=["pir"], named=named, clock_s=lambda: self.now_s)
+        self.room = ReadingCache(space="lab", agent="own", own=["pir"], named=named, clock_s=lambda: self.now_s)
         self.interlocks = Interlocks(
             rules,
             self.room,

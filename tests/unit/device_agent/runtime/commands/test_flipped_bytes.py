@@ -6,7 +6,7 @@ import pytest
 from device_agent.protocol import Command, GrantLease, Request, RunMovement, codec
 from device_agent.protocol.errors import ProtocolError, SignatureError
 from device_agent.protocol.security import signing
-from device_agent.runtime.actions.script_policy import Trust
+from device_agent.runtime.actions.script_policy import ScriptPolicy
 from device_agent.runtime.errors import Refused
 from tests.harness.agent.device_harness import signed_movement
 from tests.harness.agent.pinned_keys import pins_of
@@ -51,8 +51,8 @@ class _NoJournal:
         return 0
 
 
-def trust() -> Trust:
-    return Trust(device="arm", robot_type="toy", owner="", keys=PINS, journal=_NoJournal())  # type: ignore[arg-type]
+def trust() -> ScriptPolicy:
+    return ScriptPolicy(device="arm", robot_type="toy", owner="", keys=PINS, journal=_NoJournal())  # type: ignore[arg-type]
 
 
 def test_no_byte_of_a_movement_may_differ_though_the_order_around_it_is_signed_anew() -> None:

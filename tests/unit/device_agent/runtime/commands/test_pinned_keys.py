@@ -5,11 +5,11 @@ from pathlib import Path
 import pytest
 from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
 
-from device_agent.config.agent_config import Home, HomeError, Pairing
+from device_agent.config.agent_config import ConfigError, Home, Pairing
 from device_agent.protocol import codec
 from device_agent.protocol.security import signing
 from device_agent.protocol.security.key_rotation import KEYS_CONTEXT, NewKey
-from device_agent.runtime.commands.pinned_keys import Pins
+from device_agent.runtime.commands.pinned_keys import PinnedKeys
 from device_agent.runtime.errors import Refused
 
 FIRST, SECOND, THIRD = (signing.generate() for _ in range(3))
@@ -37,10 +37,10 @@ class Kept:
         self.home.save_pairing(Pairing(agent="a", space="s", account="ann", keys=keys))
         self.pins = self.load()
 
-    def load(self) -> Pins:
+    def load(self) -> PinnedKeys:
         pairing = self.home.pairing()
         assert pairing is not None
-        return Pins(pairing, save=self.home.save_pairing, now_ms=lambda: self.now_ms)
+        return PinnedKeys(pairing, save=self.home.save_pairing, now_ms=lambda: self.now_ms)
 
 
 @pytest.fixture
@@ -48,7 +48,7 @@ def kept(tmp_path: Path) -> Kept:
     return Kept(tmp_path / "agent")
 
 
-def refusal(pins: Pins, *statements: str) -> str:
+def refusal(pins: PinnedKeys, *statements: str) -> str:
     before = dict(pins), pins.serial
     with pytest.raises(Refused) as refused:
         pins.follow(statements)
@@ -77,7 +77,7 @@ def test_it_is_written_down_before_it_counts(kept: Kept, tmp_path: Path) -> None
 
 def test_a_key_that_cannot_be_written_down_does_not_count(kept: Kept, monkeypatch: pytest.MonkeyPatch) -> None:
     def full(_: Pairing) -> None:
-        raise HomeError("no space left on device")
+        raise ConfigError("no space left on device")
 
     monkeypatch.setattr(kept.pins, "_save", full)
     assert refusal(kept.pins, statement(SECOND, FIRST, 2)) == "journal"

@@ -9,7 +9,7 @@ from device_agent.protocol import JointTelemetry
 from device_agent.runtime.authority.lease_gate import LeaseGate
 from device_agent.runtime.control.control_loop import ControlLoop
 from device_agent.runtime.control.controller import Controller
-from device_agent.runtime.control.goals import Outcome
+from device_agent.runtime.control.goals import GoalResult
 from tests.fakes.drivers import BASE, ToyDriver, robot_type
 from tests.harness.agent.controller_fixture import lost
 
@@ -57,7 +57,7 @@ def test_the_driver_is_told_the_twist_until_the_drive_has_ended() -> None:
         drive = controller.drive(tenure, Twist(0.2), duration_s=0.3)
         assert cart.drove.wait(WITHIN_S)
         assert drive.finished.wait(WITHIN_S)
-        assert drive.outcome is Outcome.REACHED
+        assert drive.outcome is GoalResult.REACHED
     finally:
         loop.stop()
     assert 0 < max(twist.forward_m_s for twist in cart.twists) <= 0.2 + 1e-9

@@ -3,7 +3,7 @@
 import pytest
 
 from device_agent.protocol import Mode, StopLatch
-from device_agent.runtime.control.goals import Outcome
+from device_agent.runtime.control.goals import GoalResult
 from device_agent.runtime.errors import Refused
 from tests.fakes.drivers import PERIOD_S
 from tests.harness.agent.controller_fixture import Rig, interruptions, lost
@@ -180,7 +180,7 @@ def test_a_move_reaches_its_target_and_says_so() -> None:
     tenure = rig.controller.begin_action(epoch=1, on_lost=lost)
     move = rig.controller.move(tenure, {"elbow": 1.0}, speed=1.0)
     rig.run(2.0)
-    assert move.outcome is Outcome.REACHED
+    assert move.outcome is GoalResult.REACHED
     assert rig.elbow == pytest.approx(1.0, abs=1e-4)
     rig.controller.end_action(tenure)
     assert rig.run(0.1) is Mode.IDLE
@@ -207,7 +207,7 @@ def test_an_action_that_loses_the_device_moves_it_no_more(cause: str) -> None:
     rig.run(0.5)
     interruptions()[cause](rig)  # type: ignore[operator]
     rig.run(0.3)
-    assert move.outcome is Outcome.INTERRUPTED
+    assert move.outcome is GoalResult.INTERRUPTED
     assert len(why) == 1
     assert not rig.controller.moving
     with pytest.raises(Refused):

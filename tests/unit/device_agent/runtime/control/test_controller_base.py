@@ -8,7 +8,7 @@ import pytest
 from device_agent.ports.driver import REST, Twist
 from device_agent.protocol import StopLatch
 from device_agent.runtime.control.base_motion import BaseMotion
-from device_agent.runtime.control.goals import Drive, Outcome
+from device_agent.runtime.control.goals import DriveGoal, GoalResult
 from device_agent.runtime.control.joint_motion import MotionError
 from device_agent.runtime.errors import Refused
 from tests.fakes.drivers import BASE, PERIOD_S
@@ -23,7 +23,7 @@ def twists(rig: Rig, seconds: float) -> list[Twist]:
     return found
 
 
-def driving(rig: Rig, duration_s: float = 2.0) -> Drive:
+def driving(rig: Rig, duration_s: float = 2.0) -> DriveGoal:
     tenure = rig.controller.begin_action(epoch=1, on_lost=lost)
     return rig.controller.drive(tenure, Twist(0.4, 0.0, -0.5), duration_s=duration_s)
 
@@ -37,7 +37,7 @@ def test_a_drive_speeds_up_keeps_its_twist_and_ends_by_itself() -> None:
     gains = [(b.forward_m_s - a.forward_m_s) / PERIOD_S for a, b in pairwise(found)]
     assert max(gains) <= BASE.max_linear_acceleration_m_s2 + 1e-6
     assert twists(rig, 0.3)[-1] == pytest.approx(REST, abs=1e-6)
-    assert drive.outcome is Outcome.REACHED
+    assert drive.outcome is GoalResult.REACHED
     assert rig.elbow == 0.0
 
 
@@ -50,7 +50,7 @@ def test_whatever_takes_the_device_away_brakes_the_base(cause: str) -> None:
     assert rig.controller.moving
     interruptions()[cause](rig)  # type: ignore[operator]
     assert twists(rig, 0.3)[-1] == pytest.approx(REST, abs=1e-6)
-    assert drive.outcome is Outcome.INTERRUPTED
+    assert drive.outcome is GoalResult.INTERRUPTED
     assert not rig.controller.moving
 
 
@@ -84,10 +84,10 @@ def test_a_drive_takes_the_place_of_a_move_and_the_other_way_round() -> None:
     rig.run(0.3)
     drive = rig.controller.drive(tenure, Twist(0.4), duration_s=5.0)
     rig.run(0.5)
-    assert (move.outcome, move.why and move.why.code) == (Outcome.INTERRUPTED, "replaced")
+    assert (move.outcome, move.why and move.why.code) == (GoalResult.INTERRUPTED, "replaced")
     rig.controller.move(tenure, {"elbow": 0.0}, speed=1.0)
     rig.run(2.0)
-    assert drive.outcome is Outcome.INTERRUPTED
+    assert drive.outcome is GoalResult.INTERRUPTED
     assert not rig.controller.moving
 
 
@@ -151,7 +151,7 @@ def test_an_action_may_end_while_it_drives() -> None:
     rig.controller.end_action(tenure)
     rig.controller.end_action(tenure)
     assert twists(rig, 0.3)[-1] == pytest.approx(REST, abs=1e-6)
-    assert drive.outcome is Outcome.INTERRUPTED
+    assert drive.outcome is GoalResult.INTERRUPTED
 
 
 def test_two_parts_of_a_period_brake_a_base_as_much_as_a_whole_one() -> None:

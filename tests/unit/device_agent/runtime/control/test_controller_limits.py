@@ -10,10 +10,10 @@ from ruckig import InputParameter, Result, Ruckig, RuckigError, Trajectory
 from device_agent.ports.geometry import Sweep
 from device_agent.protocol import Mode
 from device_agent.protocol.manifests.robot_type import Workspace
-from device_agent.runtime.control.goals import Outcome
-from device_agent.runtime.control.joint_motion import Motion, MotionError, plan
-from device_agent.runtime.control.latency_limiter import Pace
-from device_agent.runtime.control.limits import Envelope
+from device_agent.runtime.control.goals import GoalResult
+from device_agent.runtime.control.joint_motion import JointMotion, MotionError, plan
+from device_agent.runtime.control.latency_limiter import LatencyLimiter
+from device_agent.runtime.control.limits import MotionLimits
 from device_agent.runtime.errors import Refused
 from tests.fakes.drivers import PERIOD_S, robot_type
 from tests.harness.agent.controller_fixture import WALL_RAD, Rig, Wall, lost
@@ -51,7 +51,7 @@ def test_a_wall_that_is_met_at_full_speed_is_not_touched() -> None:
     rig.controller._envelope._geometry = wall
     rig.run(3.0)
     assert 1.9 < rig.elbow <= 2.0
-    assert move.outcome is Outcome.INTERRUPTED
+    assert move.outcome is GoalResult.INTERRUPTED
     assert move.why is not None
     assert (move.why.code, "hand \u2013 wall" in move.why.message) == ("no_room", True)
     assert move.limited == ("clearance: hand \u2013 wall",)
@@ -149,7 +149,7 @@ def test_where_nobody_knows_the_shape_age_alone_slows() -> None:
 
 
 def test_one_late_answer_is_no_slow_link() -> None:
-    pace = Pace(None, watchdog_s=0.3, oldest_s=0.2)
+    pace = LatencyLimiter(None, watchdog_s=0.3, oldest_s=0.2)
     assert pace.age_s == 0.0
     for _ in range(50):
         pace.heard(0.03)
@@ -202,7 +202,7 @@ def test_a_new_order_in_the_middle_of_hard_braking_does_not_turn_the_arm_round()
 
 
 def test_a_motion_without_a_way_to_brake_is_an_error() -> None:
-    motion = Motion(robot_type())
+    motion = JointMotion(robot_type())
     motion.follow([1.0, 1.0])
     motion._braking = math.nan
     with pytest.raises(MotionError):
@@ -255,10 +255,10 @@ def test_it_says_what_it_holds_and_what_it_cannot_know() -> None:
     assert Rig(geometry=Wall()).controller.limits == (*known, "clearance")
     box = Workspace(lower_m=(-1, -1, 0), upper_m=(1, 1, 1), frames=("hand",))
     kind = msgspec.structs.replace(robot_type(), workspace=box)
-    assert Envelope(kind, Wall()).limits == (*known, "clearance", "workspace")
+    assert MotionLimits(kind, Wall()).limits == (*known, "clearance", "workspace")
 
 
 def test_a_path_that_leads_nowhere_is_not_looked_at() -> None:
-    envelope = Envelope(robot_type(), Wall(-1.0))
+    envelope = MotionLimits(robot_type(), Wall(-1.0))
     assert envelope.blocked([[0.0, 0.0], [0.0, 0.0]]) is None
     assert envelope.blocked([[0.0, 0.0], [0.0, 0.1]]) is not None

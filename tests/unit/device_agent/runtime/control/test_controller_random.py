@@ -21,7 +21,7 @@ from tests.harness.agent.controller_fixture import Rig, Wall
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
 
-    from device_agent.runtime.authority.authority import Tenure
+    from device_agent.runtime.authority.authority import Reservation
 
     Target = JointTarget | JogTarget | DriveTarget
 
@@ -80,7 +80,7 @@ class Chance:
         self.now_s = 100.0
         self.epoch = 0
         self.sequence = 0
-        self.tenure: Tenure | None = None
+        self.tenure: Reservation | None = None
         self.may_move_until_s = -1.0
         self.position = [0.0, 0.0]
         self.velocity, self.passed_s = [0.0, 0.0], PERIOD_S

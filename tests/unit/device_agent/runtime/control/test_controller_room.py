@@ -6,7 +6,7 @@ import pytest
 
 from device_agent.protocol import Mode
 from device_agent.runtime.authority.speed_restrictions import Restriction, Restrictions
-from device_agent.runtime.control.goals import Outcome
+from device_agent.runtime.control.goals import GoalResult
 from device_agent.runtime.errors import Refused
 from tests.harness.agent.controller_fixture import Rig, lost
 
@@ -54,7 +54,7 @@ def test_a_move_in_mid_motion_is_slowed_and_goes_on_when_the_zone_is_free() -> N
     assert not move.finished.is_set()
     rig.controller.lift("zone")
     rig.run(2.0)
-    assert move.outcome is Outcome.REACHED
+    assert move.outcome is GoalResult.REACHED
     assert move.limited == ("interlock: somebody is near",)
 
 
@@ -85,7 +85,7 @@ def test_a_hold_ends_an_action_and_refuses_the_next() -> None:
     rig.run(0.5)
     rig.controller.restrict("zone", 0.0, "somebody is there")
     rig.run(0.3)
-    assert (move.outcome, [refused.code for refused in why]) == (Outcome.INTERRUPTED, ["interlock"])
+    assert (move.outcome, [refused.code for refused in why]) == (GoalResult.INTERRUPTED, ["interlock"])
     assert not rig.controller.moving
     with pytest.raises(Refused) as refused:
         rig.controller.begin_action(epoch=2, on_lost=lost)

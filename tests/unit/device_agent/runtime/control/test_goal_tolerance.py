@@ -6,9 +6,9 @@ from collections.abc import Callable, Sequence
 import pytest
 
 from device_agent.protocol import Mode
-from device_agent.runtime.control.goal_tolerance import NEAR_RAD, PATIENCE_S
-from device_agent.runtime.control.goals import Course, Outcome
-from device_agent.runtime.planning.motion_planner import Routes
+from device_agent.runtime.control.goal_tolerance import NEAR_RAD, SETTLE_TIMEOUT_S
+from device_agent.runtime.control.goals import GoalResult, MotionGoal
+from device_agent.runtime.planning.motion_planner import MotionPlanner
 from tests.fakes.drivers import PERIOD_S, robot_type
 from tests.harness.agent.controller_fixture import Rig, Wall, lost
 
@@ -23,7 +23,7 @@ class Loaded(Rig):
         self.servo = servo
         self.tenure = self.controller.begin_action(epoch=1, on_lost=lost)
 
-    def go(self, course: Course, *, most_s: float = 10.0) -> float:
+    def go(self, course: MotionGoal, *, most_s: float = 10.0) -> float:
         """Until its end; gives how long the command had rested by then [s]."""
         rested_s, until_s = 0.0, self.now_s + most_s
         while not course.finished.is_set():
@@ -34,7 +34,7 @@ class Loaded(Rig):
             rested_s = 0.0 if self.controller.moving else rested_s + PERIOD_S
         return rested_s
 
-    def move(self, **position_rad: float) -> Course:
+    def move(self, **position_rad: float) -> MotionGoal:
         return self.controller.move(self.tenure, position_rad, speed=1.0)
 
 
@@ -54,7 +54,7 @@ def test_a_move_ends_when_the_joints_have_followed(periods: int) -> None:
     rig = Loaded(late(periods))
     move = rig.move(elbow=1.0)
     rested_s = rig.go(move)
-    assert move.outcome is Outcome.REACHED
+    assert move.outcome is GoalResult.REACHED
     assert rig.servo(rig.controller.commanded_rad)[1] == pytest.approx(1.0, abs=NEAR_RAD)
     assert rested_s >= 0.04 or periods == 0
     assert rested_s < 0.4
@@ -74,18 +74,18 @@ def test_what_never_comes_fails_names_the_joint_and_is_held_there(off_rad: float
     rig = Loaded(lambda told: (told[0] - 0.2, told[1] - off_rad))
     move = rig.move(elbow=1.0)
     rested_s = rig.go(move)
-    assert move.outcome is Outcome.INTERRUPTED
+    assert move.outcome is GoalResult.INTERRUPTED
     assert move.why is not None
     assert move.why.code == "not_arrived"
     assert f"elbow is {abs(off_rad):.2f} rad short" in move.why.message
     assert "shoulder" not in move.why.message, "it was not to move"
-    assert rested_s == pytest.approx(PATIENCE_S, abs=0.1)
+    assert rested_s == pytest.approx(SETTLE_TIMEOUT_S, abs=0.1)
     assert rig.controller.mode is Mode.ACTION
     assert rig.controller.commanded_rad[1] == pytest.approx(1.0, abs=1e-4)
     again = rig.move(elbow=0.9)
     rig.servo = late(0)
     rig.go(again)
-    assert again.outcome is Outcome.REACHED
+    assert again.outcome is GoalResult.REACHED
 
 
 def test_a_joint_that_holds_softly_is_where_it_sags_to() -> None:
@@ -93,7 +93,7 @@ def test_a_joint_that_holds_softly_is_where_it_sags_to() -> None:
     rig.controller.stiffen(rig.tenure, {"elbow": 0.4})
     move = rig.move(elbow=1.0)
     rig.go(move)
-    assert move.outcome is Outcome.REACHED
+    assert move.outcome is GoalResult.REACHED
 
 
 def test_the_end_of_a_planned_way_is_looked_at_too() -> None:
@@ -104,7 +104,7 @@ def test_the_end_of_a_planned_way_is_looked_at_too() -> None:
             return tuple(start_rad), tuple(goal_rad)
 
     rig = Loaded(lambda told: (told[0], told[1] - 0.12))
-    way = Routes(robot_type(), Open(9.0)).around([0.0, 0.0], [0.0, 1.0], speed=1.0, ended=lambda: False)
+    way = MotionPlanner(robot_type(), Open(9.0)).around([0.0, 0.0], [0.0, 1.0], speed=1.0, ended=lambda: False)
     passage = rig.controller.go_along(rig.tenure, way)
     rig.go(passage)
     assert passage.why is not None

@@ -3,7 +3,6 @@
 import json
 import math
 from contextlib import suppress
-from pathlib import Path
 
 import msgspec
 import numpy as np
@@ -20,8 +19,8 @@ from device_agent.runtime.control.controller import Controller
 from device_agent.runtime.errors import Refused
 from tests.fakes.drivers import BASE
 from tests.harness.agent.controller_fixture import Rig, lost
+from tests.harness.paths import UR5
 
-UR5 = Path(__file__).parents[3] / "robots" / "ur5"
 KIND = robot_type.load(UR5)
 SHAPE = geometry.load(KIND, UR5)
 HOME = [KIND.home_rad[joint.name] for joint in KIND.joints]

@@ -3,22 +3,22 @@
 import msgspec
 import pytest
 
-from device_agent.runtime.control.joint_motion import Motion
-from device_agent.runtime.planning.behaviour_trajectory import Score
-from device_agent.runtime.planning.trajectory import Way
+from device_agent.runtime.control.joint_motion import JointMotion
+from device_agent.runtime.planning.behaviour_trajectory import BehaviourTrajectory
+from device_agent.runtime.planning.trajectory import Trajectory
 from tests.fakes.drivers import robot_type
 from tests.fakes.head_driver import head
 
 
-def way_to(yaw: float) -> Way:
-    score = Score(head(), (0.0,) * 4)
+def way_to(yaw: float) -> Trajectory:
+    score = BehaviourTrajectory(head(), (0.0,) * 4)
     score._reach(0, 0.0, 2.0, yaw)
     score._end_s = 2.0
     return score.way()
 
 
 def test_a_way_that_begins_elsewhere_is_not_taken() -> None:
-    motion, one, other = Motion(head()), way_to(1.0), way_to(-1.0)
+    motion, one, other = JointMotion(head()), way_to(1.0), way_to(-1.0)
     for _ in range(50):
         motion.ride(one, share=1.0)
         motion.propose()
@@ -32,7 +32,7 @@ def test_a_way_that_begins_elsewhere_is_not_taken() -> None:
 
 
 def test_without_joints_there_is_nothing_to_plan() -> None:
-    motion = Motion(msgspec.structs.replace(head(), joints=(), mirrors=(), narrowing=(), home_rad={}))
+    motion = JointMotion(msgspec.structs.replace(head(), joints=(), mirrors=(), narrowing=(), home_rad={}))
     assert motion.propose() == [[], []]
     assert motion.update() == []
     assert motion.reached
@@ -43,7 +43,7 @@ def test_two_parts_of_a_period_brake_as_much_as_a_whole_one() -> None:
     for ridden in (False, True):
         ends = []
         for parts in ((None,), (0.25, 0.75)):
-            motion = Motion(head())
+            motion = JointMotion(head())
             way, period_s = way_to(1.0), motion._period_s
             for _ in range(45 if ridden else 15):
                 if ridden:
@@ -65,7 +65,7 @@ def test_two_parts_of_a_period_brake_as_much_as_a_whole_one() -> None:
 
 def test_who_brakes_for_a_moment_and_goes_on_does_not_run_backwards_meanwhile() -> None:
     for periods in range(1, 12):
-        motion = Motion(robot_type())
+        motion = JointMotion(robot_type())
         motion.start_at([3.0, 3.0])
         for braking in [False] * periods + [True] + [False] * 30:
             if braking:

@@ -10,10 +10,10 @@ from hypothesis import strategies as st
 
 from device_agent.protocol.manifests.capabilities import Keyframe
 from device_agent.protocol.manifests.robot_type import RobotType
-from device_agent.runtime.control.limits import Envelope
+from device_agent.runtime.control.limits import MotionLimits
 from device_agent.runtime.planning import visemes
-from device_agent.runtime.planning.behaviour_trajectory import Line, Score
-from device_agent.runtime.planning.trajectory import Way
+from device_agent.runtime.planning.behaviour_trajectory import BehaviourTrajectory, Line
+from device_agent.runtime.planning.trajectory import Trajectory
 from tests.fakes.head_driver import BENT, RANGES, head
 
 HOME = (0.0, 0.0, 0.0, 0.0)
@@ -26,7 +26,7 @@ def talking() -> RobotType:
     return msgspec.structs.replace(head(), visemes=jaw)
 
 
-def at(way: Way, time_s: float) -> list[float]:
+def at(way: Trajectory, time_s: float) -> list[float]:
     place: list[float] = way.at(time_s)[0].tolist()
     return place
 
@@ -35,7 +35,7 @@ def frame(time_s: float, say: str = "", **position_rad: float) -> Keyframe:
     return Keyframe(time_s=time_s, position_rad=position_rad, say=say)
 
 
-def check_limits(way: Way, kind: RobotType) -> None:
+def check_limits(way: Trajectory, kind: RobotType) -> None:
     """Velocity, acceleration and jerk of joints that no other one led astray."""
     for index, joint in enumerate(kind.joints):
         assert np.abs(way.velocity_rad_s[:, index]).max() <= joint.max_velocity_rad_s * 1.001
@@ -46,7 +46,7 @@ def check_limits(way: Way, kind: RobotType) -> None:
 
 
 def test_joints_are_where_a_keyframe_says_when_it_says() -> None:
-    score = Score(head(), HOME)
+    score = BehaviourTrajectory(head(), HOME)
     assert score.keyframes([frame(1.0, yaw=0.5), frame(2.0, left=-0.4), frame(3.0, yaw=0.0)], {}) == []
     way = score.way()
     assert way.duration_s == pytest.approx(3.0, abs=0.03)
@@ -59,7 +59,7 @@ def test_joints_are_where_a_keyframe_says_when_it_says() -> None:
 
 
 def test_what_cannot_be_reached_in_time_is_reached_later_and_the_rest_after_it() -> None:
-    score = Score(head(), HOME)
+    score = BehaviourTrajectory(head(), HOME)
     score.keyframes([frame(0.1, yaw=2.0), frame(0.2, yaw=-2.0)], {})
     way = score.way()
     check_limits(way, head())
@@ -70,7 +70,7 @@ def test_what_cannot_be_reached_in_time_is_reached_later_and_the_rest_after_it()
 
 
 def test_words_begin_when_their_keyframe_is_set_out_for() -> None:
-    score = Score(head(), HOME)
+    score = BehaviourTrajectory(head(), HOME)
     frames = [frame(1.0, yaw=0.2), frame(2.0, say="there"), frame(2.5, yaw=0.0, say="and back")]
     lines = score.keyframes(frames, {"there": 0.5, "and back": 3.0})
     assert lines == [Line(1.0, "there", 0.5), Line(2.0, "and back", 3.0)]
@@ -78,7 +78,7 @@ def test_words_begin_when_their_keyframe_is_set_out_for() -> None:
 
 
 def test_nothing_to_do_is_a_way_of_rest() -> None:
-    way = Score(head(), (0.3, 0.0, 0.0, 0.0)).way()
+    way = BehaviourTrajectory(head(), (0.3, 0.0, 0.0, 0.0)).way()
     assert way.duration_s > 0
     assert at(way, 0.0) == at(way, 9.0) == [0.3, 0.0, 0.0, 0.0]
 
@@ -105,10 +105,10 @@ def test_a_way_stays_inside_of_every_range_and_limit(
         time_s += more_s
         places = {name: low + share * (high - low) for name, share in shares.items() for low, high in [_range(name)]}
         frames.append(frame(time_s, say, **places))
-    score = Score(kind, HOME)
+    score = BehaviourTrajectory(kind, HOME)
     score.keyframes(frames, {"hello there": 1.0})
     way = score.way()
-    Envelope(kind, None).check_way(way.position_rad)
+    MotionLimits(kind, None).check_way(way.position_rad)
     assert np.isfinite(way.velocity_rad_s).all()
     if table is None:
         check_limits(way, kind)
@@ -119,7 +119,7 @@ def _range(name: str) -> tuple[float, float]:
 
 
 def test_a_mouth_opens_for_vowels_and_is_as_before_in_the_end() -> None:
-    score = Score(talking(), (0.0, -0.1, 0.0, 0.0))
+    score = BehaviourTrajectory(talking(), (0.0, -0.1, 0.0, 0.0))
     score.speak(Line(0.0, "mama", 3.0))
     way = score.way()
     assert way.position_rad[:, 1].min() < -0.25
@@ -128,7 +128,7 @@ def test_a_mouth_opens_for_vowels_and_is_as_before_in_the_end() -> None:
 
 
 def test_a_mouth_goes_on_where_the_keyframes_had_it_and_they_go_on_after() -> None:
-    score = Score(talking(), HOME)
+    score = BehaviourTrajectory(talking(), HOME)
     score.keyframes([frame(0.5, pitch=-0.2), frame(1.0, say="baba"), frame(4.0, pitch=0.1)], {"baba": 1.0})
     way = score.way()
     assert at(way, 0.5)[1] == pytest.approx(-0.2)
@@ -137,7 +137,7 @@ def test_a_mouth_goes_on_where_the_keyframes_had_it_and_they_go_on_after() -> No
 
 
 def test_words_that_begin_before_others_have_ended_wait_for_the_mouth() -> None:
-    score = Score(talking(), HOME)
+    score = BehaviourTrajectory(talking(), HOME)
     score.speak(Line(0.0, "mama", 3.0))
     score.speak(Line(2.9, "mama", 3.0))
     way = score.way()
@@ -151,18 +151,18 @@ def test_words_that_begin_before_others_have_ended_wait_for_the_mouth() -> None:
 
 def test_letters_become_shapes_in_their_order_and_time() -> None:
     there = ("sil", "PP", "aa", "TH", "SS")
-    shapes = visemes.shapes("Path: súm!", 2.0, there)
+    shapes = visemes.visemes_of("Path: súm!", 2.0, there)
     assert [shape for _, shape in shapes] == ["PP", "aa", "TH", "sil", "sil", "SS", "aa", "PP", "sil"]
     assert all(early < late for (early, _), (late, _) in pairwise(shapes))
     assert 0 < shapes[0][0] < shapes[-1][0] < 2.0
 
 
 def test_a_shape_that_a_robot_lacks_is_the_nearest_it_has() -> None:
-    assert [shape for _, shape in visemes.shapes("o", 1.0, ("aa",))] == ["aa"]
-    assert [shape for _, shape in visemes.shapes("m", 1.0, ("aa",))] == []
-    assert visemes.shapes("…", 1.0, ("aa",)) == []
+    assert [shape for _, shape in visemes.visemes_of("o", 1.0, ("aa",))] == ["aa"]
+    assert [shape for _, shape in visemes.visemes_of("m", 1.0, ("aa",))] == []
+    assert visemes.visemes_of("…", 1.0, ("aa",)) == []
 
 
 def test_where_nobody_speaks_it_takes_as_long_as_it_would() -> None:
-    assert visemes.guessed_s("a" * 140) == pytest.approx(10.0)
-    assert visemes.guessed_s("a") > 0.1
+    assert visemes.estimate_duration_s("a" * 140) == pytest.approx(10.0)
+    assert visemes.estimate_duration_s("a") > 0.1

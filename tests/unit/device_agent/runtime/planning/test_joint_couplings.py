@@ -12,9 +12,9 @@ from hypothesis import strategies as st
 from device_agent.protocol import JointTarget, Setpoint, StopLatch
 from device_agent.runtime.authority.lease_gate import LeaseGate
 from device_agent.runtime.control.controller import Controller
-from device_agent.runtime.control.goals import Outcome
-from device_agent.runtime.control.joint_motion import Motion
-from device_agent.runtime.control.limits import Envelope
+from device_agent.runtime.control.goals import GoalResult
+from device_agent.runtime.control.joint_motion import JointMotion
+from device_agent.runtime.control.limits import MotionLimits
 from device_agent.runtime.errors import Refused
 from device_agent.runtime.planning.joint_couplings import Couplings
 from tests.fakes.head_driver import BENT, FACTOR, PERIOD_S, RANGES, SPEED, WIDE, head
@@ -70,7 +70,7 @@ class Neck:
             self.offer(position_rad)
             self.tick()
 
-    def move(self, seconds: float = 5.0, **position_rad: float) -> Outcome | None:
+    def move(self, seconds: float = 5.0, **position_rad: float) -> GoalResult | None:
         tenure = self.controller.begin_action(epoch=self.epoch, on_lost=lambda _: None)
         move = self.controller.move(tenure, position_rad, speed=1.0)
         for _ in range(round(seconds / PERIOD_S)):
@@ -148,7 +148,7 @@ def test_from_corner_to_corner_it_arrives(table: tuple[tuple[float, float, float
     narrowing = neck.kind.narrowing[0]
     for yaw in (2.0, -2.0, 0.0, 2.0):
         for edge in narrowing.at(yaw):
-            assert neck.move(yaw=yaw, pitch=edge) is Outcome.REACHED
+            assert neck.move(yaw=yaw, pitch=edge) is GoalResult.REACHED
             assert neck.position[:2] == pytest.approx([yaw, edge], abs=2e-4)
 
 
@@ -161,8 +161,8 @@ def test_a_setpoint_is_clamped_to_where_the_other_joint_will_be_and_says_so() ->
 
 def test_a_joint_waits_until_the_other_is_out_of_its_way() -> None:
     neck = Neck()
-    assert neck.move(pitch=0.5) is Outcome.REACHED
-    assert neck.move(yaw=2.0) is Outcome.REACHED
+    assert neck.move(pitch=0.5) is GoalResult.REACHED
+    assert neck.move(yaw=2.0) is GoalResult.REACHED
     assert neck.position[1] == pytest.approx(0.1, abs=1e-3)
     assert "yaw: waits for pitch" in neck.limited
 
@@ -175,11 +175,11 @@ def test_a_move_that_asks_for_more_than_is_left_is_refused_with_what_is() -> Non
 
 def test_either_joint_of_a_mirror_moves_both() -> None:
     neck = Neck()
-    assert neck.move(left=-0.4) is Outcome.REACHED
+    assert neck.move(left=-0.4) is GoalResult.REACHED
     assert neck.position[3] == pytest.approx(0.2, abs=2e-4)
-    assert neck.move(right=0.1) is Outcome.REACHED
+    assert neck.move(right=0.1) is GoalResult.REACHED
     assert neck.position[2] == pytest.approx(-0.2, abs=2e-4)
-    assert neck.move(left=-0.4, right=0.2) is Outcome.REACHED
+    assert neck.move(left=-0.4, right=0.2) is GoalResult.REACHED
 
 
 def test_a_mirror_cannot_be_asked_to_differ() -> None:
@@ -230,7 +230,7 @@ def test_a_joint_that_cannot_get_inside_stays_where_it_is() -> None:
     ],
 )
 def test_a_way_must_not_part_what_hangs_together(places: list[list[float]], says: str) -> None:
-    envelope = Envelope(head(), None)
+    envelope = MotionLimits(head(), None)
     if says:
         with pytest.raises(Refused, match=says):
             envelope.check_way(np.array(places))
@@ -239,7 +239,7 @@ def test_a_way_must_not_part_what_hangs_together(places: list[list[float]], says
 
 
 def test_limp_joints_are_commanded_to_where_they_are() -> None:
-    motion = Motion(head())
+    motion = JointMotion(head())
     motion.start_at([0.0, 0.0, 0.0, 0.0])
     motion.loosen({0: 0.8})
     motion.follow([1.5, 0.0, -0.3, 0.15])

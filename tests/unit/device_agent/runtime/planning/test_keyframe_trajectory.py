@@ -14,10 +14,10 @@ from hypothesis import strategies as st
 
 from device_agent.ports.script_calls import Moment, Play
 from device_agent.protocol.manifests.robot_type import RobotType
-from device_agent.runtime.control.limits import Envelope
+from device_agent.runtime.control.limits import MotionLimits
 from device_agent.runtime.errors import Refused
 from device_agent.runtime.planning.keyframe_trajectory import Timeline
-from device_agent.runtime.planning.trajectory import Way
+from device_agent.runtime.planning.trajectory import Trajectory
 from tests.fakes.head_driver import RANGES, head
 
 START = (0.0, 0.0, 0.0, 0.0)
@@ -33,12 +33,12 @@ def timeline(*keyframes: Moment, speed: float = 1.0) -> Timeline:
     return Timeline(head(), START, Play(keyframes=keyframes, speed=speed))
 
 
-def at(way: Way, time_s: float) -> list[float]:
+def at(way: Trajectory, time_s: float) -> list[float]:
     place: list[float] = way.at(time_s)[0].tolist()
     return place
 
 
-def check_limits(way: Way, kind: RobotType, joints: tuple[int, ...]) -> None:
+def check_limits(way: Trajectory, kind: RobotType, joints: tuple[int, ...]) -> None:
     for index in joints:
         joint = kind.joints[index]
         assert np.abs(way.velocity_rad_s[:, index]).max() <= joint.max_velocity_rad_s * 1.001
@@ -128,7 +128,7 @@ def movements(draw: st.DrawFn) -> list[Moment]:
 def test_any_movement_stays_in_its_limits_and_between_its_places(keyframes: list[Moment]) -> None:
     kind = head()
     way = Timeline(kind, START, Play(keyframes=tuple(keyframes), speed=1.0)).way()
-    Envelope(kind, None).check_way(way.position_rad)
+    MotionLimits(kind, None).check_way(way.position_rad)
     check_limits(way, kind, (0, 2))
     for index, name in ((0, "yaw"), (2, "left")):
         places = [0.0, *(one.position_rad[name] for one in keyframes if name in one.position_rad)]

@@ -12,11 +12,11 @@ from device_agent.ports.geometry import GeometryError, PlannerLostError
 from device_agent.protocol.manifests import robot_type
 from device_agent.runtime.authority.lease_gate import LeaseGate
 from device_agent.runtime.control.controller import Controller
-from device_agent.runtime.control.goals import Outcome
+from device_agent.runtime.control.goals import GoalResult
 from device_agent.runtime.errors import Refused
-from device_agent.runtime.planning.motion_planner import Routes
+from device_agent.runtime.planning.motion_planner import MotionPlanner
+from tests.harness.paths import UR5
 
-UR5 = Path(__file__).parents[3] / "robots" / "ur5"
 KIND = robot_type.load(UR5)
 HOME = [KIND.home_rad[joint.name] for joint in KIND.joints]
 BEYOND = [1.6, *HOME[1:]]
@@ -67,11 +67,11 @@ class Physics:
 
 def check_around(scene: Path, shape: MujocoGeometry, seed: int) -> float:
     """Plan with this seed, go, and give how far the flange then is from where it should be [m]."""
-    physics, routes = Physics(scene, shape), Routes(KIND, shape, seed=seed)
+    physics, routes = Physics(scene, shape), MotionPlanner(KIND, shape, seed=seed)
     way = routes.around(HOME, BEYOND, speed=1.0, ended=lambda: False)
     passage = physics.controller.go_along(physics.tenure, way)
     physics.run(way.duration_s + 1.5)
-    assert passage.outcome is Outcome.REACHED, passage.why
+    assert passage.outcome is GoalResult.REACHED, passage.why
     assert passage.limited == ()
     assert physics.touched == 0
     return math.dist(physics.flange_m(), shape.poses(BEYOND)["flange"][:3])
@@ -98,7 +98,7 @@ def test_a_straight_way_is_straight_in_physics_too(scene: Path, shape: MujocoGeo
     physics = Physics(scene, shape)
     begin = shape.poses(HOME)["flange"]
     pose = (begin[0], begin[1] + 0.25, begin[2] - 0.05, *begin[3:])
-    way = Routes(KIND, shape).straight(HOME, "flange", pose, speed=0.5)
+    way = MotionPlanner(KIND, shape).straight(HOME, "flange", pose, speed=0.5)
     physics.controller.go_along(physics.tenure, way)
     line, off_m = np.subtract(pose[:3], begin[:3]), []
     for _ in range(round(way.duration_s / PERIOD_S) + 100):
@@ -133,7 +133,7 @@ def test_whoever_looks_for_a_way_may_be_lost(shape: MujocoGeometry, monkeypatch:
 
     monkeypatch.setattr(shape, "plan", lost)
     with pytest.raises(Refused, match="try again") as refused:
-        Routes(KIND, shape).around(HOME, BEYOND, speed=1.0, ended=lambda: False)
+        MotionPlanner(KIND, shape).around(HOME, BEYOND, speed=1.0, ended=lambda: False)
     assert refused.value.code == "planner_lost"
 
 
@@ -149,7 +149,7 @@ def test_every_leg_of_a_plan_is_clear_for_the_gate_too(shape: MujocoGeometry) ->
 
 
 def test_a_straight_way_that_needs_another_posture_or_leads_through_something_is_refused(shape: MujocoGeometry) -> None:
-    routes, begin = Routes(KIND, shape), shape.poses(HOME)["flange"]
+    routes, begin = MotionPlanner(KIND, shape), shape.poses(HOME)["flange"]
     through = (-0.249, -0.414, begin[2], *begin[3:])
     for pose in (through, (-begin[0], -begin[1], *begin[2:]), (begin[0], begin[1], -0.05, *begin[3:])):
         with pytest.raises(Refused) as refused:

@@ -11,20 +11,20 @@ from device_agent.perception.occupancy_grid import Floor, OccupancyGrid
 from device_agent.ports import script_calls
 from device_agent.ports.driver import REST, Twist
 from device_agent.protocol import StopLatch
-from device_agent.runtime.actions.device_context import Body
-from device_agent.runtime.actions.robot_api import ScriptRobot
+from device_agent.runtime.actions.device_context import DeviceContext
+from device_agent.runtime.actions.robot_api import RobotApi
 from device_agent.runtime.errors import Refused
 from device_agent.runtime.planning import navigator as errand_module
 from device_agent.runtime.planning.navigator import (
-    EVERY_S,
-    PATIENCE_S,
+    BLOCKED_TIMEOUT_S,
     SHORT_PATIENCE_S,
-    Errand,
-    Place,
-    Whereabouts,
+    UPDATE_PERIOD_S,
+    Navigator,
+    Pose2D,
+    PoseEstimator,
     way,
 )
-from device_agent.runtime.readings import Reading, Room
+from device_agent.runtime.readings import Reading, ReadingCache
 from tests.fakes.drivers import BASE, PERIOD_S, robot_type
 from tests.harness.agent.controller_fixture import Rig
 
@@ -43,21 +43,21 @@ def room(*walls: tuple[float, float, float, float]) -> OccupancyGrid:
     return grid
 
 
-def go(errand: Errand, grid: OccupancyGrid, place: Place, *, seconds: float = 60.0) -> list[Place]:
+def go(errand: Navigator, grid: OccupancyGrid, place: Pose2D, *, seconds: float = 60.0) -> list[Pose2D]:
     """Where an ideal base comes."""
     places = [place]
-    for _ in range(round(seconds / EVERY_S)):
+    for _ in range(round(seconds / UPDATE_PERIOD_S)):
         twist = errand.twist(places[-1], grid)
         if twist is None:
             return places
         assert all(abs(part) <= most + 1e-9 for part, most in zip(twist, LIMITS, strict=True))
         last = places[-1]
-        yaw = last.yaw_rad + twist.turn_rad_s * EVERY_S / 2
+        yaw = last.yaw_rad + twist.turn_rad_s * UPDATE_PERIOD_S / 2
         places.append(
-            Place(
-                last.x_m + twist.forward_m_s * EVERY_S * math.cos(yaw),
-                last.y_m + twist.forward_m_s * EVERY_S * math.sin(yaw),
-                last.yaw_rad + twist.turn_rad_s * EVERY_S,
+            Pose2D(
+                last.x_m + twist.forward_m_s * UPDATE_PERIOD_S * math.cos(yaw),
+                last.y_m + twist.forward_m_s * UPDATE_PERIOD_S * math.sin(yaw),
+                last.yaw_rad + twist.turn_rad_s * UPDATE_PERIOD_S,
             )
         )
     pytest.fail(f"not there: {places[-1]}")
@@ -65,8 +65,8 @@ def go(errand: Errand, grid: OccupancyGrid, place: Place, *, seconds: float = 60
 
 def test_it_goes_around_a_wall_and_stands_as_asked() -> None:
     grid = room((-0.1, -2.0, 0.1, 0.8))
-    errand = Errand((1.2, -1.0), 1.5, limits=LIMITS, radius_m=0.25)
-    places = go(errand, grid, Place(-1.2, -1.0, 2.0))
+    errand = Navigator((1.2, -1.0), 1.5, limits=LIMITS, radius_m=0.25)
+    places = go(errand, grid, Pose2D(-1.2, -1.0, 2.0))
     assert math.dist((places[-1].x_m, places[-1].y_m), (1.2, -1.0)) <= 0.08
     assert places[-1].yaw_rad == pytest.approx(1.5, abs=0.05)
     taken = grid.blocked(0.15)
@@ -74,7 +74,7 @@ def test_it_goes_around_a_wall_and_stands_as_asked() -> None:
 
 
 def test_without_a_heading_it_ends_as_it_comes() -> None:
-    places = go(Errand((1.0, 0.0), None, limits=LIMITS, radius_m=0.25), room(), Place(0.0, 0.0, 0.0))
+    places = go(Navigator((1.0, 0.0), None, limits=LIMITS, radius_m=0.25), room(), Pose2D(0.0, 0.0, 0.0))
     assert abs(places[-1].yaw_rad) < 0.4
 
 
@@ -82,7 +82,7 @@ def test_where_no_way_leads_is_refused() -> None:
     shut = room((-0.1, -2.0, 0.1, 2.0))
     for goal, code in (((1.0, 0.0), "no_way"), ((0.0, 0.0), "taken"), ((9.0, 0.0), "out_of_room")):
         with pytest.raises(Refused) as refused:
-            Errand(goal, None, limits=LIMITS, radius_m=0.25).twist(Place(-1.0, 0.0, 0.0), shut)
+            Navigator(goal, None, limits=LIMITS, radius_m=0.25).twist(Pose2D(-1.0, 0.0, 0.0), shut)
         assert refused.value.code == code
 
 
@@ -97,7 +97,9 @@ def test_somebody_who_stands_in_the_way_is_gone_around_or_waited_for() -> None:
 def test_a_refusal_names_the_nearest_place_that_has_a_way() -> None:
     for goal, code, near in (((1.0, 0.0), "no_way", r"x_m -0\.\d+, y_m -?0\.0"), ((0.0, 0.3), "taken", r"y_m 0\.\d+")):
         with pytest.raises(Refused, match=f"nearest place to go to is .*{near}") as refused:
-            Errand(goal, None, limits=LIMITS, radius_m=0.25).twist(Place(-1.0, 0.0, 0.0), room((-0.1, -2.0, 0.1, 2.0)))
+            Navigator(goal, None, limits=LIMITS, radius_m=0.25).twist(
+                Pose2D(-1.0, 0.0, 0.0), room((-0.1, -2.0, 0.1, 2.0))
+            )
         assert refused.value.code == code
     full = Floor(np.ones((5, 5), dtype=bool), (0.0, 0.0), 1.0)
     with pytest.raises(Refused, match=r"or nobody has seen it$"):
@@ -121,19 +123,19 @@ def test_a_way_leads_between_things_corner_by_corner() -> None:
 
 
 def test_a_place_that_is_taken_from_the_beginning_is_not_waited_for_long() -> None:
-    errand = Errand((1.0, 0.0), None, limits=LIMITS, radius_m=0.25)
+    errand = Navigator((1.0, 0.0), None, limits=LIMITS, radius_m=0.25)
     taken = Refused("taken", "")
     assert errand.patience_s(taken) == SHORT_PATIENCE_S
     assert errand.patience_s(Refused("out_of_room", "")) == 0
-    errand.twist(Place(0.0, 0.0, 0.0), room())
-    assert errand.patience_s(taken) == PATIENCE_S
+    errand.twist(Pose2D(0.0, 0.0, 0.0), room())
+    assert errand.patience_s(taken) == BLOCKED_TIMEOUT_S
 
 
 def test_the_room_corrects_what_the_wheels_believe() -> None:
-    where = Whereabouts("qbo")
+    where = PoseEstimator("qbo")
     wheels = Reading({"x_m": 1.0, "y_m": 0.0, "yaw_rad": 0.5}, 0.02)
     seen = Reading({"x_m.qbo": 1.2, "y_m.qbo": 0.1, "age_s.qbo": 0.2}, 0.1)
-    assert where.place(wheels, None) == Place(1.0, 0.0, 0.5)
+    assert where.place(wheels, None) == Pose2D(1.0, 0.0, 0.5)
     found = where.place(wheels, seen)
     assert (found.x_m, found.y_m, found.yaw_rad) == pytest.approx((1.2, 0.1, 0.5))
     assert where.place(wheels, None).x_m == pytest.approx(1.2), "what it has learned stays"
@@ -141,7 +143,7 @@ def test_the_room_corrects_what_the_wheels_believe() -> None:
 
 def test_without_wheels_that_count_the_room_alone_tells() -> None:
     seen = Reading({"x_m.nao": 1.2, "y_m.nao": 0.1, "yaw_rad.nao": 0.3}, 0.1)
-    assert Whereabouts("nao").place(None, seen) == Place(1.2, 0.1, 0.3)
+    assert PoseEstimator("nao").place(None, seen) == Pose2D(1.2, 0.1, 0.3)
 
 
 @pytest.mark.parametrize(
@@ -157,12 +159,12 @@ def test_without_wheels_that_count_the_room_alone_tells() -> None:
 )
 def test_a_robot_that_nobody_sees_does_not_go(seen: Reading | None) -> None:
     with pytest.raises(Refused, match="nobody knows where the robot is"):
-        Whereabouts("nao").place(None, seen)
+        PoseEstimator("nao").place(None, seen)
 
 
 def test_at_its_place_it_only_turns() -> None:
-    errand = Errand((0.0, 0.0), 1.0, limits=LIMITS, radius_m=0.25)
-    twist = errand.twist(Place(0.01, 0.0, 0.0), room())
+    errand = Navigator((0.0, 0.0), 1.0, limits=LIMITS, radius_m=0.25)
+    twist = errand.twist(Pose2D(0.01, 0.0, 0.0), room())
     assert twist is not None
     assert (twist.forward_m_s, twist.left_m_s) == (REST.forward_m_s, REST.left_m_s)
     assert twist.turn_rad_s > 0
@@ -173,20 +175,20 @@ class Toy:
 
     def __init__(self, ground: OccupancyGrid | None) -> None:
         self.rig = Rig(base=BASE)
-        self.at = Place(0.0, 0.0, 0.0)
+        self.at = Pose2D(0.0, 0.0, 0.0)
         self.over = threading.Event()
-        body = Body(
+        body = DeviceContext(
             robot_type=robot_type(BASE),
             controller=self.rig.controller,
             observe=lambda: None,
             geometry=None,
             skills=None,
-            room=Room(space="s", agent="a", own=["toy"]),
+            room=ReadingCache(space="s", agent="a", own=["toy"]),
             reported=lambda: {"odometry": Reading(asdict(self.at), 0.0)},
             name="toy",
             ground=lambda: ground,
         )
-        self.robot = ScriptRobot(body)
+        self.robot = RobotApi(body)
         self.robot.begin(1, lambda _: None)
         self.thread = threading.Thread(target=self.live, daemon=True)
         self.thread.start()
@@ -196,7 +198,7 @@ class Toy:
             self.rig.now_s += PERIOD_S
             twist = self.rig.controller.step(self.rig.now_s).twist
             at = self.at
-            self.at = Place(
+            self.at = Pose2D(
                 at.x_m + twist.forward_m_s * PERIOD_S * math.cos(at.yaw_rad),
                 at.y_m + twist.forward_m_s * PERIOD_S * math.sin(at.yaw_rad),
                 at.yaw_rad + twist.turn_rad_s * PERIOD_S,
@@ -217,7 +219,7 @@ def test_a_robot_goes_to_a_place_and_rests_there() -> None:
 
 
 def test_who_cannot_see_the_room_or_waits_in_vain_says_so(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(errand_module, "PATIENCE_S", 0.15)
+    monkeypatch.setattr(errand_module, "BLOCKED_TIMEOUT_S", 0.15)
     monkeypatch.setattr(errand_module, "SHORT_PATIENCE_S", 0.15)
     shut = room((0.5, -2, 0.7, 2))
     for ground, x_m, code in ((None, 1.0, "no_ground"), (shut, 0.6, "taken"), (room(), 9.0, "out_of_room")):
@@ -240,6 +242,6 @@ def test_an_errand_that_loses_the_device_ends() -> None:
 
 def test_a_place_is_finite_and_a_robot_without_a_base_goes_nowhere() -> None:
     with pytest.raises(Refused, match="does not drive"):
-        Errand.of(0.0, 0.0, None, robot_type())
+        Navigator.of(0.0, 0.0, None, robot_type())
     with pytest.raises(Refused, match="finite"):
-        Errand.of(math.nan, 0.0, None, robot_type(BASE))
+        Navigator.of(math.nan, 0.0, None, robot_type(BASE))

@@ -11,11 +11,11 @@ from hypothesis import strategies as st
 
 from device_agent.ports.geometry import Clearance, Sweep, never
 from device_agent.protocol import Mode, Pose
-from device_agent.runtime.control.goals import Outcome
+from device_agent.runtime.control.goals import GoalResult
 from device_agent.runtime.errors import Refused
 from device_agent.runtime.planning import trajectory
-from device_agent.runtime.planning.motion_planner import Routes, quaternion_of
-from device_agent.runtime.planning.trajectory import Floats, Way
+from device_agent.runtime.planning.motion_planner import MotionPlanner, quaternion_of
+from device_agent.runtime.planning.trajectory import Floats, Trajectory
 from tests.fakes.drivers import PERIOD_S, robot_type
 from tests.harness.agent.controller_fixture import Rig, Wall, interruptions, lost
 
@@ -27,10 +27,10 @@ def anywhere(_: Floats) -> bool:
     return True
 
 
-def along(corners: list[list[float]], *, speed: float = 1.0) -> Way:
-    points = trajectory.smooth(corners, anywhere)
+def along(corners: list[list[float]], *, speed: float = 1.0) -> Trajectory:
+    points = trajectory.blend_corners(corners, anywhere)
     assert points is not None
-    return trajectory.timed(points, JOINTS, speed=speed, step_s=PERIOD_S)
+    return trajectory.time_parameterize(points, JOINTS, speed=speed, step_s=PERIOD_S)
 
 
 def slopes(positions: Floats) -> list[float]:
@@ -82,12 +82,12 @@ def test_corners_are_rounded_off_as_widely_as_there_is_room() -> None:
         away = np.minimum(np.abs(path[:, 1]), np.abs(path[:, 0] - 1.2))
         return bool(np.all(away < 0.02))
 
-    wide, narrow = trajectory.smooth(CORNER, anywhere), trajectory.smooth(CORNER, near)
+    wide, narrow = trajectory.blend_corners(CORNER, anywhere), trajectory.blend_corners(CORNER, near)
     assert wide is not None
     assert narrow is not None
     assert len(wide) < len(narrow)
-    assert near(trajectory.timed(narrow, JOINTS, speed=1.0, step_s=PERIOD_S).position_rad)
-    assert trajectory.smooth(CORNER, lambda _: False) is None
+    assert near(trajectory.time_parameterize(narrow, JOINTS, speed=1.0, step_s=PERIOD_S).position_rad)
+    assert trajectory.blend_corners(CORNER, lambda _: False) is None
 
 
 def test_the_device_goes_along_a_way_and_rests_at_its_end() -> None:
@@ -95,7 +95,7 @@ def test_the_device_goes_along_a_way_and_rests_at_its_end() -> None:
     tenure = rig.controller.begin_action(epoch=1, on_lost=lost)
     passage = rig.controller.go_along(tenure, found)
     gone = ride(rig, found.duration_s + 0.1)
-    assert passage.outcome is Outcome.REACHED
+    assert passage.outcome is GoalResult.REACHED
     assert gone[: len(found.position_rad) - 1] == pytest.approx(found.position_rad[1:], abs=1e-6)
     assert rig.controller.commanded_rad == pytest.approx([1.2, 1.0], abs=1e-9)
     assert not rig.controller.moving
@@ -109,7 +109,7 @@ def ride(rig: Rig, seconds: float) -> Floats:
     return np.array(gone)
 
 
-def check_on(found: Way, gone: Floats) -> None:
+def check_on(found: Trajectory, gone: Floats) -> None:
     """Every place is one of the way's."""
     for place in gone:
         assert float(np.min(np.linalg.norm(found.position_rad - place, axis=1))) < 0.015
@@ -126,7 +126,7 @@ def test_whatever_takes_the_device_away_brakes_it_on_its_way(cause: str, after_s
     assert before[-1] != pytest.approx(before[-2], abs=1e-6)
     interruptions()[cause](rig)  # type: ignore[operator]
     gone = ride(rig, 0.3)
-    assert passage.outcome is Outcome.INTERRUPTED
+    assert passage.outcome is GoalResult.INTERRUPTED
     assert not rig.controller.moving
     assert gone[-1] == pytest.approx(gone[-2], abs=1e-6)
     check_on(found, gone)
@@ -144,7 +144,7 @@ def test_the_room_slows_a_way_and_lets_it_speed_up_again_inside_the_limits() -> 
     assert slow <= 0.3 * 3.0 + 1e-6
     rig.controller.lift("room")
     gone.append(ride(rig, 3.0))
-    assert passage.outcome is Outcome.REACHED
+    assert passage.outcome is GoalResult.REACHED
     assert any("somebody is near" in one for one in passage.limited)
     whole = np.concatenate(gone)
     check_on(found, whole)
@@ -181,9 +181,9 @@ def test_a_move_that_follows_waits_until_the_device_rests_on_its_way() -> None:
     passage = rig.controller.go_along(tenure, found)
     ride(rig, 0.5)
     move = rig.controller.move(tenure, {"shoulder": 0.0, "elbow": 0.0}, speed=1.0)
-    assert passage.outcome is Outcome.INTERRUPTED
+    assert passage.outcome is GoalResult.INTERRUPTED
     gone = ride(rig, 3.0)
-    assert move.outcome is Outcome.REACHED
+    assert move.outcome is GoalResult.REACHED
     assert slopes(gone)[1] <= 20.5
 
 
@@ -278,6 +278,6 @@ class Sliding(Narrow):
 
 def test_a_way_that_is_too_narrow_is_refused() -> None:
     with pytest.raises(Refused, match="too narrow"):
-        Routes(robot_type(), Narrow()).around([0.0, 0.0], [1.0, 1.0], speed=1.0, ended=never)
+        MotionPlanner(robot_type(), Narrow()).around([0.0, 0.0], [1.0, 1.0], speed=1.0, ended=never)
     with pytest.raises(Refused, match="something is in the way: clearance: hand"):
-        Routes(robot_type(), Sliding()).straight([0.0, 0.0], "hand", (0.1, 0, 0, 1, 0, 0, 0), speed=1.0)
+        MotionPlanner(robot_type(), Sliding()).straight([0.0, 0.0], "hand", (0.1, 0, 0, 1, 0, 0, 0), speed=1.0)

@@ -16,9 +16,9 @@ from device_agent.protocol import (
     AckStatus,
     CancelAction,
     CaptureRaw,
+    CollectData,
     Control,
     Description,
-    Gather,
     Measurements,
     Mode,
     MoveJoints,
@@ -26,23 +26,23 @@ from device_agent.protocol import (
     ResetStop,
     RoomTask,
     SetControl,
-    Shoot,
     Stop,
     StopDevice,
     Stream,
+    TakePicture,
     camera_frames,
     topics,
 )
 from device_agent.protocol.codec import MAX_BYTES
 from device_agent.protocol.manifests.room import Control as RoomControl
-from device_agent.protocol.manifests.room import RoomDevice
+from device_agent.protocol.manifests.room import RoomDeviceManifest
 from device_agent.runtime.authority.interlocks import Interlock
-from device_agent.runtime.readings import Room
-from device_agent.runtime.room.room_device import Instrument
+from device_agent.runtime.readings import ReadingCache
+from device_agent.runtime.room.room_device import RoomDevice
 from tests.harness.agent.device_harness import Bench, eventually, shown
 
 JPEG = b"\xff\xd8 a picture \xff\xd9"
-ENTRY = RoomDevice(
+ENTRY = RoomDeviceManifest(
     name="arm",  # the bench's device is called so
     kind="window",
     label="Window",
@@ -123,7 +123,7 @@ class RoomBench(Bench):
     def __init__(self, folder: Path, **more: Any) -> None:
         self.sensor, self.store = ToySensor(), ToyStore()
         self.uploads = more.pop("uploads", self.store)
-        instrument = Instrument(self.sensor, more.pop("entry", ENTRY), self.uploads)
+        instrument = RoomDevice(self.sensor, more.pop("entry", ENTRY), self.uploads)
         super().__init__(folder, driver=instrument, kind=ENTRY.robot_type(), **more)  # type: ignore[arg-type]
         self.device.start()
 
@@ -213,7 +213,7 @@ def test_a_picture_that_is_too_large_is_a_fault_that_says_what_to_do(bench: Room
 
 def test_a_gathering_changes_the_rate_tells_how_far_it_is_and_ends_by_itself(bench: RoomBench) -> None:
     before = bench.sensor.reads["rain"]
-    command = bench.command(Gather(streams=("air", "rain"), rate_hz=50.0, duration_s=1.5), epoch=bench.epoch())
+    command = bench.command(CollectData(streams=("air", "rain"), rate_hz=50.0, duration_s=1.5), epoch=bench.epoch())
     ack = bench.end(command)
     assert ack.status is AckStatus.DONE
     assert bench.sensor.reads["rain"] - before > 20, "ten times its own rate"
@@ -225,9 +225,9 @@ def test_a_gathering_changes_the_rate_tells_how_far_it_is_and_ends_by_itself(ben
 
 
 def test_a_gathering_can_be_cancelled_and_nobody_else_gathers_meanwhile(bench: RoomBench) -> None:
-    first = bench.command(Gather(rate_hz=1.0, duration_s=3000.0), epoch=bench.epoch())
+    first = bench.command(CollectData(rate_hz=1.0, duration_s=3000.0), epoch=bench.epoch())
     eventually(lambda: any(ack.status is AckStatus.STARTED for ack in bench.acks(first)))
-    second = bench.end(bench.command(Gather(rate_hz=2.0, duration_s=1.0), epoch=bench.given))
+    second = bench.end(bench.command(CollectData(rate_hz=2.0, duration_s=1.0), epoch=bench.given))
     assert (second.status, second.reason and second.reason.code) == (AckStatus.FAILED, "busy")
     bench.command(CancelAction(action=first), epoch=bench.given)
     assert bench.end(first).status is AckStatus.CANCELLED
@@ -236,10 +236,10 @@ def test_a_gathering_can_be_cancelled_and_nobody_else_gathers_meanwhile(bench: R
 
 def test_one_shot_gives_the_values_in_its_answer(bench: RoomBench) -> None:
     bench.sensor.values = {"temperature_c": 21.5}
-    ack = bench.done(Shoot(streams=("air",)))
+    ack = bench.done(TakePicture(streams=("air",)))
     assert ack.status is AckStatus.DONE
     assert ack.result["values"]["air"]["temperature_c"] == 21.5
-    assert set(bench.done(Shoot()).result["values"]) == {"air", "rain"}
+    assert set(bench.done(TakePicture()).result["values"]) == {"air", "rain"}
 
 
 def test_a_capture_is_stored_and_named_in_the_answer(bench: RoomBench) -> None:
@@ -268,8 +268,8 @@ def test_a_control_is_set_within_its_limits_and_says_what_was_applied(bench: Roo
 @pytest.mark.parametrize(
     ("request_", "code", "said"),
     [
-        (Shoot(streams=("wind",)), "unknown_stream", "there are air, rain"),
-        (Gather(streams=("wind",), rate_hz=1.0, duration_s=1.0), "unknown_stream", "there are air, rain"),
+        (TakePicture(streams=("wind",)), "unknown_stream", "there are air, rain"),
+        (CollectData(streams=("wind",), rate_hz=1.0, duration_s=1.0), "unknown_stream", "there are air, rain"),
         (CaptureRaw(name="film"), "unknown_capture", "there are: image"),
         (SetControl(control="colour", value=1.0), "unknown_control", "there are: opening"),
         (MoveJoints(position_rad={"elbow": 1.0}), "cannot", "it has"),
@@ -284,7 +284,7 @@ def test_what_it_has_not_is_refused_with_what_it_has(bench: RoomBench, request_:
 
 
 def test_an_instrument_checks_numbers_itself() -> None:
-    instrument = Instrument(ToySensor(), ENTRY, None)
+    instrument = RoomDevice(ToySensor(), ENTRY, None)
     for value in (math.nan, math.inf):
         with pytest.raises(Exception, match="must be a finite number"):
             instrument.set("opening", value)
@@ -294,18 +294,18 @@ def test_a_robot_takes_no_orders_for_room_devices(tmp_path: Path) -> None:
     bench = Bench(tmp_path)
     bench.device.start()
     try:
-        ack = bench.end(bench.command(Shoot(), epoch=1))
+        ack = bench.end(bench.command(TakePicture(), epoch=1))
         assert (ack.status, ack.reason and ack.reason.code) == (AckStatus.FAILED, "cannot")
     finally:
         bench.stop()
 
 
 def test_a_device_without_streams_or_store_says_so(tmp_path: Path) -> None:
-    bench = RoomBench(tmp_path, uploads=None, entry=RoomDevice(
+    bench = RoomBench(tmp_path, uploads=None, entry=RoomDeviceManifest(
         name="arm", kind="window", label="Window", driver="toy", captures=("image",)
     ))  # fmt: skip
     try:
-        for request, code in ((Shoot(), "no_streams"), (CaptureRaw(name="image"), "no_store")):
+        for request, code in ((TakePicture(), "no_streams"), (CaptureRaw(name="image"), "no_store")):
             ack = bench.done(request)
             assert (ack.status, ack.reason and ack.reason.code) == (AckStatus.FAILED, code)
     finally:
@@ -318,7 +318,7 @@ def test_what_fails_is_told_as_it_was_said(bench: RoomBench) -> None:
     assert ack.reason is not None
     assert (ack.reason.code, ack.reason.message) == ("not_stored", "the store is full; delete something")
     instrument = bench.device._driver
-    assert isinstance(instrument, Instrument)
+    assert isinstance(instrument, RoomDevice)
     bench.sensor.broken = "it is wet"
     for deed in (
         lambda: instrument.shoot(()),
@@ -330,7 +330,7 @@ def test_what_fails_is_told_as_it_was_said(bench: RoomBench) -> None:
 
 
 def test_stop_holds_what_moves_and_refuses_until_it_is_reset_and_measuring_goes_on(bench: RoomBench) -> None:
-    gathering = bench.command(Gather(rate_hz=20.0, duration_s=3000.0), epoch=bench.epoch())
+    gathering = bench.command(CollectData(rate_hz=20.0, duration_s=3000.0), epoch=bench.epoch())
     eventually(lambda: any(ack.status is AckStatus.STARTED for ack in bench.acks(gathering)))
     bench.command(StopDevice(), epoch=0)
     assert bench.end(gathering).status is AckStatus.FAILED
@@ -344,7 +344,7 @@ def test_stop_holds_what_moves_and_refuses_until_it_is_reset_and_measuring_goes_
 
 
 def test_the_loss_of_the_lease_ends_a_gathering(bench: RoomBench) -> None:
-    gathering = bench.command(Gather(rate_hz=20.0, duration_s=3000.0), epoch=bench.epoch())
+    gathering = bench.command(CollectData(rate_hz=20.0, duration_s=3000.0), epoch=bench.epoch())
     eventually(lambda: any(ack.status is AckStatus.STARTED for ack in bench.acks(gathering)))
     bench.command(ReleaseLease(), epoch=bench.given)
     assert bench.end(gathering).reason.code == "lease_lost"  # type: ignore[union-attr]
@@ -357,7 +357,7 @@ def test_a_sensor_that_does_not_answer_is_a_fault_that_ends_when_it_answers(benc
     state = shown(bench, lambda state: state.faults)
     assert state.mode is Mode.FAULT
     assert state.faults[0].message == bench.sensor.broken
-    refused = bench.done(Shoot())
+    refused = bench.done(TakePicture())
     assert (refused.status, refused.reason and refused.reason.code) == (AckStatus.FAILED, "fault")
     bench.sensor.broken = ""
     shown(bench, lambda state: not state.faults)
@@ -410,7 +410,7 @@ def test_the_room_holds_a_room_device_too(tmp_path: Path) -> None:
 
 
 def test_what_it_measures_is_what_the_agents_others_read_of_the_room(bench: RoomBench) -> None:
-    room = Room(space="s", agent="a", own=["arm"], named=[("arm", "air")])
+    room = ReadingCache(space="s", agent="a", own=["arm"], named=[("arm", "air")])
     bench.device._room = room
     eventually(lambda: room.latest("arm", "air"))
 
@@ -451,7 +451,7 @@ class ToyThermometer:
 
 
 def test_what_cannot_move_need_not_be_held_and_what_is_no_camera_films_nothing() -> None:
-    instrument = Instrument(ToyThermometer(), ENTRY, None)
+    instrument = RoomDevice(ToyThermometer(), ENTRY, None)
     instrument.hold()
     assert instrument.cameras == ()
     assert not instrument.simulated

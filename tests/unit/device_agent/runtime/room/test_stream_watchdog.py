@@ -1,7 +1,7 @@
 """Streams and cameras of a room device that give nothing, or the same for ever, though no error is raised."""
 
 from device_agent.protocol.manifests.room import Watch
-from device_agent.runtime.room.stream_watchdog import Vigil
+from device_agent.runtime.room.stream_watchdog import StreamWatchdog
 
 
 class Bedside:
@@ -9,7 +9,7 @@ class Bedside:
 
     def __init__(self, *watches: Watch, rate_hz: float = 1.0) -> None:
         self.now_s, self.rate_hz = 100.0, rate_hz
-        self.vigil = Vigil(watches, lambda _: self.rate_hz, lambda: self.now_s)
+        self.vigil = StreamWatchdog(watches, lambda _: self.rate_hz, lambda: self.now_s)
         self.vigil.begin()
 
     def pass_s(self, seconds: int, *contents: object) -> list[str]:
@@ -33,7 +33,7 @@ def test_what_gives_nothing_is_silent_until_it_is_heard() -> None:
 
 
 def test_nothing_is_wrong_before_anything_is_expected() -> None:
-    vigil = Vigil((Watch(source="air", silent_s=5.0),), lambda _: 1.0, lambda: 100.0)
+    vigil = StreamWatchdog((Watch(source="air", silent_s=5.0),), lambda _: 1.0, lambda: 100.0)
     vigil.note("air", {"x": 1.0})
     assert vigil.faults() == ()
 

@@ -6,45 +6,45 @@ from pathlib import Path
 
 import pytest
 
-from device_agent.runtime.storage.outbox_store import Dropped, Item, Shelf, ShelfError
+from device_agent.runtime.storage.outbox_store import DroppedCount, OutboxItem, OutboxStore, ShelfError
 
 OWN = "ts/v1/s/a/"
 EVENT, LATE = OWN + "arm/event", OWN + "arm/late/joints"
 NOW_MS = 1_800_000_000_000
 
 
-def make(path: Path, *, own: str = OWN, max_bytes: int = 10**6, max_age_ms: int = 3_600_000) -> Shelf:
-    return Shelf(path, own=own, max_bytes=max_bytes, max_age_ms=max_age_ms)
+def make(path: Path, *, own: str = OWN, max_bytes: int = 10**6, max_age_ms: int = 3_600_000) -> OutboxStore:
+    return OutboxStore(path, own=own, max_bytes=max_bytes, max_age_ms=max_age_ms)
 
 
 @pytest.fixture
-def shelf(tmp_path: Path) -> Iterator[Shelf]:
+def shelf(tmp_path: Path) -> Iterator[OutboxStore]:
     shelf = make(tmp_path / "outbox.db")
     shelf.open()
     yield shelf
     shelf.close()
 
 
-def item(number: int, topic: str = LATE, *, at_ms: int = NOW_MS, size: int = 1) -> Item:
-    return Item(topic, str(number).encode().ljust(size), at_ms, late="/late/" in topic)
+def item(number: int, topic: str = LATE, *, at_ms: int = NOW_MS, size: int = 1) -> OutboxItem:
+    return OutboxItem(topic, str(number).encode().ljust(size), at_ms, late="/late/" in topic)
 
 
-def numbers(shelf: Shelf, *, late: bool = True, last: int = 0, limit: int = 100_000) -> list[int]:
+def numbers(shelf: OutboxStore, *, late: bool = True, last: int = 0, limit: int = 100_000) -> list[int]:
     return [int(found.payload) for _, found in shelf.after(last, late=late, limit=limit)]
 
 
-def dropped(shelf: Shelf) -> list[Dropped]:
-    told: list[Dropped] = []
+def dropped(shelf: OutboxStore) -> list[DroppedCount]:
+    told: list[DroppedCount] = []
 
-    def event(what: Dropped) -> Item:
+    def event(what: DroppedCount) -> OutboxItem:
         told.append(what)
-        return Item(what.device + "/event", b"0", NOW_MS, late=False)
+        return OutboxItem(what.device + "/event", b"0", NOW_MS, late=False)
 
     shelf.tell_dropped(event)
     return told
 
 
-def test_it_gives_back_what_was_put_in_oldest_first_page_by_page(shelf: Shelf) -> None:
+def test_it_gives_back_what_was_put_in_oldest_first_page_by_page(shelf: OutboxStore) -> None:
     shelf.put([item(1), item(2, EVENT), item(3)], now_ms=NOW_MS)
     shelf.put([item(4)], now_ms=NOW_MS)
     assert numbers(shelf) == [1, 3, 4]
@@ -83,7 +83,7 @@ def test_beyond_its_bound_the_oldest_measurements_go_first_then_events_and_are_c
     left = numbers(shelf)
     assert left == list(range(300 - len(left), 300)), "the oldest went"
     (told,) = dropped(shelf)
-    assert told == Dropped(OWN + "arm", measurements=300 - len(left), events=0)
+    assert told == DroppedCount(OWN + "arm", measurements=300 - len(left), events=0)
     for number in range(300, 2000):
         shelf.put([item(number, EVENT, size=200)], now_ms=NOW_MS)
     events = numbers(shelf, late=False)
@@ -101,7 +101,7 @@ def test_the_sum_of_what_is_kept_is_true_after_anything(tmp_path: Path) -> None:
         shelf.put([item(number, size=number), item(number, EVENT)], now_ms=NOW_MS + number)
         shelf.remove([number // 2, number // 3])
         if number % 50 == 0:
-            shelf.tell_dropped(lambda what: Item(what.device + "/event", b"0", NOW_MS, late=False))
+            shelf.tell_dropped(lambda what: OutboxItem(what.device + "/event", b"0", NOW_MS, late=False))
     kept = shelf._bytes
     shelf.close()
     again = make(tmp_path / "db")
@@ -110,27 +110,27 @@ def test_the_sum_of_what_is_kept_is_true_after_anything(tmp_path: Path) -> None:
     again.close()
 
 
-def test_what_is_too_old_is_dropped_and_counted(shelf: Shelf) -> None:
+def test_what_is_too_old_is_dropped_and_counted(shelf: OutboxStore) -> None:
     shelf.put([item(1), item(2, at_ms=NOW_MS + 3_000_000), item(3, EVENT)], now_ms=NOW_MS)
     shelf.bound(now_ms=NOW_MS + 3_700_000)
     assert (numbers(shelf), numbers(shelf, late=False)) == ([2], [3])
     shelf.bound(now_ms=NOW_MS + 31 * 24 * 3_600_000)
     assert numbers(shelf, late=False) == [3], "what happened stays worth telling"
-    assert dropped(shelf) == [Dropped(OWN + "arm", measurements=2, events=0)]
+    assert dropped(shelf) == [DroppedCount(OWN + "arm", measurements=2, events=0)]
     assert dropped(shelf) == [], "told once"
 
 
-def test_what_nobody_confirms_is_dropped_and_counted(shelf: Shelf) -> None:
+def test_what_nobody_confirms_is_dropped_and_counted(shelf: OutboxStore) -> None:
     shelf.put([item(1), item(2)], now_ms=NOW_MS)
     shelf.drop([number for number, _ in shelf.after(0, late=True, limit=1)])
     assert numbers(shelf) == [2]
     assert dropped(shelf)[0].measurements == 1
 
 
-def test_the_event_that_tells_is_kept_in_the_same_step(shelf: Shelf) -> None:
+def test_the_event_that_tells_is_kept_in_the_same_step(shelf: OutboxStore) -> None:
     shelf.count({(OWN + "arm", True): 2, (OWN + "arm", False): 1, (OWN + "leg", True): 5})
     shelf.count({(OWN + "arm", True): 2})
-    assert dropped(shelf) == [Dropped(OWN + "arm", 4, 1), Dropped(OWN + "leg", 5, 0)]
+    assert dropped(shelf) == [DroppedCount(OWN + "arm", 4, 1), DroppedCount(OWN + "leg", 5, 0)]
     assert [found.topic for _, found in shelf.after(0, late=False, limit=9)] == [OWN + "arm/event", OWN + "leg/event"]
 
 
@@ -154,7 +154,7 @@ def test_where_nothing_can_be_written_it_says_so(tmp_path: Path) -> None:
             call()
 
 
-def test_a_full_disk_changes_nothing_and_is_named(tmp_path: Path, shelf: Shelf) -> None:
+def test_a_full_disk_changes_nothing_and_is_named(tmp_path: Path, shelf: OutboxStore) -> None:
     shelf.put([item(1)], now_ms=NOW_MS)
     before = shelf._bytes
     shelf._use().execute("PRAGMA max_page_count = 1")

@@ -14,7 +14,7 @@ from device_agent.ports.sensor import Frame
 from device_agent.protocol import Description, Stream, camera_frames, topics
 from device_agent.protocol.camera_frames import CameraFrame
 from device_agent.protocol.errors import ProtocolError
-from device_agent.runtime.telemetry.camera_streamer import Filmer
+from device_agent.runtime.telemetry.camera_streamer import CameraStreamer
 from tests.fakes.drivers import ToyDriver, robot_type
 from tests.harness.agent.device_harness import Bench, eventually
 
@@ -43,9 +43,9 @@ def watched(
     *,
     controlled: Callable[[], bool] = lambda: True,
     linger_s: float = 60.0,
-) -> Filmer:
+) -> CameraStreamer:
     """A filmer at work, with a link."""
-    filmer = Filmer([EYES], driver, name="cart", film=film, controlled=controlled, linger_s=linger_s)
+    filmer = CameraStreamer([EYES], driver, name="cart", film=film, controlled=controlled, linger_s=linger_s)
     filmer.link_changed(True)
     filmer.start()
     return filmer

@@ -7,7 +7,7 @@ from typing import Any
 import pytest
 
 from device_agent.ports.transport import LinkChanged, Receive
-from device_agent.runtime.telemetry.latency_probe import MOST, RoundTrips, Sample
+from device_agent.runtime.telemetry.latency_probe import MOST, LatencyProbe, Sample
 from tests.harness.agent.device_harness import eventually
 
 STATE = "ts/v1/s/a/arm/state"
@@ -41,7 +41,7 @@ class Timed:
         self.told: list[tuple[str, Sequence[Sample]]] = []
         self.trouble: list[Exception] = []
         self.link_was: list[bool] = []
-        self.trips = RoundTrips(self.link, tell=self.tell, at_ms=lambda: NOW_MS, **periods)
+        self.trips = LatencyProbe(self.link, tell=self.tell, at_ms=lambda: NOW_MS, **periods)
         self.trips.start(lambda _topic, _payload: None, self.link_was.append)
 
     def tell(self, device: str, samples: Sequence[Sample]) -> None:

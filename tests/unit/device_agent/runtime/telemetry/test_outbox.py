@@ -9,7 +9,7 @@ import pytest
 
 from device_agent.protocol import Event, codec, topics
 from device_agent.protocol.events import EventKind
-from device_agent.runtime.storage.outbox_store import Item, Shelf, ShelfError
+from device_agent.runtime.storage.outbox_store import OutboxItem, OutboxStore, ShelfError
 from device_agent.runtime.telemetry import outbox as module
 from device_agent.runtime.telemetry.outbox import BUSY_RATE_HZ, RATE_HZ, Outbox
 from tests.harness.agent.device_harness import eventually
@@ -63,7 +63,7 @@ class Bench:
 
     def renew(self) -> None:
         """As after a restart."""
-        self.shelf = Shelf(self.path, own="ts/v1/s/a/", **self.limits)
+        self.shelf = OutboxStore(self.path, own="ts/v1/s/a/", **self.limits)
         self.outbox = Outbox(
             self.shelf, publish=self.link.publish, teller=ARM, quiet=lambda: not self.moves, keep_hz=1.0
         )
@@ -333,8 +333,8 @@ def test_an_error_in_reading_is_trouble_too_and_one_nobody_thought_of_ends_nothi
 ) -> None:
     bench.outbox.link_changed(True)
 
-    def fail(error: Exception) -> Callable[..., list[tuple[int, Item]]]:
-        def after(*_: object, **__: object) -> list[tuple[int, Item]]:
+    def fail(error: Exception) -> Callable[..., list[tuple[int, OutboxItem]]]:
+        def after(*_: object, **__: object) -> list[tuple[int, OutboxItem]]:
             raise error
 
         return after

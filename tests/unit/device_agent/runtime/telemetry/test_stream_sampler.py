@@ -14,7 +14,7 @@ import pytest
 from device_agent.ports.driver import DriverError
 from device_agent.protocol import Measurements, Stream, codec, topics
 from device_agent.runtime.authority.interlocks import Interlock
-from device_agent.runtime.telemetry.stream_sampler import Reporter
+from device_agent.runtime.telemetry.stream_sampler import StreamSampler
 from tests.fakes.drivers import ToyDriver, robot_type
 from tests.harness.agent.device_harness import Bench, eventually
 from tests.unit.device_agent.runtime.actions.test_robot_api import play
@@ -58,8 +58,8 @@ class Bell:
             return self.of(stream)
 
 
-def run(gauge: Gauge | None, *streams: Stream, tell: Callable[[str, Measurements], None]) -> Reporter:
-    reporter = Reporter(streams, gauge, name="cart", tell=tell)
+def run(gauge: Gauge | None, *streams: Stream, tell: Callable[[str, Measurements], None]) -> StreamSampler:
+    reporter = StreamSampler(streams, gauge, name="cart", tell=tell)
     reporter.start()
     return reporter
 

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from function_app.domain.common.problems import Problem
 from function_app.domain.control import control_request, lease
-from function_app.domain.control.control_events import Fact, Happened, changed, ended, overdue
+from function_app.domain.control.control_events import ControlEvent, Fact, changed, ended, overdue
 from function_app.domain.control.lease import Lease
 from function_app.domain.identity.accounts import Identity
 
@@ -174,7 +174,7 @@ def test_whatever_is_done_at_once_each_request_has_one_end_and_control_passes_on
 ) -> None:
     known: Lease | None = None
     now_ms, number = START, 0
-    told: list[Happened] = []
+    told: list[ControlEvent] = []
     ends: dict[str, str] = {}
     for what, who, later_ms in steps:
         now_ms += later_ms

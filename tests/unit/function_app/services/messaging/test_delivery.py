@@ -12,10 +12,10 @@ from function_app.adapters.mqtt.connection import Broker
 from function_app.domain.devices.devices import Device
 from function_app.domain.identity.accounts import Role
 from function_app.ports.broker_access import ServiceCredentials
-from function_app.services.messaging.broker_relay import Relay
+from function_app.services.messaging.broker_relay import BrokerRelay
 from function_app.services.messaging.delivery import Delivery, Signed
 from function_app.services.messaging.mailbox import Mailbox
-from function_app.services.storage.retention import Forget
+from function_app.services.storage.retention import Retention
 
 ARM = Device(
     id="aaaaaaaaaa-arm", name="arm", label="Arm", kind="arm", robot_type="ur5", agent="aaaaaaaaaa", space="s",
@@ -33,7 +33,7 @@ class Busy(Mailbox):
 
 async def confirmed(folder: Path, wait_ms: int) -> bool:
     tables = SqliteTables(folder / "tables.sqlite")
-    forget = Forget(tables=tables, blobs=FileBlobs(folder / "blobs"))
+    forget = Retention(tables=tables, blobs=FileBlobs(folder / "blobs"))
     mailbox = Busy(tables=tables, forget=forget, clock=SystemClock())
     bus = MqttCommandBus(
         Broker(host="127.0.0.1", port=1, credentials=lambda: ServiceCredentials("c", "u", "p", math.inf))
@@ -41,7 +41,7 @@ async def confirmed(folder: Path, wait_ms: int) -> bool:
     signed = Signed("aaaaaaaaaa-arm-00000000000000000000", b"{}", SystemClock().now_ms() + 5_000)
     try:
         async with asyncio.timeout(20):
-            return await Delivery(bus=bus, mailbox=mailbox, relay=Relay(bus=bus, clock=SystemClock())).confirmed(
+            return await Delivery(bus=bus, mailbox=mailbox, relay=BrokerRelay(bus=bus, clock=SystemClock())).confirmed(
                 ARM, signed, wait_ms=wait_ms
             )
     finally:

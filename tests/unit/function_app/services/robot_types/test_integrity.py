@@ -15,10 +15,10 @@ from function_app.adapters.local.signing_keys import FileKeys
 from function_app.domain.common.problems import Problem
 from function_app.domain.robot_types.robot_types import TypeVersion
 from function_app.ports.tables import Row
-from function_app.services.robot_types.integrity import Seals, require_whole
+from function_app.services.robot_types.integrity import IntegritySeals, require_intact
 from function_app.services.storage import records
+from tests.harness.paths import ROBOTS
 
-ROBOTS = Path(__file__).parents[3] / "robots"
 TYPES = sorted(folder.parent.name for folder in ROBOTS.glob("*/robot.toml"))
 
 
@@ -26,19 +26,19 @@ async def flip_each(name: str, home: Path, *, stride: int) -> tuple[int, int]:
     """Seal a type as if it had been uploaded, and change one byte after the other; how many in files, and in rows."""
     files = {file.name: file.read_bytes() for file in sorted((ROBOTS / name).iterdir()) if file.is_file()}
     manifest = msgspec.to_builtins(manifests.parse(files["robot.toml"].decode()))
-    seals = Seals(keys=FileKeys(home / "keys"))
+    seals = IntegritySeals(keys=FileKeys(home / "keys"))
     plain = TypeVersion(1, "ready", manifest, {file: len(content) for file, content in files.items()}, 0)
     good = await seals.sealed("anna", name, plain, files)
     seal = await seals.check("anna", name, good)
 
     in_files = 0
     for file, content in files.items():
-        require_whole(name, seal, file, content)
+        require_intact(name, seal, file, content)
         changed = bytearray(content)
         for place in range(0, len(content), stride):
             changed[place] ^= 1 << place % 8
             with pytest.raises(Problem, match="was changed in the store"):
-                require_whole(name, seal, file, bytes(changed))
+                require_intact(name, seal, file, bytes(changed))
             changed[place] ^= 1 << place % 8
             in_files += 1
 

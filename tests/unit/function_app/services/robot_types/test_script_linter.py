@@ -8,8 +8,8 @@ from device_agent.protocol.documents.script_api import script_api
 from device_agent.protocol.manifests import robot_type
 from device_agent.sandbox.api_document import document
 from function_app.services.robot_types.script_linter import Mark, check_script
+from tests.harness.paths import ROBOTS
 
-ROBOTS = Path(__file__).resolve().parents[3] / "robots"
 UR5 = robot_type.load(ROBOTS / "ur5")
 NAO = robot_type.load(ROBOTS / "nao")
 
