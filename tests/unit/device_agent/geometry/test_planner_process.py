@@ -195,9 +195,9 @@ AGENT = """
 import sys, threading
 from pathlib import Path
 from device_agent.geometry.mujoco_geometry import MujocoGeometry
-from device_agent.protocol import robot_type
+from device_agent.protocol.manifests import robot_type
 from device_agent.protocol import StopLatch
-from tests.unit.geometry import test_planning as t
+from tests.unit.device_agent.geometry import test_planner_process as t
 shape = MujocoGeometry(t.KIND, Path(sys.argv[1]))
 shape.plan(t.HOME, t.HOME)
 print(t.pid_of(shape), flush=True)
