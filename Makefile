@@ -24,7 +24,7 @@ help:
 	@echo "make link          print another one-time sign-in link"
 	@echo "make test          check and test everything (about twenty-five minutes on two cores: see CONTRIBUTING.md for where it goes)"
 	@echo "make test-long     the same with every suite at full size"
-	@echo "make bench         what users feel, measured, with an hour of load: benchmarks/results, docs/benchmarks.md"
+	@echo "make bench         what users feel, measured, with an hour of load: benchmarks/results, docs/results/benchmarks.md"
 	@echo "make bench-quick   the same with fewer samples, in some minutes"
 	@echo "make coverage      every branch of the agent's runtime, by its unit tests alone"
 	@echo "make fuzz          each parser under a fuzzer, SECONDS_EACH=60"

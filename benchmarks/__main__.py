@@ -1,4 +1,4 @@
-"""``python -m benchmarks [SUITE …] [--quick]``: measures, writes ``results/*.json`` and ``docs/benchmarks.md``.
+"""``python -m benchmarks [SUITE …] [--quick]``: measures, writes ``results/*.json`` and ``docs/results/benchmarks.md``.
 
 Prints what is claimed and what was seen; the exit code is 1 where a claim does not hold. A quick run is for the
 terminal: it leaves the page and the results of whole runs alone.

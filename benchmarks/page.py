@@ -1,4 +1,4 @@
-"""``docs/benchmarks.md`` and its charts, from ``results/*.json`` and nothing else.
+"""``docs/results/benchmarks.md`` and its charts, from ``results/*.json`` and nothing else.
 
 ``python -m benchmarks.page [--check]`` writes the page, or fails when it is not what the results say.
 """
@@ -13,7 +13,7 @@ from benchmarks import suites
 from benchmarks.report import Chart, Report, Table, load, shown
 
 ROOT: Final = Path(__file__).parent.parent
-PAGE: Final = ROOT / "docs" / "benchmarks.md"
+PAGE: Final = ROOT / "docs" / "results" / "benchmarks.md"
 PICTURES: Final = ROOT / "docs" / "pictures" / "benchmarks"
 _INSIDE: Final = 5
 """So many names at most fit into a chart; more stand beside it."""
@@ -60,7 +60,7 @@ def _section(report: Report) -> Iterator[str]:
     for table in report.tables:
         yield _table(table)
     for number, chart in enumerate(report.charts):
-        yield f"![{chart.title}](pictures/benchmarks/{_file(report, number)})\n"
+        yield f"![{chart.title}](../pictures/benchmarks/{_file(report, number)})\n"
 
 
 def _table(table: Table) -> str:
@@ -156,7 +156,7 @@ def main() -> int:
     if parser.parse_args().check:
         if PAGE.read_text(encoding="utf-8") == text(reports()):
             return 0
-        sys.stderr.write("docs/benchmarks.md is not what benchmarks/results say; run `python -m benchmarks.page`\n")
+        sys.stderr.write("docs/results/benchmarks.md is not what benchmarks/results say; run `python -m benchmarks.page`\n")
         return 1
     write()
     return 0

@@ -1,4 +1,4 @@
-"""Cost and limits on paper: ``python -m benchmarks.sheet`` writes docs/scale.md from the files in benchmarks/scale.
+"""Cost and limits on paper: ``python -m benchmarks.sheet`` writes docs/results/scale.md from the files in benchmarks/scale.
 
 ``swarm.json`` is what the last whole run of the suite ``scale`` has measured, ``limits.json`` what is assumed, and
 limits and prices with their source. A price that is not known stands in the sheet by its name. ``--check`` only looks whether the page is new.
@@ -14,7 +14,7 @@ from typing import Any
 
 ROOT = Path(__file__).parents[1]
 SCALE = ROOT / "benchmarks" / "scale"
-PAGE = ROOT / "docs" / "scale.md"
+PAGE = ROOT / "docs" / "results" / "scale.md"
 MONTH_S = 30 * 86_400
 _FEW = 10
 Known = Mapping[str, Any]

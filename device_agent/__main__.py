@@ -293,7 +293,7 @@ def _run_until_told(home: Home, trace: Path | None) -> bool:
 
 
 def _let_control_loops_go_first() -> None:
-    """Shorten what a control loop may have to wait for in this process; docs/measured.md has the figures.
+    """Shorten what a control loop may have to wait for in this process; docs/results/measured.md has the figures.
 
     A thread that computes gives way after a millisecond, not five; and the collector leaves alone what was made at the
     start and stays: to go through all of it took 40 ms, in which nothing else ran.

@@ -2,7 +2,7 @@
 
 A room device has streams (named values, read at a rate), cameras (pictures, read at a rate), captures (one raw
 picture or scan, for the blob store) and controls (something to set). Each driver has some of them; asked for what it
-has not, it raises ``SensorError`` and lists what there is. ``docs/add-a-sensor.md`` makes one from nothing.
+has not, it raises ``SensorError`` and lists what there is. ``docs/guides/add-a-sensor.md`` makes one from nothing.
 """
 
 from collections.abc import Mapping

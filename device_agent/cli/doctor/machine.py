@@ -40,7 +40,7 @@ def user() -> Iterator[Finding]:
         yield warning(
             "user",
             "runs as root: a limit on processes does not bind root, and a fault here would be a fault of the machine",
-            "Run the agent as a user of its own: docs/agent.md, infra/systemd/telescope-agent.service.",
+            "Run the agent as a user of its own: docs/guides/install-an-agent.md, infra/systemd/telescope-agent.service.",
         )
     else:
         yield ok("user", f"runs as an unprivileged user (uid {os.geteuid()})")

@@ -12,7 +12,7 @@ import pytest
 from tests.harness.cloud.cloud_processes import Ground, start_ground
 from tests.harness.paths import ROOT
 
-PAGE = ROOT / "docs" / "add-a-robot.md"
+PAGE = ROOT / "docs" / "guides" / "add-a-robot.md"
 BLOCK = re.compile(r"^```(\w+)(?: (\S+))?\n(.*?)^```$", re.MULTILINE | re.DOTALL)
 SERVER = "http://127.0.0.1:8080"
 PATIENCE_S = 280

@@ -1,4 +1,4 @@
-"""``docs/add-a-sensor.md``, done as it stands: the files, found by the agent, through the suite."""
+"""``docs/guides/add-a-sensor.md``, done as it stands: the files, found by the agent, through the suite."""
 
 import os
 import re
@@ -10,7 +10,7 @@ import pytest
 
 from tests.harness.paths import ROOT
 
-PAGE = (Path(ROOT) / "docs" / "add-a-sensor.md").read_text()
+PAGE = (Path(ROOT) / "docs" / "guides" / "add-a-sensor.md").read_text()
 FILES = dict(re.findall(r"<!-- file: (\S+) -->\n```\w+\n(.*?)```", PAGE, re.DOTALL))
 
 
