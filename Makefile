@@ -1,37 +1,43 @@
-# Two commands: `make up` runs the product on this machine, `make test` passes its tests. Each sets itself up.
-# Ports, folder and broker: TELESCOPE_PORT, TELESCOPE_HOME, TELESCOPE_BROKER (see README).
+# `make up` runs the product on this machine; `make test` runs its tests. Each installs what it needs.
+# Settings: docs/reference/configuration.md.
 
 PYTHON ?= python3
 BIN := .venv/bin
-# Node.js of the machine when it is new enough, else the one that comes as a Python wheel.
+# The machine's Node.js if it is new enough, else the one from a Python wheel.
 NODE_READY = command -v npm >/dev/null && node -e 'process.exit(parseInt(process.versions.node) >= 20 ? 0 : 1)'
 NODE = PATH="$(if $(wildcard $(BIN)/npm),$(CURDIR)/$(BIN):)$$PATH" npm
 NPM = $(NODE) --prefix web
 
+PIP := $(BIN)/python -m pip install --quiet --disable-pip-version-check --no-deps --require-hashes
+PYTEST := $(BIN)/python -m pytest
 SECONDS_EACH ?= 60
-# Most tests wait for processes of their own, so three run side by side on two cores; a file's tests stay together.
-SIDE_BY_SIDE = -n 3 --dist loadfile --no-loadscope-reorder
-# Two browsers and two products fill two cores: a worker has the laboratory, the other one all that needs one arm or less.
+# Most tests wait for child processes, so three workers share two cores. The tests of one file stay in one worker.
+PARALLEL = -n 3 --dist loadfile --no-loadscope-reorder
+# Two browsers and two products use two cores fully.
 BROWSERS = -n 2 --dist loadscope tests/e2e
-# Those run one at a time that have a robot in motion before them, or an answer that must come in time.
-ALONE = tests/api tests/faults tests/security/tenants/test_secrets.py
+# These tests measure a moving robot or need a response within a deadline, so they run one at a time.
+SERIAL = tests/api tests/faults tests/security/tenants/test_secrets.py
 
-.PHONY: help up link env console test test-long bench bench-quick coverage fuzz check audit-packages contract requirements clean
+.PHONY: help up link env console test test-fast test-long bench bench-quick coverage fuzz check check-python check-web audit-packages contract requirements \
+	system-packages test-environment wheels clean
 .DELETE_ON_ERROR:
 
 help:
-	@echo "make up            run Telescope on this machine"
-	@echo "make link          print another one-time sign-in link"
-	@echo "make test          check and test everything (about twenty-five minutes on two cores: see CONTRIBUTING.md for where it goes)"
-	@echo "make test-long     the same with every suite at full size"
-	@echo "make bench         what users feel, measured, with an hour of load: benchmarks/results, docs/results/benchmarks.md"
-	@echo "make bench-quick   the same with fewer samples, in some minutes"
-	@echo "make coverage      every branch of the agent's runtime, by its unit tests alone"
-	@echo "make fuzz          each parser under a fuzzer, SECONDS_EACH=60"
-	@echo "make check         linters, types, import contracts, generated files, unsafe code, committed secrets"
-	@echo "make audit-packages  ask osv.dev what is known against the pinned packages (needs a network)"
-	@echo "make contract      regenerate docs/asyncapi.json, protocol/script_api.json and web/src/shared/mqtt/protocol.generated.ts"
-	@echo "make requirements  regenerate requirements.txt and requirements/*.txt"
+	@echo "make up              run Telescope on this machine"
+	@echo "make link            print a new one-time sign-in link"
+	@echo "make test            run all checks and tests (CI runs the same)"
+	@echo "make test-fast       run the fast unit tests"
+	@echo "make test-long       run every test suite at full size"
+	@echo "make check           linters, types, import rules, generated files, unsafe code, committed secrets"
+	@echo "make coverage        unit tests of the agent; every branch of its runtime must be covered"
+	@echo "make bench           run all benchmarks, including one hour of load; writes benchmarks/results and docs/results"
+	@echo "make bench-quick     run all benchmarks with fewer samples, in about ten minutes"
+	@echo "make fuzz            run each parser under a fuzzer for SECONDS_EACH (60) seconds"
+	@echo "make wheels          build the distributions telescope-agent and telescope-server into dist/"
+	@echo "make contract        regenerate the AsyncAPI document, the script API and the console's message types"
+	@echo "make requirements    regenerate requirements.txt and requirements/*.txt"
+	@echo "make audit-packages  query osv.dev for advisories against the pinned packages (needs a network)"
+	@echo "make clean           remove the environment and all build output"
 
 up: env console
 	@exec $(BIN)/python -m infra.local
@@ -48,22 +54,22 @@ env: .venv/.local
 
 .venv/.local: requirements/local.txt | .venv/.python
 	@echo "telescope: installing Python packages" >&2
-	@$(BIN)/python -m pip install --quiet --disable-pip-version-check --no-deps -r requirements/local.txt
+	@$(PIP) -r requirements/local.txt
 	@touch $@
 
 .venv/.dev: requirements/dev.txt | .venv/.python
 	@echo "telescope: installing Python packages for development" >&2
-	@$(BIN)/python -m pip install --quiet --disable-pip-version-check --no-deps -r requirements/dev.txt
+	@$(PIP) -r requirements/dev.txt
 	@touch $@ .venv/.local
 
 .venv/.bench: requirements/bench.txt | .venv/.dev
 	@echo "telescope: installing Python packages for benchmarks" >&2
-	@$(BIN)/python -m pip install --quiet --disable-pip-version-check --no-deps -r requirements/bench.txt
+	@$(PIP) -r requirements/bench.txt
 	@touch $@
 
 .venv/.node: requirements/node.txt | .venv/.python
 	@{ $(NODE_READY); } 2>/dev/null || { echo "telescope: installing Node.js" >&2; \
-		$(BIN)/python -m pip install --quiet --disable-pip-version-check --no-deps -r requirements/node.txt; }
+		$(PIP) -r requirements/node.txt; }
 	@touch $@
 
 web/node_modules/.installed: web/package-lock.json | .venv/.node
@@ -81,11 +87,10 @@ tests/harness/identity_provider/node_modules/.installed: tests/harness/identity_
 	@$(NODE) --prefix tests/harness/identity_provider ci --loglevel error --no-fund --no-audit >/dev/null
 	@touch $@
 
-# The Functions worker runs on every Python that Telescope does, though it asks for 3.13.
+# The Functions worker declares Python 3.13 but runs on every version that Telescope supports.
 .venv/.azure-worker: requirements/azure-worker.txt | .venv/.dev
 	@rm -rf .venv/azure-worker
-	@$(BIN)/python -m pip install --quiet --disable-pip-version-check --no-deps --ignore-requires-python \
-		--target .venv/azure-worker -r requirements/azure-worker.txt
+	@$(PIP) --ignore-requires-python --target .venv/azure-worker -r requirements/azure-worker.txt
 	@touch $@
 
 console: web/dist/index.html
@@ -95,21 +100,30 @@ web/dist/index.html: web/node_modules/.installed web/index.html web/package.json
 	@$(NPM) run --silent build -- --logLevel warn
 	@touch $@
 
-# The agent's unit tests run once: where their coverage is counted.
-test: .venv/.dev console check tests/harness/azurite/node_modules/.installed tests/harness/identity_provider/node_modules/.installed .venv/.azure-worker coverage
+# System packages come first: a missing program is reported in one line before any test runs.
+system-packages:
 	@tests/system-packages
-	@$(NPM) test --silent
-	@tests/twice -m "not long" $(SIDE_BY_SIDE) --ignore tests/unit/device_agent --ignore tests/e2e $(ALONE:%=--ignore %)
-	@tests/twice -m "not long" $(BROWSERS)
-	@tests/twice -m "not long" $(ALONE)
 
-test-long: .venv/.dev console check tests/harness/azurite/node_modules/.installed tests/harness/identity_provider/node_modules/.installed .venv/.azure-worker coverage
-	@tests/system-packages
-	@$(NPM) test --silent
-	@$(BIN)/python -m pytest
+test-environment: system-packages .venv/.dev console tests/harness/azurite/node_modules/.installed tests/harness/identity_provider/node_modules/.installed \
+	.venv/.azure-worker
 
+test: test-environment
+	@$(MAKE) --no-print-directory -j 2 check-python check-web
+	@$(MAKE) --no-print-directory coverage
+	@$(PYTEST) -q -m "not long" $(PARALLEL) --ignore tests/unit/device_agent --ignore tests/e2e $(SERIAL:%=--ignore %)
+	@$(PYTEST) -q -m "not long" $(BROWSERS)
+	@$(PYTEST) -q -m "not long" $(SERIAL)
+
+# Rules of the agent and the server without brokers, databases, browsers and physics.
+test-fast: .venv/.dev
+	@$(PYTEST) -q -m "not long and not slow" -n 2 tests/unit
+
+test-long: test-environment check coverage
+	@$(PYTEST)
+
+# Every branch of the agent's runtime is covered by the agent's unit tests alone.
 coverage: .venv/.dev
-	@tests/twice -q tests/unit/device_agent -m "not long" $(SIDE_BY_SIDE) --cov=device_agent/runtime --cov-branch \
+	@$(PYTEST) -q tests/unit/device_agent -m "not long" $(PARALLEL) --cov=device_agent/runtime --cov-branch \
 		--cov-report=term-missing:skip-covered --cov-fail-under=100
 
 bench bench-quick: .venv/.dev .venv/.bench console
@@ -119,9 +133,11 @@ bench bench-quick: .venv/.dev .venv/.bench console
 fuzz: .venv/.dev
 	@$(BIN)/python -m tests.security.fuzz $(SECONDS_EACH)
 
-check: .venv/.dev web/node_modules/.installed
-	@$(BIN)/ruff check .
-	@$(BIN)/ruff format --check .
+check: check-python check-web
+
+check-python: .venv/.dev
+	@$(BIN)/ruff check --quiet .
+	@$(BIN)/ruff format --quiet --check .
 	@$(BIN)/mypy
 	@$(BIN)/lint-imports
 	@$(BIN)/bandit --quiet --recursive --configfile pyproject.toml function_app device_agent infra
@@ -129,7 +145,10 @@ check: .venv/.dev web/node_modules/.installed
 	@$(BIN)/python requirements/export.py --check
 	@$(BIN)/python -m device_agent.protocol.documents.asyncapi | cmp - docs/asyncapi.json || { echo "docs/asyncapi.json is stale; run \`make contract\`" >&2; exit 1; }
 	@$(BIN)/python -m device_agent.sandbox.api_document | cmp - device_agent/protocol/documents/script_api.json || { echo "script_api.json is stale; run \`make contract\`" >&2; exit 1; }
+
+check-web: web/node_modules/.installed
 	@$(NPM) run --silent check
+	@$(NPM) test --silent
 
 contract: .venv/.dev web/node_modules/.installed
 	@$(BIN)/python -m device_agent.protocol.documents.asyncapi > docs/asyncapi.json
@@ -137,7 +156,7 @@ contract: .venv/.dev web/node_modules/.installed
 	@mv device_agent/protocol/documents/script_api.json.new device_agent/protocol/documents/script_api.json
 	@$(NPM) run --silent contract
 
-# Apart from `check`, which needs no network. It says so where it could not ask, and is not green then.
+# Separate from `check`, which needs no network. It fails when the database cannot be reached.
 audit-packages: .venv/.dev
 	@$(BIN)/python requirements/audit.py
 

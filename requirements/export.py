@@ -1,4 +1,8 @@
-"""Exports the dependency groups of ``pyproject.toml``, fully resolved, for pip. ``--check``: fail if a file differs."""
+"""Exports the dependency groups of ``pyproject.toml``, fully resolved and with hashes, for pip.
+
+With ``--check`` it writes nothing and fails if the pinned versions of a file differ. Hashes are not compared: an index
+may add a wheel to a version that is already pinned.
+"""
 
 import subprocess
 import sys
@@ -17,46 +21,56 @@ EXPORTS = {
     "requirements/azure-worker.txt": ("azure-worker",),
 }
 OPTIONS = {"requirements/azure-worker.txt": ("--no-deps", "--python-version", "3.13")}
-"""For what is not resolved like the others: it only runs beside packages that are there already."""
-NOWHERE = "sys_platform == 'never'"
-"""How ``pyproject.toml`` leaves out what a package asks for and does not need."""
+"""Extra options of ``uv pip compile``. The Functions worker runs beside packages that are installed already."""
+EXCLUDED = "sys_platform == 'never'"
+"""Marker with which ``pyproject.toml`` leaves out a package that another one requests and does not need."""
 HEADER = "# Exported from pyproject.toml by `make requirements`: groups {}.\n"
 
 
-def resolved(name: str, groups: tuple[str, ...]) -> str:
-    """The file's text. What is pinned in the present file stays where ``pyproject.toml`` allows it."""
+def resolve(name: str, groups: tuple[str, ...]) -> list[str]:
+    """Returns one entry per package: the pin and its hashes, joined by line continuations.
+
+    Versions of the present file are kept where ``pyproject.toml`` allows them.
+
+    Raises:
+        subprocess.CalledProcessError: The groups cannot be resolved.
+    """
     with tempfile.TemporaryDirectory() as folder:
         output = Path(folder) / "requirements.txt"
         if (ROOT / name).exists():
             output.write_text((ROOT / name).read_text(encoding="utf-8"), encoding="utf-8")
-        chosen = [word for group in groups for word in ("--group", group)]
+        group_options = [word for group in groups for word in ("--group", group)]
         subprocess.run(  # noqa: S603 (the project's own tool)
             [
                 sys.executable, "-m", "uv", "pip", "compile", "--quiet", "--universal", "--no-header",
-                "--no-annotate", *OPTIONS.get(name, ()), *chosen, "--output-file", str(output),
+                "--no-annotate", "--generate-hashes", *OPTIONS.get(name, ()), *group_options, "--output-file", str(output),
             ],
             cwd=ROOT,
             check=True,
         )  # fmt: skip
-        lines = [
-            line
-            for line in output.read_text(encoding="utf-8").splitlines()
-            if line and line[0] != "#" and NOWHERE not in line
-        ]
-    return HEADER.format(", ".join(groups)) + "\n".join(lines) + "\n"
+        text = output.read_text(encoding="utf-8").replace("\\\n    ", "\\\0")
+    entries = [line.replace("\\\0", "\\\n    ") for line in text.splitlines() if line and line[0] != "#"]
+    return [entry for entry in entries if EXCLUDED not in entry]
+
+
+def pins(text: str) -> list[str]:
+    """Returns the pinned packages of a requirements file, without hashes."""
+    lines = (line.removesuffix("\\").strip() for line in text.splitlines())
+    return [line for line in lines if line and not line.startswith(("#", "--hash="))]
 
 
 def main() -> int:
-    """Write the files, or with ``--check`` compare them."""
+    """Writes the files, or compares them with ``--check``."""
     stale = []
     for name, groups in EXPORTS.items():
-        text = resolved(name, groups)
+        entries = resolve(name, groups)
+        path = ROOT / name
         if "--check" not in sys.argv:
-            (ROOT / name).write_text(text, encoding="utf-8")
-        elif not (ROOT / name).exists() or (ROOT / name).read_text(encoding="utf-8") != text:
+            path.write_text(HEADER.format(", ".join(groups)) + "\n".join(entries) + "\n", encoding="utf-8")
+        elif not path.exists() or pins(path.read_text(encoding="utf-8")) != pins("\n".join(entries)):
             stale.append(name)
     if stale:
-        sys.stderr.write(f"{', '.join(stale)}: not what pyproject.toml says; run `make requirements`\n")
+        sys.stderr.write(f"{', '.join(stale)} differ from pyproject.toml; run `make requirements`\n")
     return 1 if stale else 0
 
 
