@@ -11,7 +11,7 @@ from typing import Any
 from function_app import bootstrap, settings
 from function_app.adapters import factory
 from function_app.bootstrap import Functions
-from function_app.domain.audit.hash_chain import CLOUD, Deed
+from function_app.domain.audit.hash_chain import CLOUD, AccountEvent
 from function_app.domain.common.problems import Problem
 from function_app.domain.common.timestamps import rfc3339
 from function_app.domain.identity.accounts import Identity, Role
@@ -137,7 +137,7 @@ async def _rotate(functions: Functions, options: argparse.Namespace) -> None:
     try:
         news = await functions.keys.rotate(learn_ms=learn_ms, overlap_ms=overlap_ms, leaked=options.leaked)
         key = news.pins[-1].id
-        await functions.chain.record(CLOUD, Deed.SIGNING_KEY_ROTATED, None, on=key, leaked=options.leaked)
+        await functions.chain.record(CLOUD, AccountEvent.SIGNING_KEY_ROTATED, None, on=key, leaked=options.leaked)
     except RotationRefused as refused:
         raise settings.SettingsError(
             f"devices are still learning the last new key, until {rfc3339(refused.until_ms)}; wait, or say --leaked"

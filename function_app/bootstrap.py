@@ -12,7 +12,7 @@ from function_app.adapters.local.command_feed import MqttOrders
 from function_app.adapters.local.password_hasher import Argon2Hashes
 from function_app.adapters.local.robot_catalogue import FolderCatalogue
 from function_app.adapters.model_compiler.compiler import MujocoCompiler
-from function_app.domain.telemetry.series import Keep
+from function_app.domain.telemetry.series import RetentionPolicy
 from function_app.ports.blobs import Blobs, Transfers
 from function_app.ports.broker_access import BrokerAccess
 from function_app.ports.certificates import Certificates
@@ -490,8 +490,8 @@ def build(settings: Settings, *, clock: Clock | None = None) -> Functions:
     )
 
 
-def _keep(settings: Settings) -> Keep:
-    return Keep(
+def _keep(settings: Settings) -> RetentionPolicy:
+    return RetentionPolicy(
         raw_ms=settings.keep_raw_hours * DAY_MS // 24,
         levels_ms={
             "10s": settings.keep_10s_days * DAY_MS,

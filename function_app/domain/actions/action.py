@@ -35,7 +35,7 @@ class Status(StrEnum):
 
 
 TERMINAL = frozenset({Status.DONE, Status.FAILED, Status.EXPIRED, Status.CANCELLED})
-REPEAT_MS = 1_000
+RETRY_MS = 1_000
 """A command that nobody has answered is published again after this time."""
 GRACE_MS = 3_000
 """An ack may be this late: until then a command whose time ran out is not called expired."""
@@ -106,7 +106,7 @@ class Action:
 
 
 @dataclass(frozen=True, slots=True)
-class Report:
+class AckReport:
     """One ack about an action. ``output`` is all the script has printed so far, not what is new.
 
     ``heard_ms`` is when it was heard, by the cloud's clock [ms since 1970]; 0: nobody has looked.
@@ -122,7 +122,7 @@ class Report:
     heard_ms: int = 0
 
 
-def apply_report(action: Action, report: Report) -> Action:
+def apply_report(action: Action, report: AckReport) -> Action:
     """The action after a report: the same object when it brings nothing new.
 
     Idempotent and monotone: doubled, late and disordered reports never take a step back.
@@ -148,10 +148,10 @@ def apply_report(action: Action, report: Report) -> Action:
     )
 
 
-def _heard(action: Action, report: Report) -> dict[str, int]:
+def _heard(action: Action, report: AckReport) -> dict[str, int]:
     """When each status was first heard: of several that hear the same ack, by whoever was soonest."""
-    known = action.heard.get(report.status.value)
-    if not report.heard_ms or (known is not None and known <= report.heard_ms):
+    existing = action.heard.get(report.status.value)
+    if not report.heard_ms or (existing is not None and existing <= report.heard_ms):
         return action.heard
     return {**action.heard, report.status.value: report.heard_ms}
 
@@ -188,16 +188,16 @@ def reached(action: Action, wanted: Status) -> bool:
     return action.status.terminal or action.status.rank >= wanted.rank
 
 
-def next_look_ms(action: Action, now_ms: int) -> int:
+def next_check_ms(action: Action, now_ms: int) -> int:
     """When a timer has to look at an open action again [ms since 1970]."""
     if action.status is Status.QUEUED:
         return action.queued_until_ms
     if action.status.rank < Status.RECEIVED.rank and now_ms < action.expires_ms + GRACE_MS:
-        return min(now_ms + REPEAT_MS, action.deadline_ms)
+        return min(now_ms + RETRY_MS, action.deadline_ms)
     return action.deadline_ms
 
 
-class Verdict(StrEnum):
+class NextStep(StrEnum):
     """What a timer has to do about an open action."""
 
     WAIT = "wait"
@@ -208,20 +208,20 @@ class Verdict(StrEnum):
     ENDED = "ended"
 
 
-def judge(action: Action, now_ms: int) -> Verdict:
+def next_step(action: Action, now_ms: int) -> NextStep:
     """What is due. An unanswered command is sent again until its time to live ends: the device drops doubles by id.
 
     Once somebody wants it cancelled, that is what is sent again: it must not begin because a message was lost.
     """
     if action.status.terminal:
-        return Verdict.ENDED
+        return NextStep.ENDED
     if action.status is Status.QUEUED:
-        return Verdict.EXPIRE if now_ms >= action.queued_until_ms else Verdict.WAIT
+        return NextStep.EXPIRE if now_ms >= action.queued_until_ms else NextStep.WAIT
     if now_ms >= action.deadline_ms:
-        return Verdict.LOSE
+        return NextStep.LOSE
     if action.status.rank < Status.RECEIVED.rank:
         if now_ms < action.expires_ms:
-            return Verdict.CANCEL if action.cancel_id else Verdict.PUBLISH
+            return NextStep.CANCEL if action.cancel_id else NextStep.PUBLISH
         if now_ms >= action.expires_ms + GRACE_MS:
-            return Verdict.EXPIRE
-    return Verdict.WAIT
+            return NextStep.EXPIRE
+    return NextStep.WAIT

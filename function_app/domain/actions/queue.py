@@ -11,7 +11,7 @@ from typing import Final
 from function_app.domain.actions.action import Status
 from function_app.domain.common.problems import Problem
 
-MOST: Final = 32
+MAX_QUEUED: Final = 32
 """Actions that may wait for one device."""
 FAILED_BEFORE = "earlier-failed"
 STOPPED = "stopped"
@@ -44,7 +44,7 @@ DROPPED: Final = {
 
 
 @dataclass(frozen=True, slots=True)
-class Queue:
+class ActionQueue:
     """Who waits.
 
     Attributes:
@@ -70,23 +70,23 @@ class Queue:
         """1 for the next one."""
         return self.actions.index(action) + 1 if action in self.actions else None
 
-    def joined(self, action: str) -> "Queue":
+    def joined(self, action: str) -> "ActionQueue":
         """With ``action`` as the last.
 
         Raises:
             Problem: ``queue-full``.
         """
-        if len(self.actions) >= MOST:
-            detail = f"{MOST} actions wait for this device. Wait until one has ended, or cancel one."
+        if len(self.actions) >= MAX_QUEUED:
+            detail = f"{MAX_QUEUED} actions wait for this device. Wait until one has ended, or cancel one."
             raise Problem("queue-full", 409, "The queue is full", detail)
         return replace(self, actions=(*self.actions, action))
 
-    def without(self, action: str) -> "Queue":
+    def without(self, action: str) -> "ActionQueue":
         """After ``action`` got its turn or its end."""
         actions = tuple(other for other in self.actions if other != action)
         return replace(self, actions=actions, dropped={id_: why for id_, why in self.dropped.items() if id_ != action})
 
-    def dropping(self, actions: Collection[str], why: str) -> "Queue":
+    def dropping(self, actions: Collection[str], why: str) -> "ActionQueue":
         """Some of them dropped; the same object when none of these waits."""
         lost = [action for action in self.actions if action in actions]
         if not lost:
@@ -94,6 +94,6 @@ class Queue:
         kept = tuple(action for action in self.actions if action not in lost)
         return replace(self, actions=kept, dropped={**self.dropped, **dict.fromkeys(lost, why)})
 
-    def halted(self, why: str) -> "Queue":
+    def halted(self, why: str) -> "ActionQueue":
         """All of them dropped; the same object when nobody waits."""
         return self.dropping(self.actions, why)

@@ -25,7 +25,7 @@ _HEAD: Final = b"telescope/v1/audit-head\n"
 _EXPECTED: Final = re.compile(r"\A([0-9]{1,12}):([0-9a-f]{64})\Z")
 
 
-class Deed(StrEnum):
+class AccountEvent(StrEnum):
     """What is done to an account rather than to control over a device; for that see ``authority.Fact``."""
 
     SIGNED_IN = "signed-in"
@@ -97,26 +97,33 @@ class Head:
 
 
 def entry(
-    what: str, who: Identity | None, *, entry_id: str, at_ms: int, on: str = "", outcome: Outcome = "done", **data: Any
+    what: str,
+    caller: Identity | None,
+    *,
+    entry_id: str,
+    at_ms: int,
+    on: str = "",
+    outcome: Outcome = "done",
+    **data: Any,
 ) -> Entry:
-    """An entry of what ``who`` did (``None``: somebody unknown, or the cloud by itself)."""
-    by = {} if who is None else {"who": who.name, "account": who.account, "session": who.session}
-    return Entry(entry_id, at_ms, what, outcome, on, **by, key="" if who is None else who.key, data=data)
+    """An entry of what ``caller`` did (``None``: somebody unknown, or the cloud by itself)."""
+    by = {} if caller is None else {"who": caller.name, "account": caller.account, "session": caller.session}
+    return Entry(entry_id, at_ms, what, outcome, on, **by, key="" if caller is None else caller.key, data=data)
 
 
-def start(chain: str) -> Head:
+def genesis(chain: str) -> Head:
     """The head of a chain without records; it differs from account to account, so that none stands in for another."""
     return Head(FIRST - 1, hashlib.sha256(_GENESIS + chain.encode()).hexdigest())
 
 
-def follow(head: Head, fields: Mapping[str, Any]) -> tuple[Head, dict[str, Any]]:
+def append(head: Head, fields: Mapping[str, Any]) -> tuple[Head, dict[str, Any]]:
     """The head once ``fields`` are recorded behind it, and the record as it is stored."""
     numbered = {**fields, "seq": head.seq + 1}
     after = Head(head.seq + 1, _hash(head.hash, numbered))
     return after, {**numbered, "hash": after.hash}
 
 
-def fault(head: Head, record: Mapping[str, Any]) -> str:
+def record_error(head: Head, record: Mapping[str, Any]) -> str:
     """What is wrong with ``record`` as the one behind ``head``; empty where nothing is."""
     if record.get("seq") != head.seq + 1 or isinstance(record["seq"], bool):
         return f"it calls itself number {record.get('seq')!r}"
@@ -126,15 +133,15 @@ def fault(head: Head, record: Mapping[str, Any]) -> str:
     return ""
 
 
-def to_sign(chain: str, head: Head, at_ms: int) -> bytes:
+def signed_bytes(chain: str, head: Head, at_ms: int) -> bytes:
     """What the cloud signs of a head."""
     return _HEAD + f"{chain}\n{head}\n{at_ms}".encode()
 
 
-def read_head(text: str) -> Head | None:
+def parse_head(text: str) -> Head | None:
     """A head as it was noted (``<number>:<hash>``); ``None`` where it is none."""
-    found = _EXPECTED.match(text.strip())
-    return Head(int(found[1]), found[2]) if found else None
+    result = _EXPECTED.match(text.strip())
+    return Head(int(result[1]), result[2]) if result else None
 
 
 def _hash(before: str, fields: Mapping[str, Any]) -> str:

@@ -77,13 +77,13 @@ def new_claim_code() -> str:
     return "".join(secrets.choice(CLAIM_ALPHABET) for _ in range(CLAIM_LENGTH))
 
 
-def show_claim_code(code: str) -> str:
+def format_claim_code(code: str) -> str:
     """As people see it: ``XXXX-XXXX``."""
     half = CLAIM_LENGTH // 2
     return f"{code[:half]}-{code[half:]}"
 
 
-def read_claim_code(text: str) -> str | None:
+def parse_claim_code(text: str) -> str | None:
     """What a person typed, as it is stored; ``None`` when it cannot be a code."""
     code = "".join(text.split()).replace("-", "").upper()
     if len(code) != CLAIM_LENGTH or any(letter not in CLAIM_ALPHABET for letter in code):

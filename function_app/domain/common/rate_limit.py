@@ -16,7 +16,7 @@ class Rate:
     burst: int
 
 
-def ask(rate: Rate, arrival_ms: float, now_ms: float) -> tuple[float, float]:
+def request(rate: Rate, arrival_ms: float, now_ms: float) -> tuple[float, float]:
     """Judge one request.
 
     Args:

@@ -9,7 +9,7 @@ from dataclasses import dataclass, field
 from enum import StrEnum
 from typing import Any, Literal
 
-from function_app.domain.control.lease import Asked, Lease
+from function_app.domain.control.lease import ControlRequest, Lease
 
 
 class Fact(StrEnum):
@@ -56,7 +56,7 @@ class ControlEvent:
         }
 
 
-def overdue(lease: Lease | None, now_ms: int) -> Iterator[ControlEvent]:
+def timed_out(lease: Lease | None, now_ms: int) -> Iterator[ControlEvent]:
     """What time alone has brought: a lease that ran out, a request that nobody answered."""
     if lease is None:
         return
@@ -68,7 +68,7 @@ def overdue(lease: Lease | None, now_ms: int) -> Iterator[ControlEvent]:
         yield _of_lease(lease, Fact.EXPIRED, lease.expires_ms, message, {"holder": lease.holder})
 
 
-def changed(before: Lease | None, after: Lease, *, by: str, now_ms: int) -> Iterator[ControlEvent]:
+def lease_changes(before: Lease | None, after: Lease, *, by: str, now_ms: int) -> Iterator[ControlEvent]:
     """What one write has changed.
 
     Args:
@@ -78,14 +78,14 @@ def changed(before: Lease | None, after: Lease, *, by: str, now_ms: int) -> Iter
         now_ms: When.
     """
     if before is not None and (after.epoch != before.epoch or not after.account):
-        yield from overdue(before, now_ms)
+        yield from timed_out(before, now_ms)
     elif before is not None and before.asked is not None and (after.asked is None or after.asked.id != before.asked.id):
-        yield from (late for late in overdue(before, now_ms) if late.fact is Fact.REQUEST_LAPSED)
+        yield from (late for late in timed_out(before, now_ms) if late.fact is Fact.REQUEST_LAPSED)
     yield from _of_change(before, after, by=by, now_ms=now_ms)
     yield from _of_asking(before, after, by=by, now_ms=now_ms)
 
 
-def ended(before: Lease, after: Lease, *, why: str, now_ms: int) -> ControlEvent:
+def control_ended(before: Lease, after: Lease, *, why: str, now_ms: int) -> ControlEvent:
     """Control has ended because the device was ``unpaired``, ``moved``, ``removed``, or is ``unshared``."""
     how = "is shared with them no longer" if why == "unshared" else f"was {why}"
     message = f"Control of {before.holder} ended: the device {how}."
@@ -115,8 +115,8 @@ def _of_change(before: Lease | None, after: Lease, *, by: str, now_ms: int) -> I
 
 
 def _of_asking(before: Lease | None, after: Lease, *, by: str, now_ms: int) -> Iterator[ControlEvent]:
-    asked, known = after.asked, before.asked if before is not None else None
-    if asked is None or asked == known:
+    asked, existing = after.asked, before.asked if before is not None else None
+    if asked is None or asked == existing:
         return
     if asked.outcome == "open":
         message = f"{asked.by} asked {after.holder} for control."
@@ -139,6 +139,6 @@ def _of_lease(
     return ControlEvent(f"{fact}-{lease.epoch}", fact, at_ms, message, {"epoch": lease.epoch, **data}, severity)
 
 
-def _of_request(asked: Asked, fact: Fact, at_ms: int, message: str) -> ControlEvent:
+def _of_request(asked: ControlRequest, fact: Fact, at_ms: int, message: str) -> ControlEvent:
     data = {"request": asked.id, "by": asked.by, "epoch": asked.epoch}
     return ControlEvent(f"{fact}-{asked.id}", fact, at_ms, message, data)

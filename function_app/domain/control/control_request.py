@@ -9,12 +9,14 @@ from dataclasses import replace
 
 from function_app.domain.common.problems import Problem, forbidden, not_found
 from function_app.domain.common.timestamps import rfc3339
-from function_app.domain.control.lease import Asked, Lease, Outcome
+from function_app.domain.control.lease import ControlRequest, Lease, Outcome
 from function_app.domain.identity.accounts import Identity
 
 
-def ask(lease: Lease | None, who: Identity, *, request: str, within_ms: int, lease_ms: int, now_ms: int) -> Lease:
-    """The lease with a request of ``who``; as it is when they ask already.
+def request_control(
+    lease: Lease | None, caller: Identity, *, request: str, within_ms: int, lease_ms: int, now_ms: int
+) -> Lease:
+    """The lease with a request of ``caller``; as it is when they ask already.
 
     Raises:
         Problem: ``lease-free``, ``lease-yours``, ``lease-requested``: somebody else was first.
@@ -22,22 +24,24 @@ def ask(lease: Lease | None, who: Identity, *, request: str, within_ms: int, lea
     if lease is None or not lease.live(now_ms):
         detail = "Nobody controls this device. Take the lease; there is nobody to ask."
         raise Problem("lease-free", 409, "Nobody holds the lease", detail)
-    if lease.mine(who):
+    if lease.mine(caller):
         detail = "You control this device already, in this very session."
         raise Problem("lease-yours", 409, "The lease is yours", detail, extras={"epoch": lease.epoch})
-    known = lease.asked
-    if known is not None and known.how(lease, now_ms) == "open":
-        if known.by_me(who):
+    existing = lease.asked
+    if existing is not None and existing.how(lease, now_ms) == "open":
+        if existing.by_me(caller):
             return lease
-        detail = f"{known.by} asks for control already. Wait for the answer, or until {rfc3339(known.expires_ms)}."
-        extras = {"by": known.by, "expires_at": rfc3339(known.expires_ms)}
+        detail = (
+            f"{existing.by} asks for control already. Wait for the answer, or until {rfc3339(existing.expires_ms)}."
+        )
+        extras = {"by": existing.by, "expires_at": rfc3339(existing.expires_ms)}
         raise Problem("lease-requested", 409, "Somebody else asks already", detail, extras=extras)
-    asked = Asked(
+    asked = ControlRequest(
         id=request,
         epoch=lease.epoch,
-        account=who.account,
-        session=who.session,
-        by=who.name,
+        account=caller.account,
+        session=caller.session,
+        by=caller.name,
         holder_account=lease.account,
         holder_session=lease.session,
         asked_ms=now_ms,
@@ -47,13 +51,13 @@ def ask(lease: Lease | None, who: Identity, *, request: str, within_ms: int, lea
     return replace(lease, asked=asked)
 
 
-def accept(lease: Lease | None, who: Identity, *, request: str, now_ms: int) -> Lease:
+def accept(lease: Lease | None, caller: Identity, *, request: str, now_ms: int) -> Lease:
     """The lease of whoever asked, with the next epoch; as it is when that was done already.
 
     Raises:
         Problem: ``request-unknown``, ``forbidden``, ``request-over``.
     """
-    current, asked = _to_answer(lease, who, request)
+    current, asked = _to_answer(lease, caller, request)
     if not _still(current, asked, "accepted", now_ms):
         return current
     return Lease(
@@ -68,26 +72,26 @@ def accept(lease: Lease | None, who: Identity, *, request: str, now_ms: int) -> 
     )
 
 
-def refuse(lease: Lease | None, who: Identity, *, request: str, now_ms: int) -> Lease:
+def refuse(lease: Lease | None, caller: Identity, *, request: str, now_ms: int) -> Lease:
     """The lease as it is, the request refused; the same when that was done already.
 
     Raises:
         Problem: ``request-unknown``, ``forbidden``, ``request-over``.
     """
-    current, asked = _to_answer(lease, who, request)
+    current, asked = _to_answer(lease, caller, request)
     if not _still(current, asked, "refused", now_ms):
         return current
     return replace(current, asked=replace(asked, outcome="refused"))
 
 
-def withdraw(lease: Lease | None, who: Identity, *, request: str, now_ms: int) -> Lease:
+def withdraw(lease: Lease | None, caller: Identity, *, request: str, now_ms: int) -> Lease:
     """The lease as it is, the request gone; the same when it was over already, unless it was accepted.
 
     Raises:
         Problem: ``request-unknown``, ``forbidden``, ``request-over``.
     """
     current, asked = find(lease, request)
-    if not asked.by_me(who):
+    if not asked.by_me(caller):
         raise forbidden("Only who asked for control may withdraw that, in the same session.")
     how = asked.how(current, now_ms)
     if how == "accepted":
@@ -97,7 +101,7 @@ def withdraw(lease: Lease | None, who: Identity, *, request: str, now_ms: int) -
     return replace(current, asked=replace(asked, outcome="withdrawn"))
 
 
-def find(lease: Lease | None, request: str) -> tuple[Lease, Asked]:
+def find(lease: Lease | None, request: str) -> tuple[Lease, ControlRequest]:
     """The lease with the request of this id: the last one is known, whatever has become of it.
 
     Raises:
@@ -108,14 +112,14 @@ def find(lease: Lease | None, request: str) -> tuple[Lease, Asked]:
     return lease, lease.asked
 
 
-def _to_answer(lease: Lease | None, who: Identity, request: str) -> tuple[Lease, Asked]:
+def _to_answer(lease: Lease | None, caller: Identity, request: str) -> tuple[Lease, ControlRequest]:
     current, asked = find(lease, request)
-    if not asked.to_me(who):
+    if not asked.to_me(caller):
         raise forbidden("Only who holds the lease may answer that, in the same session.")
     return current, asked
 
 
-def _still(lease: Lease, asked: Asked, wanted: Outcome, now_ms: int) -> bool:
+def _still(lease: Lease, asked: ControlRequest, wanted: Outcome, now_ms: int) -> bool:
     """Whether it can still be answered; not when it was answered so already."""
     how = asked.how(lease, now_ms)
     if how not in {"open", wanted}:

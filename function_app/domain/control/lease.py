@@ -12,7 +12,7 @@ Outcome = Literal["open", "accepted", "refused", "withdrawn", "lapsed", "ended"]
 
 
 @dataclass(frozen=True, slots=True)
-class Asked:
+class ControlRequest:
     """Somebody asks the holder of one epoch for control; see ``domain/handover.py``.
 
     Attributes:
@@ -45,13 +45,13 @@ class Asked:
             return "lapsed"
         return "open" if lease.epoch == self.epoch and lease.live(now_ms) else "ended"
 
-    def by_me(self, who: Identity) -> bool:
+    def by_me(self, caller: Identity) -> bool:
         """Whether this very sign-in session asks."""
-        return self.account == who.account and self.session == who.session
+        return self.account == caller.account and self.session == caller.session
 
-    def to_me(self, who: Identity) -> bool:
+    def to_me(self, caller: Identity) -> bool:
         """Whether this very sign-in session was asked."""
-        return self.holder_account == who.account and self.holder_session == who.session
+        return self.holder_account == caller.account and self.holder_session == caller.session
 
 
 @dataclass(frozen=True, slots=True)
@@ -74,21 +74,21 @@ class Lease:
     action: str = ""
     pairing: str = ""
     reason: str = ""
-    asked: Asked | None = None
+    asked: ControlRequest | None = None
 
     def live(self, now_ms: int) -> bool:
         """Whether somebody holds it."""
         return bool(self.account) and now_ms < self.expires_ms
 
-    def mine(self, who: Identity) -> bool:
+    def mine(self, caller: Identity) -> bool:
         """Whether this very sign-in session is its holder, live or not."""
-        return self.account == who.account and self.session == who.session
+        return self.account == caller.account and self.session == caller.session
 
-    def anothers(self, who: Identity, now_ms: int) -> bool:
+    def anothers(self, caller: Identity, now_ms: int) -> bool:
         """Whether somebody else holds it (another sign-in session of the same account is somebody else)."""
-        return self.live(now_ms) and not self.mine(who)
+        return self.live(now_ms) and not self.mine(caller)
 
-    def closed(self, now_ms: int) -> Asked | None:
+    def closed(self, now_ms: int) -> ControlRequest | None:
         """The last request, which is open no longer: what it asked for ends at this moment."""
         if self.asked is None:
             return None
@@ -100,14 +100,14 @@ MIN_MS = 1_000
 """The shortest lease."""
 
 
-def lasting(lease_ms: int, left_ms: int) -> int:
+def granted_ms(lease_ms: int, left_ms: int) -> int:
     """How long a lease is given to whom the right to it is left for so long [ms]."""
     return max(MIN_MS, min(lease_ms, left_ms))
 
 
-def take(
+def acquire(
     lease: Lease | None,
-    who: Identity,
+    caller: Identity,
     *,
     lease_ms: int,
     now_ms: int,
@@ -115,14 +115,14 @@ def take(
     action: str = "",
     over: str = "",
 ) -> Lease:
-    """A lease for ``who``, always with the next epoch.
+    """A lease for ``caller``, always with the next epoch.
 
     Whoever holds it already gets a new one too: that is how control is taken again after the device has ended the
     lease by itself (a hold, a Stop, a restart), which the cloud need not know.
 
     Args:
         lease: As it is.
-        who: Who takes it.
+        caller: Who takes it.
         lease_ms: For how long.
         now_ms: The time.
         pairing: Of the device's agent.
@@ -132,14 +132,14 @@ def take(
     Raises:
         Problem: ``lease-held`` by somebody else.
     """
-    taken = lease is not None and lease.anothers(who, now_ms)
+    taken = lease is not None and lease.anothers(caller, now_ms)
     if lease is not None and taken and not over:
-        raise held(lease)
+        raise lease_held(lease)
     return Lease(
         epoch=(lease.epoch if lease else 0) + 1,
-        account=who.account,
-        session=who.session,
-        holder=who.name,
+        account=caller.account,
+        session=caller.session,
+        holder=caller.name,
         expires_ms=now_ms + lease_ms,
         lease_ms=lease_ms,
         action=action,
@@ -149,23 +149,23 @@ def take(
     )
 
 
-def renew(lease: Lease | None, who: Identity, *, epoch: int, lease_ms: int, now_ms: int) -> Lease:
+def renew(lease: Lease | None, caller: Identity, *, epoch: int, lease_ms: int, now_ms: int) -> Lease:
     """The same lease with a later end.
 
     Raises:
         Problem: ``lease-lost``: it ran out, or it is another's by now.
     """
-    current = hold(lease, who, epoch=epoch, now_ms=now_ms)
+    current = require_held(lease, caller, epoch=epoch, now_ms=now_ms)
     return replace(current, expires_ms=now_ms + lease_ms, lease_ms=lease_ms, action="")
 
 
-def hold(lease: Lease | None, who: Identity, *, epoch: int, now_ms: int) -> Lease:
-    """The lease, once it is seen that ``who`` holds this epoch of it now.
+def require_held(lease: Lease | None, caller: Identity, *, epoch: int, now_ms: int) -> Lease:
+    """The lease, once it is seen that ``caller`` holds this epoch of it now.
 
     Raises:
         Problem: ``lease-lost``.
     """
-    if lease is None or lease.epoch != epoch or not lease.mine(who) or not lease.live(now_ms):
+    if lease is None or lease.epoch != epoch or not lease.mine(caller) or not lease.live(now_ms):
         extras = {"epoch": epoch, "current_epoch": lease.epoch if lease else 0}
         detail = f"Epoch {epoch} of the lease is not yours any more. Take the lease again."
         raise Problem("lease-lost", 409, "The lease is lost", detail, extras=extras)
@@ -177,14 +177,14 @@ def release(lease: Lease, *, now_ms: int) -> Lease:
     return Lease(epoch=lease.epoch, pairing=lease.pairing, asked=lease.closed(now_ms))
 
 
-def overtake(lease: Lease | None, *, pairing: str, now_ms: int) -> Lease:
+def invalidate(lease: Lease | None, *, pairing: str, now_ms: int) -> Lease:
     """Nobody's lease with the next epoch: all that was ordered under the one before is old."""
     if lease is None:
         return Lease(epoch=1, pairing=pairing)
     return Lease(epoch=lease.epoch + 1, pairing=pairing, asked=lease.closed(now_ms))
 
 
-def held(lease: Lease) -> Problem:
+def lease_held(lease: Lease) -> Problem:
     """The refusal that names the holder."""
     ends = rfc3339(lease.expires_ms)
     detail = f"{lease.holder} controls this device until {ends}. Ask for control at lease/requests, or wait."

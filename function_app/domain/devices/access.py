@@ -17,7 +17,7 @@ from function_app.domain.identity.accounts import Identity, Role
 
 Kind = Literal["device", "space", "agent"]
 """What is shared is a device or a space; what is handed over is an agent."""
-MOST_SHARES: Final = 100
+MAX_SHARES: Final = 100
 """Accounts with whom one device or space is shared."""
 _RANKS: Final = {Role.VIEWER: 0, Role.OPERATOR: 1, Role.OWNER: 2}
 
@@ -57,7 +57,7 @@ class Share:
 
 
 @dataclass(frozen=True, slots=True)
-class Standing:
+class Permissions:
     """What an account may do with a device.
 
     Attributes:
@@ -71,14 +71,14 @@ class Standing:
     space: Role | None = None
 
 
-OWNERS: Final = Standing(Role.OWNER, space=Role.OWNER)
+OWNER_PERMISSIONS: Final = Permissions(Role.OWNER, space=Role.OWNER)
 
 
-def standing(who: Identity, agent: Agent, name: str, shares: Iterable[Share], now_ms: int) -> Standing | None:
-    """What ``who`` may do with a device; ``None``: there is no such device for them.
+def permissions(caller: Identity, agent: Agent, name: str, shares: Iterable[Share], now_ms: int) -> Permissions | None:
+    """What ``caller`` may do with a device; ``None``: there is no such device for them.
 
     Args:
-        who: Who asks. No role above ``who.most``, nothing outside ``who.only``.
+        caller: Who asks. No role above ``who.most``, nothing outside ``who.only``.
         agent: The device's agent.
         name: The device's name there.
         shares: What is shared with the account: of this device and of its space.
@@ -87,23 +87,23 @@ def standing(who: Identity, agent: Agent, name: str, shares: Iterable[Share], no
     if agent.account is None:
         return None
     device, space = device_target(device_id(agent.id, name)), space_target(agent.space or "")
-    if agent.account == who.account:
-        found: Standing | None = OWNERS
+    if agent.account == caller.account:
+        result: Permissions | None = OWNER_PERMISSIONS
     else:
         live = [
             share
             for share in shares
-            if share.account == who.account and share.on in {device, space} and share.of(agent, now_ms)
+            if share.account == caller.account and share.on in {device, space} and share.of(agent, now_ms)
         ]
         best = max(live, key=lambda share: (_RANKS[share.role], share.expires_ms), default=None)
         whole = next((share for share in live if share.on == space), None)
-        found = Standing(best.role, best.expires_ms, whole.role if whole else None) if best else None
-    return None if found is None else _capped(who, found, device_id(agent.id, name), space)
+        result = Permissions(best.role, best.expires_ms, whole.role if whole else None) if best else None
+    return None if result is None else _capped(caller, result, device_id(agent.id, name), space)
 
 
-def capped(who: Identity, role: Role) -> Role:
-    """The role, or the highest that ``who`` may have."""
-    return min(role, who.most, key=_RANKS.__getitem__)
+def capped(caller: Identity, role: Role) -> Role:
+    """The role, or the highest that ``caller`` may have."""
+    return min(role, caller.most, key=_RANKS.__getitem__)
 
 
 def outranks(one: Role, other: Role) -> bool:
@@ -127,12 +127,12 @@ def split_target(on: str) -> tuple[str, str]:
     return kind, name
 
 
-def lasting(for_s: int | None, now_ms: int) -> int:
+def expiry_ms(for_s: int | None, now_ms: int) -> int:
     """The end of what begins now and lasts so long [s]; ``None``: until somebody ends it."""
     return NEVER_MS if for_s is None else now_ms + for_s * 1000
 
 
-def shareable(role: Role) -> Role:
+def require_shareable(role: Role) -> Role:
     """The role, once it is seen that it can be shared.
 
     Raises:
@@ -143,9 +143,9 @@ def shareable(role: Role) -> Role:
     return role
 
 
-def _capped(who: Identity, found: Standing, device: str, space: str) -> Standing | None:
-    whole = not who.only or space in who.only
-    if not whole and device not in who.only:
+def _capped(caller: Identity, result: Permissions, device: str, space: str) -> Permissions | None:
+    whole = not caller.only or space in caller.only
+    if not whole and device not in caller.only:
         return None
-    in_space = capped(who, found.space) if found.space is not None and whole else None
-    return Standing(capped(who, found.role), min(found.until_ms, who.until_ms), in_space)
+    in_space = capped(caller, result.space) if result.space is not None and whole else None
+    return Permissions(capped(caller, result.role), min(result.until_ms, caller.until_ms), in_space)

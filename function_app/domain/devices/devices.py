@@ -31,7 +31,7 @@ class DeviceSpec:
 
 
 @dataclass(frozen=True, slots=True)
-class Leaving:
+class Departure:
     """What was left and is still to be tidied up: whose it was, where, and which devices."""
 
     why: Literal["unpaired", "moved", "removed"]
@@ -66,7 +66,7 @@ class Agent:
     claim_code: str = ""
     claim_expires_ms: int = 0
     transport: Transport = "mqtt"
-    leaving: tuple[Leaving, ...] = ()
+    leaving: tuple[Departure, ...] = ()
     expires_ms: int = 0
     labels: dict[str, str] = field(default_factory=dict)
 
@@ -123,9 +123,9 @@ def claim(agent: Agent, *, account: str, space: str, pairing: str, now_ms: int) 
     )
 
 
-def call(agent: Agent, name: str, label: str | None) -> Agent:
+def rename(agent: Agent, name: str, label: str | None) -> Agent:
     """The agent with one of its devices called ``label``; ``None``: as it says itself."""
-    others = {known: given for known, given in agent.labels.items() if known != name}
+    others = {existing: given for existing, given in agent.labels.items() if existing != name}
     return replace(agent, labels=others if label is None else {**others, name: label})
 
 
@@ -143,7 +143,7 @@ def unpair(agent: Agent) -> Agent:
     )
 
 
-def hand_over(agent: Agent, *, account: str, space: str, pairing: str, now_ms: int) -> Agent:
+def transfer(agent: Agent, *, account: str, space: str, pairing: str, now_ms: int) -> Agent:
     """The agent, from one account to another in one step: it is nobody's at no time.
 
     A new pairing, as if it had been un-paired and claimed: nothing that was seen, said or shared under the owner before
@@ -157,7 +157,7 @@ def move(agent: Agent, space: str) -> Agent:
     return replace(_leaves(agent, "moved", [spec.name for spec in agent.devices]), space=space)
 
 
-def introduced(agent: Agent, devices: tuple[DeviceSpec, ...]) -> Agent:
+def with_devices(agent: Agent, devices: tuple[DeviceSpec, ...]) -> Agent:
     """The agent with the devices that it says it has now."""
     names = {spec.name for spec in devices}
     removed = [spec.name for spec in agent.devices if spec.name not in names]
@@ -168,7 +168,7 @@ def introduced(agent: Agent, devices: tuple[DeviceSpec, ...]) -> Agent:
 def _leaves(agent: Agent, why: Literal["unpaired", "moved", "removed"], names: list[str]) -> Agent:
     if agent.account is None or agent.space is None or not names:
         return agent
-    leaving = Leaving(why, agent.account, agent.space, agent.pairing, tuple(names))
+    leaving = Departure(why, agent.account, agent.space, agent.pairing, tuple(names))
     return replace(agent, leaving=(*agent.leaving, leaving)[-_MOST_LEAVING:])
 
 
@@ -190,15 +190,15 @@ class Link:
     pairing: str = ""
 
 
-def newer_link(known: Link | None, incoming: Link) -> Link | None:
+def newer_link(existing: Link | None, incoming: Link) -> Link | None:
     """What to store, or ``None`` when the news is old.
 
     An old connection's will may arrive after the new connection's "online": the lower session number gives it away.
     Within one session "offline" is final.
     """
-    if known is None or incoming.session > known.session or incoming.pairing != known.pairing:
+    if existing is None or incoming.session > existing.session or incoming.pairing != existing.pairing:
         return incoming
-    if incoming.session < known.session or (incoming.online and not known.online):
+    if incoming.session < existing.session or (incoming.online and not existing.online):
         return None
     return incoming
 
@@ -224,12 +224,12 @@ def online(link: Link | None, last_seen_ms: int, now_ms: int) -> bool:
     return now_ms - last_seen_ms <= (POLL_SILENT_MS if link.polled else SILENT_MS)
 
 
-def polled(known: Link | None, now_ms: int, pairing: str) -> Link | None:
+def polled(existing: Link | None, now_ms: int, pairing: str) -> Link | None:
     """What to store when an agent has polled, or ``None`` when that was noted a moment ago.
 
     Asking is better evidence than any earlier word of "offline".
     """
-    fresh = known is not None and now_ms - known.seen_ms < POLL_MARK_MS and known.pairing == pairing
-    if known is not None and known.online and known.polled and fresh:
+    created = existing is not None and now_ms - existing.seen_ms < POLL_MARK_MS and existing.pairing == pairing
+    if existing is not None and existing.online and existing.polled and created:
         return None
-    return Link(online=True, session=known.session if known else 0, seen_ms=now_ms, polled=True, pairing=pairing)
+    return Link(online=True, session=existing.session if existing else 0, seen_ms=now_ms, polled=True, pairing=pairing)

@@ -6,7 +6,7 @@ from typing import Final
 from function_app.domain.common.timestamps import NEVER_MS
 from function_app.domain.identity.accounts import Role
 
-MOST: Final = 20
+MAX_INVITATIONS: Final = 20
 """Open invitations to one thing."""
 
 

@@ -134,7 +134,7 @@ def trend(minutes: Sequence[float], limits: Limits) -> Trend | None:
 
 
 @dataclass(frozen=True, slots=True)
-class Watch:
+class DetectorState:
     """All that is kept of one field between two windows.
 
     Attributes:
@@ -190,53 +190,53 @@ SHIFT = 6.0
 """Without limits a lasting shift is one of so many standard deviations."""
 
 
-def scale(known: Watch, limits: Limits) -> float:
+def scale(previous: DetectorState, limits: Limits) -> float:
     """What a standard deviation of this field is taken to be; 0: it has not shown any."""
-    if known.baseline.varied < VARIED or known.baseline.distance <= 0:
+    if previous.baseline.varied < VARIED or previous.baseline.distance <= 0:
         return 0.0
-    room = limits.room(known.baseline.mean)
+    room = limits.room(previous.baseline.mean)
     # Rounding of a large value is no noise.
-    least = 1e-9 * abs(known.baseline.mean)
-    return max(known.baseline.noise, least, ROOM_SHARE * room if room is not None else 0.0)
+    least = 1e-9 * abs(previous.baseline.mean)
+    return max(previous.baseline.noise, least, ROOM_SHARE * room if room is not None else 0.0)
 
 
-def step(known: Watch, limits: Limits, at_ms: int, value: float) -> Watch:
+def update(previous: DetectorState, limits: Limits, at_ms: int, value: float) -> DetectorState:
     """The watch after one more window; the same object for a window that is not newer.
 
     Args:
-        known: The watch before.
+        previous: The watch before.
         limits: What is known of the field.
         at_ms: Start of the window [ms since 1970].
         value: Mean of the window; finite.
     """
-    if at_ms <= known.seen_ms:
-        return known
+    if at_ms <= previous.seen_ms:
+        return previous
     value = max(-LARGEST, min(LARGEST, value))
-    known = _after_gap(known, at_ms)
-    spread = scale(known, limits)
-    warm = known.baseline.count >= WARM_UP and spread > 0
+    previous = _after_gap(previous, at_ms)
+    spread = scale(previous, limits)
+    warm = previous.baseline.count >= WARM_UP and spread > 0
     after = replace(
-        known,
+        previous,
         seen_ms=at_ms,
         value=value,
-        baseline=learn(known.baseline, value, scale=spread, repeated=value == known.value),
-        level=_level(known.level, limits.warning_low, limits.warning_high, limits, value),
-        breach=_level(known.breach, limits.low, limits.high, limits, value),
-        outlier=_outlier(known, value, spread) if warm and OUTLIER in limits.kinds else Streak(),
+        baseline=learn(previous.baseline, value, scale=spread, repeated=value == previous.value),
+        level=_level(previous.level, limits.warning_low, limits.warning_high, limits, value),
+        breach=_level(previous.breach, limits.low, limits.high, limits, value),
+        outlier=_outlier(previous, value, spread) if warm and OUTLIER in limits.kinds else Streak(),
     )
     if LEVEL not in limits.kinds:
         after = replace(after, level=Streak(), breach=Streak())
     if CHANGE in limits.kinds:
         after = _changed(after, limits, value, spread if warm else 0.0)
-    return _minute(known, after, limits, at_ms, value)
+    return _minute(previous, after, limits, at_ms, value)
 
 
-def _after_gap(known: Watch, at_ms: int) -> Watch:
-    if not known.seen_ms or at_ms - known.seen_ms <= GAP_MS:
-        return known
-    if at_ms - known.seen_ms > ABSENCE_MS:
-        return Watch(level=known.level, breach=known.breach)
-    return replace(known, minutes=(), minute=(0.0, 0), slope_per_s=None, limit_in_s=None, trend=Streak())
+def _after_gap(previous: DetectorState, at_ms: int) -> DetectorState:
+    if not previous.seen_ms or at_ms - previous.seen_ms <= GAP_MS:
+        return previous
+    if at_ms - previous.seen_ms > ABSENCE_MS:
+        return DetectorState(level=previous.level, breach=previous.breach)
+    return replace(previous, minutes=(), minute=(0.0, 0), slope_per_s=None, limit_in_s=None, trend=Streak())
 
 
 def _level(streak: Streak, low: float | None, high: float | None, limits: Limits, value: float) -> Streak:
@@ -250,12 +250,12 @@ def _level(streak: Streak, low: float | None, high: float | None, limits: Limits
     return streak.step(bad=beyond, good=inside, after=2, until=6)
 
 
-def _outlier(known: Watch, value: float, spread: float) -> Streak:
-    distance = abs(value - known.baseline.mean) / spread
-    return known.outlier.step(bad=distance > FAR, good=distance < NEAR, after=3, until=6)
+def _outlier(previous: DetectorState, value: float, spread: float) -> Streak:
+    distance = abs(value - previous.baseline.mean) / spread
+    return previous.outlier.step(bad=distance > FAR, good=distance < NEAR, after=3, until=6)
 
 
-def _changed(after: Watch, limits: Limits, value: float, spread: float) -> Watch:
+def _changed(after: DetectorState, limits: Limits, value: float, spread: float) -> DetectorState:
     """A shift that lasts about ten minutes; over when the value is back, or has been the new normal for an hour."""
     room = limits.room(after.hinkley.mean)
     shift = limits.change or (None if room is None else room / 2)
@@ -273,19 +273,19 @@ def _changed(after: Watch, limits: Limits, value: float, spread: float) -> Watch
     return replace(after, hinkley=hinkley, change=change, settled_at=after.settled_at if change.on else None)
 
 
-def _minute(known: Watch, after: Watch, limits: Limits, at_ms: int, value: float) -> Watch:
+def _minute(previous: DetectorState, after: DetectorState, limits: Limits, at_ms: int, value: float) -> DetectorState:
     """Close the minute that is over, and look where its trend leads."""
-    total, count = known.minute
-    if not count or at_ms // MINUTE_MS == known.seen_ms // MINUTE_MS:
+    total, count = previous.minute
+    if not count or at_ms // MINUTE_MS == previous.seen_ms // MINUTE_MS:
         return replace(after, minute=(total + value, count + 1))
-    minutes = (*known.minutes, total / count)[-2 * SPAN :]
+    minutes = (*previous.minutes, total / count)[-2 * SPAN :]
     after = replace(after, minutes=minutes, minute=(value, 1))
     if TREND not in limits.kinds:
         return after
-    found = trend(minutes, limits)
-    limit_in_s = None if found is None else found.limit_in_s
-    horizon_s = limits.horizon_s * (1.0 if found is None or found.proven else SOON)
+    result = trend(minutes, limits)
+    limit_in_s = None if result is None else result.limit_in_s
+    horizon_s = limits.horizon_s * (1.0 if result is None or result.proven else SOON)
     near = limit_in_s is not None and limit_in_s <= horizon_s
     far = limit_in_s is None or limit_in_s > 1.5 * limits.horizon_s
     streak = after.trend.step(bad=near, good=far, after=3, until=5)
-    return replace(after, slope_per_s=None if found is None else found.per_s, limit_in_s=limit_in_s, trend=streak)
+    return replace(after, slope_per_s=None if result is None else result.per_s, limit_in_s=limit_in_s, trend=streak)

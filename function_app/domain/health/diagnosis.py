@@ -4,7 +4,7 @@ from collections.abc import Iterable
 from dataclasses import dataclass, field
 from enum import StrEnum
 
-from function_app.domain.health.detectors import CHANGE, LEVEL, NEAR, OUTLIER, TREND, Limits, Watch, scale
+from function_app.domain.health.detectors import CHANGE, LEVEL, NEAR, OUTLIER, TREND, DetectorState, Limits, scale
 from function_app.domain.health.faults import Fault, Report, Severity, Source
 
 _FIVE_DIGITS = 10_000.0
@@ -53,7 +53,7 @@ def health(faults: Iterable[Fault], *, online: bool) -> Health:
     return Health.OK if online else Health.UNKNOWN
 
 
-def band(watch: Watch, limits: Limits) -> tuple[float, float] | None:
+def usual_range(watch: DetectorState, limits: Limits) -> tuple[float, float] | None:
     """Where values usually are; ``None`` as long as that is not known."""
     spread = scale(watch, limits)
     if spread <= 0:
@@ -61,12 +61,16 @@ def band(watch: Watch, limits: Limits) -> tuple[float, float] | None:
     return watch.baseline.mean - NEAR * spread, watch.baseline.mean + NEAR * spread
 
 
-def judge(rule: Rule, stream: str, name: str, watch: Watch) -> Report | None:
+def diagnose(rule: Rule, stream: str, name: str, watch: DetectorState) -> Report | None:
     """The one fault of a field: what is worst of all that is found."""
-    found = watch.findings
-    if not found:
+    result = watch.findings
+    if not result:
         return None
-    kind = LEVEL if watch.breach.on else next(known for known in (TREND, LEVEL, CHANGE, OUTLIER) if known in found)
+    kind = (
+        LEVEL
+        if watch.breach.on
+        else next(previous for previous in (TREND, LEVEL, CHANGE, OUTLIER) if previous in result)
+    )
     severity = Severity.ERROR if watch.breach.on else Severity.WARNING if rule.listed else Severity.INFO
     limit = _limit(kind, rule.limits, watch)
     return Report(
@@ -83,7 +87,7 @@ def judge(rule: Rule, stream: str, name: str, watch: Watch) -> Report | None:
     )
 
 
-def _limit(kind: str, limits: Limits, watch: Watch) -> float | None:
+def _limit(kind: str, limits: Limits, watch: DetectorState) -> float | None:
     """The limit that a level is beyond or a trend leads to."""
     if kind == TREND:
         return limits.highest if (watch.slope_per_s or 0) > 0 else limits.lowest
@@ -95,7 +99,7 @@ def _limit(kind: str, limits: Limits, watch: Watch) -> float | None:
     return high if abs(watch.value - high) < abs(watch.value - low) else low
 
 
-def _words(kind: str, rule: Rule, name: str, watch: Watch, limit: float | None) -> str:
+def _words(kind: str, rule: Rule, name: str, watch: DetectorState, limit: float | None) -> str:
     part = name.partition(".")[2]
     what = f"{rule.label} ({part.replace('_', ' ')})" if part else rule.label
     value = _show(watch.value, rule.unit)

@@ -36,19 +36,19 @@ class PageHinkley:
     down: float = 0.0
 
 
-def page_hinkley(known: PageHinkley, value: float, *, delta: float, threshold: float) -> tuple[PageHinkley, bool]:
+def page_hinkley(previous: PageHinkley, value: float, *, delta: float, threshold: float) -> tuple[PageHinkley, bool]:
     """One more value; and whether the mean has changed. The caller begins anew with an empty state then.
 
     Args:
-        known: The state so far.
+        previous: The state so far.
         value: The value.
         delta: Shifts smaller than this are none.
         threshold: What the sum of shifts beyond ``delta`` may come to.
     """
-    count = min(known.count + 1, DAY)
-    mean = known.mean + (value - known.mean) / count
-    up = max(0.0, known.up + value - mean - delta)
-    down = max(0.0, known.down + mean - value - delta)
+    count = min(previous.count + 1, DAY)
+    mean = previous.mean + (value - previous.mean) / count
+    up = max(0.0, previous.up + value - mean - delta)
+    down = max(0.0, previous.down + mean - value - delta)
     return PageHinkley(count, mean, up, down), count >= SETTLED and max(up, down) > threshold
 
 
@@ -76,26 +76,26 @@ CLIP = 3.0
 """Standard deviations beyond which a value counts as if it were so many."""
 
 
-def learn(known: Baseline, value: float, *, scale: float, repeated: bool) -> Baseline:
+def learn(previous: Baseline, value: float, *, scale: float, repeated: bool) -> Baseline:
     """The baseline after one more value.
 
     Args:
-        known: The baseline before.
+        previous: The baseline before.
         value: The value.
         scale: What a standard deviation is taken to be at least.
         repeated: It is exactly the one before: a sensor that is stuck is no sensor without noise.
     """
-    count = min(known.count + 1, MEMORY)
-    shift = value - known.mean
-    if known.count >= WARM_UP:
-        reach = CLIP * max(scale, known.noise)
+    count = min(previous.count + 1, MEMORY)
+    shift = value - previous.mean
+    if previous.count >= WARM_UP:
+        reach = CLIP * max(scale, previous.noise)
         # Without any noise there is nothing to clip by.
         shift = max(-reach, min(reach, shift)) if reach > 0 else shift
-    mean = known.mean + shift / count
-    if repeated or known.count == 0:
-        return Baseline(count, mean, known.varied, known.distance)
-    varied = min(known.varied + 1, MEMORY)
-    return Baseline(count, mean, varied, known.distance + (abs(shift) - known.distance) / varied)
+    mean = previous.mean + shift / count
+    if repeated or previous.count == 0:
+        return Baseline(count, mean, previous.varied, previous.distance)
+    varied = min(previous.varied + 1, MEMORY)
+    return Baseline(count, mean, varied, previous.distance + (abs(shift) - previous.distance) / varied)
 
 
 @dataclass(frozen=True, slots=True)

@@ -33,7 +33,7 @@ class Account:
     name: str
 
 
-def folded(name: str) -> str:
+def fold_name(name: str) -> str:
     """A name as names are compared: "Anna", "ANNA" and " anna" are one person, however a keyboard makes the letters."""
     plain = unicodedata.normalize("NFKC", name).casefold()
     return " ".join(unicodedata.normalize("NFKC", plain).split())

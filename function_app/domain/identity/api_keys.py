@@ -77,8 +77,8 @@ def token(key: str, secret: str) -> str:
 
 def split(text: str) -> tuple[str, str] | None:
     """Id and secret in a token, or ``None`` where it cannot be one."""
-    found = _TOKEN.match(text)
-    return (found[1], found[2]) if found else None
+    result = _TOKEN.match(text)
+    return (result[1], result[2]) if result else None
 
 
 def hashed(secret: str) -> str:

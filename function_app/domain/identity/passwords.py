@@ -42,12 +42,12 @@ _LETTERS: Final = re.compile(r"[^\W\d_]+")
 _AS_LETTERS: Final = str.maketrans("0134578@$!", "oleastbasi")
 
 
-def normal(password: str) -> str:
+def normalize(password: str) -> str:
     """The same text in one of the ways in which it can be written: keyboards differ in how they make an ``é``."""
     return unicodedata.normalize("NFKC", password)
 
 
-def why_weak(password: str, *, name: str) -> str:
+def weakness(password: str, *, name: str) -> str:
     """What is wrong with a password that somebody wants to have, as a sentence; empty: nothing.
 
     Args:
@@ -66,7 +66,7 @@ def why_weak(password: str, *, name: str) -> str:
         return "This password is one row of keys, which is guessed first."
     for text in (lower, lower.translate(_AS_LETTERS)):
         words = {_once(word) for word in _LETTERS.findall(text)}
-        if words and words <= _COMMON | {normal(name).casefold()}:
+        if words and words <= _COMMON | {normalize(name).casefold()}:
             return "This password is made of words that are guessed first. Choose others, or add some."
     return ""
 

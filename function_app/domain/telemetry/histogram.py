@@ -74,17 +74,17 @@ def of(samples_ms: Iterable[float]) -> Histogram:
     Raises:
         ValueError: One is negative, longer than a day, or no number.
     """
-    found: dict[int, int] = {}
+    result: dict[int, int] = {}
     values = list(samples_ms)
     for value in values:
         if not 0 <= value <= LONGEST_MS:
             raise ValueError(f"a time is 0 to {LONGEST_MS:.0f} ms, not {value}")
         bucket = _bucket(value)
-        found[bucket] = found.get(bucket, 0) + 1
+        result[bucket] = result.get(bucket, 0) + 1
     if not values:
         return Histogram()
-    buckets = tuple(sorted(found))
-    counts = tuple(found[bucket] for bucket in buckets)
+    buckets = tuple(sorted(result))
+    counts = tuple(result[bucket] for bucket in buckets)
     return Histogram(len(values), math.fsum(values), min(values), max(values), buckets, counts)
 
 
@@ -93,18 +93,18 @@ def merge(histograms: Iterable[Histogram]) -> Histogram:
     parts = [part for part in histograms if part.count]
     if not parts:
         return Histogram()
-    found: dict[int, int] = {}
+    result: dict[int, int] = {}
     for part in parts:
         for bucket, count in zip(part.buckets, part.counts, strict=True):
-            found[bucket] = found.get(bucket, 0) + count
-    buckets = tuple(sorted(found))
+            result[bucket] = result.get(bucket, 0) + count
+    buckets = tuple(sorted(result))
     return Histogram(
         count=sum(part.count for part in parts),
         sum_ms=math.fsum(part.sum_ms for part in parts),
         min_ms=min(part.min_ms for part in parts),
         max_ms=max(part.max_ms for part in parts),
         buckets=buckets,
-        counts=tuple(found[bucket] for bucket in buckets),
+        counts=tuple(result[bucket] for bucket in buckets),
     )
 
 

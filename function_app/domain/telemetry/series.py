@@ -74,7 +74,7 @@ class Samples:
             begin = end
 
 
-def gather(rows: Iterable[tuple[int, Mapping[str, float]]]) -> Samples:
+def from_rows(rows: Iterable[tuple[int, Mapping[str, float]]]) -> Samples:
     """Samples from times and values in any order; of two at one time the first counts."""
     by_time: dict[int, Mapping[str, float]] = {}
     for at_ms, values in rows:
@@ -85,11 +85,11 @@ def gather(rows: Iterable[tuple[int, Mapping[str, float]]]) -> Samples:
     return Samples(array("q", ordered), columns)
 
 
-def unseen(samples: Samples, known: Samples) -> Samples:
+def new_samples(samples: Samples, existing: Samples) -> Samples:
     """Those whose time is not among the known."""
-    if not known.at_ms or not samples.at_ms or samples.at_ms[0] > known.at_ms[-1]:
+    if not existing.at_ms or not samples.at_ms or samples.at_ms[0] > existing.at_ms[-1]:
         return samples
-    times = set(known.at_ms)
+    times = set(existing.at_ms)
     chosen = [index for index, at_ms in enumerate(samples.at_ms) if at_ms not in times]
     if len(chosen) == len(samples):
         return samples
@@ -116,10 +116,10 @@ def merge(one: Samples, other: Samples) -> Samples:
     return merged
 
 
-def room(samples: Samples, known: Samples) -> Samples:
+def fit_window(samples: Samples, existing: Samples) -> Samples:
     """As many of the samples as their window still takes."""
-    names = len({*samples.columns, *known.columns}) or 1
-    left = max(0, MAX_VALUES // names - len(known))
+    names = len({*samples.columns, *existing.columns}) or 1
+    left = max(0, MAX_VALUES // names - len(existing))
     return samples if len(samples) <= left else samples.part(0, left)
 
 
@@ -247,7 +247,7 @@ def _nothing(count: int) -> "array[float]":
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Keep:
+class RetentionPolicy:
     """How long what is kept [ms]; what is not named is kept for ever.
 
     The times that a window has seen are in its raw row: with it goes the promise that a sample counts once, so nothing
@@ -267,7 +267,7 @@ class Keep:
         return None if kept_ms is None else max(kept_ms, self.raw_ms)
 
 
-def finest(first_ms: int, last_ms: int, *, points: int, now_ms: int, keep: Keep) -> Level:
+def finest_level(first_ms: int, last_ms: int, *, points: int, now_ms: int, keep: RetentionPolicy) -> Level:
     """The finest buckets of which no more than ``points`` cover the time, and which are still there for all of it."""
     for level in LEVELS:
         covering = (floor(last_ms - 1, level.span_ms) - floor(first_ms, level.span_ms)) // level.span_ms + 1

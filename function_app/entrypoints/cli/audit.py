@@ -4,7 +4,7 @@ import argparse
 from typing import Any
 
 from function_app.bootstrap import Functions
-from function_app.domain.audit.hash_chain import CLOUD, Head, read_head
+from function_app.domain.audit.hash_chain import CLOUD, Head, parse_head
 from function_app.ports.tables import StoreError
 
 _EXIT_BROKEN = 1
@@ -42,7 +42,7 @@ async def run(functions: Functions, options: argparse.Namespace) -> int:
 
 async def _run(functions: Functions, options: argparse.Namespace) -> int:
     trail = functions.trail
-    expected = [read_head(text) for text in getattr(options, "expect", [])]
+    expected = [parse_head(text) for text in getattr(options, "expect", [])]
     if None in expected:
         print("--expect is a number, a colon and 64 hexadecimal digits, as `audit head` prints it")  # noqa: T201
         return _EXIT_WRONG

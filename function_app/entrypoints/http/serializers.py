@@ -8,7 +8,7 @@ from device_agent.protocol import State
 from device_agent.protocol.manifests.robot_type import RobotType
 from function_app.domain.actions.action import Action
 from function_app.domain.common.timestamps import rfc3339
-from function_app.domain.control.lease import Asked, Lease
+from function_app.domain.control.lease import ControlRequest, Lease
 from function_app.domain.identity.accounts import Identity
 from function_app.domain.robot_types.movements import Movement
 from function_app.domain.robot_types.robot_types import TypeVersion
@@ -61,7 +61,7 @@ def lease(found: Lease | None, who: Identity, now_ms: int) -> leases.LeaseOut | 
     )
 
 
-def control_request(asked: Asked, found: Lease, who: Identity, now_ms: int) -> leases.ControlRequestOut:
+def control_request(asked: ControlRequest, found: Lease, who: Identity, now_ms: int) -> leases.ControlRequestOut:
     """A request for control."""
     return leases.ControlRequestOut(
         id=asked.id,

@@ -6,7 +6,7 @@ from collections import OrderedDict
 from dataclasses import dataclass, replace
 from typing import Final
 
-from function_app.domain.audit.hash_chain import Deed
+from function_app.domain.audit.hash_chain import AccountEvent
 from function_app.domain.common.ids import split_device
 from function_app.domain.common.problems import Problem, invalid, not_found, unauthorized
 from function_app.domain.identity import api_keys as rules
@@ -78,7 +78,7 @@ class ApiKeys:
         self._clock = clock
         self._known: OrderedDict[str, _Checked] = OrderedDict()
 
-    async def make(self, who: Identity, wanted: Wanted) -> tuple[ApiKey, str]:
+    async def make(self, caller: Identity, wanted: Wanted) -> tuple[ApiKey, str]:
         """A new key, and the token that is shown this once.
 
         Raises:
@@ -88,16 +88,16 @@ class ApiKeys:
             raise invalid("A key is operator or viewer: owning is for people, who sign in.")
         if not 1 <= wanted.days <= rules.MOST_DAYS:
             raise invalid(f"A key is good for 1 to {rules.MOST_DAYS} days; make another one then.")
-        if len(await self._ids(who.account)) >= MOST:
+        if len(await self._ids(caller.account)) >= MOST:
             detail = f"An account has at most {MOST} API keys. Revoke one that is not used."
             raise Problem("too-many-keys", 409, "Too many API keys", detail)
         only = tuple(dict.fromkeys(wanted.only))
-        await self._require_there(who, only)
+        await self._require_there(caller, only)
         now_ms, secret = self._clock.now_ms(), new_secret()
         key = ApiKey(
             id=rules.new_key_id(),
-            account=who.account,
-            owner=who.name,
+            account=caller.account,
+            owner=caller.name,
             label=wanted.label,
             hash=rules.hashed(secret),
             most=wanted.most,
@@ -108,22 +108,24 @@ class ApiKeys:
         # Forgotten on time whatever becomes of this, and on the list before it is any use.
         due_ms = key.expires_ms + SHOWN_MS
         await self._forget.row(records.API_KEYS, key.id, API_KEY, due_ms=due_ms)
-        await self._forget.row(records.MEMBERS, who.account, _INDEX + key.id, due_ms=due_ms)
+        await self._forget.row(records.MEMBERS, caller.account, _INDEX + key.id, due_ms=due_ms)
         await self._pending.note(_EXPIRES + key.id, key.expires_ms)
         about = {"name": key.label, "role": key.most.value, "only": list(only), "expires_ms": key.expires_ms}
-        async with self._chain.change(who.account, Deed.API_KEY_MADE, who, on=f"key:{key.id}", **about) as change:
+        async with self._chain.change(
+            caller.account, AccountEvent.API_KEY_MADE, caller, on=f"key:{key.id}", **about
+        ) as change:
             await change.noted()
-            await self._tables.create(records.MEMBERS, Row(who.account, _INDEX + key.id, {}))
+            await self._tables.create(records.MEMBERS, Row(caller.account, _INDEX + key.id, {}))
             await self._tables.create(records.API_KEYS, Row(key.id, API_KEY, records.fields(key)))
         return key, rules.token(key.id, secret)
 
     async def of(self, account: str) -> tuple[ApiKey, ...]:
         """Those of an account, the newest first."""
         rows = [await self._tables.get(records.API_KEYS, key, API_KEY) for key in await self._ids(account)]
-        found = [records.read(row, ApiKey) for row in rows if row is not None]
-        return tuple(sorted((key for key in found if key.account == account), key=lambda key: -key.created_ms))
+        result = [records.read(row, ApiKey) for row in rows if row is not None]
+        return tuple(sorted((key for key in result if key.account == account), key=lambda key: -key.created_ms))
 
-    async def revoke(self, who: Identity, key_id: str) -> None:
+    async def revoke(self, caller: Identity, key_id: str) -> None:
         """Refuse a key from now on, here at once and elsewhere within seconds, and end what is done with it.
 
         Raises:
@@ -131,20 +133,22 @@ class ApiKeys:
         """
         row = await self._tables.get(records.API_KEYS, key_id, API_KEY)
         key = records.read(row, ApiKey) if row else None
-        if row is None or key is None or key.account != who.account:
+        if row is None or key is None or key.account != caller.account:
             raise not_found("api-key", key_id)
-        async with self._chain.change(who.account, Deed.API_KEY_REVOKED, who, on=f"key:{key_id}") as change:
+        async with self._chain.change(
+            caller.account, AccountEvent.API_KEY_REVOKED, caller, on=f"key:{key_id}"
+        ) as change:
             await change.noted()
             try:
                 await self._tables.delete(records.API_KEYS, row)
             except Conflict:
                 change.came_to_nothing = True  # it was used just now, or somebody else revokes it too
         if await self._tables.get(records.API_KEYS, key_id, API_KEY) is not None:
-            await self.revoke(who, key_id)
+            await self.revoke(caller, key_id)
             return
         self._known.pop(key_id, None)
         await self._sign_out.end(key.identity)
-        index = await self._tables.get(records.MEMBERS, who.account, _INDEX + key_id)
+        index = await self._tables.get(records.MEMBERS, caller.account, _INDEX + key_id)
         if index is not None:
             with contextlib.suppress(Conflict):
                 await self._tables.delete(records.MEMBERS, index)
@@ -167,14 +171,14 @@ class ApiKeys:
         if parts is None:
             raise unauthorized(_REFUSED)
         now_ms = self._clock.now_ms()
-        known = self._known.get(parts[0])
-        if known is None or not 0 <= now_ms - known.at_ms < RECHECK_MS:
-            known = await self._look(parts[0], now_ms)
-        if known is None or not known.key.opened_by(parts[1]) or now_ms >= known.key.expires_ms:
+        existing = self._known.get(parts[0])
+        if existing is None or not 0 <= now_ms - existing.at_ms < RECHECK_MS:
+            existing = await self._look(parts[0], now_ms)
+        if existing is None or not existing.key.opened_by(parts[1]) or now_ms >= existing.key.expires_ms:
             raise unauthorized(_REFUSED)
-        if now_ms - known.key.used_ms >= USED_EVERY_MS:
-            known.key = await self._used(known.key, now_ms)
-        return known.key.identity
+        if now_ms - existing.key.used_ms >= USED_EVERY_MS:
+            existing.key = await self._used(existing.key, now_ms)
+        return existing.key.identity
 
     async def _look(self, key_id: str, now_ms: int) -> _Checked | None:
         row = await self._tables.get(records.API_KEYS, key_id, API_KEY)
@@ -200,11 +204,11 @@ class ApiKeys:
             _log.warning("the use of API key %s was not noted: %s", key.id, error)
         return used
 
-    async def _require_there(self, who: Identity, only: tuple[str, ...]) -> None:
+    async def _require_there(self, caller: Identity, only: tuple[str, ...]) -> None:
         spaces: set[str] = set()
         if any(each.startswith("space:") for each in only):
-            spaces = {space.id for space in await self._sign_in.spaces(who.account)}
-            spaces |= {device.space for device in await self._devices.all(who)}
+            spaces = {space.id for space in await self._sign_in.spaces(caller.account)}
+            spaces |= {device.space for device in await self._devices.all(caller)}
         for each in only:
             if each.startswith("space:"):
                 if each.removeprefix("space:") not in spaces:
@@ -212,7 +216,7 @@ class ApiKeys:
             elif split_device(each) is None:
                 raise not_found("device", each)
             else:
-                await self._devices.get(who, each)
+                await self._devices.get(caller, each)
 
     async def _ids(self, account: str) -> list[str]:
         page = await self._tables.query(records.MEMBERS, account, first=_INDEX, last="api-key;", limit=1000)

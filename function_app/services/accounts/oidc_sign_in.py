@@ -11,7 +11,7 @@ import logging
 from dataclasses import dataclass
 from typing import Final, NoReturn
 
-from function_app.domain.audit.hash_chain import CLOUD, Deed
+from function_app.domain.audit.hash_chain import CLOUD, AccountEvent
 from function_app.domain.common.problems import Problem
 from function_app.domain.identity.accounts import Identity
 from function_app.ports.clock import Clock
@@ -139,13 +139,13 @@ class OpenIdSignIn:
             _log.error("sign-in elsewhere: %s", error)
             raise _refused() from error
         is_new = not await self._sign_in.is_known_elsewhere(subject.issuer, subject.id)
-        known = await self._invited(begun["invitation"]) if is_new else None
-        if is_new and known is None and not self._anyone:
+        existing = await self._invited(begun["invitation"]) if is_new else None
+        if is_new and existing is None and not self._anyone:
             await self._refuse_stranger(subject, whence)
         account = await self._sign_in.account_elsewhere(subject.issuer, subject.id, subject.name)
         done = await self._sessions.begin(account, "open-id", whence)
-        if known is not None:
-            await self._take(Identity(account.id, account.name, done.session), known)
+        if existing is not None:
+            await self._take(Identity(account.id, account.name, done.session), existing)
         return done
 
     async def _invited(self, invitation: str) -> Known | None:
@@ -153,14 +153,14 @@ class OpenIdSignIn:
         if not invitation:
             return None
         try:
-            known = await self._invitations.find(invitation)
+            existing = await self._invitations.find(invitation)
         except Problem:
             return None
-        return None if known.invitation.account else known
+        return None if existing.invitation.account else existing
 
-    async def _take(self, who: Identity, known: Known) -> None:
+    async def _take(self, caller: Identity, existing: Known) -> None:
         try:
-            await self._invitations.redeem(who, known)
+            await self._invitations.redeem(caller, existing)
         except Problem as problem:
             # Somebody else was first with its last use. The account is there all the same, and empty.
             _log.warning("sign-in elsewhere: the invitation of a new account came to nothing: %s", problem.detail)
@@ -168,7 +168,7 @@ class OpenIdSignIn:
     async def _refuse_stranger(self, subject: Subject, whence: From) -> NoReturn:
         code = "open-id-uninvited"
         _log.warning("sign-in elsewhere: %r (%r) has no account here and was not invited", subject.name, subject.id)
-        await self._chain.refused(CLOUD, Deed.SIGN_IN_REFUSED, None, code=code, address=whence.address)
+        await self._chain.refused(CLOUD, AccountEvent.SIGN_IN_REFUSED, None, code=code, address=whence.address)
         detail = "Nobody has invited you here. Ask somebody for an invitation, or whoever runs this server."
         raise Problem(code, 403, "Not invited", detail)
 

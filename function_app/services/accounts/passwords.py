@@ -3,11 +3,11 @@
 from dataclasses import dataclass
 from typing import Final
 
-from function_app.domain.audit.hash_chain import CLOUD, Deed
+from function_app.domain.audit.hash_chain import CLOUD, AccountEvent
 from function_app.domain.common.ids import new_id
 from function_app.domain.common.problems import Problem, forbidden, invalid, unauthorized
 from function_app.domain.identity.accounts import Account, Identity
-from function_app.domain.identity.passwords import normal, why_weak
+from function_app.domain.identity.passwords import normalize, weakness
 from function_app.ports.clock import Clock
 from function_app.ports.password_hasher import PasswordHashes
 from function_app.ports.tables import Conflict, Row, Tables
@@ -77,7 +77,7 @@ class Passwords:
         account = named.id if named else ""
         row = await self._tables.get(records.ACCOUNTS, account or _NOBODY, _PASSWORD)
         stored = records.read(row, _Stored) if row else None
-        right = await self._hashes.check(stored.hash if stored else None, normal(password))
+        right = await self._hashes.check(stored.hash if stored else None, normalize(password))
         if named is None or row is None or stored is None or not right:
             await self._refused(account, whence, WRONG)
             raise unauthorized("This name and password do not belong together.")
@@ -92,7 +92,7 @@ class Passwords:
             await self._renew(again, password)
         return done
 
-    async def put(self, who: Identity, password: str, *, old: str | None, whence: From) -> None:
+    async def put(self, caller: Identity, password: str, *, old: str | None, whence: From) -> None:
         """Set or change the password of one's own account; every other session of it ends.
 
         The old one has to be given, except in the first minutes after a one-time link was redeemed: whoever finds a
@@ -101,24 +101,26 @@ class Passwords:
         Raises:
             Problem: ``password-elsewhere``, ``forbidden``, ``password-weak``, ``too-many-tries``.
         """
-        named = await self._sign_in.known(who.name)
-        if named is None or named.id != who.account:
+        named = await self._sign_in.known(caller.name)
+        if named is None or named.id != caller.account:
             detail = "This account signs in elsewhere and has no password here. Change it there."
             raise Problem("password-elsewhere", 409, "No password here", detail)
-        row = await self._tables.get(records.ACCOUNTS, who.account, _PASSWORD)
-        await self._require_right(who, row, old, whence)
-        data = records.fields(await self._store(password, who.name))
-        async with self._chain.change(who.account, Deed.PASSWORD_SET, who, address=whence.address) as change:
+        row = await self._tables.get(records.ACCOUNTS, caller.account, _PASSWORD)
+        await self._require_right(caller, row, old, whence)
+        data = records.fields(await self._store(password, caller.name))
+        async with self._chain.change(
+            caller.account, AccountEvent.PASSWORD_SET, caller, address=whence.address
+        ) as change:
             await change.noted()
             try:
                 if row is None:
-                    await self._tables.create(records.ACCOUNTS, Row(who.account, _PASSWORD, data))
+                    await self._tables.create(records.ACCOUNTS, Row(caller.account, _PASSWORD, data))
                 else:
-                    await self._tables.replace(records.ACCOUNTS, Row(who.account, _PASSWORD, data, row.etag))
+                    await self._tables.replace(records.ACCOUNTS, Row(caller.account, _PASSWORD, data, row.etag))
             except Conflict as conflict:
                 detail = "The password was changed in the meantime. Give the new one as the old one."
                 raise forbidden(detail) from conflict
-        await self._sign_out.others(who)
+        await self._sign_out.others(caller)
 
     async def register(self, name: str, password: str) -> Account:
         """A new local account. Its password is there before its name: a name without one would be nobody's.
@@ -133,7 +135,7 @@ class Passwords:
         account = new_id(12)
         row = await self._tables.create(records.ACCOUNTS, Row(account, _PASSWORD, records.fields(stored)))
         try:
-            async with self._chain.change(account, Deed.ACCOUNT_MADE, Identity(account, name, "")) as change:
+            async with self._chain.change(account, AccountEvent.ACCOUNT_MADE, Identity(account, name, "")) as change:
                 await change.noted()
                 await self._tables.create(
                     records.ACCOUNTS, Row(named_partition(name), "account", new_name(account, name))
@@ -150,34 +152,34 @@ class Passwords:
         """
         wrong = code == WRONG
         data = {"code": code, "address": whence.address}
-        await self._chain.refused(account or CLOUD, Deed.SIGN_IN_REFUSED, None, each=wrong, **data)
+        await self._chain.refused(account or CLOUD, AccountEvent.SIGN_IN_REFUSED, None, each=wrong, **data)
 
-    async def _require_right(self, who: Identity, row: Row | None, old: str | None, whence: From) -> None:
+    async def _require_right(self, caller: Identity, row: Row | None, old: str | None, whence: From) -> None:
         if old is None:
-            session = await self._sessions.get(who)
+            session = await self._sessions.get(caller)
             if session is None or not session.fresh_by_link(self._clock.now_ms()):
                 raise forbidden(
                     "Give the old password, or sign in by a new one-time link and set it within 10 minutes."
                 )
             return
-        counters = {**by_address(whence.address, WRONG_TRIES_FROM), named_partition(who.name): WRONG_TRIES}
+        counters = {**by_address(whence.address, WRONG_TRIES_FROM), named_partition(caller.name): WRONG_TRIES}
         await self._attempts.count(GUESS, counters)
-        if not await self._hashes.check(records.read(row, _Stored).hash if row else None, normal(old)):
-            await self._refused(who.account, whence, WRONG)
+        if not await self._hashes.check(records.read(row, _Stored).hash if row else None, normalize(old)):
+            await self._refused(caller.account, whence, WRONG)
             raise forbidden("The old password is not right.")
         await self._attempts.uncount(GUESS, counters)
 
     async def _store(self, password: str, name: str) -> _Stored:
-        password = normal(password)
-        why = why_weak(password, name=name)
+        password = normalize(password)
+        why = weakness(password, name=name)
         if why:
             raise invalid(why, code="password-weak")
         return _Stored(await self._hashes.make(password), self._clock.now_ms())
 
     async def _renew(self, row: Row, password: str) -> None:
         """The same password under today's parameters."""
-        fresh = _Stored(await self._hashes.make(normal(password)), self._clock.now_ms())
+        created = _Stored(await self._hashes.make(normalize(password)), self._clock.now_ms())
         try:
-            await self._tables.replace(records.ACCOUNTS, Row(row.partition, row.key, records.fields(fresh), row.etag))
+            await self._tables.replace(records.ACCOUNTS, Row(row.partition, row.key, records.fields(created), row.etag))
         except Conflict:
             return  # it was changed just now

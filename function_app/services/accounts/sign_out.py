@@ -3,7 +3,7 @@
 import asyncio
 import logging
 
-from function_app.domain.audit.hash_chain import Deed
+from function_app.domain.audit.hash_chain import AccountEvent
 from function_app.domain.common.problems import Problem, not_found
 from function_app.domain.devices.devices import Device
 from function_app.domain.identity.accounts import Identity
@@ -47,49 +47,51 @@ class SignOut:
         self._chain = chain
         self._clock = clock
 
-    async def end(self, who: Identity) -> None:
-        """End the session of ``who``: its tokens first, then its connections to the broker, then its leases.
+    async def end(self, caller: Identity) -> None:
+        """End the session of ``caller``: its tokens first, then its connections to the broker, then its leases.
 
         Whoever is not reached changes nothing: what the broker was told ends by itself within a quarter of an hour, a
         lease when it runs out, and until then nobody can renew either.
         """
-        async with self._chain.change(who.account, Deed.SIGNED_OUT, who) as change:
+        async with self._chain.change(caller.account, AccountEvent.SIGNED_OUT, caller) as change:
             await change.noted()
-            await self._identify.sign_out(who)
-            await self._sessions.drop(who.account, who.session)
+            await self._identify.sign_out(caller)
+            await self._sessions.drop(caller.account, caller.session)
         try:
-            await self._access.revoke(principal=principal(who))
+            await self._access.revoke(principal=principal(caller))
         except BrokerAccessError as error:
             _log.warning("sign-out: %s", error)
-        await self._release(who)
+        await self._release(caller)
 
-    async def one(self, who: Identity, session: str) -> None:
+    async def one(self, caller: Identity, session: str) -> None:
         """End one session of the account.
 
         Raises:
             Problem: ``session-unknown``.
         """
-        if session not in {known.id for known in await self._sessions.list(who.account)}:
+        if session not in {existing.id for existing in await self._sessions.list(caller.account)}:
             raise not_found("session", session)
-        await self.end(Identity(who.account, who.name, session))
+        await self.end(Identity(caller.account, caller.name, session))
 
-    async def others(self, who: Identity) -> int:
+    async def others(self, caller: Identity) -> int:
         """End every session of the account but the one that asks; how many there were."""
-        others = [known.id for known in await self._sessions.list(who.account) if known.id != who.session]
+        others = [
+            existing.id for existing in await self._sessions.list(caller.account) if existing.id != caller.session
+        ]
         for session in others:
-            await self.end(Identity(who.account, who.name, session))
+            await self.end(Identity(caller.account, caller.name, session))
         return len(others)
 
-    async def _release(self, who: Identity) -> None:
+    async def _release(self, caller: Identity) -> None:
         gate = asyncio.Semaphore(AT_ONCE)
-        await asyncio.gather(*(self._let_go(who, device, gate) for device in await self._devices.all(who)))
+        await asyncio.gather(*(self._let_go(caller, device, gate) for device in await self._devices.all(caller)))
 
-    async def _let_go(self, who: Identity, device: Device, gate: asyncio.Semaphore) -> None:
+    async def _let_go(self, caller: Identity, device: Device, gate: asyncio.Semaphore) -> None:
         async with gate:
             lease = await read_lease(self._tables, device)
-            if lease is None or not lease.mine(who) or not lease.live(self._clock.now_ms()):
+            if lease is None or not lease.mine(caller) or not lease.live(self._clock.now_ms()):
                 return
             try:
-                await self._leases.release(who, device.id, epoch=lease.epoch)
+                await self._leases.release(caller, device.id, epoch=lease.epoch)
             except Problem as problem:
                 _log.warning("sign-out: control over %s: %s", device.id, problem.detail)

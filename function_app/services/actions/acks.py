@@ -8,12 +8,12 @@ import msgspec
 from device_agent.protocol import Ack, codec
 from device_agent.protocol.errors import ProtocolError
 from device_agent.protocol.topics import Topic
-from function_app.domain.actions.action import Action, Report, Status, apply_report, mark_published, reached
+from function_app.domain.actions.action import AckReport, Action, Status, apply_report, mark_published, reached
 from function_app.domain.common.ids import device_id, split_command
 from function_app.domain.common.json_depth import too_deep
 from function_app.domain.devices.devices import Transport
 from function_app.ports.clock import Clock
-from function_app.services.actions.action_store import ActionRows, Found
+from function_app.services.actions.action_store import ActionRows, StoredAction
 from function_app.services.actions.queue import Queues
 from function_app.services.messaging.delivery import CONFIRMING
 from function_app.services.messaging.mailbox import Mailbox
@@ -49,11 +49,11 @@ class ActionAcks:
         if parts is None or parts[0] != device_id(topic.agent, topic.device):
             raise ProtocolError(f"'{ack.id}' is no command to {topic.agent}/{topic.device}")
         heard = report(ack, self._clock.now_ms())
-        found = await self._queues.change(ack.id, lambda action: apply_report(action, heard))
-        if found is None:
+        stored = await self._queues.change(ack.id, lambda action: apply_report(action, heard))
+        if stored is None:
             await self._answer(topic.agent, ack)
         elif ack.status.terminal:
-            await self._latencies.measured(found.action, by)
+            await self._latencies.measured(stored.action, by)
         if by != "mqtt":
             # Last: until then the agent is given the command again, and answers again.
             await self._mailbox.withdraw(topic.agent, ack.id)
@@ -64,14 +64,20 @@ class ActionAcks:
             await self._mailbox.answer(agent, ack)
 
     async def follow(
-        self, found: Found, acks: AsyncIterator[Ack] | None, *, wanted: Status, wait_ms: int, published: bool = False
+        self,
+        stored: StoredAction,
+        acks: AsyncIterator[Ack] | None,
+        *,
+        wanted: Status,
+        wait_ms: int,
+        published: bool = False,
     ) -> Action:
         """Wait until the action has reached ``wanted``, has ended, or ``wait_ms`` are over.
 
         Acks are collected and written once, before this returns: who asks next reads what this answered.
 
         Args:
-            found: The action as it was read or written last.
+            stored: The action as it was read or written last.
             acks: Its acks from before it was published, or ``None``: then the row is read again and again.
             wanted: The status to wait for.
             wait_ms: At most this long.
@@ -81,61 +87,63 @@ class ActionAcks:
         end = asyncio.get_running_loop().time() + wait_ms / 1000
         if acks is None:
             if published:
-                found = await self._write(found, (), published_ms)
-            return await self._poll(found, wanted, end)
-        found, reports = await self._hear(found, acks, wanted, end)
-        return (await self._write(found, reports, published_ms)).action
+                stored = await self._write(stored, (), published_ms)
+            return await self._poll(stored, wanted, end)
+        stored, reports = await self._hear(stored, acks, wanted, end)
+        return (await self._write(stored, reports, published_ms)).action
 
     async def _hear(
-        self, found: Found, acks: AsyncIterator[Ack], wanted: Status, end: float
-    ) -> tuple[Found, list[Report]]:
+        self, stored: StoredAction, acks: AsyncIterator[Ack], wanted: Status, end: float
+    ) -> tuple[StoredAction, list[AckReport]]:
         """Collect acks, and look into the tables now and then: the ingest may have heard what came before this call."""
         loop = asyncio.get_running_loop()
-        reports: list[Report] = []
-        action = found.action
+        reports: list[AckReport] = []
+        action = stored.action
         pause_s = _FIRST_LOOK_S
         while not reached(action, wanted) and (left_s := end - loop.time()) > 0:
             try:
                 async with asyncio.timeout(min(pause_s, left_s)):
                     reports.append(report(await anext(acks), self._clock.now_ms()))
                 if action.status is Status.QUEUED:  # not any more, or nobody would report about it
-                    found = await self._rows.get(action.id) or found
-                    action = _applied(found.action, reports)
+                    stored = await self._rows.get(action.id) or stored
+                    action = _applied(stored.action, reports)
                 else:
                     action = apply_report(action, reports[-1])
             except TimeoutError:
                 pause_s = min(2 * pause_s, _SLOWEST_LOOK_S)
-                found = await self._rows.get(found.action.id) or found
-                action = _applied(found.action, reports)
-        return found, reports
+                stored = await self._rows.get(stored.action.id) or stored
+                action = _applied(stored.action, reports)
+        return stored, reports
 
-    async def _write(self, found: Found, reports: Iterable[Report], published_ms: int | None) -> Found:
+    async def _write(
+        self, stored: StoredAction, reports: Iterable[AckReport], published_ms: int | None
+    ) -> StoredAction:
         def changed(action: Action) -> Action:
             if published_ms is not None:
                 action = mark_published(action, published_ms)
             return _applied(action, reports)
 
-        return await self._queues.change(found.action.id, changed, known=found) or found
+        return await self._queues.change(stored.action.id, changed, existing=stored) or stored
 
-    async def _poll(self, found: Found, wanted: Status, end: float) -> Action:
+    async def _poll(self, stored: StoredAction, wanted: Status, end: float) -> Action:
         loop = asyncio.get_running_loop()
         pause_s = _POLL_S
-        while not reached(found.action, wanted) and (left_s := end - loop.time()) > 0:
+        while not reached(stored.action, wanted) and (left_s := end - loop.time()) > 0:
             await asyncio.sleep(min(pause_s, left_s))
             pause_s = min(2 * pause_s, _SLOWEST_POLL_S)
-            found = await self._rows.get(found.action.id) or found
-        return found.action
+            stored = await self._rows.get(stored.action.id) or stored
+        return stored.action
 
 
-def _applied(action: Action, reports: Iterable[Report]) -> Action:
+def _applied(action: Action, reports: Iterable[AckReport]) -> Action:
     for heard in reports:
         action = apply_report(action, heard)
     return action
 
 
-def report(ack: Ack, heard_ms: int) -> Report:
+def report(ack: Ack, heard_ms: int) -> AckReport:
     """An ack as the domain reads it. A result that could not be read again is left out; the end still counts."""
-    return Report(
+    return AckReport(
         status=Status(ack.status.value),
         sequence=ack.sequence,
         at_ms=ack.at_ms,

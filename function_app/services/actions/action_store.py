@@ -20,7 +20,7 @@ _END = "action;"
 
 
 @dataclass(frozen=True, slots=True)
-class Found:
+class StoredAction:
     """An action and the row it was read from; ``waited_for``: its end, just now, was what others wait for."""
 
     action: Action
@@ -46,13 +46,13 @@ class ActionRows:
     def __init__(self, *, tables: Tables) -> None:
         self._tables = tables
 
-    async def get(self, action: str) -> Found | None:
+    async def get(self, action: str) -> StoredAction | None:
         """One action."""
         where = place(action)
         if where is None:
             return None
         row = await self._tables.get(records.CONTROL, *where)
-        return None if row is None else Found(records.read(row, Action), row)
+        return None if row is None else StoredAction(records.read(row, Action), row)
 
     async def list(self, device: Device, *, cursor: str | None, limit: int) -> tuple[list[Action], str | None]:
         """Actions of a device since it was paired, newest first.
@@ -71,8 +71,8 @@ class ActionRows:
         return actions, page.cursor if len(actions) == len(page.rows) else None
 
     async def change(
-        self, action: str, change: Callable[[Action], Action], *, known: Found | None = None
-    ) -> Found | None:
+        self, action: str, change: Callable[[Action], Action], *, existing: StoredAction | None = None
+    ) -> StoredAction | None:
         """Change an action by ETag; when that ends it, free its slot, lease and place in the queue in the same batch.
 
         Who ends one that others wait for must see to the queue then: ``Queues.change`` does both.
@@ -80,7 +80,7 @@ class ActionRows:
         Args:
             action: Its id.
             change: Gives the same object when there is nothing to change; may be called several times.
-            known: What the caller read or wrote last: saves a read, and costs one more when it is stale.
+            existing: What the caller read or wrote last: saves a read, and costs one more when it is stale.
 
         Returns:
             The action as it is now, or ``None`` when there is none.
@@ -90,25 +90,25 @@ class ActionRows:
         """
         stale = False
 
-        async def once() -> Found | None:
+        async def attempt() -> StoredAction | None:
             nonlocal stale
-            found = await self.get(action) if known is None or stale else known
+            stored = await self.get(action) if existing is None or stale else existing
             stale = True
-            if found is None:
+            if stored is None:
                 return None
-            changed = change(found.action)
-            if changed is found.action:
-                return found
-            writes = [Write("replace", replace(found.row, data=records.fields(changed)))]
+            changed = change(stored.action)
+            if changed is stored.action:
+                return stored
+            writes = [Write("replace", replace(stored.row, data=records.fields(changed)))]
             waited_for = False
             if changed.status.terminal:
                 control = await read_control_rows(self._tables, changed.device)
                 writes += _freed(changed, control)
                 waited_for = not control.queue.without(action).empty
             rows = await self._tables.batch(records.CONTROL, writes)
-            return Found(changed, rows[0], waited_for)
+            return StoredAction(changed, rows[0], waited_for)
 
-        return await records.retry(once)
+        return await records.retry(attempt)
 
 
 def _freed(action: Action, control: Control) -> list[Write]:
@@ -124,6 +124,6 @@ def _freed(action: Action, control: Control) -> list[Write]:
     if control.lease is not None and control.lease.action == action.id:
         nobody = release(control.lease, now_ms=action.ended_ms)
         writes.append(control.write_lease(action.device, nobody))
-        who = Identity(action.account, action.who, action.session)
-        writes += lease_change(action.device, control.lease, nobody, who=who, now_ms=action.ended_ms)
+        caller = Identity(action.account, action.who, action.session)
+        writes += lease_change(action.device, control.lease, nobody, caller=caller, now_ms=action.ended_ms)
     return writes

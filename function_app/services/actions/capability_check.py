@@ -37,8 +37,8 @@ async def check(tables: Tables, device: Device, asked: Task) -> None:
         return
     kind = str(type(asked).__struct_config__.tag)
     _among("kind of action", kind, described.actions)
-    for word, name, there in _named(asked, described):
-        _among(word, name, there)
+    for word, name, reached in _named(asked, described):
+        _among(word, name, reached)
 
 
 def _named(asked: Task, described: Description) -> Iterable[tuple[str, str, Sequence[str]]]:
@@ -61,7 +61,7 @@ def _named(asked: Task, described: Description) -> Iterable[tuple[str, str, Sequ
             yield "control", control, [each.name for each in described.controls]
 
 
-def _among(word: str, name: str, there: Sequence[str]) -> None:
-    if name not in there:
-        detail = f"This device has no {word} '{name}'; it has: {', '.join(there) or 'none'}."
-        raise Problem("unable", 422, "The device cannot do this", detail, extras={"names": list(there)})
+def _among(word: str, name: str, reached: Sequence[str]) -> None:
+    if name not in reached:
+        detail = f"This device has no {word} '{name}'; it has: {', '.join(reached) or 'none'}."
+        raise Problem("unable", 422, "The device cannot do this", detail, extras={"names": list(reached)})

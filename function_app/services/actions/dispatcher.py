@@ -11,7 +11,7 @@ from function_app.domain.identity.accounts import Identity
 from function_app.domain.identity.api_keys import key_of
 from function_app.ports.clock import Clock
 from function_app.ports.tables import Tables
-from function_app.services.actions.action_store import ActionRows, Found
+from function_app.services.actions.action_store import ActionRows, StoredAction
 from function_app.services.devices.device_access import Devices, devices_of
 from function_app.services.messaging.command_sender import Commands
 from function_app.services.robot_types.movements import Movements
@@ -68,17 +68,17 @@ class SendAction:
             NoLonger: The device is another's or gone, the share has ended or is a viewer's, its key has ended or
                 may do less, or whoever started it has signed out.
         """
-        who = await self._devices.acting(Identity(action.account, action.who, action.session))
-        device, _ = (None, None) if who is None else await self._devices.find(who, action.device)
-        if who is not None and device is not None and device.pairing == action.pairing and device.role.may_operate:
-            return who, device
+        caller = await self._devices.acting(Identity(action.account, action.who, action.session))
+        device, _ = (None, None) if caller is None else await self._devices.find(caller, action.device)
+        if caller is not None and device is not None and device.pairing == action.pairing and device.role.may_operate:
+            return caller, device
         if await self.device(action) is None:
             raise NoLonger(UNPAIRED)
         if key_of(action.session):
             raise NoLonger(KEY_ENDED)
-        raise NoLonger(SIGNED_OUT if who is None else UNSHARED)
+        raise NoLonger(SIGNED_OUT if caller is None else UNSHARED)
 
-    async def send(self, found: Found, device: Device) -> None:
+    async def send(self, stored: StoredAction, device: Device) -> None:
         """Publish it and write that down.
 
         Raises:
@@ -86,20 +86,20 @@ class SendAction:
             NoLonger: Who started it may not have it carried out any more.
             BusUnavailable: The broker did not confirm it.
         """
-        action = found.action
+        action = stored.action
         await self.standing(action)
         signed = await self._commands.signed(
             device,
             action.id,
             await self._command(action),
-            who=action.who,
+            caller=action.who,
             epoch=action.epoch,
             issued_ms=action.issued_ms,
             ttl_ms=action.ttl_ms,
         )
         await self._commands.publish(device, signed)
         now_ms = self._clock.now_ms()
-        await self._rows.change(action.id, lambda known: mark_published(known, now_ms), known=found)
+        await self._rows.change(action.id, lambda existing: mark_published(existing, now_ms), existing=stored)
 
     async def _command(self, action: Action) -> Task | RunMovement:
         if action.request["kind"] != "run_movement":

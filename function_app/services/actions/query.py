@@ -13,7 +13,7 @@ from function_app.ports.clock import Clock
 from function_app.ports.command_bus import BusUnavailable
 from function_app.ports.tables import Tables
 from function_app.services.actions.acks import ActionAcks
-from function_app.services.actions.action_store import ActionRows, Found
+from function_app.services.actions.action_store import ActionRows, StoredAction
 from function_app.services.devices.control_rows import read_lease
 from function_app.services.devices.device_access import Devices, require_operator
 from function_app.services.messaging.command_sender import Commands
@@ -43,63 +43,65 @@ class Actions:
         self._clock = clock
 
     async def list(
-        self, who: Identity, device: str, *, cursor: str | None, limit: int
+        self, caller: Identity, device: str, *, cursor: str | None, limit: int
     ) -> tuple[list[Action], str | None]:
         """A device's actions, newest first.
 
         Raises:
             Problem: ``device-unknown``, ``cursor-invalid``.
         """
-        return await self._rows.list(await self._devices.get(who, device), cursor=cursor, limit=limit)
+        return await self._rows.list(await self._devices.get(caller, device), cursor=cursor, limit=limit)
 
-    async def get(self, who: Identity, action: str, *, wait_ms: int, wait_for: Literal["started", "done"]) -> Action:
+    async def get(self, caller: Identity, action: str, *, wait_ms: int, wait_for: Literal["started", "done"]) -> Action:
         """One action, as soon as it has come as far as ``wait_for``, or as it is after ``wait_ms``.
 
         Raises:
             Problem: ``action-unknown``.
         """
-        device, found = await self._find(who, action)
-        if not wait_ms or found.action.status.terminal:
-            return found.action
+        device, stored = await self._find(caller, action)
+        if not wait_ms or stored.action.status.terminal:
+            return stored.action
         async with self._delivery.acks(device, action) as acks:
-            found = await self._rows.get(action) or found
-            return await self._acks.follow(found, acks, wanted=Status(wait_for), wait_ms=wait_ms)
+            stored = await self._rows.get(action) or stored
+            return await self._acks.follow(stored, acks, wanted=Status(wait_for), wait_ms=wait_ms)
 
-    async def cancel(self, who: Identity, action: str) -> Action:
+    async def cancel(self, caller: Identity, action: str) -> Action:
         """Ask the device to end an action; one that waits for its turn ends at once. It has ended when it says so.
 
         Raises:
             Problem: ``action-unknown``, ``forbidden``, ``broker-unavailable``, ``busy``.
         """
-        device, found = await self._find(who, action)
+        device, stored = await self._find(caller, action)
         require_operator(device)
-        if found.action.status.terminal:
-            return found.action
+        if stored.action.status.terminal:
+            return stored.action
         cancel_id = command_id(device.id, self._clock.now_ms())
         now_ms = self._clock.now_ms()
-        marked = await self._rows.change(action, lambda known: _cancelling(known, cancel_id, now_ms), known=found)
+        marked = await self._rows.change(
+            action, lambda existing: _cancelling(existing, cancel_id, now_ms), existing=stored
+        )
         if marked is not None and marked.action.status.terminal:
             return marked.action
         lease = await read_lease(self._tables, device)
-        epoch = max((marked or found).action.epoch, lease.epoch if lease else 0)
+        epoch = max((marked or stored).action.epoch, lease.epoch if lease else 0)
         try:
-            await self._commands.send(device, CancelAction(action=action), who=who.name, epoch=epoch)
+            await self._commands.send(device, CancelAction(action=action), caller=caller.name, epoch=epoch)
         except BusUnavailable as error:
             raise broker_unavailable(f"{error}.") from error
-        return (marked or found).action
+        return (marked or stored).action
 
-    async def _find(self, who: Identity, action: str) -> tuple[Device, Found]:
+    async def _find(self, caller: Identity, action: str) -> tuple[Device, StoredAction]:
         parts = split_command(action)
-        found = await self._rows.get(action) if parts else None
-        if parts is None or found is None:
+        stored = await self._rows.get(action) if parts else None
+        if parts is None or stored is None:
             raise not_found("action", action)
-        device = await self._device(who, parts[0], action)
-        if found.action.pairing != device.pairing:
+        device = await self._device(caller, parts[0], action)
+        if stored.action.pairing != device.pairing:
             raise not_found("action", action)
-        return device, found
+        return device, stored
 
-    async def _device(self, who: Identity, device: str, action: str) -> Device:
-        visible, _ = await self._devices.find(who, device)
+    async def _device(self, caller: Identity, device: str, action: str) -> Device:
+        visible, _ = await self._devices.find(caller, device)
         if visible is None:
             raise not_found("action", action)
         return visible

@@ -10,8 +10,8 @@ from collections.abc import Callable, Collection
 from dataclasses import replace
 from typing import Final
 
-from function_app.domain.actions.action import REPEAT_MS, Action, Status, end, give_turn
-from function_app.domain.actions.queue import DROPPED, Queue
+from function_app.domain.actions.action import RETRY_MS, Action, Status, end, give_turn
+from function_app.domain.actions.queue import DROPPED, ActionQueue
 from function_app.domain.common.problems import Problem
 from function_app.domain.control import lease as rules
 from function_app.domain.control.lease import Lease
@@ -20,7 +20,7 @@ from function_app.domain.identity.accounts import Identity
 from function_app.ports.clock import Clock
 from function_app.ports.command_bus import BusUnavailable
 from function_app.ports.tables import Row, Tables, Write
-from function_app.services.actions.action_store import ActionRows, Found
+from function_app.services.actions.action_store import ActionRows, StoredAction
 from function_app.services.actions.dispatcher import MovementChanged, NoLonger, SendAction
 from function_app.services.control.control_events import ControlEvents, lease_change
 from function_app.services.devices.control_rows import heed_device, read_control, read_control_rows
@@ -59,17 +59,17 @@ class Queues:
         self._clock = clock
 
     async def change(
-        self, action: str, change: Callable[[Action], Action], *, known: Found | None = None
-    ) -> Found | None:
+        self, action: str, change: Callable[[Action], Action], *, existing: StoredAction | None = None
+    ) -> StoredAction | None:
         """As ``ActionRows.change``; then, where others waited for its end, see to them.
 
         Raises:
             Problem: ``busy``.
         """
-        found = await self._rows.change(action, change, known=known)
-        if found is not None and found.waited_for:
-            await self.advance(found.action.device)
-        return found
+        stored = await self._rows.change(action, change, existing=existing)
+        if stored is not None and stored.waited_for:
+            await self.advance(stored.action.device)
+        return stored
 
     async def watch(self, device: str) -> None:
         """Have the timer look at a device's queue; to be noted before something is put into it."""
@@ -107,14 +107,14 @@ class Queues:
         """
         await self._lose(device, lambda queue: queue.dropping(actions, why))
 
-    async def _lose(self, device: str, change: Callable[[Queue], Queue]) -> None:
-        async def once() -> None:
+    async def _lose(self, device: str, change: Callable[[ActionQueue], ActionQueue]) -> None:
+        async def attempt() -> None:
             control = await read_control_rows(self._tables, device)
             changed = change(control.queue)
             if changed is not control.queue:
                 await self._tables.batch(records.CONTROL, [control.write_queue(device, changed)])
 
-        await records.retry(once)
+        await records.retry(attempt)
         await self.advance(device)
 
     async def positions(self, actions: list[Action]) -> dict[str, int]:
@@ -136,40 +136,40 @@ class Queues:
             return True
         if control.action or not queue.actions:
             return False
-        found = await self._rows.get(queue.actions[0])
-        if found is None or found.action.status is not Status.QUEUED:
+        stored = await self._rows.get(queue.actions[0])
+        if stored is None or stored.action.status is not Status.QUEUED:
             await self._tables.batch(records.CONTROL, [control.write_queue(device, queue.without(queue.actions[0]))])
             return True
-        return await self._turn(found)
+        return await self._turn(stored)
 
     async def _drop(self, device: str, action: str, status: Status, code: str, message: str) -> None:
         """End one that lost its place. That takes it out of the queue; what has no row or an end already goes so."""
         now_ms = self._clock.now_ms()
-        await self._rows.change(action, lambda known: _if_queued(known, status, code, message, now_ms))
+        await self._rows.change(action, lambda existing: _if_queued(existing, status, code, message, now_ms))
         control = await read_control_rows(self._tables, device)
         if control.queue.holds(action):
             await self._tables.batch(records.CONTROL, [control.write_queue(device, control.queue.without(action))])
 
-    async def _turn(self, found: Found) -> bool:
+    async def _turn(self, stored: StoredAction) -> bool:
         """Give the first one its turn, or its end where it cannot start."""
-        action = found.action
+        action = stored.action
         now_ms = self._clock.now_ms()
         if now_ms >= action.queued_until_ms:
-            await self._refuse(found, Status.EXPIRED, "queue-timeout", TIMEOUT)
+            await self._refuse(stored, Status.EXPIRED, "queue-timeout", TIMEOUT)
             return True
         try:
-            who, device = await self._sending.standing(action)
+            caller, device = await self._sending.standing(action)
         except NoLonger as ended:
             status, message = DROPPED[ended.why]
-            await self._refuse(found, status, ended.why, message)
+            await self._refuse(stored, status, ended.why, message)
             return True
         try:
-            started = await self._start(found, device, who)
+            started = await self._start(stored, device, caller)
         except Problem as problem:
             if problem.code not in {"lease-held", "lease-lost"}:
                 raise
-            await self._refuse(found, Status.FAILED, problem.code, problem.detail)
-            await self._audit.refused(device, who, "start an action that waited for its turn", problem)
+            await self._refuse(stored, Status.FAILED, problem.code, problem.detail)
+            await self._audit.refused(device, caller, "start an action that waited for its turn", problem)
             return True
         if started is None:
             return False
@@ -181,42 +181,42 @@ class Queues:
             _log.warning("action %s: %s; the timer ends it", action.id, ended.why)
         return False
 
-    async def _start(self, found: Found, device: Device, who: Identity) -> Found | None:
+    async def _start(self, stored: StoredAction, device: Device, caller: Identity) -> StoredAction | None:
         """Slot, lease, place in the queue and the action itself in one batch; ``None``: somebody was faster.
 
         The note is written before, as for every action that the timer has to see to.
         """
-        await self._pending.note(found.action.id, self._clock.now_ms() + REPEAT_MS)
+        await self._pending.note(stored.action.id, self._clock.now_ms() + RETRY_MS)
         control = await read_control(self._tables, device)
-        if control.action or control.queue.position(found.action.id) != 1:
+        if control.action or control.queue.position(stored.action.id) != 1:
             return None
         now_ms = self._clock.now_ms()
-        control = await heed_device(self._tables, device, control, who, now_ms)
+        control = await heed_device(self._tables, device, control, caller, now_ms)
         lease = run_lease(
             control.lease,
-            who,
-            epoch=found.action.epoch or None,
-            action=found.action.id,
-            lease_ms=found.action.timeout_ms,
+            caller,
+            epoch=stored.action.epoch or None,
+            action=stored.action.id,
+            lease_ms=stored.action.timeout_ms,
             now_ms=now_ms,
             pairing=device.pairing,
         )
-        started = give_turn(found.action, lease.epoch, now_ms)
+        started = give_turn(stored.action, lease.epoch, now_ms)
         writes = [
-            Write("replace", replace(found.row, data=records.fields(started))),
+            Write("replace", replace(stored.row, data=records.fields(started))),
             control.write_slot(device.id, started.id, device.pairing),
             control.write_queue(device.id, control.queue.without(started.id)),
         ]
         if lease is not control.lease:
             writes.append(control.write_lease(device.id, lease))
-            writes += lease_change(device.id, control.lease, lease, who=who, now_ms=now_ms, owner=device.owner)
+            writes += lease_change(device.id, control.lease, lease, caller=caller, now_ms=now_ms, owner=device.owner)
         rows: tuple[Row, ...] = await self._tables.batch(records.CONTROL, writes)
-        return Found(started, rows[0])
+        return StoredAction(started, rows[0])
 
-    async def _refuse(self, found: Found, status: Status, code: str, message: str) -> None:
+    async def _refuse(self, stored: StoredAction, status: Status, code: str, message: str) -> None:
         now_ms = self._clock.now_ms()
         await self._rows.change(
-            found.action.id, lambda known: _if_queued(known, status, code, message, now_ms), known=found
+            stored.action.id, lambda existing: _if_queued(existing, status, code, message, now_ms), existing=stored
         )
 
 
@@ -227,7 +227,7 @@ def queue_of(note: str) -> str | None:
 
 def run_lease(
     lease: Lease | None,
-    who: Identity,
+    caller: Identity,
     *,
     epoch: int | None,
     action: str,
@@ -241,10 +241,10 @@ def run_lease(
         Problem: ``lease-lost``, ``lease-held``.
     """
     if epoch is not None:
-        return rules.hold(lease, who, epoch=epoch, now_ms=now_ms)
-    if lease is not None and lease.live(now_ms) and lease.mine(who):
+        return rules.require_held(lease, caller, epoch=epoch, now_ms=now_ms)
+    if lease is not None and lease.live(now_ms) and lease.mine(caller):
         return lease
-    return rules.take(lease, who, lease_ms=lease_ms, now_ms=now_ms, pairing=pairing, action=action)
+    return rules.acquire(lease, caller, lease_ms=lease_ms, now_ms=now_ms, pairing=pairing, action=action)
 
 
 def _if_queued(action: Action, status: Status, code: str, message: str, now_ms: int) -> Action:

@@ -10,7 +10,7 @@ import msgspec
 from msgspec import Struct
 
 from device_agent.protocol import Ack, CollectData, Id, RunMovement, Task
-from function_app.domain.actions.action import REPEAT_MS, Action, Status, end, reached
+from function_app.domain.actions.action import RETRY_MS, Action, Status, end, reached
 from function_app.domain.actions.queue import DROPPED, KEY_ENDED, UNSHARED
 from function_app.domain.common.ids import command_id
 from function_app.domain.common.problems import Problem, busy_store, invalid
@@ -23,7 +23,7 @@ from function_app.ports.command_bus import BusUnavailable
 from function_app.ports.tables import Row, Tables, Write
 from function_app.services.actions import capability_check
 from function_app.services.actions.acks import ActionAcks
-from function_app.services.actions.action_store import ActionRows, Found, new_row
+from function_app.services.actions.action_store import ActionRows, StoredAction, new_row
 from function_app.services.actions.queue import Queues, run_lease
 from function_app.services.control.control_events import ControlEvents, lease_change
 from function_app.services.devices.control_rows import Control, heed_device, read_control
@@ -107,7 +107,7 @@ class _Plan:
 class _Begun:
     """An action that is written, and its acks from before it was sent."""
 
-    found: Found
+    found: StoredAction
     acks: AsyncIterator[Ack] | None
     published: bool = False
     undelivered: bool = False
@@ -144,14 +144,14 @@ class StartAction:
         self._clock = clock
 
     async def start(
-        self, who: Identity, device_id: str, start: Start, *, gate: AbstractAsyncContextManager[object] | None = None
+        self, caller: Identity, device_id: str, start: Start, *, gate: AbstractAsyncContextManager[object] | None = None
     ) -> tuple[Action, bool]:
         """Start it; and whether the wanted status (or an end) was reached in time.
 
         A stop of this process after any write leaves an action that the timer publishes or ends.
 
         Args:
-            who: Who asks.
+            caller: Who asks.
             device_id: On which device.
             start: What to start.
             gate: Held while it is written and sent, not while its start is waited for.
@@ -164,7 +164,7 @@ class StartAction:
         wanted = Status(start.wait_for)
         async with AsyncExitStack() as listening:
             async with gate or nullcontext():
-                begun = await self._begin(who, device_id, start, listening)
+                begun = await self._begin(caller, device_id, start, listening)
             if begun.undelivered:
                 return begun.found.action, False
             action = await self._acks.follow(
@@ -172,64 +172,64 @@ class StartAction:
             )
         return action, reached(action, wanted)
 
-    async def _begin(self, who: Identity, device_id: str, start: Start, listening: AsyncExitStack) -> "_Begun":
+    async def _begin(self, caller: Identity, device_id: str, start: Start, listening: AsyncExitStack) -> "_Begun":
         if isinstance(start.asked, AskMovement):
             parameters.check(start.asked.parameters)
-        device, link = await self._devices.with_link(who, device_id)
-        async with self._audit.refusals(device, who, "start an action"):
-            return await self._at(who, device, link, start, listening)
+        device, link = await self._devices.with_link(caller, device_id)
+        async with self._audit.refusals(device, caller, "start an action"):
+            return await self._at(caller, device, link, start, listening)
 
     async def _at(
-        self, who: Identity, device: Device, link: Link | None, start: Start, listening: AsyncExitStack
+        self, caller: Identity, device: Device, link: Link | None, start: Start, listening: AsyncExitStack
     ) -> "_Begun":
         require_operator(device)
-        earlier = await self._earlier(who, device, start)
+        earlier = await self._earlier(caller, device, start)
         if earlier is not None:
             return await self._join(earlier, device, listening)
         require_online(link, self._clock.now_ms())
-        plan = await self._plan(who, device, start)
+        plan = await self._plan(caller, device, start)
         ttl_ms = min(start.ttl_ms, start.timeout_ms)
-        await self._pending.note(plan.action, plan.created_ms + REPEAT_MS)
+        await self._pending.note(plan.action, plan.created_ms + RETRY_MS)
         if start.policy == "queue":
             await self._queues.watch(device.id)
-        found, fresh = await self._write(who, plan, start, ttl_ms)
-        if fresh and found.action.status is Status.QUEUED:
+        stored, created = await self._write(caller, plan, start, ttl_ms)
+        if created and stored.action.status is Status.QUEUED:
             await self._queues.advance(device.id)
-        if not fresh or found.action.status is Status.QUEUED:
-            return await self._join(found, device, listening)
-        await self._require_still(who, device, found)
-        signed = await self._signed(plan, found.action)
+        if not created or stored.action.status is Status.QUEUED:
+            return await self._join(stored, device, listening)
+        await self._require_still(caller, device, stored)
+        signed = await self._signed(plan, stored.action)
         acks = await listening.enter_async_context(self._delivery.acks(device, plan.action))
         try:
             await self._commands.publish(device, signed)
         except BusUnavailable:
             # It is written: the timer publishes it as soon as the broker is back, or ends it.
-            return _Begun(found, acks, undelivered=True)
-        return _Begun(found, acks, published=True)
+            return _Begun(stored, acks, undelivered=True)
+        return _Begun(stored, acks, published=True)
 
-    async def _require_still(self, who: Identity, device: Device, found: Found) -> None:
+    async def _require_still(self, caller: Identity, device: Device, stored: StoredAction) -> None:
         """End an action of somebody with whom the device was un-shared, or whose key was ended, while it was written.
 
         Raises:
             Problem: ``device-unknown``, ``forbidden``.
         """
         try:
-            await self._devices.require_still(who, device)
+            await self._devices.require_still(caller, device)
         except Problem:
-            why = KEY_ENDED if who.key else UNSHARED
+            why = KEY_ENDED if caller.key else UNSHARED
             status, message = DROPPED[why]
             now_ms = self._clock.now_ms()
             await self._queues.change(
-                found.action.id, lambda known: end(known, status, why, message, now_ms), known=found
+                stored.action.id, lambda existing: end(existing, status, why, message, now_ms), existing=stored
             )
             raise
 
-    async def _join(self, found: Found, device: Device, listening: AsyncExitStack) -> "_Begun":
+    async def _join(self, stored: StoredAction, device: Device, listening: AsyncExitStack) -> "_Begun":
         """Where nothing is to be sent: an earlier request started it, or it waits for its turn."""
-        acks = await listening.enter_async_context(self._delivery.acks(device, found.action.id))
-        return _Begun(await self._rows.get(found.action.id) or found, acks)
+        acks = await listening.enter_async_context(self._delivery.acks(device, stored.action.id))
+        return _Begun(await self._rows.get(stored.action.id) or stored, acks)
 
-    async def _plan(self, who: Identity, device: Device, start: Start) -> _Plan:
+    async def _plan(self, caller: Identity, device: Device, start: Start) -> _Plan:
         asked, now_ms = start.asked, self._clock.now_ms()
         request: dict[str, Any] = msgspec.to_builtins(asked)
         action = command_id(device.id, now_ms)
@@ -259,7 +259,7 @@ class StartAction:
             pinned = {name: getattr(command, name) for name in PINNED}
             plan = _Plan(device, action, now_ms, request, command, pinned)
         # Before anything is written: what cannot be sent must not take the slot.
-        self._commands.check(device, action, plan.command, who=who.name, ttl_ms=1)
+        self._commands.check(device, action, plan.command, caller=caller.name, ttl_ms=1)
         return plan
 
     async def _signed(self, plan: _Plan, action: Action) -> Signed:
@@ -267,32 +267,32 @@ class StartAction:
             plan.device,
             action.id,
             plan.command,
-            who=action.who,
+            caller=action.who,
             epoch=action.epoch,
             issued_ms=action.created_ms,
             ttl_ms=action.ttl_ms,
         )
 
-    async def _write(self, who: Identity, plan: _Plan, start: Start, ttl_ms: int) -> tuple[Found, bool]:
+    async def _write(self, caller: Identity, plan: _Plan, start: Start, ttl_ms: int) -> tuple[StoredAction, bool]:
         """Action, slot, lease and idempotency row in one batch; not fresh: another request with the key was first."""
 
-        async def once() -> tuple[Found, bool]:
+        async def attempt() -> tuple[StoredAction, bool]:
             now_ms = self._clock.now_ms()
             control = await read_control(self._tables, plan.device)
-            control = await heed_device(self._tables, plan.device, control, who, now_ms)
+            control = await heed_device(self._tables, plan.device, control, caller, now_ms)
             if now_ms - plan.created_ms > ABANDON_MS:
                 raise busy_store()
-            earlier = await self._earlier(who, plan.device, start)
+            earlier = await self._earlier(caller, plan.device, start)
             if earlier is not None:
                 return earlier, False
             before = control.action or next(iter((*control.queue.actions, *control.queue.dropped)), "")
-            lease = _lease(who, control, plan, start, before, now_ms)
+            lease = _lease(caller, control, plan, start, before, now_ms)
             waits = bool(before)
             action = Action(
                 id=plan.action,
                 device=plan.device.id,
-                account=who.account,
-                who=who.name,
+                account=caller.account,
+                who=caller.name,
                 pairing=plan.device.pairing,
                 request=plan.request,
                 epoch=lease.epoch if lease is not None else 0,
@@ -301,8 +301,8 @@ class StartAction:
                 deadline_ms=plan.created_ms + start.timeout_ms + (start.queue_ms if waits else 0),
                 status=Status.QUEUED if waits else Status.CREATED,
                 pinned=plan.pinned,
-                once=_once_key(who, plan.device, start) if start.once else "",
-                session=who.session,
+                once=_once_key(caller, plan.device, start) if start.once else "",
+                session=caller.session,
                 timeout_ms=start.timeout_ms,
                 queued_until_ms=plan.created_ms + start.queue_ms if waits else 0,
             )
@@ -316,21 +316,21 @@ class StartAction:
             elif lease is not None and lease is not control.lease:
                 writes.append(control.write_lease(plan.device.id, lease))
                 writes += lease_change(
-                    plan.device.id, control.lease, lease, who=who, now_ms=now_ms, owner=plan.device.owner
+                    plan.device.id, control.lease, lease, caller=caller, now_ms=now_ms, owner=plan.device.owner
                 )
             if start.once:
                 data = {"action": plan.action, "request": start.fingerprint()}
                 writes.append(Write("create", Row(plan.device.id, action.once, data)))
             rows = await self._tables.batch(records.CONTROL, writes)
-            return Found(action, rows[0]), True
+            return StoredAction(action, rows[0]), True
 
-        return await records.retry(once)
+        return await records.retry(attempt)
 
-    async def _earlier(self, who: Identity, device: Device, start: Start) -> Found | None:
+    async def _earlier(self, caller: Identity, device: Device, start: Start) -> StoredAction | None:
         """The action that an earlier request with the same idempotency key started."""
         if not start.once:
             return None
-        row = await self._tables.get(records.CONTROL, device.id, _once_key(who, device, start))
+        row = await self._tables.get(records.CONTROL, device.id, _once_key(caller, device, start))
         if row is None:
             return None
         if row.data["request"] != start.fingerprint():
@@ -346,7 +346,7 @@ def device_busy(action: str) -> Problem:
 
 
 def _lease(  # noqa: PLR0917 (what decides)
-    who: Identity, control: Control, plan: _Plan, start: Start, before: str, now_ms: int
+    caller: Identity, control: Control, plan: _Plan, start: Start, before: str, now_ms: int
 ) -> Lease | None:
     """The lease it runs under; ``None`` where it waits behind ``before`` without one, and gets its own at its turn.
 
@@ -358,12 +358,12 @@ def _lease(  # noqa: PLR0917 (what decides)
     waits = bool(before) and start.policy == "queue"
     if waits and start.epoch is None:
         held = control.lease
-        if held is not None and held.live(now_ms) and not held.mine(who) and not held.action:
-            raise rules.held(held)
+        if held is not None and held.live(now_ms) and not held.mine(caller) and not held.action:
+            raise rules.lease_held(held)
         return None
     lease = run_lease(
         control.lease,
-        who,
+        caller,
         epoch=start.epoch,
         action=plan.action,
         lease_ms=start.timeout_ms,
@@ -375,6 +375,6 @@ def _lease(  # noqa: PLR0917 (what decides)
     return lease
 
 
-def _once_key(who: Identity, device: Device, start: Start) -> str:
+def _once_key(caller: Identity, device: Device, start: Start) -> str:
     """Of one account and one pairing: the actions of an earlier pairing are nobody's any more."""
-    return "once:" + hashlib.sha256(f"{who.account}\n{device.pairing}\n{start.once}".encode()).hexdigest()
+    return "once:" + hashlib.sha256(f"{caller.account}\n{device.pairing}\n{start.once}".encode()).hexdigest()

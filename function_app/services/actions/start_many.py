@@ -20,8 +20,8 @@ _log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True, slots=True)
-class Answer:
-    """What became of it on one device: an action, or why there is none. ``there``: it is as far as was waited for."""
+class StartResult:
+    """What became of it on one device: an action, or why there is none. ``reached``: it is as far as was waited for."""
 
     device: str
     result: Action | Problem
@@ -35,8 +35,8 @@ class StartOnMany:
         self._start_action = start_action
 
     async def start(
-        self, who: Identity, devices: Sequence[str], start: Start, *, epochs: Mapping[str, int]
-    ) -> list[Answer]:
+        self, caller: Identity, devices: Sequence[str], start: Start, *, epochs: Mapping[str, int]
+    ) -> list[StartResult]:
         """Start it on each device; the answers in the order of ``devices``.
 
         The idempotency key counts for each device by itself: asked again, those that have it are not started again, and
@@ -44,15 +44,17 @@ class StartOnMany:
         """
         gate = asyncio.Semaphore(AT_ONCE)
         return await asyncio.gather(
-            *(self._one(who, device, replace(start, epoch=epochs.get(device)), gate) for device in devices)
+            *(self._one(caller, device, replace(start, epoch=epochs.get(device)), gate) for device in devices)
         )
 
-    async def _one(self, who: Identity, device: str, start: Start, gate: asyncio.Semaphore) -> Answer:
+    async def _one(self, caller: Identity, device: str, start: Start, gate: asyncio.Semaphore) -> StartResult:
         try:
-            action, there = await self._start_action.start(who, device, start, gate=gate)
+            action, reached = await self._start_action.start(caller, device, start, gate=gate)
         except Problem as problem:
-            return Answer(device, problem)
+            return StartResult(device, problem)
         except StoreError as error:
             _log.error("%s: %s", device, error)
-            return Answer(device, store_unavailable("The tables cannot be used now. Ask again, with the same key."))
-        return Answer(device, action, there)
+            return StartResult(
+                device, store_unavailable("The tables cannot be used now. Ask again, with the same key.")
+            )
+        return StartResult(device, action, reached)

@@ -67,7 +67,7 @@ class StopDevices:
         self._delivery = delivery
         self._audit = audit
 
-    async def stop(self, who: Identity, device_id: str, reason: str) -> bool:
+    async def stop(self, caller: Identity, device_id: str, reason: str) -> bool:
         """Latch Stop; whether the device has confirmed it within a second.
 
         Goes out twice: as the plain ``stop`` message, repeated until confirmed, and as a signed command. Actions that
@@ -76,32 +76,32 @@ class StopDevices:
         Raises:
             Problem: ``device-unknown``, ``forbidden``, ``broker-unavailable``: neither way was open.
         """
-        device = await self._devices.get(who, device_id)
-        async with self._audit.refusals(device, who, "stop"):
+        device = await self._devices.get(caller, device_id)
+        async with self._audit.refusals(device, caller, "stop"):
             require_operator(device)
-        return await self._stop(who, device, reason, nullcontext())
+        return await self._stop(caller, device, reason, nullcontext())
 
-    async def stop_many(self, who: Identity, reason: str, *, space: str | None = None) -> list[Stopped]:
-        """Stop every device that ``who`` may operate, of one space or of all; each has its own answer.
+    async def stop_many(self, caller: Identity, reason: str, *, space: str | None = None) -> list[Stopped]:
+        """Stop every device that ``caller`` may operate, of one space or of all; each has its own answer.
 
         All are told at the same time, and each for itself is waited for: one that is dead costs the others nothing.
 
         Raises:
             Problem: ``space-unknown``; ``forbidden``: there is nothing in this space that they may stop.
         """
-        view = None if space is None else await self._spaces.get(who, space)
+        view = None if space is None else await self._spaces.get(caller, space)
         gate = asyncio.Semaphore(AT_ONCE)
         devices = [
             device
-            for device in await self._devices.all(who)
+            for device in await self._devices.all(caller)
             if device.role.may_operate and space in {None, device.space}
         ]
         if view is not None and not devices and not view.role.may_operate:
             # "All have confirmed" would be true, and read as if something had stopped.
             raise forbidden("You may watch this space, not stop it. Ask its owner, or whoever stands there.")
-        return await asyncio.gather(*(self._one(who, device, reason, gate) for device in devices))
+        return await asyncio.gather(*(self._one(caller, device, reason, gate) for device in devices))
 
-    async def reset(self, who: Identity, device_id: str) -> bool:
+    async def reset(self, caller: Identity, device_id: str) -> bool:
         """Release the latch; whether the device has confirmed it within a second. Nothing resumes.
 
         The reset takes the next epoch for itself: whatever was ordered before it, and is still on its way, is from an
@@ -110,32 +110,34 @@ class StopDevices:
         Raises:
             Problem: ``device-unknown``, ``forbidden``, ``busy``, ``broker-unavailable``.
         """
-        device = await self._devices.get(who, device_id)
-        async with self._audit.refusals(device, who, "reset Stop"):
+        device = await self._devices.get(caller, device_id)
+        async with self._audit.refusals(device, caller, "reset Stop"):
             require_operator(device)
         _, lease = await self._rows.change(
-            who, device, lambda lease, now_ms: rules.overtake(lease, pairing=device.pairing, now_ms=now_ms)
+            caller, device, lambda lease, now_ms: rules.invalidate(lease, pairing=device.pairing, now_ms=now_ms)
         )
-        await self._devices.require_still(who, device)
-        return await self._commands.confirmed(device, ResetStop(), who=who.name, epoch=lease.epoch, wait_ms=CONFIRM_MS)
+        await self._devices.require_still(caller, device)
+        return await self._commands.confirmed(
+            device, ResetStop(), caller=caller.name, epoch=lease.epoch, wait_ms=CONFIRM_MS
+        )
 
-    async def _one(self, who: Identity, device: Device, reason: str, gate: asyncio.Semaphore) -> Stopped:
+    async def _one(self, caller: Identity, device: Device, reason: str, gate: asyncio.Semaphore) -> Stopped:
         try:
-            return Stopped(device.id, await self._stop(who, device, reason, gate))
+            return Stopped(device.id, await self._stop(caller, device, reason, gate))
         except Problem as problem:
             return Stopped(device.id, confirmed=False, problem=problem)
 
     async def _stop(
-        self, who: Identity, device: Device, reason: str, gate: AbstractAsyncContextManager[object]
+        self, caller: Identity, device: Device, reason: str, gate: AbstractAsyncContextManager[object]
     ) -> bool:
         """Tell it in both ways; the tables are written beside that, not before."""
-        plain = asyncio.create_task(self._repeat(device, Stop(id=new_id(), by=who.name, reason=reason)))
+        plain = asyncio.create_task(self._repeat(device, Stop(id=new_id(), by=caller.name, reason=reason)))
         writing: asyncio.Task[None] | None = None
         try:
             await asyncio.sleep(0)  # it goes before anything is signed or written
-            writing = asyncio.create_task(self._write(who, device, reason, gate))
+            writing = asyncio.create_task(self._write(caller, device, reason, gate))
             order = StopDevice(reason=reason)
-            return await self._commands.confirmed(device, order, who=who.name, epoch=0, wait_ms=CONFIRM_MS)
+            return await self._commands.confirmed(device, order, caller=caller.name, epoch=0, wait_ms=CONFIRM_MS)
         finally:
             plain.cancel()
             with contextlib.suppress(asyncio.CancelledError, BusUnavailable):
@@ -154,15 +156,15 @@ class StopDevices:
             await asyncio.sleep(REPEAT_S)
 
     async def _write(
-        self, who: Identity, device: Device, reason: str, gate: AbstractAsyncContextManager[object]
+        self, caller: Identity, device: Device, reason: str, gate: AbstractAsyncContextManager[object]
     ) -> None:
         """Empty the queue, and tell of it. The device is stopped without either: what waits fails at its turn."""
-        message = f"{who.name} stopped it: {reason}" if reason else f"{who.name} stopped it."
+        message = f"{caller.name} stopped it: {reason}" if reason else f"{caller.name} stopped it."
         try:
             async with gate:
                 await self._queues.halt(device.id, STOPPED)
                 await self._audit.happened(
-                    device, Fact.STOP_ORDERED, message, who=who, severity="warning", by=who.name, reason=reason
+                    device, Fact.STOP_ORDERED, message, caller=caller, severity="warning", by=caller.name, reason=reason
                 )
         except (Problem, StoreError) as error:
             _log.warning("stop of %s: %s", device.id, error)

@@ -119,7 +119,7 @@ class AuditLog:
 
     @contextlib.asynccontextmanager
     async def change(
-        self, owner: str, what: str, who: Identity | None, *, on: str = "", **data: Any
+        self, owner: str, what: str, caller: Identity | None, *, on: str = "", **data: Any
     ) -> AsyncGenerator[Change]:
         """Record a change that is made within: call ``noted`` before the write that decides it.
 
@@ -129,7 +129,7 @@ class AuditLog:
         Args:
             owner: The account in whose chain it stands; ``CLOUD``: none.
             what: A ``Deed`` or ``Fact``.
-            who: Who does it.
+            caller: Who does it.
             on: To what.
             data: What else is to be known. No secrets.
 
@@ -137,7 +137,7 @@ class AuditLog:
             StoreError: It could not be noted.
         """
         at_ms = self._clock.now_ms()
-        change = Change(self, owner, rules.entry(what, who, entry_id=new_id(), at_ms=at_ms, on=on, **data))
+        change = Change(self, owner, rules.entry(what, caller, entry_id=new_id(), at_ms=at_ms, on=on, **data))
         try:
             yield change
         except Problem as problem:
@@ -147,7 +147,7 @@ class AuditLog:
         await change.end("done")
 
     async def record(
-        self, owner: str, what: str, who: Identity | None, *, on: str = "", outcome: Outcome = "done", **data: Any
+        self, owner: str, what: str, caller: Identity | None, *, on: str = "", outcome: Outcome = "done", **data: Any
     ) -> None:
         """Record what has happened.
 
@@ -155,10 +155,12 @@ class AuditLog:
             StoreError: The tables cannot be used.
         """
         at_ms = self._clock.now_ms()
-        await self.keep(owner, rules.entry(what, who, entry_id=new_id(), at_ms=at_ms, on=on, outcome=outcome, **data))
+        await self.keep(
+            owner, rules.entry(what, caller, entry_id=new_id(), at_ms=at_ms, on=on, outcome=outcome, **data)
+        )
 
     async def refused(
-        self, owner: str, what: str, who: Identity | None, *, on: str = "", each: bool = False, **data: Any
+        self, owner: str, what: str, caller: Identity | None, *, on: str = "", each: bool = False, **data: Any
     ) -> None:
         """Record a refusal; the same again and again once in a while only, but where it says ``each``.
 
@@ -166,13 +168,13 @@ class AuditLog:
         """
         now_ms = self._clock.now_ms()
         code = str(data.get("code", ""))
-        key = (owner, what, on, code, who.session if who else str(data.get("address", "")))
+        key = (owner, what, on, code, caller.session if caller else str(data.get("address", "")))
         if not each and now_ms - self._refused.get(key, -QUIET_MS) < QUIET_MS:
             return
         self._refused[key] = now_ms
         _bound(self._refused, key)
         try:
-            await self.record(owner, what, who, on=on, outcome="refused", **data)
+            await self.record(owner, what, caller, on=on, outcome="refused", **data)
         except (StoreError, Problem) as error:
             _log.warning("audit of a refusal: %s", error)
 
@@ -263,10 +265,10 @@ class AuditLog:
     def _new(self, what: str, owner: str, when: int) -> bool:
         """Whether this process has not noted it yet."""
         key = (what, owner, when)
-        fresh = key not in self._noted
+        created = key not in self._noted
         self._noted[key] = None
         _bound(self._noted, key)
-        return fresh
+        return created
 
     async def _write(self, owner: str, jobs: list[_Job]) -> None:
         await self._note_anchor(owner)
@@ -278,7 +280,7 @@ class AuditLog:
             if not jobs:
                 return
             row = await self._tables.get(records.AUDIT, owner, _HEAD)
-            head = rules.start(owner) if row is None else Head(row.data["seq"], row.data["hash"])
+            head = rules.genesis(owner) if row is None else Head(row.data["seq"], row.data["hash"])
             try:
                 await self._try(owner, row, head, jobs)
             except Conflict:
@@ -314,7 +316,7 @@ class AuditLog:
         """Write ``jobs`` behind ``head``, which is what ``row`` says, all or none."""
         writes = []
         for job in jobs:
-            head, record = rules.follow(head, job.fields)
+            head, record = rules.append(head, job.fields)
             writes.append(Write("create", Row(owner, record_key(head.seq), record)))
             if job.waiting is not None:
                 writes.append(Write("delete", job.waiting))
@@ -327,7 +329,7 @@ class AuditLog:
     async def _signed(self, owner: str, head: Head) -> dict[str, Any]:
         key = await self._keys.current()
         at_ms = self._clock.now_ms()
-        signature = base64.urlsafe_b64encode(key.sign(rules.to_sign(owner, head, at_ms))).decode()
+        signature = base64.urlsafe_b64encode(key.sign(rules.signed_bytes(owner, head, at_ms))).decode()
         name = signing.key_id(key.public_key())
         return {"seq": head.seq, "hash": head.hash, "at_ms": at_ms, "key": name, "signature": signature}
 
@@ -366,7 +368,7 @@ def _each_once(jobs: list[_Job]) -> list[_Job]:
     return list(named.values())
 
 
-def _bound(known: OrderedDict[Any, Any], newest: Any) -> None:
-    known.move_to_end(newest)
-    if len(known) > _KNOWN:
-        known.popitem(last=False)
+def _bound(existing: OrderedDict[Any, Any], newest: Any) -> None:
+    existing.move_to_end(newest)
+    if len(existing) > _KNOWN:
+        existing.popitem(last=False)

@@ -65,38 +65,38 @@ class AuditReader:
         self._keys = keys
 
     async def read(
-        self, who: Identity, wanted: Wanted, *, cursor: str | None, limit: int
+        self, caller: Identity, wanted: Wanted, *, cursor: str | None, limit: int
     ) -> tuple[list[Mapping[str, Any]], str | None]:
         """Records of one's own chain, newest first, and where the next page begins.
 
         Raises:
             Problem: ``cursor-invalid``; ``forbidden``: with a key that is kept to less than everything of its account.
         """
-        if not who.most.may_own or who.only:
+        if not caller.most.may_own or caller.only:
             raise forbidden("Only who may do everything in this account reads who did what in it.")
         if cursor is None:
-            row = await self._tables.get(records.AUDIT, who.account, "head")
+            row = await self._tables.get(records.AUDIT, caller.account, "head")
             newest = 0 if row is None else int(row.data["seq"])
         elif cursor.isdecimal() and cursor.isascii() and len(cursor) <= _CURSOR_DIGITS:
             newest = int(cursor)
         else:
             raise invalid("The cursor is not one of this list. Begin without one.", code="cursor-invalid")
         oldest = max(FIRST, newest - LOOKED_AT + 1)
-        found: list[Mapping[str, Any]] = []
-        while newest >= oldest and len(found) < limit:
+        result: list[Mapping[str, Any]] = []
+        while newest >= oldest and len(result) < limit:
             first = max(oldest, newest - limit + 1)
             page = await self._tables.query(
-                records.AUDIT, who.account, first=record_key(first), last=record_key(newest + 1), limit=limit
+                records.AUDIT, caller.account, first=record_key(first), last=record_key(newest + 1), limit=limit
             )
             for row in reversed(page.rows):
                 newest = int(row.key.rpartition(":")[2]) - 1
                 if wanted.fits(row.data):
-                    found.append(row.data)
-                    if len(found) == limit:
+                    result.append(row.data)
+                    if len(result) == limit:
                         break
             else:
                 newest = first - 1
-        return found, str(newest) if newest >= FIRST else None
+        return result, str(newest) if newest >= FIRST else None
 
     async def chains(self) -> list[str]:
         """All chains there are, or that there have been: those noted elsewhere are named though their rows be gone."""
@@ -119,31 +119,31 @@ class AuditReader:
         """
         noted = await self._anchors(chain)
         if isinstance(noted, str):
-            return Verdict(chain, rules.start(chain), noted)
-        known = {head.seq: head for head in noted} | {head.seq: head for head in expected}
+            return Verdict(chain, rules.genesis(chain), noted)
+        existing = {head.seq: head for head in noted} | {head.seq: head for head in expected}
         for head in (*noted, *expected):
-            if known[head.seq] != head:
+            if existing[head.seq] != head:
                 return Verdict(chain, head, f"two different heads were noted for record {head.seq}")
         end = await self._tables.get(records.AUDIT, chain, "head")
-        reached, broken = await self._walk(chain, end, known)
+        reached, broken = await self._walk(chain, end, existing)
         if not broken:
             broken = await self._end(chain, end, reached)
-        if not broken and (missing := [seq for seq in known if seq > reached.seq]):
+        if not broken and (missing := [seq for seq in existing if seq > reached.seq]):
             broken = f"record {reached.seq + 1}: it and all after it are gone; {max(missing)} were noted elsewhere"
         return Verdict(chain, reached, broken, len(noted))
 
-    async def _walk(self, chain: str, end: Row | None, known: Mapping[int, Head]) -> tuple[Head, str]:
+    async def _walk(self, chain: str, end: Row | None, existing: Mapping[int, Head]) -> tuple[Head, str]:
         """How far the chain is whole up to ``end``, and what is wrong behind that."""
-        head = rules.start(chain)
+        head = rules.genesis(chain)
         last = _number(end.data.get("seq")) if end is not None else 0
         async for row in self._rows(chain, record_key(0), record_key(last + 1)):
-            wrong = rules.fault(head, row.data)
+            wrong = rules.record_error(head, row.data)
             if not wrong and row.key != record_key(head.seq + 1):
                 wrong = "it stands in another place"
             if wrong:
                 return head, f"record {head.seq + 1}: {wrong}"
             head = Head(head.seq + 1, str(row.data["hash"]))
-            if known.get(head.seq, head) != head:
+            if existing.get(head.seq, head) != head:
                 return head, f"record {head.seq}: another one was noted elsewhere"
         return head, ""
 
@@ -177,24 +177,24 @@ class AuditReader:
             signature = base64.b64decode(text, altchars=b"-_", validate=True)
             if base64.urlsafe_b64encode(signature).decode() != text:
                 return "the head's signature is not as it was written"
-            key.verify(signature, rules.to_sign(chain, head, end.data["at_ms"]))
+            key.verify(signature, rules.signed_bytes(chain, head, end.data["at_ms"]))
         except (InvalidSignature, ValueError, binascii.Error):
             return "the head's signature is wrong"
         return ""
 
     async def _anchors(self, chain: str) -> tuple[Head, ...] | str:
         text = await self._blobs.get(anchors(chain)) or b""
-        found = []
+        result = []
         for number, line in enumerate(text.splitlines(), 1):
             try:
                 read = json.loads(line)
-                head = rules.read_head(f"{read['seq']}:{read['hash']}")
+                head = rules.parse_head(f"{read['seq']}:{read['hash']}")
             except (ValueError, TypeError, KeyError):
                 head = None
             if head is None:
                 return f"line {number} of the heads noted in the blob store ({anchors(chain)}) cannot be read"
-            found.append(head)
-        return tuple(found)
+            result.append(head)
+        return tuple(result)
 
     async def _noted(self, prefix: str) -> set[str]:
         names = set(await self._blobs.list(prefix, limit=_MOST_NAMES))

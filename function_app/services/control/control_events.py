@@ -66,7 +66,7 @@ class ControlEvents:
         lease = (await read_control_rows(self._tables, device)).lease
         now_ms = self._clock.now_ms()
         pairing = lease.pairing if lease else ""
-        late = [happened.event(_name(device)) for happened in control_events.overdue(lease, now_ms)]
+        late = [happened.event(_name(device)) for happened in control_events.timed_out(lease, now_ms)]
         for event in late:
             await self._events.add(device, pairing, event)
         if late:
@@ -118,7 +118,7 @@ class ControlEvents:
         fact: Fact,
         message: str,
         *,
-        who: Identity | None = None,
+        caller: Identity | None = None,
         severity: Any = "info",
         outcome: Outcome = "done",
         **data: Any,
@@ -129,7 +129,7 @@ class ControlEvents:
             StoreError: The tables cannot be used.
         """
         event = await self.event(device, fact, message, severity=severity, **data)
-        await self._chain.keep(device.owner or CLOUD, _entry(device.id, event, _by(who), outcome))
+        await self._chain.keep(device.owner or CLOUD, _entry(device.id, event, _by(caller), outcome))
 
     async def event(
         self, device: Device, fact: Fact, message: str, *, severity: Any = "info", **data: Any
@@ -144,41 +144,41 @@ class ControlEvents:
         return event
 
     @contextlib.asynccontextmanager
-    async def refusals(self, device: Device, who: Identity, what: str) -> AsyncGenerator[None]:
+    async def refusals(self, device: Device, caller: Identity, what: str) -> AsyncGenerator[None]:
         """Tell of it when what is done within is refused for want of a role or of the lease.
 
         Args:
             device: On which device.
-            who: Who is refused.
+            caller: Who is refused.
             what: What they wanted, to go on after "was refused to".
         """
         try:
             yield
         except Problem as problem:
             if problem.code in REFUSALS:
-                await self.refused(device, who, what, problem)
+                await self.refused(device, caller, what, problem)
             raise
 
-    async def refused(self, device: Device, who: Identity, what: str, problem: Problem) -> None:
+    async def refused(self, device: Device, caller: Identity, what: str, problem: Problem) -> None:
         """Tell of a refusal. Whatever goes wrong with that: the refusal stands."""
         now_ms = self._clock.now_ms()
-        key = (device.id, who.session, what, problem.code)
+        key = (device.id, caller.session, what, problem.code)
         if now_ms - self._refused.get(key, -QUIET_MS) < QUIET_MS:
             return
         self._refused.pop(key, None)
         self._refused[key] = now_ms
         if len(self._refused) > _KNOWN:
             del self._refused[next(iter(self._refused))]
-        message = f"{who.name} was refused to {what}: {problem.detail}"
+        message = f"{caller.name} was refused to {what}: {problem.detail}"
         try:
             await self.happened(
                 device,
                 Fact.ORDER_REFUSED,
                 message,
-                who=who,
+                caller=caller,
                 severity="warning",
                 outcome="refused",
-                by=who.name,
+                by=caller.name,
                 wanted=what,
                 code=problem.code,
             )
@@ -187,7 +187,7 @@ class ControlEvents:
 
 
 def told(
-    device: str, pairing: str, facts: Iterable[ControlEvent], *, owner: str = "", who: Identity | None = None
+    device: str, pairing: str, facts: Iterable[ControlEvent], *, owner: str = "", caller: Identity | None = None
 ) -> list[Write]:
     """The writes that note facts, to go into one batch with the change that they tell of.
 
@@ -196,9 +196,9 @@ def told(
         pairing: In which.
         facts: What happened.
         owner: Whose device it is, where that is known.
-        who: Who did it, where somebody did.
+        caller: Who did it, where somebody did.
     """
-    more = ({"owner": owner} if owner else {}) | ({"by": _by(who)} if who else {})
+    more = ({"owner": owner} if owner else {}) | ({"by": _by(caller)} if caller else {})
     return [
         Write(
             "create",
@@ -214,11 +214,11 @@ def lease_of(note: str) -> str | None:
 
 
 def lease_change(
-    device: str, before: Lease | None, after: Lease, *, who: Identity, now_ms: int, owner: str = ""
+    device: str, before: Lease | None, after: Lease, *, caller: Identity, now_ms: int, owner: str = ""
 ) -> list[Write]:
     """The events of a change of a lease, to go into its batch."""
-    facts = control_events.changed(before, after, by=who.name, now_ms=now_ms)
-    return told(device, after.pairing, facts, owner=owner, who=who)
+    facts = control_events.lease_changes(before, after, by=caller.name, now_ms=now_ms)
+    return told(device, after.pairing, facts, owner=owner, caller=caller)
 
 
 def _entry(device: str, event: Mapping[str, Any], by: Mapping[str, str], outcome: Outcome = "done") -> Entry:
@@ -226,10 +226,10 @@ def _entry(device: str, event: Mapping[str, Any], by: Mapping[str, str], outcome
     return Entry(f"{device}/{event['id']}", event["at_ms"], event["kind"], outcome, device, **by, data=data)
 
 
-def _by(who: Identity | None) -> dict[str, str]:
-    if who is None:
+def _by(caller: Identity | None) -> dict[str, str]:
+    if caller is None:
         return {}
-    return {"who": who.name, "account": who.account, "session": who.session, "key": who.key}
+    return {"who": caller.name, "account": caller.account, "session": caller.session, "key": caller.key}
 
 
 def _name(device: str) -> str:

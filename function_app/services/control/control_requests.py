@@ -8,7 +8,7 @@ from device_agent.protocol import RequestControl, WithdrawRequest
 from function_app.domain.common.ids import new_id
 from function_app.domain.common.problems import Problem
 from function_app.domain.control import control_request as rules
-from function_app.domain.control.lease import Asked, Lease
+from function_app.domain.control.lease import ControlRequest, Lease
 from function_app.domain.devices.devices import Device
 from function_app.domain.identity.accounts import Identity
 from function_app.domain.identity.api_keys import key_of
@@ -47,22 +47,22 @@ class Handovers:
         self._audit = audit
         self._clock = clock
 
-    async def get(self, who: Identity, device_id: str, request: str) -> tuple[Lease, Asked]:
+    async def get(self, caller: Identity, device_id: str, request: str) -> tuple[Lease, ControlRequest]:
         """A device's last request for control, and its lease.
 
         Raises:
             Problem: ``device-unknown``, ``request-unknown``.
         """
-        device = await self._devices.get(who, device_id)
+        device = await self._devices.get(caller, device_id)
         return rules.find(await read_lease(self._tables, device), request)
 
     async def ask(
-        self, who: Identity, device_id: str, *, within_ms: int, lease_ms: int, wait_ms: int
-    ) -> tuple[Lease, Asked, bool, bool]:
+        self, caller: Identity, device_id: str, *, within_ms: int, lease_ms: int, wait_ms: int
+    ) -> tuple[Lease, ControlRequest, bool, bool]:
         """Ask the holder for control.
 
         Args:
-            who: Who asks.
+            caller: Who asks.
             device_id: For which device.
             within_ms: How long the holder has for an answer.
             lease_ms: How long control is wanted for.
@@ -75,27 +75,33 @@ class Handovers:
         Raises:
             Problem: ``device-unknown``, ``forbidden``, ``lease-free``, ``lease-yours``, ``lease-requested``, ``busy``.
         """
-        device = await self._devices.get(who, device_id)
-        fresh = new_id()
+        device = await self._devices.get(caller, device_id)
+        created = new_id()
 
         def changed(lease: Lease | None, now_ms: int) -> Lease:
-            return rules.ask(lease, who, request=fresh, within_ms=within_ms, lease_ms=lease_ms, now_ms=now_ms)
+            return rules.request_control(
+                lease, caller, request=created, within_ms=within_ms, lease_ms=lease_ms, now_ms=now_ms
+            )
 
-        async with self._audit.refusals(device, who, "ask for control"):
+        async with self._audit.refusals(device, caller, "ask for control"):
             require_operator(device)
-            _, lease = await self._rows.change(who, device, changed)
+            _, lease = await self._rows.change(caller, device, changed)
         asked = lease.asked
         assert asked is not None  # noqa: S101 (the rule has just written it)
         left_ms = max(1, asked.expires_ms - self._clock.now_ms())
         order = RequestControl(request=asked.id, by=asked.by, answer_within_ms=left_ms)
         try:
-            shown = await self._commands.confirmed(device, order, who=who.name, epoch=lease.epoch, wait_ms=wait_ms)
+            shown = await self._commands.confirmed(
+                device, order, caller=caller.name, epoch=lease.epoch, wait_ms=wait_ms
+            )
         except Problem as problem:
             _log.warning("request for %s: %s", device.id, problem.detail)
             shown = False
-        return lease, asked, asked.id == fresh, shown
+        return lease, asked, asked.id == created, shown
 
-    async def accept(self, who: Identity, device_id: str, request: str, *, wait_ms: int) -> tuple[Lease, Asked, bool]:
+    async def accept(
+        self, caller: Identity, device_id: str, request: str, *, wait_ms: int
+    ) -> tuple[Lease, ControlRequest, bool]:
         """Hand control over, in one write: the next epoch is the asker's, and what moves is held.
 
         Returns:
@@ -104,11 +110,11 @@ class Handovers:
         Raises:
             Problem: ``device-unknown``, ``forbidden``, ``request-unknown``, ``request-over``, ``asker-gone``, ``busy``.
         """
-        device = await self._devices.get(who, device_id)
-        async with self._audit.refusals(device, who, "hand control over"):
+        device = await self._devices.get(caller, device_id)
+        async with self._audit.refusals(device, caller, "hand control over"):
             require_operator(device)
             await self._require_asker(device, request)
-            before, lease = await self._change(who, device, rules.accept, request)
+            before, lease = await self._change(caller, device, rules.accept, request)
             if before is not lease:
                 await self._require_asker_still(device, lease)
         _, asked = rules.find(lease, request)
@@ -116,41 +122,42 @@ class Handovers:
             # Handed over already, by an earlier request of the same kind. The device hears of it with each renewal.
             return lease, asked, False
         confirmed, _ = await asyncio.gather(
-            self._leases.grant(device, lease, by=who.name, wait_ms=wait_ms), self._leases.revoke(device, before.epoch)
+            self._leases.grant(device, lease, by=caller.name, wait_ms=wait_ms),
+            self._leases.revoke(device, before.epoch),
         )
         return lease, asked, confirmed
 
-    async def refuse(self, who: Identity, device_id: str, request: str) -> tuple[Lease, Asked]:
+    async def refuse(self, caller: Identity, device_id: str, request: str) -> tuple[Lease, ControlRequest]:
         """Keep control.
 
         Raises:
             Problem: ``device-unknown``, ``forbidden``, ``request-unknown``, ``request-over``, ``busy``.
         """
-        device = await self._devices.get(who, device_id)
-        async with self._audit.refusals(device, who, "refuse control"):
+        device = await self._devices.get(caller, device_id)
+        async with self._audit.refusals(device, caller, "refuse control"):
             require_operator(device)
-            before, lease = await self._change(who, device, rules.refuse, request)
+            before, lease = await self._change(caller, device, rules.refuse, request)
         if before is not lease:
-            await self._drop(who, device, lease, request)
+            await self._drop(caller, device, lease, request)
         return rules.find(lease, request)
 
-    async def withdraw(self, who: Identity, device_id: str, request: str) -> None:
+    async def withdraw(self, caller: Identity, device_id: str, request: str) -> None:
         """Ask no longer.
 
         Raises:
             Problem: ``device-unknown``, ``forbidden``, ``request-unknown``, ``request-over``, ``busy``.
         """
-        device = await self._devices.get(who, device_id)
-        async with self._audit.refusals(device, who, "withdraw a request for control"):
-            before, lease = await self._change(who, device, rules.withdraw, request)
+        device = await self._devices.get(caller, device_id)
+        async with self._audit.refusals(device, caller, "withdraw a request for control"):
+            before, lease = await self._change(caller, device, rules.withdraw, request)
         if before is not lease:
-            await self._drop(who, device, lease, request)
+            await self._drop(caller, device, lease, request)
 
     async def _change(
-        self, who: Identity, device: Device, rule: Callable[..., Lease], request: str
+        self, caller: Identity, device: Device, rule: Callable[..., Lease], request: str
     ) -> tuple[Lease | None, Lease]:
         return await self._rows.change(
-            who, device, lambda lease, now_ms: rule(lease, who, request=request, now_ms=now_ms)
+            caller, device, lambda lease, now_ms: rule(lease, caller, request=request, now_ms=now_ms)
         )
 
     async def _require_asker(self, device: Device, request: str) -> None:
@@ -159,8 +166,8 @@ class Handovers:
         if asked.how(lease, self._clock.now_ms()) != "open":
             return
         asker = await self._devices.acting(Identity(asked.account, asked.by, asked.session))
-        found = (await self._devices.find(asker, device.id))[0] if asker is not None else None
-        if found is None or not found.role.may_operate:
+        result = (await self._devices.find(asker, device.id))[0] if asker is not None else None
+        if result is None or not result.role.may_operate:
             raise _asker_gone(asked.by, "Control stays with you.")
 
     async def _require_asker_still(self, device: Device, lease: Lease) -> None:
@@ -170,10 +177,10 @@ class Handovers:
         except Problem as problem:
             raise _asker_gone(lease.holder, "Nobody has control now.") from problem
 
-    async def _drop(self, who: Identity, device: Device, lease: Lease, request: str) -> None:
+    async def _drop(self, caller: Identity, device: Device, lease: Lease, request: str) -> None:
         """Have the device show it no longer. Where that does not arrive, its time is over there soon by itself."""
         try:
-            await self._commands.send(device, WithdrawRequest(request=request), who=who.name, epoch=lease.epoch)
+            await self._commands.send(device, WithdrawRequest(request=request), caller=caller.name, epoch=lease.epoch)
         except BusUnavailable as error:
             _log.warning("request for %s: %s", device.id, error)
 

@@ -4,7 +4,7 @@ import asyncio
 import logging
 
 from device_agent.protocol import ReleaseLease
-from function_app.domain.control.control_events import ended
+from function_app.domain.control.control_events import control_ended
 from function_app.domain.control.lease import Lease
 from function_app.domain.devices.devices import Device
 from function_app.ports.broker_access import BrokerAccess, BrokerAccessError
@@ -47,20 +47,20 @@ class ControlRevocation:
             Problem: ``busy``.
         """
 
-        async def once() -> Lease | None:
+        async def attempt() -> Lease | None:
             control = await read_control_rows(self._tables, device.id)
-            known = control.lease
-            if known is None or not known.account or known.pairing != device.pairing:
+            existing = control.lease
+            if existing is None or not existing.account or existing.pairing != device.pairing:
                 return None
-            if account not in {None, known.account}:
+            if account not in {None, existing.account}:
                 return None
-            lease = Lease(epoch=known.epoch + 1, pairing=device.pairing)
-            fact = ended(known, lease, why=why, now_ms=self._clock.now_ms())
+            lease = Lease(epoch=existing.epoch + 1, pairing=device.pairing)
+            fact = control_ended(existing, lease, why=why, now_ms=self._clock.now_ms())
             facts = told(device.id, device.pairing, [fact], owner=device.owner)
             await self._tables.batch(records.CONTROL, [control.write_lease(device.id, lease), *facts])
             return lease
 
-        lease = await records.retry(once)
+        lease = await records.retry(attempt)
         return lease is None or await self._tell(device, lease, until_s)
 
     async def repeat(self, device: Device, account: str, *, until_s: float) -> bool:
@@ -102,7 +102,7 @@ class ControlRevocation:
 
     async def _release(self, device: Device, epoch: int) -> bool:
         try:
-            await self._commands.send(device, ReleaseLease(), who="telescope", epoch=epoch)
+            await self._commands.send(device, ReleaseLease(), caller="telescope", epoch=epoch)
         except BusUnavailable as error:
             _log.warning("end of control of %s: %s", device.id, error)
             return False

@@ -21,12 +21,12 @@ class LeaseRows:
         self._clock = clock
 
     async def change(
-        self, who: Identity, device: Device, change: Callable[[Lease | None, int], Lease]
+        self, caller: Identity, device: Device, change: Callable[[Lease | None, int], Lease]
     ) -> tuple[Lease | None, Lease]:
         """Put what ``change`` makes of the lease in its place, by ETag; the lease before and after.
 
         Args:
-            who: Who changes it.
+            caller: Who changes it.
             device: Whose lease.
             change: Decides, from the lease and the time; gives the same object when there is nothing to change. May be
                 called several times.
@@ -36,22 +36,22 @@ class LeaseRows:
         """
         watched = False
 
-        async def once() -> tuple[Lease | None, Lease]:
+        async def attempt() -> tuple[Lease | None, Lease]:
             nonlocal watched
             control = await read_control(self._tables, device)
             now_ms = self._clock.now_ms()
-            control = await heed_device(self._tables, device, control, who, now_ms)
+            control = await heed_device(self._tables, device, control, caller, now_ms)
             lease = change(control.lease, now_ms)
             if lease is control.lease:
                 return lease, lease
-            facts = lease_change(device.id, control.lease, lease, who=who, now_ms=now_ms, owner=device.owner)
+            facts = lease_change(device.id, control.lease, lease, caller=caller, now_ms=now_ms, owner=device.owner)
             if facts and not watched:
                 await self._audit.watch(device.id)
                 watched = True
             await self._tables.batch(records.CONTROL, [control.write_lease(device.id, lease), *facts])
             return control.lease, lease
 
-        before, after = await records.retry(once)
+        before, after = await records.retry(attempt)
         if watched:
             await self._audit.tell(device.id)
         return before, after

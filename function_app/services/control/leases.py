@@ -47,13 +47,13 @@ class Leases:
         self._audit = audit
         self._clock = clock
 
-    async def get(self, who: Identity, device_id: str) -> Lease | None:
+    async def get(self, caller: Identity, device_id: str) -> Lease | None:
         """The live lease of a device, unless the device has ended it.
 
         Raises:
             Problem: ``device-unknown``.
         """
-        device = await self._devices.get(who, device_id)
+        device = await self._devices.get(caller, device_id)
         lease = await read_lease(self._tables, device)
         if lease is None or not lease.live(self._clock.now_ms()):
             return None
@@ -61,7 +61,7 @@ class Leases:
 
     async def take(
         self,
-        who: Identity,
+        caller: Identity,
         device_id: str,
         *,
         epoch: int | None,
@@ -72,7 +72,7 @@ class Leases:
         """Take the lease, or renew epoch ``epoch`` of it; and whether the device has confirmed within ``wait_ms``.
 
         Args:
-            who: Who takes it.
+            caller: Who takes it.
             device_id: Of which device.
             epoch: What is renewed; ``None``: take.
             lease_ms: For how long; not longer than the device is shared with them.
@@ -82,57 +82,57 @@ class Leases:
         Raises:
             Problem: ``device-unknown``, ``forbidden``, ``lease-held``, ``lease-lost``, ``busy``.
         """
-        device = await self._devices.get(who, device_id)
+        device = await self._devices.get(caller, device_id)
         what = "take control over" if over else "take control" if epoch is None else "go on in control"
 
         def changed(lease: Lease | None, now_ms: int) -> Lease:
-            for_ms = rules.lasting(lease_ms, device.until_ms - now_ms)
+            for_ms = rules.granted_ms(lease_ms, device.until_ms - now_ms)
             if epoch is None:
-                return rules.take(lease, who, lease_ms=for_ms, now_ms=now_ms, pairing=device.pairing, over=over)
-            return rules.renew(lease, who, epoch=epoch, lease_ms=for_ms, now_ms=now_ms)
+                return rules.acquire(lease, caller, lease_ms=for_ms, now_ms=now_ms, pairing=device.pairing, over=over)
+            return rules.renew(lease, caller, epoch=epoch, lease_ms=for_ms, now_ms=now_ms)
 
-        async with self._audit.refusals(device, who, what):
+        async with self._audit.refusals(device, caller, what):
             require_operator(device)
             if over:
                 require_owner(device)
-            before, lease = await self._rows.change(who, device, changed)
-            await self.require_still(who, device)
-        confirmed = await self.grant(device, lease, by=who.name, wait_ms=wait_ms)
+            before, lease = await self._rows.change(caller, device, changed)
+            await self.require_still(caller, device)
+        confirmed = await self.grant(device, lease, by=caller.name, wait_ms=wait_ms)
         if before is not None and lease.reason and epoch is None:
             await self.revoke(device, before.epoch)
         return lease, confirmed
 
-    async def release(self, who: Identity, device_id: str, *, epoch: int) -> None:
+    async def release(self, caller: Identity, device_id: str, *, epoch: int) -> None:
         """Give the lease back. The device holds, and credentials for this epoch's setpoints are taken back.
 
         Raises:
             Problem: ``device-unknown``, ``forbidden``, ``lease-lost``, ``busy``.
         """
-        device = await self._devices.get(who, device_id)
+        device = await self._devices.get(caller, device_id)
 
         def changed(lease: Lease | None, now_ms: int) -> Lease:
-            return rules.release(rules.hold(lease, who, epoch=epoch, now_ms=now_ms), now_ms=now_ms)
+            return rules.release(rules.require_held(lease, caller, epoch=epoch, now_ms=now_ms), now_ms=now_ms)
 
-        async with self._audit.refusals(device, who, "give control back"):
+        async with self._audit.refusals(device, caller, "give control back"):
             require_operator(device)
-            await self._rows.change(who, device, changed)
+            await self._rows.change(caller, device, changed)
         # Released it is, whoever can be told: what the device was granted ends with the time it was granted for.
         try:
-            await self._commands.send(device, ReleaseLease(), who=who.name, epoch=epoch)
+            await self._commands.send(device, ReleaseLease(), caller=caller.name, epoch=epoch)
         except BusUnavailable as error:
             _log.warning("release of %s: %s", device.id, error)
         await self.revoke(device, epoch)
 
-    async def require_still(self, who: Identity, device: Device) -> None:
+    async def require_still(self, caller: Identity, device: Device) -> None:
         """See that whoever has just got the lease may still have it; else it has ended before the device hears of it.
 
         Raises:
             Problem: ``device-unknown``, ``forbidden``.
         """
         try:
-            await self._devices.require_still(who, device)
+            await self._devices.require_still(caller, device)
         except Problem:
-            await self._fence.end(device, UNSHARED, account=who.account)
+            await self._fence.end(device, UNSHARED, account=caller.account)
             raise
 
     async def grant(self, device: Device, lease: Lease, *, by: str, wait_ms: int) -> bool:
@@ -142,7 +142,7 @@ class Leases:
         """
         order = GrantLease(holder=lease.holder, lease_ms=lease.lease_ms, reason=lease.reason)
         try:
-            return await self._commands.confirmed(device, order, who=by, epoch=lease.epoch, wait_ms=wait_ms)
+            return await self._commands.confirmed(device, order, caller=by, epoch=lease.epoch, wait_ms=wait_ms)
         except Problem as problem:
             _log.warning("lease of %s: %s", device.id, problem.detail)
             return False

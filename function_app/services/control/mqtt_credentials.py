@@ -51,7 +51,7 @@ class MqttCredentials:
         self._access = access
         self._clock = clock
 
-    async def watch(self, who: Identity) -> Issued:
+    async def watch(self, caller: Identity) -> Issued:
         """To see every device that the account may see, and to stop those it may operate.
 
         Where the account has a part in a whole space, what the broker is told is said by space and stays small however
@@ -61,25 +61,25 @@ class MqttCredentials:
         Raises:
             Problem: ``broker-unavailable``, ``busy``.
         """
-        devices = await self._devices.all(who)
-        issued = await self._watch(who, devices)
-        if any(device.owner != who.account for device in devices) and _rights(await self._devices.all(who)) != _rights(
-            devices
-        ):
+        devices = await self._devices.all(caller)
+        issued = await self._watch(caller, devices)
+        if any(device.owner != caller.account for device in devices) and _rights(
+            await self._devices.all(caller)
+        ) != _rights(devices):
             # Something was un-shared meanwhile: its sessions were cut before these credentials were there to be cut.
             await self._take_back(issued)
             raise busy_store()
-        await self._require(issued, self._devices.require_key(who))
+        await self._require(issued, self._devices.require_key(caller))
         return issued
 
-    async def _watch(self, who: Identity, devices: list[Device]) -> Issued:
+    async def _watch(self, caller: Identity, devices: list[Device]) -> Issued:
         watched = _watching(devices, self._access)
         seen = watched.devices
         now_ms = self._clock.now_ms()
-        ends_ms = min([now_ms + WATCH_S * 1000, who.until_ms, *(device.until_ms for device in seen)])
+        ends_ms = min([now_ms + WATCH_S * 1000, caller.until_ms, *(device.until_ms for device in seen)])
         grant = Grant(
-            principal=watch_principal(who),
-            client_id=f"w-{who.session}-{new_id(10)}",
+            principal=watch_principal(caller),
+            client_id=f"w-{caller.session}-{new_id(10)}",
             publish=tuple(watched.publish),
             subscribe=tuple(watched.subscribe),
             token_id=new_id(),
@@ -97,22 +97,22 @@ class MqttCredentials:
         except BrokerAccessError as error:
             raise broker_unavailable(f"{error}.") from error
 
-    async def control(self, who: Identity, device_id: str, epoch: int) -> Issued:
+    async def control(self, caller: Identity, device_id: str, epoch: int) -> Issued:
         """To send setpoints under one epoch of a lease.
 
         Raises:
             Problem: ``device-unknown``, ``forbidden``, ``lease-lost``, ``broker-unavailable``.
         """
-        device = await self._devices.get(who, device_id)
+        device = await self._devices.get(caller, device_id)
         now_ms = self._clock.now_ms()
-        async with self._audit.refusals(device, who, "steer"):
+        async with self._audit.refusals(device, caller, "steer"):
             require_operator(device)
-            lease = rules.hold(await read_lease(self._tables, device), who, epoch=epoch, now_ms=now_ms)
+            lease = rules.require_held(await read_lease(self._tables, device), caller, epoch=epoch, now_ms=now_ms)
         # Longer than the lease, which may be renewed; not than the right to it.
         lifetime_s = min(max(CONTROL_MIN_S, lease.lease_ms // 1000), max(1, (device.until_ms - now_ms) // 1000))
         publish = (f"{device.topic}/{topics.CTL}/{epoch}",)
         grant = Grant(
-            principal=principal(who),
+            principal=principal(caller),
             client_id=control_client(device.id, epoch),
             publish=publish,
             subscribe=(),
@@ -120,7 +120,7 @@ class MqttCredentials:
             expires_at=now_ms // 1000 + lifetime_s,
         )
         issued = await self._issue(grant, lifetime_s, publish, ())
-        await self._require(issued, self._devices.require_still(who, device))
+        await self._require(issued, self._devices.require_still(caller, device))
         return issued
 
     async def _require(self, issued: Issued, still: Awaitable[object]) -> None:
@@ -186,27 +186,27 @@ def _watching(devices: list[Device], access: BrokerAccess) -> _Watched:
     Whole spaces come first. All filters travel in one CONNECT, which brokers bound, some more than others: devices
     beyond what the broker takes are left out. Whoever has so many in one room is better given the room.
     """
-    found = _Watched()
+    result = _Watched()
     whole: set[str] = set()
     for space, role in sorted({(device.space, device.space_role) for device in devices if device.space_role}):
         says = [topics.device(space, topics.ANY, topics.ANY, topics.STOP)] if role.may_operate else []
-        if not found.add(says, grants.heard(space, topics.ANY, topics.ANY), access):
+        if not result.add(says, grants.heard(space, topics.ANY, topics.ANY), access):
             break
         inside = [device for device in devices if device.space == space and device.space_role]
-        found.devices += inside
+        result.devices += inside
         whole |= {device.id for device in inside}
-        found.stops += [_stop(device) for device in inside if role.may_operate]
-    stoppable = set(found.stops)
+        result.stops += [_stop(device) for device in inside if role.may_operate]
+    stoppable = set(result.stops)
     for device in devices:
         says = [_stop(device)] if device.role.may_operate and _stop(device) not in stoppable else []
         hears = () if device.id in whole else grants.heard(device.space, device.agent, device.name)
         if not says and not hears:
             continue
-        if not found.add(says, hears, access):
+        if not result.add(says, hears, access):
             break
-        found.stops += says
-        found.devices += [device] if hears else []
-    return found
+        result.stops += says
+        result.devices += [device] if hears else []
+    return result
 
 
 def _stop(device: Device) -> str:

@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass, field, replace
 
-from function_app.domain.actions.queue import Queue
+from function_app.domain.actions.queue import ActionQueue
 from function_app.domain.control.lease import Lease, release
 from function_app.domain.devices.devices import Device, LastState
 from function_app.domain.identity.accounts import Identity
@@ -21,7 +21,7 @@ class Control:
     lease: Lease | None = None
     action: str = ""
     slot_pairing: str = ""
-    queue: Queue = field(default_factory=lambda: Queue(""))
+    queue: ActionQueue = field(default_factory=lambda: ActionQueue(""))
     rows: dict[str, Row] = field(default_factory=dict)
 
     def write_lease(self, device: str, lease: Lease) -> Write:
@@ -32,7 +32,7 @@ class Control:
         """The change that gives the slot to ``action`` (empty: to nobody)."""
         return self._write(device, SLOT, {"action": action, "pairing": pairing})
 
-    def write_queue(self, device: str, queue: Queue) -> Write:
+    def write_queue(self, device: str, queue: ActionQueue) -> Write:
         """The change that puts ``queue`` in place of what was read."""
         return self._write(device, QUEUE, records.fields(queue))
 
@@ -55,7 +55,7 @@ async def read_control(tables: Tables, device: Device) -> Control:
         lease=lease,
         action=action,
         slot_pairing=device.pairing,
-        queue=queue if queue.pairing == device.pairing else Queue(device.pairing),
+        queue=queue if queue.pairing == device.pairing else ActionQueue(device.pairing),
         rows=rows,
     )
 
@@ -73,14 +73,14 @@ async def read_control_rows(tables: Tables, device: str) -> Control:
     )
 
 
-async def heed_device(tables: Tables, device: Device, control: Control, who: Identity, now_ms: int) -> Control:
+async def heed_device(tables: Tables, device: Device, control: Control, caller: Identity, now_ms: int) -> Control:
     """The same, without a lease of somebody else that the device itself has ended, as its ``state`` says.
 
     A hold, a Stop or a restart ends leases at the device. Such an epoch is never obeyed again, so what the state says
     of it stays true however old it is.
     """
     lease = control.lease
-    if lease is None or not lease.anothers(who, now_ms) or not await ended_at_device(tables, device, lease):
+    if lease is None or not lease.anothers(caller, now_ms) or not await ended_at_device(tables, device, lease):
         return control
     return replace(control, lease=release(lease, now_ms=now_ms))
 
@@ -103,8 +103,8 @@ async def _rows(tables: Tables, device: str) -> dict[str, Row]:
     return {row.key: row for row in page.rows}
 
 
-def _queue(rows: dict[str, Row]) -> Queue:
-    return records.read(rows[QUEUE], Queue) if QUEUE in rows else Queue("")
+def _queue(rows: dict[str, Row]) -> ActionQueue:
+    return records.read(rows[QUEUE], ActionQueue) if QUEUE in rows else ActionQueue("")
 
 
 def _lease(rows: dict[str, Row], device: Device) -> Lease | None:

@@ -10,8 +10,8 @@ from function_app.domain.common.ids import device_id, split_device
 from function_app.domain.common.problems import Problem, forbidden, invalid, not_found
 from function_app.domain.control.lease import Lease
 from function_app.domain.devices import access, devices
-from function_app.domain.devices.access import OWNERS, Share, Standing, device_target, space_target
-from function_app.domain.devices.devices import Agent, Device, DeviceSpec, LastState, Leaving, Link
+from function_app.domain.devices.access import OWNER_PERMISSIONS, Permissions, Share, device_target, space_target
+from function_app.domain.devices.devices import Agent, Departure, Device, DeviceSpec, LastState, Link
 from function_app.domain.identity.accounts import Account, Identity
 from function_app.ports.clock import Clock
 from function_app.ports.tables import Row, Tables
@@ -44,28 +44,28 @@ class Devices:
         self._tables = tables
         self._clock = clock
 
-    async def get(self, who: Identity, device: str) -> Device:
+    async def get(self, caller: Identity, device: str) -> Device:
         """One device.
 
         Raises:
             Problem: ``device-unknown``.
         """
-        found, _ = await self.with_link(who, device)
-        return found
+        result, _ = await self.with_link(caller, device)
+        return result
 
-    async def with_link(self, who: Identity, device: str) -> tuple[Device, Link | None]:
+    async def with_link(self, caller: Identity, device: str) -> tuple[Device, Link | None]:
         """One device and the last word about its agent's connection, in one read.
 
         Raises:
             Problem: ``device-unknown``.
         """
-        found, link = await self.find(who, device)
-        if found is None:
+        result, link = await self.find(caller, device)
+        if result is None:
             raise not_found("device", device)
-        return found, link
+        return result, link
 
-    async def find(self, who: Identity, device: str) -> tuple[Device | None, Link | None]:
-        """As ``with_link``, with ``None`` for a device that does not exist for ``who``."""
+    async def find(self, caller: Identity, device: str) -> tuple[Device | None, Link | None]:
+        """As ``with_link``, with ``None`` for a device that does not exist for ``caller``."""
         parts = split_device(device)
         if parts is None:
             return None, None
@@ -75,13 +75,13 @@ class Devices:
         spec = agent.device(parts[1]) if agent else None
         if agent is None or spec is None:
             return None, None
-        allowed = (await self._standings(who, agent, [spec.name])).get(spec.name)
+        allowed = (await self._standings(caller, agent, [spec.name])).get(spec.name)
         if allowed is None:
             return None, None
         return _device(agent, spec, allowed), _of(agent, rows, "link", Link)
 
-    async def require_still(self, who: Identity, device: Device) -> None:
-        """See, after something was written for ``who``, that they may still operate the device.
+    async def require_still(self, caller: Identity, device: Device) -> None:
+        """See, after something was written for ``caller``, that they may still operate the device.
 
         Whoever un-shares deletes the share first and then ends what it finds; whoever uses a share writes first and
         then looks here: of the two at least one sees the other. An owner is told apart by the pairing, and not read.
@@ -90,27 +90,27 @@ class Devices:
         Raises:
             Problem: ``device-unknown``, ``forbidden``.
         """
-        if who.key:
-            who = await self.require_key(who)
-        if who.key or device.owner != who.account:
-            require_operator(await self.get(who, device.id))
+        if caller.key:
+            caller = await self.require_key(caller)
+        if caller.key or device.owner != caller.account:
+            require_operator(await self.get(caller, device.id))
 
-    async def require_key(self, who: Identity) -> Identity:
-        """``who`` as their API key stands now; a person as they are.
+    async def require_key(self, caller: Identity) -> Identity:
+        """``caller`` as their API key stands now; a person as they are.
 
         Raises:
             Problem: ``forbidden``.
         """
-        now = await self.acting(who) if who.key else who
+        now = await self.acting(caller) if caller.key else caller
         if now is None:
             raise forbidden("This API key was revoked or has run out. Make a new one.")
         return now
 
-    async def acting(self, who: Identity) -> Identity | None:
+    async def acting(self, caller: Identity) -> Identity | None:
         """As ``acting``: what they may do now, and ``None`` once their key or session was ended."""
-        return await acting(self._tables, who, self._clock.now_ms())
+        return await acting(self._tables, caller, self._clock.now_ms())
 
-    async def view(self, who: Identity, device: str) -> DeviceView:
+    async def view(self, caller: Identity, device: str) -> DeviceView:
         """One device with what is known of it now.
 
         Raises:
@@ -118,62 +118,62 @@ class Devices:
         """
         parts = split_device(device)
         if parts is not None:
-            for view in await self.of_agent(who, parts[0], only=parts[1]):
+            for view in await self.of_agent(caller, parts[0], only=parts[1]):
                 return view
         raise not_found("device", device)
 
-    async def views(self, who: Identity, *, cursor: str | None, limit: int) -> tuple[list[DeviceView], str | None]:
+    async def views(self, caller: Identity, *, cursor: str | None, limit: int) -> tuple[list[DeviceView], str | None]:
         """All devices that the account may see, agent by agent: a page holds those of up to ``limit`` agents.
 
         Raises:
             Problem: ``cursor-invalid``.
         """
-        ids, following = await self._agent_ids(who, cursor, limit)
-        found = await asyncio.gather(*(self.of_agent(who, agent) for agent in ids))
-        return [view for views in found for view in views], following
+        ids, following = await self._agent_ids(caller, cursor, limit)
+        result = await asyncio.gather(*(self.of_agent(caller, agent) for agent in ids))
+        return [view for views in result for view in views], following
 
-    async def all(self, who: Identity) -> list[Device]:
+    async def all(self, caller: Identity) -> list[Device]:
         """Every device that the account may see, without what is known of it now."""
-        found: list[Device] = []
+        result: list[Device] = []
         cursor: str | None = None
         while True:
-            ids, cursor = await self._agent_ids(who, cursor, 1000)
-            for devices_ in await asyncio.gather(*(self._seen_of(who, agent) for agent in ids)):
-                found += devices_
+            ids, cursor = await self._agent_ids(caller, cursor, 1000)
+            for devices_ in await asyncio.gather(*(self._seen_of(caller, agent) for agent in ids)):
+                result += devices_
             if cursor is None:
-                return found
+                return result
 
-    async def agents(self, who: Identity, *, cursor: str | None, limit: int) -> tuple[list[Agent], str | None]:
-        """The account's own agents, as far as ``who`` may see a device of theirs.
+    async def agents(self, caller: Identity, *, cursor: str | None, limit: int) -> tuple[list[Agent], str | None]:
+        """The account's own agents, as far as ``caller`` may see a device of theirs.
 
         Raises:
             Problem: ``cursor-invalid``.
         """
-        ids, following = await self._own_agent_ids(who.account, cursor, limit)
+        ids, following = await self._own_agent_ids(caller.account, cursor, limit)
         rows = await asyncio.gather(*(self._tables.get(records.AGENTS, agent, "agent") for agent in ids))
         agents = [records.read(row, Agent) for row in rows if row is not None]
-        own = [agent for agent in agents if agent.account == who.account]
-        return [agent for agent in own if not agent.devices or await self._standings(who, agent)], following
+        own = [agent for agent in agents if agent.account == caller.account]
+        return [agent for agent in own if not agent.devices or await self._standings(caller, agent)], following
 
-    async def _seen_of(self, who: Identity, agent_id: str) -> list[Device]:
+    async def _seen_of(self, caller: Identity, agent_id: str) -> list[Device]:
         row = await self._tables.get(records.AGENTS, agent_id, "agent")
         if row is None:
             return []
         agent = records.read(row, Agent)
-        allowed = await self._standings(who, agent)
+        allowed = await self._standings(caller, agent)
         return [_device(agent, spec, allowed[spec.name]) for spec in agent.devices if spec.name in allowed]
 
-    async def _agent_ids(self, who: Identity, cursor: str | None, limit: int) -> tuple[list[str], str | None]:
+    async def _agent_ids(self, caller: Identity, cursor: str | None, limit: int) -> tuple[list[str], str | None]:
         """The account's own agents, then those of which something is shared with it."""
         own: list[str] = []
         after = ""
         if cursor is not None and cursor.startswith(_SHARED):
             after = cursor.removeprefix(_SHARED)
         else:
-            own, following = await self._own_agent_ids(who.account, cursor, limit)
+            own, following = await self._own_agent_ids(caller.account, cursor, limit)
             if following is not None:
                 return own, following
-        shared = [agent for agent in await self._shared_agent_ids(who.account) if agent > after]
+        shared = [agent for agent in await self._shared_agent_ids(caller.account) if agent > after]
         chosen = shared[: limit - len(own)]
         last = chosen[-1] if chosen else after
         return own + chosen, f"{_SHARED}{last}" if len(shared) > len(chosen) else None
@@ -189,7 +189,7 @@ class Devices:
 
     async def _shared_agent_ids(self, account: str) -> list[str]:
         """Agents of which something may be shared with an account. The shares themselves decide."""
-        found: set[str] = set()
+        result: set[str] = set()
         cursor: str | None = None
         while True:
             page = await self._tables.query(
@@ -198,21 +198,21 @@ class Devices:
             for row in page.rows:
                 kind, name = access.split_target(row.key.removeprefix("share:"))
                 if kind == "space":
-                    found |= set(await self._all_agent_ids(str(row.data["owner"])))
+                    result |= set(await self._all_agent_ids(str(row.data["owner"])))
                 elif (parts := split_device(name)) is not None:
-                    found.add(parts[0])
+                    result.add(parts[0])
             cursor = page.cursor
             if cursor is None:
-                return sorted(found)
+                return sorted(result)
 
     async def _all_agent_ids(self, account: str) -> list[str]:
-        found: list[str] = []
+        result: list[str] = []
         cursor: str | None = None
         while True:
             ids, cursor = await self._own_agent_ids(account, cursor, 1000)
-            found += ids
+            result += ids
             if cursor is None:
-                return found
+                return result
 
     async def owned(self, device: str) -> Device | None:
         """A device as its owner sees it, whoever that is."""
@@ -220,7 +220,7 @@ class Devices:
         row = await self._tables.get(records.AGENTS, parts[0], "agent") if parts else None
         if row is None:
             return None
-        return next((found for found in devices_of(records.read(row, Agent)) if found.id == device), None)
+        return next((result for result in devices_of(records.read(row, Agent)) if result.id == device), None)
 
     async def in_space(self, account: str, space: str) -> list[Device]:
         """The devices of an account's space, as their owner sees them."""
@@ -234,29 +234,31 @@ class Devices:
             for device in devices_of(agent)
         ]
 
-    async def _standings(self, who: Identity, agent: Agent, names: Iterable[str] | None = None) -> dict[str, Standing]:
-        """What ``who`` may do with the devices of an agent; those that do not exist for them are left out.
+    async def _standings(
+        self, caller: Identity, agent: Agent, names: Iterable[str] | None = None
+    ) -> dict[str, Permissions]:
+        """What ``caller`` may do with the devices of an agent; those that do not exist for them are left out.
 
         For the owner nothing is read.
         """
         wanted = [spec.name for spec in agent.devices] if names is None else list(names)
         shares: list[Share] = []
-        if agent.account is not None and agent.account != who.account:
+        if agent.account is not None and agent.account != caller.account:
             targets = [space_target(agent.space or ""), *(device_target(device_id(agent.id, name)) for name in wanted)]
-            key = share_key(who.account)
+            key = share_key(caller.account)
             rows = await asyncio.gather(*(self._tables.get(records.SHARES, on, key) for on in targets))
             shares = [records.read(row, Share) for row in rows if row is not None]
         now_ms = self._clock.now_ms()
-        found = {name: access.standing(who, agent, name, shares, now_ms) for name in wanted}
-        return {name: allowed for name, allowed in found.items() if allowed is not None}
+        result = {name: access.permissions(caller, agent, name, shares, now_ms) for name in wanted}
+        return {name: allowed for name, allowed in result.items() if allowed is not None}
 
-    async def _owner_name(self, who: Identity, agent: Agent) -> str:
-        if agent.account == who.account and not who.key:
-            return who.name
+    async def _owner_name(self, caller: Identity, agent: Agent) -> str:
+        if agent.account == caller.account and not caller.key:
+            return caller.name
         row = await self._tables.get(records.ACCOUNTS, agent.account or "-", "account")
         return records.read(row, Account).name if row else ""
 
-    async def of_agent(self, who: Identity, agent_id: str, only: str | None = None) -> list[DeviceView]:
+    async def of_agent(self, caller: Identity, agent_id: str, only: str | None = None) -> list[DeviceView]:
         """The devices of one agent that the account may see, or the one called ``only``."""
         page = await self._tables.query(records.AGENTS, agent_id, limit=1000)
         rows = {row.key: row for row in page.rows}
@@ -264,10 +266,10 @@ class Devices:
             return []
         agent = records.read(rows["agent"], Agent)
         chosen = [spec for spec in agent.devices if only in {None, spec.name}]
-        allowed = await self._standings(who, agent, [spec.name for spec in chosen])
+        allowed = await self._standings(caller, agent, [spec.name for spec in chosen])
         if not allowed:
             return []
-        owner_name = await self._owner_name(who, agent)
+        owner_name = await self._owner_name(caller, agent)
         now_ms = self._clock.now_ms()
         link = _of(agent, rows, "link", Link)
         views = []
@@ -346,7 +348,7 @@ def devices_of(agent: Agent) -> list[Device]:
     return [_device(agent, spec) for spec in agent.devices]
 
 
-def left_devices(agent: Agent, leaving: Leaving) -> list[Device]:
+def left_devices(agent: Agent, leaving: Departure) -> list[Device]:
     """The devices that an agent has left behind, as their owner saw them."""
     before = replace(agent, account=leaving.account, space=leaving.space, pairing=leaving.pairing)
     gone = DeviceSpec("", "", "", "")
@@ -365,7 +367,7 @@ def _of(agent: Agent, rows: dict[str, Row], key: str, kind: type[T]) -> T | None
     return records.read(rows[key], kind)
 
 
-def _device(agent: Agent, spec: DeviceSpec, allowed: Standing = OWNERS) -> Device:
+def _device(agent: Agent, spec: DeviceSpec, allowed: Permissions = OWNER_PERMISSIONS) -> Device:
     space = agent.space or ""
     return Device(
         id=device_id(agent.id, spec.name),

@@ -1,6 +1,6 @@
 """What an owner calls a device: kept beside what its agent calls it, until it belongs to somebody else."""
 
-from function_app.domain.audit.hash_chain import Deed
+from function_app.domain.audit.hash_chain import AccountEvent
 from function_app.domain.common.problems import not_found
 from function_app.domain.devices import devices as rules
 from function_app.domain.devices.devices import Agent
@@ -19,22 +19,24 @@ class Rename:
         self._devices = devices
         self._chain = chain
 
-    async def rename(self, who: Identity, device_id: str, label: str | None) -> None:
+    async def rename(self, caller: Identity, device_id: str, label: str | None) -> None:
         """Call a device ``label``; ``None``: as its agent does.
 
         Raises:
             Problem: ``device-unknown``, ``forbidden``, ``busy``.
         """
-        device = require_owner(await self._devices.get(who, device_id))
-        async with self._chain.change(who.account, Deed.DEVICE_RENAMED, who, on=device.id, label=label) as change:
+        device = require_owner(await self._devices.get(caller, device_id))
+        async with self._chain.change(
+            caller.account, AccountEvent.DEVICE_RENAMED, caller, on=device.id, label=label
+        ) as change:
 
-            async def once() -> None:
+            async def attempt() -> None:
                 row = await self._tables.get(records.AGENTS, device.agent, "agent")
                 agent = records.read(row, Agent) if row else None
                 if row is None or agent is None or agent.pairing != device.pairing:
                     raise not_found("device", device.id)
-                changed = rules.call(agent, device.name, label)
+                changed = rules.rename(agent, device.name, label)
                 await change.noted()
                 await self._tables.replace(records.AGENTS, Row(agent.id, "agent", records.fields(changed), row.etag))
 
-            await records.retry(once)
+            await records.retry(attempt)

@@ -29,64 +29,66 @@ class Spaces:
         self._tables = tables
         self._clock = clock
 
-    async def list(self, who: Identity) -> tuple[SpaceView, ...]:
+    async def list(self, caller: Identity) -> tuple[SpaceView, ...]:
         """The account's own, oldest first; then those that are shared with it, by id."""
-        owner = Account(who.account, await self._name(who.account))
-        page = await self._tables.query(records.ACCOUNTS, who.account, first="space:", last="space;", limit=1000)
+        owner = Account(caller.account, await self._name(caller.account))
+        page = await self._tables.query(records.ACCOUNTS, caller.account, first="space:", last="space;", limit=1000)
         own = sorted((records.read(row, Space) for row in page.rows), key=lambda space: space.created_ms)
-        found = [SpaceView(space, Role.OWNER, owner) for space in own]
+        result = [SpaceView(space, Role.OWNER, owner) for space in own]
         shared = await self._tables.query(
-            records.MEMBERS, who.account, first="share:space:", last="share:space;", limit=1000
+            records.MEMBERS, caller.account, first="share:space:", last="share:space;", limit=1000
         )
         ids = [row.key.removeprefix("share:space:") for row in shared.rows]
-        found += [view for view in await asyncio.gather(*(self._shared(who, name) for name in ids)) if view is not None]
-        return tuple(view for each in found if (view := _seen(who, each)) is not None)
+        result += [
+            view for view in await asyncio.gather(*(self._shared(caller, name) for name in ids)) if view is not None
+        ]
+        return tuple(view for each in result if (view := _seen(caller, each)) is not None)
 
-    async def get(self, who: Identity, space: str) -> SpaceView:
+    async def get(self, caller: Identity, space: str) -> SpaceView:
         """One space.
 
         Raises:
             Problem: ``space-unknown``.
         """
-        row = await self._tables.get(records.ACCOUNTS, who.account, f"space:{space}")
+        row = await self._tables.get(records.ACCOUNTS, caller.account, f"space:{space}")
         view: SpaceView | None
         if row is not None:
-            owner = Account(who.account, await self._name(who.account))
+            owner = Account(caller.account, await self._name(caller.account))
             view = SpaceView(records.read(row, Space), Role.OWNER, owner)
         else:
-            view = await self._shared(who, space)
-        seen = None if view is None else _seen(who, view)
+            view = await self._shared(caller, space)
+        seen = None if view is None else _seen(caller, view)
         if seen is None:
             raise not_found("space", space)
         return seen
 
-    async def own(self, who: Identity, space: str) -> SpaceView:
+    async def own(self, caller: Identity, space: str) -> SpaceView:
         """One space of the account's own.
 
         Raises:
             Problem: ``space-unknown``, ``forbidden``.
         """
-        view = await self.get(who, space)
+        view = await self.get(caller, space)
         if not view.role.may_own:
             raise forbidden("Only the owner of this space may do that.")
         return view
 
-    async def _shared(self, who: Identity, space: str) -> SpaceView | None:
-        row = await self._tables.get(records.SHARES, space_target(space), share_key(who.account))
+    async def _shared(self, caller: Identity, space: str) -> SpaceView | None:
+        row = await self._tables.get(records.SHARES, space_target(space), share_key(caller.account))
         share = records.read(row, Share) if row else None
         if share is None or not share.live(self._clock.now_ms()):
             return None
-        found = await self._tables.get(records.ACCOUNTS, share.owner, f"space:{space}")
-        if found is None:
+        result = await self._tables.get(records.ACCOUNTS, share.owner, f"space:{space}")
+        if result is None:
             return None
-        return SpaceView(records.read(found, Space), share.role, Account(share.owner, await self._name(share.owner)))
+        return SpaceView(records.read(result, Space), share.role, Account(share.owner, await self._name(share.owner)))
 
     async def _name(self, account: str) -> str:
         row = await self._tables.get(records.ACCOUNTS, account, "account")
         return records.read(row, Account).name if row else ""
 
 
-def _seen(who: Identity, view: SpaceView) -> SpaceView | None:
-    if who.only and space_target(view.space.id) not in who.only:
+def _seen(caller: Identity, view: SpaceView) -> SpaceView | None:
+    if caller.only and space_target(view.space.id) not in caller.only:
         return None
-    return SpaceView(view.space, access.capped(who, view.role), view.owner)
+    return SpaceView(view.space, access.capped(caller, view.role), view.owner)

@@ -54,8 +54,8 @@ class Viewers:
         self._forget = forget
         self._clock = clock
 
-    async def watch(self, who: Identity, device_id: str) -> list[Watcher]:
-        """Say that ``who`` looks at a device.
+    async def watch(self, caller: Identity, device_id: str) -> list[Watcher]:
+        """Say that ``caller`` looks at a device.
 
         Returns:
             Who else does, the longest first.
@@ -63,47 +63,47 @@ class Viewers:
         Raises:
             Problem: ``device-unknown``.
         """
-        device = await self._devices.get(who, device_id)
+        device = await self._devices.get(caller, device_id)
         now_ms = self._clock.now_ms()
         page = await self._tables.query(records.WATCHERS, device.id, limit=2 * MOST)
         rows = {row.key: (row, records.read(row, Watcher)) for row in page.rows}
         live = {
-            key: known
-            for key, (_, known) in rows.items()
-            if known.expires_ms > now_ms and known.pairing == device.pairing
+            key: existing
+            for key, (_, existing) in rows.items()
+            if existing.expires_ms > now_ms and existing.pairing == device.pairing
         }
-        mine = live.get(who.session)
+        mine = live.get(caller.session)
         if mine is None and len(live) < MOST:
             await self._tidy([row for key, (row, _) in rows.items() if key not in live])
         if (len(live) < MOST) if mine is None else now_ms - mine.said_ms >= _AGAIN_MS:
-            await self._note(device, who, now_ms)
-        others = [known for key, known in live.items() if key != who.session]
-        return sorted(others, key=lambda known: known.since_ms)
+            await self._note(device, caller, now_ms)
+        others = [existing for key, existing in live.items() if key != caller.session]
+        return sorted(others, key=lambda existing: existing.since_ms)
 
-    async def leave(self, who: Identity, device_id: str) -> None:
-        """Say that ``who`` looks no longer.
+    async def leave(self, caller: Identity, device_id: str) -> None:
+        """Say that ``caller`` looks no longer.
 
         Raises:
             Problem: ``device-unknown``.
         """
-        device = await self._devices.get(who, device_id)
-        row = await self._tables.get(records.WATCHERS, device.id, who.session)
+        device = await self._devices.get(caller, device_id)
+        row = await self._tables.get(records.WATCHERS, device.id, caller.session)
         if row is not None:
             with contextlib.suppress(Conflict):  # another tab has just said that it does
                 await self._tables.delete(records.WATCHERS, row)
 
-    async def _note(self, device: Device, who: Identity, now_ms: int) -> None:
+    async def _note(self, device: Device, caller: Identity, now_ms: int) -> None:
         # One note for all of an hour, and written first: nothing stays that nobody forgets.
         due_ms = (now_ms // _FORGOTTEN_MS + 2) * _FORGOTTEN_MS
         await self._forget.rows(records.WATCHERS, device.id, first="", last=None, due_ms=due_ms)
 
-        def said(known: Watcher | None) -> Watcher:
-            goes_on = known is not None and known.expires_ms > now_ms and known.pairing == device.pairing
-            since_ms = known.since_ms if known is not None and goes_on else now_ms
+        def said(existing: Watcher | None) -> Watcher:
+            goes_on = existing is not None and existing.expires_ms > now_ms and existing.pairing == device.pairing
+            since_ms = existing.since_ms if existing is not None and goes_on else now_ms
             return Watcher(
-                account=who.account,
-                session=who.session,
-                name=who.name,
+                account=caller.account,
+                session=caller.session,
+                name=caller.name,
                 role=device.role,
                 since_ms=since_ms,
                 said_ms=now_ms,
@@ -111,7 +111,7 @@ class Viewers:
                 pairing=device.pairing,
             )
 
-        await records.upsert(self._tables, records.WATCHERS, device.id, who.session, said, Watcher)
+        await records.upsert(self._tables, records.WATCHERS, device.id, caller.session, said, Watcher)
 
     async def _tidy(self, over: list[Row]) -> None:
         """Delete what is over, so that a device's rows stay few."""

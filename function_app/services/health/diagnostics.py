@@ -15,7 +15,7 @@ from device_agent.protocol import Description, Diagnostic, topics
 from function_app.domain.common.problems import Problem
 from function_app.domain.devices.devices import Agent, Device
 from function_app.domain.health import detectors, diagnosis
-from function_app.domain.health.detectors import MINUTE_MS, WINDOW_MS, Limits, Watch
+from function_app.domain.health.detectors import MINUTE_MS, WINDOW_MS, DetectorState, Limits
 from function_app.domain.health.diagnosis import Health, Rule
 from function_app.domain.health.faults import Fault, Report, Severity
 from function_app.domain.identity.accounts import Identity
@@ -46,7 +46,7 @@ class FieldView:
     stream: str
     name: str
     rule: Rule
-    watch: Watch
+    watch: DetectorState
 
 
 @dataclass(frozen=True, slots=True)
@@ -68,7 +68,7 @@ class _Kept:
 
     window_ms: int = 0
     sums: dict[str, tuple[float, int]] = field(default_factory=dict)
-    watches: dict[str, Watch] = field(default_factory=dict)
+    watches: dict[str, DetectorState] = field(default_factory=dict)
 
 
 class Diagnostics:
@@ -104,20 +104,20 @@ class Diagnostics:
             return
         tried: set[str] = set()
 
-        async def once() -> None:
+        async def attempt() -> None:
             row = await self._tables.get(records.DIAGNOSTICS, _partition(device), stream)
-            known = _Kept() if row is None else records.read(row, _Kept)
-            rules = _rules(listed, stream, names | set(known.sums) | set(known.watches))
-            after = known
+            existing = _Kept() if row is None else records.read(row, _Kept)
+            rules = _rules(listed, stream, names | set(existing.sums) | set(existing.watches))
+            after = existing
             for at_ms, values in sorted(means, key=lambda mean: mean[0]):
                 after = _take(after, rules, at_ms, values)
-            if after is known:
+            if after is existing:
                 return
             # Looked at when something has changed, and each minute: what a killed process left is put right then.
-            before = {name for name, watch in known.watches.items() if watch.findings}
+            before = {name for name, watch in existing.watches.items() if watch.findings}
             now = {name for name, watch in after.watches.items() if watch.findings}
-            minute = known.window_ms // MINUTE_MS != after.window_ms // MINUTE_MS
-            if minute or now != before | tried or _worse(known, after):
+            minute = existing.window_ms // MINUTE_MS != after.window_ms // MINUTE_MS
+            if minute or now != before | tried or _worse(existing, after):
                 await self._faults.settle(device, f"detector/{stream}", _reports(listed, stream, after))
                 tried.update(now)
             data = records.fields(after)
@@ -126,15 +126,15 @@ class Diagnostics:
             else:
                 await self._tables.replace(records.DIAGNOSTICS, Row(row.partition, stream, data, row.etag))
 
-        await records.retry(once)
+        await records.retry(attempt)
 
-    async def of_device(self, who: Identity, device_id: str) -> tuple[Summary, list[FieldView]]:
+    async def of_device(self, caller: Identity, device_id: str) -> tuple[Summary, list[FieldView]]:
         """A device's health, and each watched field.
 
         Raises:
             Problem: ``device-unknown``.
         """
-        view = await self._devices.view(who, device_id)
+        view = await self._devices.view(caller, device_id)
         summary = await self._summary(view)
         listed = await self._listed(view.device)
         page = await self._tables.query(records.DIAGNOSTICS, _partition(view.device), limit=1000)
@@ -148,7 +148,7 @@ class Diagnostics:
         return summary, fields
 
     async def summaries(
-        self, who: Identity, *, space: str | None, cursor: str | None, limit: int
+        self, caller: Identity, *, space: str | None, cursor: str | None, limit: int
     ) -> tuple[list[Summary], str | None]:
         """Devices with their health, worst first; a page holds those of up to ``limit`` agents.
 
@@ -156,13 +156,13 @@ class Diagnostics:
             Problem: ``space-unknown``, ``cursor-invalid``.
         """
         if space is not None:
-            await self._spaces.get(who, space)
-        views, following = await self._devices.views(who, cursor=cursor, limit=limit)
+            await self._spaces.get(caller, space)
+        views, following = await self._devices.views(caller, cursor=cursor, limit=limit)
         chosen = [view for view in views if space in {None, view.device.space}]
-        found: list[Summary] = []
+        result: list[Summary] = []
         for first in range(0, len(chosen), _AT_ONCE):
-            found += await asyncio.gather(*(self._summary(view) for view in chosen[first : first + _AT_ONCE]))
-        return sorted(found, key=lambda summary: (-summary.health.rank, summary.view.device.id)), following
+            result += await asyncio.gather(*(self._summary(view) for view in chosen[first : first + _AT_ONCE]))
+        return sorted(result, key=lambda summary: (-summary.health.rank, summary.view.device.id)), following
 
     async def _summary(self, view: DeviceView) -> Summary:
         faults = tuple(await self._faults.open(view.device))
@@ -172,16 +172,16 @@ class Diagnostics:
         """What is said about its measurements: by itself, as a room's devices do, or else by its robot type."""
         now_ms = self._clock.now_ms()
         key = (device.id, device.pairing)
-        known = self._rules.get(key)
-        if known is not None and 0 <= now_ms - known[0] < RULES_MS:
-            return known[1]
+        existing = self._rules.get(key)
+        if existing is not None and 0 <= now_ms - existing[0] < RULES_MS:
+            return existing[1]
         row = await self._tables.get(records.DESCRIPTIONS, device.agent, device.name)
-        found = () if row is None else records.read(row, Description).diagnostics
-        found = found or await self._of_type(device)
+        result = () if row is None else records.read(row, Description).diagnostics
+        result = result or await self._of_type(device)
         if len(self._rules) >= _RULES_KEPT:
             self._rules.clear()
-        self._rules[key] = (now_ms, found)
-        return found
+        self._rules[key] = (now_ms, result)
+        return result
 
     async def _of_type(self, device: Device) -> tuple[Diagnostic, ...]:
         row = await self._tables.get(records.AGENTS, device.agent, "agent")
@@ -198,7 +198,7 @@ class Diagnostics:
 
 def _rules(listed: Sequence[Diagnostic], stream: str, names: set[str]) -> dict[str, Rule]:
     """The rule of each field that is watched. Of the joints' own stream only those that are listed."""
-    found: dict[str, Rule] = {}
+    result: dict[str, Rule] = {}
     for name in sorted(names):
         given = next((one for one in listed if one.stream == stream and fnmatch.fnmatchcase(name, one.fields)), None)
         if given is not None:
@@ -211,11 +211,11 @@ def _rules(listed: Sequence[Diagnostic], stream: str, names: set[str]) -> dict[s
                 horizon_s=given.horizon_s,
                 kinds=given.questions,
             )
-            found[name] = Rule(given.label, given.unit, given.advice, limits, listed=True)
+            result[name] = Rule(given.label, given.unit, given.advice, limits, listed=True)
         elif stream != topics.JOINTS:
-            found[name] = Rule(name.partition(".")[0])
-    chosen = sorted(found, key=lambda name: (not found[name].listed, name))[:MAX_FIELDS]
-    return {name: found[name] for name in chosen}
+            result[name] = Rule(name.partition(".")[0])
+    chosen = sorted(result, key=lambda name: (not result[name].listed, name))[:MAX_FIELDS]
+    return {name: result[name] for name in chosen}
 
 
 def _take(kept: _Kept, rules: Mapping[str, Rule], at_ms: int, values: Values) -> _Kept:
@@ -228,8 +228,8 @@ def _take(kept: _Kept, rules: Mapping[str, Rule], at_ms: int, values: Values) ->
         watches = dict(watches)
         for name, (total, count) in sums.items():
             if name in rules:
-                watch = watches.get(name, Watch())
-                watches[name] = detectors.step(watch, rules[name].limits, kept.window_ms, total / count)
+                watch = watches.get(name, DetectorState())
+                watches[name] = detectors.update(watch, rules[name].limits, kept.window_ms, total / count)
         watches = {name: watch for name, watch in watches.items() if name in rules}
         sums = {}
     sums = dict(sums)
@@ -240,17 +240,17 @@ def _take(kept: _Kept, rules: Mapping[str, Rule], at_ms: int, values: Values) ->
     return _Kept(window_ms, sums, watches)
 
 
-def _worse(known: _Kept, after: _Kept) -> bool:
+def _worse(existing: _Kept, after: _Kept) -> bool:
     """Whether a field has passed a limit that had not."""
     return any(
-        watch.breach.on and not (name in known.watches and known.watches[name].breach.on)
+        watch.breach.on and not (name in existing.watches and existing.watches[name].breach.on)
         for name, watch in after.watches.items()
     )
 
 
 def _reports(listed: Sequence[Diagnostic], stream: str, kept: _Kept) -> list[Report]:
     rules = _rules(listed, stream, set(kept.watches))
-    reports = [diagnosis.judge(rule, stream, name, kept.watches[name]) for name, rule in rules.items()]
+    reports = [diagnosis.diagnose(rule, stream, name, kept.watches[name]) for name, rule in rules.items()]
     return [report for report in reports if report is not None]
 
 

@@ -53,26 +53,26 @@ class Faults:
         """
         wanted = {_key(scope, report.code): report for report in list(reports)[:MAX_OPEN]}
 
-        async def once() -> bool:
+        async def attempt() -> bool:
             rows = await self._read(device)
-            known = {row.key: row for row in rows if row.key.startswith(f"{_OPEN}{scope}:")}
+            existing = {row.key: row for row in rows if row.key.startswith(f"{_OPEN}{scope}:")}
             news = any(row.key.startswith(_EVENT) for row in rows)
-            for key, row in known.items():
+            for key, row in existing.items():
                 if key not in wanted:
                     await self._clear(device, row)
                     news = True
             for key, report in wanted.items():
-                news |= await self._report(device, key, report, known.get(key))
+                news |= await self._report(device, key, report, existing.get(key))
             return news
 
-        if await records.retry(once):
+        if await records.retry(attempt):
             await self._tell(device)
 
     async def open(self, device: Device) -> list[Fault]:
         """What is wrong now, worst first, then newest first."""
         rows = await self._read(device)
-        found = [records.read(row, Fault) for row in rows if row.key.startswith(_OPEN)]
-        return sorted(found, key=lambda fault: (-fault.severity.rank, fault.id))
+        result = [records.read(row, Fault) for row in rows if row.key.startswith(_OPEN)]
+        return sorted(result, key=lambda fault: (-fault.severity.rank, fault.id))
 
     async def past(self, device: Device, *, cursor: str | None, limit: int) -> tuple[list[Fault], str | None]:
         """What was wrong, newest first.
@@ -95,23 +95,23 @@ class Faults:
             Problem: ``fault-unknown``, ``fault-cleared``, ``busy``.
         """
 
-        async def once() -> Fault:
+        async def attempt() -> Fault:
             rows = [row for row in await self._read(device) if row.key.startswith(_OPEN)]
             row = next((row for row in rows if row.data["id"] == fault), None)
             if row is None:
                 if await self._tables.get(records.FAULTS, _partition(device), f"{_PAST}{fault[:64]}") is None:
                     raise not_found("fault", fault)
                 raise Problem("fault-cleared", 409, "The fault is over", "It was cleared; there is nothing left to do.")
-            known = records.read(row, Fault)
-            seen = rules.acknowledged(known, by=by, now_ms=self._clock.now_ms())
-            if seen is not known:
+            existing = records.read(row, Fault)
+            seen = rules.acknowledged(existing, by=by, now_ms=self._clock.now_ms())
+            if seen is not existing:
                 write = Write("replace", Row(row.partition, row.key, records.fields(seen), row.etag))
                 await self._write(device, seen, "acknowledged", [write])
             return seen
 
-        found = await records.retry(once)
+        result = await records.retry(attempt)
         await self._tell(device)
-        return found
+        return result
 
     async def _read(self, device: Device) -> list[Row]:
         """What is open, and what is still to be told."""
@@ -122,12 +122,12 @@ class Faults:
         """Raise a fault or make it worse; whether that was news."""
         partition = _partition(device)
         if row is not None:
-            known = records.read(row, Fault)
-            worse = rules.reported(known, report)
-            if worse is not known:
+            existing = records.read(row, Fault)
+            worse = rules.reported(existing, report)
+            if worse is not existing:
                 write = Write("replace", Row(partition, key, records.fields(worse), row.etag))
                 await self._write(device, worse, f"worsened-{worse.worse}", [write])
-            return worse is not known
+            return worse is not existing
         now_ms = self._clock.now_ms()
         count_key = _COUNT + key.removeprefix(_OPEN)
         counted = await self._tables.get(records.FAULTS, partition, count_key)

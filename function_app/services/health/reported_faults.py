@@ -52,16 +52,16 @@ class ReportedFaults:
         Raises:
             Problem: ``busy``.
         """
-        device = next(found for found in devices_of(agent) if found.name == name)
+        device = next(result for result in devices_of(agent) if result.name == name)
         row = await self._tables.get(records.AGENTS, agent.id, f"state:{name}")
-        known = None if row is None else records.read(row, LastState)
-        if known is not None and msgspec.convert(known.state, State, strict=False) == state:
+        existing = None if row is None else records.read(row, LastState)
+        if existing is not None and msgspec.convert(existing.state, State, strict=False) == state:
             return  # delivered again: no sign of life
         now_ms = self._clock.now_ms()
-        if known is None or now_ms - known.seen_ms > SILENT_MS:
+        if existing is None or now_ms - existing.seen_ms > SILENT_MS:
             await self._watch(agent.id, now_ms)
             await self._faults.settle(device, _CLOUD, [])
-        if known is None or state.faults or known.state.get("faults"):
+        if existing is None or state.faults or existing.state.get("faults"):
             await self._faults.settle(device, _DEVICE, [_reported(fault.code, fault.message) for fault in state.faults])
 
     async def run(self, now_ms: int) -> None:
@@ -111,14 +111,14 @@ class ReportedFaults:
         with contextlib.suppress(Conflict):
             await self._tables.create(records.WATCHED, Row(shard, key, {}))
 
-        async def once() -> None:
+        async def attempt() -> None:
             newest = await self._tables.get(records.WATCHED, shard, f"agent:{agent}")
             if newest is None:
                 await self._tables.create(records.WATCHED, Row(shard, f"agent:{agent}", {"note": key}))
             elif newest.data["note"] < key:
                 await self._tables.replace(records.WATCHED, Row(shard, newest.key, {"note": key}, newest.etag))
 
-        await records.retry(once)
+        await records.retry(attempt)
 
 
 def _reported(code: str, message: str) -> Report:

@@ -58,11 +58,11 @@ class Identify:
         self._clock = clock
         self._known: OrderedDict[tuple[str, str], _Known] = OrderedDict()
 
-    async def issue(self, who: Identity, audience: Audience, lifetime_s: int, *, csrf: str | None = None) -> str:
+    async def issue(self, caller: Identity, audience: Audience, lifetime_s: int, *, csrf: str | None = None) -> str:
         """A token of one sign-in session, good no longer than that.
 
         Args:
-            who: Account, session, and when that ends.
+            caller: Account, session, and when that ends.
             audience: What it is for.
             lifetime_s: How long it is good for at most [s].
             csrf: In a cookie, what a page has to show beside it.
@@ -72,12 +72,12 @@ class Identify:
         claims = {
             "iss": "telescope",
             "aud": audience,
-            "sub": who.account,
-            "name": who.name,
-            "sid": who.session,
+            "sub": caller.account,
+            "name": caller.name,
+            "sid": caller.session,
             "iat": now_ms // 1000,
-            "exp": now_ms // 1000 + who.lasting_s(lifetime_s, now_ms),
-            "until": who.until_ms // 1000,
+            "exp": now_ms // 1000 + caller.lasting_s(lifetime_s, now_ms),
+            "until": caller.until_ms // 1000,
             "jti": new_id(),
         }
         if csrf is not None:
@@ -98,43 +98,43 @@ class Identify:
         Raises:
             Problem: ``unauthorized``, as ``person``.
         """
-        known = await self._find(cookie, SESSION)
-        return known.identity, known.csrf
+        existing = await self._find(cookie, SESSION)
+        return existing.identity, existing.csrf
 
     async def _find(self, token: str, audience: Audience) -> _Known:
         now_ms = self._clock.now_ms()
-        known = self._known.get((audience, token))
-        if known is None or not self._fresh(known, now_ms):
+        existing = self._known.get((audience, token))
+        if existing is None or not self._fresh(existing, now_ms):
             # In full, and not for sign-outs alone: its key may have leaked, and counts no more.
-            known = await self._verify(token, audience)
-            self._remember((audience, token), known)
-        if now_ms >= known.expires_ms:
+            existing = await self._verify(token, audience)
+            self._remember((audience, token), existing)
+        if now_ms >= existing.expires_ms:
             self._known.pop((audience, token), None)
             raise unauthorized("The access token has expired. Sign in again.")
-        return known
+        return existing
 
-    def _remember(self, name: tuple[str, str], known: _Known) -> None:
+    def _remember(self, name: tuple[str, str], existing: _Known) -> None:
         """Keep what was checked just now, and nothing that would have to be checked again in any case."""
-        self._known[name] = known
+        self._known[name] = existing
         self._known.move_to_end(name)
-        while len(self._known) > KNOWN_TOKENS or not self._fresh(next(iter(self._known.values())), known.checked_ms):
+        while len(self._known) > KNOWN_TOKENS or not self._fresh(next(iter(self._known.values())), existing.checked_ms):
             self._known.popitem(last=False)
 
     @staticmethod
-    def _fresh(known: _Known, now_ms: int) -> bool:
-        return 0 <= now_ms - known.checked_ms < RECHECK_MS
+    def _fresh(existing: _Known, now_ms: int) -> bool:
+        return 0 <= now_ms - existing.checked_ms < RECHECK_MS
 
-    async def sign_out(self, who: Identity) -> None:
+    async def sign_out(self, caller: Identity) -> None:
         """End the session: its tokens are refused from now on, by other instances within ``RECHECK_MS``."""
         ends_ms = self._clock.now_ms() + SESSION_S * 1000
-        row = Row(who.account, signed_out_key(who.session), {"expires_ms": ends_ms})
+        row = Row(caller.account, signed_out_key(caller.session), {"expires_ms": ends_ms})
         await self._forget.row(records.ACCOUNTS, row.partition, row.key, due_ms=ends_ms)
         try:
             await self._tables.create(records.ACCOUNTS, row)
         except Conflict:
             return
         finally:
-            for name in [name for name, known in self._known.items() if known.identity.session == who.session]:
+            for name in [name for name, existing in self._known.items() if existing.identity.session == caller.session]:
                 del self._known[name]
 
     async def enrolling(self, token: str, public_key: str) -> str:
@@ -187,8 +187,8 @@ class Identify:
         await self._check_signed_out(identity)
         return _Known(identity, int(claims["exp"]) * 1000, self._clock.now_ms(), str(claims.get("csrf", "")))
 
-    async def _check_signed_out(self, who: Identity) -> None:
-        if await self._tables.get(records.ACCOUNTS, who.account, signed_out_key(who.session)) is not None:
+    async def _check_signed_out(self, caller: Identity) -> None:
+        if await self._tables.get(records.ACCOUNTS, caller.account, signed_out_key(caller.session)) is not None:
             raise unauthorized("This session was signed out. Sign in again.")
 
     def _check_agent(self, token: str, key: Ed25519PublicKey) -> None:
@@ -208,14 +208,14 @@ def new_session() -> str:
     return new_id()
 
 
-def principal(who: Identity) -> str:
+def principal(caller: Identity) -> str:
     """A sign-in session, as the broker knows it: signing out ends its connections and nobody else's."""
-    return f"account:{who.account}:{who.session}"
+    return f"account:{caller.account}:{caller.session}"
 
 
-def watch_principal(who: Identity) -> str:
+def watch_principal(caller: Identity) -> str:
     """The part of a sign-in session that watches: it is cut apart from what steers, and by account (``watchers``)."""
-    return f"{principal(who)}:watch"
+    return f"{principal(caller)}:watch"
 
 
 def watchers(account: str) -> str:

@@ -9,7 +9,7 @@ from collections import OrderedDict
 from typing import Final, Literal
 
 from function_app.domain.common.problems import Problem
-from function_app.domain.common.rate_limit import Rate, ask
+from function_app.domain.common.rate_limit import Rate, request
 from function_app.ports.clock import Clock
 
 BURST_S: Final = 20
@@ -36,7 +36,7 @@ class Limits:
             Problem: ``too-many-requests``.
         """
         key = (kind, name)
-        arrival_ms, wait_ms = ask(self._rates[kind], self._arrivals.get(key, 0.0), self._clock.now_ms())
+        arrival_ms, wait_ms = request(self._rates[kind], self._arrivals.get(key, 0.0), self._clock.now_ms())
         self._arrivals[key] = arrival_ms
         self._arrivals.move_to_end(key)
         if len(self._arrivals) > KNOWN:

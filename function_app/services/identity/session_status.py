@@ -12,21 +12,21 @@ API_KEY: Final = "key"
 """The key of an API key's one row."""
 
 
-async def acting(tables: Tables, who: Identity, now_ms: int) -> Identity | None:
-    """``who`` with what they may do now: an API key as it stands in the tables.
+async def acting(tables: Tables, caller: Identity, now_ms: int) -> Identity | None:
+    """``caller`` with what they may do now: an API key as it stands in the tables.
 
     Returns:
         ``None`` once the key was revoked or has run out, or somebody has ended the session. One that has only run out
         by itself still counts: what its person has begun goes on.
     """
-    key_id = who.key or key_of(who.session)
+    key_id = caller.key or key_of(caller.session)
     if not key_id:
-        return None if await tables.get(records.ACCOUNTS, who.account, signed_out_key(who.session)) else who
+        return None if await tables.get(records.ACCOUNTS, caller.account, signed_out_key(caller.session)) else caller
     row = await tables.get(records.API_KEYS, key_id, API_KEY)
     key = records.read(row, ApiKey) if row else None
-    if key is None or key.account != who.account or now_ms >= key.expires_ms:
+    if key is None or key.account != caller.account or now_ms >= key.expires_ms:
         return None
-    return replace(key.identity, name=who.name)
+    return replace(key.identity, name=caller.name)
 
 
 def signed_out_key(session: str) -> str:

@@ -3,7 +3,7 @@
 from dataclasses import dataclass
 from typing import Final, Literal
 
-from function_app.domain.audit.hash_chain import Deed
+from function_app.domain.audit.hash_chain import AccountEvent
 from function_app.domain.identity.accounts import Account, Identity
 from function_app.ports.clock import Clock
 from function_app.ports.tables import Conflict, Row, Tables
@@ -91,43 +91,45 @@ class Sessions:
         begun = Session(new_session(), how, now_ms, ends_ms, address=whence.address, program=whence.program[:_SHOWN])
         row = Row(account.id, _ROW + begun.id, records.fields(begun))
         await self._forget.row(records.ACCOUNTS, row.partition, row.key, due_ms=ends_ms)
-        who = Identity(account.id, account.name, begun.id, until_ms=ends_ms)
-        async with self._chain.change(account.id, Deed.SIGNED_IN, who, how=how, address=whence.address) as change:
+        caller = Identity(account.id, account.name, begun.id, until_ms=ends_ms)
+        async with self._chain.change(
+            account.id, AccountEvent.SIGNED_IN, caller, how=how, address=whence.address
+        ) as change:
             await change.noted()
             await self._tables.create(records.ACCOUNTS, row)
         csrf = new_secret()
         return SignedIn(
             account=account,
             session=begun.id,
-            access_token=await self._identify.issue(who, API, ACCESS_S),
-            cookie=await self._identify.issue(who, SESSION, SESSION_S, csrf=csrf),
+            access_token=await self._identify.issue(caller, API, ACCESS_S),
+            cookie=await self._identify.issue(caller, SESSION, SESSION_S, csrf=csrf),
             csrf=csrf,
         )
 
-    async def access_token(self, who: Identity) -> tuple[str, int]:
+    async def access_token(self, caller: Identity) -> tuple[str, int]:
         """The next access token of a session, and how long it is good [s]: not longer than the session."""
-        lifetime_s = who.lasting_s(ACCESS_S, self._clock.now_ms())
-        return await self._identify.issue(who, API, lifetime_s), lifetime_s
+        lifetime_s = caller.lasting_s(ACCESS_S, self._clock.now_ms())
+        return await self._identify.issue(caller, API, lifetime_s), lifetime_s
 
     async def list(self, account: str) -> tuple[Session, ...]:
         """The sessions of an account that have not ended, the newest first."""
         now_ms = self._clock.now_ms()
-        found: list[Session] = []
+        result: list[Session] = []
         cursor: str | None = None
         while True:
             page = await self._tables.query(
                 records.ACCOUNTS, account, first=_ROW, last="session;", limit=1000, cursor=cursor
             )
-            found += [records.read(row, Session) for row in page.rows]
+            result += [records.read(row, Session) for row in page.rows]
             cursor = page.cursor
             if cursor is None:
                 break
-        live = [session for session in found if now_ms < session.expires_ms]
+        live = [session for session in result if now_ms < session.expires_ms]
         return tuple(sorted(live, key=lambda session: -session.since_ms))
 
-    async def get(self, who: Identity) -> Session | None:
+    async def get(self, caller: Identity) -> Session | None:
         """The session that asks, as it was begun."""
-        row = await self._tables.get(records.ACCOUNTS, who.account, _ROW + who.session)
+        row = await self._tables.get(records.ACCOUNTS, caller.account, _ROW + caller.session)
         return records.read(row, Session) if row else None
 
     async def drop(self, account: str, session: str) -> bool:

@@ -2,10 +2,10 @@
 
 import hashlib
 
-from function_app.domain.audit.hash_chain import CLOUD, Deed
+from function_app.domain.audit.hash_chain import CLOUD, AccountEvent
 from function_app.domain.common.ids import new_id
 from function_app.domain.common.problems import Problem, unauthorized
-from function_app.domain.identity.accounts import Account, Identity, Space, folded
+from function_app.domain.identity.accounts import Account, Identity, Space, fold_name
 from function_app.ports.clock import Clock
 from function_app.ports.tables import Conflict, Row, Tables
 from function_app.services.audit.audit_log import AuditLog
@@ -45,7 +45,7 @@ class SignIn:
             records.ACCOUNTS,
             account.id,
             "account",
-            lambda known: None if known == account else account,
+            lambda existing: None if existing == account else account,
             Account,
         )
         return account
@@ -83,19 +83,21 @@ class SignIn:
         page = await self._tables.query(records.ACCOUNTS, account, first="space:", last="space;", limit=1000)
         return tuple(sorted((records.read(row, Space) for row in page.rows), key=lambda space: space.created_ms))
 
-    async def add_space(self, who: Identity, name: str) -> Space:
+    async def add_space(self, caller: Identity, name: str) -> Space:
         """A further space.
 
         Raises:
             Problem: ``too-many-spaces``.
         """
-        if len(await self.spaces(who.account)) >= MOST_SPACES:
+        if len(await self.spaces(caller.account)) >= MOST_SPACES:
             detail = f"An account has at most {MOST_SPACES} spaces. Use one of them."
             raise Problem("too-many-spaces", 409, "Too many spaces", detail)
         space = Space(id=new_id(12), name=name, created_ms=self._clock.now_ms())
-        async with self._chain.change(who.account, Deed.SPACE_MADE, who, on=space.id, name=name) as change:
+        async with self._chain.change(
+            caller.account, AccountEvent.SPACE_MADE, caller, on=space.id, name=name
+        ) as change:
             await change.noted()
-            await self._tables.create(records.ACCOUNTS, Row(who.account, f"space:{space.id}", records.fields(space)))
+            await self._tables.create(records.ACCOUNTS, Row(caller.account, f"space:{space.id}", records.fields(space)))
         return space
 
     async def known(self, name: str) -> Account | None:
@@ -127,7 +129,7 @@ class SignIn:
         row = await self._tables.get(records.SIGN_INS, hashed[0], hashed)
         if row is None:
             address = whence.address if whence else ""
-            await self._chain.refused(CLOUD, Deed.SIGN_IN_REFUSED, None, code="link-unknown", address=address)
+            await self._chain.refused(CLOUD, AccountEvent.SIGN_IN_REFUSED, None, code="link-unknown", address=address)
             raise refused
         try:
             await self._tables.delete(records.SIGN_INS, row)
@@ -155,7 +157,7 @@ class SignIn:
 
 def named_partition(name: str) -> str:
     """Where it is written which local account has a name."""
-    return f"{_NAME}{folded(name)}"
+    return f"{_NAME}{fold_name(name)}"
 
 
 def new_name(account: str, name: str) -> dict[str, str]:

@@ -6,7 +6,7 @@ Run every second by one or more timers; every step is safe to repeat and to be r
 import logging
 
 from device_agent.protocol import CancelAction
-from function_app.domain.actions.action import Action, Status, Verdict, end, judge, next_look_ms
+from function_app.domain.actions.action import Action, NextStep, Status, end, next_check_ms, next_step
 from function_app.domain.actions.queue import DROPPED
 from function_app.domain.common.ids import CLAIM_ALPHABET
 from function_app.domain.common.problems import Problem
@@ -15,7 +15,7 @@ from function_app.ports.clock import Clock
 from function_app.ports.command_bus import BusUnavailable
 from function_app.ports.tables import Conflict, Row, Tables
 from function_app.services.accounts.api_keys import ApiKeys, about_key
-from function_app.services.actions.action_store import ActionRows, Found, place
+from function_app.services.actions.action_store import ActionRows, StoredAction, place
 from function_app.services.actions.dispatcher import MovementChanged, NoLonger, SendAction
 from function_app.services.actions.queue import TIMEOUT, Queues, queue_of
 from function_app.services.actions.start import ABANDON_MS
@@ -37,7 +37,7 @@ ORPHAN_MS = 2 * ABANDON_MS
 """A note whose action was never written is kept this long: whoever writes it gives up before."""
 KEEP_ONCE_MS = DAY_MS
 """An idempotency key is good for a day."""
-_ENDING = frozenset({Verdict.ENDED, Verdict.LOSE, Verdict.EXPIRE})
+_ENDING = frozenset({NextStep.ENDED, NextStep.LOSE, NextStep.EXPIRE})
 _HEX = "0123456789abcdef"
 
 _log = logging.getLogger(__name__)
@@ -142,44 +142,44 @@ class Scheduler:
             await self._look_at_action(what, note)
 
     async def _look_at_action(self, action_id: str, note: Row) -> None:
-        found = await self._rows.get(action_id)
+        result = await self._rows.get(action_id)
         now_ms = self._clock.now_ms()
-        if found is None:
+        if result is None:
             if now_ms - int(note.key.partition(":")[0]) > ORPHAN_MS:
                 await self._pending.drop(note)
             return
-        await self._audit.tell(found.action.device)
-        verdict = judge(found.action, now_ms)
+        await self._audit.tell(result.action.device)
+        verdict = next_step(result.action, now_ms)
         if verdict in _ENDING:
-            after = await self._ended(found, verdict, now_ms)
+            after = await self._ended(result, verdict, now_ms)
             if after is not None and after.status.terminal:
                 await self._keep_for_a_while(after)
             elif after is not None:  # something was heard of it meanwhile
-                await self._pending.note(action_id, next_look_ms(after, now_ms))
+                await self._pending.note(action_id, next_check_ms(after, now_ms))
         else:
             # The next note before this one goes: a stop in between leaves two, which is one too many, not too few.
-            await self._pending.note(action_id, next_look_ms(found.action, now_ms))
-            if verdict is Verdict.PUBLISH:
-                await self._publish(found, now_ms)
-            elif verdict is Verdict.CANCEL:
-                await self._cancel(found.action)
+            await self._pending.note(action_id, next_check_ms(result.action, now_ms))
+            if verdict is NextStep.PUBLISH:
+                await self._publish(result, now_ms)
+            elif verdict is NextStep.CANCEL:
+                await self._cancel(result.action)
         await self._pending.drop(note)
 
-    async def _ended(self, found: Found, verdict: Verdict, now_ms: int) -> Action | None:
+    async def _ended(self, result: StoredAction, verdict: NextStep, now_ms: int) -> Action | None:
         """The action with its end, known or given now, unless it has come to deserve another verdict."""
-        if verdict is Verdict.ENDED:
-            return found.action
-        if verdict is Verdict.LOSE:
-            await self._cancel(found.action)
+        if verdict is NextStep.ENDED:
+            return result.action
+        if verdict is NextStep.LOSE:
+            await self._cancel(result.action)
             message = "The device did not say how it ended before its time was over. Look at the device."
-            return await self._end(found, Status.FAILED, "lost", message, now_ms)
-        if found.action.status is Status.QUEUED:
-            return await self._end(found, Status.EXPIRED, "queue-timeout", TIMEOUT, now_ms)
-        if found.action.cancel_id:
+            return await self._end(result, Status.FAILED, "lost", message, now_ms)
+        if result.action.status is Status.QUEUED:
+            return await self._end(result, Status.EXPIRED, "queue-timeout", TIMEOUT, now_ms)
+        if result.action.cancel_id:
             message = "Cancelled before the device took it."
-            return await self._end(found, Status.CANCELLED, "cancelled", message, now_ms)
+            return await self._end(result, Status.CANCELLED, "cancelled", message, now_ms)
         message = "The device did not take the command in time. Check that it is online, then start it again."
-        return await self._end(found, Status.EXPIRED, "no-answer", message, now_ms)
+        return await self._end(result, Status.EXPIRED, "no-answer", message, now_ms)
 
     async def _look_at_queue(self, device: str, note: Row) -> None:
         """Whoever freed the slot may have been killed before it gave the next one its turn."""
@@ -197,14 +197,14 @@ class Scheduler:
             return  # somebody may be about to write what this is about
         await self._pending.drop(note)
 
-    async def _end(self, found: Found, status: Status, code: str, message: str, now_ms: int) -> Action | None:
-        verdict = judge(found.action, now_ms)
+    async def _end(self, result: StoredAction, status: Status, code: str, message: str, now_ms: int) -> Action | None:
+        verdict = next_step(result.action, now_ms)
 
         def ended(action: Action) -> Action:
             # An ack, or its turn, may have come since it was read.
-            return end(action, status, code, message, now_ms) if judge(action, now_ms) is verdict else action
+            return end(action, status, code, message, now_ms) if next_step(action, now_ms) is verdict else action
 
-        after = await self._queues.change(found.action.id, ended, known=found)
+        after = await self._queues.change(result.action.id, ended, existing=result)
         return None if after is None else after.action
 
     async def _keep_for_a_while(self, action: Action) -> None:
@@ -216,28 +216,28 @@ class Scheduler:
         if action.once:
             await self._forget.row(records.CONTROL, where[0], action.once, due_ms=action.created_ms + KEEP_ONCE_MS)
 
-    async def _publish(self, found: Found, now_ms: int) -> None:
+    async def _publish(self, result: StoredAction, now_ms: int) -> None:
         """Send the very same command again: same id, same time of issue, so the device runs it at most once."""
-        device = await self._sending.device(found.action)
+        device = await self._sending.device(result.action)
         if device is None:
             message = "The device was un-paired before the command reached it."
-            await self._end(found, Status.FAILED, "unpaired", message, now_ms)
+            await self._end(result, Status.FAILED, "unpaired", message, now_ms)
             return
         try:
-            await self._sending.send(found, device)
+            await self._sending.send(result, device)
         except MovementChanged:
             message = "The movement's script was changed before the command could be sent. Start it again."
-            await self._end(found, Status.FAILED, "movement-changed", message, now_ms)
+            await self._end(result, Status.FAILED, "movement-changed", message, now_ms)
         except NoLonger as ended:
             status, message = DROPPED[ended.why]
-            await self._end(found, status, ended.why, message, now_ms)
+            await self._end(result, status, ended.why, message, now_ms)
 
     async def _cancel(self, action: Action) -> None:
         device = await self._sending.device(action)
         if device is None:
             return
         try:
-            await self._commands.send(device, CancelAction(action=action.id), who=action.who, epoch=action.epoch)
+            await self._commands.send(device, CancelAction(action=action.id), caller=action.who, epoch=action.epoch)
         except BusUnavailable as error:
             _log.warning("cancel of %s: %s", action.id, error)
 

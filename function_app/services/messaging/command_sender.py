@@ -29,20 +29,20 @@ class Commands:
         self._keys = keys
         self._clock = clock
 
-    def check(self, device: Device, command: str, request: Request, *, who: str, ttl_ms: int) -> None:
+    def check(self, device: Device, command: str, request: Request, *, caller: str, ttl_ms: int) -> None:
         """Refuse what a device would drop unread, before anything is written about it.
 
         Raises:
             Problem: ``invalid``: a field is out of its range, a number is not finite, or it is too long for a message.
         """
-        order = _order(device, command, request, who=who, epoch=0, issued_ms=0, ttl_ms=ttl_ms)
+        order = _order(device, command, request, caller=caller, epoch=0, issued_ms=0, ttl_ms=ttl_ms)
         try:
             codec.decode(codec.encode(order, limit=codec.MAX_BYTES - _ENVELOPE_BYTES), Command)
         except ProtocolError as error:
             raise invalid(f"{error}.") from error
 
     async def signed(
-        self, device: Device, command: str, request: Request, *, who: str, epoch: int, issued_ms: int, ttl_ms: int
+        self, device: Device, command: str, request: Request, *, caller: str, epoch: int, issued_ms: int, ttl_ms: int
     ) -> Signed:
         """One command, ready to be sent. The same arguments make the same bytes: the device drops the double.
 
@@ -51,7 +51,7 @@ class Commands:
         """
         if isinstance(request, RunMovement):
             request = await self._known_to_devices(request)
-        order = _order(device, command, request, who=who, epoch=epoch, issued_ms=issued_ms, ttl_ms=ttl_ms)
+        order = _order(device, command, request, caller=caller, epoch=epoch, issued_ms=issued_ms, ttl_ms=ttl_ms)
         try:
             payload = signing.sign(codec.encode(order), await self._keys.for_devices())
         except ProtocolError as error:
@@ -67,7 +67,7 @@ class Commands:
         """
         await self._delivery.send(device, signed)
 
-    async def send(self, device: Device, request: Request, *, who: str, epoch: int) -> str:
+    async def send(self, device: Device, request: Request, *, caller: str, epoch: int) -> str:
         """Sign and send a short-lived command; gives its id. A cancel takes back an action nobody has fetched.
 
         Raises:
@@ -75,17 +75,17 @@ class Commands:
         """
         if isinstance(request, CancelAction):
             await self._delivery.withdraw(device, request.action)
-        signed = await self._short(device, request, who=who, epoch=epoch)
+        signed = await self._short(device, request, caller=caller, epoch=epoch)
         await self._delivery.send(device, signed)
         return signed.command
 
-    async def confirmed(self, device: Device, request: Request, *, who: str, epoch: int, wait_ms: int) -> bool:
+    async def confirmed(self, device: Device, request: Request, *, caller: str, epoch: int, wait_ms: int) -> bool:
         """Sign and send a short-lived command; whether the device accepted it within ``wait_ms``.
 
         Raises:
             Problem: ``broker-unavailable``.
         """
-        signed = await self._short(device, request, who=who, epoch=epoch)
+        signed = await self._short(device, request, caller=caller, epoch=epoch)
         try:
             return await self._delivery.confirmed(device, signed, wait_ms=wait_ms)
         except BusUnavailable as error:
@@ -109,14 +109,16 @@ class Commands:
         signature = signing.sign_text(text, key, context=signing.MOVEMENT_CONTEXT)
         return replace(order, key=name, signature=signature)
 
-    async def _short(self, device: Device, request: Request, *, who: str, epoch: int) -> Signed:
+    async def _short(self, device: Device, request: Request, *, caller: str, epoch: int) -> Signed:
         now_ms = self._clock.now_ms()
         command = command_id(device.id, now_ms)
-        return await self.signed(device, command, request, who=who, epoch=epoch, issued_ms=now_ms, ttl_ms=SHORT_TTL_MS)
+        return await self.signed(
+            device, command, request, caller=caller, epoch=epoch, issued_ms=now_ms, ttl_ms=SHORT_TTL_MS
+        )
 
 
 def _order(
-    device: Device, command: str, request: Request, *, who: str, epoch: int, issued_ms: int, ttl_ms: int
+    device: Device, command: str, request: Request, *, caller: str, epoch: int, issued_ms: int, ttl_ms: int
 ) -> Command:
     return Command(
         id=command,
@@ -125,7 +127,7 @@ def _order(
         device=device.name,
         issued_at_ms=issued_ms,
         ttl_ms=ttl_ms,
-        who=who,
+        who=caller,
         epoch=epoch,
         request=request,
     )

@@ -38,11 +38,11 @@ class KeyAnnouncer:
             self._told.clear()
         if agent.id in self._told:
             return
-        found = next((each for each in devices_of(agent) if each.name == device), None)
-        if found is None:
+        result = next((each for each in devices_of(agent) if each.name == device), None)
+        if result is None:
             return
         try:
-            await self._commands.send(found, RotateKey(statements=news.statements), who=_WHO, epoch=0)
+            await self._commands.send(result, RotateKey(statements=news.statements), caller=_WHO, epoch=0)
         except (BusUnavailable, Problem) as error:
             _log.warning("agent %s could not be told of a new key: %s", agent.id, error)
             return

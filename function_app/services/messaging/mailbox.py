@@ -83,7 +83,7 @@ class Mailbox:
             limit: At most so many.
             have: Ids of commands that are not to be given again.
         """
-        found: list[MailboxEntry] = []
+        result: list[MailboxEntry] = []
         now_ms, size = self._clock.now_ms(), 0
         cursor: str | None = None
         while True:
@@ -95,14 +95,14 @@ class Mailbox:
                 if letter.pairing != agent.pairing or letter.expires_ms <= now_ms or letter.command in have:
                     continue
                 size += len(letter.payload)
-                if found and size > ANSWER_BYTES:
-                    return found
-                found.append(letter)
-                if len(found) == limit:
-                    return found
+                if result and size > ANSWER_BYTES:
+                    return result
+                result.append(letter)
+                if len(result) == limit:
+                    return result
             cursor = page.cursor
             if cursor is None:
-                return found
+                return result
 
     async def withdraw(self, agent: str, command: str) -> None:
         """Do not give this command any more: it was answered, or nobody wants it now."""
@@ -127,7 +127,7 @@ class Mailbox:
             Problem: ``busy``.
         """
 
-        async def once() -> None:
+        async def attempt() -> None:
             row = await self._tables.get(records.MAILBOX, agent, _answer_key(ack.id))
             if row is None:
                 return
@@ -136,7 +136,7 @@ class Mailbox:
                 data = records.fields(replace(awaited, status=ack.status))
                 await self._tables.replace(records.MAILBOX, replace(row, data=data))
 
-        await records.retry(once)
+        await records.retry(attempt)
         self._ring(agent)
 
     async def answered(self, agent: str, command: str) -> AckStatus | None:

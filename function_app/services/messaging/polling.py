@@ -38,10 +38,10 @@ class Polling:
         with self._mailbox.listen(agent.id) as bell:
             while True:
                 bell.clear()
-                found = await self._mailbox.waiting(agent, limit=limit, have=have)
+                result = await self._mailbox.waiting(agent, limit=limit, have=have)
                 left_s = end - loop.time()
-                if found or left_s <= 0:
-                    return found
+                if result or left_s <= 0:
+                    return result
                 with contextlib.suppress(TimeoutError):
                     async with asyncio.timeout(min(pause_s, left_s)):
                         await bell.wait()
@@ -57,5 +57,10 @@ class Polling:
             return
         now_ms = self._clock.now_ms()
         await records.upsert(
-            self._tables, records.AGENTS, agent.id, "link", lambda known: polled(known, now_ms, agent.pairing), Link
+            self._tables,
+            records.AGENTS,
+            agent.id,
+            "link",
+            lambda existing: polled(existing, now_ms, agent.pairing),
+            Link,
         )

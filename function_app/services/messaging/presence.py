@@ -60,7 +60,7 @@ class PresenceIngest:
             if link.online:
                 await self._conditions.connected(agent, link.session)
             await records.upsert(
-                self._tables, records.AGENTS, topic.agent, "link", lambda known: newer_link(known, link), Link
+                self._tables, records.AGENTS, topic.agent, "link", lambda existing: newer_link(existing, link), Link
             )
         elif topic.kind == topics.STATE:
             said = codec.decode(payload, State)

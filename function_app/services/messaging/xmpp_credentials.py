@@ -104,7 +104,7 @@ class XmppAccess:
         require_claimed(agent)
         return await self._signed(agent.id, f"agent:{agent.id}", AGENT_S, pairing=agent.pairing)
 
-    async def account(self, who: Identity) -> Password:
+    async def account(self, caller: Identity) -> Password:
         """For a person's own XMPP client; good as long as the sign-in session.
 
         Raises:
@@ -112,9 +112,9 @@ class XmppAccess:
         """
         self._require()
         now_ms = self._clock.now_ms()
-        lifetime_s = who.lasting_s(SESSION_S, now_ms)
-        token = await self._identify.issue(who, XMPP, lifetime_s)
-        return Password(who.account, token, now_ms + lifetime_s * 1000, lifetime_s)
+        lifetime_s = caller.lasting_s(SESSION_S, now_ms)
+        token = await self._identify.issue(caller, XMPP, lifetime_s)
+        return Password(caller.account, token, now_ms + lifetime_s * 1000, lifetime_s)
 
     async def cloud(self) -> Password:
         """For the program that speaks for the cloud.
@@ -154,17 +154,17 @@ class XmppAccess:
         return Admitted(user, agent.name, "agent", self._left_s(claims), contacts)
 
     async def _verify_account(self, user: str, password: str) -> Admitted:
-        who = await self._identify.person(password, XMPP)
-        if who.account != user:
+        caller = await self._identify.person(password, XMPP)
+        if caller.account != user:
             raise _refused()
         contacts = [Contact(jids.CLOUD, CLOUD_NAME)]
         cursor: str | None = None
         while True:
-            agents, cursor = await self._devices.agents(who, cursor=cursor, limit=_PAGE)
+            agents, cursor = await self._devices.agents(caller, cursor=cursor, limit=_PAGE)
             contacts += [Contact(agent.id, agent.name) for agent in agents if agent.transport == "xmpp"]
             if cursor is None:
-                left_s = who.lasting_s(LOGIN_S, self._clock.now_ms())
-                return Admitted(user, who.name, "account", left_s, tuple(contacts))
+                left_s = caller.lasting_s(LOGIN_S, self._clock.now_ms())
+                return Admitted(user, caller.name, "account", left_s, tuple(contacts))
 
     def _require(self) -> None:
         if not self._domain:

@@ -3,8 +3,8 @@
 import contextlib
 from dataclasses import dataclass
 
-from function_app.domain.audit.hash_chain import Deed
-from function_app.domain.common.ids import new_id, read_claim_code
+from function_app.domain.audit.hash_chain import AccountEvent
+from function_app.domain.common.ids import new_id, parse_claim_code
 from function_app.domain.common.problems import Problem, not_found
 from function_app.domain.devices import devices
 from function_app.domain.devices.devices import Agent
@@ -39,8 +39,8 @@ class Claim:
         self._chain = chain
         self._clock = clock
 
-    async def claim(self, who: Identity, text: str, space: str | None, *, address: str = "") -> Agent:
-        """Make the agent that shows this code an agent of ``who``.
+    async def claim(self, caller: Identity, text: str, space: str | None, *, address: str = "") -> Agent:
+        """Make the agent that shows this code an agent of ``caller``.
 
         Wrong codes are counted by the account and, where it is known, by the address that the request comes from; a
         right code is not.
@@ -49,45 +49,49 @@ class Claim:
             Problem: ``claim-code-unknown`` for a wrong, used or expired code alike; ``too-many-tries``;
                 ``space-unknown``.
         """
-        spaces = await self._sign_in.spaces(who.account)
-        chosen = next((known.id for known in spaces if space in (None, known.id)), None)
+        spaces = await self._sign_in.spaces(caller.account)
+        chosen = next((existing.id for existing in spaces if space in (None, existing.id)), None)
         if chosen is None:
             raise not_found("space", space or "")
-        counters = {who.account: WRONG_TRIES, **by_address(address, WRONG_TRIES)}
+        counters = {caller.account: WRONG_TRIES, **by_address(address, WRONG_TRIES)}
         try:
             await self._attempts.count(GUESS, counters)
-            agent = await self._redeem(who, read_claim_code(text), chosen)
+            agent = await self._redeem(caller, parse_claim_code(text), chosen)
         except Problem as problem:
-            await self._refused(who, problem, address)
+            await self._refused(caller, problem, address)
             raise
         if agent is None:
             detail = "This code is wrong, used or expired. Codes live five minutes; the agent shows its newest."
             unknown = Problem("claim-code-unknown", 404, "No such claim code", detail)
-            await self._refused(who, unknown, address)
+            await self._refused(caller, unknown, address)
             raise unknown
         await self._attempts.uncount(GUESS, counters)
         return agent
 
-    async def _refused(self, who: Identity, problem: Problem, address: str) -> None:
-        await self._chain.refused(who.account, Deed.CLAIM_REFUSED, who, code=problem.code, address=address)
+    async def _refused(self, caller: Identity, problem: Problem, address: str) -> None:
+        await self._chain.refused(
+            caller.account, AccountEvent.CLAIM_REFUSED, caller, code=problem.code, address=address
+        )
 
-    async def _redeem(self, who: Identity, code: str | None, space: str) -> Agent | None:
+    async def _redeem(self, caller: Identity, code: str | None, space: str) -> Agent | None:
         if code is None:
             return None
-        found = await self._tables.get(records.CLAIMS, code[0], code)
-        if found is None:
+        result = await self._tables.get(records.CLAIMS, code[0], code)
+        if result is None:
             return None
-        agent = str(found.data["agent"])
-        async with self._chain.change(who.account, Deed.AGENT_CLAIMED, who, on=agent, space=space) as change:
-            claimed = await records.retry(lambda: self._take(who, code, agent, space, change))
+        agent = str(result.data["agent"])
+        async with self._chain.change(
+            caller.account, AccountEvent.AGENT_CLAIMED, caller, on=agent, space=space
+        ) as change:
+            claimed = await records.retry(lambda: self._take(caller, code, agent, space, change))
             if claimed is None:
                 change.came_to_nothing = True
         if claimed is not None:
             with contextlib.suppress(Conflict):
-                await self._tables.delete(records.CLAIMS, found)
+                await self._tables.delete(records.CLAIMS, result)
         return claimed
 
-    async def _take(self, who: Identity, code: str, agent_id: str, space: str, change: Change) -> Agent | None:
+    async def _take(self, caller: Identity, code: str, agent_id: str, space: str, change: Change) -> Agent | None:
         row = await self._tables.get(records.AGENTS, agent_id, "agent")
         if row is None:
             return None
@@ -97,9 +101,11 @@ class Claim:
             return None
         await self._leave.settle(agent)
         await change.noted()
-        claimed = devices.claim(agent, account=who.account, space=space, pairing=new_id(), now_ms=now_ms)
+        claimed = devices.claim(agent, account=caller.account, space=space, pairing=new_id(), now_ms=now_ms)
         # The index first: without the agent's row behind it it shows nothing, so a stop in between leaves no harm.
         member = _Member(claimed.pairing)
-        await records.upsert(self._tables, records.MEMBERS, who.account, f"agent:{agent.id}", lambda _: member, _Member)
+        await records.upsert(
+            self._tables, records.MEMBERS, caller.account, f"agent:{agent.id}", lambda _: member, _Member
+        )
         await self._tables.replace(records.AGENTS, Row(agent.id, "agent", records.fields(claimed), row.etag))
         return claimed

@@ -5,7 +5,7 @@ from dataclasses import dataclass, replace
 
 from function_app.domain.common.ids import new_claim_code
 from function_app.domain.common.problems import Problem
-from function_app.domain.devices.devices import Agent, DeviceSpec, Transport, introduced
+from function_app.domain.devices.devices import Agent, DeviceSpec, Transport, with_devices
 from function_app.ports.clock import Clock
 from function_app.ports.tables import Conflict, Row, Tables, Write
 from function_app.services.pairing.offboarding import Offboarding
@@ -48,7 +48,7 @@ class Enroll:
             Problem: ``agent-id-taken``: another key has the same id (one in 2⁵⁰).
         """
 
-        async def once() -> Agent:
+        async def attempt() -> Agent:
             row = await self._tables.get(records.AGENTS, agent, "agent")
             now_ms = self._clock.now_ms()
             if row is None:
@@ -59,7 +59,7 @@ class Enroll:
                     detail = "Another agent's key has the same id. Make a new key."
                     raise Problem("agent-id-taken", 409, "The id is taken", detail)
                 before = record.leaving
-                record = replace(introduced(record, told.devices), name=told.name, software=told.software)
+                record = replace(with_devices(record, told.devices), name=told.name, software=told.software)
                 if record.leaving != before:
                     await self._leave.watch(agent)
             record = replace(record, transport=told.transport)
@@ -73,7 +73,7 @@ class Enroll:
             await self._tables.batch(records.AGENTS, [Write("replace" if row else "create", new)])
             return record
 
-        record = await records.retry(once)
+        record = await records.retry(attempt)
         if record.claimed and record.leaving:
             await self._leave.finish(agent)
         return record

@@ -16,7 +16,7 @@ from function_app.domain.actions.action import Status, end
 from function_app.domain.actions.queue import DROPPED
 from function_app.domain.common.ids import device_id
 from function_app.domain.devices.access import Share, device_target
-from function_app.domain.devices.devices import Agent, Device, Leaving
+from function_app.domain.devices.devices import Agent, Departure, Device
 from function_app.ports.broker_access import BrokerAccess, BrokerAccessError
 from function_app.ports.certificates import Certificates
 from function_app.ports.clock import Clock
@@ -110,7 +110,7 @@ class Offboarding:
         for leaving in agent.leaving:
             await self._settle(agent, leaving)
 
-    async def _settle(self, agent: Agent, leaving: Leaving) -> None:
+    async def _settle(self, agent: Agent, leaving: Departure) -> None:
         for device in left_devices(agent, leaving):
             # Before its actions end: with them would go the lease that tells that somebody has moved it.
             await self._fence.end(device, leaving.why)
@@ -144,17 +144,17 @@ class Offboarding:
             now_ms = self._clock.now_ms()
             await self._rows.change(control.action, lambda action: end(action, Status.FAILED, why, message, now_ms))
 
-    async def _delete(self, table: str, partition: str, key: str, leaving: Leaving) -> None:
+    async def _delete(self, table: str, partition: str, key: str, leaving: Departure) -> None:
         """Delete a row of the pairing that is left, not one that was written anew."""
         row = await self._tables.get(table, partition, key)
         if row is not None and row.data.get("pairing", "") in {"", leaving.pairing}:
             with contextlib.suppress(Conflict):
                 await self._tables.delete(table, row)
 
-    async def _tell_broker(self, agent_id: str, leaving: Leaving) -> None:
+    async def _tell_broker(self, agent_id: str, leaving: Departure) -> None:
         """Cut the agent, then clear what is retained: its will may have spoken. Not what is said there anew."""
-        found = await self._tables.get(records.AGENTS, agent_id, "agent")
-        now = records.read(found, Agent) if found else None
+        result = await self._tables.get(records.AGENTS, agent_id, "agent")
+        now = records.read(result, Agent) if result else None
         if leaving.why != "removed":
             if leaving.why == "unpaired":
                 await self._certificates.revoke(agent_id)
@@ -194,19 +194,19 @@ class Offboarding:
                 if index is not None:
                     await self._tables.delete(records.MEMBERS, index)
 
-    async def _strike(self, agent_id: str, done: Iterable[Leaving]) -> None:
+    async def _strike(self, agent_id: str, done: Iterable[Departure]) -> None:
         gone = set(done)
 
-        async def once() -> None:
+        async def attempt() -> None:
             row = await self._tables.get(records.AGENTS, agent_id, "agent")
             if row is None:
                 return
             agent = records.read(row, Agent)
             left = tuple(leaving for leaving in agent.leaving if leaving not in gone)
-            fresh = records.fields(replace(agent, leaving=left))
-            await self._tables.replace(records.AGENTS, Row(agent_id, "agent", fresh, row.etag))
+            created = records.fields(replace(agent, leaving=left))
+            await self._tables.replace(records.AGENTS, Row(agent_id, "agent", created, row.etag))
 
-        await records.retry(once)
+        await records.retry(attempt)
 
 
 def offboarding_of(note: str) -> str | None:

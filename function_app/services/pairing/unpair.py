@@ -2,7 +2,7 @@
 
 from collections.abc import Callable
 
-from function_app.domain.audit.hash_chain import Deed
+from function_app.domain.audit.hash_chain import AccountEvent
 from function_app.domain.common.problems import not_found
 from function_app.domain.devices import devices as rules
 from function_app.domain.devices.devices import Agent
@@ -23,7 +23,7 @@ class Unpair:
         self._leave = leave
         self._chain = chain
 
-    async def unpair(self, who: Identity, agent_id: str) -> None:
+    async def unpair(self, caller: Identity, agent_id: str) -> None:
         """End the pairing. The write on the agent's row decides; all that follows only tidies up.
 
         Leases, slots and actions name the pairing they belong to: what a stop half way leaves is nobody's, and the
@@ -32,36 +32,38 @@ class Unpair:
         Raises:
             Problem: ``agent-unknown``, ``busy``.
         """
-        async with self._chain.change(who.account, Deed.AGENT_UNPAIRED, who, on=agent_id) as change:
-            changed = await self._change(who, agent_id, rules.unpair, change)
+        async with self._chain.change(caller.account, AccountEvent.AGENT_UNPAIRED, caller, on=agent_id) as change:
+            changed = await self._change(caller, agent_id, rules.unpair, change)
         await self._finish(changed)
 
-    async def move(self, who: Identity, agent_id: str, space: str) -> Agent:
+    async def move(self, caller: Identity, agent_id: str, space: str) -> Agent:
         """Take an agent to another space of its account. What is known of its devices stays; what they do ends.
 
         Raises:
             Problem: ``agent-unknown``, ``space-unknown``, ``busy``.
         """
-        own = {known.id for known in await self._sign_in.spaces(who.account)}
+        own = {existing.id for existing in await self._sign_in.spaces(caller.account)}
 
         def moved(agent: Agent) -> Agent:
             if space not in own:
                 raise not_found("space", space)
             return agent if agent.space == space else rules.move(agent, space)
 
-        async with self._chain.change(who.account, Deed.AGENT_MOVED, who, on=agent_id, space=space) as change:
-            changed = await self._change(who, agent_id, moved, change)
+        async with self._chain.change(
+            caller.account, AccountEvent.AGENT_MOVED, caller, on=agent_id, space=space
+        ) as change:
+            changed = await self._change(caller, agent_id, moved, change)
         await self._finish(changed)
         return changed
 
-    async def _change(self, who: Identity, agent_id: str, rule: Callable[[Agent], Agent], change: Change) -> Agent:
+    async def _change(self, caller: Identity, agent_id: str, rule: Callable[[Agent], Agent], change: Change) -> Agent:
         watched = False
 
-        async def once() -> Agent:
+        async def attempt() -> Agent:
             nonlocal watched
             row = await self._tables.get(records.AGENTS, agent_id, "agent")
             agent = records.read(row, Agent) if row else None
-            if row is None or agent is None or agent.account != who.account:
+            if row is None or agent is None or agent.account != caller.account:
                 raise not_found("agent", agent_id)
             changed = rule(agent)
             if changed is not agent:
@@ -72,7 +74,7 @@ class Unpair:
                 await self._tables.replace(records.AGENTS, Row(agent_id, "agent", records.fields(changed), row.etag))
             return changed
 
-        return await records.retry(once)
+        return await records.retry(attempt)
 
     async def _finish(self, agent: Agent) -> None:
         if agent.leaving:

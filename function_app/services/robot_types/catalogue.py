@@ -68,7 +68,9 @@ class RobotTypes:
         self._blobs = blobs
         self._catalogue = catalogue
 
-    async def list(self, who: Identity, *, cursor: str | None, limit: int) -> tuple[tuple[KnownType, ...], str | None]:
+    async def list(
+        self, caller: Identity, *, cursor: str | None, limit: int
+    ) -> tuple[tuple[KnownType, ...], str | None]:
         """Robot types by id.
 
         Raises:
@@ -78,17 +80,17 @@ class RobotTypes:
             raise invalid("The cursor is not one of this list. Begin without one.", code="cursor-invalid")
         after = "" if cursor is None else cursor + "\0"
         page = await self._tables.query(
-            records.MEMBERS, who.account, first=INDEX + after, last=INDEX + "\x7f", limit=limit
+            records.MEMBERS, caller.account, first=INDEX + after, last=INDEX + "\x7f", limit=limit
         )
         own = [row.key.removeprefix(INDEX) for row in page.rows]
         end = None if page.cursor is None else own[-1]
         built_in = [name for name in await self._catalogue.types() if after <= name and (end is None or name <= end)]
         names = sorted({*own, *built_in})
         last = names[limit - 1] if len(names) > limit else end
-        found = await asyncio.gather(*(self._find(who, name) for name in names[:limit]))
-        return tuple(each for each in found if each is not None), last
+        result = await asyncio.gather(*(self._find(caller, name) for name in names[:limit]))
+        return tuple(each for each in result if each is not None), last
 
-    async def get(self, who: Identity, robot_type: str) -> RobotType:
+    async def get(self, caller: Identity, robot_type: str) -> RobotType:
         """A robot type that can be used.
 
         Raises:
@@ -97,46 +99,46 @@ class RobotTypes:
         built_in = (await self._catalogue.types()).get(robot_type)
         if built_in is not None:
             return built_in
-        where, head = await self._head(who, robot_type)
+        where, head = await self._head(caller, robot_type)
         if not head.ready:
             detail = f"No version of '{robot_type}' is ready. Look at the robot type: it says why."
             raise Problem("robot-type-not-ready", 409, "The robot type is not ready", detail)
         await self._seals.check(where.account, robot_type, head)
         return msgspec.convert(head.manifest, RobotType)
 
-    async def view(self, who: Identity, robot_type: str) -> KnownType:
+    async def view(self, caller: Identity, robot_type: str) -> KnownType:
         """A robot type with what is known of it.
 
         Raises:
             Problem: ``robot-type-unknown``.
         """
-        found = await self._find(who, robot_type)
-        if found is None:
+        result = await self._find(caller, robot_type)
+        if result is None:
             raise not_found("robot-type", robot_type)
-        return found
+        return result
 
-    async def file(self, who: Identity, robot_type: str, name: str) -> bytes:
+    async def file(self, caller: Identity, robot_type: str, name: str) -> bytes:
         """One file of the version in use; ``robot.toml`` is the manifest.
 
         Raises:
             Problem: ``robot-type-unknown``, ``robot-type-not-ready``, ``robot-type-damaged``, ``file-unknown``.
         """
-        await self.get(who, robot_type)
+        await self.get(caller, robot_type)
         files = await self._catalogue.files(robot_type)
         if robot_type in await self._catalogue.types():
             content = files.get(name)
         else:
-            where, head = await self._head(who, robot_type)
+            where, head = await self._head(caller, robot_type)
             _, version = await read_version(self._tables, where, head.ready)
-            known = version is not None and name in version.files
-            content = await self._blobs.get(where.prefix(head.ready) + name) if known else None
+            existing = version is not None and name in version.files
+            content = await self._blobs.get(where.prefix(head.ready) + name) if existing else None
             if content is not None:
                 require_intact(robot_type, head.seal, name, content)
         if content is None:
             raise not_found("file", name)
         return content
 
-    async def model(self, who: Identity, robot_type: str) -> Model:
+    async def model(self, caller: Identity, robot_type: str) -> Model:
         """The drawing of the version in use.
 
         Raises:
@@ -148,8 +150,8 @@ class RobotTypes:
             if drawing is None:
                 raise not_found("model", robot_type)
             return _model(robot_type, msgspec.json.decode(drawing, type=Looked))
-        await self.get(who, robot_type)
-        where, head = await self._head(who, robot_type)
+        await self.get(caller, robot_type)
+        where, head = await self._head(caller, robot_type)
         _, version = await read_version(self._tables, where, head.ready)
         if version is None:
             raise not_found("model", robot_type)
@@ -166,24 +168,24 @@ class RobotTypes:
             raise not_found("model", version.manifest["type"])
         return _model(version.manifest["type"], msgspec.json.decode(content, type=Looked))
 
-    async def archive(self, who: Identity, robot_type: str) -> bytes:
+    async def archive(self, caller: Identity, robot_type: str) -> bytes:
         """All files of the version in use as a zip, in a folder of the type's name.
 
         Raises:
             Problem: ``robot-type-unknown``, ``robot-type-not-ready``, ``file-unknown``.
         """
-        await self.get(who, robot_type)
-        known = await self.view(who, robot_type)
-        files = {f"{robot_type}/{name}": await self.file(who, robot_type, name) for name in sorted(known.files)}
+        await self.get(caller, robot_type)
+        existing = await self.view(caller, robot_type)
+        files = {f"{robot_type}/{name}": await self.file(caller, robot_type, name) for name in sorted(existing.files)}
         return await asyncio.to_thread(_zip, files)
 
-    async def _find(self, who: Identity, robot_type: str) -> KnownType | None:
+    async def _find(self, caller: Identity, robot_type: str) -> KnownType | None:
         built_in = (await self._catalogue.types()).get(robot_type)
         if built_in is not None:
             files = await self._catalogue.files(robot_type)
             sizes = {name: len(content) for name, content in files.items()}
             return KnownType(built_in, built_in.version, sizes, usable=True)
-        where = place(who, robot_type)
+        where = place(caller, robot_type)
         if where is None:
             return None
         _, head = await read_head(self._tables, where)
@@ -198,8 +200,8 @@ class RobotTypes:
             used = ready or newest
         return KnownType(_manifest(used.manifest), used.version, used.files, usable=head.ready > 0, upload=newest)
 
-    async def _head(self, who: Identity, robot_type: str) -> tuple[Place, TypeHead]:
-        where = place(who, robot_type)
+    async def _head(self, caller: Identity, robot_type: str) -> tuple[Place, TypeHead]:
+        where = place(caller, robot_type)
         _, head = (None, None) if where is None else await read_head(self._tables, where)
         if where is None or head is None or head.deleted:
             raise not_found("robot-type", robot_type)

@@ -3,7 +3,7 @@
 import contextlib
 from dataclasses import replace
 
-from function_app.domain.audit.hash_chain import Deed
+from function_app.domain.audit.hash_chain import AccountEvent
 from function_app.domain.common.problems import Problem, not_found
 from function_app.domain.identity.accounts import Identity
 from function_app.ports.clock import Clock
@@ -40,7 +40,7 @@ class DeleteRobotType:
         self._chain = chain
         self._clock = clock
 
-    async def delete(self, who: Identity, robot_type: str) -> None:
+    async def delete(self, caller: Identity, robot_type: str) -> None:
         """Delete it, all versions. The write on its row decides; the timer deletes versions and files.
 
         Raises:
@@ -49,31 +49,31 @@ class DeleteRobotType:
         if robot_type in await self._catalogue.types():
             detail = f"'{robot_type}' comes with the installation and cannot be deleted."
             raise Problem("robot-type-built-in", 409, "Built-in", detail)
-        where = place(who, robot_type)
+        where = place(caller, robot_type)
         if where is None:
             raise not_found("robot-type", robot_type)
-        index = await self._tables.get(records.MEMBERS, who.account, INDEX + robot_type)
+        index = await self._tables.get(records.MEMBERS, caller.account, INDEX + robot_type)
 
-        async def once() -> None:
+        async def attempt() -> None:
             row, head = await read_head(self._tables, where)
             if row is None or head is None or head.deleted:
                 raise not_found("robot-type", robot_type)
-            await self._require_unused(who, robot_type)
+            await self._require_unused(caller, robot_type)
             await note_look(self._tables, where, self._clock.now_ms() + AFTER_MS)
             await change.noted()
             gone = replace(head, deleted=True, ready=0, manifest={})
             await self._tables.replace(records.ROBOT_TYPES, Row(row.partition, row.key, records.fields(gone), row.etag))
 
-        async with self._chain.change(who.account, Deed.ROBOT_TYPE_DELETED, who, on=robot_type) as change:
-            await records.retry(once)
+        async with self._chain.change(caller.account, AccountEvent.ROBOT_TYPE_DELETED, caller, on=robot_type) as change:
+            await records.retry(attempt)
         if index is not None:
             with contextlib.suppress(Conflict):
                 await self._tables.delete(records.MEMBERS, index)
 
-    async def _require_unused(self, who: Identity, robot_type: str) -> None:
-        own = [device for device in await self._devices.all(who) if device.owner == who.account]
+    async def _require_unused(self, caller: Identity, robot_type: str) -> None:
+        own = [device for device in await self._devices.all(caller) if device.owner == caller.account]
         devices = [device.id for device in own if device.robot_type == robot_type]
-        movements = list(await self._movements.own(who, robot_type))
+        movements = list(await self._movements.own(caller, robot_type))
         users = [f"device {name}" for name in devices] + [f"movement {name}" for name in movements]
         if users:
             more = f" and {len(users) - _NAMED} more" if len(users) > _NAMED else ""

@@ -125,7 +125,7 @@ async def give_verdict(
     A version that is ready takes the place of those before it in the same batch; these are looked at a day later.
     """
 
-    async def once() -> None:
+    async def attempt() -> None:
         head_row, head = await read_head(tables, where)
         row, upload = await read_version(tables, where, number)
         if row is None or upload is None or head_row is None or head is None:
@@ -143,7 +143,7 @@ async def give_verdict(
             writes.append(Write("replace", Row(row.partition, HEAD, head_data, head_row.etag)))
         await tables.batch(records.ROBOT_TYPES, writes)
 
-    await records.retry(once)
+    await records.retry(attempt)
 
 
 def _sentences(texts: Sequence[str]) -> tuple[str, ...]:

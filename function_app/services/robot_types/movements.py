@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 from device_agent.protocol import SHIPPED
-from function_app.domain.audit.hash_chain import Deed
+from function_app.domain.audit.hash_chain import AccountEvent
 from function_app.domain.common.ids import ID
 from function_app.domain.common.problems import Problem, invalid, not_found
 from function_app.domain.identity.accounts import Identity
@@ -77,18 +77,18 @@ class Movements:
         self._read: dict[str, Script] = {}
 
     async def list(
-        self, who: Identity, robot_type: str, *, cursor: str | None, limit: int
+        self, caller: Identity, robot_type: str, *, cursor: str | None, limit: int
     ) -> tuple[tuple[Movement, ...], str | None]:
         """Newest versions, by name; an account's own in place of a built-in one of the same name.
 
         Raises:
             Problem: ``robot-type-unknown``, ``cursor-invalid``.
         """
-        await self._types.get(who, robot_type)
+        await self._types.get(caller, robot_type)
         if cursor is not None and not ID.match(cursor):
             raise _bad_cursor()
         after = "" if cursor is None else cursor + "\0"
-        partition = _partition(who, robot_type)
+        partition = _partition(caller, robot_type)
         page = await self._tables.query(records.MOVEMENTS, partition, first=after, last=_VERSIONS, limit=limit)
         own = {row.key: records.read(row, Movement) for row in page.rows}
         end = None if page.cursor is None else page.rows[-1].key
@@ -103,22 +103,22 @@ class Movements:
         return tuple(shown[name] for name in names[:limit]), last
 
     async def versions(
-        self, who: Identity, robot_type: str, name: str, *, cursor: str | None, limit: int
+        self, caller: Identity, robot_type: str, name: str, *, cursor: str | None, limit: int
     ) -> tuple[tuple[Movement, ...], str | None]:
         """Every version of one movement, newest first; at the end the built-in one that it shadows.
 
         Raises:
             Problem: ``robot-type-unknown``, ``movement-unknown``, ``cursor-invalid``.
         """
-        newest = await self._newest(who, robot_type, name)
+        newest = await self._newest(caller, robot_type, name)
         built_in = (await self._catalogue.movements(robot_type)).get(name)
-        found: list[Movement] = []
+        result: list[Movement] = []
         following = None
         if not newest.built_in:
             try:
                 page = await self._tables.query(
                     records.MOVEMENTS,
-                    _partition(who, robot_type),
+                    _partition(caller, robot_type),
                     first=_version_key(name, newest.version),
                     last=_version_key(name, newest.since) + "\0",
                     limit=limit,
@@ -126,30 +126,32 @@ class Movements:
                 )
             except ValueError as error:
                 raise _bad_cursor() from error
-            found = [records.read(row, Movement) for row in page.rows]
+            result = [records.read(row, Movement) for row in page.rows]
             following = page.cursor
         if built_in is not None and following is None:
-            found.append(await self._built_in(robot_type, built_in))
-        return tuple(found), following
+            result.append(await self._built_in(robot_type, built_in))
+        return tuple(result), following
 
-    async def get(self, who: Identity, robot_type: str, name: str, version: int | None = None) -> tuple[Movement, str]:
+    async def get(
+        self, caller: Identity, robot_type: str, name: str, version: int | None = None
+    ) -> tuple[Movement, str]:
         """One movement and its source: the newest version, or the one that is asked for.
 
         Raises:
             Problem: ``robot-type-unknown``, ``movement-unknown``, ``movement-version-unknown``, ``movement-damaged``.
         """
-        found = await self._newest(who, robot_type, name)
+        result = await self._newest(caller, robot_type, name)
         built_in = (await self._catalogue.movements(robot_type)).get(name)
-        if version is not None and version != found.version:
+        if version is not None and version != result.version:
             if built_in is not None and version == built_in.version:
-                found = await self._built_in(robot_type, built_in)
+                result = await self._built_in(robot_type, built_in)
             else:
-                found = await self._version(who, robot_type, found, version)
-        if found.built_in and built_in is not None:
-            return found, built_in.source
-        return found, await self._scripts.get(who, robot_type, found)
+                result = await self._version(caller, robot_type, result, version)
+        if result.built_in and built_in is not None:
+            return result, built_in.source
+        return result, await self._scripts.get(caller, robot_type, result)
 
-    async def put(self, who: Identity, robot_type: str, name: str, draft: Draft) -> tuple[Movement, bool]:
+    async def put(self, caller: Identity, robot_type: str, name: str, draft: Draft) -> tuple[Movement, bool]:
         """Store a new version; and whether the account had none of this name.
 
         The script is stored before the rows that name it: a row without its script cannot be.
@@ -158,7 +160,7 @@ class Movements:
             Problem: ``robot-type-unknown``, ``movement-invalid`` with the line, ``schema-invalid``, ``movements-full``,
                 ``movement-changed`` with the newest version.
         """
-        await self._types.get(who, robot_type)
+        await self._types.get(caller, robot_type)
         if not ID.match(name):
             raise invalid("A movement's name has letters, digits, _ and -, 1 to 64 of them.")
         script = read_script(draft.source)
@@ -168,36 +170,38 @@ class Movements:
             version=0,
             sha256=hashlib.sha256(draft.source.encode()).hexdigest(),
             updated_ms=self._clock.now_ms(),
-            author=who.account,
+            author=caller.account,
             parameters_schema=script.schema if draft.parameters_schema is None else draft.parameters_schema,
         )
         lost: list[Movement] = []
 
-        async def once() -> tuple[Movement, bool]:
-            row = await self._row(who, robot_type, name)
+        async def attempt() -> tuple[Movement, bool]:
+            row = await self._row(caller, robot_type, name)
             old = records.read(row, Movement) if row else None
             await self._check_newest(robot_type, name, old, draft.based_on)
             if row is None:
-                await self._check_room(who, robot_type)
+                await self._check_room(caller, robot_type)
             elif old is not None and old.deleted:
-                await self._forget_versions(who, robot_type, old)
+                await self._forget_versions(caller, robot_type, old)
             numbered = await self._scripts.sign(robot_type, await self._numbered(robot_type, new, old))
-            await self._scripts.put(who, robot_type, numbered, draft.source)
+            await self._scripts.put(caller, robot_type, numbered, draft.source)
             lost.append(numbered)
             change.data["version"] = numbered.version
             await change.noted()
-            await self._tables.batch(records.MOVEMENTS, _writes(_partition(who, robot_type), numbered, row))
+            await self._tables.batch(records.MOVEMENTS, _writes(_partition(caller, robot_type), numbered, row))
             lost.pop()
             return numbered, old is None or old.deleted
 
         on = f"{robot_type}/{name}"
-        async with self._chain.change(who.account, Deed.MOVEMENT_SAVED, who, on=on, sha256=new.sha256) as change:
-            done = await records.retry(once)
+        async with self._chain.change(
+            caller.account, AccountEvent.MOVEMENT_SAVED, caller, on=on, sha256=new.sha256
+        ) as change:
+            done = await records.retry(attempt)
         for tried in lost:
-            await self._drop_lost(who, robot_type, tried)
+            await self._drop_lost(caller, robot_type, tried)
         return done
 
-    async def delete(self, who: Identity, robot_type: str, name: str) -> None:
+    async def delete(self, caller: Identity, robot_type: str, name: str) -> None:
         """Delete the account's own movement, all versions; a built-in one of the same name shows again.
 
         An action that was started with it goes on to its end: its script stays for ``KEPT_MS``.
@@ -205,14 +209,14 @@ class Movements:
         Raises:
             Problem: ``robot-type-unknown``, ``movement-unknown``, ``movement-built-in``.
         """
-        await self._types.get(who, robot_type)
+        await self._types.get(caller, robot_type)
 
-        async def once() -> Movement:
-            row = await self._row(who, robot_type, name)
+        async def attempt() -> Movement:
+            row = await self._row(caller, robot_type, name)
             old = records.read(row, Movement) if row else None
             if row is None or old is None or old.deleted:
                 if old is not None:
-                    await self._forget_versions(who, robot_type, old)
+                    await self._forget_versions(caller, robot_type, old)
                 if name in await self._catalogue.movements(robot_type):
                     detail = f"'{name}' comes with the robot type and cannot be deleted."
                     raise Problem("movement-built-in", 409, "Built-in", detail)
@@ -222,48 +226,50 @@ class Movements:
             await self._tables.replace(records.MOVEMENTS, Row(row.partition, row.key, records.fields(gone), row.etag))
             return gone
 
-        async with self._chain.change(who.account, Deed.MOVEMENT_DELETED, who, on=f"{robot_type}/{name}") as change:
-            gone = await records.retry(once)
-        await self._forget_versions(who, robot_type, gone)
+        async with self._chain.change(
+            caller.account, AccountEvent.MOVEMENT_DELETED, caller, on=f"{robot_type}/{name}"
+        ) as change:
+            gone = await records.retry(attempt)
+        await self._forget_versions(caller, robot_type, gone)
 
-    async def own(self, who: Identity, robot_type: str) -> tuple[str, ...]:
+    async def own(self, caller: Identity, robot_type: str) -> tuple[str, ...]:
         """Names of the account's own movements of a robot type."""
-        partition = _partition(who, robot_type)
+        partition = _partition(caller, robot_type)
         page = await self._tables.query(records.MOVEMENTS, partition, last=_VERSIONS, limit=MAX_OWN)
         return tuple(row.key for row in page.rows if not records.read(row, Movement).deleted)
 
-    async def pinned_source(self, who: Identity, name: str, pinned: Mapping[str, Any]) -> str | None:
+    async def pinned_source(self, caller: Identity, name: str, pinned: Mapping[str, Any]) -> str | None:
         """The script of an action that is sent again, by what was pinned at its start; ``None`` when it is gone."""
-        found = (await self._catalogue.movements(pinned["robot_type"])).get(name)
-        if found is not None and found.sha256 == pinned["sha256"]:
-            return found.source
+        result = (await self._catalogue.movements(pinned["robot_type"])).get(name)
+        if result is not None and result.sha256 == pinned["sha256"]:
+            return result.source
         movement = Movement(name=name, description="", version=pinned["version"], sha256=pinned["sha256"], updated_ms=0)
-        return await self._scripts.find(who, pinned["robot_type"], movement)
+        return await self._scripts.find(caller, pinned["robot_type"], movement)
 
-    async def _newest(self, who: Identity, robot_type: str, name: str) -> Movement:
-        await self._types.get(who, robot_type)
-        row = await self._row(who, robot_type, name)
+    async def _newest(self, caller: Identity, robot_type: str, name: str) -> Movement:
+        await self._types.get(caller, robot_type)
+        row = await self._row(caller, robot_type, name)
         own = records.read(row, Movement) if row else None
         if own is not None and not own.deleted:
             return own
-        found = (await self._catalogue.movements(robot_type)).get(name)
-        if found is None:
+        result = (await self._catalogue.movements(robot_type)).get(name)
+        if result is None:
             raise not_found("movement", name)
-        return await self._built_in(robot_type, found)
+        return await self._built_in(robot_type, result)
 
-    async def _version(self, who: Identity, robot_type: str, newest: Movement, version: int) -> Movement:
+    async def _version(self, caller: Identity, robot_type: str, newest: Movement, version: int) -> Movement:
         row = None
         if not newest.built_in and newest.since <= version < newest.version:
             key = _version_key(newest.name, version)
-            row = await self._tables.get(records.MOVEMENTS, _partition(who, robot_type), key)
+            row = await self._tables.get(records.MOVEMENTS, _partition(caller, robot_type), key)
         if row is None:
             raise not_found("movement-version", f"{newest.name}, version {version}")
         return records.read(row, Movement)
 
-    async def _row(self, who: Identity, robot_type: str, name: str) -> Row | None:
+    async def _row(self, caller: Identity, robot_type: str, name: str) -> Row | None:
         if not ID.match(name):
             return None
-        return await self._tables.get(records.MOVEMENTS, _partition(who, robot_type), name)
+        return await self._tables.get(records.MOVEMENTS, _partition(caller, robot_type), name)
 
     async def _check_newest(self, robot_type: str, name: str, old: Movement | None, based_on: int | None) -> None:
         """Refuse to save over what somebody has saved meanwhile."""
@@ -275,8 +281,8 @@ class Movements:
         detail = f"{made}, and this was made from version {based_on}." if based_on else f"There is a '{name}' already."
         raise Problem("movement-changed", 409, "Somebody has saved it meanwhile", detail, extras={"version": newest})
 
-    async def _check_room(self, who: Identity, robot_type: str) -> None:
-        partition = _partition(who, robot_type)
+    async def _check_room(self, caller: Identity, robot_type: str) -> None:
+        partition = _partition(caller, robot_type)
         page = await self._tables.query(records.MOVEMENTS, partition, last=_VERSIONS, limit=MAX_OWN)
         if len(page.rows) >= MAX_OWN:
             detail = f"An account keeps at most {MAX_OWN} movements for one robot type."
@@ -288,22 +294,22 @@ class Movements:
         version = max(old.version if old else 0, built_in.version if built_in else 0) + 1
         return replace(new, version=version, since=old.since if old and not old.deleted else version)
 
-    async def _drop_lost(self, who: Identity, robot_type: str, tried: Movement) -> None:
+    async def _drop_lost(self, caller: Identity, robot_type: str, tried: Movement) -> None:
         """Delete the script of a version that another writer got, unless it is that very script."""
         key = _version_key(tried.name, tried.version)
-        row = await self._tables.get(records.MOVEMENTS, _partition(who, robot_type), key)
+        row = await self._tables.get(records.MOVEMENTS, _partition(caller, robot_type), key)
         if row is None or row.data["sha256"] != tried.sha256:
-            await self._scripts.delete(who, robot_type, tried)
+            await self._scripts.delete(caller, robot_type, tried)
 
-    async def _forget_versions(self, who: Identity, robot_type: str, gone: Movement) -> None:
+    async def _forget_versions(self, caller: Identity, robot_type: str, gone: Movement) -> None:
         """Note scripts, then rows, of a deleted movement. Whoever meets one again notes the same again."""
         due_ms = gone.updated_ms + KEPT_MS
-        partition = _partition(who, robot_type)
+        partition = _partition(caller, robot_type)
         first, last = _version_key(gone.name, gone.version), _version_key(gone.name, gone.since) + "\0"
         start: str | None = first
         while start is not None:
             page = await self._tables.query(records.MOVEMENTS, partition, first=start, last=last)
-            blobs = [blob_name(who, robot_type, records.read(row, Movement)) for row in page.rows]
+            blobs = [blob_name(caller, robot_type, records.read(row, Movement)) for row in page.rows]
             await asyncio.gather(*(self._forget.blob(blob, due_ms=due_ms) for blob in blobs))
             start = page.rows[-1].key + "\0" if page.cursor is not None else None
         await self._forget.rows(records.MOVEMENTS, partition, first=first, last=last, due_ms=due_ms)
@@ -337,8 +343,8 @@ def _bad_cursor() -> Problem:
     return invalid("The cursor is not one of this list. Begin without one.", code="cursor-invalid")
 
 
-def _partition(who: Identity, robot_type: str) -> str:
-    return f"{who.account}/{robot_type}"
+def _partition(caller: Identity, robot_type: str) -> str:
+    return f"{caller.account}/{robot_type}"
 
 
 def _version_key(name: str, version: int) -> str:

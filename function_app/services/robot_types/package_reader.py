@@ -74,15 +74,15 @@ def read_upload(manifest: str, files: Mapping[str, str]) -> Upload:
 
 def missing(files: Mapping[str, bytes]) -> tuple[tuple[str, str, int], ...]:
     """Files that the XML names and that are in no folder of the upload: who names it, what, and in which line."""
-    known = {name.rpartition("/")[2] for name in files}
-    found: list[tuple[str, str, int]] = []
+    existing = {name.rpartition("/")[2] for name in files}
+    result: list[tuple[str, str, int]] = []
 
     def look(name: str, parser: expat.XMLParserType) -> None:
         def element(_: str, attributes: dict[str, str]) -> None:
             for attribute, value in attributes.items():
                 wanted = value.rpartition("/")[2]
-                if _FILE.match(attribute) and wanted and wanted not in known:
-                    found.append((name, wanted, parser.CurrentLineNumber))
+                if _FILE.match(attribute) and wanted and wanted not in existing:
+                    result.append((name, wanted, parser.CurrentLineNumber))
 
         parser.StartElementHandler = element
 
@@ -92,7 +92,7 @@ def missing(files: Mapping[str, bytes]) -> tuple[tuple[str, str, int], ...]:
             look(name, parser)
             with contextlib.suppress(expat.ExpatError):
                 parser.Parse(text, True)
-    return tuple(found)
+    return tuple(result)
 
 
 def malformed(files: Mapping[str, bytes]) -> tuple[str, ...]:
@@ -120,8 +120,8 @@ def _unnamed(robot_type: RobotType, content: Mapping[str, bytes]) -> Iterator[Pr
     for field in ("model", "scene"):
         named = getattr(robot_type, field)
         if named not in content or not named.endswith(TEXT):
-            known = _xml_names(content)
-            yield _bad_manifest(f"{field} is '{named[:120]}'; it must be one of the .xml files: {known}.")
+            existing = _xml_names(content)
+            yield _bad_manifest(f"{field} is '{named[:120]}'; it must be one of the .xml files: {existing}.")
 
 
 def _or_note(wrong: list[Problem], read: Callable[[], T]) -> T | None:
@@ -137,14 +137,14 @@ def _manifest(text: str) -> RobotType:
     if len(text.encode()) > MAX_MANIFEST:
         raise _bad_manifest(f"It has at most {MAX_MANIFEST} bytes.")
     try:
-        found = manifests.parse(text)
+        result = manifests.parse(text)
     except (ProtocolError, RecursionError) as error:
         raise _bad_manifest(f"{error}.") from error
-    if not ID.match(found.type):
+    if not ID.match(result.type):
         raise _bad_manifest("type has letters, digits, _ and -, 1 to 64 of them.")
-    if not 1 <= found.version <= MAX_VERSION:
-        raise _bad_manifest(f"version is {found.version}; it must be 1 to {MAX_VERSION}.")
-    return found
+    if not 1 <= result.version <= MAX_VERSION:
+        raise _bad_manifest(f"version is {result.version}; it must be 1 to {MAX_VERSION}.")
+    return result
 
 
 def _content(name: str, text: str) -> bytes:

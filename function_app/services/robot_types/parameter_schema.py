@@ -118,9 +118,9 @@ def of_properties(properties: Mapping[str, Any]) -> ObjectSchema:
 
 def plain(schema: ObjectSchema) -> dict[str, Any]:
     """The schema as JSON; also as another program's validator of JSON Schema reads it."""
-    found: dict[str, Any] = msgspec.json.decode(msgspec.json.encode(schema))
-    _close(found)
-    return found
+    result: dict[str, Any] = msgspec.json.decode(msgspec.json.encode(schema))
+    _close(result)
+    return result
 
 
 def check_schema(schema: ObjectSchema) -> None:
@@ -129,11 +129,11 @@ def check_schema(schema: ObjectSchema) -> None:
     Raises:
         Problem: ``schema-invalid``.
     """
-    found = plain(schema)
-    size = len(msgspec.json.encode(found))
-    if size > MAX_SCHEMA_BYTES or too_deep(found, SCHEMA_LEVELS):
+    result = plain(schema)
+    size = len(msgspec.json.encode(result))
+    if size > MAX_SCHEMA_BYTES or too_deep(result, SCHEMA_LEVELS):
         raise _bad_schema(f"It has at most {MAX_SCHEMA_BYTES} bytes and {SCHEMA_LEVELS} levels, not {size} bytes.")
-    _check(found, "$")
+    _check(result, "$")
 
 
 def fit(schema: Mapping[str, Any] | None, given: Mapping[str, Any]) -> dict[str, Any]:
@@ -189,12 +189,12 @@ def check(given: Mapping[str, Any]) -> None:
 def _filled(schema: Mapping[str, Any], value: Any) -> Any:
     """A copy with defaults in every object that is there; an object that is not there stays away."""
     if schema["type"] == "object" and isinstance(value, dict):
-        known = schema["properties"]
-        found = {name: _filled(known[name], part) if name in known else part for name, part in value.items()}
-        for name, each in known.items():
+        existing = schema["properties"]
+        result = {name: _filled(existing[name], part) if name in existing else part for name, part in value.items()}
+        for name, each in existing.items():
             if name not in value and "default" in each:
-                found[name] = _filled(each, deepcopy(each["default"]))
-        return found
+                result[name] = _filled(each, deepcopy(each["default"]))
+        return result
     if schema["type"] == "array" and isinstance(value, list):
         return [_filled(schema["items"], part) for part in value]
     return value

@@ -78,7 +78,7 @@ class RobotTypePreview:
         self._clock = clock
 
     async def begin(
-        self, who: Identity, manifest: str, files: Mapping[str, str], scripts: Mapping[str, str], *, wait_ms: int
+        self, caller: Identity, manifest: str, files: Mapping[str, str], scripts: Mapping[str, str], *, wait_ms: int
     ) -> Preview:
         """Store an upload for a look. The notes for the timer come first: whatever a stop cuts off goes by itself.
 
@@ -92,7 +92,7 @@ class RobotTypePreview:
             problem.extras["errors"] = [*problem.extras.get("errors", [problem.detail]), *wrong][:MAX_TOLD]
             raise
         await require_own(self._catalogue, given.robot_type.type)
-        where = Place(who.account, f"~{new_id()}")
+        where = Place(caller.account, f"~{new_id()}")
         now_ms = self._clock.now_ms()
         await note_look(self._tables, where, now_ms + KEEP_LOOK_MS)
         await note_look(self._tables, where, now_ms + GIVE_UP_MS)
@@ -108,34 +108,34 @@ class RobotTypePreview:
         done = await self._versions.verdict(where, _ONLY, wait_ms)
         return Preview(where.type[1:], done or upload, given.robot_type)
 
-    async def get(self, who: Identity, look: str, *, wait_ms: int = 0) -> Preview:
+    async def get(self, caller: Identity, look: str, *, wait_ms: int = 0) -> Preview:
         """How it fares.
 
         Raises:
             Problem: ``look-unknown``.
         """
-        where, upload = await self._find(who, look)
+        where, upload = await self._find(caller, look)
         if upload.open and wait_ms:
             upload = await self._versions.verdict(where, _ONLY, wait_ms) or upload
         return Preview(look, upload, msgspec.convert(upload.manifest, RobotType))
 
-    async def model(self, who: Identity, look: str) -> Model:
+    async def model(self, caller: Identity, look: str) -> Model:
         """What it was found to be.
 
         Raises:
             Problem: ``look-unknown``, ``robot-type-not-ready``, ``model-unknown``.
         """
-        where, upload = await self._find(who, look)
+        where, upload = await self._find(caller, look)
         _require_good(upload)
         return await self._types.checked_model(where, upload)
 
-    async def save(self, who: Identity, look: str, *, wait_ms: int) -> tuple[KnownType, bool]:
+    async def save(self, caller: Identity, look: str, *, wait_ms: int) -> tuple[KnownType, bool]:
         """Make what was looked at the next version of its robot type; it is checked as any upload is.
 
         Raises:
             Problem: ``look-unknown``, ``robot-type-not-ready``, ``robot-type-damaged``, and those of an upload.
         """
-        where, upload = await self._find(who, look)
+        where, upload = await self._find(caller, look)
         _require_good(upload)
         seal = await self._seals.check(where.account, where.type, upload)
         names = list(upload.files)
@@ -143,28 +143,30 @@ class RobotTypePreview:
         files = {name: content or b"" for name, content in zip(names, contents, strict=True)}
         for name, content in files.items():
             require_intact(where.type, seal, name, content)
-        found = await self._upload.add(who, Upload(msgspec.convert(upload.manifest, RobotType), files), wait_ms=wait_ms)
-        await self.drop(who, look)
-        return found
+        result = await self._upload.add(
+            caller, Upload(msgspec.convert(upload.manifest, RobotType), files), wait_ms=wait_ms
+        )
+        await self.drop(caller, look)
+        return result
 
-    async def drop(self, who: Identity, look: str) -> None:
+    async def drop(self, caller: Identity, look: str) -> None:
         """End it; the timer deletes what it has stored.
 
         Raises:
             Problem: ``look-unknown``.
         """
-        where, _ = await self._find(who, look)
+        where, _ = await self._find(caller, look)
         await self._end(where)
 
     async def _end(self, where: Place) -> None:
-        async def once() -> None:
+        async def attempt() -> None:
             row, head = await read_head(self._tables, where)
             await note_look(self._tables, where, self._clock.now_ms())
             if row is not None and head is not None and not head.deleted:
                 gone = records.fields(replace(head, deleted=True))
                 await self._tables.replace(records.ROBOT_TYPES, Row(row.partition, row.key, gone, row.etag))
 
-        await records.retry(once)
+        await records.retry(attempt)
 
     async def _list(self, where: Place, now_ms: int) -> None:
         """See that there are not too many: the oldest ones end."""
@@ -175,8 +177,8 @@ class RobotTypePreview:
         row = Row(where.account, trial_index(where), {"created_ms": now_ms})
         await self._tables.create(records.MEMBERS, row)
 
-    async def _find(self, who: Identity, look: str) -> tuple[Place, TypeVersion]:
-        where = trial_place(who, look)
+    async def _find(self, caller: Identity, look: str) -> tuple[Place, TypeVersion]:
+        where = trial_place(caller, look)
         if where is not None:
             _, head = await read_head(self._tables, where)
             _, upload = await read_version(self._tables, where, _ONLY)
@@ -195,14 +197,14 @@ def _require_good(upload: TypeVersion) -> None:
 
 def _wrong_scripts(scripts: Mapping[str, str]) -> tuple[str, ...]:
     """What is wrong with movements, as far as one can say without running them."""
-    found = []
+    result = []
     for name, source in scripts.items():
         file = f"movements/{name[:80]}.py"
         if not ID.match(name):
-            found.append(f"{file}: a movement's name has letters, digits, _ and -, 1 to 64 of them.")
+            result.append(f"{file}: a movement's name has letters, digits, _ and -, 1 to 64 of them.")
             continue
         try:
             read_script(source)
         except Problem as problem:
-            found.append(f"{file}: {problem.detail}")
-    return tuple(found)
+            result.append(f"{file}: {problem.detail}")
+    return tuple(result)

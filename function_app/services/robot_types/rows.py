@@ -46,14 +46,14 @@ class Place:
         return f"robot-types/{self.account}/{self.type}/{version}/"
 
 
-def place(who: Identity, robot_type: str) -> Place | None:
+def place(caller: Identity, robot_type: str) -> Place | None:
     """Where the type is, or ``None`` where the text cannot be one."""
-    return Place(who.account, robot_type) if ID.match(robot_type) else None
+    return Place(caller.account, robot_type) if ID.match(robot_type) else None
 
 
-def trial_place(who: Identity, look: str) -> Place | None:
+def trial_place(caller: Identity, look: str) -> Place | None:
     """Where a look at an upload is: like a robot type, where nobody finds it who asks for robot types."""
-    return Place(who.account, _TRIAL + look) if ID.match(look) else None
+    return Place(caller.account, _TRIAL + look) if ID.match(look) else None
 
 
 def trial_index(where: Place) -> str:

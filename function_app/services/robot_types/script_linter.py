@@ -67,8 +67,8 @@ def check_script(source: str, robot_type: RobotType) -> Checked:
     except Problem as problem:
         return Checked((_refusal(source, problem),), None)
     tree = ast.parse(source)
-    found = sorted(_Reader(tree, names_of(robot_type)).marks(), key=lambda mark: (mark.line, mark.column))
-    return Checked(tuple(_in_characters(found[:MAX_MARKS], source)), script)
+    result = sorted(_Reader(tree, names_of(robot_type)).marks(), key=lambda mark: (mark.line, mark.column))
+    return Checked(tuple(_in_characters(result[:MAX_MARKS], source)), script)
 
 
 def _refusal(source: str, problem: Problem) -> Mark:
@@ -174,12 +174,12 @@ def _wrong_arguments(node: ast.Call, call: Call) -> Iterator[Mark]:
     if any(each.kind == "rest" for each in call.parameters):
         return
     order = [each.name for each in call.parameters if each.kind == "positional"]
-    known = [each.name for each in call.parameters]
+    existing = [each.name for each in call.parameters]
     if len(node.args) > len(order):
         yield _mark("warning", node.args[len(order)], f"Too many arguments: {call.signature}.")
     given = {*order[: len(node.args)]}
     for each in node.keywords:
-        if each.arg not in known:
+        if each.arg not in existing:
             yield _mark("warning", each, f"There is no argument '{each.arg}': {call.signature}.")
         elif each.arg in given:
             yield _mark("warning", each, f"'{each.arg}' is given twice.")
@@ -201,7 +201,7 @@ def _texts(value: ast.expr) -> Iterable[ast.Constant]:
 
 def _bound_by(node: ast.AST) -> set[str]:
     """The names that a node gives something to, wherever they are known."""
-    found: set[str] = set()
+    result: set[str] = set()
     match node:
         case (
             ast.Name(id=name, ctx=ast.Store() | ast.Del())
@@ -215,14 +215,14 @@ def _bound_by(node: ast.AST) -> set[str]:
             | ast.MatchStar(name=str(name))
             | ast.MatchMapping(rest=str(name))
         ):
-            found = {name}
+            result = {name}
         case ast.Assign(targets=targets):
-            found = {each.id for each in targets if isinstance(each, ast.Name)}
+            result = {each.id for each in targets if isinstance(each, ast.Name)}
         case ast.Import(names=names) | ast.ImportFrom(names=names):
-            found = {each.asname or each.name.partition(".")[0] for each in names}
+            result = {each.asname or each.name.partition(".")[0] for each in names}
         case ast.Global(names=several) | ast.Nonlocal(names=several):
-            found = set(several)
-    return found
+            result = set(several)
+    return result
 
 
 def _mark(severity: Literal["error", "warning"], node: ast.stmt | ast.expr | ast.keyword, message: str) -> Mark:

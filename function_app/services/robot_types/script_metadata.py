@@ -62,13 +62,13 @@ def _schema(tree: ast.Module) -> dict[str, Any] | None:
 
 def _literal(value: ast.expr) -> dict[str, Any]:
     try:
-        found = json.loads(json.dumps(ast.literal_eval(value), allow_nan=False))
+        result = json.loads(json.dumps(ast.literal_eval(value), allow_nan=False))
     except (ValueError, TypeError) as error:
         detail = f"Line {value.lineno}: {PARAMETERS} must be a plain dictionary, with nothing in it to compute."
         raise _bad(detail, line=value.lineno) from error
-    if not isinstance(found, dict):
+    if not isinstance(result, dict):
         raise _bad(f"Line {value.lineno}: {PARAMETERS} must be a dictionary: name → schema.", line=value.lineno)
-    return parameter_schema.plain(parameter_schema.of_properties(found))
+    return parameter_schema.plain(parameter_schema.of_properties(result))
 
 
 def _bad(detail: str, **extras: Any) -> Problem:

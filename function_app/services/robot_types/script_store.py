@@ -29,11 +29,11 @@ class ScriptStore:
         signature = signing.sign_text(signed_text(robot_type, movement), key, context=signing.MOVEMENT_CONTEXT)
         return replace(movement, key=signing.key_id(key.public_key()), signature=signature)
 
-    async def put(self, who: Identity, robot_type: str, movement: Movement, source: str) -> None:
+    async def put(self, caller: Identity, robot_type: str, movement: Movement, source: str) -> None:
         """Store a script; before the rows that name it, so that a row without its script cannot be."""
-        await self._blobs.put(blob_name(who, robot_type, movement), source.encode())
+        await self._blobs.put(blob_name(caller, robot_type, movement), source.encode())
 
-    async def get(self, who: Identity, robot_type: str, movement: Movement) -> str:
+    async def get(self, caller: Identity, robot_type: str, movement: Movement) -> str:
         """A script, once signature and hash are seen to be right.
 
         From memory where this process has read it before: content under its own hash never changes.
@@ -42,11 +42,11 @@ class ScriptStore:
             Problem: ``movement-damaged``.
         """
         await self._verify(robot_type, movement)
-        name = blob_name(who, robot_type, movement)
+        name = blob_name(caller, robot_type, movement)
         if name in self._kept:
             self._kept.move_to_end(name)
             return self._kept[name]
-        source = await self.find(who, robot_type, movement)
+        source = await self.find(caller, robot_type, movement)
         if source is None:
             raise _damaged(movement, "is missing or was changed in the store")
         self._kept[name] = source
@@ -54,16 +54,16 @@ class ScriptStore:
             self._kept.popitem(last=False)
         return source
 
-    async def find(self, who: Identity, robot_type: str, movement: Movement) -> str | None:
+    async def find(self, caller: Identity, robot_type: str, movement: Movement) -> str | None:
         """The script with the movement's hash; ``None`` when it is gone or was changed."""
-        content = await self._blobs.get(blob_name(who, robot_type, movement))
+        content = await self._blobs.get(blob_name(caller, robot_type, movement))
         if content is None or hashlib.sha256(content).hexdigest() != movement.sha256:
             return None
         return content.decode()
 
-    async def delete(self, who: Identity, robot_type: str, movement: Movement) -> None:
+    async def delete(self, caller: Identity, robot_type: str, movement: Movement) -> None:
         """Delete a script that no row names."""
-        await self._blobs.delete(blob_name(who, robot_type, movement))
+        await self._blobs.delete(blob_name(caller, robot_type, movement))
 
     async def _verify(self, robot_type: str, movement: Movement) -> None:
         key = (await self._keys.archive()).get(movement.key)
@@ -82,9 +82,9 @@ def signed_text(robot_type: str, movement: Movement) -> str:
     return signing.movement_text(robot_type, movement.name, movement.version, movement.sha256)
 
 
-def blob_name(who: Identity, robot_type: str, movement: Movement) -> str:
+def blob_name(caller: Identity, robot_type: str, movement: Movement) -> str:
     """Where a version's script is."""
-    return f"movements/{who.account}/{robot_type}/{movement.name}/{movement.version}-{movement.sha256}.py"
+    return f"movements/{caller.account}/{robot_type}/{movement.name}/{movement.version}-{movement.sha256}.py"
 
 
 def _damaged(movement: Movement, how: str) -> Problem:

@@ -5,7 +5,7 @@ from collections.abc import Mapping
 
 import msgspec
 
-from function_app.domain.audit.hash_chain import Deed
+from function_app.domain.audit.hash_chain import AccountEvent
 from function_app.domain.common.problems import Problem
 from function_app.domain.identity.accounts import Identity
 from function_app.domain.robot_types.robot_types import TypeHead, TypeVersion, next_version
@@ -47,7 +47,7 @@ class UploadRobotType:
         self._clock = clock
 
     async def upload(
-        self, who: Identity, manifest: str, files: Mapping[str, str], *, wait_ms: int
+        self, caller: Identity, manifest: str, files: Mapping[str, str], *, wait_ms: int
     ) -> tuple[KnownType, bool]:
         """Add a robot type, or the next version of one; and whether the account had none of this id.
 
@@ -58,22 +58,24 @@ class UploadRobotType:
             Problem: ``manifest-invalid``, ``robot-type-invalid``, ``robot-type-built-in``, ``robot-types-full``,
                 ``robot-type-checking``, ``robot-type-refused`` with ``errors``.
         """
-        return await self.add(who, read_upload(manifest, files), wait_ms=wait_ms)
+        return await self.add(caller, read_upload(manifest, files), wait_ms=wait_ms)
 
-    async def add(self, who: Identity, given: Upload, *, wait_ms: int) -> tuple[KnownType, bool]:
+    async def add(self, caller: Identity, given: Upload, *, wait_ms: int) -> tuple[KnownType, bool]:
         """As ``upload``, of files that have been read."""
-        where = Place(who.account, given.robot_type.type)
+        where = Place(caller.account, given.robot_type.type)
         await require_own(self._catalogue, where.type)
         await note_look(self._tables, where, self._clock.now_ms() + GIVE_UP_MS)
         await self._index(where)
-        async with self._chain.change(who.account, Deed.ROBOT_TYPE_UPLOADED, who, on=where.type) as change:
+        async with self._chain.change(
+            caller.account, AccountEvent.ROBOT_TYPE_UPLOADED, caller, on=where.type
+        ) as change:
             version, new = await self._number(where, given, change)
         await self._index(where)
         await self._versions.store(where, version, given.files)
         done = await self._versions.verdict(where, version, wait_ms)
         if done is not None and done.state == "refused":
             raise refused(done)
-        return await self._types.view(who, where.type), new
+        return await self._types.view(caller, where.type), new
 
     async def _index(self, where: Place) -> None:
         """List the type. A new ETag each time keeps a deletion that began before from taking it off the list."""
@@ -96,7 +98,7 @@ class UploadRobotType:
         manifest = msgspec.to_builtins(given.robot_type)
         sizes = {name: len(content) for name, content in given.files.items()}
 
-        async def once() -> tuple[int, bool]:
+        async def attempt() -> tuple[int, bool]:
             row, head = await read_head(self._tables, where)
             if head is not None and not head.deleted:
                 await self._require_no_other(where, head)
@@ -111,7 +113,7 @@ class UploadRobotType:
             await self._tables.batch(records.ROBOT_TYPES, writes)
             return following.last, head is None or head.deleted
 
-        return await records.retry(once)
+        return await records.retry(attempt)
 
     async def _require_no_other(self, where: Place, head: TypeHead) -> None:
         _, newest = await read_version(self._tables, where, head.last)

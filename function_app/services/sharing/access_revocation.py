@@ -100,9 +100,9 @@ class AccessRevocation:
         return True
 
     async def _end_at(self, device: Device, account: str, until_s: float, *, again: bool) -> bool:
-        who = Identity(account, "", "")
-        found, _ = await self._devices.find(who, device.id)
-        if found is not None and found.role.may_operate:
+        caller = Identity(account, "", "")
+        result, _ = await self._devices.find(caller, device.id)
+        if result is not None and result.role.may_operate:
             return True
         done = await self._fence.end(device, UNSHARED, account=account, until_s=until_s)
         if again:
@@ -113,24 +113,26 @@ class AccessRevocation:
         control = await read_control_rows(self._tables, device.id)
         waiting = []
         for action in control.queue.actions:
-            found = await self._rows.get(action)
-            if found is not None and found.action.account == account:
+            result = await self._rows.get(action)
+            if result is not None and result.action.account == account:
                 waiting.append(action)
         if waiting:
             await self._queues.drop(device.id, waiting, UNSHARED)
-        found = await self._rows.get(control.action) if control.action else None
-        if found is None or found.action.account != account or found.action.pairing != device.pairing:
+        result = await self._rows.get(control.action) if control.action else None
+        if result is None or result.action.account != account or result.action.pairing != device.pairing:
             return True
         # Written before it is told. Where this is not heard, the lease's release is told until it is: it holds, too.
         status, message = DROPPED[UNSHARED]
         now_ms = self._clock.now_ms()
-        await self._queues.change(found.action.id, lambda known: end(known, status, UNSHARED, message, now_ms))
-        epoch = max(control.lease.epoch if control.lease else 0, found.action.epoch)
+        await self._queues.change(result.action.id, lambda existing: end(existing, status, UNSHARED, message, now_ms))
+        epoch = max(control.lease.epoch if control.lease else 0, result.action.epoch)
         try:
             async with asyncio.timeout_at(until_s):
-                await self._commands.send(device, CancelAction(action=found.action.id), who="telescope", epoch=epoch)
+                await self._commands.send(
+                    device, CancelAction(action=result.action.id), caller="telescope", epoch=epoch
+                )
         except (BusUnavailable, TimeoutError) as error:
-            _log.warning("end of action %s: %s", found.action.id, str(error) or "the broker did not answer in time")
+            _log.warning("end of action %s: %s", result.action.id, str(error) or "the broker did not answer in time")
             return False
         return True
 

@@ -9,7 +9,7 @@ import hashlib
 from dataclasses import dataclass
 from typing import Final
 
-from function_app.domain.audit.hash_chain import Deed
+from function_app.domain.audit.hash_chain import AccountEvent
 from function_app.domain.common.ids import ID, new_id
 from function_app.domain.common.problems import Problem, forbidden, not_found
 from function_app.domain.devices import invitations as rules
@@ -87,7 +87,7 @@ class Invitations:
 
     # ------------------------------------------------------------ the owner's side
 
-    async def agent(self, who: Identity, agent_id: str) -> Shared:
+    async def agent(self, caller: Identity, agent_id: str) -> Shared:
         """An agent of the caller's own, to hand it over.
 
         Raises:
@@ -95,25 +95,25 @@ class Invitations:
         """
         row = await self._tables.get(records.AGENTS, agent_id, "agent")
         agent = records.read(row, Agent) if row else None
-        if agent is None or agent.account != who.account:
+        if agent is None or agent.account != caller.account:
             raise not_found("agent", agent_id)
-        require_person(who)
-        owner = Account(who.account, await self._sign_in.named(who.account))
+        require_person(caller)
+        owner = Account(caller.account, await self._sign_in.named(caller.account))
         return Shared(f"agent:{agent_id}", owner, agent.name, agent.pairing)
 
-    async def space(self, who: Identity, space: str) -> Shared:
+    async def space(self, caller: Identity, space: str) -> Shared:
         """A space of the caller's own, to hand it over.
 
         Raises:
             Problem: ``space-unknown``, ``forbidden``, ``last-space``.
         """
-        shared = await self._sharing.of(who, "space", space)
-        require_person(who)
-        if len(await self._sign_in.spaces(who.account)) == 1:
+        shared = await self._sharing.of(caller, "space", space)
+        require_person(caller)
+        if len(await self._sign_in.spaces(caller.account)) == 1:
             raise _last_space("It is this account's only space. Make another one first.")
         return shared
 
-    async def make(self, who: Identity, shared: Shared, offer: Offer) -> tuple[str, Known]:
+    async def make(self, caller: Identity, shared: Shared, offer: Offer) -> tuple[str, Known]:
         """A new invitation, and its secret, which nobody can be told again.
 
         Raises:
@@ -121,15 +121,15 @@ class Invitations:
         """
         if offer.role is Role.OWNER and offer.account == shared.owner.id:
             raise yours("It belongs to this account already. Name another one, or none for whoever has the link.")
-        if len(await self.open(shared)) >= rules.MOST:
-            detail = f"There are {rules.MOST} open invitations to it, the most there can be. Take one back."
+        if len(await self.open(shared)) >= rules.MAX_INVITATIONS:
+            detail = f"There are {rules.MAX_INVITATIONS} open invitations to it, the most there can be. Take one back."
             raise Problem("too-many-invitations", 409, "Too many invitations", detail)
         now_ms = self._clock.now_ms()
-        fresh = Invitation(
+        created = Invitation(
             on=shared.on,
             role=offer.role,
             owner=shared.owner.id,
-            by=who.name,
+            by=caller.name,
             label=shared.label,
             uses=offer.uses,
             created_ms=now_ms,
@@ -139,49 +139,53 @@ class Invitations:
             account=offer.account,
         )
         secret = new_secret()
-        known = Known(_hash(secret), fresh)
+        existing = Known(_hash(secret), created)
         # Forgotten on time whatever happens from here on, and listed before it can be redeemed.
-        await self._forget.row(records.INVITATIONS, known.id[0], known.id, due_ms=fresh.expires_ms)
-        await self._forget.row(records.SHARES, fresh.on, _INDEX + known.id, due_ms=fresh.expires_ms)
-        await self._tables.create(records.SHARES, Row(fresh.on, _INDEX + known.id, {"expires_ms": fresh.expires_ms}))
-        terms = {"invitation": known.id[:12], "role": offer.role.value, "uses": offer.uses, "for": offer.account}
-        async with self._chain.change(fresh.owner, Deed.INVITED, who, on=fresh.on, **terms) as change:
+        await self._forget.row(records.INVITATIONS, existing.id[0], existing.id, due_ms=created.expires_ms)
+        await self._forget.row(records.SHARES, created.on, _INDEX + existing.id, due_ms=created.expires_ms)
+        await self._tables.create(
+            records.SHARES, Row(created.on, _INDEX + existing.id, {"expires_ms": created.expires_ms})
+        )
+        terms = {"invitation": existing.id[:12], "role": offer.role.value, "uses": offer.uses, "for": offer.account}
+        async with self._chain.change(created.owner, AccountEvent.INVITED, caller, on=created.on, **terms) as change:
             await change.noted()
-            await self._tables.create(records.INVITATIONS, Row(known.id[0], known.id, records.fields(fresh)))
-        return secret, known
+            await self._tables.create(records.INVITATIONS, Row(existing.id[0], existing.id, records.fields(created)))
+        return secret, existing
 
     async def open(self, shared: Shared) -> list[Known]:
         """Open invitations to something, oldest first."""
         page = await self._tables.query(records.SHARES, shared.on, first=_INDEX, last="invitation;", limit=1000)
-        found = [await self._get(row.key.removeprefix(_INDEX)) for row in page.rows]
+        result = [await self._get(row.key.removeprefix(_INDEX)) for row in page.rows]
         now_ms = self._clock.now_ms()
-        known = [
+        existing = [
             Known(row.key, invitation)
-            for row, invitation in found
+            for row, invitation in result
             if row is not None
             and invitation is not None
             and invitation.open(now_ms)
             and (invitation.owner, invitation.pairing) == (shared.owner.id, shared.pairing)
         ]
-        return sorted(known, key=lambda each: each.invitation.created_ms)
+        return sorted(existing, key=lambda each: each.invitation.created_ms)
 
-    async def withdraw(self, who: Identity, shared: Shared, invitation: str) -> None:
+    async def withdraw(self, caller: Identity, shared: Shared, invitation: str) -> None:
         """Take an invitation back. What was redeemed stays shared.
 
         Raises:
             Problem: ``invitation-unknown``, ``busy``.
         """
 
-        async def once() -> None:
-            row, known = await self._get(invitation)
-            if row is None or known is None or known.on != shared.on or not known.open(self._clock.now_ms()):
+        async def attempt() -> None:
+            row, existing = await self._get(invitation)
+            if row is None or existing is None or existing.on != shared.on or not existing.open(self._clock.now_ms()):
                 raise not_found("invitation", invitation)
             await change.noted()
             await self._tables.delete(records.INVITATIONS, row)
 
         named = {"invitation": invitation[:12]}
-        async with self._chain.change(shared.owner.id, Deed.INVITATION_REVOKED, who, on=shared.on, **named) as change:
-            await records.retry(once)
+        async with self._chain.change(
+            shared.owner.id, AccountEvent.INVITATION_REVOKED, caller, on=shared.on, **named
+        ) as change:
+            await records.retry(attempt)
         await self._unlist(shared.on, invitation)
 
     # ------------------------------------------------------------ the other side
@@ -200,67 +204,69 @@ class Invitations:
         Raises:
             Problem: ``invitation-unknown``.
         """
-        row, known = await self._get(invitation)
-        if row is None or known is None or not known.open(self._clock.now_ms()) or not await self._good(known):
+        row, existing = await self._get(invitation)
+        if row is None or existing is None or not existing.open(self._clock.now_ms()) or not await self._good(existing):
             raise _unknown()
-        return Known(row.key, known)
+        return Known(row.key, existing)
 
-    async def redeem(self, who: Identity, known: Known, *, space: str | None = None) -> None:
+    async def redeem(self, caller: Identity, existing: Known, *, space: str | None = None) -> None:
         """Take what an invitation offers.
 
         Args:
-            who: Who takes it.
-            known: The invitation, which they have shown the secret of.
+            caller: Who takes it.
+            existing: The invitation, which they have shown the secret of.
             space: The space of theirs for an agent that is handed over; ``None``: their first.
 
         Raises:
             Problem: ``invitation-unknown``; ``forbidden``: it is for another account, or an API key asks;
                 ``already-yours``, ``last-space``, ``space-unknown``, ``too-many-shares``, ``transfer-void``, ``busy``.
         """
-        require_person(who)
-        offered = known.invitation
-        if offered.account and offered.account != who.account:
+        require_person(caller)
+        offered = existing.invitation
+        if offered.account and offered.account != caller.account:
             raise forbidden("This invitation is for another account. Sign in as the one it was made for.")
-        if offered.owner == who.account:
+        if offered.owner == caller.account:
             raise yours("It belongs to this account: there is nothing to take. Send the link to somebody else.")
         if offered.role is Role.OWNER:
-            await self._take(who, known, space)
+            await self._take(caller, existing, space)
         else:
-            await self._use(who, known)
+            await self._use(caller, existing)
             owner = Account(offered.owner, offered.by)
             shared = Shared(offered.on, owner, offered.label, offered.pairing)
             giver = Identity(offered.owner, offered.by, "")
             ends_ms = offered.ends_ms(self._clock.now_ms())
-            await self._sharing.give(giver, shared, Account(who.account, who.name), offered.role, ends_ms)
+            await self._sharing.give(giver, shared, Account(caller.account, caller.name), offered.role, ends_ms)
 
     async def go_on(self, what: str, note: Row) -> None:
         """The timer's look at a transfer that was accepted."""
-        row, known = await self._get(what.removeprefix(_NOTE))
-        if row is not None and known is not None and known.taken_by:
+        row, existing = await self._get(what.removeprefix(_NOTE))
+        if row is not None and existing is not None and existing.taken_by:
             with contextlib.suppress(_Void):
-                await self._carry_out(row.key, known)
+                await self._carry_out(row.key, existing)
         await self._pending.drop(note)
 
-    async def _take(self, who: Identity, known: Known, space: str | None) -> None:
+    async def _take(self, caller: Identity, existing: Known, space: str | None) -> None:
         """Accept a transfer. The write on the invitation decides; from then on the timer sees to it as well."""
-        kind, _ = split_target(known.invitation.on)
+        kind, _ = split_target(existing.invitation.on)
         goal = new_id(12)
         if kind == "agent":
-            own = await self._sign_in.spaces(who.account)
+            own = await self._sign_in.spaces(caller.account)
             chosen = next((each.id for each in own if space in {None, each.id}), None)
             if chosen is None:
                 raise not_found("space", space or "")
             goal = chosen
-        elif len(await self._sign_in.spaces(known.invitation.owner)) == 1:
+        elif len(await self._sign_in.spaces(existing.invitation.owner)) == 1:
             # It was not when it was offered: another one was handed over since.
-            raise _last_space(f"It is {known.invitation.by}'s only space by now. Ask them to make another one first.")
-        note = await self._pending.note(f"{_NOTE}{known.id}", self._clock.now_ms() + LOOK_MS)
+            raise _last_space(
+                f"It is {existing.invitation.by}'s only space by now. Ask them to make another one first."
+            )
+        note = await self._pending.note(f"{_NOTE}{existing.id}", self._clock.now_ms() + LOOK_MS)
 
-        async def once() -> Invitation:
-            row, fresh = await self._get(known.id)
-            if row is None or fresh is None or not fresh.open(self._clock.now_ms()):
+        async def attempt() -> Invitation:
+            row, created = await self._get(existing.id)
+            if row is None or created is None or not created.open(self._clock.now_ms()):
                 raise _unknown()
-            taken = fresh.taken(who.account, goal)
+            taken = created.taken(caller.account, goal)
             await given.noted()
             await got.noted()
             await self._tables.replace(
@@ -268,14 +274,14 @@ class Invitations:
             )
             return taken
 
-        owner, on, to = known.invitation.owner, known.invitation.on, {"to": who.account}
+        owner, on, to = existing.invitation.owner, existing.invitation.on, {"to": caller.account}
         async with (
-            self._chain.change(owner, Deed.TRANSFERRED, who, on=on, **to) as given,
-            self._chain.change(who.account, Deed.TRANSFERRED, who, on=on, **to) as got,
+            self._chain.change(owner, AccountEvent.TRANSFERRED, caller, on=on, **to) as given,
+            self._chain.change(caller.account, AccountEvent.TRANSFERRED, caller, on=on, **to) as got,
         ):
-            taken = await records.retry(once)
+            taken = await records.retry(attempt)
         try:
-            await self._carry_out(known.id, taken)
+            await self._carry_out(existing.id, taken)
         except _Void as nothing:
             raise void() from nothing
         if note is not None:
@@ -291,14 +297,19 @@ class Invitations:
             raise _Void from problem
         await self._delete(invitation, taken)
 
-    async def _use(self, who: Identity, known: Known) -> None:
+    async def _use(self, caller: Identity, existing: Known) -> None:
         """Count one use, or find that somebody else was faster."""
 
-        async def once() -> None:
-            row, fresh = await self._get(known.id)
-            if row is None or fresh is None or not fresh.open(self._clock.now_ms()) or who.account in fresh.takers:
+        async def attempt() -> None:
+            row, created = await self._get(existing.id)
+            if (
+                row is None
+                or created is None
+                or not created.open(self._clock.now_ms())
+                or caller.account in created.takers
+            ):
                 raise _unknown()
-            left = fresh.used(who.account)
+            left = created.used(caller.account)
             await change.noted()
             if left.uses:
                 await self._tables.replace(
@@ -306,20 +317,20 @@ class Invitations:
                 )
             else:
                 await self._tables.delete(records.INVITATIONS, row)
-                await self._unlist(left.on, known.id)
+                await self._unlist(left.on, existing.id)
 
-        owner, on, terms = known.invitation.owner, known.invitation.on, {"invitation": known.id[:12]}
-        async with self._chain.change(owner, Deed.INVITATION_REDEEMED, who, on=on, **terms) as change:
-            await records.retry(once)
+        owner, on, terms = existing.invitation.owner, existing.invitation.on, {"invitation": existing.id[:12]}
+        async with self._chain.change(owner, AccountEvent.INVITATION_REDEEMED, caller, on=on, **terms) as change:
+            await records.retry(attempt)
 
-    async def _good(self, known: Invitation) -> bool:
+    async def _good(self, existing: Invitation) -> bool:
         """Whether what it offers is still the offerer's."""
-        kind, name = split_target(known.on)
+        kind, name = split_target(existing.on)
         if kind == "space":
-            return await self._tables.get(records.ACCOUNTS, known.owner, f"space:{name}") is not None
+            return await self._tables.get(records.ACCOUNTS, existing.owner, f"space:{name}") is not None
         row = await self._tables.get(records.AGENTS, name.partition("-")[0], "agent")
         agent = records.read(row, Agent) if row else None
-        return agent is not None and (agent.account, agent.pairing) == (known.owner, known.pairing)
+        return agent is not None and (agent.account, agent.pairing) == (existing.owner, existing.pairing)
 
     async def _get(self, invitation: str) -> tuple[Row | None, Invitation | None]:
         if not ID.match(invitation):
@@ -327,12 +338,12 @@ class Invitations:
         row = await self._tables.get(records.INVITATIONS, invitation[0], invitation)
         return row, records.read(row, Invitation) if row else None
 
-    async def _delete(self, invitation: str, known: Invitation) -> None:
+    async def _delete(self, invitation: str, existing: Invitation) -> None:
         row, _ = await self._get(invitation)
         if row is not None:
             with contextlib.suppress(Conflict):
                 await self._tables.delete(records.INVITATIONS, row)
-        await self._unlist(known.on, invitation)
+        await self._unlist(existing.on, invitation)
 
     async def _unlist(self, on: str, invitation: str) -> None:
         row = await self._tables.get(records.SHARES, on, _INDEX + invitation)

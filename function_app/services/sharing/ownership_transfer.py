@@ -75,7 +75,7 @@ class Transfer:
         """Take an agent over, if it is still of that pairing, or in that space; whether it is the new owner's."""
         await self._leave.watch(agent_id)
 
-        async def once() -> Agent | None:
+        async def attempt() -> Agent | None:
             row = await self._tables.get(records.AGENTS, agent_id, "agent")
             agent = records.read(row, Agent) if row else None
             if row is None or agent is None:
@@ -85,7 +85,7 @@ class Transfer:
             if space and agent.space != space:
                 return agent
             now_ms = self._clock.now_ms()
-            changed = rules.hand_over(
+            changed = rules.transfer(
                 agent, account=taken.taken_by, space=taken.taken_space, pairing=new_id(), now_ms=now_ms
             )
             member = _Member(changed.pairing)
@@ -95,7 +95,7 @@ class Transfer:
             await self._tables.replace(records.AGENTS, Row(agent_id, "agent", records.fields(changed), row.etag))
             return changed
 
-        agent = await records.retry(once)
+        agent = await records.retry(attempt)
         if agent is not None and agent.leaving:
             await self._leave.finish(agent_id)
         return agent is not None and agent.account == taken.taken_by

@@ -9,17 +9,17 @@ import logging
 from dataclasses import dataclass, replace
 from typing import Final, Literal
 
-from function_app.domain.audit.hash_chain import Deed
+from function_app.domain.audit.hash_chain import AccountEvent
 from function_app.domain.common.problems import Problem, forbidden, invalid, not_found
 from function_app.domain.common.timestamps import NEVER_MS
 from function_app.domain.control.control_events import Fact
 from function_app.domain.devices.access import (
-    MOST_SHARES,
+    MAX_SHARES,
     Share,
     device_target,
-    lasting,
+    expiry_ms,
     outranks,
-    shareable,
+    require_shareable,
     space_target,
     split_target,
 )
@@ -83,7 +83,7 @@ class Sharing:
 
     # ------------------------------------------------------------ what people ask for
 
-    async def of(self, who: Identity, kind: Literal["device", "space"], name: str) -> Shared:
+    async def of(self, caller: Identity, kind: Literal["device", "space"], name: str) -> Shared:
         """A device or space of the caller's own, to share it.
 
         Raises:
@@ -91,13 +91,13 @@ class Sharing:
                 outlive it.
         """
         if kind == "space":
-            view = await self._spaces.own(who, name)
-            require_person(who)
+            view = await self._spaces.own(caller, name)
+            require_person(caller)
             return Shared(space_target(name), view.owner, view.space.name)
-        device = await self._devices.get(who, name)
-        async with self._audit.refusals(device, who, "share it"):
+        device = await self._devices.get(caller, name)
+        async with self._audit.refusals(device, caller, "share it"):
             require_owner(device)
-        require_person(who)
+        require_person(caller)
         owner = Account(device.owner, await self._sign_in.named(device.owner))
         return Shared(device_target(name), owner, device.label, device.pairing)
 
@@ -105,12 +105,12 @@ class Sharing:
         """With whom it is shared now, each with the account's name."""
         page = await self._tables.query(records.SHARES, shared.on, first="account:", last="account;", limit=1000)
         now_ms = self._clock.now_ms()
-        found = [share for row in page.rows if _holds(share := records.read(row, Share), shared, now_ms)]
-        names = await asyncio.gather(*(self._sign_in.named(share.account) for share in found))
-        return sorted(zip(found, names, strict=True), key=lambda each: each[0].created_ms)
+        result = [share for row in page.rows if _holds(share := records.read(row, Share), shared, now_ms)]
+        names = await asyncio.gather(*(self._sign_in.named(share.account) for share in result))
+        return sorted(zip(result, names, strict=True), key=lambda each: each[0].created_ms)
 
     async def put(
-        self, who: Identity, shared: Shared, account: Account, role: Role, for_s: int | None
+        self, caller: Identity, shared: Shared, account: Account, role: Role, for_s: int | None
     ) -> tuple[Share, bool, bool]:
         """Share it with an account, or change that.
 
@@ -121,16 +121,16 @@ class Sharing:
         Raises:
             Problem: ``invalid``, ``too-many-shares``, ``busy``.
         """
-        expires_ms = lasting(for_s, self._clock.now_ms())
-        share = self._share(shared, account.id, shareable(role), who.name, expires_ms)
-        return await self._write(who, shared, account, share, keep_more=False)
+        expires_ms = expiry_ms(for_s, self._clock.now_ms())
+        share = self._share(shared, account.id, require_shareable(role), caller.name, expires_ms)
+        return await self._write(caller, shared, account, share, keep_more=False)
 
-    async def give(self, who: Identity, shared: Shared, account: Account, role: Role, expires_ms: int) -> Share:
+    async def give(self, caller: Identity, shared: Shared, account: Account, role: Role, expires_ms: int) -> Share:
         """The same by an invitation, which takes nothing away from who has more already."""
-        share = self._share(shared, account.id, role, who.name, expires_ms)
-        return (await self._write(who, shared, account, share, keep_more=True))[0]
+        share = self._share(shared, account.id, role, caller.name, expires_ms)
+        return (await self._write(caller, shared, account, share, keep_more=True))[0]
 
-    async def end(self, who: Identity, shared: Shared, account: str) -> bool:
+    async def end(self, caller: Identity, shared: Shared, account: str) -> bool:
         """Un-share; whether everybody has been told. Else the timer tells them as soon as the broker answers.
 
         Raises:
@@ -139,7 +139,7 @@ class Sharing:
         row = await self._tables.get(records.SHARES, shared.on, share_key(account))
         if row is None or not _holds(records.read(row, Share), shared, self._clock.now_ms()):
             raise not_found("share", account)
-        return await self._end(who, row)
+        return await self._end(caller, row)
 
     async def end_all(self, on: str) -> None:
         """End all shares of something that its owner has given away.
@@ -151,19 +151,19 @@ class Sharing:
         for row in page.rows:
             await self._end(None, row)
 
-    async def leave(self, who: Identity, on: str) -> bool:
+    async def leave(self, caller: Identity, on: str) -> bool:
         """Give one's own part in something of another's back; whether everybody has been told, as ``end``.
 
         Raises:
             Problem: ``share-unknown``, ``already-yours``, ``forbidden``, ``busy``.
         """
-        require_person(who)
-        row = await self._tables.get(records.SHARES, on, share_key(who.account))
-        if row is None and await self._owns(who, on):
+        require_person(caller)
+        row = await self._tables.get(records.SHARES, on, share_key(caller.account))
+        if row is None and await self._owns(caller, on):
             raise yours("It is this account's own, which has no share in it. To be rid of it, transfer or un-pair it.")
         if row is None:
-            raise not_found("share", who.account)
-        return await self._end(who, row)
+            raise not_found("share", caller.account)
+        return await self._end(caller, row)
 
     async def person(self, name: str) -> Account:
         """The account of this name.
@@ -171,18 +171,18 @@ class Sharing:
         Raises:
             Problem: ``account-unknown``.
         """
-        found = await self._sign_in.known(name)
-        if found is None:
+        result = await self._sign_in.known(name)
+        if result is None:
             detail = f"There is no account '{name[:80]}'. Ask for the name they sign in with, or make an invitation."
             raise Problem("account-unknown", 404, "No such account", detail)
-        return found
+        return result
 
-    async def _owns(self, who: Identity, on: str) -> bool:
+    async def _owns(self, caller: Identity, on: str) -> bool:
         kind, name = split_target(on)
         if kind == "space":
-            return name in {space.id for space in await self._sign_in.spaces(who.account)}
-        device, _ = await self._devices.find(who, name)
-        return device is not None and device.owner == who.account
+            return name in {space.id for space in await self._sign_in.spaces(caller.account)}
+        device, _ = await self._devices.find(caller, name)
+        return device is not None and device.owner == caller.account
 
     # ------------------------------------------------------------ writing
 
@@ -201,7 +201,7 @@ class Sharing:
         )
 
     async def _write(
-        self, who: Identity, shared: Shared, account: Account, share: Share, *, keep_more: bool
+        self, caller: Identity, shared: Shared, account: Account, share: Share, *, keep_more: bool
     ) -> tuple[Share, bool, bool]:
         note = await self._pending.note(_note(_CHANGED, share), self._clock.now_ms() + LOOK_MS)
         if share.expires_ms < NEVER_MS:
@@ -210,11 +210,11 @@ class Sharing:
         await index(self._tables, share)
         lowered = False
 
-        async def once() -> tuple[Share, bool]:
+        async def attempt() -> tuple[Share, bool]:
             nonlocal lowered
             row = await self._tables.get(records.SHARES, share.on, share_key(share.account))
-            known = records.read(row, Share) if row else None
-            before = known if known is not None and _holds(known, shared, self._clock.now_ms()) else None
+            existing = records.read(row, Share) if row else None
+            before = existing if existing is not None and _holds(existing, shared, self._clock.now_ms()) else None
             if before is not None and keep_more and not _more(share, before):
                 return before, False
             lowered = before is not None and (outranks(before.role, share.role) or share.expires_ms < before.expires_ms)
@@ -230,45 +230,47 @@ class Sharing:
             return share, before is None
 
         terms = {"with": account.id, "name": account.name, "role": share.role.value, "expires_ms": share.expires_ms}
-        async with self._chain.change(share.owner, Deed.SHARED, who, on=share.on, **terms) as change:
-            written, fresh = await records.retry(once)
+        async with self._chain.change(share.owner, AccountEvent.SHARED, caller, on=share.on, **terms) as change:
+            written, created = await records.retry(attempt)
         if written is share:
-            message = f"{who.name} shared it with {account.name} as {share.role}."
-            await self._tell(share, Fact.SHARED, message, by=who.name, account=account.id, role=share.role.value)
-        return written, fresh, not lowered or await self._settle(share, note)
+            message = f"{caller.name} shared it with {account.name} as {share.role}."
+            await self._tell(share, Fact.SHARED, message, by=caller.name, account=account.id, role=share.role.value)
+        return written, created, not lowered or await self._settle(share, note)
 
     async def _check_room(self, on: str) -> None:
-        page = await self._tables.query(records.SHARES, on, first="account:", last="account;", limit=MOST_SHARES)
+        page = await self._tables.query(records.SHARES, on, first="account:", last="account;", limit=MAX_SHARES)
         now_ms = self._clock.now_ms()
         dead = [row for row in page.rows if not records.read(row, Share).live(now_ms)]
-        if len(page.rows) - len(dead) >= MOST_SHARES:
-            detail = f"It is shared with {MOST_SHARES} accounts, the most there can be. End one of these shares."
+        if len(page.rows) - len(dead) >= MAX_SHARES:
+            detail = f"It is shared with {MAX_SHARES} accounts, the most there can be. End one of these shares."
             raise Problem("too-many-shares", 409, "Too many shares", detail)
 
-    async def _end(self, who: Identity | None, row: Row) -> bool:
+    async def _end(self, caller: Identity | None, row: Row) -> bool:
         """Delete the share's row, which decides, and end what was done under it; whether everybody has been told."""
         share = records.read(row, Share)
         note = await self._pending.note(_note(_CHANGED, share), self._clock.now_ms() + LOOK_MS)
         name = await self._sign_in.named(share.account)
         on = {"on": share.on, "with": share.account, "name": name}
-        async with self._chain.change(share.owner, Deed.UNSHARED, who, **on) as change:
+        async with self._chain.change(share.owner, AccountEvent.UNSHARED, caller, **on) as change:
             await change.noted()
             try:
                 await self._tables.delete(records.SHARES, row)
             except Conflict:
                 change.came_to_nothing = True
         if change.came_to_nothing:
-            fresh = await self._tables.get(records.SHARES, row.partition, row.key)
+            created = await self._tables.get(records.SHARES, row.partition, row.key)
             # What time has ended, and somebody has shared anew at that moment, goes on.
-            if fresh is not None and (who is not None or not records.read(fresh, Share).live(self._clock.now_ms())):
-                return await self._end(who, fresh)
+            if created is not None and (
+                caller is not None or not records.read(created, Share).live(self._clock.now_ms())
+            ):
+                return await self._end(caller, created)
             return True
         done = await self._settle(share, note)
-        if who is None:
+        if caller is None:
             await self._tell(share, Fact.UNSHARED, f"{name}'s share is over.", account=share.account)
         else:
-            message = f"{who.name} ended {name}'s share."
-            await self._tell(share, Fact.UNSHARED, message, by=who.name, account=share.account)
+            message = f"{caller.name} ended {name}'s share."
+            await self._tell(share, Fact.UNSHARED, message, by=caller.name, account=share.account)
         return done
 
     async def _settle(self, share: Share, note: Row | None) -> bool:
@@ -301,13 +303,13 @@ class Sharing:
         await self._pending.drop(note)
 
 
-def require_person(who: Identity) -> None:
+def require_person(caller: Identity) -> None:
     """See that it is a person who shares, gives away or takes: an API key never does.
 
     Raises:
         Problem: ``forbidden``.
     """
-    if who.key:
+    if caller.key:
         raise forbidden("An API key shares nothing, gives nothing away and takes nothing. Sign in for that.")
 
 

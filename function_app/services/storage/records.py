@@ -109,7 +109,7 @@ async def upsert(  # noqa: PLR0917 (a place, a change, a type: read best in this
 ) -> T | None:
     """Change one record that may not exist yet; ``change`` gives ``None`` to leave it as it is."""
 
-    async def once() -> T | None:
+    async def attempt() -> T | None:
         row = await tables.get(table, partition, key)
         record = change(None if row is None else read(row, kind))
         if record is None:
@@ -121,4 +121,4 @@ async def upsert(  # noqa: PLR0917 (a place, a change, a type: read best in this
             await tables.replace(table, Row(partition, key, data, row.etag))
         return record
 
-    return await retry(once)
+    return await retry(attempt)

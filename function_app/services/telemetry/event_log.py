@@ -61,14 +61,14 @@ class Events:
 
     async def _note(self, partition: str, day: int, seen_day: int) -> None:
         """See that the events of one day that were seen on another will be forgotten: one note for all of them."""
-        known = (partition, day, seen_day)
-        if known in self._noted:
+        existing = (partition, day, seen_day)
+        if existing in self._noted:
             return
         # Keys count down with time: the day's last moment comes first.
         first, last = (new_suffix((day + 1) * DAY_MS - 1)[:9], new_suffix(day * DAY_MS)[:9] + ";")
         due_ms = (seen_day + 1) * DAY_MS + KEEP_EVENTS_MS
         await self._forget.rows(records.EVENTS, partition, first=first, last=last, due_ms=due_ms)
-        self._noted[known] = None
+        self._noted[existing] = None
         if len(self._noted) > _NOTED:
             del self._noted[next(iter(self._noted))]
 

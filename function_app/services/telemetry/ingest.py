@@ -97,19 +97,19 @@ class TelemetryIngest:
         for number, message in enumerate(messages):
             if number % _AT_ONCE == 0:
                 await asyncio.sleep(0)
-            known = await self._agent(message.topic.agent)
-            device = known.devices.get(message.topic.device)
-            if device is None or known.space != message.topic.space:
+            existing = await self._agent(message.topic.agent)
+            device = existing.devices.get(message.topic.device)
+            if device is None or existing.space != message.topic.space:
                 continue
             try:
-                sample = _sample(message, known.joints.get(message.topic.device, ()))
+                sample = _sample(message, existing.joints.get(message.topic.device, ()))
             except ProtocolError as error:
                 _log.warning("%s of %s dropped: %s", message.topic.name, device.id, error)
                 dropped[number] = str(error)
                 continue
             devices[device.id] = device
             parts[device.id, message.topic.name].append(sample)
-        gathered = [_Part(devices[id_], stream, series.gather(rows)) for (id_, stream), rows in parts.items()]
+        gathered = [_Part(devices[id_], stream, series.from_rows(rows)) for (id_, stream), rows in parts.items()]
         for batch in _batches(gathered):
             await self._distribute(await self._queue(batch), batch)
         return dropped
@@ -156,8 +156,8 @@ class TelemetryIngest:
         parts: list[_Part] = []
         for part in row.data["parts"]:
             agent, name = split_device(part["device"]) or ("", "")
-            known = await self._agent(agent)
-            device = known.devices.get(name)
+            existing = await self._agent(agent)
+            device = existing.devices.get(name)
             if device is not None and device.pairing == part["pairing"]:
                 parts.append(_Part(device, part["stream"], series.unpack(part["samples"])))
         return parts
@@ -181,21 +181,21 @@ class TelemetryIngest:
 
     async def _agent(self, agent_id: str) -> _Agent:
         now_ms = self._clock.now_ms()
-        known = self._agents.get(agent_id)
-        if known is not None and 0 <= now_ms - known.read_ms < KNOWN_MS:
-            return known
+        existing = self._agents.get(agent_id)
+        if existing is not None and 0 <= now_ms - existing.read_ms < KNOWN_MS:
+            return existing
         if len(self._agents) >= MAX_KNOWN:
             self._agents.clear()
         row = await self._tables.get(records.AGENTS, agent_id, "agent") if agent_id else None
         agent = None if row is None else records.read(row, Agent)
         if agent is None or not agent.claimed:
-            known = _Agent(None, {}, {}, now_ms)
+            existing = _Agent(None, {}, {}, now_ms)
         else:
             page = await self._tables.query(records.DESCRIPTIONS, agent_id, limit=1000)
             joints = {row.key: _joints(records.read(row, Description)) for row in page.rows}
-            known = _Agent(agent.space, {device.name: device for device in devices_of(agent)}, joints, now_ms)
-        self._agents[agent_id] = known
-        return known
+            existing = _Agent(agent.space, {device.name: device for device in devices_of(agent)}, joints, now_ms)
+        self._agents[agent_id] = existing
+        return existing
 
 
 class _Part(NamedTuple):

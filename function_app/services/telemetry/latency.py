@@ -101,13 +101,13 @@ class Latencies:
         self._forget = forget
         self._clock = clock
 
-    async def add(self, device: Device, given: Samples, *, who: str, once: str = "") -> None:
+    async def add(self, device: Device, given: Samples, *, caller: str, once: str = "") -> None:
         """Count samples in. A batch that comes again changes nothing: same ``once``, or else the same samples.
 
         Args:
             device: Whose they are.
             given: The samples.
-            who: Who measured.
+            caller: Who measured.
             once: The sender's idempotency key for this batch.
 
         Raises:
@@ -117,7 +117,7 @@ class Latencies:
         fingerprint = given.fingerprint()
         name = once or fingerprint
         day = max(at_ms for at_ms, _ in given.samples) // DAY_MS
-        mark = _mark(day) + hashlib.sha256(f"{who}\n{name}".encode()).hexdigest()
+        mark = _mark(day) + hashlib.sha256(f"{caller}\n{name}".encode()).hexdigest()
         hours: dict[int, list[tuple[int, float]]] = {}
         for sample in given.samples:
             hours.setdefault(sample[0] // HOUR_MS, []).append(sample)
@@ -192,9 +192,9 @@ class Latencies:
         self, partition: str, mark: str, fingerprint: str, parts: Mapping[str, Sequence[tuple[int, float]]]
     ) -> None:
         """One batch: histograms and newest samples of each transport and path, and the note that they are in."""
-        known = await self._tables.get(records.LATENCY, partition, mark)
-        if known is not None:
-            if known.data["fingerprint"] != fingerprint:
+        existing = await self._tables.get(records.LATENCY, partition, mark)
+        if existing is not None:
+            if existing.data["fingerprint"] != fingerprint:
                 detail = "This Idempotency-Key was used with other samples. Use a new key for new samples."
                 raise invalid(detail, code="idempotency-key-reused")
             return
@@ -254,15 +254,15 @@ def _key(step: str, kind: str, at_ms: int) -> str:
 
 def _times(action: Action) -> dict[str, tuple[int, float]]:
     """What an action's times tell: differences of one clock each. What a clock makes that was set back is left out."""
-    found: dict[str, tuple[int, float]] = {}
+    result: dict[str, tuple[int, float]] = {}
     published_ms = action.times.get("published")
     if published_ms is not None and action.heard:
-        found["command-answered"] = (published_ms, min(action.heard.values()) - published_ms)
+        result["command-answered"] = (published_ms, min(action.heard.values()) - published_ms)
         if "started" in action.heard:
-            found["command-started"] = (published_ms, action.heard["started"] - published_ms)
+            result["command-started"] = (published_ms, action.heard["started"] - published_ms)
     if {"received", "started"} <= set(action.times):
-        found["received-started"] = (action.issued_ms, action.times["started"] - action.times["received"])
-    return {path: sample for path, sample in found.items() if 0 <= sample[1] <= histogram.LONGEST_MS}
+        result["received-started"] = (action.issued_ms, action.times["started"] - action.times["received"])
+    return {path: sample for path, sample in result.items() if 0 <= sample[1] <= histogram.LONGEST_MS}
 
 
 def _partition(device: str, pairing: str) -> str:

@@ -10,7 +10,16 @@ from device_agent.protocol import topics
 from function_app.domain.common.problems import invalid, not_found
 from function_app.domain.identity.accounts import Identity
 from function_app.domain.telemetry import series
-from function_app.domain.telemetry.series import FINEST, LEVELS, RAW, WINDOW_MS, Keep, Level, Samples, Summary
+from function_app.domain.telemetry.series import (
+    FINEST,
+    LEVELS,
+    RAW,
+    WINDOW_MS,
+    Level,
+    RetentionPolicy,
+    Samples,
+    Summary,
+)
 from function_app.ports.clock import Clock
 from function_app.ports.tables import Tables
 from function_app.services.devices.device_access import Devices
@@ -80,32 +89,32 @@ class StreamView(NamedTuple):
 class SeriesReader:
     """Reads what ``SeriesWriter`` has written."""
 
-    def __init__(self, *, tables: Tables, devices: Devices, keep: Keep, clock: Clock) -> None:
+    def __init__(self, *, tables: Tables, devices: Devices, keep: RetentionPolicy, clock: Clock) -> None:
         self._tables = tables
         self._devices = devices
         self._keep = keep
         self._clock = clock
 
-    async def streams(self, who: Identity, device: str) -> list[StreamView]:
+    async def streams(self, caller: Identity, device: str) -> list[StreamView]:
         """The streams of a device, by name.
 
         Raises:
             Problem: ``device-unknown``.
         """
-        found = await self._devices.get(who, device)
-        place = Place(found.id, found.pairing, "")
+        result = await self._devices.get(caller, device)
+        place = Place(result.id, result.pairing, "")
         listed = await self._tables.query(records.SERIES, place.streams, limit=MAX_STREAMS)
         views = await asyncio.gather(*(self._about(place._replace(stream=row.key)) for row in listed.rows))
         return [StreamView(row.key, about) for row, about in zip(listed.rows, views, strict=True) if about is not None]
 
-    async def read(self, who: Identity, device: str, stream: str, wanted: Range) -> Part:
+    async def read(self, caller: Identity, device: str, stream: str, wanted: Range) -> Part:
         """A page of one stream.
 
         Raises:
             Problem: ``device-unknown``, ``stream-unknown``, ``invalid``, ``cursor-invalid``.
         """
-        found = await self._devices.get(who, device)
-        place = Place(found.id, found.pairing, stream)
+        result = await self._devices.get(caller, device)
+        place = Place(result.id, result.pairing, stream)
         about = await self._about(place)
         if about is None:
             raise not_found("stream", stream)
@@ -125,7 +134,7 @@ class SeriesReader:
             part, _ = await self._buckets(level, asked)
             return part
         now_ms = self._clock.now_ms()
-        level = series.finest(first_ms, last_ms, points=wanted.points, now_ms=now_ms, keep=self._keep)
+        level = series.finest_level(first_ms, last_ms, points=wanted.points, now_ms=now_ms, keep=self._keep)
         part, samples = await self._buckets(level, asked)
         if level == FINEST and samples <= wanted.points and first_ms > now_ms - self._keep.raw_ms:
             return await self._raw(asked)

@@ -10,7 +10,7 @@ from dataclasses import dataclass, field
 from typing import Any, NamedTuple
 
 from function_app.domain.telemetry import series
-from function_app.domain.telemetry.series import DAY, LEVELS, RAW, Bucket, Keep, Level, Samples
+from function_app.domain.telemetry.series import DAY, LEVELS, RAW, Bucket, Level, RetentionPolicy, Samples
 from function_app.ports.clock import Clock
 from function_app.ports.tables import MAX_BATCH, MAX_BATCH_BYTES, Conflict, Row, Tables, Write
 from function_app.services.storage import records
@@ -86,7 +86,7 @@ _Windows = Sequence[tuple[int, Samples]]
 class SeriesWriter:
     """Adds samples. Safe to repeat, by any number at once, in any order."""
 
-    def __init__(self, *, tables: Tables, forget: Retention, keep: Keep, clock: Clock) -> None:
+    def __init__(self, *, tables: Tables, forget: Retention, keep: RetentionPolicy, clock: Clock) -> None:
         self._tables = tables
         self._forget = forget
         self._keep = keep
@@ -126,28 +126,28 @@ class SeriesWriter:
         """A part that fits into one batch, or, where what is known already makes it too large, into several."""
         first_ms, last_ms = windows[0][0], windows[-1][0]
 
-        async def once() -> Samples | None:
+        async def attempt() -> Samples | None:
             # What this instance wrote last, as long as nobody else has: if so, the ETags say it, and it is read.
-            known = self._written.pop(place.partition, None)
-            if known is None or first_ms < known.last_ms:
-                known = await self._read(place.partition, first_ms, last_ms)
-            return await self._write(place, windows, known)
+            existing = self._written.pop(place.partition, None)
+            if existing is None or first_ms < existing.last_ms:
+                existing = await self._read(place.partition, first_ms, last_ms)
+            return await self._write(place, windows, existing)
 
-        written = await retry(once)
+        written = await retry(attempt)
         if written is not None:
             return written
         half = len(windows) // 2
         return series.merge(await self._add(place, windows[:half]), await self._add(place, windows[half:]))
 
-    async def _write(self, place: Place, windows: _Windows, known: _Known) -> Samples | None:
+    async def _write(self, place: Place, windows: _Windows, existing: _Known) -> Samples | None:
         """Decide and write; ``None``: too much for one batch.
 
         Raises:
             Conflict: Somebody else has written meanwhile.
         """
         partition = place.partition
-        about = records.read(known.about, About) if known.about else About()
-        if known.about is None and not await self._announce(place):
+        about = records.read(existing.about, About) if existing.about else About()
+        if existing.about is None and not await self._announce(place):
             return Samples()
         names = _names(about, windows)
         new = Samples()
@@ -155,17 +155,17 @@ class SeriesWriter:
         writes: list[Write] = []
         for start_ms, window in windows:
             key = series.key(RAW, start_ms)
-            row = known.rows.get(key)
+            row = existing.rows.get(key)
             there = series.unpack(row.data) if row else Samples()
-            fresh = series.unseen(_only(window, names), there)
-            fitting = series.room(fresh, there)
-            if len(fitting) < len(fresh):
-                _log.warning("%s: %d samples are more than a window holds", place, len(fresh) - len(fitting))
+            created = series.new_samples(_only(window, names), there)
+            fitting = series.fit_window(created, there)
+            if len(fitting) < len(created):
+                _log.warning("%s: %d samples are more than a window holds", place, len(created) - len(fitting))
             if not fitting:
                 continue
             new = series.merge(new, fitting)
-            writes.append(known.write(partition, key, series.pack(series.merge(there, fitting))))
-            _into(buckets, known, start_ms, series.summarize(fitting))
+            writes.append(existing.write(partition, key, series.pack(series.merge(there, fitting))))
+            _into(buckets, existing, start_ms, series.summarize(fitting))
         if not new:
             return new
         size = sum(
@@ -174,9 +174,9 @@ class SeriesWriter:
         size += _BYTES_PER_SUMMARY * sum(len(each.fields) for each in buckets.values())
         if size > _MAX_BYTES and len(windows) > 1:
             return None
-        writes += (known.write(partition, key, each.data()) for key, each in buckets.items())
-        writes.append(known.write(partition, ABOUT, records.fields(_grown(about, new, names))))
-        await self._note(partition, known, buckets)
+        writes += (existing.write(partition, key, each.data()) for key, each in buckets.items())
+        writes.append(existing.write(partition, ABOUT, records.fields(_grown(about, new, names))))
+        await self._note(partition, existing, buckets)
         self._remember(partition, windows[-1][0], await self._tables.batch(records.SERIES, writes))
         return new
 
@@ -219,10 +219,10 @@ class SeriesWriter:
             _log.debug("%s is listed already", place)
         return True
 
-    async def _note(self, partition: str, known: _Known, buckets: dict[str, Bucket]) -> None:
+    async def _note(self, partition: str, existing: _Known, buckets: dict[str, Bucket]) -> None:
         """See that each new day's rows will be forgotten, before there are any."""
         for key in buckets:
-            if not key.startswith(f"{DAY.name}:") or key in known.rows:
+            if not key.startswith(f"{DAY.name}:") or key in existing.rows:
                 continue
             begin_ms = series.start_of(key)
             end_ms = begin_ms + DAY.span_ms
@@ -253,12 +253,12 @@ def _start(level: Level, at_ms: int) -> int:
     return series.floor(at_ms, level.span_ms or series.WINDOW_MS)
 
 
-def _into(buckets: dict[str, Bucket], known: _Known, start_ms: int, summary: Bucket) -> None:
+def _into(buckets: dict[str, Bucket], existing: _Known, start_ms: int, summary: Bucket) -> None:
     """Add a summary to every bucket that the window is in."""
     for level in LEVELS:
         key = series.key(level, _start(level, start_ms))
         if key not in buckets:
-            buckets[key] = series.bucket(known.rows[key].data) if key in known.rows else Bucket()
+            buckets[key] = series.bucket(existing.rows[key].data) if key in existing.rows else Bucket()
         buckets[key].add(summary)
 
 

@@ -165,9 +165,9 @@ class Uploads:
             )
         except ValueError as error:
             raise invalid("The cursor is not one of this list. Begin without one.", code="cursor-invalid") from error
-        found = [records.read(row, Capture) for row in page.rows]
+        result = [records.read(row, Capture) for row in page.rows]
         now_ms = self._clock.now_ms()
-        return [capture for capture in found if capture.expires_ms > now_ms], page.cursor
+        return [capture for capture in result if capture.expires_ms > now_ms], page.cursor
 
     async def get(self, device: Device, upload: str) -> tuple[Capture, str]:
         """One registered capture, and an address from which it can be read.
@@ -187,12 +187,12 @@ class Uploads:
         Raises:
             Problem: ``upload-unknown``, ``busy``.
         """
-        found = await self._stored(device, upload)
+        result = await self._stored(device, upload)
         now_ms = self._clock.now_ms()
-        await self._note(device, found.capture.id, now_ms)
+        await self._note(device, result.capture.id, now_ms)
         # From here on it is not there, whether or not this process comes to delete it.
-        ended = replace(found.capture, expires_ms=now_ms)
-        row = Row(found.row.partition, found.row.key, records.fields(ended), found.row.etag)
+        ended = replace(result.capture, expires_ms=now_ms)
+        row = Row(result.row.partition, result.row.key, records.fields(ended), result.row.etag)
         try:
             row = await self._tables.replace(records.UPLOADS, row)
             await self._blobs.delete(ended.blob)

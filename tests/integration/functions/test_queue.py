@@ -10,7 +10,7 @@ import pytest
 
 from device_agent.protocol import AckStatus, CancelAction, Command, MoveJoints, ResetStop, codec, topics
 from function_app.domain.actions.action import GRACE_MS
-from function_app.domain.actions.queue import MOST
+from function_app.domain.actions.queue import MAX_QUEUED
 from function_app.services.actions.queue import LOOK_MS
 from function_app.services.maintenance.scheduler import ORPHAN_MS
 from function_app.services.storage import records
@@ -108,7 +108,7 @@ class TestTurns:
 
     def test_only_so_many_may_wait(self, pair: Pair, running: str) -> None:
         anna, robot = pair
-        waiting = [queued(anna, robot.device) for _ in range(MOST)]
+        waiting = [queued(anna, robot.device) for _ in range(MAX_QUEUED)]
         problem(anna.start(robot.device, **QUEUE), 409, "queue-full")
         anna.post(f"/actions/{waiting[5]}/cancel")
         queued(anna, robot.device)

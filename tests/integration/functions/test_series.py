@@ -16,7 +16,7 @@ from function_app.domain.common.problems import Problem
 from function_app.domain.devices.devices import Agent, Device, DeviceSpec
 from function_app.domain.identity.accounts import Identity
 from function_app.domain.telemetry import series
-from function_app.domain.telemetry.series import DAY, FINEST, LEVELS, RAW, Keep, Samples
+from function_app.domain.telemetry.series import DAY, FINEST, LEVELS, RAW, RetentionPolicy, Samples
 from function_app.ports.tables import Row, StoreError, Tables
 from function_app.services.devices.device_access import Devices
 from function_app.services.storage import records
@@ -92,7 +92,7 @@ class House:
 
     def __init__(self, tables: Tables, blobs: FileBlobs) -> None:
         self.clock = Clock()
-        self.keep = Keep()
+        self.keep = RetentionPolicy()
         self.tables = Spoilt(tables)
         self.seen: list[tuple[str, str, Sequence[tuple[int, Values]]]] = []
         self.blobs = blobs
@@ -206,7 +206,7 @@ async def test_every_sample_counts_once_however_it_comes(house: House, seed: int
     for begin in range(0, len(pieces), 4):
         added = await asyncio.gather(
             *(
-                writer.add(PLACE, series.gather(piece.items()))
+                writer.add(PLACE, series.from_rows(piece.items()))
                 for writer, piece in zip(writers, pieces[begin:], strict=False)
             )
         )
@@ -217,9 +217,9 @@ async def test_every_sample_counts_once_however_it_comes(house: House, seed: int
 
 async def test_a_long_stretch_is_split_into_batches(house: House) -> None:
     rows = {NOW_MS - 3_600_000 + 2000 * n: {"a": float(n), "b": n / 7} for n in range(1800)}
-    new = await house.writer.add(PLACE, series.gather(rows.items()))
+    new = await house.writer.add(PLACE, series.from_rows(rows.items()))
     assert len(new) == len(rows)
-    assert len(await house.writer.add(PLACE, series.gather(rows.items()))) == 0
+    assert len(await house.writer.add(PLACE, series.from_rows(rows.items()))) == 0
     await assert_whole(house, rows)
 
 
@@ -232,7 +232,7 @@ async def test_windows_that_are_too_large_for_one_batch_are_written_in_several(
     names = [f"{'x' * 77}{number:03d}" for number in range(fields)]
     rows = {begin_ms + at_ms: {name: -chance.random() for name in names} for at_ms in range(0, 300_000, every_ms)}
     for _ in range(2):
-        new = await house.writer.add(PLACE, series.gather(rows.items()))
+        new = await house.writer.add(PLACE, series.from_rows(rows.items()))
     assert len(new) == 0
     part = await house.read(level="1h", points=10)
     summaries = [summary for summary in part.summaries[names[7]] if summary is not None]
@@ -242,17 +242,17 @@ async def test_windows_that_are_too_large_for_one_batch_are_written_in_several(
 async def test_what_is_too_old_or_ahead_of_time_is_left_out(house: House) -> None:
     kept = {NOW_MS - house.keep.raw_ms: {"a": 1.0}, NOW_MS: {"a": 2.0}, NOW_MS + 60_000: {"a": 3.0}}
     refused = {NOW_MS - house.keep.raw_ms - 1: {"a": 4.0}, NOW_MS + 400_000: {"a": 5.0}, 0: {"a": 6.0}}
-    await house.writer.add(PLACE, series.gather((kept | refused).items()))
+    await house.writer.add(PLACE, series.from_rows((kept | refused).items()))
     await assert_whole(house, kept)
 
 
 async def test_a_device_has_so_many_streams_and_a_stream_so_many_fields(house: House) -> None:
     for number in range(MAX_STREAMS + 1):
-        new = await house.writer.add(PLACE._replace(stream=f"s{number}"), series.gather([(NOW_MS, {"a": 1.0})]))
+        new = await house.writer.add(PLACE._replace(stream=f"s{number}"), series.from_rows([(NOW_MS, {"a": 1.0})]))
         assert len(new) == (number < MAX_STREAMS)
     assert len(await house.reader.streams(ANNA, DEVICE)) == MAX_STREAMS
     many = {NOW_MS + n: {f"f{n}": 1.0} for n in range(2 * series.MAX_FIELDS)}
-    await house.writer.add(PLACE._replace(stream="s1"), series.gather(many.items()))
+    await house.writer.add(PLACE._replace(stream="s1"), series.from_rows(many.items()))
     part = await house.read("s1", level="1d")
     assert len(part.summaries) == series.MAX_FIELDS
 
@@ -273,7 +273,7 @@ async def test_a_live_stream_is_written_without_reading_until_somebody_else_writ
     async def add(writer: SeriesWriter, number: int) -> None:
         new = {house.clock.at_ms + 100 * n: {"a": float(n)} for n in range(number * 50, number * 50 + 50)}
         rows.update(new)
-        assert len(await writer.add(PLACE, series.gather(new.items()))) == 50
+        assert len(await writer.add(PLACE, series.from_rows(new.items()))) == 50
 
     for number in range(20):
         await add(house.writer, number)
@@ -281,7 +281,7 @@ async def test_a_live_stream_is_written_without_reading_until_somebody_else_writ
     await add(other, 20)
     await add(house.writer, 21)
     assert reads == 2
-    assert len(await house.writer.add(PLACE, series.gather(rows.items()))) == 0
+    assert len(await house.writer.add(PLACE, series.from_rows(rows.items()))) == 0
     await assert_whole(house, rows)
 
 
@@ -290,7 +290,7 @@ async def test_a_live_stream_is_written_without_reading_until_somebody_else_writ
 
 async def test_few_samples_are_given_as_they_are_and_many_in_buckets(house: House) -> None:
     rows = {NOW_MS - 3_600_000 + 1000 * n: {"a": float(n)} for n in range(3600)}
-    await house.writer.add(PLACE, series.gather(rows.items()))
+    await house.writer.add(PLACE, series.from_rows(rows.items()))
     few = await house.read(first_ms=NOW_MS - 60_000, last_ms=NOW_MS, points=100)
     assert few.level == RAW
     assert values_of(few, "a") == {at_ms: each["a"] for at_ms, each in rows.items() if at_ms >= NOW_MS - 60_000}
@@ -302,7 +302,7 @@ async def test_few_samples_are_given_as_they_are_and_many_in_buckets(house: Hous
 
 async def test_pages_follow_one_another(house: House) -> None:
     rows = {NOW_MS - 3_600_000 + 700 * n: {"a": float(n)} for n in range(5000)}
-    await house.writer.add(PLACE, series.gather(rows.items()))
+    await house.writer.add(PLACE, series.from_rows(rows.items()))
     for level in (RAW, FINEST):
         found: list[int] = []
         cursor: str | None = None
@@ -322,7 +322,7 @@ async def test_pages_follow_one_another(house: House) -> None:
 
 @pytest.mark.parametrize("wanted", [{"level": "2h"}, {"fields": ["z"]}, {"cursor": "x"}, {"cursor": "raw.1_0"}])
 async def test_what_cannot_be_read_is_refused(house: House, wanted: dict[str, Any]) -> None:
-    await house.writer.add(PLACE, series.gather([(NOW_MS, {"a": 1.0})]))
+    await house.writer.add(PLACE, series.from_rows([(NOW_MS, {"a": 1.0})]))
     with pytest.raises(Problem) as caught:
         await house.read(**wanted)
     assert caught.value.status == 422
@@ -428,7 +428,7 @@ async def test_a_new_owner_sees_nothing_of_the_former_one(house: House) -> None:
 
 async def test_what_was_left_in_the_queue_is_not_the_next_owners(house: House) -> None:
     device = (await house.intake._agent(AGENT)).devices["arm"]
-    await house.intake._queue([_Part(device, "health", series.gather([(NOW_MS, {"a": 1.0})]))])
+    await house.intake._queue([_Part(device, "health", series.from_rows([(NOW_MS, {"a": 1.0})]))])
     await house.pair(pairing="p2", account="bert")
     house.clock.at_ms += LEFT_MS + 1
     for _ in range(SHARDS):
@@ -477,7 +477,7 @@ async def test_what_can_never_be_distributed_is_given_up(house: House) -> None:
     await house.intake.take([])
     _, intake, _, _ = house.instance()
     device = (await intake._agent(AGENT)).devices["arm"]
-    await intake._queue([_Part(device, "health", series.gather([(NOW_MS, {"a": 1.0})]))])
+    await intake._queue([_Part(device, "health", series.from_rows([(NOW_MS, {"a": 1.0})]))])
 
     async def busy(*_: Any) -> Samples:
         raise Problem("busy", 503, "Busy", "Try again.")
@@ -504,10 +504,10 @@ async def test_a_store_that_is_away_is_said(house: House) -> None:
 
 async def test_each_level_is_kept_as_long_as_it_is_said(house: House) -> None:
     day_ms = DAY.span_ms
-    house.keep = Keep(raw_ms=day_ms, levels_ms={"10s": 2 * day_ms, "1min": 3 * day_ms, "10min": 5 * day_ms})
+    house.keep = RetentionPolicy(raw_ms=day_ms, levels_ms={"10s": 2 * day_ms, "1min": 3 * day_ms, "10min": 5 * day_ms})
     reader, _, writer, forget = house.instance()
     rows = {NOW_MS - 1000 * n: {"a": float(n)} for n in range(500)}
-    await writer.add(PLACE, series.gather(rows.items()))
+    await writer.add(PLACE, series.from_rows(rows.items()))
     end_ms = series.floor(NOW_MS, day_ms) + day_ms
     gone = {"raw": 1, "10s": 2, "1min": 3, "10min": 5}
     for days in range(8):
@@ -526,7 +526,7 @@ async def test_no_row_is_written_that_will_not_be_forgotten(house: House) -> Non
     """Every raw row lies in a range that a note names."""
     chance = random.Random(9)  # noqa: S311 (the same each time)
     rows = some_rows(chance, 300, span_ms=house.keep.raw_ms)
-    await house.writer.add(PLACE, series.gather(rows.items()))
+    await house.writer.add(PLACE, series.from_rows(rows.items()))
     notes: list[Row] = []
     for shard in range(8):
         notes += (await house.tables.query(records.FORGET, str(shard), limit=1000)).rows

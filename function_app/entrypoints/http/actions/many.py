@@ -12,7 +12,7 @@ from function_app.entrypoints.http.framework.authentication import Caller
 from function_app.entrypoints.http.framework.responses import answer, problem_type, read
 from function_app.entrypoints.http.framework.routing import Routes
 from function_app.entrypoints.http.framework.schemas import Problem as Refusal
-from function_app.services.actions.start_many import Answer
+from function_app.services.actions.start_many import StartResult
 
 
 def router(functions: Functions, caller: Caller) -> Routes:
@@ -43,7 +43,7 @@ def router(functions: Functions, caller: Caller) -> Routes:
         there = all(each.there for each in found)
         return answer(contract.FleetOut(items=tuple(items)), 207 if refused else 200 if there else 202)
 
-    async def item(found: Answer) -> contract.FleetItem:
+    async def item(found: StartResult) -> contract.FleetItem:
         if isinstance(found.result, Problem):
             why = found.result
             told = Refusal(type=problem_type(why), title=why.title, status=why.status, detail=why.detail)

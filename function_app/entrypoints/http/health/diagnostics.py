@@ -4,7 +4,7 @@ from fastapi import Request, Response
 
 from function_app.bootstrap import Functions
 from function_app.domain.common.timestamps import rfc3339
-from function_app.domain.health.diagnosis import Health, band
+from function_app.domain.health.diagnosis import Health, usual_range
 from function_app.domain.health.faults import Severity
 from function_app.entrypoints.http.framework.authentication import Caller
 from function_app.entrypoints.http.framework.responses import answer
@@ -96,7 +96,7 @@ def _counts(summary: Summary) -> contract.FaultCounts:
 
 def _field(known: FieldView) -> contract.FieldOut:
     limits, watch = known.rule.limits, known.watch
-    usual = band(watch, limits)
+    usual = usual_range(watch, limits)
     return contract.FieldOut(
         stream=known.stream,
         field=known.name,

@@ -7,7 +7,7 @@ from fastapi import Query, Request, Response
 
 from device_agent.protocol.security import signing
 from function_app.bootstrap import Functions
-from function_app.domain.common.ids import show_claim_code
+from function_app.domain.common.ids import format_claim_code
 from function_app.domain.common.problems import invalid
 from function_app.domain.common.timestamps import rfc3339
 from function_app.domain.devices.devices import Agent, DeviceSpec
@@ -50,7 +50,7 @@ def router(functions: Functions, caller: Caller) -> Routes:
         left_ms = max(0, done.claim_expires_ms - functions.clock.now_ms())
         body = contract.Enrolled(
             agent=done.id,
-            claim_code=show_claim_code(done.claim_code),
+            claim_code=format_claim_code(done.claim_code),
             expires_at=rfc3339(done.claim_expires_ms),
             expires_in_s=left_ms // 1000,
         )

@@ -49,7 +49,7 @@ def router(functions: Functions, caller: Caller) -> Routes:
         who = await caller.account(request)
         asked: contract.LatencyRequest = await read(request, contract.LatencyRequest)
         found = require_operator(await functions.devices.get(who, device))
-        await functions.latencies.add(found, _samples(asked), who=f"account:{who.account}", once=once or "")
+        await functions.latencies.add(found, _samples(asked), caller=f"account:{who.account}", once=once or "")
         return empty()
 
     @routes.add(
@@ -70,7 +70,7 @@ def router(functions: Functions, caller: Caller) -> Routes:
         device = next((found for found in devices_of(known) if found.name == asked.device), None)
         if device is None:
             raise not_found("device", asked.device)
-        await functions.latencies.add(device, _samples(asked), who=f"agent:{known.id}", once=once or "")
+        await functions.latencies.add(device, _samples(asked), caller=f"agent:{known.id}", once=once or "")
         return empty()
 
     @routes.add(

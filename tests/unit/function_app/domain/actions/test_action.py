@@ -10,16 +10,16 @@ from hypothesis import strategies as st
 
 from function_app.domain.actions.action import (
     GRACE_MS,
-    REPEAT_MS,
+    RETRY_MS,
+    AckReport,
     Action,
-    Report,
+    NextStep,
     Status,
-    Verdict,
     apply_report,
     end,
-    judge,
     mark_published,
-    next_look_ms,
+    next_check_ms,
+    next_step,
     reached,
 )
 
@@ -39,15 +39,15 @@ LIFE = (Status.RECEIVED, Status.ACCEPTED, Status.STARTED, Status.STARTED, Status
 ENDS = (Status.DONE, Status.FAILED, Status.EXPIRED, Status.CANCELLED)
 
 
-def life(*statuses: Status) -> list[Report]:
+def life(*statuses: Status) -> list[AckReport]:
     """Reports as a device sends them: numbered, each with its own time and output."""
     return [
-        Report(status, number, 1_000_100 + number, progress=number / 10, output=f"line {number}")
+        AckReport(status, number, 1_000_100 + number, progress=number / 10, output=f"line {number}")
         for number, status in enumerate(statuses, start=1)
     ]
 
 
-def applied(action: Action, reports: Sequence[Report]) -> Action:
+def applied(action: Action, reports: Sequence[AckReport]) -> Action:
     for report in reports:
         action = apply_report(action, report)
     return action
@@ -75,7 +75,7 @@ def test_reports_in_any_order_end_alike(order: tuple[int, ...]) -> None:
 
 reports_ = st.lists(
     st.builds(
-        Report,
+        AckReport,
         status=st.sampled_from([status for status in Status if status.rank >= Status.RECEIVED.rank]),
         sequence=st.integers(min_value=0, max_value=6),
         at_ms=st.integers(min_value=0, max_value=10),
@@ -87,7 +87,7 @@ reports_ = st.lists(
 
 
 @given(reports_)
-def test_any_reports_never_take_a_step_back_and_the_first_end_stays(reports: list[Report]) -> None:
+def test_any_reports_never_take_a_step_back_and_the_first_end_stays(reports: list[AckReport]) -> None:
     action = NEW
     for report in reports:
         before, action = action, apply_report(action, report)
@@ -101,7 +101,7 @@ def test_any_reports_never_take_a_step_back_and_the_first_end_stays(reports: lis
 
 
 @given(reports_, st.data())
-def test_doubled_reports_change_nothing(reports: list[Report], data: st.DataObject) -> None:
+def test_doubled_reports_change_nothing(reports: list[AckReport], data: st.DataObject) -> None:
     action = applied(NEW, reports)
     for report in data.draw(st.lists(st.sampled_from(reports), max_size=10)) if reports else []:
         again = apply_report(action, report)
@@ -135,8 +135,8 @@ def test_late_news_of_an_earlier_step_adds_its_time_only() -> None:
 @pytest.mark.parametrize("first", ENDS)
 @pytest.mark.parametrize("second", ENDS)
 def test_the_first_end_stays_whoever_says_another(first: Status, second: Status) -> None:
-    ended = apply_report(NEW, Report(first, 1, 5))
-    assert apply_report(ended, Report(second, 2, 6)) is ended
+    ended = apply_report(NEW, AckReport(first, 1, 5))
+    assert apply_report(ended, AckReport(second, 2, 6)) is ended
     assert end(ended, second, "lost", "x", 7) is ended
 
 
@@ -144,14 +144,14 @@ def test_an_end_by_the_cloud_has_its_reason_and_time() -> None:
     ended = end(NEW, Status.EXPIRED, "no-answer", "Nobody came.", 77)
     assert (ended.status, ended.reason) == (Status.EXPIRED, {"code": "no-answer", "message": "Nobody came."})
     assert ended.times == {"expired": 77}
-    assert apply_report(ended, Report(Status.DONE, 9, 9)) is ended
+    assert apply_report(ended, AckReport(Status.DONE, 9, 9)) is ended
 
 
 def test_publishing_is_noted_once_and_takes_no_step_back() -> None:
     published = mark_published(NEW, 5)
     assert (published.status, published.times) == (Status.PUBLISHED, {"published": 5})
     assert mark_published(published, 6) is published
-    fast = mark_published(apply_report(NEW, Report(Status.DONE, 1, 4)), 5)
+    fast = mark_published(apply_report(NEW, AckReport(Status.DONE, 1, 4)), 5)
     assert (fast.status, fast.times) == (Status.DONE, {"done": 4, "published": 5})
 
 
@@ -173,24 +173,24 @@ def test_waiting_is_over_when_it_is_reached_or_can_not_be(status: Status, wanted
 @pytest.mark.parametrize(
     ("status", "after_ms", "verdict"),
     [
-        (Status.CREATED, 0, Verdict.PUBLISH),
-        (Status.PUBLISHED, 9_999, Verdict.PUBLISH),
-        (Status.PUBLISHED, 10_000, Verdict.WAIT),
-        (Status.PUBLISHED, 10_000 + GRACE_MS, Verdict.EXPIRE),
-        (Status.RECEIVED, 10_000 + GRACE_MS, Verdict.WAIT),
-        (Status.STARTED, 59_999, Verdict.WAIT),
-        (Status.STARTED, 60_000, Verdict.LOSE),
-        (Status.CREATED, 60_000, Verdict.LOSE),
+        (Status.CREATED, 0, NextStep.PUBLISH),
+        (Status.PUBLISHED, 9_999, NextStep.PUBLISH),
+        (Status.PUBLISHED, 10_000, NextStep.WAIT),
+        (Status.PUBLISHED, 10_000 + GRACE_MS, NextStep.EXPIRE),
+        (Status.RECEIVED, 10_000 + GRACE_MS, NextStep.WAIT),
+        (Status.STARTED, 59_999, NextStep.WAIT),
+        (Status.STARTED, 60_000, NextStep.LOSE),
+        (Status.CREATED, 60_000, NextStep.LOSE),
     ],
 )
-def test_a_timer_repeats_what_nobody_answered_then_ends_it(status: Status, after_ms: int, verdict: Verdict) -> None:
-    assert judge(replace(NEW, status=status), NEW.created_ms + after_ms) is verdict
+def test_a_timer_repeats_what_nobody_answered_then_ends_it(status: Status, after_ms: int, verdict: NextStep) -> None:
+    assert next_step(replace(NEW, status=status), NEW.created_ms + after_ms) is verdict
 
 
 def test_what_was_cancelled_is_not_sent_again() -> None:
     cancelled = replace(NEW, status=Status.PUBLISHED, cancel_id="x")
-    assert judge(cancelled, NEW.created_ms + 5_000) is Verdict.CANCEL
-    assert judge(cancelled, NEW.created_ms + 10_000 + GRACE_MS) is Verdict.EXPIRE
+    assert next_step(cancelled, NEW.created_ms + 5_000) is NextStep.CANCEL
+    assert next_step(cancelled, NEW.created_ms + 10_000 + GRACE_MS) is NextStep.EXPIRE
 
 
 @given(
@@ -199,15 +199,15 @@ def test_what_was_cancelled_is_not_sent_again() -> None:
 )
 def test_the_next_look_is_later_and_never_after_the_deadline(status: Status, after_ms: int) -> None:
     now_ms = NEW.created_ms + after_ms
-    due_ms = next_look_ms(replace(NEW, status=status), now_ms)
+    due_ms = next_check_ms(replace(NEW, status=status), now_ms)
     assert now_ms < due_ms <= NEW.deadline_ms
     if status.rank < Status.RECEIVED.rank and now_ms < NEW.expires_ms:
-        assert due_ms <= now_ms + REPEAT_MS
+        assert due_ms <= now_ms + RETRY_MS
 
 
 def test_what_several_hear_was_heard_when_the_first_of_them_did() -> None:
-    def heard(at_ms: int) -> Report:
-        return Report(Status.RECEIVED, 1, 1_000_100, heard_ms=at_ms)
+    def heard(at_ms: int) -> AckReport:
+        return AckReport(Status.RECEIVED, 1, 1_000_100, heard_ms=at_ms)
 
     action = applied(NEW, [heard(50), heard(30)])
     assert action.heard == {"received": 30}

@@ -86,21 +86,21 @@ def test_any_text_is_read_or_refused(text: str) -> None:
     for read in (ids.split_device, ids.split_command):
         found = read(text)
         assert found is None or "-".join(found) == text
-    code = ids.read_claim_code(text)
+    code = ids.parse_claim_code(text)
     assert code is None or set(code) <= set(ids.CLAIM_ALPHABET)
 
 
 def test_a_claim_code_is_read_as_people_type_it() -> None:
     for _ in range(100):
         code = ids.new_claim_code()
-        shown = ids.show_claim_code(code)
+        shown = ids.format_claim_code(code)
         assert re.fullmatch("[BCDFGHJKLMNPQRSTVWXZ]{4}-[BCDFGHJKLMNPQRSTVWXZ]{4}", shown)
         for typed in (shown, code, shown.lower(), f" {shown[:4]} - {shown[5:]} ", shown.replace("-", "")):
-            assert ids.read_claim_code(typed) == code
+            assert ids.parse_claim_code(typed) == code
 
 
 @pytest.mark.parametrize(
     "text", ["", "BCDF-GHJ", "BCDF-GHJKL", "ABCD-EFGH", "BCDF-GHJ1", "BCDF_GHJK", "\uff22CDF-GHJK"]
 )
 def test_what_is_no_claim_code_is_refused(text: str) -> None:
-    assert ids.read_claim_code(text) is None
+    assert ids.parse_claim_code(text) is None

@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from function_app.domain.common.problems import Problem
-from function_app.domain.common.rate_limit import Rate, ask
+from function_app.domain.common.rate_limit import Rate, request
 from function_app.services.identity import rate_limiter
 from function_app.services.identity.rate_limiter import BURST_S, Limits
 from tests.harness.cloud.cloud import API, Cloud, MovingClock, problem, settings
@@ -22,7 +22,7 @@ def test_in_no_stretch_of_time_more_is_let_through_than_burst_and_rate_allow(pau
     let: list[float] = []
     for pause_ms in pauses_ms:
         now_ms += pause_ms
-        arrival_ms, wait_ms = ask(RATE, arrival_ms, now_ms)
+        arrival_ms, wait_ms = request(RATE, arrival_ms, now_ms)
         if not wait_ms:
             let.append(now_ms)
     for first in range(len(let)):
@@ -33,21 +33,21 @@ def test_in_no_stretch_of_time_more_is_let_through_than_burst_and_rate_allow(pau
 def test_after_the_wait_that_is_told_it_is_let_through() -> None:
     arrival_ms, now_ms, wait_ms = 0.0, 1e12, 0.0
     for _ in range(RATE.burst):
-        arrival_ms, wait_ms = ask(RATE, arrival_ms, now_ms)
+        arrival_ms, wait_ms = request(RATE, arrival_ms, now_ms)
         assert wait_ms == 0
-    arrival_ms, wait_ms = ask(RATE, arrival_ms, now_ms)
+    arrival_ms, wait_ms = request(RATE, arrival_ms, now_ms)
     assert wait_ms == pytest.approx(100)
-    assert ask(RATE, arrival_ms, now_ms + wait_ms)[1] == 0
+    assert request(RATE, arrival_ms, now_ms + wait_ms)[1] == 0
 
 
 def test_a_clock_that_jumps_back_locks_nobody_out_for_long() -> None:
-    arrival_ms, _ = ask(RATE, 0.0, 2e12)
-    _, wait_ms = ask(RATE, arrival_ms, 1e12)
+    arrival_ms, _ = request(RATE, 0.0, 2e12)
+    _, wait_ms = request(RATE, arrival_ms, 1e12)
     assert wait_ms <= 100
 
 
 def test_rate_zero_is_no_limit() -> None:
-    assert ask(Rate(0, 0), 0.0, 1e12) == (0.0, 0.0)
+    assert request(Rate(0, 0), 0.0, 1e12) == (0.0, 0.0)
 
 
 def test_of_many_names_the_newest_are_remembered(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -9,21 +9,23 @@ from hypothesis import strategies as st
 
 from function_app.domain.common.problems import Problem
 from function_app.domain.control import control_request, lease
-from function_app.domain.control.control_events import ControlEvent, Fact, changed, ended, overdue
+from function_app.domain.control.control_events import ControlEvent, Fact, control_ended, lease_changes, timed_out
 from function_app.domain.control.lease import Lease
 from function_app.domain.identity.accounts import Identity
 
 ANNA, BERT, CLEO = (Identity(name[0], name, f"session of {name}") for name in ("anna", "bert", "cleo"))
 START = 1_000_000
-HELD = lease.take(None, ANNA, lease_ms=60_000, now_ms=START, pairing="p")
+HELD = lease.acquire(None, ANNA, lease_ms=60_000, now_ms=START, pairing="p")
 
 
 def ask(known: Lease | None, who: Identity = BERT, *, now_ms: int = START, request: str = "r1") -> Lease:
-    return control_request.ask(known, who, request=request, within_ms=10_000, lease_ms=20_000, now_ms=now_ms)
+    return control_request.request_control(
+        known, who, request=request, within_ms=10_000, lease_ms=20_000, now_ms=now_ms
+    )
 
 
 def kinds(before: Lease | None, after: Lease, now_ms: int = START) -> list[Fact]:
-    return [happened.fact for happened in changed(before, after, by="somebody", now_ms=now_ms)]
+    return [happened.fact for happened in lease_changes(before, after, by="somebody", now_ms=now_ms)]
 
 
 def how(known: Lease, now_ms: int) -> str:
@@ -80,7 +82,7 @@ def test_who_has_been_given_control_gives_it_back_instead_of_withdrawing() -> No
 
 
 def test_only_the_lease_that_was_in_force_when_it_was_asked_is_handed_over() -> None:
-    again = lease.take(ask(HELD), ANNA, lease_ms=60_000, now_ms=START + 1)
+    again = lease.acquire(ask(HELD), ANNA, lease_ms=60_000, now_ms=START + 1)
     assert how(again, START + 1) == "ended"
     with pytest.raises(Problem) as refused:
         control_request.accept(again, ANNA, request="r1", now_ms=START + 1)
@@ -93,10 +95,10 @@ def test_only_the_lease_that_was_in_force_when_it_was_asked_is_handed_over() -> 
         (None, HELD, [Fact.TAKEN]),
         (HELD, lease.renew(HELD, ANNA, epoch=1, lease_ms=9_000, now_ms=START), []),
         (HELD, lease.release(HELD, now_ms=START), [Fact.RELEASED]),
-        (HELD, lease.take(HELD, ANNA, lease_ms=1_000, now_ms=START), [Fact.TAKEN]),
-        (HELD, lease.take(HELD, BERT, lease_ms=1_000, now_ms=START, over="now"), [Fact.TAKEN_OVER]),
-        (HELD, lease.overtake(HELD, pairing="p", now_ms=START), [Fact.RESET_ORDERED]),
-        (None, lease.overtake(None, pairing="p", now_ms=START), [Fact.RESET_ORDERED]),
+        (HELD, lease.acquire(HELD, ANNA, lease_ms=1_000, now_ms=START), [Fact.TAKEN]),
+        (HELD, lease.acquire(HELD, BERT, lease_ms=1_000, now_ms=START, over="now"), [Fact.TAKEN_OVER]),
+        (HELD, lease.invalidate(HELD, pairing="p", now_ms=START), [Fact.RESET_ORDERED]),
+        (None, lease.invalidate(None, pairing="p", now_ms=START), [Fact.RESET_ORDERED]),
         (ask(HELD), control_request.refuse(ask(HELD), ANNA, request="r1", now_ms=START), [Fact.REQUEST_REFUSED]),
         (ask(HELD), control_request.withdraw(ask(HELD), BERT, request="r1", now_ms=START), [Fact.REQUEST_WITHDRAWN]),
         (replace(HELD, action="x"), lease.release(replace(HELD, action="x"), now_ms=START), []),
@@ -109,19 +111,19 @@ def test_each_change_is_told_as_what_it_is(before: Lease | None, after: Lease, f
 def test_what_time_has_brought_is_told_with_the_next_change_and_at_its_own_time() -> None:
     asked = ask(HELD)
     late = START + 60_000
-    taken = lease.take(asked, CLEO, lease_ms=1_000, now_ms=late)
+    taken = lease.acquire(asked, CLEO, lease_ms=1_000, now_ms=late)
     assert kinds(asked, taken, late) == [Fact.REQUEST_LAPSED, Fact.EXPIRED, Fact.TAKEN]
-    lapsed, expired, _ = changed(asked, taken, by="cleo", now_ms=late)
+    lapsed, expired, _ = lease_changes(asked, taken, by="cleo", now_ms=late)
     assert (lapsed.at_ms, expired.at_ms) == (START + 10_000, START + 60_000)
-    assert list(overdue(asked, late)) == [lapsed, expired], "told by the timer it is the same event"
-    assert list(overdue(None, late)) == list(overdue(taken, late)) == []
+    assert list(timed_out(asked, late)) == [lapsed, expired], "told by the timer it is the same event"
+    assert list(timed_out(None, late)) == list(timed_out(taken, late)) == []
     second = ask(asked, CLEO, now_ms=START + 10_000, request="r2")
     assert kinds(asked, second, START + 10_000) == [Fact.REQUEST_LAPSED, Fact.REQUESTED]
 
 
 def test_an_event_names_who_had_control() -> None:
-    over = lease.take(HELD, BERT, lease_ms=1_000, now_ms=START, over="needed")
-    (told,) = changed(HELD, over, by="bert", now_ms=START)
+    over = lease.acquire(HELD, BERT, lease_ms=1_000, now_ms=START, over="needed")
+    (told,) = lease_changes(HELD, over, by="bert", now_ms=START)
     assert told.data == {"epoch": 2, "holder": "bert", "from": "anna", "reason": "needed"}
     assert told.event("arm") | {"data": {}} == {
         "id": "control-taken-over-2",
@@ -132,7 +134,7 @@ def test_an_event_names_who_had_control() -> None:
         "message": "bert took control from anna: needed",
         "data": {},
     }
-    left = ended(HELD, Lease(epoch=2), why="moved", now_ms=START)
+    left = control_ended(HELD, Lease(epoch=2), why="moved", now_ms=START)
     assert (left.fact, left.data) == (Fact.ENDED, {"epoch": 2, "holder": "anna", "why": "moved"})
 
 
@@ -146,13 +148,13 @@ def act(what: str, known: Lease | None, who: Identity, *, now_ms: int, fresh: st
     match what:
         case "take" | "over":
             over = "why" if what == "over" else ""
-            after = lease.take(known, who, lease_ms=20_000, now_ms=now_ms, pairing="p", over=over)
+            after = lease.acquire(known, who, lease_ms=20_000, now_ms=now_ms, pairing="p", over=over)
         case "renew":
             after = lease.renew(known, who, epoch=epoch, lease_ms=20_000, now_ms=now_ms)
         case "release":
-            after = lease.release(lease.hold(known, who, epoch=epoch, now_ms=now_ms), now_ms=now_ms)
+            after = lease.release(lease.require_held(known, who, epoch=epoch, now_ms=now_ms), now_ms=now_ms)
         case "reset":
-            after = lease.overtake(known, pairing="p", now_ms=now_ms)
+            after = lease.invalidate(known, pairing="p", now_ms=now_ms)
         case "ask":
             after = ask(known, who, now_ms=now_ms, request=fresh)
         case "accept":
@@ -185,7 +187,7 @@ def test_whatever_is_done_at_once_each_request_has_one_end_and_control_passes_on
         except Problem:
             continue
         if known is not before:
-            told += changed(before, known, by=who.name, now_ms=now_ms)
+            told += lease_changes(before, known, by=who.name, now_ms=now_ms)
         _see(before, known, what, who, now_ms)
         if known.asked is not None and (end := known.asked.how(known, now_ms)) != "open":
             assert ends.setdefault(known.asked.id, end) == end, "it had another end before"

@@ -19,7 +19,7 @@ START = 1_000_000
 
 
 def take(lease: Lease | None, who: Identity, now_ms: int = START, lease_ms: int = 1_000) -> Lease:
-    return rules.take(lease, who, lease_ms=lease_ms, now_ms=now_ms)
+    return rules.acquire(lease, who, lease_ms=lease_ms, now_ms=now_ms)
 
 
 def test_the_first_lease_has_epoch_1_and_ends_on_time() -> None:
@@ -70,7 +70,7 @@ def test_what_is_not_held_now_is_not_renewed(who: Identity, epoch: int, now_ms: 
 
 def test_a_lease_that_never_was_is_lost() -> None:
     with pytest.raises(Problem, match="Epoch 3"):
-        rules.hold(None, ANNA, epoch=3, now_ms=START)
+        rules.require_held(None, ANNA, epoch=3, now_ms=START)
 
 
 def test_a_released_lease_is_nobodys_and_keeps_its_epoch() -> None:
@@ -107,7 +107,7 @@ def test_whatever_happens_epochs_rise_and_a_live_lease_stays_with_its_holder(ste
             elif lease is not None and what == "renew":
                 lease = rules.renew(lease, who, epoch=lease.epoch, lease_ms=1_000, now_ms=now_ms)
             elif lease is not None:
-                held = rules.hold(lease, who, epoch=lease.epoch, now_ms=now_ms)
+                held = rules.require_held(lease, who, epoch=lease.epoch, now_ms=now_ms)
                 lease = rules.release(held, now_ms=now_ms)
         except Problem:
             assert lease is before

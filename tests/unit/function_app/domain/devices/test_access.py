@@ -7,7 +7,7 @@ import pytest
 from function_app.domain.common.problems import Problem
 from function_app.domain.common.timestamps import NEVER_MS
 from function_app.domain.devices import access
-from function_app.domain.devices.access import OWNERS, Share, Standing
+from function_app.domain.devices.access import OWNER_PERMISSIONS, Permissions, Share
 from function_app.domain.devices.devices import Agent, DeviceSpec
 from function_app.domain.identity.accounts import Identity, Role
 
@@ -26,12 +26,12 @@ def share(on: str, role: Role, **more: object) -> Share:
 
 
 def role(*shares: Share, who: Identity = BERT, agent: Agent = AGENT, now_ms: int = NOW_MS) -> Role | None:
-    found = access.standing(who, agent, "arm", shares, now_ms)
+    found = access.permissions(who, agent, "arm", shares, now_ms)
     return None if found is None else found.role
 
 
 def test_the_owner_needs_no_share_and_nobody_else_has_a_part_without_one() -> None:
-    assert access.standing(Identity("anna", "anna", "s"), AGENT, "arm", (), NOW_MS) == OWNERS
+    assert access.permissions(Identity("anna", "anna", "s"), AGENT, "arm", (), NOW_MS) == OWNER_PERMISSIONS
     assert role() is None
 
 
@@ -40,7 +40,7 @@ def test_the_owner_needs_no_share_and_nobody_else_has_a_part_without_one() -> No
 )
 def test_the_higher_of_both_shares_counts(of_device: Role | None, of_space: Role | None) -> None:
     shares = [share(on, each) for on, each in ((DEVICE, of_device), (SPACE, of_space)) if each is not None]
-    found = access.standing(BERT, AGENT, "arm", shares, NOW_MS)
+    found = access.permissions(BERT, AGENT, "arm", shares, NOW_MS)
     assert RANK[found.role if found else None] == max(RANK[of_device], RANK[of_space])
     assert (found.space if found else None) == of_space
 
@@ -71,9 +71,9 @@ def test_a_share_counts_until_the_very_moment_of_its_end() -> None:
 
 def test_the_end_that_is_told_is_that_of_the_role_that_counts() -> None:
     shares = [share(DEVICE, Role.OPERATOR, expires_ms=5_000), share(SPACE, Role.VIEWER, expires_ms=9_000)]
-    assert access.standing(BERT, AGENT, "arm", shares, NOW_MS) == Standing(Role.OPERATOR, 5_000, Role.VIEWER)
+    assert access.permissions(BERT, AGENT, "arm", shares, NOW_MS) == Permissions(Role.OPERATOR, 5_000, Role.VIEWER)
     equal = [share(DEVICE, Role.VIEWER, expires_ms=5_000), share(SPACE, Role.VIEWER)]
-    assert access.standing(BERT, AGENT, "arm", equal, NOW_MS) == Standing(Role.VIEWER, NEVER_MS, Role.VIEWER)
+    assert access.permissions(BERT, AGENT, "arm", equal, NOW_MS) == Permissions(Role.VIEWER, NEVER_MS, Role.VIEWER)
 
 
 @pytest.mark.parametrize(
@@ -95,7 +95,7 @@ def test_a_key_caps_the_role_and_keeps_to_its_devices(most: Role, only: tuple[st
 
 def test_a_key_for_one_device_has_no_part_in_the_space_around_it() -> None:
     who = Identity("anna", "app", "k", key="k", only=("aaaaaaaaaa-arm",))
-    assert access.standing(who, AGENT, "arm", (), NOW_MS) == Standing(Role.OWNER, NEVER_MS, None)
+    assert access.permissions(who, AGENT, "arm", (), NOW_MS) == Permissions(Role.OWNER, NEVER_MS, None)
 
 
 def test_an_agent_that_nobody_has_claimed_has_no_roles() -> None:
@@ -104,6 +104,6 @@ def test_an_agent_that_nobody_has_claimed_has_no_roles() -> None:
 
 
 def test_ownership_cannot_be_shared() -> None:
-    assert access.shareable(Role.VIEWER) is Role.VIEWER
+    assert access.require_shareable(Role.VIEWER) is Role.VIEWER
     with pytest.raises(Problem, match="transfer"):
-        access.shareable(Role.OWNER)
+        access.require_shareable(Role.OWNER)

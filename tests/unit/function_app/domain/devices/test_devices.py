@@ -12,11 +12,11 @@ from function_app.domain.devices.devices import (
     DeviceSpec,
     Link,
     claim,
-    introduced,
     move,
     newer_link,
     online,
     unpair,
+    with_devices,
 )
 from function_app.domain.identity.accounts import Role
 
@@ -110,9 +110,9 @@ def test_what_leaves_is_told_with_whose_it_was_and_where() -> None:
 
 
 def test_only_devices_that_are_no_longer_named_leave_and_only_from_an_owner() -> None:
-    assert [(each.why, each.devices) for each in introduced(CLAIMED, (CAM,)).leaving] == [("removed", ("arm",))]
-    assert introduced(CLAIMED, (CAM, ARM)).leaving == ()
-    assert introduced(Agent("a", "lab", "k", "1", (ARM, CAM), 0), (CAM,)).leaving == ()
+    assert [(each.why, each.devices) for each in with_devices(CLAIMED, (CAM,)).leaving] == [("removed", ("arm",))]
+    assert with_devices(CLAIMED, (CAM, ARM)).leaving == ()
+    assert with_devices(Agent("a", "lab", "k", "1", (ARM, CAM), 0), (CAM,)).leaving == ()
 
 
 def test_an_agent_that_is_moved_again_and_again_does_not_grow_without_end() -> None:

@@ -18,10 +18,10 @@ from function_app.domain.health.detectors import (
     LEVEL,
     OUTLIER,
     TREND,
+    DetectorState,
     Limits,
-    Watch,
-    step,
     trend,
+    update,
 )
 from function_app.domain.health.estimators import (
     MEMORY,
@@ -41,14 +41,14 @@ values = st.floats(min_value=-1e6, max_value=1e6, allow_nan=False)
 
 
 def life(
-    given: Iterable[tuple[int, float]], limits: Limits = JOINT, watch: Watch | None = None
-) -> tuple[Watch, list[tuple[int, tuple[str, ...]]]]:
+    given: Iterable[tuple[int, float]], limits: Limits = JOINT, watch: DetectorState | None = None
+) -> tuple[DetectorState, list[tuple[int, tuple[str, ...]]]]:
     """The watch at the end, and each change of what is found."""
-    watch = watch or Watch()
+    watch = watch or DetectorState()
     found: list[tuple[int, tuple[str, ...]]] = []
     for at_ms, value in given:
         before = watch.findings
-        watch = step(watch, limits, at_ms, value)
+        watch = update(watch, limits, at_ms, value)
         if watch.findings != before:
             found.append((at_ms, watch.findings))
     return watch, found
@@ -171,7 +171,7 @@ class TestSilent:
         given = steady(35.0, 100, noise=0.3)
         watch, _ = life(given)
         for at_ms, _ in given[-3:]:
-            assert step(watch, JOINT, at_ms, 500.0) is watch
+            assert update(watch, JOINT, at_ms, 500.0) is watch
 
     @given(
         st.lists(st.tuples(st.integers(1, 3_600_000), st.floats(allow_nan=False, allow_infinity=False)), max_size=80),
@@ -182,10 +182,10 @@ class TestSilent:
     def test_no_values_break_it_and_its_state_stays_small_and_finite(
         self, gaps: list[tuple[int, float]], limits: Limits
     ) -> None:
-        watch, at_ms = Watch(), 1
+        watch, at_ms = DetectorState(), 1
         for gap_ms, value in gaps:
             at_ms += gap_ms
-            watch = step(watch, limits, at_ms, value)
+            watch = update(watch, limits, at_ms, value)
         assert len(json.dumps(asdict(watch), allow_nan=False)) < 2_000
 
 
@@ -248,11 +248,11 @@ class TestAgainstRiver:
         truth = working(10.0, 600.0, seed=7, days=3)
         theirs = drift.PageHinkley(min_instances=30, delta=11.0, threshold=330.0)
         alarms = 0
-        watch = Watch()
+        watch = DetectorState()
         for at_ms, value in windows(truth, hours=72, seed=7):
             theirs.update(value)
             alarms += theirs.drift_detected
-            watch = step(watch, JOINT, at_ms, value)
+            watch = update(watch, JOINT, at_ms, value)
             assert watch.findings == ()
         assert alarms > 0
 

@@ -10,7 +10,16 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from function_app.domain.telemetry import series
-from function_app.domain.telemetry.series import DAY, FINEST, LEVELS, MAX_VALUES, WINDOW_MS, Bucket, Keep, Samples
+from function_app.domain.telemetry.series import (
+    DAY,
+    FINEST,
+    LEVELS,
+    MAX_VALUES,
+    WINDOW_MS,
+    Bucket,
+    RetentionPolicy,
+    Samples,
+)
 from function_app.ports.tables import MAX_DATA_BYTES
 
 VALUES = st.floats(-1e300, 1e300)
@@ -37,14 +46,14 @@ def truth(rows: list[tuple[int, dict[str, float]]]) -> dict[int, dict[str, float
 
 @given(ROWS)
 def test_of_samples_at_one_time_the_first_counts(rows: list[tuple[int, dict[str, float]]]) -> None:
-    samples = series.gather(rows)
+    samples = series.from_rows(rows)
     assert rows_of(samples) == truth(rows)
     assert list(samples.at_ms) == sorted(set(samples.at_ms))
 
 
 @given(ROWS)
 def test_what_is_packed_comes_out_as_it_was(rows: list[tuple[int, dict[str, float]]]) -> None:
-    samples = series.gather(rows)
+    samples = series.from_rows(rows)
     packed = json.loads(json.dumps(series.pack(samples)))
     assert rows_of(series.unpack(packed)) == rows_of(samples)
 
@@ -53,15 +62,15 @@ def test_what_is_packed_comes_out_as_it_was(rows: list[tuple[int, dict[str, floa
 def test_samples_are_a_set_by_time(
     one: list[tuple[int, dict[str, float]]], other: list[tuple[int, dict[str, float]]]
 ) -> None:
-    there = series.gather(one)
-    fresh = series.unseen(series.gather(other), there)
+    there = series.from_rows(one)
+    fresh = series.new_samples(series.from_rows(other), there)
     assert rows_of(series.merge(there, fresh)) == truth(one + other)
-    assert len(series.unseen(series.gather(other), series.merge(there, fresh))) == 0
+    assert len(series.new_samples(series.from_rows(other), series.merge(there, fresh))) == 0
 
 
 @given(ROWS)
 def test_windows_hold_every_sample_once(rows: list[tuple[int, dict[str, float]]]) -> None:
-    samples = series.gather(rows)
+    samples = series.from_rows(rows)
     found: dict[int, dict[str, float]] = {}
     for start_ms, window in samples.windows():
         assert start_ms % WINDOW_MS == 0
@@ -74,7 +83,7 @@ def test_windows_hold_every_sample_once(rows: list[tuple[int, dict[str, float]]]
 def test_a_bucket_is_what_its_samples_are_in_whatever_order_they_came(
     rows: list[tuple[int, dict[str, float]]], chance: random.Random
 ) -> None:
-    samples = series.gather(rows)
+    samples = series.from_rows(rows)
     parts = [samples.part(index, index + 1) for index in range(len(samples))]
     chance.shuffle(parts)
     bucket = Bucket()
@@ -98,23 +107,23 @@ def test_a_full_window_fits_into_a_row_however_badly_it_compresses(fields: int) 
     times = sorted(chance.sample(range(WINDOW_MS), 9_000))
     names = [f"{'x' * 76}{number:03d}" for number in range(fields)]
     noise = {name: array("d", [chance.uniform(-1e9, 1e9) for _ in times]) for name in names}
-    window = series.room(Samples(array("q", [NOW_MS + at_ms for at_ms in times]), noise), Samples())
+    window = series.fit_window(Samples(array("q", [NOW_MS + at_ms for at_ms in times]), noise), Samples())
     assert len(window) == min(9_000, MAX_VALUES // fields)
     assert len(json.dumps(series.pack(window))) < MAX_DATA_BYTES
-    assert not series.room(window, Samples(window.at_ms, window.columns)) or fields == 1
+    assert not series.fit_window(window, Samples(window.at_ms, window.columns)) or fields == 1
 
 
 def test_a_bucket_of_all_fields_fits_into_a_row() -> None:
     names = [f"{'x' * 77}{number:03d}" for number in range(series.MAX_FIELDS)]
     value = -1.2345678901234567e300
-    bucket = series.summarize(series.gather([(NOW_MS + n, dict.fromkeys(names, value)) for n in range(3)]))
+    bucket = series.summarize(series.from_rows([(NOW_MS + n, dict.fromkeys(names, value)) for n in range(3)]))
     assert len(json.dumps(bucket.data())) < MAX_DATA_BYTES
 
 
 def test_sums_of_the_largest_values_stay_finite() -> None:
     bucket = Bucket()
     for day in range(2_000):
-        bucket.add(series.summarize(series.gather([(day, {"a": series.MAX_MAGNITUDE})])))
+        bucket.add(series.summarize(series.from_rows([(day, {"a": series.MAX_MAGNITUDE})])))
     assert math.isfinite(bucket.fields["a"].total)
 
 
@@ -124,16 +133,19 @@ def test_sums_of_the_largest_values_stay_finite() -> None:
 )
 def test_the_finest_buckets_that_fit_are_chosen(hours: int, points: int, level: str) -> None:
     first_ms = NOW_MS - hours * 3_600_000
-    assert series.finest(first_ms, NOW_MS, points=points, now_ms=NOW_MS, keep=Keep()).name == level
+    assert series.finest_level(first_ms, NOW_MS, points=points, now_ms=NOW_MS, keep=RetentionPolicy()).name == level
 
 
 def test_buckets_that_are_forgotten_already_are_not_chosen() -> None:
     first_ms = NOW_MS - 20 * DAY.span_ms
     last_ms = first_ms + 600_000
-    assert series.finest(first_ms, last_ms, points=500, now_ms=first_ms, keep=Keep()) == FINEST
-    assert series.finest(first_ms, last_ms, points=500, now_ms=NOW_MS, keep=Keep()).name == "1min"
+    assert series.finest_level(first_ms, last_ms, points=500, now_ms=first_ms, keep=RetentionPolicy()) == FINEST
+    assert series.finest_level(first_ms, last_ms, points=500, now_ms=NOW_MS, keep=RetentionPolicy()).name == "1min"
     ancient_ms = NOW_MS - 3000 * DAY.span_ms
-    assert series.finest(ancient_ms, ancient_ms + 60_000, points=500, now_ms=NOW_MS, keep=Keep()).name == "1h"
+    assert (
+        series.finest_level(ancient_ms, ancient_ms + 60_000, points=500, now_ms=NOW_MS, keep=RetentionPolicy()).name
+        == "1h"
+    )
 
 
 def test_keys_of_a_level_sort_by_time_and_say_their_start() -> None:
