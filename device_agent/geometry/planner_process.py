@@ -140,7 +140,7 @@ class _Process:
         ours, theirs = socket.socketpair()
         with theirs:
             try:
-                self.running = subprocess.Popen(  # noqa: S603 (our own program, run by our own interpreter)
+                self.running = subprocess.Popen(
                     [sys.executable, "-m", "device_agent.geometry.planner_worker"],
                     stdin=theirs.fileno(),
                     stdout=subprocess.DEVNULL,

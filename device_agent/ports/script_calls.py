@@ -8,7 +8,8 @@ from typing import Annotated
 
 from msgspec import Meta, Struct
 
-from device_agent.protocol import JointPositions, Quaternion, Vector3, codec
+from device_agent.protocol import RobotTask, codec
+from device_agent.protocol.commands import Speed
 
 MAX_LINE = 65_536
 """Bytes of a line, with its end. A print of 8,000 characters, each written as six bytes or twelve, fits."""
@@ -48,26 +49,6 @@ class Ended(_Message, frozen=True, kw_only=True, tag="ended"):
     error: _Text = ""
 
 
-class MoveJoints(_Message, frozen=True, kw_only=True, tag="move_joints"):
-    """``robot.move_joints``."""
-
-    position_rad: JointPositions
-    speed: float
-    plan: bool = False
-
-
-class MoveTo(_Message, frozen=True, kw_only=True, tag="move_to"):
-    """``robot.move_to``; with neither orientation the frame keeps its own, with no frame it is the last."""
-
-    frame: _Name
-    position_m: Vector3
-    quaternion: Quaternion | None = None
-    rpy_rad: Vector3 | None = None
-    speed: float
-    straight: bool = False
-    plan: bool = False
-
-
 class Moment(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """One of the keyframes of ``robot.play``: when, and where the joints that it names are then."""
 
@@ -89,65 +70,7 @@ class Play(_Message, frozen=True, kw_only=True, tag="play"):
 class Home(_Message, frozen=True, kw_only=True, tag="home"):
     """``robot.home``."""
 
-    speed: float
-
-
-class Drive(_Message, frozen=True, kw_only=True, tag="drive"):
-    """``robot.drive``."""
-
-    forward_m_s: float
-    left_m_s: float
-    turn_rad_s: float
-    duration_s: float
-
-
-class GoTo(_Message, frozen=True, kw_only=True, tag="go_to"):
-    """``robot.go_to``; without a heading it stands as it comes."""
-
-    x_m: float
-    y_m: float
-    yaw_rad: float | None = None
-
-
-class Look(_Message, frozen=True, kw_only=True, tag="look"):
-    """``robot.look``."""
-
-    position_m: Vector3
-    speed: float
-
-
-class Say(_Message, frozen=True, kw_only=True, tag="say"):
-    """``robot.say``."""
-
-    text: Annotated[str, Meta(max_length=2000)]
-    language: Annotated[str, Meta(max_length=35)]
-
-
-class Stiffness(_Message, frozen=True, kw_only=True, tag="stiffness"):
-    """``robot.stiffness``; no joints: all."""
-
-    value: float
-    joints: Annotated[tuple[_Name, ...], Meta(max_length=128)]
-
-
-class Express(_Message, frozen=True, kw_only=True, tag="express"):
-    """``robot.express``."""
-
-    name: _Name
-    strength: float
-
-
-class Behaviour(_Message, frozen=True, kw_only=True, tag="behaviour"):
-    """``robot.behaviour``."""
-
-    name: _Name
-
-
-class Posture(_Message, frozen=True, kw_only=True, tag="posture"):
-    """``robot.posture``."""
-
-    name: _Name
-    speed: float
+    speed: Speed
 
 
 class AskState(_Message, frozen=True, kw_only=True, tag="state"):
@@ -161,10 +84,8 @@ class AskLatest(_Message, frozen=True, kw_only=True, tag="latest"):
     stream: _Name
 
 
-Show = Say | Stiffness | Express | Posture | Behaviour
-"""Calls for what a robot shows, by its manifest or by its driver."""
-Call = MoveJoints | Play | MoveTo | Home | Drive | GoTo | Look | Show | AskState | AskLatest
-"""What the process waits for an answer to."""
+Call = RobotTask | Play | Home | AskState | AskLatest
+"""Messages that the agent answers. ``RobotTask`` is shared with the commands of the wire contract."""
 Message = Ready | Unfit | Output | Progress | Ended | Call
 
 

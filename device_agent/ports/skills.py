@@ -7,8 +7,9 @@ when the thing is done.
 """
 
 from collections.abc import Collection
-from dataclasses import dataclass
 from typing import Protocol, runtime_checkable
+
+from device_agent.protocol import Express, LookAt, RunBehaviour, Say, SetStiffness, TakePosture
 
 SPEECH, STIFFNESS, GAZE, EXPRESSIONS, BEHAVIOURS = "speech", "stiffness", "gaze", "expressions", "behaviours"
 POSTURES = "postures"
@@ -19,54 +20,8 @@ class SkillError(Exception):
     """It was not done. Its text is fit for an operator, and lists what there is where a name was unknown."""
 
 
-@dataclass(frozen=True, slots=True)
-class Say:
-    """Speak ``text``; ``language`` as ``en`` or ``sk``, or empty for the robot's own."""
-
-    text: str
-    language: str = ""
-
-
-@dataclass(frozen=True, slots=True)
-class Stiffen:
-    """Hold with ``value``, 0 (limp) to 1; empty ``joints``: all. Of these joints only that the robot has."""
-
-    value: float
-    joints: tuple[str, ...] = ()
-
-
-@dataclass(frozen=True, slots=True)
-class LookAt:
-    """Turn the gaze to a point in the robot's base frame [m]."""
-
-    position_m: tuple[float, float, float]
-    speed: float
-
-
-@dataclass(frozen=True, slots=True)
-class Express:
-    """Show the expression ``name``, ``strength`` 0 to 1."""
-
-    name: str
-    strength: float = 1.0
-
-
-@dataclass(frozen=True, slots=True)
-class Behave:
-    """Run the behaviour ``name``."""
-
-    name: str
-
-
-@dataclass(frozen=True, slots=True)
-class Pose:
-    """Take the posture ``name``; ``speed`` is the share of each joint's velocity limit."""
-
-    name: str
-    speed: float = 0.5
-
-
-Skill = Say | Stiffen | LookAt | Express | Behave | Pose
+Skill = Say | SetStiffness | LookAt | Express | RunBehaviour | TakePosture
+"""The messages of the wire contract that a driver can execute itself."""
 
 
 class Stage(Protocol):

@@ -49,7 +49,7 @@ def decode(payload: bytes, kind: type[T]) -> T:
     try:
         message: T = decoder.decode(payload)
     except (msgspec.DecodeError, UnicodeDecodeError, RecursionError) as error:
-        raise ProtocolError(f"not a valid {getattr(kind, '__name__', kind)}: {error}") from error
+        raise ProtocolError(f"not a valid {getattr(kind, '__name__', 'message')}: {error}") from error
     return message
 
 

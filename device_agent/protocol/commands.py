@@ -186,10 +186,10 @@ class SetControl(_Order, frozen=True, kw_only=True, tag="set_control"):
 
 RoomTask = CollectData | TakePicture | CaptureRaw | SetControl
 """What is done with devices of a room."""
-Task = (
-    MoveJoints | MovePose | Say | Express | TakePosture | RunBehaviour | SetStiffness | LookAt | Drive | GoTo | RoomTask
-)
-"""Orders that are actions and reach a device just as they were asked of the API."""
+RobotTask = MoveJoints | MovePose | Say | Express | TakePosture | RunBehaviour | SetStiffness | LookAt | Drive | GoTo
+"""Actions of a robot. A movement script makes the same requests with the same messages."""
+Task = RobotTask | RoomTask
+"""Actions that the API passes to a device unchanged."""
 
 
 class CancelAction(_Order, frozen=True, kw_only=True, tag="cancel_action"):

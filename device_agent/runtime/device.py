@@ -22,7 +22,6 @@ from device_agent.protocol import JointTelemetry, Measurements, Setpoint, Stop, 
 from device_agent.protocol.errors import ProtocolError
 from device_agent.protocol.events import EventKind
 from device_agent.protocol.manifests.robot_type import RobotType
-from device_agent.runtime.actions import call_action
 from device_agent.runtime.actions.device_context import DeviceContext
 from device_agent.runtime.actions.executor import ActionExecutor
 from device_agent.runtime.actions.script_policy import ScriptPolicy
@@ -140,7 +139,7 @@ class Device:
             room_device=None if instrument is None else instrument.manifest,
             simulated=driver.simulated,
             limits=self._controller.limits if robot_type.joints else (),
-            actions=call_action.kinds(body.can()) if instrument is None else instrument.actions,
+            actions=body.tasks() if instrument is None else instrument.actions,
             interlocks=[rule.shown for rule in interlocks],
             journal=journal,
             publish=publish,

@@ -113,7 +113,7 @@ class Robot:
         if quaternion is not None and rpy_rad is not None:
             raise RobotError("give a quaternion or rpy_rad, not both")
         self._ask(
-            "move_to",
+            "move_pose",
             frame=frame or (self.frames[-1] if self.frames else ""),
             position_m=_numbers(position_m, 3, "position_m"),
             quaternion=None if quaternion is None else _numbers(quaternion, 4, "quaternion"),
@@ -151,7 +151,7 @@ class Robot:
 
     def look(self, position_m: Sequence[float], speed: float = 0.5) -> None:
         """Turn the gaze to a point x, y, z in the robot's base frame [m]."""
-        self._ask("look", position_m=_numbers(position_m, 3, "position_m"), speed=float(speed))
+        self._ask("look_at", position_m=_numbers(position_m, 3, "position_m"), speed=float(speed))
 
     def say(self, text: str, language: str = "") -> None:
         """Speak and wait for the end; ``language`` as ``en`` or ``sk``, else the robot's own."""
@@ -159,7 +159,7 @@ class Robot:
 
     def stiffness(self, value: float, joints: Sequence[str] = ()) -> None:
         """How firmly joints hold, 0 (limp) to 1; all of them when none is named."""
-        self._ask("stiffness", value=float(value), joints=[str(name) for name in joints])
+        self._ask("set_stiffness", value=float(value), joints=[str(name) for name in joints])
 
     def express(self, name: str, strength: float = 1.0) -> None:
         """Show an expression, ``strength`` 0 to 1."""
@@ -167,11 +167,11 @@ class Robot:
 
     def posture(self, name: str, speed: float = 0.5) -> None:
         """Move to one of the robot type's postures and wait until there; ``speed`` as for ``move_joints``."""
-        self._ask("posture", name=str(name), speed=float(speed))
+        self._ask("take_posture", name=str(name), speed=float(speed))
 
     def behaviour(self, name: str) -> None:
         """Run a behaviour that the robot has of its own, and wait for its end."""
-        self._ask("behaviour", name=str(name))
+        self._ask("run_behaviour", name=str(name))
 
     def state(self) -> dict[str, Any]:
         """Measured ``position_rad``, ``velocity_rad_s``, ``effort_nm`` by joint name, ``frames`` by name, ``mode``.

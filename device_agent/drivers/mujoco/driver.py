@@ -18,7 +18,7 @@ from device_agent.ports import skills
 from device_agent.ports.driver import DriverError, Observation
 from device_agent.ports.sensor import Frame
 from device_agent.ports.skills import Skill, SkillError, Stage
-from device_agent.protocol import Pose, Twin
+from device_agent.protocol import Pose, SetStiffness, Twin
 from device_agent.protocol.manifests.robot_type import RobotType
 from device_agent.simulation.mjcf import twin
 from device_agent.simulation.scene_assembly import SCALAR_JOINTS
@@ -181,7 +181,7 @@ class MujocoDriver:
             SkillError: Another skill, or not connected.
         """
         del stage
-        if not isinstance(skill, skills.Stiffen) or self._stiffness is None:
+        if not isinstance(skill, SetStiffness) or self._stiffness is None:
             raise SkillError(f"the simulation of '{self._device}' cannot do this now")
         self._stiffness.want(skill.value, skill.joints or [joint.name for joint in self._type.joints])
 

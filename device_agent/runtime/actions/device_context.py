@@ -2,13 +2,29 @@
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, get_args
+
+from msgspec import StructMeta
 
 from device_agent.ports import skills
 from device_agent.ports.driver import Observation
 from device_agent.ports.floor_map import ObstacleMap
 from device_agent.ports.geometry import RobotGeometry
+from device_agent.ports.script_calls import AskLatest, AskState, Home, Play
 from device_agent.ports.skills import Skills
+from device_agent.protocol import (
+    Drive,
+    Express,
+    GoTo,
+    LookAt,
+    MoveJoints,
+    MovePose,
+    RobotTask,
+    RunBehaviour,
+    Say,
+    SetStiffness,
+    TakePosture,
+)
 from device_agent.protocol.manifests.robot_type import RobotType
 from device_agent.runtime.actions.speech_output import SpeechOutput
 from device_agent.runtime.control.controller import Controller
@@ -16,6 +32,14 @@ from device_agent.runtime.errors import Refused
 from device_agent.runtime.readings import Reading, ReadingCache
 from device_agent.runtime.room.room_device import RoomDevice
 
+SCRIPT_NAMES: Mapping[StructMeta, str] = {
+    MovePose: "move_to",
+    LookAt: "look",
+    SetStiffness: "stiffness",
+    TakePosture: "posture",
+    RunBehaviour: "behaviour",
+}
+"""Methods of the script API whose name differs from the kind of their message."""
 CARTESIAN = "cartesian"
 """A capability that a manifest may name, besides those of ``ports.skills``."""
 
@@ -70,32 +94,46 @@ class DeviceContext:
             return {}
         return {"position_rad": by_name(self.robot_type, seen.position_rad)}
 
-    def can(self) -> tuple[str, ...]:
-        """Names of the calls that scripts have on this robot."""
+    def supported(self) -> tuple[StructMeta, ...]:
+        """Types of the calls that this robot supports."""
         kind, named = self.robot_type, set(self.robot_type.capabilities)
-        by_skill = {capability for capability in named if self.performs(capability)}
-        has = {
-            "move_joints": bool(kind.joints),
-            "play": bool(kind.joints),
-            "home": bool(kind.joints),
-            "move_to": CARTESIAN in named and self.geometry is not None,
-            "drive": kind.base is not None,
-            "go_to": kind.base is not None and self.ground is not None,
-            "look": skills.GAZE in by_skill or (kind.gaze is not None and self.geometry is not None),
-            "say": skills.SPEECH in named,
-            "stiffness": skills.STIFFNESS in by_skill,
-            "express": skills.EXPRESSIONS in by_skill or bool(kind.expressions),
-            "posture": skills.POSTURES in by_skill or bool(kind.postures),
-            "behaviour": skills.BEHAVIOURS in by_skill or bool(kind.behaviours),
-            "state": True,
-            "latest": True,
+        by_driver = {capability for capability in named if self.performs(capability)}
+        has: dict[StructMeta, bool] = {
+            MoveJoints: bool(kind.joints),
+            Play: bool(kind.joints),
+            Home: bool(kind.joints),
+            MovePose: CARTESIAN in named and self.geometry is not None,
+            Drive: kind.base is not None,
+            GoTo: kind.base is not None and self.ground is not None,
+            LookAt: skills.GAZE in by_driver or (kind.gaze is not None and self.geometry is not None),
+            Say: skills.SPEECH in named,
+            SetStiffness: skills.STIFFNESS in by_driver,
+            Express: skills.EXPRESSIONS in by_driver or bool(kind.expressions),
+            TakePosture: skills.POSTURES in by_driver or bool(kind.postures),
+            RunBehaviour: skills.BEHAVIOURS in by_driver or bool(kind.behaviours),
+            AskState: True,
+            AskLatest: True,
         }
-        return tuple(name for name, there in has.items() if there)
+        return tuple(call for call, available in has.items() if available)
+
+    def script_calls(self) -> tuple[str, ...]:
+        """Names of the script API's methods that this robot supports."""
+        return tuple(SCRIPT_NAMES.get(call, tag(call)) for call in self.supported())
+
+    def tasks(self) -> tuple[str, ...]:
+        """Kinds of the wire contract's tasks that this robot supports."""
+        supported = self.supported()
+        return tuple(tag(task) for task in get_args(RobotTask) if task in supported)
 
     def performs(self, capability: str) -> bool:
         """Whether its driver does this itself; else it is done by what the manifest says."""
         able = self.skills
         return able is not None and capability in self.robot_type.capabilities and capability in able.performs
+
+
+def tag(call: StructMeta) -> str:
+    """The ``kind`` of a message type."""
+    return str(call.__struct_config__.tag)
 
 
 def by_name(robot_type: RobotType, values: Sequence[float]) -> dict[str, float]:

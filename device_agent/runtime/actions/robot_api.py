@@ -4,12 +4,12 @@ import threading
 from collections.abc import Callable, Mapping
 from typing import Any
 
-from device_agent.ports import script_calls, skills
 from device_agent.ports.driver import REST, Twist
 from device_agent.ports.geometry import GeometryError, RobotGeometry
-from device_agent.protocol import Vector3
-from device_agent.runtime.actions.device_context import DeviceContext, by_name
-from device_agent.runtime.actions.skill_runner import SkillRunner, check_share
+from device_agent.ports.script_calls import AskLatest, AskState, Call, Home, Play
+from device_agent.protocol import Drive, GoTo, LookAt, MoveJoints, MovePose
+from device_agent.runtime.actions.device_context import SCRIPT_NAMES, DeviceContext, by_name, tag
+from device_agent.runtime.actions.skill_runner import SkillRunner
 from device_agent.runtime.authority.authority import Reservation
 from device_agent.runtime.control.goals import GoalResult, MotionGoal
 from device_agent.runtime.errors import Refused
@@ -39,7 +39,8 @@ class RobotApi:
         self.over = threading.Event()
         self.joints = tuple(joint.name for joint in body.robot_type.joints)
         self.frames = () if body.geometry is None else tuple(body.geometry.frames)
-        self.can = body.can()
+        self.can = body.script_calls()
+        self._supported = body.supported()
         self.limited: tuple[str, ...] = ()
         self.performer = SkillRunner(body, self)
 
@@ -60,31 +61,36 @@ class RobotApi:
         self.end()
         self._body.controller.end_action(self.tenure)
 
-    def do(self, call: script_calls.Call) -> Any:
+    def do(self, call: Call) -> Any:
         """See ``Reach``."""
-        kind = str(type(call).__struct_config__.tag)
-        if kind not in self.can:
-            raise Refused("cannot", f"this robot has no {kind}; it has {', '.join(self.can)}")
+        self._check_supported(call)
         match call:
-            case script_calls.MoveJoints(position_rad=position_rad, speed=speed, plan=plan):
+            case MoveJoints(position_rad=position_rad, speed=speed, plan=plan):
                 self.move_joints(position_rad, speed, plan=plan)
-            case script_calls.Play():
+            case Play():
                 self._play(call)
-            case script_calls.Home(speed=speed):
+            case Home(speed=speed):
                 self.move_joints(self._body.robot_type.home_rad, speed)
-            case script_calls.MoveTo():
+            case MovePose():
                 self._move_to(call)
-            case script_calls.Drive():
+            case Drive():
                 self._drive(call)
-            case script_calls.GoTo():
+            case GoTo():
                 self._go_to(call)
-            case script_calls.Look(position_m=position_m, speed=speed):
-                self._look(position_m, speed)
-            case script_calls.AskState() | script_calls.AskLatest():
-                return self._tell(call)
+            case LookAt():
+                self._look(call)
+            case AskState():
+                return self._state()
+            case AskLatest(device=device, stream=stream):
+                return self._latest(device, stream)
             case _:
                 self.performer.show(call)
         return None
+
+    def _check_supported(self, call: Call) -> None:
+        if type(call) not in self._supported:
+            name = SCRIPT_NAMES.get(type(call), tag(type(call)))
+            raise Refused("cannot", f"this robot has no {name}; it has {', '.join(self.can)}")
 
     def move_joints(self, position_rad: Mapping[str, float], speed: float, *, plan: bool = False) -> None:
         """Move and wait until there [rad], around what is in between if ``plan``.
@@ -92,7 +98,6 @@ class RobotApi:
         Raises:
             Refused: It did not get there.
         """
-        check_share("speed", speed, above_zero=True)
         controller = self._body.controller
         if plan:
             routes = MotionPlanner(self._body.robot_type, self._shape())
@@ -102,7 +107,7 @@ class RobotApi:
         else:
             self.follow(controller.move(self.tenure, dict(position_rad), speed=speed))
 
-    def _play(self, call: script_calls.Play) -> None:
+    def _play(self, call: Play) -> None:
         if not 0 < call.speed <= FASTEST:  # false for NaN
             raise Refused("bad_speed", f"speed must be above 0 and at most {FASTEST:g}, not {call.speed}")
         self.performer.come_to_rest()
@@ -117,8 +122,7 @@ class RobotApi:
         passage.note(timeline.limited)
         self.follow(passage)
 
-    def _move_to(self, call: script_calls.MoveTo) -> None:
-        check_share("speed", call.speed, above_zero=True)
+    def _move_to(self, call: MovePose) -> None:
         if call.straight and call.plan:
             raise Refused("bad_way", "a way is straight or planned, not both")
         controller, geometry = self._body.controller, self._shape()
@@ -136,11 +140,11 @@ class RobotApi:
             raise Refused("out_of_reach", str(error)) from error
         self.move_joints(by_name(self._body.robot_type, solved), call.speed, plan=call.plan)
 
-    def _drive(self, call: script_calls.Drive) -> None:
+    def _drive(self, call: Drive) -> None:
         twist = Twist(call.forward_m_s, call.left_m_s, call.turn_rad_s)
         self.follow(self._body.controller.drive(self.tenure, twist, duration_s=call.duration_s))
 
-    def _go_to(self, call: script_calls.GoTo) -> None:
+    def _go_to(self, call: GoTo) -> None:
         """A short drive after the other, each of which ends by itself: who stops deciding stands."""
         body, controller = self._body, self._body.controller
         errand, where = Navigator.of(call.x_m, call.y_m, call.yaw_rad, body.robot_type), PoseEstimator(body.name)
@@ -172,21 +176,17 @@ class RobotApi:
         if course.outcome is not GoalResult.REACHED:
             raise course.why or Refused("interrupted", "the move was interrupted")
 
-    def _look(self, position_m: Vector3, speed: float) -> None:
-        check_share("speed", speed, above_zero=True)
+    def _look(self, call: LookAt) -> None:
         if self._body.robot_type.gaze is None:
-            self.performer.perform(skills.LookAt(position_m, speed))
+            self.performer.perform(call)
         else:
             start = self._body.seen().position_rad
-            self.move_joints(gaze.aim(self._body.robot_type, self._shape(), start, position_m), speed)
+            self.move_joints(gaze.aim(self._body.robot_type, self._shape(), start, call.position_m), call.speed)
 
     def _shape(self) -> RobotGeometry:
         if self._body.geometry is None:
             raise Refused("no_model", "this robot's type has no model")
         return self._body.geometry
-
-    def _tell(self, call: script_calls.AskState | script_calls.AskLatest) -> dict[str, Any] | None:
-        return self._state() if isinstance(call, script_calls.AskState) else self._latest(call.device, call.stream)
 
     def _state(self) -> dict[str, Any]:
         seen, kind = self._body.seen(), self._body.robot_type

@@ -5,8 +5,9 @@ import threading
 import time
 from typing import Protocol
 
-from device_agent.ports import script_calls, skills
+from device_agent.ports import skills
 from device_agent.ports.skills import Skill, SkillError
+from device_agent.protocol import Express, RunBehaviour, Say, SetStiffness, TakePosture
 from device_agent.runtime.actions.device_context import DeviceContext
 from device_agent.runtime.actions.speech_output import Utterance
 from device_agent.runtime.authority.authority import Reservation
@@ -53,28 +54,26 @@ class SkillRunner:
         self._body = body
         self._mover = mover
 
-    def show(self, call: script_calls.Show) -> None:
-        """Do it to its end; the driver goes first.
+    def show(self, skill: Skill) -> None:
+        """Execute a skill to its end, by the driver if it supports the skill.
 
         Raises:
             Refused: It was not done.
         """
         kind = self._body.robot_type
-        match call:
-            case script_calls.Express(name=name, strength=strength) if not self._body.performs(skills.EXPRESSIONS):
-                check_share("strength", strength)
+        match skill:
+            case Express(name=name, strength=strength) if not self._body.performs(skills.EXPRESSIONS):
                 self._mover.move_joints(named_poses.expression(kind, name, strength), named_poses.EXPRESSION_SPEED)
-            case script_calls.Posture(name=name, speed=speed) if not self._body.performs(skills.POSTURES):
+            case TakePosture(name=name, speed=speed) if not self._body.performs(skills.POSTURES):
                 self._mover.move_joints(named_poses.posture(kind, name), speed)
-            case script_calls.Behaviour(name=name) if not self._body.performs(skills.BEHAVIOURS):
+            case RunBehaviour(name=name) if not self._body.performs(skills.BEHAVIOURS):
                 self._behave(name)
-            case script_calls.Say(text=text, language=language) if not self._body.performs(skills.SPEECH):
+            case Say(text=text, language=language) if not self._body.performs(skills.SPEECH):
                 self._say(text, language)
-            case script_calls.Stiffness(value=value, joints=joints):
-                check_share("stiffness", value)
-                self._stiffen(value, joints)
+            case SetStiffness():
+                self._stiffen(skill)
             case _:
-                self.perform(_skill(call))
+                self.perform(skill)
 
     def perform(self, skill: Skill) -> None:
         """Have the driver do it, to its end.
@@ -131,20 +130,20 @@ class SkillRunner:
 
     def _aloud(self, text: str) -> None:
         with contextlib.suppress(Refused):  # the words of a behaviour that is over, or of a robot that lost its voice
-            self.perform(skills.Say(text))
+            self.perform(Say(text=text))
 
     # ------------------------------------------------------------ stiffness
 
-    def _stiffen(self, value: float, joints: tuple[str, ...]) -> None:
+    def _stiffen(self, order: SetStiffness) -> None:
         """While servos change their strength their joints are commanded to where they are: nothing jumps or drops."""
         controller = self._body.controller
-        held = before = controller.stiffness(joints)
+        held = before = controller.stiffness(order.joints)
         self.come_to_rest()
         controller.stiffen(self._mover.tenure, dict.fromkeys(before, 0.0))
         try:
             self._mover.over.wait(_PERIODS * self._body.robot_type.period_ms / 1000)
-            self.perform(skills.Stiffen(value, joints))
-            held = dict.fromkeys(before, value)
+            self.perform(order)
+            held = dict.fromkeys(before, order.value)
             self._mover.over.wait(_PERIODS * self._body.robot_type.period_ms / 1000)
         finally:
             controller.stiffened(held)
@@ -188,26 +187,3 @@ class _SkillContext:
             self._mover.move_joints(position_rad, speed)
         except Refused as refused:
             raise SkillError(refused.message) from refused
-
-
-def check_share(name: str, value: float, *, above_zero: bool = False) -> None:
-    """A share is 0 to 1.
-
-    Raises:
-        Refused: It is not, or is 0 where that is none.
-    """
-    if not (0 < value <= 1 if above_zero else 0 <= value <= 1):  # false for NaN
-        raise Refused(f"bad_{name}", f"{name} must be {'above ' if above_zero else ''}0 and at most 1, not {value}")
-
-
-def _skill(call: script_calls.Say | script_calls.Express | script_calls.Posture | script_calls.Behaviour) -> Skill:
-    match call:
-        case script_calls.Say(text=text, language=language):
-            return skills.Say(text, language)
-        case script_calls.Express(name=name, strength=strength):
-            check_share("strength", strength)
-            return skills.Express(name, strength)
-        case script_calls.Posture(name=name, speed=speed):
-            check_share("speed", speed, above_zero=True)
-            return skills.Pose(name, speed)
-    return skills.Behave(call.name)

@@ -12,7 +12,7 @@ import pytest
 
 from device_agent.drivers.mujoco import WheeledDriver
 from device_agent.ports import script_calls
-from device_agent.protocol import Measurements
+from device_agent.protocol import GoTo, Measurements
 from device_agent.protocol.manifests import robot_type
 from device_agent.runtime.actions.device_context import DeviceContext
 from device_agent.runtime.actions.robot_api import RobotApi
@@ -191,7 +191,7 @@ def play(lab: Laboratory, movement: str, parameters: dict[str, Any]) -> list[str
 
 
 def check(lab: Laboratory, x_m: float, y_m: float, yaw_rad: float) -> None:
-    lab.robot.do(script_calls.GoTo(x_m=x_m, y_m=y_m, yaw_rad=yaw_rad))
+    lab.robot.do(GoTo(x_m=x_m, y_m=y_m, yaw_rad=yaw_rad))
     x, y, yaw = lab.truth
     assert math.dist((x, y), (x_m, y_m)) <= NEAR_M
     assert abs(math.remainder(yaw - yaw_rad, 2 * math.pi)) <= NEAR_RAD
@@ -200,7 +200,7 @@ def check(lab: Laboratory, x_m: float, y_m: float, yaw_rad: float) -> None:
 
 def test_qbo_goes_around_another_robot_to_where_it_is_sent(lab: Laboratory) -> None:
     with pytest.raises(Refused, match="nearest place to go to is x_m") as refused:
-        lab.robot.do(script_calls.GoTo(x_m=1.5, y_m=2.0))  # the arm's table stands there
+        lab.robot.do(GoTo(x_m=1.5, y_m=2.0))  # the arm's table stands there
     assert refused.value.code == "taken"
     check(lab, 0.6, -0.35, 1.0)  # straight there stands the NAO
 

@@ -5,8 +5,8 @@ import numpy as np
 import pytest
 
 from device_agent.drivers.mujoco import MujocoDriver, World
-from device_agent.ports import skills
 from device_agent.ports.skills import SkillError, Stage
+from device_agent.protocol import Say, SetStiffness
 from device_agent.protocol.manifests import robot_type
 from tests.harness.paths import ROOT
 
@@ -26,7 +26,7 @@ class Arm:
         self.names = [joint.name for joint in KIND.joints]
 
     def stiffen(self, value: float, *joints: str) -> None:
-        self.driver.perform(skills.Stiffen(value, joints), STAGE)
+        self.driver.perform(SetStiffness(value=value, joints=joints), STAGE)
 
     def run(self, seconds: float) -> dict[str, float]:
         snapshot = self.world.step(round(seconds / 0.002))
@@ -60,4 +60,4 @@ def test_with_all_of_its_stiffness_back_it_is_as_it_was_made() -> None:
 
 def test_other_skills_are_not_the_simulations() -> None:
     with pytest.raises(SkillError, match="cannot do this"):
-        Arm().driver.perform(skills.Say("hello"), STAGE)
+        Arm().driver.perform(Say(text="hello"), STAGE)

@@ -16,9 +16,8 @@ import pytest
 from device_agent import geometry
 from device_agent.geometry.joint_bounds import Bounds
 from device_agent.geometry.mujoco_geometry import MujocoGeometry
-from device_agent.ports import script_calls
 from device_agent.ports.geometry import GeometryError, PlannerLostError
-from device_agent.protocol import StopLatch
+from device_agent.protocol import MoveJoints, StopLatch
 from device_agent.protocol.manifests import robot_type
 from device_agent.runtime.actions.device_context import DeviceContext
 from device_agent.runtime.actions.robot_api import RobotApi
@@ -132,7 +131,7 @@ class Arm:
     def cross(self) -> Refused:
         """Ask for what there is no way to; gives why it did not go."""
         with pytest.raises(Refused) as refused:
-            self.robot.do(script_calls.MoveJoints(position_rad={KIND.joints[0].name: BEYOND[0]}, speed=0.5, plan=True))
+            self.robot.do(MoveJoints(position_rad={KIND.joints[0].name: BEYOND[0]}, speed=0.5, plan=True))
         return refused.value
 
 

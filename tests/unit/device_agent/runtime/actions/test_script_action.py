@@ -11,6 +11,7 @@ from typing import Any
 
 import pytest
 
+from device_agent import protocol
 from device_agent.ports import script_calls
 from device_agent.ports.sandbox import JailError, Limits, SandboxStatus
 from device_agent.protocol import RunMovement
@@ -30,7 +31,7 @@ class Notes:
 
     def do(self, call: script_calls.Call) -> Any:
         match call:
-            case script_calls.MoveJoints(position_rad=position_rad, speed=speed):
+            case protocol.MoveJoints(position_rad=position_rad, speed=speed):
                 if "knee" in position_rad:
                     raise Refused("unknown_joint", "no joint 'knee'")
                 self.calls.append((position_rad, speed))
@@ -159,14 +160,14 @@ def test_every_call_of_the_api_arrives_as_it_was_meant() -> None:
         "room.latest('agent-pir', 'presence')\n"
     )
     assert notes.calls == [
-        script_calls.MoveTo(frame="tool", position_m=(0.1, 0, 0.3), rpy_rad=(0, 0, 1), speed=0.2),
-        script_calls.MoveTo(frame="camera", position_m=(0.1, 0, 0.3), quaternion=(1, 0, 0, 0), speed=0.5),
-        script_calls.Drive(forward_m_s=0.1, left_m_s=0, turn_rad_s=0.5, duration_s=2),
-        script_calls.Look(position_m=(1, 0, 0), speed=0.5),
-        script_calls.Say(text="ahoj", language="sk"),
-        script_calls.Stiffness(value=0.5, joints=("elbow",)),
-        script_calls.Express(name="smile", strength=0.7),
-        script_calls.Behaviour(name="wave"),
+        protocol.MovePose(frame="tool", position_m=(0.1, 0, 0.3), rpy_rad=(0, 0, 1), speed=0.2),
+        protocol.MovePose(frame="camera", position_m=(0.1, 0, 0.3), quaternion=(1, 0, 0, 0), speed=0.5),
+        protocol.Drive(forward_m_s=0.1, left_m_s=0, turn_rad_s=0.5, duration_s=2),
+        protocol.LookAt(position_m=(1, 0, 0), speed=0.5),
+        protocol.Say(text="ahoj", language="sk"),
+        protocol.SetStiffness(value=0.5, joints=("elbow",)),
+        protocol.Express(name="smile", strength=0.7),
+        protocol.RunBehaviour(name="wave"),
         script_calls.AskLatest(device="agent-pir", stream="presence"),
     ]
 
@@ -186,19 +187,19 @@ def test_keyframes_are_played_up_to_each_at_which_something_is_done() -> None:
     there = script_calls.Moment(time_s=1, position_rad={"elbow": 0.2})
     assert notes.calls == [
         ({"elbow": 0.1}, 0.25),
-        script_calls.Say(text="off", language=""),
+        protocol.Say(text="off", language=""),
         script_calls.Play(keyframes=(there, script_calls.Moment(time_s=2)), first=2, speed=0.5),
-        script_calls.Posture(name="Sit", speed=0.5),
-        script_calls.Express(name="smile", strength=1),
-        script_calls.Drive(forward_m_s=0.1, left_m_s=0, turn_rad_s=0, duration_s=2),
+        protocol.TakePosture(name="Sit", speed=0.5),
+        protocol.Express(name="smile", strength=1),
+        protocol.Drive(forward_m_s=0.1, left_m_s=0, turn_rad_s=0, duration_s=2),
         script_calls.Play(
             keyframes=(script_calls.Moment(time_s=2), script_calls.Moment(time_s=2.5, position_rad={"shoulder": 0.3})),
             first=4,
             speed=0.5,
         ),
-        script_calls.Behaviour(name="nod"),
-        script_calls.GoTo(x_m=1, y_m=2),
-        script_calls.Say(text="end", language=""),
+        protocol.RunBehaviour(name="nod"),
+        protocol.GoTo(x_m=1, y_m=2),
+        protocol.Say(text="end", language=""),
     ]
 
 

@@ -9,7 +9,6 @@ from typing import Any
 import msgspec
 import pytest
 
-from device_agent.ports import skills
 from device_agent.ports.driver import Observation
 from device_agent.ports.skills import Skill, SkillError, Stage
 from device_agent.ports.speech import SpeechError, Spoken
@@ -62,7 +61,7 @@ class Servos(ToyDriver):
         return Observation(self.position, (0.0, 0.0), (0.0, 0.0), ())
 
     def perform(self, skill: Skill, stage: Stage) -> None:
-        assert isinstance(skill, skills.Stiffen)
+        assert isinstance(skill, SetStiffness)
         assert not stage.ended
         if self.fails:
             raise SkillError("the servos do not answer")
@@ -267,7 +266,7 @@ class Speaking(Servos):
 
     def perform(self, skill: Skill, stage: Stage) -> None:
         del stage
-        assert isinstance(skill, skills.Say)
+        assert isinstance(skill, Say)
         self.heard.append(skill.text)
 
 
@@ -324,7 +323,7 @@ def test_servos_that_do_not_change_are_not_taken_for_limp(bench: Bench) -> None:
     ("request_", "says"),
     [
         (SetStiffness(value=0.5, joints=("nose",)), "no joint 'nose'; there are shoulder, elbow"),
-        ("robot.stiffness(2)", "stiffness must be 0 and at most 1, not 2.0"),
+        ("robot.stiffness(2)", "not a valid message: Expected `float` <= 1.0 - at `$.value`"),
     ],
 )
 def test_a_stiffness_that_is_none_is_refused(bench: Bench, request_: Any, says: str) -> None:

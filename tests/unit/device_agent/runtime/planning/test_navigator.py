@@ -8,9 +8,8 @@ import numpy as np
 import pytest
 
 from device_agent.perception.occupancy_grid import Floor, OccupancyGrid
-from device_agent.ports import script_calls
 from device_agent.ports.driver import REST, Twist
-from device_agent.protocol import StopLatch
+from device_agent.protocol import GoTo, StopLatch
 from device_agent.runtime.actions.device_context import DeviceContext
 from device_agent.runtime.actions.robot_api import RobotApi
 from device_agent.runtime.errors import Refused
@@ -212,7 +211,7 @@ class Toy:
 
 def test_a_robot_goes_to_a_place_and_rests_there() -> None:
     toy = Toy(room())
-    toy.robot.do(script_calls.GoTo(x_m=0.3, y_m=0.0, yaw_rad=0.3))
+    toy.robot.do(GoTo(x_m=0.3, y_m=0.0, yaw_rad=0.3))
     assert math.dist((toy.at.x_m, toy.at.y_m), (0.3, 0.0)) < 0.15
     assert not toy.rig.controller.moving
     toy.end()
@@ -225,7 +224,7 @@ def test_who_cannot_see_the_room_or_waits_in_vain_says_so(monkeypatch: pytest.Mo
     for ground, x_m, code in ((None, 1.0, "no_ground"), (shut, 0.6, "taken"), (room(), 9.0, "out_of_room")):
         toy = Toy(ground)
         with pytest.raises(Refused) as refused:
-            toy.robot.do(script_calls.GoTo(x_m=x_m, y_m=0.0))
+            toy.robot.do(GoTo(x_m=x_m, y_m=0.0))
         assert refused.value.code == code
         toy.end()
 
@@ -234,10 +233,10 @@ def test_an_errand_that_loses_the_device_ends() -> None:
     toy = Toy(room())
     threading.Timer(0.3, lambda: toy.rig.controller.stop(StopLatch(by="ann", reason="", at_ms=0))).start()
     with pytest.raises(Refused, match="stopped"):
-        toy.robot.do(script_calls.GoTo(x_m=1.5, y_m=0.0))
+        toy.robot.do(GoTo(x_m=1.5, y_m=0.0))
     toy.end()
     with pytest.raises(Refused):
-        toy.robot.do(script_calls.GoTo(x_m=1.5, y_m=0.0))
+        toy.robot.do(GoTo(x_m=1.5, y_m=0.0))
 
 
 def test_a_place_is_finite_and_a_robot_without_a_base_goes_nowhere() -> None:
