@@ -156,7 +156,9 @@ def main() -> int:
     if parser.parse_args().check:
         if PAGE.read_text(encoding="utf-8") == text(reports()):
             return 0
-        sys.stderr.write("docs/results/benchmarks.md is not what benchmarks/results say; run `python -m benchmarks.page`\n")
+        sys.stderr.write(
+            "docs/results/benchmarks.md is not what benchmarks/results say; run `python -m benchmarks.page`\n"
+        )
         return 1
     write()
     return 0

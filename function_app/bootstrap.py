@@ -6,11 +6,9 @@ As long as there are services: each is made here once, with all that it is given
 from dataclasses import dataclass
 
 from function_app.adapters import factory
-from function_app.adapters.local.blobs import FileBlobs
+from function_app.adapters.factory import Adapters
 from function_app.adapters.local.clock import SystemClock
 from function_app.adapters.local.command_feed import MqttOrders
-from function_app.adapters.local.password_hasher import Argon2Hashes
-from function_app.adapters.local.robot_catalogue import FolderCatalogue
 from function_app.adapters.model_compiler.compiler import MujocoCompiler
 from function_app.domain.telemetry.series import RetentionPolicy
 from function_app.ports.blobs import Blobs, Transfers
@@ -175,23 +173,21 @@ class Functions:
         await self.certificates.close()
 
 
-def build(settings: Settings, *, clock: Clock | None = None) -> Functions:
-    """The functions, with the stores that the settings choose. Reads the signing keys, opens no socket.
+def build(settings: Settings, *, clock: Clock | None = None, adapters: Adapters | None = None) -> Functions:
+    """The services over the adapters that the settings choose. Reads the signing keys, opens no connection.
+
+    Args:
+        settings: Of this installation.
+        clock: The wall clock; by default the machine's.
+        adapters: Used instead of those that the settings choose.
 
     Raises:
         StoreError: The signing keys cannot be used.
     """
     now = clock or SystemClock()
-    keys = factory.keys(settings, now.now_ms)
-    tables, blobs = factory.stores(settings, keys)
-    catalogue = FolderCatalogue(settings.robots)
-
-    async def publish(topic: str, payload: bytes) -> None:
-        await bus.publish(topic, payload)
-
-    access = factory.access(settings, keys, tables, publish)
-    bus = factory.bus(settings, access)
-    feed, telemetry, late = factory.feeds(settings, access)
+    chosen = adapters or factory.adapters(settings, now)
+    keys, tables, blobs, catalogue = chosen.keys, chosen.tables, chosen.blobs, chosen.catalogue
+    access, bus = chosen.access, chosen.bus
 
     forget = Retention(tables=tables, blobs=blobs)
     pending = Reminders(tables=tables)
@@ -280,7 +276,7 @@ def build(settings: Settings, *, clock: Clock | None = None) -> Functions:
         pending=pending,
         fence=fence,
         access=access,
-        certificates=factory.certificates(settings),
+        certificates=chosen.certificates,
         bus=bus,
         series=writer,
         forget=forget,
@@ -337,12 +333,12 @@ def build(settings: Settings, *, clock: Clock | None = None) -> Functions:
         tables=tables,
         blobs=blobs,
         bus=bus,
-        feed=feed,
-        telemetry=telemetry,
-        late=late,
+        feed=chosen.feed,
+        telemetry=chosen.telemetry,
+        late=chosen.late,
         access=access,
-        certificates=factory.certificates(settings),
-        certify=AgentCertificates(certificates=factory.certificates(settings)),
+        certificates=chosen.certificates,
+        certify=AgentCertificates(certificates=chosen.certificates),
         keys=keys,
         clock=now,
         identify=identify,
@@ -363,7 +359,7 @@ def build(settings: Settings, *, clock: Clock | None = None) -> Functions:
         ),
         passwords=Passwords(
             tables=tables,
-            hashes=Argon2Hashes(),
+            hashes=chosen.password_hashes,
             attempts=attempts,
             sign_in=sign_in,
             sessions=sessions,
@@ -451,7 +447,7 @@ def build(settings: Settings, *, clock: Clock | None = None) -> Functions:
         latencies=latencies,
         intake=intake,
         uploads=uploads,
-        transfers=blobs if isinstance(blobs, FileBlobs) else None,
+        transfers=chosen.transfers,
         series=SeriesReader(tables=tables, devices=devices, keep=keep, clock=now),
         chain=chain,
         trail=AuditReader(tables=tables, blobs=blobs, keys=keys),

@@ -6,6 +6,7 @@ Of the stores, and of the clouds' adapters, only those in use are imported, and 
 import hashlib
 import ssl
 from collections.abc import Awaitable, Callable
+from dataclasses import dataclass
 
 from function_app.adapters.local.blobs import FileBlobs
 from function_app.adapters.local.broker_access import MosquittoBrokerAccess, TokenBrokerAccess
@@ -13,18 +14,22 @@ from function_app.adapters.local.certificates import FileCertificates, NoCertifi
 from function_app.adapters.local.clock import SystemClock
 from function_app.adapters.local.command_bus import MqttCommandBus
 from function_app.adapters.local.device_feed import MqttFeed, MqttLate, MqttTelemetry
+from function_app.adapters.local.password_hasher import Argon2Hashes
+from function_app.adapters.local.robot_catalogue import FolderCatalogue
 from function_app.adapters.local.signing_keys import FileKeys
 from function_app.adapters.mqtt.connection import Broker
 from function_app.adapters.mqtt.tls import client_context
 from function_app.adapters.shared.key_ring_keys import RingKeys
 from function_app.adapters.shared.vault_keys import VaultKeys
-from function_app.ports.blobs import Blobs
+from function_app.ports.blobs import Blobs, Transfers
 from function_app.ports.broker_access import BrokerAccess, BrokerAccessError
 from function_app.ports.certificates import Certificates
 from function_app.ports.clock import Clock
 from function_app.ports.command_bus import CommandBus
 from function_app.ports.device_feed import Feed, Telemetry
 from function_app.ports.oidc_provider import OpenId
+from function_app.ports.password_hasher import PasswordHashes
+from function_app.ports.robot_catalogue import Catalogue
 from function_app.ports.tables import StoreError, Tables
 from function_app.settings import AwsStore, AzureStore, EventGridBus, IotBus, KeyVault, SecretsManager, Settings
 
@@ -32,6 +37,55 @@ TABLES_FILE = "tables.sqlite"
 BLOBS_PATH = "/api/v1/blobs"
 """Where the addresses of blobs in files lead to."""
 MOSQUITTO_SERVICE = "service"
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Adapters:
+    """The implementation of each port that the services use."""
+
+    keys: RingKeys
+    tables: Tables
+    blobs: Blobs
+    transfers: Transfers | None
+    access: BrokerAccess
+    bus: CommandBus
+    feed: Feed
+    telemetry: Telemetry
+    late: Telemetry
+    certificates: Certificates
+    password_hashes: PasswordHashes
+    catalogue: Catalogue
+
+
+def adapters(settings: Settings, clock: Clock) -> Adapters:
+    """The adapters that the settings choose. Opens no connection.
+
+    Raises:
+        StoreError: The signing keys cannot be used.
+    """
+    signing = keys(settings, clock.now_ms)
+    tables, blobs = stores(settings, signing)
+
+    async def publish(topic: str, payload: bytes) -> None:
+        await command_bus.publish(topic, payload)
+
+    granted = access(settings, signing, tables, publish)
+    command_bus = bus(settings, granted)
+    feed, telemetry, late = feeds(settings, granted)
+    return Adapters(
+        keys=signing,
+        tables=tables,
+        blobs=blobs,
+        transfers=blobs if isinstance(blobs, FileBlobs) else None,
+        access=granted,
+        bus=command_bus,
+        feed=feed,
+        telemetry=telemetry,
+        late=late,
+        certificates=certificates(settings),
+        password_hashes=Argon2Hashes(),
+        catalogue=FolderCatalogue(settings.robots),
+    )
 
 
 def keys(settings: Settings, now_ms: Callable[[], int]) -> RingKeys:

@@ -15,12 +15,12 @@ from collections.abc import AsyncIterator, Awaitable, Callable, Mapping, Sequenc
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, TypeVar
-from unittest import mock
 
 from device_agent.protocol import Command, codec, topics
 from device_agent.protocol.security import signing
 from function_app import bootstrap
 from function_app.adapters import factory
+from function_app.adapters.local.broker_access import TokenBrokerAccess
 from function_app.bootstrap import Functions
 from function_app.domain.common.ids import agent_id
 from function_app.domain.devices.devices import DeviceSpec
@@ -137,19 +137,21 @@ class MortalTables:
 
 
 def open_functions(place: Place, *, dies_at: int | None = None, clock: SetClock | None = None) -> Functions:
-    """An instance over the real store, with the noting bus in the broker's place."""
+    """An instance over the real store, whose messages to devices are recorded in a file."""
     death = Death(dies_at)
-    stores = factory.stores
-
-    def cut(*given: Any) -> Any:
-        tables, blobs = stores(*given)
-        return MortalTables(tables, death), blobs
-
-    with (
-        mock.patch.object(factory, "stores", cut),
-        mock.patch.object(factory, "MqttCommandBus", return_value=NotingBus(place.sent, death)),
-    ):
-        return bootstrap.build(read(place.environment), clock=clock or SetClock(place.now_ms))
+    settings, now = read(place.environment), clock or SetClock(place.now_ms)
+    adapters = factory.adapters(settings, now)
+    bus = NotingBus(place.sent, death)
+    return bootstrap.build(
+        settings,
+        clock=now,
+        adapters=replace(
+            adapters,
+            tables=MortalTables(adapters.tables, death),
+            bus=bus,
+            access=TokenBrokerAccess(signer=adapters.keys.signer, publish=bus.publish),
+        ),
+    )
 
 
 def run_here(place: Place, work: Callable[[Functions], Awaitable[T]]) -> T:

@@ -2,7 +2,6 @@
 
 import asyncio
 import contextlib
-import time
 from collections.abc import Mapping
 
 from function_app.domain.common.problems import Problem, busy_store, invalid
@@ -53,10 +52,11 @@ class TypeVersions:
 
     async def verdict(self, where: Place, version: int, wait_ms: int) -> TypeVersion | None:
         """The version once there is a verdict, or as it is after ``wait_ms``."""
-        end_s = time.monotonic() + wait_ms / 1000
+        loop = asyncio.get_running_loop()
+        end_s = loop.time() + wait_ms / 1000
         while True:
             _, upload = await read_version(self._tables, where, version)
-            left_s = end_s - time.monotonic()
+            left_s = end_s - loop.time()
             if upload is None or not upload.open or left_s <= 0:
                 return upload
             await asyncio.sleep(min(_LOOK_S, left_s))
