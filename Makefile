@@ -156,6 +156,10 @@ contract: .venv/.dev web/node_modules/.installed
 	@mv device_agent/protocol/documents/script_api.json.new device_agent/protocol/documents/script_api.json
 	@$(NPM) run --silent contract
 
+wheels: .venv/.dev console
+	@$(BIN)/python -m pip wheel --quiet --disable-pip-version-check --no-deps --no-build-isolation --wheel-dir dist . ./infra/packaging/telescope-agent
+	@ls dist/*.whl
+
 # Separate from `check`, which needs no network. It fails when the database cannot be reached.
 audit-packages: .venv/.dev
 	@$(BIN)/python requirements/audit.py
@@ -164,4 +168,4 @@ requirements: .venv/.dev
 	@$(BIN)/python requirements/export.py
 
 clean:
-	rm -rf .venv web/node_modules web/dist .mypy_cache .ruff_cache .pytest_cache .hypothesis
+	rm -rf .venv dist site web/node_modules web/dist .mypy_cache .ruff_cache .pytest_cache .hypothesis

@@ -8,7 +8,12 @@ from pathlib import Path
 from typing import Literal, cast
 from urllib.parse import urlsplit
 
+from device_agent.protocol.manifests.shipped import ROBOTS
+
 ROOT = Path(__file__).resolve().parents[1]
+_CONSOLE_IN_WHEEL = Path(__file__).resolve().parent / "console"
+CONSOLE = _CONSOLE_IN_WHEEL if _CONSOLE_IN_WHEEL.is_dir() else ROOT / "web" / "dist"
+"""Built console. A wheel contains it inside the package."""
 Broker = Literal["amqtt", "mosquitto", "iot", "eventgrid"]
 _LAST_PORT = 65_535
 _NUMBER = re.compile(r"\A[0-9]{1,9}\Z")
@@ -236,8 +241,8 @@ class Settings:
     xmpp_host: str = "127.0.0.1"
     xmpp_port: int = 5222
     open_id: OpenIdClient | None = None
-    robots: Path = ROOT / "robots"
-    console: Path = ROOT / "web" / "dist"
+    robots: Path = ROBOTS
+    console: Path = CONSOLE
     trusted_proxies: int = 0
     rate_address: int = 200
     rate_account: int = 100
@@ -294,8 +299,8 @@ def read(environment: Mapping[str, str] | None = None) -> Settings:
         xmpp_host=_host(given, "TELESCOPE_XMPP_HOST", host),
         xmpp_port=_port(given, "TELESCOPE_XMPP_PORT", 5222),
         open_id=_open_id(given),
-        robots=_folder(given, "TELESCOPE_ROBOTS", ROOT / "robots"),
-        console=_folder(given, "TELESCOPE_CONSOLE", ROOT / "web" / "dist"),
+        robots=_folder(given, "TELESCOPE_ROBOTS", ROBOTS),
+        console=_folder(given, "TELESCOPE_CONSOLE", CONSOLE),
         trusted_proxies=_number(given, "TELESCOPE_TRUSTED_PROXIES", 0, 0, 10),
         rate_address=_number(given, "TELESCOPE_RATE_ADDRESS", 200, 0, 1_000_000),
         rate_account=_number(given, "TELESCOPE_RATE_ACCOUNT", 100, 0, 1_000_000),

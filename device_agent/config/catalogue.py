@@ -9,8 +9,8 @@ from typing import Generic, TypeVar
 from device_agent.config.agent_config import ConfigError, Configuration, DeviceEntry
 from device_agent.protocol.errors import ProtocolError
 from device_agent.protocol.manifests import robot_type, room
+from device_agent.protocol.manifests.shipped import ROBOTS
 
-ROBOTS = Path(__file__).resolve().parents[2] / "robots"
 ROBOTS_PATH = "TELESCOPE_ROBOTS_PATH"
 """Environment: folders of other people's robot types, separated as those of ``PATH``."""
 

@@ -1,0 +1,45 @@
+"""Build hooks of the two distributions.
+
+``DependencyGroups`` takes the dependencies from the groups of the root ``pyproject.toml``, the only place that names
+them. ``Console`` adds the built console to the server's wheel.
+"""
+
+import tomllib
+from pathlib import Path
+from typing import Any
+
+from hatchling.builders.hooks.plugin.interface import BuildHookInterface
+from hatchling.metadata.plugin.interface import MetadataHookInterface
+
+_ROOT = Path(__file__).resolve().parents[2]
+_CONSOLE = _ROOT / "web" / "dist"
+
+
+class DependencyGroups(MetadataHookInterface):
+    """Sets ``dependencies`` and ``optional-dependencies`` from the groups that the hook's configuration names."""
+
+    def update(self, metadata: dict[str, Any]) -> None:
+        """Completes the project metadata in place."""
+        groups = tomllib.loads((_ROOT / "pyproject.toml").read_text(encoding="utf-8"))["dependency-groups"]
+        metadata["dependencies"] = _packages(groups, self.config["dependencies"])
+        metadata["optional-dependencies"] = {name: _packages(groups, [name]) for name in self.config["extras"]}
+
+
+class Console(BuildHookInterface[Any]):
+    """Includes ``web/dist``; without it the server answers the console's address with instructions."""
+
+    def initialize(self, version: str, build_data: dict[str, Any]) -> None:
+        """Adds the folder to the files of the wheel."""
+        del version
+        if _CONSOLE.is_dir():
+            build_data["force_include"][str(_CONSOLE)] = "function_app/console"
+        else:
+            self.app.display_warning("The console is not built: run `make wheels` to include it.")
+
+
+def _packages(groups: dict[str, list[Any]], names: list[str]) -> list[str]:
+    packages: list[str] = []
+    for name in names:
+        for entry in groups[name]:
+            packages += _packages(groups, [entry["include-group"]]) if isinstance(entry, dict) else [entry]
+    return list(dict.fromkeys(packages))
