@@ -8,7 +8,7 @@ import msgspec
 
 from device_agent import drivers, geometry, sensors
 from device_agent.config.agent_config import ConfigError, Configuration, DeviceEntry, Home, Pairing
-from device_agent.config.catalogue import ROBOTS, ROOMS, TYPES, enrolled_devices, room_device_of, type_of
+from device_agent.config.catalogue import ROOMS, TYPES, enrolled_devices, room_device_of, type_of
 from device_agent.config.client_certificate import OwnCertificate
 from device_agent.ports.clock import CloudClock, tick_ms, wall_ms
 from device_agent.ports.driver import Driver, DriverError
@@ -20,6 +20,7 @@ from device_agent.ports.transport import Transport
 from device_agent.ports.uploads import Uploads
 from device_agent.protocol import topics
 from device_agent.protocol.manifests.robot_type import RobotType
+from device_agent.protocol.manifests.shipped import ROBOTS
 from device_agent.runtime.agent import Agent
 from device_agent.runtime.commands.pinned_keys import PinnedKeys
 from device_agent.runtime.device import Device

@@ -43,7 +43,8 @@ def resolve(name: str, groups: tuple[str, ...]) -> list[str]:
         subprocess.run(  # noqa: S603 (the project's own tool)
             [
                 sys.executable, "-m", "uv", "pip", "compile", "--quiet", "--universal", "--no-header",
-                "--no-annotate", "--generate-hashes", *OPTIONS.get(name, ()), *group_options, "--output-file", str(output),
+                "--no-annotate", "--generate-hashes", *OPTIONS.get(name, ()), *group_options,
+                "--output-file", str(output),
             ],
             cwd=ROOT,
             check=True,

@@ -5,15 +5,14 @@ from pathlib import Path
 
 import pytest
 
-from device_agent.config import catalogue
 from device_agent.drivers import load
 from device_agent.drivers.mujoco import MujocoDriver, Placement, World
 from device_agent.ports.driver import Driver
 from device_agent.protocol.manifests import robot_type
 from device_agent.protocol.manifests.robot_type import RobotType
 from tests.contract.drivers.suite import DriverContract
+from tests.harness.paths import ROBOTS
 
-ROBOTS = catalogue.ROBOTS
 TYPES = sorted(path.parent.name for path in ROBOTS.glob("*/robot.toml"))
 
 

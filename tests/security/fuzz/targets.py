@@ -21,12 +21,12 @@ import requests
 from amqtt.mqtt.packet import CONNECT, PUBACK, PUBLISH, SUBSCRIBE, UNSUBSCRIBE
 
 from device_agent.config.agent_config import ConfigError, Home
-from device_agent.config.catalogue import ROBOTS
 from device_agent.ports import script_calls
 from device_agent.ports.clock import CloudClock
 from device_agent.protocol import codec, topics
 from device_agent.protocol.errors import ProtocolError
 from device_agent.protocol.manifests import robot_type
+from device_agent.protocol.manifests.shipped import ROBOTS
 from device_agent.protocol.security import grants, signing
 from device_agent.protocol.xmpp import stanzas
 from device_agent.transports.http import responses

@@ -9,8 +9,9 @@ import msgspec
 import pytest
 
 from device_agent import drivers, geometry
-from device_agent.config.catalogue import ROBOTS, TYPES
+from device_agent.config.catalogue import TYPES
 from device_agent.protocol import AckStatus
+from device_agent.protocol.manifests.shipped import ROBOTS
 from function_app.services.robot_types.script_linter import check_script
 from tests.harness.agent.device_harness import Bench
 from tests.harness.paths import ROOT
