@@ -1,3 +1,4 @@
+# mypy: disable-error-code="misc"
 """Build hooks of the two distributions.
 
 ``DependencyGroups`` takes the dependencies from the groups of the root ``pyproject.toml``, the only place that names

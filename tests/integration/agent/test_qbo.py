@@ -12,7 +12,7 @@ from device_agent.drivers.mujoco import WheeledDriver
 from device_agent.protocol import AckStatus, Measurements, topics
 from device_agent.protocol.manifests import robot_type
 from tests.harness.agent.device_harness import Bench, eventually
-from tests.unit.robots.folders import ROBOTS
+from tests.harness.paths import ROBOTS
 
 FOLDER = ROBOTS / "qbo"
 QBO = robot_type.load(FOLDER)

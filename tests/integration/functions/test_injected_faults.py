@@ -16,8 +16,8 @@ from function_app.entrypoints.ingest.router import ingest, ingest_telemetry
 from tests.fakes.agent import Robot
 from tests.harness.agent.device_harness import Bench, eventually
 from tests.harness.cloud.cloud import Cloud
+from tests.harness.paths import ROBOTS
 from tests.integration.functions.test_diagnostics import MINUTE, Pair, field, open_faults
-from tests.unit.robots.folders import ROBOTS
 
 UR5 = robot_type.load(ROBOTS / "ur5")
 NAMES = [joint.name for joint in UR5.joints]

@@ -5,7 +5,8 @@ from pathlib import Path
 
 import pytest
 
-from tests.unit.robots.folders import ROBOTS, Bench
+from tests.harness.paths import ROBOTS
+from tests.unit.robots.folders import Bench
 
 FACTS = json.loads((Path(__file__).parent / "facts.json").read_text(encoding="utf-8"))
 HALF_LAST_DIGIT = 6e-4

@@ -12,7 +12,8 @@ import pytest
 from device_agent import geometry
 from device_agent.protocol import topics
 from device_agent.protocol.manifests import robot_type
-from tests.unit.robots.folders import FOLDERS, MOVEMENTS, ROBOTS, SHIPPED, Bench
+from tests.harness.paths import ROBOTS
+from tests.unit.robots.folders import FOLDERS, MOVEMENTS, SHIPPED, Bench
 
 pytestmark = pytest.mark.filterwarnings("error")
 folders = pytest.mark.parametrize("folder", FOLDERS, ids=lambda folder: folder.name)

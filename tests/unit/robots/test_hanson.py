@@ -12,7 +12,8 @@ from device_agent.runtime.planning import gaze
 from device_agent.runtime.planning import visemes as mouth
 from device_agent.runtime.planning.behaviour_trajectory import BehaviourTrajectory, Line
 from device_agent.simulation.mjcf.equality_joints import EqualityJoints
-from tests.unit.robots.folders import ROBOTS, Bench
+from tests.harness.paths import ROBOTS
+from tests.unit.robots.folders import Bench
 
 FOLDER = ROBOTS / "hanson"
 SIX = {"happy", "sad", "angry", "surprised", "afraid", "disgusted"}

@@ -16,7 +16,8 @@ from device_agent.runtime.control.controller import Controller
 from device_agent.runtime.control.goals import GoalResult, MotionGoal
 from device_agent.runtime.errors import Refused
 from device_agent.runtime.planning import gaze, named_poses
-from tests.unit.robots.folders import MOVEMENTS, ROBOTS, heard, whereabouts
+from tests.harness.paths import ROBOTS
+from tests.unit.robots.folders import MOVEMENTS, heard, whereabouts
 
 LONGEST_S = 60.0
 

@@ -12,8 +12,9 @@ import pytest
 from device_agent.drivers.mujoco.wheeled_driver import wheel_speeds
 from device_agent.ports.driver import Twist
 from device_agent.runtime.planning import named_poses
+from tests.harness.paths import ROBOTS
 from tests.unit.robots.balance import WalkedRobot
-from tests.unit.robots.folders import MOVEMENTS, ROBOTS, Bench, heard, whereabouts
+from tests.unit.robots.folders import MOVEMENTS, Bench, heard, whereabouts
 
 STEPS = 4  # of 2 ms: one control period
 

@@ -16,8 +16,8 @@ from device_agent.drivers.mujoco import MujocoDriver, WalkingDriver, World, crea
 from device_agent.ports.driver import REST, DriverError, Twist
 from device_agent.protocol import StopLatch
 from device_agent.protocol.manifests import robot_type
+from tests.harness.paths import ROBOTS
 from tests.unit.robots.balance import Walking
-from tests.unit.robots.folders import ROBOTS
 
 FOLDER = ROBOTS / "nao"
 TYPE = robot_type.load(FOLDER)

@@ -25,9 +25,9 @@ from device_agent.sandbox import api
 from device_agent.sensors.perception.driver import _flat
 from device_agent.simulation import world_registry
 from tests.harness.agent.rooms import STEP_S
+from tests.harness.paths import ROBOTS
 from tests.unit.device_agent.perception.lab import PERIOD_S as LOOK_S
 from tests.unit.device_agent.perception.lab import Watched, by_hand
-from tests.unit.robots.folders import ROBOTS
 
 QBO = robot_type.load(ROBOTS / "qbo")
 PERIOD_S = QBO.period_ms / 1000

@@ -14,7 +14,7 @@ from device_agent.ports.driver import REST, DriverError, MobileDriver, ReportsSt
 from device_agent.protocol.manifests import robot_type
 from device_agent.runtime.control.base_motion import BaseMotion
 from device_agent.simulation import world_registry
-from tests.unit.robots.folders import ROBOTS
+from tests.harness.paths import ROBOTS
 
 FOLDER = ROBOTS / "qbo"
 

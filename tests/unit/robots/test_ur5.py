@@ -8,7 +8,8 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 
-from tests.unit.robots.folders import ROBOTS, Bench
+from tests.harness.paths import ROBOTS
+from tests.unit.robots.folders import Bench
 
 FOLDER = ROBOTS / "ur5"
 # UR's article on DH parameters: a [m], d [m], alpha [rad] of joints 1 to 6.

@@ -23,7 +23,7 @@ from device_agent.ports.driver import DriverError
 from device_agent.protocol.errors import ProtocolError
 from device_agent.protocol.manifests import robot_type
 from device_agent.protocol.manifests.capabilities import Battery
-from tests.unit.robots.folders import ROBOTS
+from tests.harness.paths import ROBOTS
 
 WITHIN_S = 60.0
 UR5 = robot_type.load(ROBOTS / "ur5")
