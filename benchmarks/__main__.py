@@ -10,8 +10,9 @@ import sys
 import time
 from typing import Any
 
-from benchmarks import page, suites
-from benchmarks.report import QUICK, RESULTS, Report, save
+from benchmarks import suites
+from benchmarks.reporting import page
+from benchmarks.reporting.report import QUICK, RESULTS, Report, save
 
 
 def main() -> int:

@@ -8,9 +8,9 @@ from typing import Final, Self
 
 import msgspec
 
-from benchmarks.faults.ground import STREAMED, Ground
-from benchmarks.faults.hand import FULL, SLOW_RAD_S, Hand
-from benchmarks.faults.noted import Period
+from benchmarks.faults.operator import FULL, SLOW_RAD_S, Hand
+from benchmarks.faults.processes import STREAMED, Ground
+from benchmarks.faults.recorder import Period
 from device_agent.protocol import Stop, codec
 from tests.faults.stack import now_ms
 

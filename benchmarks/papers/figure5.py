@@ -10,10 +10,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final, NamedTuple
 
-from benchmarks.measure import median
-from benchmarks.report import Cell, Chart, Claim, Report, Table, percentile
-from benchmarks.stand import Caller, Hand
-from benchmarks.watched import Watched, start
+from benchmarks.baseline.interleaved import median
+from benchmarks.baseline.product import Caller, Hand
+from benchmarks.reporting.report import Cell, Chart, Claim, Report, Table, percentile
+from benchmarks.tracing.traced_product import Watched, start
 
 RTT_MS: Final = 15
 PRINTED: Final = (86.0, 259.0)

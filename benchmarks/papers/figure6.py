@@ -9,9 +9,9 @@ from functools import partial
 from pathlib import Path
 from typing import Final
 
-from benchmarks.measure import Exchange, in_turns
-from benchmarks.report import Cell, Chart, Claim, Report, Table, percentile
-from benchmarks.stand import PATIENCE_S, PAYLOAD, Caller, Hand, Line, Stand, start
+from benchmarks.baseline.interleaved import Exchange, in_turns
+from benchmarks.baseline.product import PATIENCE_S, PAYLOAD, Caller, Hand, Line, Stand, start
+from benchmarks.reporting.report import Cell, Chart, Claim, Report, Table, percentile
 from device_agent.ports.clock import CloudClock
 from device_agent.protocol.security import signing
 from device_agent.transports.http.client import CloudClient

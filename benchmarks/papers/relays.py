@@ -10,7 +10,7 @@ import json
 import sys
 from typing import Any
 
-from benchmarks.echoes import HOST, serve
+from benchmarks.baseline.echo_servers import HOST, serve
 
 LIFETIME_S = 3600
 

@@ -9,10 +9,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
 
-from benchmarks.measure import SHARES, Exchange, in_turns, median
-from benchmarks.papers import messengers, polled
-from benchmarks.report import Cell, Chart, Claim, Report, Table, percentile
-from benchmarks.stand import free_port, peer
+from benchmarks.baseline.interleaved import SHARES, Exchange, in_turns, median
+from benchmarks.baseline.product import free_port, peer
+from benchmarks.papers import exchanges, http_polling
+from benchmarks.reporting.report import Cell, Chart, Claim, Report, Table, percentile
 from tests.harness.cloud.cloud_processes import Ground, start_ground
 from tests.harness.network.brokers import HOST, TRANSPORTS, RunningBroker, start_broker
 from tests.harness.network.delay import start_delay
@@ -119,7 +119,7 @@ def at(there: Servers, condition: Condition, *, quick: bool) -> dict[str, list[f
             way = stack.enter_context(start_delay(*there.ports, rtt_ms=condition.rtt_ms))
             ports = way.ports
         ways = _ways(stack, ports, there, quick=quick)
-        slow: dict[str, Exchange] = {HELD: polled.held(stack, ports, there.ground)}
+        slow: dict[str, Exchange] = {HELD: http_polling.held(stack, ports, there.ground)}
         if condition.loss:
             way.set(rtt_ms=condition.rtt_ms, loss=condition.loss)
         waiting = _poll(stack, ports[there.web])
@@ -130,21 +130,21 @@ def at(there: Servers, condition: Condition, *, quick: bool) -> dict[str, list[f
 
 def _ways(stack: contextlib.ExitStack, ports: Mapping[int, int], there: Servers, *, quick: bool) -> dict[str, Exchange]:
     brokers = {OURS: there.mosquitto, EMBEDDED: there.amqtt}
-    found = {name: messengers.mqtt(stack, ports, broker) for name, broker in brokers.items()}
+    found = {name: exchanges.mqtt(stack, ports, broker) for name, broker in brokers.items()}
     if not quick:
         for name, broker in brokers.items():
-            found[f"{name}, over WebSocket"] = messengers.mqtt(stack, ports, broker, "websockets")
+            found[f"{name}, over WebSocket"] = exchanges.mqtt(stack, ports, broker, "websockets")
     return found | {
-        "WebSocket, JSON relay": messengers.web_socket(stack, ports, there.relay),
-        "XMPP, Prosody": messengers.xmpp(stack, ports, there.prosody),
+        "WebSocket, JSON relay": exchanges.web_socket(stack, ports, there.relay),
+        "XMPP, Prosody": exchanges.xmpp(stack, ports, there.prosody),
     }
 
 
 def _poll(stack: contextlib.ExitStack, port: int) -> dict[str, Future[list[float]]]:
     pool = stack.enter_context(ThreadPoolExecutor(2))
     return {
-        IN_STEP: pool.submit(polled.pairs, port, SAMPLES, in_step=True, seed=1),
-        ANY_PHASE: pool.submit(polled.pairs, port, SAMPLES, in_step=False, seed=2),
+        IN_STEP: pool.submit(http_polling.pairs, port, SAMPLES, in_step=True, seed=1),
+        ANY_PHASE: pool.submit(http_polling.pairs, port, SAMPLES, in_step=False, seed=2),
     }
 
 
@@ -187,7 +187,7 @@ def _one_by_one(taken: Mapping[str, list[float]]) -> Table:
         rows=rows,
         note="One way: from the sender through a server to the receiver, who each have this round trip to the server. "
         "The paper's server stood in Singapore; how far away that was it does not say. "
-        + " ".join((polled.__doc__ or "").split("\n\n")[1].split()),
+        + " ".join((http_polling.__doc__ or "").split("\n\n")[1].split()),
     )
 
 
@@ -211,7 +211,7 @@ def _why(condition: Condition, taken: Mapping[str, list[float]]) -> str:
         return "A stall holds up what follows it on the same connection. What polls hardly notices: it waits anyway."
     slower = [name for name in (OURS, EMBEDDED) if median(taken[name]) > claim_best(taken)]
     told = (
-        f"A setpoint of {len(messengers.SETPOINT)} bytes, one way. What is pushed over a connection that stands takes "
+        f"A setpoint of {len(exchanges.SETPOINT)} bytes, one way. What is pushed over a connection that stands takes "
         "half of each round trip and what its programs need. Our long poll brings a whole action (identity, role, "
         "rows, signature), not a bare message."
     )

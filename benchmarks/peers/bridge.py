@@ -11,7 +11,7 @@ import msgspec
 from websockets.asyncio.server import ServerConnection, serve
 from websockets.exceptions import ConnectionClosed
 
-from benchmarks.echoes import HOST
+from benchmarks.baseline.echo_servers import HOST
 
 
 class Bridge:

@@ -9,11 +9,11 @@ import time
 from collections.abc import Callable, Iterator
 from typing import Any, Final
 
-from benchmarks.echoes import HOST
-from benchmarks.measure import Exchange
+from benchmarks.baseline.echo_servers import HOST
+from benchmarks.baseline.interleaved import Exchange
+from benchmarks.baseline.product import PATIENCE_S, PERIOD_S, free_port, peer
 from benchmarks.peers.arm import HOME_RAD, NAMES, setpoint
 from benchmarks.peers.robots import CONTROL, JOINTS, METHOD, ROS_TYPE, zenoh_peer
-from benchmarks.stand import PATIENCE_S, PERIOD_S, free_port, peer
 from device_agent.protocol import JointTelemetry, codec
 
 _PROGRAM: Final = "benchmarks.peers.robots"

@@ -10,7 +10,7 @@ import threading
 from collections.abc import AsyncIterator, Callable, Mapping
 from typing import Any, Final
 
-from benchmarks.echoes import HOST
+from benchmarks.baseline.echo_servers import HOST
 from benchmarks.peers import bridge
 from benchmarks.peers.arm import NAMES, Arm
 from device_agent.protocol import JointTarget, JointTelemetry, Setpoint

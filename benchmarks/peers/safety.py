@@ -2,7 +2,7 @@
 
 from typing import Final
 
-from benchmarks.report import Table
+from benchmarks.reporting.report import Table
 
 COLUMNS: Final = ["", "Telescope", "rosbridge", "zenoh", "gRPC (Viam)", "Foxglove"]
 _ROWS: Final = (

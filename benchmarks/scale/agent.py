@@ -12,7 +12,7 @@ from typing import Any, Final
 
 import msgspec
 
-from benchmarks.report import percentile
+from benchmarks.reporting.report import percentile
 from device_agent import __main__ as agent
 from device_agent import drivers
 from device_agent.runtime.control import control_loop
@@ -79,7 +79,7 @@ class Watcher:
 
 def main(rate_hz: float, arguments: Sequence[str]) -> int:
     """The agent's exit code."""
-    drivers._BUILT_IN[LIGHT] = "benchmarks.scale.light"  # type: ignore[index] # noqa: SLF001 (of the bench alone)
+    drivers._BUILT_IN[LIGHT] = "benchmarks.scale.light_driver"  # type: ignore[index] # noqa: SLF001 (of the bench alone)
     control_loop.IDLE_RATE_HZ = rate_hz
     watcher = Watcher()
     watcher.install()

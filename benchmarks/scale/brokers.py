@@ -10,10 +10,10 @@ from typing import Any, Final
 
 import msgspec
 
-from benchmarks.report import Cell, Claim, Table
-from benchmarks.scale.ear import Ear, Heard
-from benchmarks.scale.fleet import Fleet, Robot, Told
+from benchmarks.reporting.report import Cell, Claim, Table
 from benchmarks.scale.processes import processor_s
+from benchmarks.scale.publishers import Fleet, Robot, Told
+from benchmarks.scale.subscriber import Ear, Heard
 from tests.harness.network.brokers import BrokerKind, RunningBroker, start_broker
 from tests.harness.paths import ROOT
 

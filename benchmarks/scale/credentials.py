@@ -9,7 +9,7 @@ import tempfile
 from pathlib import Path
 from typing import Final
 
-from benchmarks.report import Cell, Table
+from benchmarks.reporting.report import Cell, Table
 from benchmarks.scale.processes import processor_s
 from device_agent.protocol.security import grants
 from tests.harness.network.brokers import start_broker

@@ -16,12 +16,12 @@ from typing import Any, Final
 
 import msgspec
 
-from benchmarks.echoes import HOST
-from benchmarks.report import Cell, Chart, Claim, Table
-from benchmarks.scale.askers import Answered, Askers, Request
+from benchmarks.baseline.echo_servers import HOST
+from benchmarks.baseline.product import PATIENCE_S, Stand, free_port, peer, start
+from benchmarks.reporting.report import Cell, Chart, Claim, Table
 from benchmarks.scale.brokers import answer, program
+from benchmarks.scale.http_load import Answered, Askers, Request
 from benchmarks.scale.processes import processor_s
-from benchmarks.stand import PATIENCE_S, Stand, free_port, peer, start
 from tests.harness.paths import ROOT
 
 CONNECTIONS: Final = 16
@@ -175,7 +175,7 @@ def started() -> Iterator[tuple[Stand, Site]]:
 def bare(stack: contextlib.ExitStack, length: int) -> Ask:
     """The bare application: as many bytes of JSON, by the same framework and server."""
     port = free_port()
-    process = stack.enter_context(peer("benchmarks.echoes", "http", str(port)))
+    process = stack.enter_context(peer("benchmarks.baseline.echo_servers", "http", str(port)))
     return clients(stack, BARE, [port], [process.pid], [Request("GET", f"/sized/{length}")])
 
 

@@ -7,13 +7,13 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Final
 
-from benchmarks.echoes import HOST
-from benchmarks.report import Cell, Table
-from benchmarks.scale import wire
-from benchmarks.scale.askers import Request
+from benchmarks.baseline.echo_servers import HOST
+from benchmarks.baseline.product import PATIENCE_S
+from benchmarks.reporting.report import Cell, Table
+from benchmarks.scale import mqtt_packets
 from benchmarks.scale.functions import Site
+from benchmarks.scale.http_load import Request
 from benchmarks.scale.processes import resident_mb
-from benchmarks.stand import PATIENCE_S
 from tests.harness.network.brokers import BROKERS, BrokerKind, start_broker
 
 COLUMNS: Final = ["", "connections", "MB", "kB a connection"]
@@ -46,9 +46,9 @@ def broker(kind: BrokerKind, steps: tuple[int, ...]) -> list[list[Cell]]:
                 name = f"idle-{len(lines)}"
                 topic = f"ts/v1/lab/{name}/arm/cmd"
                 issued = running.issue(running.grant(name, subscribe=(topic,)))
-                line = wire.connect(running.tcp_port, name, issued.username, issued.password)
+                line = mqtt_packets.connect(running.tcp_port, name, issued.username, issued.password)
                 lines.append(stack.enter_context(line))
-                wire.subscribe(line, topic)
+                mqtt_packets.subscribe(line, topic)
 
         grow(1)  # the functions' own connection, by which rights are given, is there from the first on
         return _rows(kind, running.process.pid, steps, grow)

@@ -12,10 +12,10 @@ from typing import Final, Literal
 
 import msgspec
 
-from benchmarks.report import Cell, Chart, Table
+from benchmarks.baseline.product import Stand
+from benchmarks.reporting.report import Cell, Chart, Table
 from benchmarks.scale.agent import DIVIDER, LIGHT, Seen
 from benchmarks.scale.processes import processor_s, resident_mb
-from benchmarks.stand import Stand
 from tests.harness.browser.product import Api
 from tests.harness.paths import ROOT
 

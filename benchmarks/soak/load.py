@@ -10,7 +10,7 @@ from typing import Any, Final, Self
 
 import httpx
 
-from benchmarks.stand import LEASE_MS, PATIENCE_S, Line, Stand
+from benchmarks.baseline.product import LEASE_MS, PATIENCE_S, Line, Stand
 from device_agent.protocol import JointTarget, JointTelemetry, Setpoint, codec
 from device_agent.protocol.manifests import robot_type
 from tests.harness.browser.product import Api

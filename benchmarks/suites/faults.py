@@ -4,11 +4,11 @@ import math
 from collections.abc import Callable, Iterable
 from typing import Final
 
-from benchmarks.faults.ground import start
-from benchmarks.faults.orders import Orders, doubled, lost
-from benchmarks.faults.rounds import Found, Rounds
+from benchmarks.faults.action_load import Orders, doubled, lost
+from benchmarks.faults.fault_runs import Found, Rounds
+from benchmarks.faults.processes import start
 from benchmarks.faults.stops import CALL, MESSAGE, SPEEDS, Stopped, Stops, series
-from benchmarks.report import Cell, Chart, Claim, Report, Table, percentile
+from benchmarks.reporting.report import Cell, Chart, Claim, Report, Table, percentile
 from device_agent.protocol.manifests import robot_type
 from tests.harness.network.brokers import BROKERS
 from tests.harness.paths import ROOT

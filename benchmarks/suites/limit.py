@@ -8,10 +8,10 @@ from functools import partial
 from pathlib import Path
 from typing import Final
 
-from benchmarks.echoes import HOST
-from benchmarks.measure import Exchange, in_turns, median, table
-from benchmarks.report import Claim, Report, Table
-from benchmarks.stand import PATIENCE_S, PAYLOAD, PERIOD_S, Caller, Hand, Stand, free_port, peer, start
+from benchmarks.baseline.echo_servers import HOST
+from benchmarks.baseline.interleaved import Exchange, in_turns, median, table
+from benchmarks.baseline.product import PATIENCE_S, PAYLOAD, PERIOD_S, Caller, Hand, Stand, free_port, peer, start
+from benchmarks.reporting.report import Claim, Report, Table
 from tests.harness.network.brokers import BROKERS
 
 SETPOINT_MOST: Final = 1.5
@@ -95,8 +95,8 @@ def paths(stand: Stand) -> Iterator[dict[str, Exchange]]:
     """All exchanges, warm."""
     with contextlib.ExitStack() as stack:
         tcp, web = free_port(), free_port()
-        stack.enter_context(peer("benchmarks.echoes", "tcp", str(tcp)))
-        stack.enter_context(peer("benchmarks.echoes", "http", str(web)))
+        stack.enter_context(peer("benchmarks.baseline.echo_servers", "tcp", str(tcp)))
+        stack.enter_context(peer("benchmarks.baseline.echo_servers", "http", str(web)))
         found: dict[str, Exchange] = {"TCP": _tcp(stack, tcp), "HTTP": _http(stack, web)}
         hand = stack.enter_context(Hand(stand))
         hand.exchange()
@@ -137,7 +137,16 @@ def mqtt(
     there, back = (f"{topic}/{qos}" for topic in _TOPICS)
     rights = stand.rights(publish=(back,), subscribe=(there,))
     stack.enter_context(
-        peer("benchmarks.echoes", "mqtt", str(stand.mqtt_port), *rights, there, back, str(qos), str(answer_bytes))
+        peer(
+            "benchmarks.baseline.echo_servers",
+            "mqtt",
+            str(stand.mqtt_port),
+            *rights,
+            there,
+            back,
+            str(qos),
+            str(answer_bytes),
+        )
     )
     line = stack.enter_context(stand.line(publish=(there,), subscribe=(back,), qos=qos))
 

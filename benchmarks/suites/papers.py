@@ -4,7 +4,7 @@ from collections.abc import Callable
 from typing import Final
 
 from benchmarks.papers import figure5, figure6, table2
-from benchmarks.report import Report
+from benchmarks.reporting.report import Report
 
 _ABOUT: Final = """What the papers printed was measured over their networks and on their machines; here a program of its
 own delays each direction of each connection by half of the round trip that is named, and where loss is named, that

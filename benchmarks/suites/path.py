@@ -8,10 +8,10 @@ from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Final
 
-from benchmarks.marks import Mark
-from benchmarks.report import Cell, Chart, Report, Table, percentile
-from benchmarks.stand import Caller, Hand
-from benchmarks.watched import Watched, start
+from benchmarks.baseline.product import Caller, Hand
+from benchmarks.reporting.report import Cell, Chart, Report, Table, percentile
+from benchmarks.tracing.timestamps import Mark
+from benchmarks.tracing.traced_product import Watched, start
 from tests.harness.network.brokers import BROKERS
 
 ROBOT: Final = "ur5"

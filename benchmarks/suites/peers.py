@@ -6,10 +6,10 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Final
 
-from benchmarks.measure import Exchange, in_turns, median, table
+from benchmarks.baseline.interleaved import Exchange, in_turns, median, table
+from benchmarks.baseline.product import Hand, start
 from benchmarks.peers import operators, safety
-from benchmarks.report import Chart, Claim, Report, percentile
-from benchmarks.stand import Hand, start
+from benchmarks.reporting.report import Chart, Claim, Report, percentile
 from tests.harness.network.brokers import BROKERS
 
 OURS: Final = "Telescope, mosquitto"

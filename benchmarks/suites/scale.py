@@ -5,9 +5,9 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Final
 
-from benchmarks import sheet
-from benchmarks.report import Report
-from benchmarks.scale import brokers, credentials, functions, memory, robots, swarms
+from benchmarks.reporting import cost_model
+from benchmarks.reporting.report import Report
+from benchmarks.scale import brokers, credentials, functions, load_tests, memory, robots
 
 _ABOUT: Final = """What one small machine carries, and what each more of something costs it. Every program of these
 figures, also those that ask, runs on the same cores."""
@@ -33,13 +33,13 @@ def run(*, quick: bool, say: Callable[[str], None]) -> Report:
         crews = robots.measure(stand, quick=quick, say=say)
         report.tables.append(robots.table(crews))
         report.charts += [drawn] if (drawn := robots.chart(crews)) else []
-        swarm = swarms.Swarm(stand, Path(folder))
+        swarm = load_tests.Swarm(stand, Path(folder))
         runs = []
-        for count, rate_hz, gap_s in swarms.QUICK if quick else swarms.WHOLE:
+        for count, rate_hz, gap_s in load_tests.QUICK if quick else load_tests.WHOLE:
             runs.append(swarm.run(count, rate_hz, gap_s, 5.0 if quick else 8.0))
             say(f"swarm of {count}: {runs[-1].figures['out_per_s']:.0f} messages/s, lost {runs[-1].lost}")
-        report.tables.append(swarms.table(runs))
-        started = swarms.actions(
+        report.tables.append(load_tests.table(runs))
+        started = load_tests.actions(
             site, stand, Path(folder), seconds=3.0 if quick else 6.0, processes=functions.PROCESSES[:2]
         )
         report.tables.insert(2, functions.actions_table(started))
@@ -47,5 +47,5 @@ def run(*, quick: bool, say: Callable[[str], None]) -> Report:
     steps = credentials.measure(credentials.QUICK if quick else credentials.WHOLE)
     report.tables.append(credentials.table(steps))
     if not quick:
-        sheet.keep({"runs": [run.kept() for run in runs], "credentials": {"steps": steps}})
+        cost_model.keep({"runs": [run.kept() for run in runs], "credentials": {"steps": steps}})
     return report

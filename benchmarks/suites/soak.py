@@ -7,11 +7,11 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Final
 
-from benchmarks.report import QUICK, Chart, Claim, Report, Table, load
-from benchmarks.soak.figures import Held, after_warm_up, drawn_together
+from benchmarks.baseline.product import start
+from benchmarks.reporting.report import QUICK, Chart, Claim, Report, Table, load
 from benchmarks.soak.load import Load
 from benchmarks.soak.processes import PARTS, TOGETHER, Sample, Watch
-from benchmarks.stand import start
+from benchmarks.soak.trends import Held, after_warm_up, drawn_together
 
 MINUTES: Final = "SOAK_MINUTES"
 """The environment variable for another length of the whole run [min]."""

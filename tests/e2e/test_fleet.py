@@ -6,9 +6,9 @@ from pathlib import Path
 import pytest
 from playwright.sync_api import Browser, Page, expect
 
-from benchmarks.console_fleet import ROBOTS, kept, open_together
-from benchmarks.crowd import crowd
-from benchmarks.puppets import puppets
+from benchmarks.console.frames import ROBOTS, kept, open_together
+from benchmarks.console.kinematic_arms import puppets
+from benchmarks.console.minimal_agents import crowd
 from tests.harness.browser.browser import PATIENCE_MS, pages
 from tests.harness.browser.product import Machine, start_machine
 from tests.harness.network.brokers import wait_until

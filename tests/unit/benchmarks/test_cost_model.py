@@ -2,12 +2,12 @@
 
 import pytest
 
-from benchmarks import sheet
+from benchmarks.reporting import cost_model
 
 
 def test_the_page_is_what_the_files_say() -> None:
-    page = sheet.PAGE.read_text(encoding="utf-8")
-    assert page == "\n".join(sheet.lines()) + "\n", "run `python -m benchmarks.sheet`"
+    page = cost_model.PAGE.read_text(encoding="utf-8")
+    assert page == "\n".join(cost_model.lines()) + "\n", "run `python -m benchmarks.reporting.cost_model`"
 
 
 def test_what_robots_ask_for_grows_with_them() -> None:
@@ -26,7 +26,7 @@ def test_what_robots_ask_for_grows_with_them() -> None:
         "write_units_a_row": value(2),
         "subscribers": value(1),
     }
-    found = sheet.demand(assumed, 10, 0.9, 100.0)
+    found = cost_model.demand(assumed, 10, 0.9, 100.0)
     assert found["in_per_s"] == pytest.approx(10 * (0.9 + 0.1 + 2))
     assert found["in_bytes_per_s"] == pytest.approx(3000)
     assert found["stores_per_s"] == pytest.approx(5)
@@ -35,10 +35,10 @@ def test_what_robots_ask_for_grows_with_them() -> None:
 
 
 def test_a_price_that_is_not_known_stays_a_formula() -> None:
-    assert sheet.cost({"A": {"value": None}}, "A", 12.0) == "12 x A"
-    assert sheet.cost({"A": {"value": 0.5}}, "A", 12.0) == "6 $"
+    assert cost_model.cost({"A": {"value": None}}, "A", 12.0) == "12 x A"
+    assert cost_model.cost({"A": {"value": 0.5}}, "A", 12.0) == "6 $"
 
 
 def test_the_slope_is_that_of_a_line() -> None:
     steps = [{"known": known, "processor_ms_each": 1 + known / 10} for known in (100, 200, 400)]
-    assert sheet.slope_s(steps) == pytest.approx(1e-4)
+    assert cost_model.slope_s(steps) == pytest.approx(1e-4)

@@ -2,9 +2,9 @@
 
 import socket
 
-from benchmarks.faults.noted import Noted, Period
-from benchmarks.faults.orders import STEP_RAD, Order, doubled, lost, went_back
-from benchmarks.faults.rounds import Found
+from benchmarks.faults.action_load import STEP_RAD, Order, doubled, lost, went_back
+from benchmarks.faults.fault_runs import Found
+from benchmarks.faults.recorder import Noted, Period
 from benchmarks.faults.stops import CALL, MESSAGE, SPEEDS, Stopped, judged
 from benchmarks.suites.faults import claims, faults_table, stops_table
 from tests.harness.network.brokers import wait_until

@@ -5,8 +5,8 @@ from contextlib import ExitStack, closing
 
 import pytest
 
-from benchmarks.marks import Mark, Marks, Teller
 from benchmarks.suites.path import ANSWERED, ASKED, parts, whole
+from benchmarks.tracing.timestamps import Mark, Marks, Teller
 
 STEPS = (("in", "there"), ("out", "work"), (ANSWERED, "back"))
 

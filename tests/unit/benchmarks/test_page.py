@@ -2,9 +2,10 @@
 
 import pytest
 
-from benchmarks import page, suites
-from benchmarks.measure import in_turns, table
-from benchmarks.report import Claim, Report, Table, load, percentile, save, shown
+from benchmarks import suites
+from benchmarks.baseline.interleaved import in_turns, table
+from benchmarks.reporting import page
+from benchmarks.reporting.report import Claim, Report, Table, load, percentile, save, shown
 
 
 def report(*claims: Claim) -> Report:
@@ -20,7 +21,9 @@ def report(*claims: Claim) -> Report:
 
 
 def test_the_page_is_what_the_results_say() -> None:
-    assert page.PAGE.read_text(encoding="utf-8") == page.text(page.reports()), "run `python -m benchmarks.page`"
+    assert page.PAGE.read_text(encoding="utf-8") == page.text(page.reports()), (
+        "run `python -m benchmarks.reporting.page`"
+    )
 
 
 def test_every_suite_has_results() -> None:

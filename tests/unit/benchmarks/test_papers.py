@@ -3,9 +3,9 @@
 import statistics
 
 from benchmarks.papers import figure5, figure6, table2
-from benchmarks.papers.messengers import SETPOINT
+from benchmarks.papers.exchanges import SETPOINT
 from benchmarks.papers.table2 import EMBEDDED, OURS, Condition
-from benchmarks.report import Report
+from benchmarks.reporting.report import Report
 
 
 def test_table_2_is_as_printed() -> None:

@@ -5,26 +5,26 @@ import os
 
 import pytest
 
-from benchmarks.scale import brokers, functions, wire
+from benchmarks.scale import brokers, functions, mqtt_packets
 from benchmarks.scale.agent import Seen, Watcher
-from benchmarks.scale.askers import Answered, Line, Request
 from benchmarks.scale.brokers import Run
-from benchmarks.scale.ear import MEASURED, Heard, said_ms
-from benchmarks.scale.fleet import SENT, Told, telemetry
 from benchmarks.scale.functions import Load
+from benchmarks.scale.http_load import Answered, Line, Request
 from benchmarks.scale.processes import family, processor_s, resident_mb
+from benchmarks.scale.publishers import SENT, Told, telemetry
 from benchmarks.scale.robots import Crew, ceilings
+from benchmarks.scale.subscriber import MEASURED, Heard, said_ms
 from device_agent.protocol import JointTelemetry, codec
 
 
 def test_packets_are_taken_when_they_are_whole_and_no_sooner() -> None:
     long = b"x" * 300
-    stream = wire.packet(0x30, b"ab") + wire.packet(0x31, long)
-    assert wire.packet(0x30, long)[1:3] == bytes([300 % 128 | 128, 300 // 128])
+    stream = mqtt_packets.packet(0x30, b"ab") + mqtt_packets.packet(0x31, long)
+    assert mqtt_packets.packet(0x30, long)[1:3] == bytes([300 % 128 | 128, 300 // 128])
     buffer, found = bytearray(), list[tuple[int, bytes]]()
     for byte in stream:
         buffer.append(byte)
-        found += wire.packets(buffer)
+        found += mqtt_packets.packets(buffer)
     assert found == [(0x30, b"ab"), (0x31, long)]
     assert not buffer
 

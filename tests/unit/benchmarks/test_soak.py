@@ -7,8 +7,8 @@ import time
 
 import pytest
 
-from benchmarks.soak.figures import after_warm_up, drawn_together, theil_sen
 from benchmarks.soak.processes import CHILDREN, STARTER, TOGETHER, Sample, Watch, look
+from benchmarks.soak.trends import after_warm_up, drawn_together, theil_sen
 
 
 def sample(at_s: float, *, mb: float = 100.0, descriptors: int = 20, part: str = "agent") -> Sample:

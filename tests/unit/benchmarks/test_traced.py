@@ -7,8 +7,8 @@ from types import SimpleNamespace
 
 import pytest
 
-from benchmarks import traced
-from benchmarks.marks import VARIABLE
+from benchmarks.tracing import traced_programs
+from benchmarks.tracing.timestamps import VARIABLE
 from tests.harness.paths import ROOT
 
 
@@ -16,7 +16,7 @@ from tests.harness.paths import ROOT
 def test_a_traced_program_starts_with_all_that_it_is_to_tell(program: str) -> None:
     # Its help is printed after every function was wrapped; one that is gone would end it before.
     done = subprocess.run(
-        [sys.executable, "-m", "benchmarks.traced", program, "--help"],
+        [sys.executable, "-m", "benchmarks.tracing.traced_programs", program, "--help"],
         cwd=ROOT,
         env=os.environ | {VARIABLE: "9"},
         capture_output=True,
@@ -30,7 +30,7 @@ def test_a_traced_program_starts_with_all_that_it_is_to_tell(program: str) -> No
 
 def test_motion_is_told_once_and_rest_only_after_a_while() -> None:
     told: list[str] = []
-    motion = traced.Motion("arm", told.append)
+    motion = traced_programs.Motion("arm", told.append)
     for speed, times in ((1e-6, 25), (1e-4, 3), (0.01, 3), (1e-6, 24), (0.01, 2), (1e-6, 50), (1e-4, 1)):
         for _ in range(times):
             motion.see(speed)
@@ -39,7 +39,7 @@ def test_motion_is_told_once_and_rest_only_after_a_while() -> None:
 
 def test_a_function_that_is_gone_ends_the_program_with_its_name() -> None:
     with pytest.raises(AttributeError, match="vanished"):
-        traced._wrap(SimpleNamespace(), "vanished", lambda call: call)
+        traced_programs._wrap(SimpleNamespace(), "vanished", lambda call: call)
 
 
 def test_what_is_wrapped_is_told_first_and_still_done() -> None:
@@ -50,6 +50,6 @@ def test_what_is_wrapped_is_told_first_and_still_done() -> None:
         return "done"
 
     owner = SimpleNamespace(call=call)
-    traced._wrap(owner, "call", traced._told_first(told.append))
+    traced_programs._wrap(owner, "call", traced_programs._told_first(told.append))
     assert owner.call(1, two=2) == "done"
     assert told == [1, (1, 2)]

@@ -1,0 +1,1 @@
+"""Cost of the parts of one agent."""

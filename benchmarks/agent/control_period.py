@@ -1,0 +1,104 @@
+"""What one control period costs, with the robot's shape looked at and without.
+
+``python -m benchmarks.agent.control_period [TYPE]`` moves a robot type (``ur5``) for a simulated minute in each way and prints
+percentiles of ``Controller.step`` [ms], in the processor time of its thread: what else the machine does counts little.
+
+- *setpoints*: a new random target every 2 s, 40 setpoints a second with a loop age of 30 ms;
+- *moves*: full speed, one after another, to random targets with room around them.
+"""
+
+import random
+import sys
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+from device_agent import geometry
+from device_agent.ports.geometry import RobotGeometry
+from device_agent.protocol import JointTarget, Setpoint
+from device_agent.protocol.manifests import robot_type
+from device_agent.protocol.manifests.robot_type import RobotType
+from device_agent.runtime.authority.lease_gate import LeaseGate
+from device_agent.runtime.control.controller import Controller
+from device_agent.runtime.errors import Refused
+
+ROBOTS = Path(__file__).resolve().parents[2] / "robots"
+SIMULATED_S = 60.0
+SETPOINT_PERIODS = 3
+TARGET_S = 2.0
+LOOP_AGE_MS = 30
+Source = Callable[[Controller, RobotType], Iterator[None]]
+
+
+def _random_target(kind: RobotType, chance: random.Random) -> dict[str, float]:
+    return {
+        joint.name: min(max(kind.home_rad[joint.name] + chance.uniform(-1, 1), joint.lower_rad), joint.upper_rad)
+        for joint in kind.joints
+    }
+
+
+def setpoints(controller: Controller, kind: RobotType) -> Iterator[None]:
+    """Ask as an operator does, before each period."""
+    chance, sequence, target = random.Random(1), 0, dict(kind.home_rad)
+    controller.grant(epoch=1, holder="ann", lease_s=1e6, now_s=0.0)
+    for period in range(round(SIMULATED_S * 1000 / kind.period_ms)):
+        now_ms = period * kind.period_ms
+        if period % round(TARGET_S * 1000 / kind.period_ms) == 0:
+            target = _random_target(kind, chance)
+        if period % SETPOINT_PERIODS == 0:
+            sequence += 1
+            asked = Setpoint(
+                epoch=1,
+                sequence=sequence,
+                echo_tick_ms=now_ms,
+                sent_ms=0.0,
+                target=JointTarget(position_rad=target),
+            )
+            controller.offer(asked, now_s=now_ms / 1000, tick_ms=now_ms + LOOP_AGE_MS)
+        yield
+
+
+def moves(controller: Controller, kind: RobotType) -> Iterator[None]:
+    """Ask as a movement does, before each period."""
+    chance = random.Random(2)
+    tenure = controller.begin_action(epoch=1, on_lost=lambda _: None)
+    move = None
+    for _ in range(round(SIMULATED_S * 1000 / kind.period_ms)):
+        while move is None or move.finished.is_set():
+            try:
+                move = controller.move(tenure, _random_target(kind, chance), speed=1.0)
+            except Refused:
+                continue  # no room there: another
+        yield
+
+
+def measure(kind: RobotType, shape: RobotGeometry | None, source: Source) -> list[float]:
+    """Processor time of each step in which something moves [ms]."""
+    controller = Controller(kind, LeaseGate(), geometry=shape)
+    controller.start_at([kind.home_rad[joint.name] for joint in kind.joints])
+    found = []
+    for period, _ in enumerate(source(controller, kind)):
+        began = time.thread_time()
+        controller.step(period * kind.period_ms / 1000)
+        if controller.moving:
+            found.append((time.thread_time() - began) * 1000)
+    return sorted(found)
+
+
+def main() -> None:
+    """Command line."""
+    name = sys.argv[1] if len(sys.argv) > 1 else "ur5"
+    kind = robot_type.load(ROBOTS / name)
+    shape = geometry.load(kind, ROBOTS / name)
+    print(f"{name}, a period of {kind.period_ms} ms; ms of processor time")
+    print(f"{'':28}{'p50':>8}{'p95':>8}{'p99':>8}{'max':>8}")
+    for label, source in (("setpoints", setpoints), ("moves", moves)):
+        for known, looked_at in ((None, "ranges only"), (shape, "with its shape")):
+            times = measure(kind, known, source)
+            last = len(times) - 1
+            marks = "".join(f"{times[round(last * mark)]:8.3f}" for mark in (0.5, 0.95, 0.99, 1))
+            print(f"{label + ', ' + looked_at:28}{marks}")
+
+
+if __name__ == "__main__":
+    main()

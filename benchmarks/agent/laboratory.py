@@ -1,0 +1,250 @@
+"""The whole laboratory in real time: whether it keeps up, and what each part of the agent costs.
+
+``python -m benchmarks.agent.laboratory [SECONDS] [--broker amqtt]`` starts what ``make up`` starts, in a folder of its own and on
+ports of its own. The robots move all the time, by their own movements, started over the API as an operator would; each
+tells its joints 50 times a second, the two colour cameras film ten pictures of 320x240 a second. After half a minute
+for warming up it measures for ``SECONDS`` (60) and prints
+
+- the real-time factor of the simulation, and how much simulated time was lost;
+- the processor time of each thread of the agent, by part, in per cent of one core (``/proc/self/task``);
+- how late control loops were: the gap between two decisions, less the period;
+- what else the machine did meanwhile.
+"""
+
+import argparse
+import contextlib
+import json
+import os
+import platform
+import sys
+import tempfile
+import threading
+import time
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+from typing import Any
+
+from device_agent import __main__ as agent
+from device_agent.config.catalogue import ROOMS
+from device_agent.runtime.control import control_loop
+from device_agent.runtime.control.command_arbiter import ControlOutput
+from device_agent.runtime.control.controller import Controller
+from device_agent.simulation import world_registry
+from infra.local import __main__ as local
+from infra.local import settings
+
+ROOM = "lab"
+TELEMETRY_HZ = 50.0
+WARM_UP_S = 30.0
+MOVEMENTS = {"ur5": "slow_square", "nao": "wave", "qbo": "patrol", "hanson": "look_around"}
+"""What each robot does again and again."""
+PARTS = (
+    ("physics", ("mujoco-world",)),
+    ("control loops", ("-loop",)),
+    ("drawing for cameras", ("studio", "llvmpipe")),
+    ("perception", ("perception",)),
+    ("sensors, JPEG", ("-sensing",)),
+    ("robots' other streams", ("-reporter",)),
+    ("network", ("mqtt", "outbox", "paho")),
+    ("orders, journal, events", ("-office", "action-", "script-")),
+)
+OTHER = "else"
+DIVIDER = "--"
+"""Behind it stand the agent's own arguments."""
+TOLD_PERCENT = 0.3
+_TICKS_S = os.sysconf("SC_CLK_TCK")
+_MARKS = (0.5, 0.95, 0.99, 1.0)
+
+
+# ------------------------------------------------------------ in the agent's process
+
+
+def run_agent(report: Path, for_s: float, arguments: Sequence[str]) -> int:
+    """The agent, with somebody who looks at its threads."""
+    gaps: dict[str, list[float]] = {}
+    last: dict[str, float] = {}
+    step = Controller.step
+
+    def timed(controller: Controller, *given: Any, **named: Any) -> ControlOutput:
+        name, at_s = threading.current_thread().name, time.monotonic()
+        if name in last:
+            gaps.setdefault(name, []).append(at_s - last[name])
+        last[name] = at_s
+        return step(controller, *given, **named)
+
+    Controller.step = timed  # type: ignore[method-assign,assignment]
+    control_loop.IDLE_RATE_HZ = TELEMETRY_HZ
+    threading.Thread(target=_watch, args=(report, for_s, gaps), name="bench", daemon=True).start()
+    return agent.main(arguments)
+
+
+def _watch(report: Path, for_s: float, gaps: dict[str, list[float]]) -> None:
+    time.sleep(WARM_UP_S)
+    world = world_registry.of(ROOMS.folder(ROOM))
+    gaps.clear()
+    before, busy, began_s = _threads(), _busy_s(), time.monotonic()
+    first, process_s = world.snapshot(), time.process_time()
+    time.sleep(for_s)
+    last, took_s = world.snapshot(), time.monotonic() - began_s
+    after = _threads()
+    used_s = time.process_time() - process_s
+    cost: dict[str, float] = {}
+    for name, spent_s in after.items():
+        part = _part(name)
+        cost[part] = cost.get(part, 0.0) + spent_s - before.get(name, 0.0)
+    named = {
+        name: (spent - before.get(name, 0.0)) / took_s * 100 for name, spent in after.items() if _part(name) == OTHER
+    }
+    named["threads that ended"] = (used_s - sum(cost.values())) / took_s * 100
+    cost[OTHER] = used_s - sum(spent for part, spent in cost.items() if part != OTHER)
+    report.write_text(
+        json.dumps(
+            {
+                "factor": (last.time_s - first.time_s) / took_s,
+                "lost_ms": last.lag_ms - first.lag_ms,
+                "cost_percent": {part: spent_s / took_s * 100 for part, spent_s in cost.items()},
+                "else_percent": {name: percent for name, percent in named.items() if percent >= TOLD_PERCENT},
+                "agent_percent": used_s / took_s * 100,
+                "others_percent": (_busy_s() - busy - used_s) / took_s * 100,
+                "gaps_ms": {
+                    name: [len(each), *([round(_at(each, mark) * 1000, 2) for mark in _MARKS])]
+                    for name, each in sorted(gaps.items())
+                    if name.endswith("-loop") and each
+                },
+            }
+        )
+    )
+
+
+def _threads() -> dict[str, float]:
+    """Processor time of each thread by name [s]; of threads that are not Python's, by what their library calls them."""
+    names = {thread.native_id: thread.name for thread in threading.enumerate()}
+    found: dict[str, float] = {}
+    for task in Path("/proc/self/task").iterdir():
+        try:
+            before, _, after = (task / "stat").read_text(encoding="ascii").rpartition(")")
+        except OSError:  # it has ended
+            continue
+        spent, name = after.split(), names.get(int(task.name), before.partition("(")[2])
+        found[name] = found.get(name, 0.0) + (int(spent[11]) + int(spent[12])) / _TICKS_S
+    return found
+
+
+def _busy_s() -> float:
+    """Processor time of the whole machine that was not idle [s]."""
+    spent = [int(each) for each in Path("/proc/stat").read_text(encoding="ascii").splitlines()[0].split()[1:9]]
+    return (sum(spent) - spent[3] - spent[4]) / _TICKS_S
+
+
+def _part(thread: str) -> str:
+    return next((part for part, names in PARTS if any(name in thread for name in names)), OTHER)
+
+
+def _at(values: Iterable[float], mark: float) -> float:
+    ordered = sorted(values)
+    return ordered[round((len(ordered) - 1) * mark)]
+
+
+# ------------------------------------------------------------ beside it
+
+
+class Laboratory(local.Machine):
+    """What ``make up`` starts, with the agent watched."""
+
+    def __init__(self, chosen: settings.Settings, report: Path, for_s: float) -> None:
+        super().__init__(chosen)
+        self._report = report
+        self._for_s = for_s
+        self._token = ""
+
+    def _run(self, name: str, *arguments: str) -> Any:
+        if name == "agent":
+            arguments = (
+                "-m",
+                "benchmarks.agent.laboratory",
+                str(self._for_s),
+                "--agent",
+                str(self._report),
+                DIVIDER,
+                *arguments[2:],
+            )
+        return super()._run(name, *arguments)
+
+    def operate(self, ending: threading.Event) -> None:
+        """Keep all robots moving."""
+        link = self._sign_in_link().partition("#sign-in=")[2].split()[0]
+        signed_in = self._call("POST", "/auth/sign-in", {"link": link})["access_token"]
+        wanted = {"name": "benchmark", "role": "operator", "days": 1}
+        self._token = self._call("POST", "/api-keys", wanted, signed_in)["token"]
+        while not ending.wait(1.0):
+            for device in self._call("GET", "/devices", token=self._token)["items"]:
+                if device["robot_type"] in MOVEMENTS:
+                    asked = {"request": {"kind": "run_movement", "name": MOVEMENTS[device["robot_type"]]}}
+                    # Refused while it still moves.
+                    with contextlib.suppress(ValueError, OSError):
+                        self._call("POST", f"/devices/{device['id']}/actions", asked, self._token)
+
+
+def show(found: dict[str, Any], for_s: float, broker: str) -> None:
+    """Print what was found."""
+    print(f"{platform.python_version()}, {os.cpu_count()} cores, {broker}, {for_s:.0f} s")
+    print(f"real-time factor {found['factor']:.4f}, {found['lost_ms']:.0f} ms of simulated time lost")
+    for part, percent in sorted(found["cost_percent"].items(), key=lambda entry: -entry[1]):
+        print(f"  {part:28}{percent:6.1f} % of a core")
+    for name, percent in found["else_percent"].items():
+        print(f"    of which {name:19}{percent:6.1f} %")
+    print(f"  {'the agent in all':28}{found['agent_percent']:6.1f} %")
+    print(f"  {'all else on the machine':28}{found['others_percent']:6.1f} %")
+    print(f"{'ms between two decisions':30}{'n':>8}{'p50':>8}{'p95':>8}{'p99':>8}{'max':>8}")
+    for name, (count, *marks) in found["gaps_ms"].items():
+        print(f"  {name:28}{count:8}" + "".join(f"{mark:8.2f}" for mark in marks))
+
+
+def measure(for_s: float, broker: str, port: int) -> None:
+    """Start it all, wait, show, end it all."""
+    with tempfile.TemporaryDirectory(prefix="ts-bench-lab-") as folder:
+        report = Path(folder) / "report.json"
+        chosen = settings.read(
+            os.environ
+            | {
+                "TELESCOPE_HOME": folder,
+                "TELESCOPE_PORT": str(port),
+                "TELESCOPE_BROKER": broker,
+                "TELESCOPE_ROOM": ROOM,
+            }
+        )
+        laboratory = Laboratory(chosen, report, for_s)
+        ending = threading.Event()
+        try:
+            laboratory.start()
+            operator = threading.Thread(target=laboratory.operate, args=(ending,), name="operator", daemon=True)
+            operator.start()
+            patience_s = time.monotonic() + WARM_UP_S + for_s + 60
+            while not report.is_file():
+                if time.monotonic() > patience_s:
+                    sys.exit(f"no report; see {folder}")
+                time.sleep(0.5)
+            time.sleep(0.5)
+            show(json.loads(report.read_text()), for_s, broker)
+        finally:
+            ending.set()
+            laboratory.stop()
+
+
+def main() -> int:
+    """Command line."""
+    parser = argparse.ArgumentParser(description="The whole laboratory in real time.")
+    parser.add_argument("seconds", type=float, nargs="?", default=60.0)
+    parser.add_argument("--broker", choices=["amqtt", "mosquitto"], default="amqtt")
+    parser.add_argument("--port", type=int, default=8600, help="and the next two")
+    parser.add_argument("--agent", type=Path, help=argparse.SUPPRESS)
+    own = sys.argv[1 : sys.argv.index(DIVIDER)] if DIVIDER in sys.argv else sys.argv[1:]
+    chosen = parser.parse_args(own)
+    if chosen.agent is not None:
+        return run_agent(chosen.agent, chosen.seconds, sys.argv[len(own) + 2 :])
+    measure(chosen.seconds, chosen.broker, chosen.port)
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

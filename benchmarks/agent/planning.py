@@ -1,0 +1,131 @@
+"""How late control loops are while somebody plans.
+
+``python -m benchmarks.agent.planning [SECONDS]`` runs the control loops of the laboratory's four robots in one process, with
+the agent's own controllers and shapes, while a fifth thread has the arm find one way after the other around a post, as
+an action does. It prints how late the loops were without and with that, how long a plan took, and how much memory the
+program that plans has.
+"""
+
+import argparse
+import os
+import threading
+import time
+from pathlib import Path
+
+import mujoco
+
+from benchmarks.agent.laboratory import _at
+from device_agent.geometry.mujoco_geometry import MujocoGeometry
+from device_agent.protocol.manifests import robot_type
+from device_agent.protocol.manifests.robot_type import RobotType
+from device_agent.runtime.authority.lease_gate import LeaseGate
+from device_agent.runtime.control.controller import Controller
+from device_agent.runtime.planning.motion_planner import MotionPlanner
+
+ROBOTS = Path(__file__).resolve().parents[2] / "robots"
+NAMES = ("ur5", "nao", "qbo", "hanson")
+POST_SIZE_M, POST_M = (0.04, 0.35, 0.0), (-0.249, -0.414, 0.35)
+BEYOND_RAD = 1.6
+"""Where the arm's first joint is to go, with the post half way."""
+_MARKS = (0.5, 0.95, 0.99, 1.0)
+
+
+class Loop:
+    """One robot's control loop, without a driver: what the arm's takes in each period, and when."""
+
+    def __init__(self, kind: RobotType, shape: MujocoGeometry, ending: threading.Event) -> None:
+        self._kind = kind
+        self._ending = ending
+        self._controller = Controller(kind, LeaseGate(), geometry=shape)
+        home = [kind.home_rad[joint.name] for joint in kind.joints]
+        self._controller.start_at(home)
+        self._tenure = self._controller.begin_action(epoch=1, on_lost=lambda _: None)
+        self._ends = home, [rad + 0.2 * (joint.upper_rad - rad) for rad, joint in zip(home, kind.joints, strict=True)]
+        self.late_s: list[float] = []
+        self.thread = threading.Thread(target=self._run, daemon=True)
+
+    def _run(self) -> None:
+        period_s, joint = self._kind.period_ms / 1000, self._kind.joints[0].name
+        due_s, turn, move = time.monotonic(), 0, None
+        while not self._ending.is_set():
+            now_s = time.monotonic()
+            self.late_s.append(max(0.0, now_s - due_s))
+            if move is None or move.finished.is_set():
+                turn += 1
+                move = self._controller.move(self._tenure, {joint: self._ends[turn % 2][0]}, speed=0.3)
+            self._controller.step(now_s)
+            due_s = max(due_s + period_s, time.monotonic() - period_s)
+            time.sleep(max(0.0, due_s - time.monotonic()))
+
+
+def scene(folder: Path) -> Path:
+    """The arm's table with a post on it."""
+    kind = robot_type.load(folder)
+    spec = mujoco.MjSpec.from_file(str(folder / kind.scene))
+    spec.worldbody.add_geom(name="post", type=mujoco.mjtGeom.mjGEOM_CYLINDER, size=POST_SIZE_M, pos=POST_M)
+    path = folder / f".post-{os.getpid()}.xml"
+    path.write_text(spec.to_xml(), encoding="utf-8")
+    return path
+
+
+def measure(for_s: float, *, planning: bool) -> None:
+    """Run the loops for so long, and print."""
+    ending = threading.Event()
+    loops = {}
+    for name in NAMES:
+        kind = robot_type.load(ROBOTS / name)
+        loops[name] = Loop(kind, MujocoGeometry(kind, ROBOTS / name / kind.scene), ending)
+    kind = robot_type.load(ROBOTS / "ur5")
+    path = scene(ROBOTS / "ur5")
+    try:
+        shape = MujocoGeometry(kind, path)
+        home = [kind.home_rad[joint.name] for joint in kind.joints]
+        took_s: list[float] = []
+        if planning:  # the first starts the program
+            MotionPlanner(kind, shape).around(home, [BEYOND_RAD, *home[1:]], speed=1.0, ended=ending.is_set)
+        for loop in loops.values():
+            loop.thread.start()
+        began_s, seed = time.monotonic(), 0
+        while (now_s := time.monotonic()) - began_s < for_s:
+            if not planning:
+                time.sleep(0.1)
+                continue
+            seed += 1
+            MotionPlanner(kind, shape, seed=seed).around(home, [BEYOND_RAD, *home[1:]], speed=1.0, ended=ending.is_set)
+            took_s.append(time.monotonic() - now_s)
+            time.sleep(0.2)
+        ending.set()
+    finally:
+        path.unlink()
+    for loop in loops.values():
+        loop.thread.join()
+    print("planning" if planning else "nobody plans")
+    for name, loop in loops.items():
+        late_ms = " ".join(f"{_at(loop.late_s, mark) * 1000:8.2f}" for mark in _MARKS)
+        print(f"  {name:8} {len(loop.late_s):6} periods, late p50, p95, p99, max ms {late_ms}")
+    if took_s:
+        print(f"  {len(took_s)} plans, p50 {_at(took_s, 0.5) * 1000:.0f} ms, max {max(took_s) * 1000:.0f} ms")
+        print(f"  memory of the program that plans: {_planner_mb():.0f} MB")
+
+
+def _planner_mb() -> float:
+    """Resident memory of this process's children [MB]."""
+    found = 0.0
+    for task in Path("/proc/self/task").iterdir():
+        for child in (task / "children").read_text(encoding="ascii").split():
+            status = Path(f"/proc/{child}/status").read_text(encoding="ascii")
+            found += float(status.partition("VmRSS:")[2].split()[0]) / 1024
+    return found
+
+
+def main() -> None:
+    """Command line."""
+    parser = argparse.ArgumentParser(description="How late control loops are while somebody plans.")
+    parser.add_argument("seconds", type=float, nargs="?", default=30.0)
+    seconds = parser.parse_args().seconds
+    for planning in (False, True):
+        measure(seconds, planning=planning)
+
+
+if __name__ == "__main__":
+    main()

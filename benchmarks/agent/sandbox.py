@@ -1,0 +1,87 @@
+"""How soon a movement script runs, and how soon a stopped one is dead.
+
+``python -m benchmarks.agent.sandbox [RUNS]`` prints percentiles over 300 runs of each kind [ms].
+
+- *start*: from asking for a process to the script's first line (its first message has arrived). As a rule one is asked
+  for at once after the other, when none is ready yet; where it says so, when one is;
+- *stop*: from the kill to the dead process, its memory taken back.
+"""
+
+import contextlib
+import json
+import sys
+import time
+
+from device_agent.ports.sandbox import Limits, SandboxProcess
+from device_agent.sandbox.host import SandboxHost
+
+_STUBBORN = "import signal\nfor n in (signal.SIGTERM, signal.SIGINT, signal.SIGHUP): signal.signal(n, signal.SIG_IGN)\n"
+_GREEDY = "kept = []\ntry:\n    while True: kept.append(bytearray(b'x' * 2**20))\nexcept MemoryError: pass\n"
+_UNTIL_READY_S = 0.7
+SCRIPTS = {
+    "a script that waits": "print(1)\nwait(600)",
+    "one that imports NumPy": "import numpy\nprint(numpy.zeros(3))\nwait(600)",
+    "one that ignores SIGTERM and computes": f"{_STUBBORN}print(1)\nwhile True: pass",
+    "one that has filled its memory": f"{_GREEDY}print(1)\nwhile True: pass",
+}
+
+
+def first_line(inmate: SandboxProcess, source: str) -> None:
+    """Send the script and wait for what it says first."""
+    with inmate.link.makefile("rwb") as lines:
+        lines.readline()
+        task = {"source": source, "name": "x", "parameters": {}, "joints": [], "frames": [], "can": []}
+        lines.write(json.dumps(task).encode() + b"\n")
+        lines.flush()
+        if b"output" not in lines.readline():
+            raise RuntimeError("the script did not print")
+
+
+def measure(
+    jail: SandboxHost, source: str, runs: int, *, stranger: bool, pause_s: float = 0.0
+) -> tuple[list[float], list[float]]:
+    """Start and stop of each run [ms]."""
+    starts, stops = [], []
+    for _ in range(runs):
+        time.sleep(pause_s)
+        begun_s = time.perf_counter()
+        with contextlib.closing(jail.open(Limits(), stranger=stranger)) as inmate:
+            first_line(inmate, source)
+            starts.append((time.perf_counter() - begun_s) * 1000)
+            stopped_s = time.perf_counter()
+            inmate.kill()
+            if not inmate.wait(10):
+                raise RuntimeError("it does not die")
+            stops.append((time.perf_counter() - stopped_s) * 1000)
+    return starts, stops
+
+
+def percentiles(values: list[float]) -> str:
+    """Median, 95 %, 99 % and the longest."""
+    values = sorted(values)
+    p50, p95, p99 = (values[min(len(values) - 1, int(share * len(values)))] for share in (0.5, 0.95, 0.99))
+    return f"p50 {p50:6.1f}   p95 {p95:6.1f}   p99 {p99:6.1f}   max {values[-1]:6.1f}"
+
+
+def main(runs: int = 300) -> None:
+    """Measure all of it."""
+    jail = SandboxHost()
+    begun_s = time.perf_counter()
+    jail.start()
+    print(f"warm parent ready after {(time.perf_counter() - begun_s) * 1000:.0f} ms; {runs} runs each [ms]")
+    for stranger in (False, True):
+        with contextlib.closing(jail.open(Limits(), stranger=stranger)):
+            pass  # the first starts the warm parent
+        where = "bubblewrap: " if stranger else ""
+        for name, source in SCRIPTS.items():
+            starts, stops = measure(jail, source, runs, stranger=stranger)
+            print(f"{where + name:50} start {percentiles(starts)}")
+            print(f"{'':50} stop  {percentiles(stops)}")
+        waits = SCRIPTS["a script that waits"]
+        starts, _ = measure(jail, waits, max(1, runs // 6), stranger=stranger, pause_s=_UNTIL_READY_S)
+        print(f"{where + 'a script that waits, where one is ready':50} start {percentiles(starts)}")
+    jail.close()
+
+
+if __name__ == "__main__":
+    main(*map(int, sys.argv[1:]))

@@ -1,0 +1,1 @@
+"""Reference measurements and the product that every suite measures."""

@@ -1,0 +1,98 @@
+"""The least that an exchange must contain, each in a process of its own: it answers what comes with what came.
+
+``python -m benchmarks.baseline.echo_servers tcp|http PORT`` or ``… mqtt PORT CLIENT USER PASSWORD TOPIC ANSWER QOS BYTES``; it prints
+``ready`` once it is. Over MQTT the answer is made as long as ``BYTES`` if it is shorter.
+"""
+
+import asyncio
+import json
+import socket
+import sys
+from typing import Any
+
+import paho.mqtt.client as paho
+from paho.mqtt.enums import CallbackAPIVersion
+
+HOST = "127.0.0.1"
+
+
+def send_at_once(_client: Any, _userdata: Any, opened: Any) -> None:
+    """Paho's ``on_socket_open``: a small message does not wait for the acknowledgement of the one before."""
+    opened.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+
+
+async def _tcp(port: int) -> None:
+    async def answer(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        while data := await reader.read(65_536):
+            writer.write(data)
+
+    async with await asyncio.start_server(answer, HOST, port) as server:
+        print("ready", flush=True)
+        await server.serve_forever()
+
+
+async def serve(app: Any, port: int) -> None:
+    """An application under uvicorn, as the functions are served; prints ``ready``."""
+    import uvicorn
+
+    config = uvicorn.Config(app, host=HOST, port=port, log_level="error", access_log=False, timeout_keep_alive=600)
+    server = uvicorn.Server(config)
+    serving = asyncio.create_task(server.serve())
+    while not server.started:  # noqa: ASYNC110 (it offers nothing to wait for)
+        await asyncio.sleep(0.01)
+    print("ready", flush=True)
+    await serving
+
+
+async def _http(port: int) -> None:
+    from fastapi import FastAPI, Request, Response
+
+    app = FastAPI()
+
+    @app.post("/echo")
+    async def echo(request: Request) -> Response:
+        return Response(await request.body(), media_type="application/json")
+
+    @app.get("/echo")
+    async def again() -> dict[str, str]:
+        return {"status": "ok"}
+
+    @app.get("/sized/{length}")
+    async def sized(length: int) -> Response:
+        return Response(json.dumps("x" * (length - 2)), media_type="application/json")
+
+    await serve(app, port)
+
+
+def _mqtt(port: int, *words: str) -> None:
+    client_id, user, password, topic, answer, level, least = words
+    qos, size = int(level), int(least)
+    client = paho.Client(CallbackAPIVersion.VERSION2, client_id, protocol=paho.MQTTv311)
+    client.username_pw_set(user, password)
+    client.on_socket_open = send_at_once
+
+    def back(_client: paho.Client, _userdata: Any, message: paho.MQTTMessage) -> None:
+        client.publish(answer, message.payload.ljust(size), qos)
+
+    def subscribe(*_: Any) -> None:
+        client.subscribe(topic, qos)
+
+    client.on_message = back
+    client.on_connect = subscribe
+    client.on_subscribe = lambda *_: print("ready", flush=True)
+    client.connect(HOST, port, keepalive=60)
+    client.loop_forever()
+
+
+def main(kind: str, port: str, *more: str) -> None:
+    """Until it is ended."""
+    if kind == "tcp":
+        asyncio.run(_tcp(int(port)))
+    elif kind == "http":
+        asyncio.run(_http(int(port)))
+    else:
+        _mqtt(int(port), *more)
+
+
+if __name__ == "__main__":
+    main(*sys.argv[1:])

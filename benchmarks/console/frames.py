@@ -1,0 +1,146 @@
+"""Ten arms on one page, all of them moving: how far apart its frames are, and what its memory does.
+
+What opening the page costs (its code, ten scenes, the shaders' compilation) is printed by itself and is not in the
+minute, which begins ``WARM_UP_S`` after every twin was drawn.
+"""
+
+import os
+import statistics
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any, Final
+
+from playwright.sync_api import Browser, CDPSession, Page, expect
+
+from benchmarks.console.kinematic_arms import puppets
+from tests.harness.browser.browser import PATIENCE_MS, pages
+from tests.harness.browser.product import Machine
+from tests.harness.network.brokers import wait_until
+
+ROBOTS: Final = 10
+WARM_UP_S: Final = 20.0
+LONGEST_FRAME_MS: Final = 100.0
+GROWS_MB_MIN: Final = 0.2
+"""Memory that grows faster than this after the first minute is a leak."""
+MORE: Final = 1.1
+"""So many times the nodes and listeners of the first minute, at the end."""
+
+# Of each frame when it was, and of the long ones what they were spent on, as the browser has it.
+WATCH_FRAMES: Final = """() => {
+    const frames = (window.benchFrames = {gaps: [], long: []});
+    let last = performance.now();
+    const look = (now) => {
+        frames.gaps.push(now - last);
+        last = now;
+        requestAnimationFrame(look);
+    };
+    requestAnimationFrame(look);
+    new PerformanceObserver((list) => {
+        for (const each of list.getEntries()) {
+            const until = each.startTime + each.duration;
+            frames.long.push({
+                duration: each.duration,
+                drawing: each.renderStart === 0 ? 0 : until - each.renderStart,
+                layout: each.styleAndLayoutStart === 0 ? 0 : until - each.styleAndLayoutStart,
+                scripts: each.scripts.map((script) => `${script.invoker} ${Math.round(script.duration)}`),
+            });
+        }
+    }).observe({type: "long-animation-frame"});
+}"""
+TAKE_FRAMES: Final = """() => {
+    const {gaps, long} = benchFrames;
+    const taken = {gaps: [...gaps], long: [...long]};
+    gaps.length = long.length = 0;
+    return taken;
+}"""
+DRAWN: Final = (
+    "() => [...document.querySelectorAll('[data-testid=view-3d]')].map((each) => Number(each.dataset.frames))"
+)
+
+
+@dataclass(frozen=True)
+class Kept:
+    """What a page holds on to, after everything else was collected."""
+
+    heap_mb: float
+    nodes: int
+    listeners: int
+
+    def __str__(self) -> str:
+        return f"{self.heap_mb:.2f} MB, {self.nodes} nodes, {self.listeners} listeners"
+
+
+def kept(session: CDPSession) -> Kept:
+    """Collect garbage, and look."""
+    session.send("HeapProfiler.collectGarbage")
+    heap = session.send("Runtime.getHeapUsage")["usedSize"]
+    counted = session.send("Memory.getDOMCounters")
+    return Kept(heap / 1e6, counted["nodes"], counted["jsEventListeners"])
+
+
+def steady(every_minute: Sequence[Kept]) -> bool:
+    """Print what memory did since the first minute; whether it stays."""
+    first, last = every_minute[0], every_minute[-1]
+    slope = 0.0
+    if len(every_minute) > 1:
+        slope = statistics.linear_regression(range(len(every_minute)), [each.heap_mb for each in every_minute]).slope
+    stays = slope <= GROWS_MB_MIN and last.nodes <= MORE * first.nodes and last.listeners <= MORE * first.listeners
+    print(f"memory {'steady' if stays else 'GROWS'}: {slope:+.3f} MB a minute over {len(every_minute) - 1} minutes")
+    return stays
+
+
+def open_together(page: Page, machine: Machine, ids: Sequence[str]) -> None:
+    """All on one page, each of them heard and drawn."""
+    page.goto(f"{machine.url}/#/operate/{','.join(ids)}")
+    expect(page.get_by_test_id("station")).to_have_count(len(ids), timeout=PATIENCE_MS)
+    wait_until(
+        lambda: [frames > 0 for frames in page.evaluate(DRAWN)] == [True] * len(ids),
+        "every twin",
+    )
+
+
+def show_fleet(browser: Browser, machine: Machine, minutes: float) -> bool:
+    """Look at ten arms; whether frames come in time and memory stays."""
+    with puppets(machine, ROBOTS) as ids, pages(browser, machine) as (page,):
+        session = page.context.new_cdp_session(page)
+        page.evaluate(WATCH_FRAMES)
+        began_s = time.monotonic()
+        open_together(page, machine, ids)
+        print(f"{len(ids)} arms, opened in {time.monotonic() - began_s:.1f} s; load {os.getloadavg()[0]:.1f}")
+        _show_frames("while opening, not counted", page.evaluate(TAKE_FRAMES))
+        time.sleep(WARM_UP_S)
+        _show_frames(f"the {WARM_UP_S:.0f} s after, not counted", page.evaluate(TAKE_FRAMES))
+        print(f"at the start of the minute: {kept(session)}")
+        before = sum(page.evaluate(DRAWN))
+        page.evaluate(TAKE_FRAMES)  # to collect garbage takes its time, and is the benchmark's doing
+        time.sleep(60)
+        taken = page.evaluate(TAKE_FRAMES)
+        drawn = sum(page.evaluate(DRAWN)) - before
+        quick = _show_minute(taken, drawn / 60)
+        every_minute = [kept(session)]
+        print(f"after minute 1: {every_minute[0]}", flush=True)
+        for minute in range(2, round(minutes) + 1):
+            time.sleep(60)
+            every_minute.append(kept(session))
+            print(f"after minute {minute}: {every_minute[-1]}", flush=True)
+        return steady(every_minute) and quick
+
+
+def _show_minute(taken: dict[str, Any], drawn_hz: float) -> bool:
+    longest = _show_frames("the minute", taken)
+    print(f"twins drawn: {drawn_hz:.0f} a second together; load {os.getloadavg()[0]:.1f} on {os.cpu_count()} cores")
+    for each in sorted(taken["long"], key=lambda frame: -float(frame["duration"]))[:3]:
+        print("  {duration:.0f} ms, of which drawing {drawing:.0f}, layout {layout:.0f}; {scripts}".format(**each))
+    quick = longest <= LONGEST_FRAME_MS
+    print(f"longest frame {longest:.0f} ms, {'within' if quick else 'MORE THAN'} {LONGEST_FRAME_MS:.0f} ms", flush=True)
+    return quick
+
+
+def _show_frames(when: str, taken: dict[str, Any]) -> float:
+    gaps: list[float] = sorted(taken["gaps"]) or [float("inf")]
+    marks = [gaps[round((len(gaps) - 1) * share)] for share in (0.5, 0.95, 0.99, 1.0)]
+    late = sum(gap > LONGEST_FRAME_MS for gap in gaps)
+    said = "p50 {:.0f}, p95 {:.0f}, p99 {:.0f}, max {:.0f}".format(*marks)
+    print(f"{when}: {len(gaps)} frames, ms apart: {said}; longer than {LONGEST_FRAME_MS:.0f}: {late}", flush=True)
+    return marks[-1]

@@ -1,0 +1,116 @@
+"""Arms as a page sees them, without physics: the product's own arm describes and draws them, and they swing.
+
+A page is what is measured with them. Ten simulated arms beside it on one small machine would take what it draws with.
+"""
+
+import contextlib
+import itertools
+import math
+import threading
+import time
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Final
+
+import msgspec
+
+from benchmarks.console.minimal_agents import crowd
+from device_agent.ports.clock import tick_ms, wall_ms
+from device_agent.protocol import Description, JointTelemetry, Mode, State, Twin, codec, topics
+from function_app.ports.broker_access import Credentials
+from tests.fakes.agent import Robot
+from tests.harness.browser.product import Machine
+from tests.harness.network.brokers import Client, wait_until
+
+RATE_HZ: Final = 20.0
+SWING_S: Final = 9.0
+SIDE_RAD: Final = 0.9
+PAN: Final = 0
+AGENT_HAS: Final = 5
+STATE_EVERY_S: Final = 10.0
+
+
+@dataclass(frozen=True)
+class _Pattern:
+    """What one arm has said of itself."""
+
+    description: Description
+    twin: Twin
+    joints: JointTelemetry
+
+
+@contextlib.contextmanager
+def puppets(machine: Machine, count: int) -> Iterator[list[str]]:
+    """So many arms of the demo account, measured ``RATE_HZ`` times a second; their devices' ids."""
+    over = threading.Event()
+    with crowd(machine, count, AGENT_HAS) as robots:
+        pattern = _pattern(machine)
+        everyone = [(robot, name) for robot in robots for name in robot.names]
+        for robot, name in everyone:
+            _introduce(robot, name, pattern)
+        thread = threading.Thread(target=_swing, args=(everyone, pattern, over))
+        thread.start()
+        try:
+            yield [device for robot in robots for device in robot.devices]
+        finally:
+            over.set()
+            thread.join()
+
+
+def _pattern(machine: Machine) -> _Pattern:
+    """Of the product's own arm."""
+    with machine.api() as api:
+        topic = api.device()["topic"]
+        issued = api.post("/mqtt/credentials", {"purpose": "watch"})
+    login = Credentials(issued["username"], issued["password"])
+    with Client(issued["client_id"], login, port=issued["tcp"]["port"]).open() as client:
+        wanted = [f"{topic}/{kind}" for kind in ("desc", "desc/twin", "tele/joints")]
+        client.subscribe(*wanted)
+        found: dict[str, bytes] = {}
+
+        def complete() -> bool:
+            found.update({message.topic: message.payload for message in client.heard()})
+            return found.keys() >= set(wanted)
+
+        wait_until(complete, "what the arm says of itself")
+    description, twin, joints = (found[each] for each in wanted)
+    return _Pattern(
+        codec.decode(description, Description), codec.decode(twin, Twin), codec.decode(joints, JointTelemetry)
+    )
+
+
+def _introduce(robot: Robot, name: str, pattern: _Pattern) -> None:
+    def say(kind: str, message: msgspec.Struct, more: str = "") -> None:
+        topic = topics.device(robot.space, robot.id, name, kind, more)
+        robot.say(topic, msgspec.structs.replace(message, device=name), retain=True)
+
+    say(topics.DESC, pattern.description)
+    say(topics.DESC, pattern.twin, topics.TWIN)
+    _tell_state(robot, name)
+
+
+def _tell_state(robot: Robot, name: str) -> None:
+    state = State(device=name, at_ms=wall_ms(), tick_ms=tick_ms(), mode=Mode.IDLE, epoch=0)
+    robot.say(topics.device(robot.space, robot.id, name, topics.STATE), state, retain=True)
+
+
+def _swing(everyone: list[tuple[Robot, str]], pattern: _Pattern, over: threading.Event) -> None:
+    """Tell where they are until it is over, each a little behind the one before."""
+    next_s = began_s = time.monotonic()
+    for sequence in itertools.count(1):
+        for place, (robot, name) in enumerate(everyone):
+            phase = 2 * math.pi * (time.monotonic() - began_s) / SWING_S - place
+            told = _at(pattern.joints, SIDE_RAD * math.sin(phase), sequence)
+            topic = topics.device(robot.space, robot.id, name, topics.TELE, topics.JOINTS)
+            if robot.link is not None:
+                robot.link.publish(topic, codec.encode(told), qos=0)
+        next_s = max(next_s + 1 / RATE_HZ, time.monotonic())
+        if over.wait(next_s - time.monotonic()):
+            return
+
+
+def _at(pattern: JointTelemetry, pan_rad: float, sequence: int) -> JointTelemetry:
+    position = tuple(value + (pan_rad if index == PAN else 0.0) for index, value in enumerate(pattern.position_rad))
+    return msgspec.structs.replace(
+        pattern, tick_ms=tick_ms(), at_ms=wall_ms(), sequence=sequence, position_rad=position, commanded_rad=position
+    )

@@ -1,0 +1,218 @@
+"""How quick the console is, in a real Chromium against the product as ``make up`` starts it.
+
+``python -m benchmarks.console.slider [--samples 40]`` presses a joint's slider and follows what comes of it, all on the
+machine's own clock: the press, the setpoint that leaves the page, the command that the simulation gets, the first
+motion of the simulated joint, the telemetry that tells of it to the page, and the twin that is drawn from it. The
+clock of the page is compared with the machine's at each press.
+
+``python -m benchmarks.console.slider --fleet [--minutes 10]`` shows ten simulated arms on one page (``console_fleet.py``),
+``--devices 200`` the list of so many devices (``console_list.py``).
+"""
+
+import argparse
+import os
+import platform
+import statistics
+import sys
+import tempfile
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Final
+
+from playwright.sync_api import Page, expect, sync_playwright
+
+from benchmarks.console.device_list import show_list
+from benchmarks.console.frames import show_fleet
+from tests.harness.browser.browser import PATIENCE_MS, chromium, pages
+from tests.harness.browser.product import Machine, Trace, start_machine
+from tests.harness.network.brokers import wait_until
+
+JOINT: Final = "elbow"
+PARTS: Final = ("input", "published", "commanded", "moved", "told", "drawn")
+"""In their order: pressed and handled by the page, sent to the broker, at the simulation, moving, heard, drawn."""
+MOST_MS: Final = 60.0
+"""From the press to simulated motion, median."""
+MOVES_RAD_S: Final = 0.002
+"""A simulated joint that is faster than this moves: a tenth of a degree per second."""
+
+# Looks on from outside: what the page sends, hears and draws stays as it is.
+WATCH: Final = """() => {
+    const at = () => performance.timeOrigin + performance.now();
+    const marks = (window.benchMarks = {});
+    const first = (name) => { if (marks.pressed !== undefined && marks[name] === undefined) marks[name] = at(); };
+    const text = (data) => new TextDecoder("latin1").decode(data);
+    const Native = window.WebSocket;
+    window.WebSocket = class extends Native {
+        constructor(...given) {
+            super(...given);
+            this.addEventListener("message", ({data}) => {
+                if (!(data instanceof ArrayBuffer) || marks.published === undefined || marks.told !== undefined) return;
+                const said = text(data);
+                if (!said.includes("/tele/joints")) return;
+                const speeds = /"velocity_rad_s":\\[([^\\]]*)\\]/.exec(said);
+                if (speeds === null || !speeds[1].split(",").some((each) => Math.abs(Number(each)) > MOVES)) return;
+                first("told");
+            });
+        }
+        send(data) {
+            if (marks.pressed !== undefined && text(data).includes("/ctl/")) first("published");
+            super.send(data);
+        }
+    };
+    addEventListener("pointerdown", (event) => {
+        if (marks.armed) marks.pressed = performance.timeOrigin + event.timeStamp;
+    }, {capture: true});
+    addEventListener("input", () => first("input"), {capture: true});
+    window.benchDrawn = () => {
+        const box = document.querySelector("[data-testid=view-3d]");
+        const drawn = () => { if (marks.told !== undefined) first("drawn"); };
+        new MutationObserver(drawn).observe(box, {attributeFilter: ["data-frames"]});
+    };
+    window.benchArm = () => {
+        for (const name of Object.keys(marks)) delete marks[name];
+        marks.armed = true;
+        let ahead = Infinity;
+        for (let tries = 0; tries < 2000; tries += 1) ahead = Math.min(ahead, at() - Date.now());
+        marks.ahead = ahead;
+    };
+}"""
+
+
+@dataclass(frozen=True)
+class Press:
+    """One press of a slider; ``at_ms``: part → when it was done, after the press [ms]."""
+
+    at_ms: dict[str, float]
+
+
+def watch(page: Page) -> None:
+    """Begin to look on: from the page's next load on."""
+    page.add_init_script(f"({WATCH.replace('MOVES', str(MOVES_RAD_S))})()")
+
+
+def presses(page: Page, machine: Machine, count: int) -> list[Press]:
+    """Press the slider of an arm that is operated, again and again, and follow what comes of it.
+
+    What the machine was too busy for (a robot that had to hold) is tried again.
+    """
+    trace = machine.trace()
+    page.evaluate("() => benchDrawn()")
+    slider = page.get_by_test_id(f"slider-{JOINT}")
+    slider.scroll_into_view_if_needed()
+    found: list[Press] = []
+    for index in range(3 * count):
+        if len(found) == count:
+            break
+        _take(page)
+        wait_until(lambda: _speed(trace) < MOVES_RAD_S, "rest", 20)
+        page.wait_for_timeout(
+            300 + 37 * (index % 7)
+        )  # telemetry of a robot at rest comes every 50 ms: at any phase of it
+        if (press := _press(page, trace, 0.55 if index % 2 else 0.6)) is not None:
+            found.append(press)
+    return found
+
+
+def _take(page: Page) -> None:
+    """Take control; on a machine so busy that setpoints come late, the robot ends it, as it must: take it again."""
+    state, slider = page.get_by_test_id("control-state"), page.get_by_test_id(f"slider-{JOINT}")
+
+    def may() -> bool:
+        button = page.get_by_test_id("take-control")
+        if state.get_attribute("data-state") != "mine" and button.count() and button.is_enabled():
+            button.click()
+            page.wait_for_timeout(300)
+        return slider.is_enabled()
+
+    wait_until(may, "control", 60)
+
+
+def _press(page: Page, trace: Trace, share: float) -> Press | None:
+    box = page.get_by_test_id(f"slider-{JOINT}").bounding_box()
+    if box is None:
+        return None
+    page.mouse.move(box["x"] + box["width"] * share, box["y"] + box["height"] / 2)
+    page.evaluate("() => benchArm()")
+    before = trace.now()
+    page.mouse.down()
+    page.mouse.up()
+    marks: dict[str, float] = {}
+
+    def whole() -> bool:
+        marks.update(page.evaluate("() => benchMarks"))
+        return "drawn" in marks
+
+    try:
+        wait_until(whole, "the twin to be drawn", 5)
+    except AssertionError:
+        return None
+    page.wait_for_timeout(100)
+    at: dict[str, float] = {name: marks[name] - marks["ahead"] for name in marks if name not in ("ahead", "armed")}
+    rows = [row for row in trace.rows() if row["tick_ms"] > before["tick_ms"]]
+    told = next((row for row in rows if row["target"][JOINT] != before["target"][JOINT]), None)
+    moved = next((row for row in rows if abs(row["qvel"][JOINT]) > MOVES_RAD_S), None)
+    if told is None or moved is None:
+        return None
+    at |= {"commanded": told["at_ms"], "moved": moved["at_ms"]}
+    return Press({part: at[part] - at["pressed"] for part in PARTS})
+
+
+def _speed(trace: Trace) -> float:
+    return abs(float(trace.now()["qvel"][JOINT]))
+
+
+def show(found: Sequence[Press]) -> bool:
+    """Print what was found; whether it is quick enough."""
+    print(f"{platform.python_version()}, {os.cpu_count()} cores, {len(found)} presses of the {JOINT}'s slider")
+    print(f"{'ms':14}{'since the press: p50':>22}{'p95':>8}{'max':>8}{'since the part before: p50':>30}")
+    before = "pressed"
+    for part in PARTS:
+        whole = sorted(press.at_ms[part] for press in found)
+        step = [press.at_ms[part] - press.at_ms.get(before, 0.0) for press in found]
+        marks = (statistics.median(whole), whole[round((len(whole) - 1) * 0.95)], whole[-1])
+        print(f"{part:14}{marks[0]:22.1f}{marks[1]:8.1f}{marks[2]:8.1f}{statistics.median(step):30.1f}")
+        before = part
+    median = statistics.median(press.at_ms["moved"] for press in found)
+    good = median <= MOST_MS
+    print(f"slider to simulated motion: {median:.1f} ms, {'within' if good else 'MORE THAN'} {MOST_MS:.0f} ms")
+    return good
+
+
+def main() -> int:
+    """Command line."""
+    parser = argparse.ArgumentParser(description="How quick the console is.")
+    parser.add_argument("--samples", type=int, default=40)
+    parser.add_argument("--fleet", action="store_true", help="ten arms on one page")
+    parser.add_argument("--minutes", type=float, default=10.0, help="with --fleet: how long memory is looked at")
+    parser.add_argument("--devices", type=int, default=0, help="the list of so many devices")
+    chosen = parser.parse_args()
+    with tempfile.TemporaryDirectory(prefix="ts-bench-console-") as name:
+        folder = Path(name)
+        with (
+            start_machine(folder / "machine") as machine,
+            sync_playwright() as playwright,
+            chromium(playwright) as browser,
+        ):
+            if chosen.fleet:
+                return 0 if show_fleet(browser, machine, chosen.minutes) else 1
+            if chosen.devices:
+                return 0 if show_list(browser, machine, chosen.devices) else 1
+            with pages(browser, machine) as (page,):
+                found = measure(page, machine, chosen.samples)
+            return 0 if show(found) else 1
+
+
+def measure(page: Page, machine: Machine, count: int) -> list[Press]:
+    """Open the arm's page, look on, press."""
+    watch(page)
+    page.reload()
+    page.get_by_test_id("device-row").filter(has_text="UR5").get_by_role("link").first.click()
+    expect(page.get_by_test_id("control-state")).to_be_visible(timeout=PATIENCE_MS)
+    drawn: Any = "() => Number(document.querySelector('[data-testid=view-3d]')?.dataset.frames) > 0"
+    wait_until(lambda: bool(page.evaluate(drawn)), "the twin", 60)
+    return presses(page, machine, count)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,98 @@
+"""The product in processes that can be killed one by one, with an agent that tells what it decides."""
+
+import contextlib
+import time
+from collections.abc import Callable, Iterator
+from typing import Any
+
+import httpx
+
+from benchmarks.baseline.product import Line, rights
+from benchmarks.faults.recorder import Noted
+from function_app import settings
+from tests.faults.stack import Stack
+from tests.harness.cloud.cloud import Cloud
+from tests.harness.cloud.people import sign_in_link
+from tests.harness.network.brokers import BrokerKind
+from tests.harness.network.delay import start_delay
+from tests.harness.network.proxy import Proxy
+
+STREAMED, ORDERED = "arm0", "arm1"
+"""Who streams has the one, who orders actions has the other."""
+_WATCHDOG_S = 0.3
+
+
+class Ground(Stack):
+    """As ``Stack``; the agent's link goes through a network as well (`tests.harness.network.delay`).
+
+    Attributes:
+        noted: What the agent tells of its periods.
+        network: Between the agent's link and the broker.
+        owner: HTTP of somebody who has signed in, for what an API key may not do.
+    """
+
+    AGENT = "benchmarks.faults.agent"
+
+    def __init__(self, kind: BrokerKind) -> None:
+        super().__init__(kind, 2, watchdog_s=_WATCHDOG_S)
+        self.kind = kind
+        self.noted = Noted(self.home / "noted.socket")
+        self._closing.callback(self.noted.close)
+
+    def begin(self) -> None:
+        """Start all of it."""
+        super().begin()
+        self.owner = self._closing.enter_context(httpx.Client(base_url=self.api, timeout=15))
+        link = sign_in_link(self._environment, "ann")
+        token = self.owner.post("/auth/sign-in", json={"link": link}).json()["access_token"]
+        self.owner.headers["Authorization"] = f"Bearer {token}"
+        self.owner.cookies.clear()
+        self.cloud = self._closing.enter_context(Cloud(settings.read(self._environment)))
+
+    def _proxy(self, behind: int, heard: Callable[[bytes], None]) -> Proxy:
+        self.network = self._closing.enter_context(start_delay(behind, rtt_ms=0))
+        return super()._proxy(self.network.ports[behind], heard)
+
+    def device(self, name: str) -> str:
+        """The path of a device's routes."""
+        return f"/devices/{self.agent_id}-{name}"
+
+    def topic(self, name: str) -> str:
+        """Where a device's topics begin."""
+        return f"ts/v1/{self.space}/{self.agent_id}/{name}"
+
+    @contextlib.contextmanager
+    def issued(self, wanted: dict[str, Any], *topics: str) -> Iterator[Line]:
+        """A client with credentials as people get them."""
+        given = self.post("/mqtt/credentials", **wanted)
+        who = (given["client_id"], given["username"], given["password"])
+        with Line(self.port + 1, *who, subscribe=topics, qos=0) as line:
+            yield line
+
+    @contextlib.contextmanager
+    def allowed(self, name: str, *, publish: tuple[str, ...] = (), subscribe: tuple[str, ...] = ()) -> Iterator[Line]:
+        """A client with exactly these rights, as nobody gets them."""
+        with Line(self.port + 1, *rights(self.cloud, name, publish, subscribe), subscribe=subscribe, qos=1) as line:
+            yield line
+
+    def restart_agent_without_proxies(self) -> None:
+        """Its link goes straight to the broker from now on."""
+        self.agent.stop()
+        self.agent = self._child("agent", self.AGENT, *self.agent_arguments(self.port + 1))
+        self.agent.await_line("running", 60)
+        deadline_s = time.monotonic() + 60
+        while not all(each["online"] for each in self.devices()):
+            if time.monotonic() > deadline_s:
+                raise TimeoutError("the agent does not come back")
+            time.sleep(0.1)
+
+
+@contextlib.contextmanager
+def start(kind: BrokerKind) -> Iterator[Ground]:
+    """The product with two arms, until the end of the ``with``."""
+    ground = Ground(kind)
+    try:
+        ground.begin()
+        yield ground
+    finally:
+        ground.close()

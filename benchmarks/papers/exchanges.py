@@ -1,0 +1,133 @@
+"""One message from a sender through a server to a receiver, each way that a robot's command may go.
+
+Each function gives an exchange: it sends one setpoint and ends when the receiver has it. Sender and receiver have a
+connection each, and both are in this process, so one clock times them; servers are processes of their own.
+"""
+
+import asyncio
+import contextlib
+import json
+import queue
+import threading
+from collections.abc import Callable, Mapping
+from typing import Any, Final, Self
+
+from websockets.sync.client import connect
+
+from benchmarks.baseline.interleaved import Exchange
+from benchmarks.baseline.product import PATIENCE_S
+from device_agent.protocol import JointTarget, Setpoint, codec
+from device_agent.protocol.xmpp import stanzas
+from device_agent.protocol.xmpp.stream import Login, Stream
+from tests.harness.network.brokers import HOST, Client, RunningBroker, Transport
+from tests.harness.network.xmpp import DOMAIN
+
+JOINTS: Final = ("base", "shoulder", "elbow", "wrist_1", "wrist_2", "wrist_3")
+SETPOINT: Final = codec.encode(
+    Setpoint(
+        epoch=7,
+        sequence=1234,
+        echo_tick_ms=123456789,
+        sent_ms=1234567.25,
+        target=JointTarget(position_rad={name: round(0.1 * index + 0.05, 3) for index, name in enumerate(JOINTS)}),
+    )
+)
+"""What a console sends while somebody moves six sliders."""
+Ports = Mapping[int, int]
+"""A server's port → where clients connect: the same port, or a delay before it."""
+_TOPIC: Final = "bench/setpoint"
+_CLOUD, _ROBOT = "cloud", "robot"
+
+
+def mqtt(stack: contextlib.ExitStack, ports: Ports, broker: RunningBroker, transport: Transport = "tcp") -> Exchange:
+    """At QoS 0, as setpoints go."""
+    port = ports[broker.port(transport)]
+    topic = f"{_TOPIC}/{port}"  # a broker's TCP and its WebSocket are two ways: neither may hear the other
+    heard: queue.SimpleQueue[bytes] = queue.SimpleQueue()
+
+    def line(name: str) -> Client:
+        rights = broker.grant(f"{name}-{port}", publish=(topic,), subscribe=(topic,), lifetime_s=3600)
+        client = Client(rights.client_id, broker.issue(rights), port=port, transport=transport)
+        return stack.enter_context(client.open())
+
+    sender, receiver = line("sender"), line("receiver")
+    receiver.paho.on_message = lambda _c, _u, message: heard.put(bytes(message.payload))
+    receiver.subscribe(topic, qos=0)
+
+    def exchange() -> None:
+        _require_none(heard)
+        sender.publish(topic, SETPOINT, qos=0)
+        heard.get(timeout=PATIENCE_S)
+
+    return exchange
+
+
+def web_socket(stack: contextlib.ExitStack, ports: Ports, port: int) -> Exchange:
+    """JSON over WebSocket through a relay."""
+    address = f"ws://{HOST}:{ports[port]}"
+    sender, receiver = (stack.enter_context(connect(address, compression=None)) for _ in range(2))
+    text = json.dumps({"op": "publish", "topic": _TOPIC, "msg": json.loads(SETPOINT)})
+
+    def exchange() -> None:
+        sender.send(text)
+        receiver.recv(timeout=PATIENCE_S)
+
+    return exchange
+
+
+def xmpp(stack: contextlib.ExitStack, ports: Ports, port: int) -> Exchange:
+    """A message from one user to another at Prosody."""
+    heard: queue.SimpleQueue[Any] = queue.SimpleQueue()
+    sender = stack.enter_context(_XmppUser(ports[port], _CLOUD, lambda _: None))
+    receiver = stack.enter_context(_XmppUser(ports[port], _ROBOT, heard.put))
+    stanza = stanzas.message(receiver.jid, _TOPIC, SETPOINT)
+
+    def exchange() -> None:
+        _require_none(heard)
+        sender.say(stanza)
+        heard.get(timeout=PATIENCE_S)
+
+    return exchange
+
+
+def _require_none(heard: "queue.SimpleQueue[Any]") -> None:
+    if not heard.empty():
+        raise RuntimeError("a message came that was not sent: what is measured would be another's")
+
+
+class _XmppUser:
+    """An XMPP client in a thread of its own. ``with`` ends it."""
+
+    def __init__(self, port: int, name: str, hear: Callable[[Any], None]) -> None:
+        self.jid = f"{name}@{DOMAIN}/bench"
+        self._login = Login(HOST, port, self.jid, "any")
+        self._hear = hear
+        self._loop = asyncio.new_event_loop()
+        self._thread = threading.Thread(target=self._loop.run_forever, daemon=True)
+        self._thread.start()
+
+    async def _open(self) -> None:
+        self._stream = Stream(self._login, message=self._hear, presence=lambda _: None)
+        await self._stream.open()
+        self._staying = asyncio.create_task(self._stream.stay())
+
+    async def _close(self) -> None:
+        self._staying.cancel()
+        await asyncio.gather(self._staying, return_exceptions=True)
+        await self._stream.close()
+
+    def say(self, stanza: str) -> None:
+        self._loop.call_soon_threadsafe(self._stream.send, stanza)
+
+    def __enter__(self) -> Self:
+        self._run(self._open())
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._run(self._close())
+        self._loop.call_soon_threadsafe(self._loop.stop)
+        self._thread.join()
+        self._loop.close()
+
+    def _run(self, work: Any) -> None:
+        asyncio.run_coroutine_threadsafe(work, self._loop).result(PATIENCE_S)

@@ -1,0 +1,118 @@
+"""Over HTTP: a receiver that asks now and then, as the paper's did, and one whose asking is held until there is news.
+
+The paper does not say how its HTTP receiver worked. Its figures do: 2,711 to 3,298 ms with a message every 3 s is what
+a receiver sees that asks every 3 s in step with the sender, and each time just before the message is there. At any
+other phase it would be 0 to 3,000 ms, 1,500 on average; both are measured. Each request opens a connection of its own,
+as clients of that time do. Many pairs at once, so that 20 samples do not take a minute.
+"""
+
+import contextlib
+import http.client
+import json
+import queue
+import random
+import socket
+import threading
+import time
+from collections.abc import Mapping
+from typing import Any, Final
+
+from benchmarks.baseline.interleaved import Exchange
+from benchmarks.baseline.product import PATIENCE_S, Caller
+from benchmarks.papers.exchanges import SETPOINT
+from device_agent.protocol import AckStatus
+from tests.harness.cloud.cloud_processes import Ground
+from tests.harness.cloud.polling import PollingRobot, Site
+from tests.harness.network.brokers import HOST, Message, wait_until
+
+PERIOD_S: Final = 3.0
+_HELD_MS: Final = 5_000
+
+
+def pairs(port: int, count: int, *, in_step: bool, seed: int) -> list[float]:
+    """So many senders and receivers, one message each; how long each took [ms].
+
+    Args:
+        port: Of the web server, or of a delay before it.
+        count: How many.
+        in_step: The message comes as soon as the receiver was told that there is none; else at any time between.
+        seed: Of those times.
+    """
+    chance, found, lock = random.Random(seed), list[float](), threading.Lock()
+
+    def run(name: str, begin_s: float, later_s: float) -> None:
+        time.sleep(begin_s)
+        asked_s = time.monotonic()
+        _ask(port, "GET", name)
+        time.sleep(later_s)
+        sent_s = time.monotonic()
+        putting = threading.Thread(target=_ask, args=(port, "PUT", name, SETPOINT))
+        putting.start()
+        while True:
+            asked_s += PERIOD_S
+            time.sleep(max(0.0, asked_s - time.monotonic()))
+            if _ask(port, "GET", name) is not None:
+                break
+        with lock:
+            found.append((time.monotonic() - sent_s) * 1000)
+        putting.join()
+
+    threads = [
+        threading.Thread(
+            target=run,
+            args=(f"{seed}-{in_step}-{number}", number / count, 0.0 if in_step else chance.uniform(0, PERIOD_S)),
+        )
+        for number in range(count)
+    ]
+    for each in threads:
+        each.start()
+    for each in threads:
+        each.join()
+    if len(found) != count:
+        raise RuntimeError(f"{count - len(found)} of {count} pollers have failed")
+    return found
+
+
+def _ask(port: int, method: str, name: str, body: bytes | None = None) -> Any:
+    with contextlib.closing(http.client.HTTPConnection(HOST, port, timeout=PATIENCE_S)) as line:
+        line.connect()
+        line.sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+        line.request(method, f"/messages/{name}", body, {"Content-Type": "application/json"})
+        return json.loads(line.getresponse().read())
+
+
+class _Receiver(PollingRobot):
+    """As an agent that speaks HTTP alone; it says what it has heard as soon as it has."""
+
+    def __init__(self, site: Site) -> None:
+        super().__init__(site, wait_ms=_HELD_MS)
+        self.arrived: queue.SimpleQueue[float] = queue.SimpleQueue()
+        self.reports = lambda _: (AckStatus.ACCEPTED, AckStatus.STARTED, AckStatus.DONE)
+
+    def obey(self, message: Message) -> None:
+        self.arrived.put(time.perf_counter())
+        super().obey(message)
+
+
+def held(stack: contextlib.ExitStack, ports: Mapping[int, int], ground: Ground) -> Exchange:
+    """Our own HTTP transport: an account's action through the functions, until the agent that waits for it has it."""
+    port = ports[ground.endpoints["server"].port]
+    robot = _Receiver(Site(f"http://{HOST}:{port}"))
+    stack.callback(robot.cloud.close)  # type: ignore[attr-defined]  # a Site's
+    robot.pair(ground.anna)
+    stack.enter_context(robot)
+    robot.connect()
+    device = robot.device
+    wait_until(lambda: ground.anna.get(f"/devices/{device}").json()["online"], "the robot to be online")
+    key = ground.anna.post("/api-keys", {"name": device, "role": "operator", "days": 1}).json()["token"]
+    caller = stack.enter_context(Caller(port, {"Authorization": f"Bearer {key}"}))
+    body = json.dumps({"request": {"kind": "move_joints", "position_rad": {"elbow": 0.1}}}).encode()
+
+    def exchange() -> float:
+        began = time.perf_counter()
+        started = caller.ask("POST", f"/api/v1/devices/{device}/actions", body)
+        took_ms = (robot.arrived.get(timeout=PATIENCE_S) - began) * 1000
+        caller.ask("GET", f"/api/v1/actions/{started['id']}?wait_ms=10000")
+        return took_ms
+
+    return exchange

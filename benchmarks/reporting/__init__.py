@@ -1,0 +1,1 @@
+"""Reports, the generated results page and the cost model."""

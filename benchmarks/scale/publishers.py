@@ -1,0 +1,115 @@
+"""Robots that only tell: ``python -m benchmarks.scale.publishers``, a program of its own for as many connections as asked.
+
+Reads one line of JSON, ``Fleet``, connects, prints ``ready``. Then for each line with a rate and seconds it publishes,
+and prints what it did as JSON: ``Told``. A broker that takes nothing any more makes it late.
+"""
+
+import random
+import socket
+import sys
+import time
+from typing import Final
+
+import msgspec
+
+from benchmarks.reporting.report import percentile
+from benchmarks.scale import mqtt_packets
+from device_agent.ports.clock import tick_ms, wall_ms
+from device_agent.protocol import JointTelemetry, Mode, Pose, codec
+
+SENT: Final = b'"setpoint_sent_ms":'
+"""Before the moment at which it was sent [ms], of the clock that all processes of a machine share."""
+_POSES: Final = 7
+
+
+class Robot(msgspec.Struct):
+    """Who publishes where."""
+
+    client: str
+    user: str
+    password: str
+    topic: str
+
+
+class Fleet(msgspec.Struct):
+    """All of them."""
+
+    port: int
+    robots: list[Robot]
+
+
+class Told(msgspec.Struct):
+    """What was done. ``late_ms``: 99 % of the messages went out within this after they were due."""
+
+    sent: int
+    late_ms: float
+    took_s: float
+    processor_s: float
+    message_bytes: int
+
+
+def telemetry() -> bytes:
+    """As the simulated UR5 tells: six joints, the poses of seven frames."""
+    chance = random.Random(1)
+
+    def some(count: int) -> tuple[float, ...]:
+        return tuple(round(chance.uniform(-2, 2), 6) for _ in range(count))
+
+    told = JointTelemetry(
+        tick_ms=tick_ms(),
+        at_ms=wall_ms(),
+        sequence=12_345,
+        mode=Mode.IDLE,
+        position_rad=some(6),
+        velocity_rad_s=some(6),
+        effort_nm=some(6),
+        commanded_rad=some(6),
+        frames=tuple(msgspec.convert(some(7), Pose) for _ in range(_POSES)),
+        epoch=7,
+        setpoint_sent_ms=-1.0,
+    )
+    return codec.encode(told)
+
+
+def publish(lines: list[tuple[socket.socket, str]], rate_hz: float, seconds: float) -> Told:
+    """All of them in turn, each ``rate_hz`` times a second."""
+    before, after = telemetry().split(SENT + b"-1.0")
+    made = [(line, mqtt_packets.text(topic) + before + SENT) for line, topic in lines]
+    count, gap_s = round(len(made) * rate_hz * seconds), 1 / (len(made) * rate_hz)
+    late, clock = [], time.monotonic
+    spent_s, began_s = time.process_time(), clock()
+    size = 0
+    for number in range(count):
+        due_s = began_s + number * gap_s
+        now_s = clock()
+        if now_s < due_s:
+            time.sleep(due_s - now_s)
+            now_s = clock()
+        line, start = made[number % len(made)]
+        packet = mqtt_packets.packet(mqtt_packets.PUBLISH, b"%b%.3f%b" % (start, now_s * 1000, after))
+        line.sendall(packet)
+        size = len(packet)
+        late.append(now_s - due_s)
+    return Told(
+        sent=count,
+        late_ms=percentile(late, 0.99) * 1000,
+        took_s=clock() - began_s,
+        processor_s=time.process_time() - spent_s,
+        message_bytes=size,
+    )
+
+
+def main() -> None:
+    """Until standard input ends."""
+    fleet = msgspec.json.decode(sys.stdin.readline(), type=Fleet)
+    lines = [
+        (mqtt_packets.connect(fleet.port, each.client, each.user, each.password), each.topic) for each in fleet.robots
+    ]
+    print("ready", flush=True)
+    for line in sys.stdin:
+        rate_hz, seconds = map(float, line.split())
+        print(msgspec.json.encode(publish(lines, rate_hz, seconds)).decode(), flush=True)
+
+
+if __name__ == "__main__":
+    main()

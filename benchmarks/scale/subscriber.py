@@ -1,0 +1,93 @@
+"""One subscriber: ``python -m benchmarks.scale.subscriber``, a program of its own.
+
+Reads one line of JSON, ``Ear``, subscribes, prints ``ready``. For each further line, once nothing more has come for a
+moment, prints what has come since the line before as JSON: ``Heard``.
+"""
+
+import sys
+import threading
+import time
+from typing import Final
+
+import msgspec
+
+from benchmarks.reporting.report import percentile
+from benchmarks.scale import mqtt_packets
+from benchmarks.scale.publishers import SENT
+
+_QUIET_S: Final = 0.5
+_AT_ONCE: Final = 262_144
+MEASURED: Final = b'"at_ms":'
+"""Before the moment of a measurement on the wall clock [ms]."""
+
+
+class Ear(msgspec.Struct):
+    """Who listens to what."""
+
+    port: int
+    client: str
+    user: str
+    password: str
+    topic: str
+    wall: bool = False
+    """Whether messages tell when they were measured, by the wall clock, and not when they were sent, by the other."""
+
+
+class Heard(msgspec.Struct):
+    """What has come; ``ms`` from its publisher's clock to here, by share."""
+
+    count: int
+    p50_ms: float
+    p99_ms: float
+    most_ms: float
+    processor_s: float
+
+
+class Listener:
+    """Takes in what comes, in a thread of its own."""
+
+    def __init__(self, asked: Ear) -> None:
+        self._clock, self._mark = (time.time, MEASURED) if asked.wall else (time.monotonic, SENT)
+        self._line = mqtt_packets.connect(asked.port, asked.client, asked.user, asked.password)
+        mqtt_packets.subscribe(self._line, asked.topic)
+        self._line.settimeout(None)
+        self._taken: list[float] = []
+        self._spent_s = time.process_time()
+        threading.Thread(target=self._listen, daemon=True).start()
+
+    def _listen(self) -> None:
+        buffer = bytearray()
+        while came := self._line.recv(_AT_ONCE):
+            now_ms = self._clock() * 1000
+            buffer += came
+            for kind, body in mqtt_packets.packets(buffer):
+                if kind & 0xF0 == mqtt_packets.PUBLISH:
+                    self._taken.append(now_ms - said_ms(body, self._mark))
+
+    def heard(self) -> Heard:
+        """Since the last time."""
+        known = -1
+        while known != len(self._taken):
+            known = len(self._taken)
+            time.sleep(_QUIET_S)
+        taken, self._taken = self._taken, []
+        spent_s, self._spent_s = time.process_time() - self._spent_s, time.process_time()
+        found = taken or [0.0]
+        return Heard(len(taken), percentile(found, 0.5), percentile(found, 0.99), max(found), spent_s)
+
+
+def said_ms(body: bytes, mark: bytes) -> float:
+    """The moment that stands behind a mark in a message [ms]."""
+    return float(body[body.rindex(mark) + len(mark) :].split(b",", 1)[0])
+
+
+def main() -> None:
+    """Until standard input ends."""
+    listener = Listener(msgspec.json.decode(sys.stdin.readline(), type=Ear))
+    print("ready", flush=True)
+    for _ in sys.stdin:
+        print(msgspec.json.encode(listener.heard()).decode(), flush=True)
+
+
+if __name__ == "__main__":
+    main()

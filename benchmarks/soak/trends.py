@@ -1,0 +1,132 @@
+"""What a series of samples says: how fast memory grows, and whether descriptors stay what they were."""
+
+import math
+import statistics
+from collections.abc import Iterable, Sequence
+from typing import Final
+
+import msgspec
+import numpy as np
+
+from benchmarks.reporting.report import percentile
+from benchmarks.soak.processes import CHILDREN, PARTS, TOGETHER, Sample
+
+_Z_95: Final = 1.96
+_POINTS: Final = 60
+"""Samples are drawn together to so many medians at most: neighbours in time are not independent of each other."""
+_LEAST_POINTS: Final = 4
+_LEAST: Final = 0.1
+
+
+class Slope(msgspec.Struct, frozen=True):
+    """Growth per hour [% of the median], and between which values it lies with 95 % confidence."""
+
+    percent_per_h: float
+    low: float
+    high: float
+
+
+class Held(msgspec.Struct, frozen=True, kw_only=True):
+    """One part over the time after warm-up; ``first`` and ``last`` are the lowest tenths of its first and last ones.
+
+    Low, since a script that runs has descriptors of its own: a leak raises what is there while least runs.
+    """
+
+    part: str
+    rss: Slope
+    own: Slope
+    rss_mb: float
+    own_mb: float
+    first_descriptors: float
+    last_descriptors: float
+    most_descriptors: int
+    first_threads: float
+    last_threads: float
+
+    @property
+    def more_descriptors(self) -> float:
+        """How many more there are at the end."""
+        return self.last_descriptors - self.first_descriptors
+
+
+def theil_sen(at_s: Sequence[float], values: Sequence[float]) -> Slope:
+    """The median of the slopes between all pairs of points, and Sen's interval of it.
+
+    One outlier, or a third of them, moves it little. Raises: ValueError: There are too few points.
+    """
+    count = len(at_s)
+    if count < _LEAST_POINTS:
+        raise ValueError(f"{count} points are too few for a slope")
+    times, seen = np.asarray(at_s), np.asarray(values)
+    one, other = np.triu_indices(count, 1)
+    pairs = (seen[other] - seen[one]) / (times[other] - times[one])
+    pairs.sort()
+    spread = _Z_95 * math.sqrt(count * (count - 1) * (2 * count + 5) / 18)
+    low = max(0, round((len(pairs) - spread) / 2) - 1)
+    high = min(len(pairs) - 1, round((len(pairs) + spread) / 2))
+    to_percent = 3600 * 100 / float(np.median(seen))
+    return Slope(*(float(each) * to_percent for each in (np.median(pairs), pairs[low], pairs[high])))
+
+
+def drawn_together(at_s: Sequence[float], values: Sequence[float]) -> tuple[list[float], list[float]]:
+    """Medians of stretches of equal length."""
+    size = max(1, math.ceil(len(at_s) / _POINTS))
+    stretches = [slice(begin, begin + size) for begin in range(0, len(at_s), size)]
+    return [statistics.median(at_s[each]) for each in stretches], [
+        statistics.median(values[each]) for each in stretches
+    ]
+
+
+def after_warm_up(samples: Iterable[Sample], warm_up_s: float, *, end_share: float = 0.1) -> list[Held]:
+    """What each part held, and at last all of them together. ``end_share``: of its samples, first and last."""
+    samples = list(samples)
+    samples += together(samples)
+    found = []
+    for part in (*PARTS, TOGETHER):
+        mine = [each for each in samples if each.part == part and each.at_s >= warm_up_s]
+        if len(mine) < _LEAST_POINTS:
+            continue
+        at_s = [each.at_s for each in mine]
+        few = max(1, round(len(mine) * end_share))
+
+        def ends(values: list[int], few: int = few) -> tuple[float, float]:
+            return percentile(values[:few], _LEAST), percentile(values[-few:], _LEAST)
+
+        rss, own = [each.rss_mb for each in mine], [each.own_mb for each in mine]
+        descriptors, threads = [each.descriptors for each in mine], [each.threads for each in mine]
+        found.append(
+            Held(
+                part=part,
+                rss=theil_sen(*drawn_together(at_s, rss)),
+                own=theil_sen(*drawn_together(at_s, own)),
+                rss_mb=percentile(rss, 0.5),
+                own_mb=percentile(own, 0.5),
+                first_descriptors=ends(descriptors)[0],
+                last_descriptors=ends(descriptors)[1],
+                most_descriptors=max(descriptors),
+                first_threads=ends(threads)[0],
+                last_threads=ends(threads)[1],
+            )
+        )
+    return found
+
+
+def together(samples: Iterable[Sample]) -> list[Sample]:
+    """The sums of each look at the processes; of the agent's children there are as many as run something."""
+    looks: dict[float, list[Sample]] = {}
+    for each in samples:
+        if each.part != CHILDREN:
+            looks.setdefault(each.at_s, []).append(each)
+    return [
+        Sample(
+            at_s=at_s,
+            part=TOGETHER,
+            processes=sum(each.processes for each in found),
+            rss_mb=sum(each.rss_mb for each in found),
+            pss_mb=sum(each.pss_mb for each in found),
+            own_mb=sum(each.own_mb for each in found),
+            descriptors=sum(each.descriptors for each in found),
+            threads=sum(each.threads for each in found),
+        )
+        for at_s, found in looks.items()
+    ]

@@ -1,0 +1,1 @@
+"""Timestamps at each hop of a command, on one clock."""

@@ -1,0 +1,77 @@
+"""The product with one simulated robot, whose programs tell when they do what; operator and agent behind networks."""
+
+import contextlib
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+
+from benchmarks.baseline.product import Caller, Stand
+from benchmarks.tracing import traced_programs
+from benchmarks.tracing.timestamps import Marks
+from function_app import settings
+from tests.harness.browser.product import Machine, free_ports, start_program
+from tests.harness.cloud.cloud import Cloud
+from tests.harness.network.brokers import BrokerKind
+from tests.harness.network.delay import Way, start_delay
+
+
+class Watched(Stand):
+    """As ``Stand``. ``start`` gives one.
+
+    Attributes:
+        marks: What its programs tell.
+    """
+
+    def __init__(self, machine: Machine, kind: BrokerKind, cloud: Cloud, *, marks: Marks, way: Way) -> None:
+        super().__init__(machine, kind, cloud)
+        self.marks = marks
+        self._way = way
+        self._far = False
+
+    def place(self, *, rtt_ms: float) -> None:
+        """Put operator and agent so far from the cloud, each; the operator's connections from now on go that way."""
+        self._way.set(rtt_ms=rtt_ms)
+        self._far = rtt_ms > 0
+
+    @property
+    def mqtt_port(self) -> int:
+        """Where the operator reaches the broker."""
+        return self._way.ports[super().mqtt_port] if self._far else super().mqtt_port
+
+    def caller(self) -> Caller:
+        """The operator's warm connection to the API."""
+        port = self._way.ports[self.machine.port] if self._far else self.machine.port
+        return Caller(port, {"Authorization": f"Bearer {self.token}"})
+
+
+@contextlib.contextmanager
+def start(home: Path, kind: BrokerKind, joints: Mapping[str, str], **more: str) -> Iterator[Watched]:
+    """The product with a robot alone in a scene of its own, or with ``TELESCOPE_ROOM`` in ``more`` all of a room.
+
+    The agent reaches cloud and broker through a delay, of no time as long as nobody is ``place``d.
+
+    Args:
+        home: Its folder.
+        kind: Its broker.
+        joints: Robot → the joints, with + between them, whose motion is told.
+        more: Settings.
+    """
+    port = free_ports()
+    with contextlib.ExitStack() as stack:
+        marks = stack.enter_context(Marks())
+        way = stack.enter_context(start_delay(port, port + 1, rtt_ms=0))
+        wanted = {
+            "TELESCOPE_BROKER": kind,
+            "TELESCOPE_RATE_KEY": "0",
+            "TELESCOPE_RATE_ACCOUNT": "0",
+            traced_programs.DEVICE: next(iter(joints)),
+            traced_programs.JOINTS: ",".join(f"{robot}:{each}" for robot, each in joints.items()),
+            traced_programs.WAYS: ",".join(f"{each}={way.ports[each]}" for each in way.ports),
+            **marks.settings,
+            **more,
+        }
+        machine = stack.enter_context(start_program("benchmarks.tracing.traced_programs machine", home, port, wanted))
+        if machine.process.poll() is not None:
+            raise RuntimeError("".join(machine.lines))
+        given = {"TELESCOPE_HOME": str(home), "TELESCOPE_PORT": str(machine.port), **wanted}
+        cloud = stack.enter_context(Cloud(settings.read(given)))
+        yield Watched(machine, kind, cloud, marks=marks, way=way)

@@ -1,0 +1,97 @@
+"""Rules for the structure and the language of the repository. Each function returns the violations it finds."""
+
+import re
+import subprocess
+from collections import Counter
+from collections.abc import Iterable
+from pathlib import Path, PurePosixPath
+from typing import Final
+
+MAX_ENTRIES: Final = 16
+MAX_LINES: Final = 400
+SOURCES: Final = frozenset({".py", ".ts", ".tsx", ".css", ".mjs", ".cjs", ".lua"})
+TEXTS: Final = SOURCES | {".md", ".toml", ".html", ".yml", ".service"}
+WIDE_FOLDERS: Final = {
+    ".": "root: files that a Functions host, package tools and repository hosts look for there",
+}
+"""Folders that may have more entries, each with the reason."""
+LONG_FILES: Final = {
+    "web/src/shared/mqtt/protocol.generated.ts": "generated from docs/asyncapi.json",
+}
+"""Files that may be longer, each with the reason."""
+FORBIDDEN_STEMS: Final = frozenset(
+    word
+    for line in (
+        "office helm pilot voice vigil shelf errand pace way ride score slack shows rounds tend tell look_at",
+        "asking kept held gather later lasting turns desk care courses sight seals fence forget ailments",
+        "knife rig toys wire",
+    )
+    for word in line.split()
+)
+_WORDS: Final = ("whoever", "somebody", "nobody", "whatever", "what comes", "is told", "are told")
+FORBIDDEN_WORDS: Final = re.compile(rf"\b(?:{'|'.join(_WORDS)})\b", re.IGNORECASE)
+"""Dialect of earlier versions. The words are split so that this file does not contain them."""
+
+
+def tracked_files(root: Path) -> list[str]:
+    """Returns the paths of the files under version control, relative to ``root``."""
+    listed = subprocess.run(
+        ["git", "ls-files", "-z", "--cached", "--others", "--exclude-standard"],
+        cwd=root,
+        capture_output=True,
+        text=True,
+        check=True,
+    ).stdout
+    return [name for name in listed.split("\0") if name and (root / name).is_file()]
+
+
+def wide_folders(files: Iterable[str]) -> list[str]:
+    """Returns each folder with more than ``MAX_ENTRIES`` files and sub-folders; ``__init__.py`` does not count."""
+    entries: set[PurePosixPath] = set()
+    for name in files:
+        path = PurePosixPath(name)
+        if path.name != "__init__.py":
+            entries |= {path, *path.parents}
+    counts = Counter(str(entry.parent) for entry in entries if entry != PurePosixPath("."))
+    return [
+        f"{folder} has {count} entries"
+        for folder, count in sorted(counts.items())
+        if count > MAX_ENTRIES and folder not in WIDE_FOLDERS
+    ]
+
+
+def long_files(root: Path, files: Iterable[str]) -> list[str]:
+    """Returns each source file with more than ``MAX_LINES`` lines."""
+    found = []
+    for name in files:
+        if PurePosixPath(name).suffix in SOURCES and name not in LONG_FILES:
+            lines = len((root / name).read_text(encoding="utf-8").splitlines())
+            if lines > MAX_LINES:
+                found.append(f"{name} has {lines} lines")
+    return found
+
+
+def unclear_names(files: Iterable[str]) -> list[str]:
+    """Returns each source file whose name contains a term that is not standard."""
+    return [
+        name
+        for name in files
+        if PurePosixPath(name).suffix in SOURCES and _parts(PurePosixPath(name).stem) & FORBIDDEN_STEMS
+    ]
+
+
+def dialect(root: Path, files: Iterable[str]) -> list[str]:
+    """Returns each line of code or text with a forbidden word."""
+    found = []
+    for name in files:
+        if PurePosixPath(name).suffix in TEXTS:
+            text = (root / name).read_text(encoding="utf-8")
+            if FORBIDDEN_WORDS.search(text):
+                lines = enumerate(text.splitlines(), 1)
+                found += [f"{name}:{number}: {line.strip()}" for number, line in lines if FORBIDDEN_WORDS.search(line)]
+    return found
+
+
+def _parts(stem: str) -> set[str]:
+    stem = stem.removeprefix("test_")
+    return {stem, *re.split(r"[_.-]", stem)}
