@@ -229,7 +229,7 @@ def build(home: Home, *, trace: Path | None = None) -> Cell:
         factory.make(wiring), tell=latencies.tell, at_ms=lambda: round(clock.now_ms() or wall_ms())
     )
     outbox = _outbox(home, configuration, pairing, publish=transport.publish, quiet=lambda: agent.quiet)
-    jail = SandboxHost(trusted=configuration.trusted_scripts)
+    jail = SandboxHost(trusted=configuration.allow_unconfined_scripts)
     uploads = HttpUploads(pairing.agent, lambda: api_of(home, configuration, clock))
     devices: dict[str, Device] = {}
     neighbours: dict[str, RoomDriver] = {}

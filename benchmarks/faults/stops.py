@@ -77,7 +77,7 @@ class Stops:
 
     def _send(self) -> None:
         self._number += 1
-        stop = Stop(id=f"bench{self._number}", by="bench")
+        stop = Stop(id=f"bench{self._number}", caller="bench")
         self._line.client.publish(f"{self._ground.topic(STREAMED)}/stop", codec.encode(stop), 1)
 
     def _call(self) -> None:

@@ -100,7 +100,7 @@ class Buffer(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
 class Configuration(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """``agent.toml``. ``transport`` is one of ``device_agent.transports.factory.names()``.
 
-    ``ca``: a file beside it, the authority that alone may speak for the server. ``trusted-scripts``: movement scripts
+    ``ca``: a file beside it, the authority that alone may speak for the server. ``allow_unconfined_scripts``: movement scripts
     run also where this machine cannot lock them in. Set by hand, on the machine.
     """
 
@@ -110,7 +110,7 @@ class Configuration(Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tru
     ca: str = ""
     transport: str = "mqtt"
     http: HttpPolling = HttpPolling()
-    trusted_scripts: bool = msgspec.field(default=False, name="trusted-scripts")
+    allow_unconfined_scripts: bool = False
     buffer: Buffer = Buffer()
     room: Annotated[tuple[RoomStream, ...], Meta(max_length=64)] = ()
 
@@ -119,7 +119,11 @@ class Configuration(Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tru
         rules = {device.name: device.interlocks for device in before.devices}
         devices = tuple(replace(device, interlocks=rules.get(device.name, ())) for device in self.devices)
         return replace(
-            self, devices=devices, room=before.room, buffer=before.buffer, trusted_scripts=before.trusted_scripts
+            self,
+            devices=devices,
+            room=before.room,
+            buffer=before.buffer,
+            allow_unconfined_scripts=before.allow_unconfined_scripts,
         )
 
     @property
@@ -224,8 +228,8 @@ class Home:
         lines = [f"{key} = {_toml(getattr(configuration, key))}" for key in ("server", "name", "transport")]
         if configuration.ca:
             lines.insert(1, f"ca = {_toml(configuration.ca)}")
-        if configuration.trusted_scripts:
-            lines.append("trusted-scripts = true")
+        if configuration.allow_unconfined_scripts:
+            lines.append("allow_unconfined_scripts = true")
         if configuration.transport == "http" or configuration.http != HttpPolling():
             lines += ["", "[http]"]
             lines += [f"{key} = {_toml(getattr(configuration.http, key))}" for key in ("poll", "poll_ms")]

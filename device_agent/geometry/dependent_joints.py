@@ -32,11 +32,11 @@ class Carried:
 
     def __init__(self, model: Any, robot_type: RobotType, joints: Sequence[int], ties: EqualityJoints) -> None:
         names = [joint.name for joint in robot_type.joints]
-        mirrors = {mirror.joint: mirror for mirror in robot_type.mirrors}
+        mirrors = {mirror.joint: mirror for mirror in robot_type.mimic_joints}
         self.leading: Ints = np.array([index for index, name in enumerate(names) if name not in mirrors], dtype=np.intp)
         self.spread: Floats = np.eye(len(names))
-        for mirror in robot_type.mirrors:
-            self.spread[names.index(mirror.joint)] = mirror.factor * self.spread[names.index(mirror.of)]
+        for mirror in robot_type.mimic_joints:
+            self.spread[names.index(mirror.joint)] = mirror.multiplier * self.spread[names.index(mirror.mimics)]
         self.spread = self.spread[:, self.leading]
         own = np.zeros((model.nv, len(names)))
         for index, joint in enumerate(joints):

@@ -58,10 +58,11 @@ class Bounds:
         index = {joint.name: number for number, joint in enumerate(robot_type.joints)}
         self.lower = np.array([joint.lower_rad for joint in robot_type.joints])
         self.upper = np.array([joint.upper_rad for joint in robot_type.joints])
-        self._mirrors = [(index[one.joint], index[one.of], one.factor) for one in robot_type.mirrors]
+        self._mirrors = [(index[one.joint], index[one.mimics], one.multiplier) for one in robot_type.mimic_joints]
         self.led: Ints = np.array([joint for joint, _, _ in self._mirrors], dtype=np.intp)
         self._narrowed = [
-            _Narrowed(index[one.joint], index[one.by], np.array(one.table).T) for one in robot_type.narrowing
+            _Narrowed(index[one.joint], index[one.depends_on], np.array(one.table).T)
+            for one in robot_type.position_dependent_limits
         ]
 
     def tie(self, position_rad: Floats) -> None:

@@ -186,7 +186,7 @@ class SwarmRobot:
         if lease is not None:
             request = None
             if asked is not None:
-                request = OpenRequest(id=asked.id, by=asked.by, expires_in_ms=_left_ms(asked.expires_s, now_s))
+                request = OpenRequest(id=asked.id, requester=asked.by, expires_in_ms=_left_ms(asked.expires_s, now_s))
             leased = LeaseState(
                 holder=lease.holder,
                 epoch=lease.epoch,
@@ -245,7 +245,7 @@ class SwarmRobot:
                 self._follow(parsed.name, codec.decode(payload, Setpoint))
             elif parsed.kind == topics.STOP:
                 stop = codec.decode(payload, Stop)
-                self._authority.stop(StopLatch(by=stop.by, reason=stop.reason, at_ms=wall_ms()))
+                self._authority.stop(StopLatch(caller=stop.caller, reason=stop.reason, at_ms=wall_ms()))
         except (ProtocolError, SignatureError, Refused):
             self.refused += 1
 
@@ -320,14 +320,14 @@ class SwarmRobot:
             case WithdrawRequest(request=request):
                 self._handover.drop(request)
             case StopDevice(reason=reason):
-                self._authority.stop(StopLatch(by=command.who, reason=reason, at_ms=wall_ms()))
+                self._authority.stop(StopLatch(caller=command.caller, reason=reason, at_ms=wall_ms()))
             case ResetStop():
                 self._authority.fence(command.epoch)
                 self._authority.reset_stop()
             case RotateKey(statements=statements):
                 self._pins.follow(statements)
             case CancelAction(action=action):
-                self._cancel(action, command.who)
+                self._cancel(action, command.caller)
             case _:
                 raise Refused("unsupported", "a robot of a swarm moves its joints and nothing else")
         self._ack(command.id, AckStatus.DONE)

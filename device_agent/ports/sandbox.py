@@ -29,10 +29,10 @@ class SandboxStatus:
 
     Attributes:
         how: In the jail with all its layers; with fewer, since the owner trusts them; or not at all.
-        why: What is missing, and what to do about it; empty where they are ``jailed``.
+        why: What is missing, and what to do about it; empty where they are ``sandboxed``.
     """
 
-    how: Literal["jailed", "trusted", "refused"]
+    how: Literal["sandboxed", "unconfined", "unavailable"]
     why: str = ""
 
 

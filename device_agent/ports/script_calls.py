@@ -28,7 +28,7 @@ class Ready(_Message, frozen=True, kw_only=True, tag="ready"):
 class Unfit(_Message, frozen=True, kw_only=True, tag="unfit"):
     """The jail does not hold; the process has ended."""
 
-    why: _Text
+    reason: _Text
 
 
 class Output(_Message, frozen=True, kw_only=True, tag="output"):

@@ -37,7 +37,7 @@ class RequestControl(_Order, frozen=True, kw_only=True, tag="ask_lease"):
     """Show the holder, and everybody, that somebody asks for control. Changes nothing else; lapses by itself."""
 
     request: Id
-    by: Label
+    requester: Label
     answer_within_ms: Annotated[int, Meta(ge=1, le=3_600_000)]
 
 
@@ -249,7 +249,7 @@ class Command(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     device: Id
     issued_at_ms: Milliseconds
     ttl_ms: Annotated[int, Meta(ge=1, le=86_400_000)]
-    who: Label
+    caller: Label
     epoch: Count
     request: Request
 
@@ -298,5 +298,5 @@ class Stop(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """``stop``: latch Stop now. Needs no lease and no signature: the broker lets only those publish it who may."""
 
     id: Id
-    by: Label
+    caller: Label
     reason: Text = ""

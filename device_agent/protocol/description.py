@@ -48,7 +48,7 @@ class Joint(Struct, frozen=True, kw_only=True):
     max_effort_nm: float
 
 
-class Mirror(Struct, frozen=True, kw_only=True):
+class MimicJoint(Struct, frozen=True, kw_only=True):
     """One motor moves two joints.
 
     Attributes:
@@ -57,11 +57,11 @@ class Mirror(Struct, frozen=True, kw_only=True):
     """
 
     joint: Label
-    of: Label
-    factor: float = 1.0
+    mimics: Label
+    multiplier: float = 1.0
 
 
-class Narrowing(Struct, frozen=True, kw_only=True):
+class PositionDependentLimit(Struct, frozen=True, kw_only=True):
     """The range of one joint depends on where another one is.
 
     Attributes:
@@ -71,7 +71,7 @@ class Narrowing(Struct, frozen=True, kw_only=True):
     """
 
     joint: Label
-    by: Label
+    depends_on: Label
     table: Annotated[tuple[Vector3, ...], Meta(min_length=2, max_length=200)]
 
     def at(self, by_rad: float) -> tuple[float, float]:
@@ -138,7 +138,7 @@ class Diagnostic(Struct, frozen=True, kw_only=True):
     warning_high: float | None = None
     change: Annotated[float, Meta(gt=0)] | None = None
     horizon_s: Annotated[float, Meta(ge=60, le=86_400)] = 2_700.0
-    questions: tuple[Label, ...] = ("level", "trend", "change", "outlier")
+    checks: tuple[Label, ...] = ("level", "trend", "change", "outlier")
 
 
 class InterlockRule(Struct, frozen=True, kw_only=True):
@@ -177,8 +177,8 @@ class Description(Struct, frozen=True, kw_only=True):
     robot_type: Id
     label: Label
     joints: tuple[Joint, ...] = ()
-    mirrors: tuple[Mirror, ...] = ()
-    narrowing: tuple[Narrowing, ...] = ()
+    mimic_joints: tuple[MimicJoint, ...] = ()
+    position_dependent_limits: tuple[PositionDependentLimit, ...] = ()
     frames: tuple[Label, ...] = ()
     capabilities: tuple[Label, ...] = ()
     actions: tuple[Label, ...] = ()
@@ -197,7 +197,7 @@ class Description(Struct, frozen=True, kw_only=True):
     diagnostics: Annotated[tuple[Diagnostic, ...], Meta(max_length=100)] = ()
     position_m: Vector3 | None = None
     base: BaseLimits | None = None
-    scripts: Literal["jailed", "trusted", "refused"] = "refused"
+    scripts: Literal["sandboxed", "unconfined", "unavailable"] = "unavailable"
     scripts_note: Text = ""
 
 
@@ -261,7 +261,7 @@ class Mode(StrEnum):
 class StopLatch(Struct, frozen=True, kw_only=True):
     """Who stopped the device, and when. There until somebody who may resets it."""
 
-    by: Label
+    caller: Label
     reason: Text
     at_ms: Milliseconds
 
@@ -270,7 +270,7 @@ class OpenRequest(Struct, frozen=True, kw_only=True):
     """Somebody asks the holder for control, and gets an answer in the time that is left or none."""
 
     id: Id
-    by: Label
+    requester: Label
     expires_in_ms: Milliseconds
 
 
@@ -310,7 +310,7 @@ class Restriction(Struct, frozen=True, kw_only=True):
 
     source: Text
     speed: float
-    why: Text
+    reason: Text
 
 
 class State(Struct, frozen=True, kw_only=True):

@@ -44,11 +44,11 @@ from device_agent.runtime.telemetry.outbox import Outbox, Publish
 from device_agent.runtime.telemetry.stream_sampler import StreamSampler
 
 _REFUSED = {
-    topics.CTL: EventKind.SETPOINTS_REFUSED,
-    topics.STOP: EventKind.STOP_REFUSED,
-    topics.CMD: EventKind.COMMAND_REFUSED,
+    topics.CTL: EventKind.SETPOINTS_REJECTED,
+    topics.STOP: EventKind.STOP_REJECTED,
+    topics.CMD: EventKind.COMMAND_REJECTED,
 }
-_SCRIPTS = {"refused": EventKind.SCRIPTS_REFUSED, "trusted": EventKind.SCRIPTS_TRUSTED}
+_SCRIPTS = {"unavailable": EventKind.SCRIPTS_UNAVAILABLE, "unconfined": EventKind.SCRIPTS_UNCONFINED}
 _log = logging.getLogger(__name__)
 
 
@@ -208,8 +208,8 @@ class Device:
             EventRecord(EventKind.AGENT_STARTED, "the agent started; leases of before have ended", data=data)
         )
         self.voice.scripts = scripts = self._jail.standing()
-        if scripts.how != "jailed":
-            self._audit.note(EventRecord(_SCRIPTS[scripts.how], scripts.why, "warning", {"why": scripts.why}))
+        if scripts.how != "sandboxed":
+            self._audit.note(EventRecord(_SCRIPTS[scripts.how], scripts.why, "warning", {"reason": scripts.why}))
         self._office.start(None if isinstance(self._driver, RoomDevice) else self._driver.twin())
 
     def stop(self) -> None:
@@ -241,9 +241,9 @@ class Device:
                 self._take_setpoint(topic.name, payload)
             elif topic.kind == topics.STOP:
                 stop = codec.decode(payload, Stop)
-                self._controller.stop(StopLatch(by=stop.by, reason=stop.reason, at_ms=wall_ms()))
+                self._controller.stop(StopLatch(caller=stop.caller, reason=stop.reason, at_ms=wall_ms()))
                 self._hurry()
-                _log.warning("%s: stopped by %s", self.name, stop.by)
+                _log.warning("%s: stopped by %s", self.name, stop.caller)
             elif topic.kind == topics.CMD:
                 self._office.put(payload)
         except Refused as refused:

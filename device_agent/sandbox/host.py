@@ -38,7 +38,7 @@ _ENVIRONMENT = {
 }
 _WHAT_TO_DO = (
     "Run the agent on Linux 5.13 or newer with Landlock and seccomp (`python -m device_agent doctor` says what is "
-    "missing), or, if you trust every script, write `trusted-scripts = true` into its agent.toml."
+    "missing), or, if you trust every script, write `allow_unconfined_scripts = true` into its agent.toml."
 )
 _ENDINGS = {
     -31: "it tried something that no script may",  # SIGSYS; by number, since Windows has none of these
@@ -68,17 +68,17 @@ class SandboxHost:
     def start(self) -> None:
         """See ``Jail``."""
         standing = self.standing()
-        if standing.how != "jailed":
+        if standing.how != "sandboxed":
             _log.warning("movement scripts are %s: %s", standing.how, standing.why)
-        if standing.how != "refused":
+        if standing.how != "unavailable":
             self._prepare(self._own, self._task(self._own, Limits()))
 
     def standing(self) -> SandboxStatus:
         """See ``Jail``."""
         refusal = self.refusal(stranger=False)
         if refusal is not None:
-            return SandboxStatus("refused", refusal)
-        return SandboxStatus("trusted", self._lack(self._own)) if self._own.missing else SandboxStatus("jailed")
+            return SandboxStatus("unavailable", refusal)
+        return SandboxStatus("unconfined", self._lack(self._own)) if self._own.missing else SandboxStatus("sandboxed")
 
     def refusal(self, *, stranger: bool) -> str | None:
         """See ``Jail``."""

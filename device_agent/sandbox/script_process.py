@@ -80,10 +80,10 @@ def prepare() -> None:
         numpy.random.seed()
 
 
-def give_up(why: str) -> None:
+def give_up(reason: str) -> None:
     """Tell the agent that the jail does not hold; the script is then never sent."""
     with suppress(OSError):
-        Link().tell("unfit", why=why[:1000])
+        Link().tell("unfit", reason=reason[:1000])
 
 
 def main() -> None:

@@ -1,6 +1,6 @@
 """A toy head: two joints of a neck, one of which narrows the other, and two ears, one of which mirrors the other."""
 
-from device_agent.protocol.manifests.capabilities import Mirror, Narrowing
+from device_agent.protocol.manifests.capabilities import MimicJoint, PositionDependentLimit
 from device_agent.protocol.manifests.robot_type import RobotType
 from tests.fakes import drivers
 
@@ -31,6 +31,6 @@ def head(table: tuple[tuple[float, float, float], ...] = WIDE) -> RobotType:
         period_ms=round(PERIOD_S * 1000),
         braking_rad_s2=25.0,
         streaming_speed=1.0,
-        mirrors=(Mirror(joint="right", of="left", factor=FACTOR),),
-        narrowing=(Narrowing(joint="pitch", by="yaw", table=table),),
+        mimic_joints=(MimicJoint(joint="right", mimics="left", multiplier=FACTOR),),
+        position_dependent_limits=(PositionDependentLimit(joint="pitch", depends_on="yaw", table=table),),
     )

@@ -57,7 +57,7 @@ class Cloud:
         number = len(self.orders)
         command = Command(
             id=f"c{number}", space=SPACE, agent=AGENT, device=DEVICE, issued_at_ms=self.cloud_ms, ttl_ms=TTL_MS,
-            who="ann", epoch=self.epoch, request=request,
+            caller="ann", epoch=self.epoch, request=request,
         )  # fmt: skip
         self.orders[command.id] = command
         return command

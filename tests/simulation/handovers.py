@@ -214,7 +214,7 @@ class History:
 
     def _stop(self, _message: Message) -> None:
         self._witness.all_ended()
-        self._latch = StopLatch(by="bob", reason="", at_ms=1)
+        self._latch = StopLatch(caller="bob", reason="", at_ms=1)
         self._robot.stop(self._latch)
 
     def _reset(self, message: Message) -> None:

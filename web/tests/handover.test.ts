@@ -166,7 +166,7 @@ describe("who asks for control", () => {
   });
 
   it("hears of the answer with the word of the device, before the next look", async () => {
-    watch.tell("state", state(5, "Ann", { id: "r1", by: "Bob", expires_in_ms: 30_000 }));
+    watch.tell("state", state(5, "Ann", { id: "r1", requester: "Bob", expires_in_ms: 30_000 }));
     await control.asking.ask();
     desk.outcome = "accepted";
     watch.tell("state", state(6, "Bob"));
@@ -228,7 +228,7 @@ describe("who asks for control", () => {
 describe("who has control", () => {
   beforeEach(async () => {
     await control.take();
-    watch.tell("state", state(5, "Ann", { id: "r1", by: "Bob", expires_in_ms: 20_000 }));
+    watch.tell("state", state(5, "Ann", { id: "r1", requester: "Bob", expires_in_ms: 20_000 }));
   });
 
   it("sees who asks, and for how long still", () => {

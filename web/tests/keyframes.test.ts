@@ -226,7 +226,7 @@ describe("a recording", () => {
     recorder.hear(heard(0, 0, 0, 0, 0));
     recorder.start();
     for (const tick of [1000, 1050, 1100, 3100, 3150]) recorder.hear(heard(tick, tick / 1000, 0, 0, 0));
-    recorder.hearEvent({ kind: "said", at_ms: 1_003_150, data: { text: "hello" } } as never);
+    recorder.hearEvent({ kind: "speech-started", at_ms: 1_003_150, data: { text: "hello" } } as never);
     recorder.hear({ ...heard(20, 4, 0, 0, 0), at_ms: 1_004_150 });
     recorder.stop();
     recorder.hear(heard(5000, 9, 0, 0, 0));

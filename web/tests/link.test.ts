@@ -105,9 +105,9 @@ describe("the link to the broker", () => {
   it("publishes at once or not at all", async () => {
     await start();
     const link = open();
-    await expect(link.publish(`${TOPIC}/stop`, { id: "s", by: "me" }, 1)).rejects.toThrow(/no connection/);
+    await expect(link.publish(`${TOPIC}/stop`, { id: "s", caller: "me" }, 1)).rejects.toThrow(/no connection/);
     await until(() => link.up.value, "the connection");
-    await link.publish(`${TOPIC}/stop`, { id: "s", by: "me" }, 1);
+    await link.publish(`${TOPIC}/stop`, { id: "s", caller: "me" }, 1);
     expect(cloud.arm?.stops).toBe(1);
   });
 

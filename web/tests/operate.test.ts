@@ -254,7 +254,7 @@ describe("stop", () => {
     stop.press("test");
     expect(stop.state.value.kind).toBe("sending");
     await until(() => stop.state.value.kind === "latched", "the latch");
-    expect(arm().stop).toMatchObject({ by: "Demo", reason: "test" });
+    expect(arm().stop).toMatchObject({ caller: "Demo", reason: "test" });
     await until(() => cloud.callsTo("POST", `/devices/${DEVICE}/stop`).length === 1, "the call");
   });
 

@@ -32,7 +32,7 @@ def examine(home: Home) -> Iterator[Finding]:
 
 
 def _checks(home: Home, configuration: Configuration) -> Iterator[Finding]:
-    yield from _run("scripts", partial(machine.scripts, trusted=configuration.trusted_scripts))
+    yield from _run("scripts", partial(machine.scripts, trusted=configuration.allow_unconfined_scripts))
     yield from _run("renderer", partial(devices.renderer, configuration))
     for entry in configuration.devices:
         yield from _run(f"device {entry.name}", partial(devices.device, entry))

@@ -129,7 +129,7 @@ def scripts(*, trusted: bool) -> Iterator[Finding]:
         yield warning(
             "scripts",
             f"movement scripts run with this agent's rights, as its agent.toml wants it: there is no {lacks}",
-            "Remove `trusted-scripts` from agent.toml unless you wrote every script yourself.",
+            "Remove `allow_unconfined_scripts` from agent.toml unless you wrote every script yourself.",
         )
     elif sys.platform != "linux":
         yield warning("scripts", refusal, "Everything else works here.")

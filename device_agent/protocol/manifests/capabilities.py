@@ -25,11 +25,11 @@ _SAME = 1e-9
 _TIED_RAD = 1e-6
 
 
-class Mirror(description.Mirror, frozen=True, kw_only=True, forbid_unknown_fields=True):
+class MimicJoint(description.MimicJoint, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """As a manifest has it."""
 
 
-class Narrowing(description.Narrowing, frozen=True, kw_only=True, forbid_unknown_fields=True):
+class PositionDependentLimit(description.PositionDependentLimit, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """As a manifest has it."""
 
 
@@ -120,8 +120,8 @@ class Abilities(Struct, frozen=True, kw_only=True):
         simulation: What only a simulation needs to know.
     """
 
-    mirrors: tuple[Mirror, ...] = ()
-    narrowing: tuple[Narrowing, ...] = ()
+    mimic_joints: tuple[MimicJoint, ...] = ()
+    position_dependent_limits: tuple[PositionDependentLimit, ...] = ()
     postures: dict[Id, Positions] = {}
     expressions: dict[Id, Positions] = {}
     visemes: dict[Id, Positions] = {}
@@ -136,7 +136,7 @@ def check(abilities: Abilities, joints: Sequence[Joint], home_rad: Mapping[str, 
         ProtocolError: The text names what is wrong, and the joints there are.
     """
     known = {joint.name: joint for joint in joints}
-    _check_mirrors(abilities.mirrors, known)
+    _check_mirrors(abilities.mimic_joints, known)
     _check_narrowing(abilities, known)
     allowed = _Allowed(abilities, known, home_rad)
     allowed.check("home_rad", home_rad)
@@ -170,47 +170,49 @@ def _check_simulation(simulation: Simulation, known: Mapping[str, Joint]) -> Non
         raise ProtocolError("simulation.battery: empty_v must not be above full_v")
 
 
-def _check_mirrors(mirrors: Sequence[Mirror], known: Mapping[str, Joint]) -> None:
+def _check_mirrors(mirrors: Sequence[MimicJoint], known: Mapping[str, Joint]) -> None:
     followers = [mirror.joint for mirror in mirrors]
     for mirror in mirrors:
-        where = f"mirrors: '{mirror.joint}'"
-        check_known("mirrors", "joint", (mirror.joint, mirror.of), known)
+        where = f"mimic_joints: '{mirror.joint}'"
+        check_known("mimic_joints", "joint", (mirror.joint, mirror.mimics), known)
         if followers.count(mirror.joint) > 1:
             raise ProtocolError(f"{where} mirrors two joints")
-        if mirror.of in followers:
-            raise ProtocolError(f"{where} mirrors '{mirror.of}', which is a mirror itself; name the joint that counts")
-        if mirror.factor == 0 or not math.isfinite(mirror.factor):
-            raise ProtocolError(f"{where}: factor is {mirror.factor}; it must be finite and not 0")
-        follower, leader = known[mirror.joint], known[mirror.of]
-        lower, upper = sorted((leader.lower_rad * mirror.factor, leader.upper_rad * mirror.factor))
+        if mirror.mimics in followers:
+            raise ProtocolError(
+                f"{where} mirrors '{mirror.mimics}', which is a mirror itself; name the joint that counts"
+            )
+        if mirror.multiplier == 0 or not math.isfinite(mirror.multiplier):
+            raise ProtocolError(f"{where}: multiplier is {mirror.multiplier}; it must be finite and not 0")
+        follower, leader = known[mirror.joint], known[mirror.mimics]
+        lower, upper = sorted((leader.lower_rad * mirror.multiplier, leader.upper_rad * mirror.multiplier))
         if lower < follower.lower_rad - _SAME or upper > follower.upper_rad + _SAME:
-            raise ProtocolError(f"{where} cannot follow over all of the range of '{mirror.of}'")
+            raise ProtocolError(f"{where} cannot follow over all of the range of '{mirror.mimics}'")
         for field in ("max_velocity_rad_s", "max_acceleration_rad_s2", "max_jerk_rad_s3"):
-            if getattr(leader, field) * abs(mirror.factor) > getattr(follower, field) * (1 + _SAME):
-                raise ProtocolError(f"{where}: its {field} is too low to follow '{mirror.of}'")
+            if getattr(leader, field) * abs(mirror.multiplier) > getattr(follower, field) * (1 + _SAME):
+                raise ProtocolError(f"{where}: its {field} is too low to follow '{mirror.mimics}'")
 
 
 def _check_narrowing(abilities: Abilities, known: Mapping[str, Joint]) -> None:
-    followers = {mirror.joint for mirror in abilities.mirrors}
-    narrowed = [narrowing.joint for narrowing in abilities.narrowing]
-    for narrowing in abilities.narrowing:
-        where = f"narrowing of '{narrowing.joint}'"
-        check_known("narrowing", "joint", (narrowing.joint, narrowing.by), known)
+    followers = {mirror.joint for mirror in abilities.mimic_joints}
+    narrowed = [narrowing.joint for narrowing in abilities.position_dependent_limits]
+    for narrowing in abilities.position_dependent_limits:
+        where = f"position_dependent_limits of '{narrowing.joint}'"
+        check_known("position_dependent_limits", "joint", (narrowing.joint, narrowing.depends_on), known)
         if narrowed.count(narrowing.joint) > 1:
             raise ProtocolError(f"{where} stands there twice")
-        if narrowing.by in narrowed:
-            raise ProtocolError(f"{where}: '{narrowing.by}' is narrowed itself")
-        if followers & {narrowing.joint, narrowing.by}:
+        if narrowing.depends_on in narrowed:
+            raise ProtocolError(f"{where}: '{narrowing.depends_on}' is narrowed itself")
+        if followers & {narrowing.joint, narrowing.depends_on}:
             raise ProtocolError(f"{where}: a mirror cannot stand there; name the joint that counts")
         if not all(math.isfinite(value) for row in narrowing.table for value in row):
             raise ProtocolError(f"{where}: all numbers of its table must be finite")
         places = [row[0] for row in narrowing.table]
         if any(later <= earlier for earlier, later in pairwise(places)):
-            raise ProtocolError(f"{where}: positions of '{narrowing.by}' must rise from row to row")
-        by, joint = known[narrowing.by], known[narrowing.joint]
+            raise ProtocolError(f"{where}: positions of '{narrowing.depends_on}' must rise from row to row")
+        by, joint = known[narrowing.depends_on], known[narrowing.joint]
         if places[0] > by.lower_rad or places[-1] < by.upper_rad:
             raise ProtocolError(
-                f"{where}: its table must reach from {by.lower_rad} to {by.upper_rad}, the range of '{narrowing.by}'"
+                f"{where}: its table must reach from {by.lower_rad} to {by.upper_rad}, the range of '{narrowing.depends_on}'"
             )
         for place, lower, upper in narrowing.table:
             if not joint.lower_rad <= lower < upper <= joint.upper_rad:
@@ -235,8 +237,8 @@ class _Allowed:
     """Where joints may be, by name; where a place does not say, they are taken to be at home."""
 
     def __init__(self, abilities: Abilities, known: Mapping[str, Joint], home_rad: Mapping[str, float]) -> None:
-        self._mirrors = abilities.mirrors
-        self._narrowing = abilities.narrowing
+        self._mirrors = abilities.mimic_joints
+        self._narrowing = abilities.position_dependent_limits
         self._known = known
         self._home_rad = home_rad
 
@@ -250,15 +252,17 @@ class _Allowed:
                 )
         for mirror in self._mirrors:
             given = position_rad.get(mirror.joint)
-            leads = position_rad.get(mirror.of)
-            if given is not None and leads is not None and abs(given - leads * mirror.factor) > _TIED_RAD:
-                raise ProtocolError(f"{where}: '{mirror.joint}' must be {mirror.factor} times '{mirror.of}'")
+            leads = position_rad.get(mirror.mimics)
+            if given is not None and leads is not None and abs(given - leads * mirror.multiplier) > _TIED_RAD:
+                raise ProtocolError(f"{where}: '{mirror.joint}' must be {mirror.multiplier} times '{mirror.mimics}'")
         for narrowing in self._narrowing:
             if narrowing.joint in position_rad:
-                lower, upper = narrowing.at(position_rad.get(narrowing.by, self._home_rad[narrowing.by]))
+                lower, upper = narrowing.at(
+                    position_rad.get(narrowing.depends_on, self._home_rad[narrowing.depends_on])
+                )
                 value = position_rad[narrowing.joint]
                 if not lower - _SAME <= value <= upper + _SAME:
                     raise ProtocolError(
                         f"{where}: '{narrowing.joint}' is {value}, but goes from {lower:.4f} to {upper:.4f} "
-                        f"where '{narrowing.by}' is"
+                        f"where '{narrowing.depends_on}' is"
                     )

@@ -25,7 +25,7 @@ MAX_JOINTS = 128
 class Diagnostic(reports.Diagnostic, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """How some measurements are to be judged, as a manifest says it."""
 
-    questions: tuple[Literal["level", "trend", "change", "outlier"], ...] = ("level", "trend", "change", "outlier")
+    checks: tuple[Literal["level", "trend", "change", "outlier"], ...] = ("level", "trend", "change", "outlier")
 
 
 class Workspace(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):

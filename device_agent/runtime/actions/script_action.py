@@ -156,7 +156,7 @@ class Script:
         except ProtocolError as error:
             raise EOFError from error
         if isinstance(first, script_calls.Unfit):
-            raise ScriptFailed(f"the script was not run, the jail does not hold: {first.why[:MAX_OUTPUT]}")
+            raise ScriptFailed(f"the script was not run, the jail does not hold: {first.reason[:MAX_OUTPUT]}")
         _write(
             link,
             source=self._order.source,

@@ -98,7 +98,7 @@ class SpeechOutput:
         if self._heard is not None:
             self._heard(utterance.duration_s)
         if self._tell is not None:
-            self._tell(EventRecord(EventKind.SAID, utterance.text, data=data))
+            self._tell(EventRecord(EventKind.SPEECH_STARTED, utterance.text, data=data))
 
     def _spoken(self, text: str, language: str) -> Spoken | None:
         if self._speech is None:

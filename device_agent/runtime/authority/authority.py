@@ -114,8 +114,8 @@ class Authority:
         """Latch Stop. The first latch stays the one shown."""
         if self.latch is None:
             self.latch = latch
-            data = {"by": latch.by, "reason": latch.reason}
-            self.note(EventKind.STOP_LATCHED, f"stopped by {latch.by}", data, "warning")
+            data = {"caller": latch.caller, "reason": latch.reason}
+            self.note(EventKind.STOP_LATCHED, f"stopped by {latch.caller}", data, "warning")
         self.end(Refused("stopped", "the device was stopped"))
 
     def reset_stop(self) -> None:
@@ -167,7 +167,7 @@ class Authority:
             Refused: Stopped, faulty, or the room holds it.
         """
         if self.latch is not None:
-            raise Refused("stopped", f"stopped by {self.latch.by}; reset Stop first")
+            raise Refused("stopped", f"stopped by {self.latch.caller}; reset Stop first")
         if self.fault is not None:
             raise Refused("fault", self.fault)
         strictest = self.restrictions.strictest

@@ -34,7 +34,7 @@ class PendingControlRequest:
             raise Refused("no_lease", f"lease {epoch} is not in force here; there is nothing to ask for")
         # Two of the cloud's processes may have sent the end of it and the request itself in the other order.
         if order.request != self._dropped:
-            self._asked = Asked(order.request, order.by, epoch, now_s + order.answer_within_ms / 1000)
+            self._asked = Asked(order.request, order.requester, epoch, now_s + order.answer_within_ms / 1000)
 
     def drop(self, request: str) -> None:
         """Show it no longer; the end of an earlier request does not end a later one."""

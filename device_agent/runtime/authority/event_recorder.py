@@ -107,7 +107,7 @@ class EventRecorder:
                 flood.told_s, flood.count = now_s, 0
             if self._lost:
                 message = f"{self._lost} events are not told one by one: too much happened at once"
-                found.append(_stamped(EventRecord(EventKind.EVENTS_LOST, message, "warning", {"count": self._lost})))
+                found.append(_stamped(EventRecord(EventKind.EVENTS_DROPPED, message, "warning", {"count": self._lost})))
                 self._lost = 0
             return found
 

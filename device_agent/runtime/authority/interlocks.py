@@ -156,9 +156,9 @@ class Interlocks:
         rule, before = watched.rule, watched.why
         if why is not None:
             self._restrict(rule.name, rule.left, why)
-            data = {"interlock": rule.name, "action": rule.action, "why": why}
+            data = {"interlock": rule.name, "action": rule.action, "reason": why}
             verb = "held" if rule.action == "hold" else "slowed"
-            happened = EventRecord(EventKind.INTERLOCK_ACTED, f"the room {verb} the device: {why}", "warning", data)
+            happened = EventRecord(EventKind.INTERLOCK_ENGAGED, f"the room {verb} the device: {why}", "warning", data)
             self._note(happened, f"{rule.name} {why}", now_s)
         else:
             self._lift(rule.name)

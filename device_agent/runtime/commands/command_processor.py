@@ -206,8 +206,8 @@ class CommandProcessor:
         data: dict[str, object] = {"code": code}
         if command is not None:
             request = type(command.request).__struct_config__.tag
-            data |= {"command": command.id, "request": request, "who": command.who, "epoch": command.epoch}
-        happened = EventRecord(EventKind.COMMAND_REFUSED, f"a command was refused: {message}", "warning", data)
+            data |= {"command": command.id, "request": request, "caller": command.caller, "epoch": command.epoch}
+        happened = EventRecord(EventKind.COMMAND_REJECTED, f"a command was refused: {message}", "warning", data)
         self._audit.refused(happened, code=code, now_s=time.monotonic())
 
     def _check_time(self, command: Command) -> None:
@@ -242,19 +242,19 @@ class CommandProcessor:
             case ReleaseLease():
                 self._controller.release(epoch=command.epoch)
             case StopDevice(reason=reason):
-                self._controller.stop(StopLatch(by=command.who, reason=reason, at_ms=wall_ms()))
+                self._controller.stop(StopLatch(caller=command.caller, reason=reason, at_ms=wall_ms()))
                 self._hurry()
             case ResetStop():
                 latched = self._controller.latch is not None
                 self._controller.reset_stop(epoch=command.epoch)
                 if latched:
-                    message = f"Stop was reset by {command.who}"
-                    self._audit.note(EventRecord(EventKind.STOP_RESET, message, data={"by": command.who}))
-                _log.warning("%s: Stop reset by %s", self._name, command.who)
+                    message = f"Stop was reset by {command.caller}"
+                    self._audit.note(EventRecord(EventKind.STOP_RESET, message, data={"caller": command.caller}))
+                _log.warning("%s: Stop reset by %s", self._name, command.caller)
             case RotateKey(statements=statements):
                 self._keys.follow(statements)
             case CancelAction(action=action):
-                self._executor.cancel(action, command.who)
+                self._executor.cancel(action, command.caller)
             case order:  # an action
                 # Journalled before it begins: after a crash here it is ended, never run again.
                 self._voice.pass_by(command.id, AckStatus.ACCEPTED)
@@ -300,7 +300,7 @@ class CommandProcessor:
             faults=self._faults(),
             action=self._executor.current(),
             restrictions=tuple(
-                Restriction(source=one.source, speed=one.speed, why=one.why) for one in self._controller.restrictions
+                Restriction(source=one.source, speed=one.speed, reason=one.why) for one in self._controller.restrictions
             ),
             stiffness=self._controller.slack,
         )

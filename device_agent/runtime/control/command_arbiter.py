@@ -188,7 +188,7 @@ class CommandArbiter:
         self.stream.drop()
         if self.helm.moving:
             if self.mode in {Mode.STREAMING, Mode.ACTION}:  # told once, not for each order to hold while it brakes
-                self.authority.note(EventKind.HELD, why.message, self.authority.said(why), "warning")
+                self.authority.note(EventKind.MOTION_HELD, why.message, self.authority.said(why), "warning")
             self.mode = Mode.HOLDING
         self.helm.interrupt(why)
         self.helm.brake()

@@ -49,7 +49,7 @@ class SetpointStream:
         self._envelope = envelope
         self._geometry = geometry
         self._limits = [joint.max_velocity_rad_s for joint in robot_type.joints]
-        led = {mirror.joint for mirror in robot_type.mirrors}
+        led = {mirror.joint for mirror in robot_type.mimic_joints}
         self._leading = {i: joint.name for i, joint in enumerate(robot_type.joints) if joint.name not in led}
         self._drives = robot_type.base is not None
         self._pace = LatencyLimiter(geometry, watchdog_s=WATCHDOG_S, oldest_s=MAX_LOOP_AGE_S)

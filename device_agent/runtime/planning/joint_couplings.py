@@ -12,7 +12,7 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from device_agent.protocol.manifests.capabilities import Narrowing
+from device_agent.protocol.manifests.capabilities import PositionDependentLimit
 from device_agent.protocol.manifests.robot_type import RobotType
 
 Floats = npt.NDArray[np.float64]
@@ -36,7 +36,7 @@ class _Narrowed:
 
     joint: int
     by: int
-    says: Narrowing
+    says: PositionDependentLimit
 
     def over(self, *places: float) -> tuple[float, float]:
         """What is inside of the range wherever ``by`` is between some positions; empty when lower exceeds upper."""
@@ -71,9 +71,13 @@ class Couplings:
     def __init__(self, robot_type: RobotType) -> None:
         self._names = [joint.name for joint in robot_type.joints]
         index = {name: number for number, name in enumerate(self._names)}
-        self._mirrors = [_Mirror(index[one.joint], index[one.of], one.factor) for one in robot_type.mirrors]
-        self._followers = {one.joint: one for one in robot_type.mirrors}
-        self._narrowed = [_Narrowed(index[one.joint], index[one.by], one) for one in robot_type.narrowing]
+        self._mirrors = [
+            _Mirror(index[one.joint], index[one.mimics], one.multiplier) for one in robot_type.mimic_joints
+        ]
+        self._followers = {one.joint: one for one in robot_type.mimic_joints}
+        self._narrowed = [
+            _Narrowed(index[one.joint], index[one.depends_on], one) for one in robot_type.position_dependent_limits
+        ]
 
     def __bool__(self) -> bool:
         """Whether any joint hangs together with another."""
@@ -89,9 +93,9 @@ class Couplings:
             mirror = self._followers.get(name)
             if mirror is None:
                 led[name] = value
-            elif mirror.of not in position_rad:
-                led[mirror.of] = value / mirror.factor
-            elif abs(value - position_rad[mirror.of] * mirror.factor) > _SAME_RAD:
+            elif mirror.mimics not in position_rad:
+                led[mirror.mimics] = value / mirror.multiplier
+            elif abs(value - position_rad[mirror.mimics] * mirror.multiplier) > _SAME_RAD:
                 differing.append(name)
         return led, tuple(differing)
 
@@ -106,7 +110,7 @@ class Couplings:
         for one in self._narrowed:
             lower, upper = one.says.at(position_rad[one.by])
             if not lower <= position_rad[one.joint] <= upper:
-                found.append((one.joint, lower, upper, one.says.by))
+                found.append((one.joint, lower, upper, one.says.depends_on))
         return found
 
     def confine(self, position_rad: Floats) -> None:
@@ -129,7 +133,7 @@ class Couplings:
             low, high = np.interp(there, by, lower), np.interp(there, by, upper)
             place = position_rad[:, one.joint]
             if np.any((place < low - _SAME_RAD) | (place > high + _SAME_RAD)):
-                return f"leads {self._names[one.joint]} where {one.says.by} leaves it no room"
+                return f"leads {self._names[one.joint]} where {one.says.depends_on} leaves it no room"
         return ""
 
     def steer(

@@ -81,8 +81,8 @@ class Timeline:
         """Where joints are at each keyframe [rad], without those that only follow others."""
         moments = self._moments()[1:]
         places = [_through(self._curve(index), moments)[0] for index in range(len(self._names))]
-        followers = {mirror.joint for mirror in self._type.mirrors}
-        narrowed = {narrowing.joint for narrowing in self._type.narrowing}
+        followers = {mirror.joint for mirror in self._type.mimic_joints}
+        narrowed = {narrowing.joint for narrowing in self._type.position_dependent_limits}
         named = [{number for number, _ in keys} for keys in self._keys]
         return [
             {

@@ -132,7 +132,7 @@ class DevicePublisher:
         self._shown: tuple[object, ...] = ()
         self._shown_at_s = float("-inf")
         self.refusals: dict[str, int] = {}
-        self.scripts = SandboxStatus("refused", "the agent has not looked yet what this machine has")
+        self.scripts = SandboxStatus("unavailable", "the agent has not looked yet what this machine has")
 
     # ------------------------------------------------------------ answers to commands
 
@@ -247,8 +247,8 @@ class DevicePublisher:
             robot_type=kind.type,
             label=self._label,
             joints=kind.joints,
-            mirrors=kind.mirrors,
-            narrowing=kind.narrowing,
+            mimic_joints=kind.mimic_joints,
+            position_dependent_limits=kind.position_dependent_limits,
             frames=kind.frames,
             capabilities=kind.capabilities,
             actions=self._actions,
@@ -281,7 +281,7 @@ def _lease_state(lease: Lease | None, asked: Asked | None, now_s: float) -> Leas
         return None
     request = None
     if asked is not None:
-        request = OpenRequest(id=asked.id, by=asked.by, expires_in_ms=_left_ms(asked.expires_s, now_s))
+        request = OpenRequest(id=asked.id, requester=asked.by, expires_in_ms=_left_ms(asked.expires_s, now_s))
     return LeaseState(
         holder=lease.holder,
         epoch=lease.epoch,

@@ -89,7 +89,7 @@ def control_ended(before: Lease, after: Lease, *, why: str, now_ms: int) -> Cont
     """Control has ended because the device was ``unpaired``, ``moved``, ``removed``, or is ``unshared``."""
     how = "is shared with them no longer" if why == "unshared" else f"was {why}"
     message = f"Control of {before.holder} ended: the device {how}."
-    return _of_lease(after, Fact.ENDED, now_ms, message, {"holder": before.holder, "why": why})
+    return _of_lease(after, Fact.ENDED, now_ms, message, {"holder": before.holder, "reason": why})
 
 
 def _of_change(before: Lease | None, after: Lease, *, by: str, now_ms: int) -> Iterator[ControlEvent]:
@@ -101,7 +101,7 @@ def _of_change(before: Lease | None, after: Lease, *, by: str, now_ms: int) -> I
     data = {"holder": after.holder} | ({"from": had} if had else {})
     asked = after.asked
     if not after.account:
-        yield _of_lease(after, Fact.RESET_ORDERED, now_ms, f"{by} ordered the reset of Stop.", {"by": by, **data})
+        yield _of_lease(after, Fact.RESET_ORDERED, now_ms, f"{by} ordered the reset of Stop.", {"caller": by, **data})
     elif asked is not None and asked.outcome == "accepted" and asked.epoch == after.epoch - 1:
         message = f"{by} handed control over to {after.holder}."
         yield _of_lease(after, Fact.HANDED_OVER, now_ms, message, {"request": asked.id, **data})
@@ -140,5 +140,5 @@ def _of_lease(
 
 
 def _of_request(asked: ControlRequest, fact: Fact, at_ms: int, message: str) -> ControlEvent:
-    data = {"request": asked.id, "by": asked.by, "epoch": asked.epoch}
+    data = {"request": asked.id, "requester": asked.by, "epoch": asked.epoch}
     return ControlEvent(f"{fact}-{asked.id}", fact, at_ms, message, data)

@@ -231,7 +231,7 @@ class XmppGateway:
             said = codec.decode(told.payload, State)
         except ProtocolError:
             return
-        body = f"{said.device}: {said.mode.value}" + (f", stopped by {said.stop.by}" if said.stop else "")
+        body = f"{said.device}: {said.mode.value}" + (f", stopped by {said.stop.caller}" if said.stop else "")
         for jid in places:
             self._line.send(stanzas.message(jid, told.topic, told.payload, body=body))
 

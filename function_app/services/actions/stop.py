@@ -131,7 +131,7 @@ class StopDevices:
         self, caller: Identity, device: Device, reason: str, gate: AbstractAsyncContextManager[object]
     ) -> bool:
         """Tell it in both ways; the tables are written beside that, not before."""
-        plain = asyncio.create_task(self._repeat(device, Stop(id=new_id(), by=caller.name, reason=reason)))
+        plain = asyncio.create_task(self._repeat(device, Stop(id=new_id(), caller=caller.name, reason=reason)))
         writing: asyncio.Task[None] | None = None
         try:
             await asyncio.sleep(0)  # it goes before anything is signed or written
@@ -164,7 +164,12 @@ class StopDevices:
             async with gate:
                 await self._queues.halt(device.id, STOPPED)
                 await self._audit.happened(
-                    device, Fact.STOP_ORDERED, message, caller=caller, severity="warning", by=caller.name, reason=reason
+                    device,
+                    Fact.STOP_ORDERED,
+                    message,
+                    caller=caller,
+                    severity="warning",
+                    data={"caller": caller.name, "reason": reason},
                 )
         except (Problem, StoreError) as error:
             _log.warning("stop of %s: %s", device.id, error)

@@ -121,25 +121,25 @@ class ControlEvents:
         caller: Identity | None = None,
         severity: Any = "info",
         outcome: Outcome = "done",
-        **data: Any,
+        data: Mapping[str, Any],
     ) -> None:
         """Tell of something that is no change of a lease.
 
         Raises:
             StoreError: The tables cannot be used.
         """
-        event = await self.event(device, fact, message, severity=severity, **data)
+        event = await self.event(device, fact, message, severity=severity, data=data)
         await self._chain.keep(device.owner or CLOUD, _entry(device.id, event, _by(caller), outcome))
 
     async def event(
-        self, device: Device, fact: Fact, message: str, *, severity: Any = "info", **data: Any
+        self, device: Device, fact: Fact, message: str, *, severity: Any = "info", data: Mapping[str, Any]
     ) -> Mapping[str, Any]:
         """The same among the device's events alone, for what has its record otherwise; gives the event.
 
         Raises:
             StoreError: The tables cannot be used.
         """
-        event = ControlEvent(new_id(), fact, self._clock.now_ms(), message, data, severity).event(device.name)
+        event = ControlEvent(new_id(), fact, self._clock.now_ms(), message, dict(data), severity).event(device.name)
         await self._events.add(device.id, device.pairing, event)
         return event
 
@@ -178,9 +178,7 @@ class ControlEvents:
                 caller=caller,
                 severity="warning",
                 outcome="refused",
-                by=caller.name,
-                wanted=what,
-                code=problem.code,
+                data={"caller": caller.name, "wanted": what, "code": problem.code},
             )
         except (StoreError, Problem) as error:
             _log.warning("refusal on %s: %s", device.id, error)

@@ -89,7 +89,7 @@ class Handovers:
         asked = lease.asked
         assert asked is not None  # noqa: S101 (the rule has just written it)
         left_ms = max(1, asked.expires_ms - self._clock.now_ms())
-        order = RequestControl(request=asked.id, by=asked.by, answer_within_ms=left_ms)
+        order = RequestControl(request=asked.id, requester=asked.by, answer_within_ms=left_ms)
         try:
             shown = await self._commands.confirmed(
                 device, order, caller=caller.name, epoch=lease.epoch, wait_ms=wait_ms

@@ -209,7 +209,7 @@ def _rules(listed: Sequence[Diagnostic], stream: str, names: set[str]) -> dict[s
                 warning_high=given.warning_high,
                 change=given.change,
                 horizon_s=given.horizon_s,
-                kinds=given.questions,
+                kinds=given.checks,
             )
             result[name] = Rule(given.label, given.unit, given.advice, limits, listed=True)
         elif stream != topics.JOINTS:

@@ -127,7 +127,7 @@ def _order(
         device=device.name,
         issued_at_ms=issued_ms,
         ttl_ms=ttl_ms,
-        who=caller,
+        caller=caller,
         epoch=epoch,
         request=request,
     )

@@ -286,7 +286,7 @@ class Sharing:
         kind, name = split_target(share.on)
         device = await self._devices.owned(name) if kind == "device" else None
         if device is not None and device.pairing == share.pairing:
-            await self._audit.event(device, fact, message, **data)
+            await self._audit.event(device, fact, message, data=data)
 
     async def look(self, what: str, note: Row) -> None:
         """The timer's look at a share that was changed, or whose time may be over."""

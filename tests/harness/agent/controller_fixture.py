@@ -81,7 +81,7 @@ def lost(_: Refused) -> None:
 
 def interruptions() -> dict[str, object]:
     return {
-        "stop": lambda rig: rig.controller.stop(StopLatch(by="bob", reason="", at_ms=1)),
+        "stop": lambda rig: rig.controller.stop(StopLatch(caller="bob", reason="", at_ms=1)),
         "link": lambda rig: rig.controller.lost(Refused("link_lost", "the link is gone")),
         "takeover": lambda rig: rig.take(2),
         "release": lambda rig: rig.controller.release(epoch=1),

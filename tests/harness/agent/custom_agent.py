@@ -137,7 +137,7 @@ class OwnAgent:
             device=DEVICE,
             issued_at_ms=wall_ms(),
             ttl_ms=ttl_ms,
-            who="ann",
+            caller="ann",
             epoch=epoch,
             request=request,
         )

@@ -125,7 +125,7 @@ class Bench:
             "device": "arm",
             "issued_at_ms": wall_ms(),
             "ttl_ms": 10_000,
-            "who": "ann",
+            "caller": "ann",
             "epoch": epoch,
             "request": request,
         }

@@ -23,13 +23,13 @@ class LateJail(SandboxHost):
     """The real one, which starts its first process for the first script only: for agents that live a moment."""
 
     def standing(self) -> SandboxStatus:
-        return SandboxStatus("jailed")
+        return SandboxStatus("sandboxed")
 
 
 class NoJail:
     """A machine on which no script runs; starts no process."""
 
-    def __init__(self, how: Literal["trusted", "refused"] = "refused") -> None:
+    def __init__(self, how: Literal["unconfined", "unavailable"] = "unavailable") -> None:
         self._how = how
 
     def start(self) -> None:

@@ -150,7 +150,7 @@ class Ground:
             device=device.name,
             issued_at_ms=now_ms,
             ttl_ms=ORDER_MS,
-            who="anna",
+            caller="anna",
             epoch=epoch,
             request=request,
         )

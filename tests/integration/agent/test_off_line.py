@@ -50,7 +50,7 @@ def test_what_happened_while_the_broker_and_then_the_agent_were_dead_is_told_lat
         wait_until(lambda: agent.events(EventKind.AGENT_STARTED), "its first life to be told")
 
         broker.kill()
-        wait_until(lambda: kept_event(agent, EventKind.HELD), "the hold, on disk")
+        wait_until(lambda: kept_event(agent, EventKind.MOTION_HELD), "the hold, on disk")
         wait_until(lambda: len(kept(agent, late=True)) > 5, "measurements on disk")
         agent.kill()
         died_ms = wall_ms()
@@ -66,7 +66,7 @@ def test_what_happened_while_the_broker_and_then_the_agent_were_dead_is_told_lat
         agent.ready()
         wait_until(lambda: not kept(agent, late=False) and not kept(agent, late=True), "all of it to be told")
 
-        (held,) = agent.events(EventKind.HELD)
+        (held,) = agent.events(EventKind.MOTION_HELD)
         assert held.data["code"] == "link_lost"
         assert held.at_ms < died_ms
         assert len(agent.events(EventKind.AGENT_STARTED)) == 2

@@ -48,7 +48,7 @@ def broker(tmp_path: Path) -> Iterator[RunningBroker]:
 
 
 def acted(agent: OwnAgent) -> list[str]:
-    return [event.data["why"] for event in agent.events(EventKind.INTERLOCK_ACTED)]
+    return [event.data["reason"] for event in agent.events(EventKind.INTERLOCK_ENGAGED)]
 
 
 def restrictions(agent: OwnAgent) -> dict[str, float]:

@@ -81,7 +81,7 @@ def test_the_command_is_what_was_asked_signed_and_with_the_leases_epoch(pair: Pa
     (command,) = robot.heard(RunMovement)
     assert isinstance(command.request, RunMovement)
     shown = anna.get("/robot-types/ur5/movements/mine").json()
-    assert (command.id, command.epoch, command.who, command.ttl_ms) == (action["id"], epoch, "anna", 7_000)
+    assert (command.id, command.epoch, command.caller, command.ttl_ms) == (action["id"], epoch, "anna", 7_000)
     assert (command.request.source, command.request.sha256) == (shown["source"], shown["sha256"])
     assert command.request.parameters == {"times": 2, "note": "grüß 🤖"}
     assert action["request"] == asked

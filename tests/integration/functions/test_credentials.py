@@ -57,7 +57,7 @@ def test_watching_hears_every_device_of_the_account_and_no_other(
                 heard.add(page.receive(PATIENCE_S).topic)
             heard |= {message.topic for message in page.heard()}
             assert not [topic for topic in heard if foreign.space in topic]
-            page.publish(f"{bases[0]}/stop", b'{"id":"s1","by":"anna"}')
+            page.publish(f"{bases[0]}/stop", b'{"id":"s1","caller":"anna"}')
             wait_until(lambda: robot.stops, "the Stop")
         assert robot.link is not None
         robot.link.heard()

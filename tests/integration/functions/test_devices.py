@@ -44,7 +44,7 @@ def state(**changes: Any) -> State:
 @pytest.mark.parametrize("broker", BROKERS, indirect=True)
 def test_presence_and_state_arrive_over_the_broker(pair: Pair) -> None:
     anna, robot = pair
-    stop = StopLatch(by="anna", reason="test", at_ms=4)
+    stop = StopLatch(caller="anna", reason="test", at_ms=4)
     robot.say_state(state(stop=stop, lease=LeaseState(holder="anna", epoch=3, expires_in_ms=100)))
     wait_until(lambda: anna.get(f"/devices/{robot.device}").json()["state"], "the state")
     shown = anna.get(f"/devices/{robot.device}").json()

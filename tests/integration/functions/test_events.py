@@ -16,7 +16,7 @@ def happened(cloud: Cloud, robot: Robot, number: int, **changes: Any) -> None:
         "id": f"e{number}",
         "device": "arm",
         "at_ms": 1_700_000_000_000 + number,
-        "kind": EventKind.COMMAND_REFUSED,
+        "kind": EventKind.COMMAND_REJECTED,
         "severity": "warning",
         "message": "a command was refused",
         "data": {"code": "expired", "epoch": number},
@@ -42,7 +42,7 @@ def test_they_are_shown_newest_first_page_by_page_with_both_times(cloud: Cloud, 
     assert [event["id"] for event in shown] == ["e4", "e3", "e2", "e1", "e0"]
     newest = shown[0]
     assert newest["data"] == {"code": "expired", "epoch": 4}
-    assert (newest["kind"], newest["severity"]) == ("command-refused", "warning")
+    assert (newest["kind"], newest["severity"]) == ("command-rejected", "warning")
     assert newest["at"] < newest["heard_at"]
 
 

@@ -72,7 +72,7 @@ def test_what_is_asked_for_and_accepted_is_the_askers_with_the_next_epoch(held: 
         (order,) = robot.heard(RequestControl)
         assert order.epoch == 1
         assert isinstance(order.request, RequestControl)
-        assert (order.request.request, order.request.by) == (shown["id"], "anna")
+        assert (order.request.request, order.request.requester) == (shown["id"], "anna")
         assert 0 < order.request.answer_within_ms <= WITHIN_MS
         assert lease(anna, robot)["request"] == shown | {"mine": False}
         given = anna.post(at(robot, shown["id"], "accept")).json()
@@ -334,7 +334,7 @@ def test_every_refusal_is_told_but_not_each_time(cloud: Cloud, held: Three) -> N
     cloud.clock.advance(10)
     problem(other.take(robot.device), 409, "lease-held")
     items = anna.get(f"/devices/{robot.device}/events").json()["items"]
-    assert items[0]["data"] == {"by": "anna", "wanted": "take control", "code": "lease-held"}
+    assert items[0]["data"] == {"caller": "anna", "wanted": "take control", "code": "lease-held"}
     assert items[0]["severity"] == "warning"
     assert [item["kind"] for item in items].count("order-refused") == 3
 

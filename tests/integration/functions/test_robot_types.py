@@ -164,9 +164,9 @@ class TestLife:
         nao = anna.get("/robot-types/nao").json()
         assert set(nao["home_rad"]) == {joint["name"] for joint in nao["joints"]}
         assert {"take_posture", "run_behaviour", "drive"} <= set(nao["actions"])
-        assert all(len(nao[key]) > 0 for key in ("mirrors", "narrowing", "postures", "behaviours"))
+        assert all(len(nao[key]) > 0 for key in ("mimic_joints", "position_dependent_limits", "postures", "behaviours"))
         ur5 = anna.get("/robot-types/ur5").json()
-        assert (ur5["actions"], ur5["mirrors"], ur5["postures"]) == (["move_joints"], [], [])
+        assert (ur5["actions"], ur5["mimic_joints"], ur5["postures"]) == (["move_joints"], [], [])
 
     def test_one_is_added_seen_and_used_like_a_built_in_one(self, cloud: Cloud, anna: Person) -> None:
         added = add(anna)

@@ -302,7 +302,7 @@ def test_watching_a_shared_device_hears_that_device_alone(cloud: Cloud, broker: 
             while (message := page.receive()).topic.endswith("/conn"):
                 pass
             assert message.topic == f"{base}/event"
-            page.publish(f"{base}/stop", b'{"id":"s1","by":"bert"}')
+            page.publish(f"{base}/stop", b'{"id":"s1","caller":"bert"}')
             wait_until(lambda: second.stops, "the Stop")
 
 

@@ -20,7 +20,7 @@ def test_stop_goes_out_plain_and_signed_and_reset_signed(pair: Pair) -> None:
     answer = anna.post(f"/devices/{robot.device}/stop", {"reason": "smoke"})
     assert (answer.status_code, answer.json()) == (200, {"confirmed": True})
     wait_until(lambda: robot.stops, "the plain Stop")
-    assert (robot.stops[0].by, robot.stops[0].reason) == ("anna", "smoke")
+    assert (robot.stops[0].caller, robot.stops[0].reason) == ("anna", "smoke")
     assert [command.request for command in robot.heard(StopDevice)] == [StopDevice(reason="smoke")]
     assert robot.heard(ResetStop) == []
     assert anna.post(f"/devices/{robot.device}/stop/reset").json() == {"confirmed": True}
@@ -145,6 +145,6 @@ def test_stop_and_its_reset_are_told_with_who_did_it(pair: Pair) -> None:
     anna.post(f"/devices/{robot.device}/stop/reset")
     events = anna.get(f"/devices/{robot.device}/events").json()["items"]
     reset, stop, _ = events
-    assert (reset["kind"], reset["data"]["by"], reset["data"]["from"]) == ("stop-reset-ordered", "anna", "anna")
-    assert (stop["kind"], stop["data"]) == ("stop-ordered", {"by": "anna", "reason": "smoke"})
+    assert (reset["kind"], reset["data"]["caller"], reset["data"]["from"]) == ("stop-reset-ordered", "anna", "anna")
+    assert (stop["kind"], stop["data"]) == ("stop-ordered", {"caller": "anna", "reason": "smoke"})
     assert stop["severity"] == "warning"

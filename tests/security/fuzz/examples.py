@@ -134,7 +134,7 @@ HOMES = (
     b"""server = "http://127.0.0.1:8080"
 name = "lab"
 transport = "http"
-trusted-scripts = false
+allow_unconfined_scripts = false
 
 [http]
 poll = "plain"

@@ -386,7 +386,7 @@ LIES = {
     "sends_names_of_other_kinds": """
         for kind in ('ready', 'unfit', '__class__', 'stop', 'reset_stop', 'grant_lease'):
             os.write(3, b'{"kind": "%s"}\\n' % kind.encode())""",
-    "claims_that_the_jail_is_broken": 'os.write(3, b\'{"kind": "unfit", "why": "x"}\\n\')',
+    "claims_that_the_jail_is_broken": 'os.write(3, b\'{"kind": "unfit", "reason": "x"}\\n\')',
     "ends_without_a_word": "os._exit(0)",
     "closes_its_socket": """
         os.close(3)

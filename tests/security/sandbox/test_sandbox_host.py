@@ -246,7 +246,7 @@ def test_where_the_kernel_lacks_a_layer_scripts_are_refused_unless_they_are_trus
     refusals, said, error = done.stdout.strip().split("\n", 2)
     careful, trusting = json.loads(refusals)
     assert f"no {layer}" in careful
-    assert "trusted-scripts = true" in careful
+    assert "allow_unconfined_scripts = true" in careful
     assert trusting is None
     assert "7" in said
     assert "JailError" in error

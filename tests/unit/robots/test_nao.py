@@ -61,7 +61,7 @@ def test_masses_are_those_of_the_description(model: Any) -> None:
 
 
 def test_one_motor_turns_both_hips() -> None:
-    assert [(mirror.joint, mirror.of) for mirror in TYPE.mirrors] == [("RHipYawPitch", "LHipYawPitch")]
+    assert [(mirror.joint, mirror.mimics) for mirror in TYPE.mimic_joints] == [("RHipYawPitch", "LHipYawPitch")]
     walking = Walking(FOLDER)
     walking.driver.send([(TYPE.home_rad | {"LHipYawPitch": 0.1})[name] for name in walking.names])
     walking.world.step(200)
@@ -70,8 +70,8 @@ def test_one_motor_turns_both_hips() -> None:
 
 
 def test_the_head_has_less_room_the_further_it_is_turned() -> None:
-    (narrowing,) = TYPE.narrowing
-    assert (narrowing.joint, narrowing.by) == ("HeadPitch", "HeadYaw")
+    (narrowing,) = TYPE.position_dependent_limits
+    assert (narrowing.joint, narrowing.depends_on) == ("HeadPitch", "HeadYaw")
     ahead, aside = narrowing.at(0.0), narrowing.at(1.5)
     assert ahead[0] < aside[0] < aside[1] < ahead[1]
 
@@ -186,7 +186,7 @@ def test_a_stop_ends_a_walk_on_both_feet_within_the_brakes() -> None:
         walking.period()
     base = TYPE.base
     assert base is not None
-    walking.controller.stop(StopLatch(by="somebody", at_ms=0, reason=""))
+    walking.controller.stop(StopLatch(caller="somebody", at_ms=0, reason=""))
     braking_s = 0.1 / base.braking_linear_m_s2 + 0.05
     walking.wait(braking_s)
     assert walking.twist == pytest.approx(REST, abs=1e-6)

@@ -33,7 +33,7 @@ export class Arm {
   mute = false;
   epoch = 0;
   holder: string | null = null;
-  stop: { by: string; reason: string; at_ms: number } | null = null;
+  stop: { caller: string; reason: string; at_ms: number } | null = null;
   action: { id: string; kind: string; name: string; progress: number } | null = null;
   /** Every setpoint that came, for assertions. */
   readonly setpoints: Setpoint[] = [];
@@ -71,10 +71,10 @@ export class Arm {
     });
   }
 
-  latch(by: string, reason: string): void {
+  latch(caller: string, reason: string): void {
     this.stops += 1;
     if (this.deaf || this.stop !== null) return;
-    this.stop = { by, reason, at_ms: Date.now() };
+    this.stop = { caller, reason, at_ms: Date.now() };
     this.#target = [...this.#position];
   }
 

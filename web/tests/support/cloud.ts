@@ -167,7 +167,7 @@ export class Cloud {
     if (packet.topic.startsWith(`${TOPIC}/ctl/`)) this.arm?.take(JSON.parse(text) as Setpoint);
     if (packet.topic === `${TOPIC}/stop`) {
       const stop = JSON.parse(text) as Stop;
-      this.arm?.latch(stop.by, stop.reason ?? "");
+      this.arm?.latch(stop.caller, stop.reason ?? "");
     }
   }
 

@@ -15,11 +15,11 @@ export function head(): Robot {
       max_jerk_rad_s3: 100,
       max_effort_nm: 5,
     })),
-    mirrors: [{ joint: "right", of: "left", factor: -0.5 }],
-    narrowing: [
+    mimic_joints: [{ joint: "right", mimics: "left", multiplier: -0.5 }],
+    position_dependent_limits: [
       {
         joint: "pitch",
-        by: "yaw",
+        depends_on: "yaw",
         table: [
           [-2, -0.4, 0.1],
           [-0.5, -0.7, 0.5],

@@ -5,7 +5,7 @@ from typing import Annotated, Literal
 from msgspec import Meta, field
 
 from device_agent.protocol import Body, Joint, Stream
-from device_agent.protocol.description import Mirror, Narrowing
+from device_agent.protocol.description import MimicJoint, PositionDependentLimit
 from function_app.entrypoints.http.framework.schemas import Answer, Moment, Request, WaitMs
 from function_app.services.robot_types.package_reader import MAX_FILES, MAX_MANIFEST
 
@@ -41,8 +41,8 @@ class RobotTypeOut(Answer, frozen=True, kw_only=True):
     frames: tuple[str, ...]
     capabilities: tuple[str, ...]
     home_rad: dict[str, float]
-    mirrors: tuple[Mirror, ...]
-    narrowing: tuple[Narrowing, ...]
+    mimic_joints: tuple[MimicJoint, ...]
+    position_dependent_limits: tuple[PositionDependentLimit, ...]
     postures: tuple[str, ...]
     expressions: tuple[str, ...]
     behaviours: tuple[str, ...]

@@ -62,7 +62,7 @@ def test_what_is_written_is_read_again(
         room=room,
         ca="server-ca.pem" if options else "",
     )
-    written = replace(written, buffer=Buffer(max_mb=2), trusted_scripts=bool(options))
+    written = replace(written, buffer=Buffer(max_mb=2), allow_unconfined_scripts=bool(options))
     home.save_configuration(written)
     assert home.configuration() == written
 

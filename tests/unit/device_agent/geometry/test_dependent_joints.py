@@ -85,7 +85,7 @@ def test_a_jog_moves_the_frame_as_it_is_asked_by_what_motors_can_do(
     kind, shape, home = request.getfixturevalue({"hanson": "head", "nao": "walker"}[robot])
     rates = np.array(shape.rates(frame, twist, home.tolist(), tool=False))
     names = [joint.name for joint in kind.joints]
-    for mirror in kind.mirrors:
+    for mirror in kind.mimic_joints:
         assert rates[names.index(mirror.joint)] == mirror.factor * rates[names.index(mirror.of)]
     before, after = (np.array(shape.poses((home + rates * at).tolist())[frame]) for at in (0.0, STEP_S))
     linear = (after[:3] - before[:3]) / STEP_S

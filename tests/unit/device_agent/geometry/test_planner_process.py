@@ -168,7 +168,7 @@ def test_a_stop_ends_the_search(shape: MujocoGeometry) -> None:
 
     def stop() -> None:
         until(lambda: pid_of(shape) > 0)
-        arm.controller.stop(StopLatch(by="ann", reason="", at_ms=0))
+        arm.controller.stop(StopLatch(caller="ann", reason="", at_ms=0))
 
     stopper = threading.Thread(target=stop)
     stopper.start()

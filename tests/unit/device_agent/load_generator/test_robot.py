@@ -75,7 +75,7 @@ class Bench:
             "device": DEVICE,
             "issued_at_ms": wall_ms(),
             "ttl_ms": 5000,
-            "who": "ann",
+            "caller": "ann",
             "epoch": epoch,
             "request": request,
         }
@@ -178,7 +178,7 @@ def test_the_same_command_runs_once_and_is_answered_again(bench: Bench) -> None:
         (MoveJoints(position_rad={"tail": 1.0}), 1, "unknown_joint"),
         (Say(text="hello"), 1, "unsupported"),
         (CancelAction(action="nothing"), 1, "not_running"),
-        (RequestControl(request="r", by="bob", answer_within_ms=1000), 5, "no_lease"),
+        (RequestControl(request="r", requester="bob", answer_within_ms=1000), 5, "no_lease"),
     ],
 )
 def test_what_it_may_not_or_cannot_do_it_says(bench: Bench, request_: Any, epoch: int, code: str) -> None:
@@ -191,7 +191,7 @@ def test_a_command_of_a_stranger_or_for_another_device_is_not_even_answered(benc
     bench.command(StopDevice(), key=signing.generate())
     bench.command(StopDevice(), device="leg")
     bench.hear(topics.CMD, b"{}")
-    bench.robot.receive("ts/v1/space/other/arm/stop", codec.encode(Stop(id="s", by="x")), bench.now_s)
+    bench.robot.receive("ts/v1/space/other/arm/stop", codec.encode(Stop(id="s", caller="x")), bench.now_s)
     bench.robot.receive("nonsense", b"", bench.now_s)
     assert bench.told(topics.ACK, Ack) == []
     assert bench.after(0.1).mode is Mode.IDLE
@@ -213,7 +213,7 @@ def test_stop_ends_what_runs_holds_and_latches_until_it_is_reset(bench: Bench) -
     bench.take()
     move = bench.command(MoveJoints(position_rad=FAR, speed=1.0), epoch=1)
     bench.after(0.5)
-    bench.hear(topics.STOP, codec.encode(Stop(id="s", by="bob")))
+    bench.hear(topics.STOP, codec.encode(Stop(id="s", caller="bob")))
     assert bench.code(move) == "stopped"
     there = bench.after(0.1).position_rad
     assert bench.after(5.0).position_rad == there
@@ -298,9 +298,9 @@ def test_a_lease_that_runs_out_and_a_link_that_is_lost_end_what_moves(bench: Ben
 
 def test_who_asks_for_control_is_shown_until_the_request_is_dropped(bench: Bench) -> None:
     bench.take()
-    bench.command(RequestControl(request="r1", by="bob", answer_within_ms=60_000), epoch=1)
+    bench.command(RequestControl(request="r1", requester="bob", answer_within_ms=60_000), epoch=1)
     bench.after(2)
-    assert bench.told(topics.STATE, State)[-1].lease.request.by == "bob"
+    assert bench.told(topics.STATE, State)[-1].lease.request.requester == "bob"
     bench.command(WithdrawRequest(request="r1"))
     bench.after(2)
     assert bench.told(topics.STATE, State)[-1].lease.request is None

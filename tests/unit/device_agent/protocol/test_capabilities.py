@@ -3,7 +3,7 @@
 import pytest
 
 from device_agent.protocol.errors import ProtocolError
-from device_agent.protocol.manifests.capabilities import Narrowing
+from device_agent.protocol.manifests.capabilities import PositionDependentLimit
 from device_agent.protocol.manifests.robot_type import RobotType, parse
 from tests.harness.paths import ROOT
 
@@ -42,15 +42,15 @@ JOINTS = "".join(
     for name, lower, upper in (("yaw", -2.0, 2.0), ("pitch", -0.7, 0.5), ("left", -1.0, 0.5), ("right", -1.0, 0.5))
 )
 MIRRORS = """
-[[mirrors]]
+[[mimic_joints]]
 joint = "right"
-of = "left"
-factor = 1.0
+mimics = "left"
+multiplier = 1.0
 """
 NARROWING = """
-[[narrowing]]
+[[position_dependent_limits]]
 joint = "pitch"
-by = "yaw"
+depends_on = "yaw"
 table = [[-2.0, -0.4, 0.1], [0.0, -0.7, 0.5], [2.0, -0.4, 0.1]]
 """
 SHOWN = """
@@ -94,7 +94,7 @@ def read(text: str = ALL) -> RobotType:
 
 def test_abilities_are_read() -> None:
     kind = read()
-    assert kind.mirrors[0].of == "left"
+    assert kind.mimic_joints[0].mimics == "left"
     assert kind.postures == {"Crouch": {"left": -0.5}}
     assert kind.expressions["doubtful"]["pitch"] == -0.3
     assert [(frame.time_s, frame.say) for frame in kind.behaviours["bow"]] == [(0.5, "Good day"), (1.5, "")]
@@ -107,7 +107,7 @@ def test_abilities_are_read() -> None:
 
 def test_a_manifest_without_them_has_none() -> None:
     kind = read(HEAD + JOINTS)
-    assert (kind.mirrors, kind.narrowing, kind.postures, kind.simulation) == ((), (), {}, None)
+    assert (kind.mimic_joints, kind.position_dependent_limits, kind.postures, kind.simulation) == ((), (), {}, None)
 
 
 @pytest.mark.parametrize(
@@ -115,23 +115,25 @@ def test_a_manifest_without_them_has_none() -> None:
     [(-9.0, (-0.4, 0.1)), (-2.0, (-0.4, 0.1)), (-1.0, (-0.55, 0.3)), (0.0, (-0.7, 0.5)), (3.0, (-0.4, 0.1))],
 )
 def test_a_narrowed_range_is_linear_between_the_rows(by_rad: float, there: tuple[float, float]) -> None:
-    narrowing = Narrowing(joint="pitch", by="yaw", table=((-2.0, -0.4, 0.1), (0.0, -0.7, 0.5), (2.0, -0.4, 0.1)))
+    narrowing = PositionDependentLimit(
+        joint="pitch", depends_on="yaw", table=((-2.0, -0.4, 0.1), (0.0, -0.7, 0.5), (2.0, -0.4, 0.1))
+    )
     assert narrowing.at(by_rad) == pytest.approx(there)
 
 
 @pytest.mark.parametrize(
     ("was", "now", "says"),
     [
-        ('of = "left"', 'of = "leg"', "mirrors: no joint 'leg'; there are: yaw, pitch, left, right"),
-        ('of = "left"', 'of = "right"', "which is a mirror itself"),
+        ('mimics = "left"', 'mimics = "leg"', "mimic_joints: no joint 'leg'; there are: yaw, pitch, left, right"),
+        ('mimics = "left"', 'mimics = "right"', "which is a mirror itself"),
         (MIRRORS, MIRRORS + MIRRORS.replace('"left"', '"yaw"'), "'right' mirrors two joints"),
-        ("factor = 1.0", "factor = 0.0", "factor is 0.0"),
-        ("factor = 1.0", "factor = nan", "factor is nan"),
-        ("factor = 1.0", "factor = -1.0", "cannot follow over all of the range of 'left'"),
-        ("factor = 1.0", "factor = 2.0", "cannot follow over all of the range"),
-        ('by = "yaw"', 'by = "head"', "narrowing: no joint 'head'"),
-        ('by = "yaw"', 'by = "right"', "a mirror cannot stand there"),
-        ('joint = "pitch"\nby', 'joint = "right"\nby', "a mirror cannot stand there"),
+        ("multiplier = 1.0", "multiplier = 0.0", "multiplier is 0.0"),
+        ("multiplier = 1.0", "multiplier = nan", "multiplier is nan"),
+        ("multiplier = 1.0", "multiplier = -1.0", "cannot follow over all of the range of 'left'"),
+        ("multiplier = 1.0", "multiplier = 2.0", "cannot follow over all of the range"),
+        ('depends_on = "yaw"', 'depends_on = "head"', "position_dependent_limits: no joint 'head'"),
+        ('depends_on = "yaw"', 'depends_on = "right"', "a mirror cannot stand there"),
+        ('joint = "pitch"\ndepends_on', 'joint = "right"\ndepends_on', "a mirror cannot stand there"),
         (NARROWING, NARROWING + NARROWING, "stands there twice"),
         (NARROWING, NARROWING + NARROWING.replace('"yaw"', '"pitch"').replace('t = "pitch"', 't = "left"'), "itself"),
         ("[0.0, -0.7, 0.5]", "[-2.0, -0.7, 0.5]", "must rise from row to row"),

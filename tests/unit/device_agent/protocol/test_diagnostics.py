@@ -14,10 +14,10 @@ def given(lines: str) -> str:
 
 
 def test_limits_that_rise_are_read() -> None:
-    known = robot_type.parse(given("low = -1\nwarning_high = 2\nhigh = 3\nquestions = ['level']"))
+    known = robot_type.parse(given("low = -1\nwarning_high = 2\nhigh = 3\nchecks = ['level']"))
     last = known.diagnostics[-1]
     assert (last.low, last.warning_low, last.warning_high, last.high) == (-1.0, None, 2.0, 3.0)
-    assert (last.stream, last.questions) == ("health", ("level",))
+    assert (last.stream, last.checks) == ("health", ("level",))
 
 
 @pytest.mark.parametrize(
@@ -29,7 +29,7 @@ def test_limits_that_rise_are_read() -> None:
         "high = inf",
         "change = 0",
         "horizon_s = 1",
-        "questions = ['why']",
+        "checks = ['why']",
         "limit = 3",
         "fields = ''",
     ],

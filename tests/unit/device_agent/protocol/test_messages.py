@@ -31,7 +31,7 @@ def command() -> Command:
         device="d",
         issued_at_ms=1,
         ttl_ms=1000,
-        who="ann",
+        caller="ann",
         epoch=1,
         request=MoveJoints(position_rad={"elbow": 1.0}),
     )

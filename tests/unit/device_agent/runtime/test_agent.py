@@ -60,13 +60,13 @@ def test_a_device_holds_before_anybody_can_speak_to_it(whole: Whole) -> None:
 
 
 def test_what_arrives_reaches_its_device(whole: Whole) -> None:
-    whole.link.receive("ts/v1/s/a/arm/stop", codec.encode(Stop(id="s1", by="bob")))
+    whole.link.receive("ts/v1/s/a/arm/stop", codec.encode(Stop(id="s1", caller="bob")))
     eventually(lambda: whole.bench.telemetry().mode is Mode.STOPPED)
 
 
 @pytest.mark.parametrize("topic", ["ts/v1/s/a/leg/stop", "ts/v2/s/a/arm/stop", "$SYS", "", "ts/v1/x/y/arm/stop"])
 def test_what_is_for_nobody_here_harms_nothing(whole: Whole, topic: str) -> None:
-    whole.link.receive(topic, codec.encode(Stop(id="s1", by="bob")))
+    whole.link.receive(topic, codec.encode(Stop(id="s1", caller="bob")))
     assert whole.bench.telemetry().mode is Mode.IDLE
 
 

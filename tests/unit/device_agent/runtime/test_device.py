@@ -139,14 +139,14 @@ def test_an_epoch_in_the_topic_that_differs_from_the_message_is_refused(bench: B
 def test_stop_needs_no_lease_and_survives_a_restart(bench: Bench, tmp_path: Path) -> None:
     running = bench.command(bench.script("wait(600)"), epoch=1)
     eventually(lambda: [ack for ack in bench.acks(running) if ack.status is AckStatus.STARTED])
-    bench.receive(topics.STOP, codec.encode(Stop(id="s1", by="bob", reason="smoke")))
+    bench.receive(topics.STOP, codec.encode(Stop(id="s1", caller="bob", reason="smoke")))
     ack = bench.end(running)
     assert ack.status is AckStatus.FAILED
     assert ack.reason is not None
     assert ack.reason.code == "stopped"
     state = shown(bench, lambda state: state.mode is Mode.STOPPED)
     assert state.stop is not None
-    assert state.stop.by == "bob"
+    assert state.stop.caller == "bob"
     refused = bench.end(bench.command(MoveJoints(position_rad={"elbow": 0.2}), epoch=2))
     assert refused.reason is not None
     assert refused.reason.code == "stopped"
@@ -270,15 +270,20 @@ def test_garbage_is_counted_and_harms_nothing(bench: Bench) -> None:
 
 
 def test_state_shows_who_asks_for_control_until_that_is_dropped(bench: Bench) -> None:
-    early = bench.end(bench.command(RequestControl(request="r1", by="bob", answer_within_ms=30_000), epoch=1))
+    early = bench.end(bench.command(RequestControl(request="r1", requester="bob", answer_within_ms=30_000), epoch=1))
     assert early.reason is not None
     assert early.reason.code == "no_lease"
     bench.end(bench.command(GrantLease(holder="ann", lease_ms=60_000, reason="needed in the lab"), epoch=1))
-    bench.end(bench.command(RequestControl(request="r1", by="bob", answer_within_ms=30_000), epoch=1))
+    bench.end(bench.command(RequestControl(request="r1", requester="bob", answer_within_ms=30_000), epoch=1))
     lease = shown(bench, lambda state: state.lease and state.lease.request).lease
     assert lease is not None
     assert lease.request is not None
-    assert (lease.holder, lease.reason, lease.request.id, lease.request.by) == ("ann", "needed in the lab", "r1", "bob")
+    assert (lease.holder, lease.reason, lease.request.id, lease.request.requester) == (
+        "ann",
+        "needed in the lab",
+        "r1",
+        "bob",
+    )
     assert 0 < lease.request.expires_in_ms <= 30_000
     bench.end(bench.command(GrantLease(holder="ann", lease_ms=60_000), epoch=1))
     bench.end(bench.command(WithdrawRequest(request="r1"), epoch=1))

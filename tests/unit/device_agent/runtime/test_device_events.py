@@ -91,14 +91,14 @@ def test_a_stop_in_motion_is_told_as_what_it_did(bench: Bench) -> None:
     command = bench.command(MoveJoints(position_rad={"elbow": 2.0}), epoch=1)
     eventually(lambda: bench.telemetry().velocity_rad_s and bench.device._controller.moving)
     for _ in range(50):
-        bench.receive(topics.STOP, codec.encode(Stop(id="s1", by="cat", reason="smoke")))
+        bench.receive(topics.STOP, codec.encode(Stop(id="s1", caller="cat", reason="smoke")))
     assert bench.end(command).status is AckStatus.FAILED
-    assert event(bench, EventKind.STOP_LATCHED).data == {"by": "cat", "reason": "smoke"}
-    assert event(bench, EventKind.HELD).data == {"code": "stopped", "epoch": 1}
+    assert event(bench, EventKind.STOP_LATCHED).data == {"caller": "cat", "reason": "smoke"}
+    assert event(bench, EventKind.MOTION_HELD).data == {"code": "stopped", "epoch": 1}
     assert event(bench, EventKind.ACTION_LOST).data == {"code": "stopped", "epoch": 1}
     assert event(bench, EventKind.LEASE_ENDED).data["code"] == "stopped"
     bench.end(bench.command(ResetStop(), epoch=2))
-    assert event(bench, EventKind.STOP_RESET).data == {"by": "ann"}
+    assert event(bench, EventKind.STOP_RESET).data == {"caller": "ann"}
     told = bench.heard(topics.EVENT, Event)
     assert len(told) == len({each.id for each in told}) <= 8, "fifty Stops are one fact"
 
@@ -113,32 +113,32 @@ def test_a_reset_of_nothing_is_no_event(bench: Bench) -> None:
 def test_a_flood_of_setpoints_without_a_lease_is_one_event(bench: Bench) -> None:
     for number in range(200):
         bench.setpoint(epoch=7, sequence=number + 1)
-    refused = event(bench, EventKind.SETPOINTS_REFUSED)
+    refused = event(bench, EventKind.SETPOINTS_REJECTED)
     assert refused.data == {"code": "no_lease"}
     assert refused.severity == "warning"
     bench.device.stop()
-    eventually(lambda: len(events(bench, EventKind.SETPOINTS_REFUSED)) == 2)
-    first, rest = events(bench, EventKind.SETPOINTS_REFUSED)
+    eventually(lambda: len(events(bench, EventKind.SETPOINTS_REJECTED)) == 2)
+    first, rest = events(bench, EventKind.SETPOINTS_REJECTED)
     assert (first.id, rest.data) == (refused.id, {"code": "no_lease", "count": 199})
 
 
 def test_refused_commands_are_told_with_what_could_be_read(bench: Bench) -> None:
     bench.receive(topics.CMD, signing.sign(b"{}", signing.generate()))
-    assert event(bench, EventKind.COMMAND_REFUSED).data == {"code": "bad_signature"}
+    assert event(bench, EventKind.COMMAND_REJECTED).data == {"code": "bad_signature"}
     bench.command(StopDevice(reason=""), device="other")
-    eventually(lambda: events(bench, EventKind.COMMAND_REFUSED)[-1].data["code"] == "wrong_address")
+    eventually(lambda: events(bench, EventKind.COMMAND_REJECTED)[-1].data["code"] == "wrong_address")
     command = bench.command(MoveJoints(position_rad={"elbow": 1.0}), epoch=3, issued_at_ms=1)
     bench.end(command)
-    expected = {"code": "expired", "command": command, "request": "move_joints", "who": "ann", "epoch": 3}
-    eventually(lambda: events(bench, EventKind.COMMAND_REFUSED)[-1].data == expected)
+    expected = {"code": "expired", "command": command, "request": "move_joints", "caller": "ann", "epoch": 3}
+    eventually(lambda: events(bench, EventKind.COMMAND_REJECTED)[-1].data == expected)
     signed = signing.sign(b"{}", bench.key)
     bench.receive(topics.CMD, signed)
-    eventually(lambda: events(bench, EventKind.COMMAND_REFUSED)[-1].data == {"code": "malformed"})
+    eventually(lambda: events(bench, EventKind.COMMAND_REJECTED)[-1].data == {"code": "malformed"})
 
 
 def test_a_stop_that_cannot_be_read_is_told(bench: Bench) -> None:
     bench.receive(topics.STOP, b"stop!")
-    assert event(bench, EventKind.STOP_REFUSED).data == {"code": "malformed"}
+    assert event(bench, EventKind.STOP_REJECTED).data == {"code": "malformed"}
 
 
 def test_a_driver_that_fails_and_comes_back_is_told(bench: Bench) -> None:
@@ -167,7 +167,7 @@ def test_a_journal_that_cannot_be_written_is_told_and_the_command_not_obeyed(
         assert failed.severity == "error"
         assert "disk full" in failed.message
         assert bench.device._controller.lease(0.0) is None
-        bench.receive(topics.STOP, codec.encode(Stop(id="s1", by="cat")))
+        bench.receive(topics.STOP, codec.encode(Stop(id="s1", caller="cat")))
         eventually(lambda: bench.device._controller.mode is Mode.STOPPED)
         time.sleep(0.3)
     eventually(lambda: bench.journal.device("arm").latch is not None)
@@ -187,7 +187,7 @@ def test_commands_beyond_what_can_wait_are_refused_and_told(bench: Bench, monkey
 
     monkeypatch.setattr(bench.device._office._commands, "put_nowait", full)
     bench.command(ResetStop())
-    assert event(bench, EventKind.COMMAND_REFUSED).data == {"code": "overrun"}
+    assert event(bench, EventKind.COMMAND_REJECTED).data == {"code": "overrun"}
 
 
 def test_a_mistake_in_the_office_ends_neither_the_office_nor_the_device(
@@ -221,7 +221,7 @@ def test_a_room_that_is_not_known_holds_and_is_shown(tmp_path: Path) -> None:
     bench = Bench(tmp_path, interlocks=(rule,))
     bench.device.start()
     bench.device.link_changed(True)
-    (acted,) = eventually(lambda: events(bench, EventKind.INTERLOCK_ACTED))
+    (acted,) = eventually(lambda: events(bench, EventKind.INTERLOCK_ENGAGED))
     assert acted.data["interlock"] == rule.name
     (shown,) = eventually(lambda: [state.restrictions for state in bench.heard(topics.STATE, State)][-1:])
     assert [(each.source, each.speed) for each in shown] == [(rule.name, 0.0)]

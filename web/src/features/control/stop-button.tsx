@@ -35,7 +35,7 @@ function Latched({ device, stop }: StopBannerProps) {
     <>
       <div>
         <strong class="big">{texts.stop.latched}</strong>{" "}
-        {latch !== undefined && latch !== null && texts.stop.by(latch.by, latch.reason)}
+        {latch !== undefined && latch !== null && texts.stop.by(latch.caller, latch.reason)}
         <p>{texts.stop.explain}</p>
       </div>
       {asking ? (

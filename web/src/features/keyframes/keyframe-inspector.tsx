@@ -112,7 +112,7 @@ export function NumberField({ id, label, value, digits, onSet }: NumberFieldProp
 
 function Joints({ editor, index, keyframe, measured }: PartProps & { measured: Positions | null }) {
   const { robot } = editor;
-  const followers = new Set(robot.mirrors.map(({ joint }) => joint));
+  const followers = new Set(robot.mimic_joints.map(({ joint }) => joint));
   const pose = editor.poseAtKeyframe(index);
   const wrong = new Set(editor.problems.value.flatMap(({ keyframe: at, joint }) => (at === index && joint !== null ? [joint] : [])));
   return (

@@ -1,9 +1,9 @@
 /** All that a device can be asked to do: one union, whoever asks. Which of it a device takes, its description says. */
 import type {
   CaptureRaw,
+  CollectData,
   Drive,
   Express,
-  Gather,
   GoTo,
   LookAt,
   MoveJoints,
@@ -12,7 +12,7 @@ import type {
   Say,
   SetControl,
   SetStiffness,
-  Shoot,
+  TakePicture,
   TakePosture,
 } from "../mqtt/protocol.generated";
 
@@ -37,7 +37,7 @@ export type RobotRequest =
   | GoTo;
 
 /** What is asked of a room device. */
-export type RoomRequest = Gather | Shoot | CaptureRaw | SetControl;
+export type RoomRequest = CollectData | TakePicture | CaptureRaw | SetControl;
 
 export type AnyRequest = RobotRequest | RoomRequest;
 

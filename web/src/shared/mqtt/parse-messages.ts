@@ -20,9 +20,9 @@ import type {
   JointTelemetry,
   LeaseState,
   Measurements,
-  Mirror,
+  MimicJoint,
   Mode,
-  Narrowing,
+  PositionDependentLimit,
   OpenRequest,
   Presence,
   Reason,
@@ -146,8 +146,8 @@ const joint = object<Joint>({
   max_effort_nm: number,
 });
 
-const mirror = object<Required<Mirror>>({ joint: text, of: text, factor: optional(number, 1) });
-const narrowing = object<Narrowing>({ joint: text, by: text, table: list(vector3, 200) });
+const mimicJoint = object<Required<MimicJoint>>({ joint: text, mimics: text, multiplier: optional(number, 1) });
+const positionDependentLimit = object<PositionDependentLimit>({ joint: text, depends_on: text, table: list(vector3, 200) });
 
 const stream = object<Stream>({ name: text, rate_hz: number });
 
@@ -171,7 +171,7 @@ const diagnostic = object<Required<Diagnostic>>({
   warning_high: nullable(number),
   change: nullable(number),
   horizon_s: optional(number, 0),
-  questions: optional(list(text, MAX_JOINTS), []),
+  checks: optional(list(text, MAX_JOINTS), []),
 });
 
 const description = object<KnownDescription>({
@@ -180,8 +180,8 @@ const description = object<KnownDescription>({
   robot_type: text,
   label: text,
   joints: optional(list(joint, MAX_JOINTS), []),
-  mirrors: optional(list(mirror, MAX_JOINTS), []),
-  narrowing: optional(list(narrowing, MAX_JOINTS), []),
+  mimic_joints: optional(list(mimicJoint, MAX_JOINTS), []),
+  position_dependent_limits: optional(list(positionDependentLimit, MAX_JOINTS), []),
   frames: optional(list(text, MAX_JOINTS), []),
   capabilities: optional(list(text, MAX_JOINTS), []),
   actions: optional(list(text, MAX_JOINTS), []),
@@ -196,7 +196,7 @@ const description = object<KnownDescription>({
   max_loop_age_ms: optional(count, 0),
   simulated: optional(flag, false),
   limits: optional(list(text, MAX_JOINTS), []),
-  scripts: optional(oneOf("jailed", "refused", "trusted"), "refused"),
+  scripts: optional(oneOf("sandboxed", "unavailable", "unconfined"), "unavailable"),
   scripts_note: optional(text, ""),
   interlocks: optional(
     list(object<InterlockRule>({ name: text, action: oneOf("slow", "hold"), speed: number, stale_ms: count }), MAX_JOINTS),
@@ -242,14 +242,14 @@ const state = object<Required<State>>({
   mode,
   epoch: count,
   ended_epoch: optional(count, 0),
-  stop: nullable(object<StopLatch>({ by: text, reason: text, at_ms: count })),
+  stop: nullable(object<StopLatch>({ caller: text, reason: text, at_ms: count })),
   lease: nullable<LeaseState>(
     object<Required<LeaseState>>({
       holder: text,
       epoch: count,
       expires_in_ms: count,
       reason: optional(text, ""),
-      request: nullable(object<OpenRequest>({ id: text, by: text, expires_in_ms: count })),
+      request: nullable(object<OpenRequest>({ id: text, requester: text, expires_in_ms: count })),
     }),
   ),
   action: nullable<ActionState>(
@@ -261,7 +261,7 @@ const state = object<Required<State>>({
     }),
   ),
   faults: optional(list(object<Fault>({ code: text, message: text, since_ms: count }), MAX_JOINTS), []),
-  restrictions: optional(list(object<Restriction>({ source: text, speed: number, why: text }), MAX_JOINTS), []),
+  restrictions: optional(list(object<Restriction>({ source: text, speed: number, reason: text }), MAX_JOINTS), []),
   stiffness: optional(byName, {}),
 });
 
@@ -332,9 +332,9 @@ function read<T>(payload: Uint8Array, check: Check<T>, name: string): T {
 }
 
 export type KnownDiagnostic = Required<Diagnostic>;
-export type KnownDescription = Required<Omit<Description, "diagnostics" | "mirrors">> & {
+export type KnownDescription = Required<Omit<Description, "diagnostics" | "mimic_joints">> & {
   diagnostics: KnownDiagnostic[];
-  mirrors: Required<Mirror>[];
+  mimic_joints: Required<MimicJoint>[];
 };
 export type KnownBody = Required<Body>;
 export interface KnownTwin {

@@ -39,8 +39,8 @@ export interface Description {
   robot_type: string;
   label: string;
   joints?: Joint[];
-  mirrors?: Mirror[];
-  narrowing?: Narrowing[];
+  mimic_joints?: MimicJoint[];
+  position_dependent_limits?: PositionDependentLimit[];
   frames?: string[];
   capabilities?: string[];
   actions?: string[];
@@ -59,7 +59,7 @@ export interface Description {
   diagnostics?: Diagnostic[];
   position_m?: [number, number, number] | null;
   base?: BaseLimits | null;
-  scripts?: "jailed" | "refused" | "trusted";
+  scripts?: "sandboxed" | "unavailable" | "unconfined";
   scripts_note?: string;
 }
 
@@ -82,10 +82,10 @@ export interface Joint {
  * joint: The one that only follows: at `factor` times the position of
  * of: the joint that counts. Whoever names either moves both.
  */
-export interface Mirror {
+export interface MimicJoint {
   joint: string;
-  of: string;
-  factor?: number;
+  mimics: string;
+  multiplier?: number;
 }
 
 /**
@@ -96,9 +96,9 @@ export interface Mirror {
  * table: Rows of `by`'s position and the range there, lower and upper [rad]; linear in between. It reaches over
  * all of `by`'s range.
  */
-export interface Narrowing {
+export interface PositionDependentLimit {
   joint: string;
-  by: string;
+  depends_on: string;
   table: [number, number, number][];
 }
 
@@ -158,7 +158,7 @@ export interface Diagnostic {
   warning_high?: number | null;
   change?: number | null;
   horizon_s?: number;
-  questions?: string[];
+  checks?: string[];
 }
 
 /** How fast a base may be driven: forward or back, to a side (0: it cannot), turning. */
@@ -241,7 +241,7 @@ export type Mode = "action" | "fault" | "holding" | "idle" | "stopped" | "stream
 
 /** Who stopped the device, and when. There until somebody who may resets it. */
 export interface StopLatch {
-  by: string;
+  caller: string;
   reason: string;
   at_ms: number;
 }
@@ -264,7 +264,7 @@ export interface LeaseState {
 export interface OpenRequest {
   /** letters, digits, _ and -, 1 to 64 of them */
   id: string;
-  by: string;
+  requester: string;
   expires_in_ms: number;
 }
 
@@ -288,7 +288,7 @@ export interface Fault {
 export interface Restriction {
   source: string;
   speed: number;
-  why: string;
+  reason: string;
 }
 
 /**
@@ -383,7 +383,7 @@ export interface Command {
   device: string;
   issued_at_ms: number;
   ttl_ms: number;
-  who: string;
+  caller: string;
   epoch: number;
   request: GrantLease | ReleaseLease | RequestControl | WithdrawRequest | RunMovement | MoveJoints | MovePose | Say | Express | TakePosture | RunBehaviour | SetStiffness | LookAt | Drive | GoTo | CollectData | TakePicture | CaptureRaw | SetControl | CancelAction | StopDevice | ResetStop | RotateKey;
 }
@@ -410,7 +410,7 @@ export interface RequestControl {
   kind: "ask_lease";
   /** letters, digits, _ and -, 1 to 64 of them */
   request: string;
-  by: string;
+  requester: string;
   answer_within_ms: number;
 }
 
@@ -643,7 +643,7 @@ export interface DriveTarget {
 export interface Stop {
   /** letters, digits, _ and -, 1 to 64 of them */
   id: string;
-  by: string;
+  caller: string;
   reason?: string;
 }
 

@@ -278,7 +278,7 @@ def test_what_is_not_done_says_why_and_in_which_line(bench: Bench, call: str, sa
 def test_stop_ends_a_skill_and_nothing_more_is_performed(bench: Bench) -> None:
     running = bench.command(bench.script("robot.behaviour('dance')\nrobot.say('still here')"), epoch=1)
     eventually(lambda: driver_of(bench).performed)
-    bench.receive(topics.STOP, msgspec.json.encode(Stop(id="s1", by="bob", reason="smoke")))
+    bench.receive(topics.STOP, msgspec.json.encode(Stop(id="s1", caller="bob", reason="smoke")))
     reason = bench.end(running).reason
     assert reason is not None
     assert reason.code == "stopped"
@@ -289,7 +289,7 @@ def test_stop_ends_a_skill_and_nothing_more_is_performed(bench: Bench) -> None:
 def test_stop_ends_a_move_of_a_script_and_the_script(bench: Bench) -> None:
     running = bench.command(bench.script("print('off')\nrobot.move_joints({'elbow': 2.5}, speed=0.05)"), epoch=1)
     eventually(lambda: bench.driver.position[1] > 1e-4)
-    bench.receive(topics.STOP, msgspec.json.encode(Stop(id="s1", by="bob", reason="smoke")))
+    bench.receive(topics.STOP, msgspec.json.encode(Stop(id="s1", caller="bob", reason="smoke")))
     reason = bench.end(running).reason
     assert reason is not None
     assert reason.code == "stopped"
@@ -345,9 +345,9 @@ def test_a_move_says_what_limited_it(bench: Bench) -> None:
     assert ack.result["limited"] == ["interlock: somebody is near"]
 
 
-@pytest.mark.parametrize("how", ["refused", "trusted"])
+@pytest.mark.parametrize("how", ["unavailable", "unconfined"])
 def test_where_scripts_cannot_be_locked_in_it_is_said_at_once(
-    tmp_path: Path, how: Literal["refused", "trusted"]
+    tmp_path: Path, how: Literal["unavailable", "unconfined"]
 ) -> None:
     bench = Bench(tmp_path, jail=NoJail(how))
     bench.device.start()
@@ -363,7 +363,7 @@ def test_where_scripts_cannot_be_locked_in_it_is_said_at_once(
 
 def test_where_the_jail_holds_desc_says_so(bench: Bench) -> None:
     described: Description = eventually(lambda: bench.heard(topics.DESC, Description))[0]
-    assert (described.scripts, described.scripts_note) == ("jailed", "")
+    assert (described.scripts, described.scripts_note) == ("sandboxed", "")
 
 
 def test_an_agent_that_is_shut_down_ends_the_script(bench: Bench) -> None:

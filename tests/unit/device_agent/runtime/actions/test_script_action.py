@@ -91,7 +91,7 @@ class FakeJail:
         pass
 
     def standing(self) -> SandboxStatus:
-        return SandboxStatus("jailed")
+        return SandboxStatus("sandboxed")
 
     def refusal(self, *, stranger: bool) -> str | None:
         del stranger
@@ -329,7 +329,7 @@ def test_without_a_process_it_says_why() -> None:
 
 def test_a_jail_that_does_not_hold_gets_no_script() -> None:
     inmate = FakeInmate()
-    inmate.say(b'{"kind": "unfit", "why": "landlock: no"}')
+    inmate.say(b'{"kind": "unfit", "reason": "landlock: no"}')
     with pytest.raises(ScriptFailed, match="the jail does not hold: landlock: no"):
         run_fake(inmate)
 

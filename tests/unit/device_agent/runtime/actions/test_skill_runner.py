@@ -139,7 +139,7 @@ def servos(bench: Bench) -> Servos:
 
 
 def said(bench: Bench) -> list[Event]:
-    return [event for event in bench.heard(topics.EVENT, Event) if event.kind == "said"]
+    return [event for event in bench.heard(topics.EVENT, Event) if event.kind == "speech-started"]
 
 
 def ends(bench: Bench, request: Any, epoch: int = 1) -> AckStatus:
@@ -203,7 +203,7 @@ def test_stop_ends_speech_without_a_mouth(tmp_path: Path) -> None:
     bench = make(tmp_path, kind=msgspec.structs.replace(actor(), visemes={}))
     running = bench.command(Say(text="a" * 1000), epoch=1)
     eventually(lambda: said(bench))
-    bench.receive(topics.STOP, msgspec.json.encode(Stop(id="s1", by="bob", reason="enough")))
+    bench.receive(topics.STOP, msgspec.json.encode(Stop(id="s1", caller="bob", reason="enough")))
     reason = bench.end(running).reason
     assert reason is not None
     assert reason.code == "stopped"
@@ -248,7 +248,7 @@ def test_an_unknown_behaviour_is_refused_with_those_there_are(bench: Bench) -> N
 def test_stop_ends_a_behaviour_before_its_next_words(bench: Bench) -> None:
     running = bench.command(RunBehaviour(name="speech"), epoch=1)
     eventually(lambda: said(bench))
-    bench.receive(topics.STOP, msgspec.json.encode(Stop(id="s1", by="bob", reason="enough")))
+    bench.receive(topics.STOP, msgspec.json.encode(Stop(id="s1", caller="bob", reason="enough")))
     reason = bench.end(running).reason
     assert reason is not None
     assert reason.code == "stopped"

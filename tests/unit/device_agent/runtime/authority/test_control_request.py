@@ -8,7 +8,7 @@ from device_agent.runtime.authority.lease_gate import Lease
 from device_agent.runtime.errors import Refused
 
 LEASE = Lease("ann", 5, 1_000.0)
-ASKED = RequestControl(request="r1", by="bob", answer_within_ms=30_000)
+ASKED = RequestControl(request="r1", requester="bob", answer_within_ms=30_000)
 
 
 def asked(handover: PendingControlRequest, lease: Lease | None = LEASE, now_s: float = 100.0) -> str | None:
@@ -49,7 +49,9 @@ def test_the_end_of_a_request_counts_even_before_the_request_itself_and_for_no_o
     handover.drop("r1")
     handover.ask(ASKED, epoch=5, lease=LEASE, now_s=100.0)
     assert asked(handover) is None
-    handover.ask(RequestControl(request="r2", by="cid", answer_within_ms=1_000), epoch=5, lease=LEASE, now_s=100.0)
+    handover.ask(
+        RequestControl(request="r2", requester="cid", answer_within_ms=1_000), epoch=5, lease=LEASE, now_s=100.0
+    )
     handover.drop("r1")
     assert asked(handover) == "r2"
     handover.drop("r2")

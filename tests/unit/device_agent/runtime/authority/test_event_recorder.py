@@ -6,7 +6,7 @@ from device_agent.runtime.authority.event_recorder import GAP_S, EventRecord, Ev
 
 
 def refusal(message: str = "too late") -> EventRecord:
-    return EventRecord(EventKind.SETPOINTS_REFUSED, message, "warning", {"code": "too_old"})
+    return EventRecord(EventKind.SETPOINTS_REJECTED, message, "warning", {"code": "too_old"})
 
 
 def test_facts_come_out_once_in_their_order_with_their_own_time() -> None:
@@ -48,14 +48,14 @@ def test_different_codes_are_told_by_themselves_up_to_a_bound_and_the_rest_is_co
         audit.refused(refusal(), code=f"code{number}", now_s=0.0)
     told = audit.take(0.0)
     assert len(told) == module._MOST_COUNTED + 1
-    assert (told[-1].kind, told[-1].data) == (EventKind.EVENTS_LOST, {"count": 3})
+    assert (told[-1].kind, told[-1].data) == (EventKind.EVENTS_DROPPED, {"count": 3})
     assert audit.take(0.1) == []
 
 
 def test_an_office_that_is_stuck_costs_no_memory() -> None:
     audit = EventRecorder()
     for _ in range(module._MOST_WAITING + 7):
-        audit.note(EventRecord(EventKind.HELD, "held"))
+        audit.note(EventRecord(EventKind.MOTION_HELD, "held"))
     told = audit.take(0.0)
     assert len(told) == module._MOST_WAITING + 1
     assert told[-1].data == {"count": 7}

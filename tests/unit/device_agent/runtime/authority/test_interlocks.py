@@ -112,7 +112,7 @@ def test_a_room_that_is_not_known_yet_holds() -> None:
     bench = Bench(rule(equals=True))
     assert bench.step() == [(NAME, 0.0, "nothing was heard yet of pir/presence")]
     assert bench.step(1.0) == [], "once"
-    assert [happened.kind for happened in bench.told] == [EventKind.INTERLOCK_ACTED]
+    assert [happened.kind for happened in bench.told] == [EventKind.INTERLOCK_ENGAGED]
 
 
 def test_presence_slows_absence_frees_and_silence_slows_again() -> None:
@@ -129,8 +129,8 @@ def test_presence_slows_absence_frees_and_silence_slows_again() -> None:
     bench.measure(present=False)
     assert bench.step() == [(NAME,)]
     kinds = [happened.kind for happened in bench.told]
-    assert kinds == [EventKind.INTERLOCK_ACTED, EventKind.INTERLOCK_CLEARED] * 2
-    assert bench.told[0].data == {"interlock": NAME, "action": "slow", "why": "present = true"}
+    assert kinds == [EventKind.INTERLOCK_ENGAGED, EventKind.INTERLOCK_CLEARED] * 2
+    assert bench.told[0].data == {"interlock": NAME, "action": "slow", "reason": "present = true"}
 
 
 def test_each_rule_acts_by_itself() -> None:

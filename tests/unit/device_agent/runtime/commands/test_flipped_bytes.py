@@ -23,7 +23,7 @@ def envelope(request: Request) -> bytes:
         device="arm",
         issued_at_ms=1000,
         ttl_ms=5000,
-        who="ann",
+        caller="ann",
         epoch=5,
         request=request,
     )

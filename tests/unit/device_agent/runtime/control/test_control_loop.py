@@ -195,7 +195,7 @@ def test_what_goes_wrong_in_a_setpoints_own_period_is_a_fault_until_the_driver_a
 
 
 def plainly(bench: Bench) -> None:
-    bench.receive(topics.STOP, codec.encode(Stop(id="s", by="ann", reason="")))
+    bench.receive(topics.STOP, codec.encode(Stop(id="s", caller="ann", reason="")))
 
 
 def signed(bench: Bench) -> None:
@@ -255,7 +255,7 @@ def test_a_stop_in_motion_brakes_at_once_and_by_no_more_than_has_passed() -> Non
     before_rad, speed_rad_s = desk.driver.position[1], desk.controller._motion.velocity_rad_s[1]
     commanded = len(desk.driver.threads)
     desk.loop._next_s = time.monotonic() + 0.004 - 0.001  # a quarter of the period has passed, or more
-    desk.controller.stop(StopLatch(by="bob", reason="", at_ms=1))
+    desk.controller.stop(StopLatch(caller="bob", reason="", at_ms=1))
     desk.loop.hurry()
     assert desk.controller.mode is Mode.STOPPED
     assert len(desk.driver.threads) == commanded + 1
@@ -269,7 +269,7 @@ def test_a_stop_in_motion_brakes_at_once_and_by_no_more_than_has_passed() -> Non
 def test_a_stop_waits_for_no_period_after_a_setpoints_own_either() -> None:
     desk = moving(period_ms=4)
     desk.loop._early = True
-    desk.controller.stop(StopLatch(by="bob", reason="", at_ms=1))
+    desk.controller.stop(StopLatch(caller="bob", reason="", at_ms=1))
     desk.loop.hurry()
     assert desk.controller.mode is Mode.STOPPED
 
@@ -284,7 +284,7 @@ def test_what_has_passed_is_never_more_than_a_period_and_never_nothing() -> None
 
 def test_a_stop_waits_for_the_end_of_a_period_that_may_not_know_of_it() -> None:
     desk = moving(period_ms=100, periods=3)
-    desk.controller.stop(StopLatch(by="bob", reason="", at_ms=1))
+    desk.controller.stop(StopLatch(caller="bob", reason="", at_ms=1))
     desk.loop._turn.acquire()
     threading.Timer(0.05, desk.loop._turn.release).start()
     desk.loop.hurry()

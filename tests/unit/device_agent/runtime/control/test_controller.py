@@ -120,7 +120,7 @@ def test_stop_latches_and_reset_resumes_nothing() -> None:
     rig = Rig()
     rig.take(1)
     rig.stream(1, 1.0)
-    rig.controller.stop(StopLatch(by="bob", reason="", at_ms=1))
+    rig.controller.stop(StopLatch(caller="bob", reason="", at_ms=1))
     assert rig.at_rest_after(0.5) < 0.2
     assert rig.controller.mode is Mode.STOPPED
     rig.take(2)
@@ -142,9 +142,9 @@ def test_stop_latches_and_reset_resumes_nothing() -> None:
 def test_a_reset_that_comes_again_or_late_does_not_release_a_later_stop() -> None:
     rig = Rig()
     rig.take(1)
-    rig.controller.stop(StopLatch(by="bob", reason="", at_ms=1))
+    rig.controller.stop(StopLatch(caller="bob", reason="", at_ms=1))
     rig.controller.reset_stop(epoch=3)
-    rig.controller.stop(StopLatch(by="eve", reason="", at_ms=2))
+    rig.controller.stop(StopLatch(caller="eve", reason="", at_ms=2))
     for epoch, code in ((3, "lease_ended"), (2, "stale_epoch"), (0, "stale_epoch")):
         with pytest.raises(Refused) as refused:
             rig.controller.reset_stop(epoch=epoch)
@@ -157,7 +157,7 @@ def test_a_reset_that_comes_again_or_late_does_not_release_a_later_stop() -> Non
 def test_what_was_ordered_before_a_reset_is_not_obeyed_after_it() -> None:
     rig = Rig()
     rig.take(1)
-    rig.controller.stop(StopLatch(by="bob", reason="", at_ms=1))
+    rig.controller.stop(StopLatch(caller="bob", reason="", at_ms=1))
     rig.controller.reset_stop(epoch=3)
     for epoch in (1, 2, 3):
         with pytest.raises(Refused) as refused:
@@ -169,10 +169,10 @@ def test_what_was_ordered_before_a_reset_is_not_obeyed_after_it() -> None:
 
 def test_the_first_stop_stays_the_one_shown() -> None:
     rig = Rig()
-    rig.controller.stop(StopLatch(by="bob", reason="", at_ms=1))
-    rig.controller.stop(StopLatch(by="eve", reason="", at_ms=2))
+    rig.controller.stop(StopLatch(caller="bob", reason="", at_ms=1))
+    rig.controller.stop(StopLatch(caller="eve", reason="", at_ms=2))
     assert rig.controller.latch is not None
-    assert rig.controller.latch.by == "bob"
+    assert rig.controller.latch.caller == "bob"
 
 
 def test_a_move_reaches_its_target_and_says_so() -> None:

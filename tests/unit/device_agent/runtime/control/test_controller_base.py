@@ -132,7 +132,7 @@ def test_a_driver_that_comes_back_finds_the_base_at_rest() -> None:
 
 def test_a_stop_while_nothing_moves_leaves_the_base_at_rest() -> None:
     rig = Rig(base=BASE)
-    rig.controller.stop(StopLatch(by="bob", reason="", at_ms=1))
+    rig.controller.stop(StopLatch(caller="bob", reason="", at_ms=1))
     assert twists(rig, 0.1)[-1] == REST
 
 

@@ -201,7 +201,7 @@ class Chance:
             self.tenure = None
 
     def stop(self) -> None:
-        self.controller.stop(StopLatch(by="bob", reason="", at_ms=1))
+        self.controller.stop(StopLatch(caller="bob", reason="", at_ms=1))
         self.taken_away()
         if self.random.random() < 0.7:
             self.tick(self.random.uniform(0.02, 1.0) * PERIOD_S)

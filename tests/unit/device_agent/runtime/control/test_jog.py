@@ -203,7 +203,7 @@ def test_an_action_that_begins_takes_the_base_from_the_joystick() -> None:
 def test_stop_brakes_a_base_that_is_driven_and_nothing_resumes() -> None:
     rig = jogger(base=True)
     rig.hold(DriveTarget(forward_m_s=0.3), 1.0)
-    rig.controller.stop(StopLatch(by="ann", reason="", at_ms=0))
+    rig.controller.stop(StopLatch(caller="ann", reason="", at_ms=0))
     rig.rest(0.3)
     assert rig.twists[-1] == pytest.approx((0.0, 0.0, 0.0), abs=1e-6)
     rig.controller.reset_stop(epoch=2)

@@ -32,7 +32,9 @@ def test_a_way_that_begins_elsewhere_is_not_taken() -> None:
 
 
 def test_without_joints_there_is_nothing_to_plan() -> None:
-    motion = JointMotion(msgspec.structs.replace(head(), joints=(), mirrors=(), narrowing=(), home_rad={}))
+    motion = JointMotion(
+        msgspec.structs.replace(head(), joints=(), mimic_joints=(), position_dependent_limits=(), home_rad={})
+    )
     assert motion.propose() == [[], []]
     assert motion.update() == []
     assert motion.reached

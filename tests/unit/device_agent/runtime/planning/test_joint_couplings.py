@@ -57,7 +57,7 @@ class Neck:
         tick = self.controller.step(self.now_s)
         self.limited |= set(tick.limited)
         yaw, pitch, left, right = tick.position_rad
-        lower, upper = self.kind.narrowing[0].at(yaw)
+        lower, upper = self.kind.position_dependent_limits[0].at(yaw)
         assert lower <= pitch <= upper, f"pitch {pitch} at yaw {yaw}"
         assert right == left * FACTOR
         for (low, high), now, before in zip(RANGES, tick.position_rad, self.position, strict=True):
@@ -105,7 +105,7 @@ def live(neck: Neck, life: list[tuple[str, dict[str, float], int]]) -> None:
     for act, position_rad, periods in life:
         match act:
             case "stop":
-                neck.controller.stop(StopLatch(by="bob", reason="", at_ms=0))
+                neck.controller.stop(StopLatch(caller="bob", reason="", at_ms=0))
             case "move":
                 tenure = neck.controller.begin_action(epoch=neck.epoch, on_lost=lambda _: None)
                 with suppress(Refused):
@@ -145,7 +145,7 @@ def test_no_command_ever_leaves_the_range_that_is_left_in_thousands_of_lives(
 @pytest.mark.parametrize("table", [WIDE, BENT], ids=["wide", "bent"])
 def test_from_corner_to_corner_it_arrives(table: tuple[tuple[float, float, float], ...]) -> None:
     neck = Neck(table)
-    narrowing = neck.kind.narrowing[0]
+    narrowing = neck.kind.position_dependent_limits[0]
     for yaw in (2.0, -2.0, 0.0, 2.0):
         for edge in narrowing.at(yaw):
             assert neck.move(yaw=yaw, pitch=edge) is GoalResult.REACHED

@@ -231,7 +231,7 @@ def test_who_cannot_see_the_room_or_waits_in_vain_says_so(monkeypatch: pytest.Mo
 
 def test_an_errand_that_loses_the_device_ends() -> None:
     toy = Toy(room())
-    threading.Timer(0.3, lambda: toy.rig.controller.stop(StopLatch(by="ann", reason="", at_ms=0))).start()
+    threading.Timer(0.3, lambda: toy.rig.controller.stop(StopLatch(caller="ann", reason="", at_ms=0))).start()
     with pytest.raises(Refused, match="stopped"):
         toy.robot.do(GoTo(x_m=1.5, y_m=0.0))
     toy.end()

@@ -417,9 +417,9 @@ def test_what_it_measures_is_what_the_agents_others_read_of_the_room(bench: Room
 
 def test_stop_by_message_latches(bench: RoomBench) -> None:
     bench.device.link_changed(True)
-    bench.receive(topics.STOP, b'{"id":"x","by":"ann"}')
+    bench.receive(topics.STOP, b'{"id":"x","caller":"ann"}')
     assert shown(bench, lambda state: state.stop).mode in {Mode.STOPPED, Mode.IDLE}
-    assert Stop(id="x", by="ann").by == shown(bench, lambda state: state.stop).stop.by  # type: ignore[union-attr]
+    assert Stop(id="x", caller="ann").caller == shown(bench, lambda state: state.stop).stop.caller  # type: ignore[union-attr]
 
 
 def test_it_lets_the_driver_go_at_the_end_also_when_it_is_ended_twice(tmp_path: Path) -> None:

@@ -75,13 +75,13 @@ def test_epochs_and_latch_survive_and_epochs_never_fall(tmp_path: Path) -> None:
     before.open(now_ms=0)
     before.save_epoch("arm", epoch=7, burned=5)
     before.save_epoch("arm", epoch=3, burned=6)
-    before.save_latch("arm", StopLatch(by="ann", reason="smoke", at_ms=1))
+    before.save_latch("arm", StopLatch(caller="ann", reason="smoke", at_ms=1))
     after = Journal(tmp_path / "journal.db")
     after.open(now_ms=0)
     record = after.device("arm")
     assert (record.epoch, record.burned) == (7, 6)
     assert record.latch is not None
-    assert record.latch.by == "ann"
+    assert record.latch.caller == "ann"
     after.save_latch("arm", None)
     assert after.device("arm").latch is None
     assert after.device("other").epoch == 0

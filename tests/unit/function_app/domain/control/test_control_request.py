@@ -135,7 +135,7 @@ def test_an_event_names_who_had_control() -> None:
         "data": {},
     }
     left = control_ended(HELD, Lease(epoch=2), why="moved", now_ms=START)
-    assert (left.fact, left.data) == (Fact.ENDED, {"epoch": 2, "holder": "anna", "why": "moved"})
+    assert (left.fact, left.data) == (Fact.ENDED, {"epoch": 2, "holder": "anna", "reason": "moved"})
 
 
 Step = tuple[str, Identity, int]

@@ -83,7 +83,7 @@ export class StopSwitch {
     const at = now();
     this.#problem.value = null;
     this.#pressed.value = { kind: "sending", at, doubtful: false };
-    const message: Stop = { id: newId(), by: this.#by.slice(0, 200), reason };
+    const message: Stop = { id: newId(), caller: this.#by.slice(0, 200), reason };
     clearInterval(this.#timer);
     this.#timer = setInterval(() => {
       const age = now() - at;

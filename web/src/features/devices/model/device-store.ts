@@ -161,7 +161,7 @@ export class DeviceStore {
     const lease = this.#lease.value;
     if (told !== null && told.epoch >= (lease?.epoch ?? 0)) {
       const { request } = told;
-      return request ? { id: request.id, by: request.by, until: this.#stateAt + request.expires_in_ms } : null;
+      return request ? { id: request.id, by: request.requester, until: this.#stateAt + request.expires_in_ms } : null;
     }
     const request = lease?.request ?? null;
     return request === null ? null : { id: request.id, by: request.by, until: onThisClock(Date.parse(request.expires_at)) };

@@ -191,7 +191,7 @@ export function watchedQuantity(watched: Watched, description: KnownDescription 
   const [name = field, ...part] = field.split(".");
   const limited = [low, high, warning_low, warning_high].some((limit) => limit !== null);
   const listed = label !== name;
-  const judged = { stream, fields: field, label, unit, advice, low, high, warning_low, warning_high, change: null, horizon_s: 0, questions: [] };
+  const judged = { stream, fields: field, label, unit, advice, low, high, warning_low, warning_high, change: null, horizon_s: 0, checks: [] };
   const known = { controls: description?.controls ?? [], diagnostics: limited || listed ? [judged] : [] };
   const quantity = quantityOf(known, stream, field);
   if (!listed) return { ...quantity, judged: limited ? judged : null };

@@ -50,7 +50,7 @@ export interface Movement {
 /** What the editor needs to know of a robot. */
 export type Robot = Pick<
   KnownDescription,
-  "joints" | "mirrors" | "narrowing" | "postures" | "expressions" | "behaviours" | "capabilities" | "actions"
+  "joints" | "mimic_joints" | "position_dependent_limits" | "postures" | "expressions" | "behaviours" | "capabilities" | "actions"
 >;
 
 export const LONGEST_S = 600;
@@ -84,10 +84,10 @@ export function withKeyframe(movement: Movement, index: number, change: (old: Ke
 
 /** Where a joint is at a keyframe [rad]; `null`: it passes there, on its way. */
 export function setPosition(movement: Movement, index: number, joint: Joint, position: number | null, robot: Robot): Movement {
-  const mirror = robot.mirrors.find((one) => one.joint === joint.name);
-  const leader = robot.joints.find((one) => one.name === mirror?.of);
+  const mirror = robot.mimic_joints.find((one) => one.joint === joint.name);
+  const leader = robot.joints.find((one) => one.name === mirror?.mimics);
   if (mirror !== undefined && leader !== undefined) {
-    return setPosition(movement, index, leader, position === null ? null : position / mirror.factor, robot);
+    return setPosition(movement, index, leader, position === null ? null : position / mirror.multiplier, robot);
   }
   return withKeyframe(movement, index, (old) => {
     const all = { ...old.position_rad };
@@ -104,7 +104,7 @@ export function setPose(movement: Movement, index: number, positions: Positions,
 
 /** A whole pose as keyframes hold it. */
 export function poseOf(positions: Positions, robot: Robot): Positions {
-  const followers = new Set(robot.mirrors.map(({ joint }) => joint));
+  const followers = new Set(robot.mimic_joints.map(({ joint }) => joint));
   const counted = robot.joints.flatMap(({ name, lower_rad, upper_rad }) => {
     const value = positions[name];
     return value === undefined || followers.has(name) ? [] : [[name, tidy(value, lower_rad, upper_rad)] as const];
@@ -211,7 +211,7 @@ interface Piece {
 function pieces(keyframes: readonly Keyframe[], robot: Robot): Piece[] {
   const found: Piece[] = [];
   const rests = new Map<string, number>();
-  const followers = new Set(robot.mirrors.map(({ joint }) => joint));
+  const followers = new Set(robot.mimic_joints.map(({ joint }) => joint));
   for (const joint of robot.joints) {
     // Where a joint is before it is named first nobody knows; it is drawn where it is named first.
     const named = keyframes.find(({ position_rad }) => joint.name in position_rad);
@@ -301,21 +301,21 @@ function between(value: number, from: readonly number[], to: readonly number[]):
 /** Joints that hang together as they do: the range that narrows, and those that one motor moves. */
 export function poseAt(positions: Positions, robot: Robot): Positions {
   const all: Record<string, number> = { ...positions };
-  for (const { joint, by, table } of robot.narrowing) {
-    const [place, where] = [all[joint], all[by]];
+  for (const { joint, depends_on, table } of robot.position_dependent_limits) {
+    const [place, where] = [all[joint], all[depends_on]];
     if (place === undefined || where === undefined) continue;
     const [lower, upper] = room(table, where);
     all[joint] = clamp(place, lower, upper);
   }
-  for (const { joint, of, factor } of robot.mirrors) {
-    const leads = all[of];
-    if (leads !== undefined) all[joint] = leads * factor;
+  for (const { joint, mimics, multiplier } of robot.mimic_joints) {
+    const leads = all[mimics];
+    if (leads !== undefined) all[joint] = leads * multiplier;
   }
   return all;
 }
 
 /** The range that is left where the other joint is. */
-function room(table: KnownDescription["narrowing"][number]["table"], where: number): [number, number] {
+function room(table: KnownDescription["position_dependent_limits"][number]["table"], where: number): [number, number] {
   const by = table.map((row) => row[0]);
   return [1, 2].map((column) => between(where, by, table.map((row) => row[column] ?? NaN))) as [number, number];
 }
@@ -394,21 +394,21 @@ function placeProblems(movement: Movement, index: number, robot: Robot): Problem
   return Object.entries(positions).flatMap(([name, place]): Problem[] => {
     const joint = robot.joints.find((one) => one.name === name);
     if (joint === undefined) return [say(name, { kind: "unknown-joint" }, without(name))];
-    const mirror = robot.mirrors.find((one) => one.joint === name);
-    const leads = mirror === undefined ? undefined : positions[mirror.of];
-    if (mirror !== undefined && leads !== undefined && Math.abs(place - leads * mirror.factor) > SAME_RAD) {
-      return [say(name, { kind: "mirrored", of: mirror.of }, without(name))];
+    const mirror = robot.mimic_joints.find((one) => one.joint === name);
+    const leads = mirror === undefined ? undefined : positions[mirror.mimics];
+    if (mirror !== undefined && leads !== undefined && Math.abs(place - leads * mirror.multiplier) > SAME_RAD) {
+      return [say(name, { kind: "mirrored", of: mirror.mimics }, without(name))];
     }
     const { lower_rad, upper_rad } = joint;
     if (!(place >= lower_rad && place <= upper_rad)) {
       return [say(name, { kind: "range", lower_rad, upper_rad }, inside(name, lower_rad, upper_rad))];
     }
-    const narrowing = robot.narrowing.find((one) => one.joint === name);
-    const where = narrowing === undefined ? undefined : placeOf(movement, index, narrowing.by);
+    const narrowing = robot.position_dependent_limits.find((one) => one.joint === name);
+    const where = narrowing === undefined ? undefined : placeOf(movement, index, narrowing.depends_on);
     if (narrowing !== undefined && where !== undefined) {
       const [lower, upper] = room(narrowing.table, where);
       if (place < lower - SAME_RAD || place > upper + SAME_RAD) {
-        const what = { kind: "narrowed", lower_rad: lower, upper_rad: upper, by: narrowing.by } as const;
+        const what = { kind: "narrowed", lower_rad: lower, upper_rad: upper, by: narrowing.depends_on } as const;
         return [say(name, what, inside(name, lower, upper))];
       }
     }
@@ -463,7 +463,7 @@ export function can(robot: Robot, deed: Deed): boolean {
 /** Joints whose beginning nobody knows: the robot begins them from wherever it is. */
 function lateJoints(movement: Movement, robot: Robot): Problem[] {
   const first = movement.keyframes[0]?.position_rad ?? {};
-  const followers = new Set(robot.mirrors.map(({ joint }) => joint));
+  const followers = new Set(robot.mimic_joints.map(({ joint }) => joint));
   return robot.joints.flatMap(({ name }): Problem[] => {
     if (followers.has(name)) return [];
     const index = movement.keyframes.findIndex(({ position_rad }) => name in position_rad);

@@ -67,7 +67,7 @@ export class Recorder {
   /** What the robot said is a fact of this moment. */
   hearEvent(event: KnownEvent): void {
     const text = event.data["text"];
-    if (!this.#running.value || event.kind !== "said" || typeof text !== "string" || this.#last === null) return;
+    if (!this.#running.value || event.kind !== "speech-started" || typeof text !== "string" || this.#last === null) return;
     const begun_ms = this.#last.at_ms - (this.#samples.at(-1)?.time_s ?? 0) * 1000;
     this.#said.push({ time_s: Math.max(0, (event.at_ms - begun_ms) / 1000), text });
     this.#tell();

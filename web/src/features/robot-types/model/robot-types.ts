@@ -2,7 +2,7 @@
 import type { Http } from "../../../shared/api/http";
 import { readTwin, type KnownTwin } from "../../../shared/mqtt/parse-messages";
 import type { Robot } from "../../keyframes/model/keyframes";
-import type { Joint, Mirror, Narrowing } from "../../../shared/mqtt/protocol.generated";
+import type { Joint, MimicJoint, PositionDependentLimit } from "../../../shared/mqtt/protocol.generated";
 
 export type TypeState = "checking" | "ready" | "refused";
 
@@ -25,8 +25,8 @@ export interface RobotType {
   frames: string[];
   capabilities: string[];
   home_rad: Record<string, number>;
-  mirrors: Mirror[];
-  narrowing: Narrowing[];
+  mimic_joints: MimicJoint[];
+  position_dependent_limits: PositionDependentLimit[];
   postures: string[];
   expressions: string[];
   behaviours: string[];
@@ -76,9 +76,9 @@ interface TwinAnswer {
 }
 
 /** What the keyframe editor needs to know of any robot of a type. */
-export function robotOf({ joints, narrowing, mirrors, postures, expressions, behaviours, capabilities, actions }: RobotType): Robot {
-  const counted = mirrors.map(({ joint, of, factor = 1 }) => ({ joint, of, factor }));
-  return { joints, narrowing, mirrors: counted, postures, expressions, behaviours, capabilities, actions };
+export function robotOf({ joints, mimic_joints, position_dependent_limits, postures, expressions, behaviours, capabilities, actions }: RobotType): Robot {
+  const complete = mimic_joints.map(({ joint, mimics, multiplier = 1 }) => ({ joint, mimics, multiplier }));
+  return { joints, mimic_joints: complete, position_dependent_limits, postures, expressions, behaviours, capabilities, actions };
 }
 
 /** How long a large upload may take on a slow line [ms]. */
