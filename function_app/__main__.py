@@ -21,7 +21,7 @@ from function_app.entrypoints.hosts.worker import check_models, work
 from function_app.ports.model_compiler import CompilerMissingError
 from function_app.ports.signing_keys import LEARN_MS, OVERLAP_MS, RotationRefused
 from function_app.ports.tables import StoreError
-from function_app.services.accounts.api_keys import Wanted
+from function_app.services.accounts.api_keys import ApiKeyRequest
 
 _EXIT_FAILED = 1
 _WORKER_NICE = 5
@@ -137,7 +137,7 @@ async def _rotate(functions: Functions, options: argparse.Namespace) -> None:
     try:
         news = await functions.keys.rotate(learn_ms=learn_ms, overlap_ms=overlap_ms, leaked=options.leaked)
         key = news.pins[-1].id
-        await functions.chain.record(CLOUD, AccountEvent.SIGNING_KEY_ROTATED, None, on=key, leaked=options.leaked)
+        await functions.audit_log.record(CLOUD, AccountEvent.SIGNING_KEY_ROTATED, None, on=key, leaked=options.leaked)
     except RotationRefused as refused:
         raise settings.SettingsError(
             f"devices are still learning the last new key, until {rfc3339(refused.until_ms)}; wait, or say --leaked"
@@ -162,7 +162,7 @@ async def _link(functions: Functions, options: argparse.Namespace) -> None:
 
 async def _api_key(functions: Functions, options: argparse.Namespace) -> None:
     account = await functions.sign_in.account(options.account)
-    wanted = Wanted(label=options.name, most=Role(options.role), only=tuple(options.only), days=options.days)
+    wanted = ApiKeyRequest(label=options.name, most=Role(options.role), only=tuple(options.only), days=options.days)
     try:
         _, token = await functions.api_keys.make(Identity(account.id, account.name, "terminal"), wanted)
     except Problem as problem:

@@ -16,53 +16,53 @@ from function_app.ports.broker_access import BrokerAccess
 from function_app.ports.certificates import Certificates
 from function_app.ports.clock import Clock
 from function_app.ports.command_bus import CommandBus
-from function_app.ports.command_feed import Orders
-from function_app.ports.device_feed import Feed, Telemetry
-from function_app.ports.signing_keys import Keys
+from function_app.ports.command_feed import CommandFeed
+from function_app.ports.device_feed import DeviceFeed, TelemetryFeed
+from function_app.ports.signing_keys import SigningKeys
 from function_app.ports.tables import Tables
 from function_app.ports.xmpp_connection import XmppConnection
 from function_app.services.accounts.api_keys import ApiKeys
-from function_app.services.accounts.oidc_sign_in import OpenIdSignIn
+from function_app.services.accounts.oidc_sign_in import OidcSignIn
 from function_app.services.accounts.passwords import Passwords
 from function_app.services.accounts.sign_out import SignOut
 from function_app.services.actions.acks import ActionAcks
-from function_app.services.actions.action_store import ActionRows
-from function_app.services.actions.dispatcher import SendAction
+from function_app.services.actions.action_store import ActionStore
+from function_app.services.actions.dispatcher import ActionDispatcher
 from function_app.services.actions.query import Actions
-from function_app.services.actions.queue import Queues
+from function_app.services.actions.queue import ActionQueues
 from function_app.services.actions.start import StartAction
 from function_app.services.actions.start_many import StartOnMany
 from function_app.services.actions.stop import StopDevices
 from function_app.services.audit.audit_log import AuditLog
 from function_app.services.audit.audit_reader import AuditReader
 from function_app.services.control.control_events import ControlEvents
-from function_app.services.control.control_requests import Handovers
+from function_app.services.control.control_requests import ControlRequests
 from function_app.services.control.fencing import ControlRevocation
-from function_app.services.control.lease_store import LeaseRows
+from function_app.services.control.lease_store import LeaseStore
 from function_app.services.control.leases import Leases
 from function_app.services.control.mqtt_credentials import MqttCredentials
-from function_app.services.devices.device_access import Devices
-from function_app.services.devices.rename import Rename
+from function_app.services.devices.device_access import DeviceAccess
+from function_app.services.devices.rename import DeviceRename
 from function_app.services.devices.spaces import Spaces
 from function_app.services.devices.viewers import Viewers
 from function_app.services.health.diagnostics import Diagnostics
 from function_app.services.health.faults import Faults
 from function_app.services.health.reported_faults import ReportedFaults
-from function_app.services.identity.authenticator import Identify
-from function_app.services.identity.guess_limiter import Attempts
-from function_app.services.identity.rate_limiter import Limits
+from function_app.services.identity.authenticator import Authenticator
+from function_app.services.identity.guess_limiter import GuessLimiter
+from function_app.services.identity.rate_limiter import RateLimiter
 from function_app.services.identity.sessions import Sessions
 from function_app.services.identity.sign_in import SignIn
-from function_app.services.maintenance.readiness import CheckHealth
+from function_app.services.maintenance.readiness import ReadinessCheck
 from function_app.services.maintenance.scheduler import Scheduler
 from function_app.services.messaging.broker_relay import BrokerRelay
-from function_app.services.messaging.command_sender import Commands
+from function_app.services.messaging.command_sender import CommandSender
 from function_app.services.messaging.delivery import Delivery
 from function_app.services.messaging.key_announcer import KeyAnnouncer
 from function_app.services.messaging.mailbox import Mailbox
-from function_app.services.messaging.polling import Polling
+from function_app.services.messaging.polling import CommandPolling
 from function_app.services.messaging.presence import PresenceIngest
-from function_app.services.messaging.xmpp_credentials import XmppAccess
+from function_app.services.messaging.xmpp_credentials import XmppCredentials
 from function_app.services.pairing.agent_certificates import AgentCertificates
 from function_app.services.pairing.claim import Claim
 from function_app.services.pairing.enroll import Enroll
@@ -70,22 +70,22 @@ from function_app.services.pairing.offboarding import Offboarding
 from function_app.services.pairing.unpair import Unpair
 from function_app.services.robot_types.catalogue import RobotTypes
 from function_app.services.robot_types.cleanup import RobotTypeCleanup
-from function_app.services.robot_types.delete import DeleteRobotType
+from function_app.services.robot_types.delete import RobotTypeDeletion
 from function_app.services.robot_types.integrity import IntegritySeals
-from function_app.services.robot_types.model_validation import ModelChecks
+from function_app.services.robot_types.model_validation import ModelValidator
 from function_app.services.robot_types.movements import Movements
 from function_app.services.robot_types.preview import RobotTypePreview
-from function_app.services.robot_types.upload import UploadRobotType
+from function_app.services.robot_types.upload import RobotTypeUpload
 from function_app.services.robot_types.versions import TypeVersions
 from function_app.services.sharing.access_revocation import AccessRevocation
 from function_app.services.sharing.invitations import Invitations
-from function_app.services.sharing.ownership_transfer import Transfer
+from function_app.services.sharing.ownership_transfer import OwnershipTransfer
 from function_app.services.sharing.shares import Sharing
 from function_app.services.storage.reminders import Reminders
 from function_app.services.storage.retention import DAY_MS, Retention
-from function_app.services.telemetry.event_log import Events
+from function_app.services.telemetry.event_log import EventLog
 from function_app.services.telemetry.ingest import TelemetryIngest
-from function_app.services.telemetry.latency import Latencies
+from function_app.services.telemetry.latency import LatencyStore
 from function_app.services.telemetry.series_reader import SeriesReader
 from function_app.services.telemetry.series_writer import SeriesWriter
 from function_app.services.telemetry.uploads import Uploads
@@ -103,65 +103,65 @@ class Functions:
     tables: Tables
     blobs: Blobs
     bus: CommandBus
-    feed: Feed
-    telemetry: Telemetry
-    late: Telemetry
+    feed: DeviceFeed
+    telemetry: TelemetryFeed
+    late: TelemetryFeed
     access: BrokerAccess
     certificates: Certificates
-    certify: AgentCertificates
-    keys: Keys
+    agent_certificates: AgentCertificates
+    keys: SigningKeys
     clock: Clock
-    identify: Identify
+    authenticator: Authenticator
     sign_in: SignIn
     sessions: Sessions
     sign_out: SignOut
     passwords: Passwords
-    open_id: OpenIdSignIn
+    open_id: OidcSignIn
     api_keys: ApiKeys
     enroll: Enroll
     claim: Claim
     unpair: Unpair
-    rename: Rename
-    watchers: Viewers
-    devices: Devices
+    rename: DeviceRename
+    viewers: Viewers
+    devices: DeviceAccess
     spaces: Spaces
     sharing: Sharing
     invitations: Invitations
     leases: Leases
-    handovers: Handovers
+    control_requests: ControlRequests
     robot_types: RobotTypes
-    upload_robot_type: UploadRobotType
-    look_at_robot_type: RobotTypePreview
-    delete_robot_type: DeleteRobotType
-    model_checks: ModelChecks
+    upload_robot_type: RobotTypeUpload
+    robot_type_preview: RobotTypePreview
+    delete_robot_type: RobotTypeDeletion
+    model_checks: ModelValidator
     movements: Movements
     start_action: StartAction
-    fleet: StartOnMany
+    start_many: StartOnMany
     actions: Actions
-    queues: Queues
+    queues: ActionQueues
     action_acks: ActionAcks
     stop: StopDevices
     mqtt_credentials: MqttCredentials
-    xmpp_access: XmppAccess
+    xmpp_credentials: XmppCredentials
     presence: PresenceIngest
-    polling: Polling
+    polling: CommandPolling
     mailbox: Mailbox
     relay: BrokerRelay
-    forget: Retention
-    events: Events
+    retention: Retention
+    events: EventLog
     faults: Faults
-    conditions: ReportedFaults
+    reported_faults: ReportedFaults
     diagnostics: Diagnostics
-    latencies: Latencies
-    intake: TelemetryIngest
+    latencies: LatencyStore
+    telemetry_ingest: TelemetryIngest
     uploads: Uploads
     transfers: Transfers | None
     series: SeriesReader
-    chain: AuditLog
-    trail: AuditReader
-    limits: Limits
-    sweep: Scheduler
-    health: CheckHealth
+    audit_log: AuditLog
+    audit_reader: AuditReader
+    rate_limiter: RateLimiter
+    scheduler: Scheduler
+    health: ReadinessCheck
 
     async def close(self) -> None:
         """Let go of all connections."""
@@ -189,72 +189,72 @@ def build(settings: Settings, *, clock: Clock | None = None, adapters: Adapters 
     keys, tables, blobs, catalogue = chosen.keys, chosen.tables, chosen.blobs, chosen.catalogue
     access, bus = chosen.access, chosen.bus
 
-    forget = Retention(tables=tables, blobs=blobs)
-    pending = Reminders(tables=tables)
-    chain = AuditLog(tables=tables, blobs=blobs, keys=keys, forget=forget, pending=pending, clock=now)
-    events = Events(tables=tables, forget=forget, clock=now)
-    faults = Faults(tables=tables, events=events, forget=forget, clock=now)
-    conditions = ReportedFaults(tables=tables, faults=faults, clock=now)
-    identify = Identify(tables=tables, keys=keys, forget=forget, clock=now)
-    sessions = Sessions(tables=tables, identify=identify, forget=forget, chain=chain, clock=now)
-    sign_in = SignIn(tables=tables, sessions=sessions, chain=chain, clock=now)
-    attempts = Attempts(tables=tables, forget=forget, clock=now)
-    devices = Devices(tables=tables, clock=now)
+    retention = Retention(tables=tables, blobs=blobs)
+    reminders = Reminders(tables=tables)
+    audit_log = AuditLog(tables=tables, blobs=blobs, keys=keys, retention=retention, reminders=reminders, clock=now)
+    events = EventLog(tables=tables, retention=retention, clock=now)
+    faults = Faults(tables=tables, events=events, retention=retention, clock=now)
+    reported_faults = ReportedFaults(tables=tables, faults=faults, clock=now)
+    authenticator = Authenticator(tables=tables, keys=keys, retention=retention, clock=now)
+    sessions = Sessions(tables=tables, authenticator=authenticator, retention=retention, audit_log=audit_log, clock=now)
+    sign_in = SignIn(tables=tables, sessions=sessions, audit_log=audit_log, clock=now)
+    guess_limiter = GuessLimiter(tables=tables, retention=retention, clock=now)
+    devices = DeviceAccess(tables=tables, clock=now)
     spaces = Spaces(tables=tables, clock=now)
     keep = _keep(settings)
-    writer = SeriesWriter(tables=tables, forget=forget, keep=keep, clock=now)
+    writer = SeriesWriter(tables=tables, retention=retention, keep=keep, clock=now)
     uploads = Uploads(tables=tables, blobs=blobs, keep_ms=settings.keep_uploads_days * DAY_MS, clock=now)
-    mailbox = Mailbox(tables=tables, forget=forget, clock=now)
+    mailbox = Mailbox(tables=tables, retention=retention, clock=now)
     relay = BrokerRelay(bus=bus, clock=now)
     delivery = Delivery(bus=bus, mailbox=mailbox, relay=relay)
-    commands = Commands(delivery=delivery, keys=keys, clock=now)
-    robot_types = RobotTypes(tables=tables, blobs=blobs, catalogue=catalogue, seals=IntegritySeals(keys=keys))
+    command_sender = CommandSender(delivery=delivery, keys=keys, clock=now)
+    robot_types = RobotTypes(tables=tables, blobs=blobs, catalogue=catalogue, integrity=IntegritySeals(keys=keys))
     versions = TypeVersions(tables=tables, blobs=blobs, clock=now)
-    upload_robot_type = UploadRobotType(
+    upload_robot_type = RobotTypeUpload(
         tables=tables,
         versions=versions,
         catalogue=catalogue,
         robot_types=robot_types,
-        seals=IntegritySeals(keys=keys),
-        chain=chain,
+        integrity=IntegritySeals(keys=keys),
+        audit_log=audit_log,
         clock=now,
     )
     diagnostics = Diagnostics(
         tables=tables, devices=devices, faults=faults, robot_types=robot_types, spaces=spaces, clock=now
     )
-    intake = TelemetryIngest(tables=tables, writer=writer, clock=now, observers=(diagnostics.observe,))
+    telemetry_ingest = TelemetryIngest(tables=tables, writer=writer, clock=now, observers=(diagnostics.observe,))
     movements = Movements(
         tables=tables,
         blobs=blobs,
         catalogue=catalogue,
         robot_types=robot_types,
         keys=keys,
-        forget=forget,
-        chain=chain,
+        retention=retention,
+        audit_log=audit_log,
         clock=now,
     )
-    rows = ActionRows(tables=tables)
-    audit = ControlEvents(tables=tables, events=events, chain=chain, pending=pending, clock=now)
-    lease_rows = LeaseRows(tables=tables, audit=audit, clock=now)
-    fence = ControlRevocation(tables=tables, commands=commands, access=access, clock=now)
+    action_store = ActionStore(tables=tables)
+    control_events = ControlEvents(tables=tables, events=events, audit_log=audit_log, reminders=reminders, clock=now)
+    lease_store = LeaseStore(tables=tables, control_events=control_events, clock=now)
+    revocation = ControlRevocation(tables=tables, command_sender=command_sender, access=access, clock=now)
     leases = Leases(
         tables=tables,
         devices=devices,
-        rows=lease_rows,
-        fence=fence,
-        commands=commands,
+        lease_store=lease_store,
+        revocation=revocation,
+        command_sender=command_sender,
         access=access,
-        audit=audit,
+        control_events=control_events,
         clock=now,
     )
     sign_out = SignOut(
         tables=tables,
-        identify=identify,
+        authenticator=authenticator,
         sessions=sessions,
         access=access,
         devices=devices,
         leases=leases,
-        chain=chain,
+        audit_log=audit_log,
         clock=now,
     )
     api_keys = ApiKeys(
@@ -262,25 +262,40 @@ def build(settings: Settings, *, clock: Clock | None = None, adapters: Adapters 
         devices=devices,
         sign_in=sign_in,
         sign_out=sign_out,
-        chain=chain,
-        forget=forget,
-        pending=pending,
+        audit_log=audit_log,
+        retention=retention,
+        reminders=reminders,
         clock=now,
     )
-    sending = SendAction(tables=tables, devices=devices, rows=rows, commands=commands, movements=movements, clock=now)
-    queues = Queues(tables=tables, devices=devices, rows=rows, pending=pending, sending=sending, audit=audit, clock=now)
-    leave = Offboarding(
+    dispatcher = ActionDispatcher(
         tables=tables,
-        rows=rows,
+        devices=devices,
+        action_store=action_store,
+        command_sender=command_sender,
+        movements=movements,
+        clock=now,
+    )
+    queues = ActionQueues(
+        tables=tables,
+        devices=devices,
+        action_store=action_store,
+        reminders=reminders,
+        dispatcher=dispatcher,
+        control_events=control_events,
+        clock=now,
+    )
+    offboarding = Offboarding(
+        tables=tables,
+        action_store=action_store,
         queues=queues,
-        pending=pending,
-        fence=fence,
+        reminders=reminders,
+        revocation=revocation,
         access=access,
         certificates=chosen.certificates,
         bus=bus,
         series=writer,
-        forget=forget,
-        audit=audit,
+        retention=retention,
+        control_events=control_events,
         clock=now,
     )
     sharing = Sharing(
@@ -288,44 +303,46 @@ def build(settings: Settings, *, clock: Clock | None = None, adapters: Adapters 
         devices=devices,
         spaces=spaces,
         sign_in=sign_in,
-        unshare=AccessRevocation(
+        access_revocation=AccessRevocation(
             tables=tables,
             devices=devices,
-            rows=rows,
+            action_store=action_store,
             queues=queues,
-            commands=commands,
-            fence=fence,
+            command_sender=command_sender,
+            revocation=revocation,
             access=access,
             clock=now,
         ),
-        pending=pending,
-        audit=audit,
-        chain=chain,
+        reminders=reminders,
+        control_events=control_events,
+        audit_log=audit_log,
         clock=now,
     )
     invitations = Invitations(
         tables=tables,
         sharing=sharing,
-        transfer=Transfer(tables=tables, devices=devices, sharing=sharing, leave=leave, clock=now),
+        ownership_transfer=OwnershipTransfer(
+            tables=tables, devices=devices, sharing=sharing, offboarding=offboarding, clock=now
+        ),
         sign_in=sign_in,
-        pending=pending,
-        forget=forget,
-        chain=chain,
+        reminders=reminders,
+        retention=retention,
+        audit_log=audit_log,
         clock=now,
     )
-    latencies = Latencies(tables=tables, forget=forget, clock=now)
-    acks = ActionAcks(rows=rows, queues=queues, mailbox=mailbox, latencies=latencies, clock=now)
+    latencies = LatencyStore(tables=tables, retention=retention, clock=now)
+    acks = ActionAcks(action_store=action_store, queues=queues, mailbox=mailbox, latencies=latencies, clock=now)
     start_action = StartAction(
         tables=tables,
         devices=devices,
         movements=movements,
-        commands=commands,
-        rows=rows,
+        command_sender=command_sender,
+        action_store=action_store,
         acks=acks,
-        pending=pending,
+        reminders=reminders,
         queues=queues,
         delivery=delivery,
-        audit=audit,
+        control_events=control_events,
         clock=now,
     )
     return Functions(
@@ -338,15 +355,15 @@ def build(settings: Settings, *, clock: Clock | None = None, adapters: Adapters 
         late=chosen.late,
         access=access,
         certificates=chosen.certificates,
-        certify=AgentCertificates(certificates=chosen.certificates),
+        agent_certificates=AgentCertificates(certificates=chosen.certificates),
         keys=keys,
         clock=now,
-        identify=identify,
+        authenticator=authenticator,
         sign_in=sign_in,
         sessions=sessions,
         sign_out=sign_out,
         api_keys=api_keys,
-        open_id=OpenIdSignIn(
+        open_id=OidcSignIn(
             tables=tables,
             provider=factory.open_id(settings, now),
             redirect=f"{settings.public_url}{OPEN_ID_PATH}",
@@ -354,104 +371,119 @@ def build(settings: Settings, *, clock: Clock | None = None, adapters: Adapters 
             sign_in=sign_in,
             sessions=sessions,
             invitations=invitations,
-            chain=chain,
+            audit_log=audit_log,
             clock=now,
         ),
         passwords=Passwords(
             tables=tables,
-            hashes=chosen.password_hashes,
-            attempts=attempts,
+            hasher=chosen.password_hashes,
+            guess_limiter=guess_limiter,
             sign_in=sign_in,
             sessions=sessions,
             sign_out=sign_out,
-            chain=chain,
+            audit_log=audit_log,
             clock=now,
         ),
-        enroll=Enroll(tables=tables, leave=leave, forget=forget, clock=now),
-        claim=Claim(tables=tables, sign_in=sign_in, attempts=attempts, leave=leave, chain=chain, clock=now),
-        unpair=Unpair(tables=tables, sign_in=sign_in, leave=leave, chain=chain),
-        rename=Rename(tables=tables, devices=devices, chain=chain),
-        watchers=Viewers(tables=tables, devices=devices, forget=forget, clock=now),
+        enroll=Enroll(tables=tables, offboarding=offboarding, retention=retention, clock=now),
+        claim=Claim(
+            tables=tables,
+            sign_in=sign_in,
+            guess_limiter=guess_limiter,
+            offboarding=offboarding,
+            audit_log=audit_log,
+            clock=now,
+        ),
+        unpair=Unpair(tables=tables, sign_in=sign_in, offboarding=offboarding, audit_log=audit_log),
+        rename=DeviceRename(tables=tables, devices=devices, audit_log=audit_log),
+        viewers=Viewers(tables=tables, devices=devices, retention=retention, clock=now),
         devices=devices,
         spaces=spaces,
         sharing=sharing,
         invitations=invitations,
         leases=leases,
-        handovers=Handovers(
+        control_requests=ControlRequests(
             tables=tables,
             devices=devices,
             leases=leases,
-            rows=lease_rows,
-            commands=commands,
-            audit=audit,
+            lease_store=lease_store,
+            command_sender=command_sender,
+            control_events=control_events,
             clock=now,
         ),
         robot_types=robot_types,
         upload_robot_type=upload_robot_type,
-        look_at_robot_type=RobotTypePreview(
+        robot_type_preview=RobotTypePreview(
             tables=tables,
             blobs=blobs,
             versions=versions,
             catalogue=catalogue,
             robot_types=robot_types,
             upload=upload_robot_type,
-            seals=IntegritySeals(keys=keys),
+            integrity=IntegritySeals(keys=keys),
             clock=now,
         ),
-        delete_robot_type=DeleteRobotType(
-            tables=tables, catalogue=catalogue, devices=devices, movements=movements, chain=chain, clock=now
+        delete_robot_type=RobotTypeDeletion(
+            tables=tables, catalogue=catalogue, devices=devices, movements=movements, audit_log=audit_log, clock=now
         ),
-        model_checks=ModelChecks(tables=tables, blobs=blobs, compiler=MujocoCompiler(), clock=now),
+        model_checks=ModelValidator(tables=tables, blobs=blobs, compiler=MujocoCompiler(), clock=now),
         movements=movements,
         start_action=start_action,
-        fleet=StartOnMany(start_action=start_action),
+        start_many=StartOnMany(start_action=start_action),
         actions=Actions(
-            tables=tables, devices=devices, rows=rows, acks=acks, commands=commands, delivery=delivery, clock=now
+            tables=tables,
+            devices=devices,
+            action_store=action_store,
+            acks=acks,
+            command_sender=command_sender,
+            delivery=delivery,
+            clock=now,
         ),
         queues=queues,
         action_acks=acks,
         stop=StopDevices(
             devices=devices,
             spaces=spaces,
-            rows=lease_rows,
-            commands=commands,
+            lease_store=lease_store,
+            command_sender=command_sender,
             queues=queues,
             delivery=delivery,
-            audit=audit,
+            control_events=control_events,
         ),
-        mqtt_credentials=MqttCredentials(tables=tables, devices=devices, access=access, audit=audit, clock=now),
-        xmpp_access=XmppAccess(
+        mqtt_credentials=MqttCredentials(
+            tables=tables, devices=devices, access=access, control_events=control_events, clock=now
+        ),
+        xmpp_credentials=XmppCredentials(
             tables=tables,
             keys=keys,
-            identify=identify,
+            authenticator=authenticator,
             sign_in=sign_in,
             devices=devices,
             clock=now,
             domain=settings.xmpp_domain,
         ),
-        polling=Polling(tables=tables, mailbox=mailbox, clock=now),
+        polling=CommandPolling(tables=tables, mailbox=mailbox, clock=now),
         mailbox=mailbox,
         relay=relay,
         presence=PresenceIngest(
             tables=tables,
             events=events,
-            conditions=conditions,
-            keys=KeyAnnouncer(keys=keys, commands=commands),
+            reported_faults=reported_faults,
+            key_announcer=KeyAnnouncer(keys=keys, command_sender=command_sender),
             clock=now,
         ),
-        forget=forget,
+        retention=retention,
         events=events,
         faults=faults,
-        conditions=conditions,
+        reported_faults=reported_faults,
         diagnostics=diagnostics,
         latencies=latencies,
-        intake=intake,
+        telemetry_ingest=telemetry_ingest,
         uploads=uploads,
         transfers=chosen.transfers,
         series=SeriesReader(tables=tables, devices=devices, keep=keep, clock=now),
-        chain=chain,
-        trail=AuditReader(tables=tables, blobs=blobs, keys=keys),
-        limits=Limits(
+        audit_log=audit_log,
+        audit_reader=AuditReader(tables=tables, blobs=blobs, keys=keys),
+        rate_limiter=RateLimiter(
             per_s={
                 "address": settings.rate_address,
                 "account": settings.rate_account,
@@ -460,29 +492,29 @@ def build(settings: Settings, *, clock: Clock | None = None, adapters: Adapters 
             },
             clock=now,
         ),
-        sweep=Scheduler(
+        scheduler=Scheduler(
             tables=tables,
-            rows=rows,
-            pending=pending,
-            commands=commands,
-            sending=sending,
+            action_store=action_store,
+            reminders=reminders,
+            command_sender=command_sender,
+            dispatcher=dispatcher,
             queues=queues,
-            leave=leave,
+            offboarding=offboarding,
             sharing=sharing,
             invitations=invitations,
             api_keys=api_keys,
-            audit=audit,
-            chain=chain,
+            control_events=control_events,
+            audit_log=audit_log,
             access=access,
-            forget=forget,
-            conditions=conditions,
-            intake=intake,
+            retention=retention,
+            reported_faults=reported_faults,
+            telemetry_ingest=telemetry_ingest,
             uploads=uploads,
             robot_types=RobotTypeCleanup(tables=tables, blobs=blobs, clock=now),
             keep_actions_ms=settings.keep_actions_days * DAY_MS,
             clock=now,
         ),
-        health=CheckHealth(tables=tables, bus=bus),
+        health=ReadinessCheck(tables=tables, bus=bus),
     )
 
 
@@ -510,12 +542,12 @@ def xmpp_line(functions: Functions) -> XmppConnection:
         raise SettingsError("TELESCOPE_XMPP_DOMAIN is empty; it must be the domain that the XMPP server serves")
 
     async def password() -> str:
-        return (await functions.xmpp_access.cloud()).password
+        return (await functions.xmpp_credentials.cloud()).password
 
     return SlixmppLine(host=settings.xmpp_host, port=settings.xmpp_port, domain=settings.xmpp_domain, password=password)
 
 
-def orders(functions: Functions) -> Orders:
+def orders(functions: Functions) -> CommandFeed:
     """What the broker brings for agents that a program of ours speaks for, not yet open."""
     settings = functions.settings
     return MqttOrders(

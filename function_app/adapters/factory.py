@@ -117,7 +117,7 @@ def keys(settings: Settings, now_ms: Callable[[], int]) -> RingKeys:
             return found
 
 
-def open_id(settings: Settings, clock: Clock) -> OpenId | None:
+def open_id(settings: Settings, clock: Clock) -> OidcProvider | None:
     """Where people may sign in, beside here."""
     if settings.open_id is None:
         return None
@@ -208,7 +208,7 @@ def bus(settings: Settings, granted: BrokerAccess) -> CommandBus:
             return MqttCommandBus(_broker(settings, granted))
 
 
-def feeds(settings: Settings, granted: BrokerAccess) -> tuple[Feed, Telemetry, Telemetry]:
+def feeds(settings: Settings, granted: BrokerAccess) -> tuple[DeviceFeed, TelemetryFeed, TelemetryFeed]:
     """What brings what devices say, what they measure, and what they measured while their link was down."""
     broker = _broker(settings, granted)
     return MqttFeed(broker), MqttTelemetry(broker), MqttLate(broker)

@@ -52,7 +52,7 @@ class BrokerAccess(Protocol):
             BrokerAccessError: The broker cannot be told. Nothing usable was left behind; ask again.
         """
 
-    def takes(self, publish: Sequence[str], subscribe: Sequence[str]) -> bool:
+    def accepts(self, publish: Sequence[str], subscribe: Sequence[str]) -> bool:
         """Whether one grant may hold so much on this broker; nobody is asked."""
 
     async def revoke(self, *, client_id: str | None = None, principal: str | None = None) -> None:

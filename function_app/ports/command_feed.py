@@ -3,22 +3,22 @@
 from collections.abc import Callable, Sequence
 from typing import Protocol
 
-Hear = Callable[[str, bytes], None]
+OnMessage = Callable[[str, bytes], None]
 """Given topic and payload; must not block."""
 
 
-class Orders(Protocol):
+class CommandFeed(Protocol):
     """Commands, Stop and setpoints to chosen agents. What is missed here is in the mailbox, setpoints excepted."""
 
     @property
     def up(self) -> bool:
         """Whether they are heard now."""
 
-    async def run(self, hear: Hear) -> None:
+    async def run(self, hear: OnMessage) -> None:
         """Deliver until cancelled; reconnects for ever."""
 
     async def add(self, space: str, agent: str, listen: Sequence[str] = ()) -> None:
-        """Hear what is for this agent too, and the topics that it listens to, instead of those before."""
+        """OnMessage what is for this agent too, and the topics that it listens to, instead of those before."""
 
     def drop(self, space: str, agent: str) -> None:
-        """Hear it no longer."""
+        """OnMessage it no longer."""

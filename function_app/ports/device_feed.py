@@ -7,7 +7,7 @@ Handler = Callable[[str, bytes], Awaitable[None]]
 """Given topic and payload. Returns once it is stored: only then is the message confirmed to the broker."""
 
 
-class Feed(Protocol):
+class DeviceFeed(Protocol):
     """A subscription of the functions' own."""
 
     async def run(self, handler: Handler) -> None:
@@ -22,7 +22,7 @@ BatchHandler = Callable[[Sequence[tuple[str, bytes]]], Awaitable[None]]
 """Given topics and payloads of what arrived in a short while."""
 
 
-class Telemetry(Protocol):
+class TelemetryFeed(Protocol):
     """A subscription to measurements: many, each of little worth, and never in the way of the others."""
 
     async def run(self, handler: BatchHandler) -> None:

@@ -9,7 +9,7 @@ from device_agent.protocol.manifests.robot_type import RobotType
 
 
 @dataclass(frozen=True, slots=True)
-class Looked:
+class ModelReport:
     """What a model was found to be.
 
     Attributes:
@@ -41,7 +41,9 @@ class ModelCompiler(Protocol):
             CompilerMissingError: It cannot.
         """
 
-    async def check(self, robot_type: RobotType, files: Mapping[str, bytes], missing: Sequence[str] = ()) -> Looked:
+    async def check(
+        self, robot_type: RobotType, files: Mapping[str, bytes], missing: Sequence[str] = ()
+    ) -> ModelReport:
         """Compile model and scene and compare them with the manifest.
 
         Args:

@@ -4,7 +4,7 @@ from dataclasses import dataclass
 from typing import Protocol
 
 
-class OpenIdError(Exception):
+class OidcError(Exception):
     """The provider cannot be used, or what came from it is not believed. Fit for an operator, never for the page."""
 
 
@@ -17,7 +17,7 @@ class Subject:
     name: str
 
 
-class OpenId(Protocol):
+class OidcProvider(Protocol):
     """One provider, by the code flow with PKCE. The constructor reaches nobody; what is fetched is kept for a while."""
 
     async def address(self, *, state: str, nonce: str, challenge: str, redirect: str) -> str:

@@ -3,7 +3,7 @@
 from typing import Protocol
 
 
-class PasswordHashes(Protocol):
+class PasswordHasher(Protocol):
     """Makes and checks them. Each call takes tens of milliseconds of a processor; none of them blocks the others."""
 
     async def make(self, password: str) -> str:

@@ -8,7 +8,7 @@ from device_agent.protocol.manifests.robot_type import RobotType
 
 
 @dataclass(frozen=True, slots=True)
-class BuiltIn:
+class BuiltInMovement:
     """One movement of a robot type's folder."""
 
     name: str
@@ -19,7 +19,7 @@ class BuiltIn:
     source: str
 
 
-class Catalogue(Protocol):
+class RobotCatalogue(Protocol):
     """Read once and kept; what is on disk changes with an installation, not while it runs."""
 
     async def types(self) -> Mapping[str, RobotType]:
@@ -32,7 +32,7 @@ class Catalogue(Protocol):
     async def files(self, robot_type: str) -> Mapping[str, bytes]:
         """What a type's folder holds, movements too: name → content; empty for a type that is not known."""
 
-    async def movements(self, robot_type: str) -> Mapping[str, BuiltIn]:
+    async def movements(self, robot_type: str) -> Mapping[str, BuiltInMovement]:
         """Movements of a type by name; empty for a type that is not known."""
 
     async def drawing(self, robot_type: str) -> bytes | None:

@@ -25,7 +25,7 @@ class RotationRefused(Exception):  # noqa: N818 (an answer, not always a fault)
 
 
 @dataclass(frozen=True, slots=True)
-class Pin:
+class PinnedKey:
     """A key as a device pins it: its place in the order of keys, and until when it counts (0: no end)."""
 
     id: str
@@ -35,7 +35,7 @@ class Pin:
 
 
 @dataclass(frozen=True, slots=True)
-class News:
+class KeyAnnouncement:
     """What agents are told of keys.
 
     Attributes:
@@ -44,7 +44,7 @@ class News:
         signing: Id of the key that orders are signed with now.
     """
 
-    pins: tuple[Pin, ...]
+    pins: tuple[PinnedKey, ...]
     statements: tuple[str, ...]
     signing: str
 
@@ -54,7 +54,7 @@ class News:
         return self.pins[-1].serial
 
 
-class Keys(Protocol):
+class SigningKeys(Protocol):
     """Ed25519 keys. Any number of processes use the same; each follows a rotation without a restart."""
 
     async def current(self) -> Ed25519PrivateKey:
@@ -77,10 +77,12 @@ class Keys(Protocol):
     async def archive(self) -> Mapping[str, Ed25519PublicKey]:
         """Every key whose signature on what is stored counts: former ones too, unless they have leaked."""
 
-    async def news(self) -> News:
+    async def news(self) -> KeyAnnouncement:
         """What agents are told."""
 
-    async def rotate(self, *, learn_ms: int = LEARN_MS, overlap_ms: int = OVERLAP_MS, leaked: bool = False) -> News:
+    async def rotate(
+        self, *, learn_ms: int = LEARN_MS, overlap_ms: int = OVERLAP_MS, leaked: bool = False
+    ) -> KeyAnnouncement:
         """Make a new key, and let the present one end.
 
         Args:

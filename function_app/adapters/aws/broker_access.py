@@ -13,7 +13,7 @@ from function_app.adapters.aws import iot_policies
 from function_app.adapters.aws.client import Client, Refused
 from function_app.adapters.shared.grant_registry import GrantRegistry, each
 from function_app.ports.broker_access import BrokerAccessError, Credentials, ServiceCredentials
-from function_app.ports.signing_keys import Keys
+from function_app.ports.signing_keys import SigningKeys
 from function_app.ports.tables import StoreError, Tables
 
 _MISSING = "ResourceNotFoundException"
@@ -31,7 +31,7 @@ class IotBrokerAccess:
         endpoint: The account's own address for data.
     """
 
-    def __init__(self, *, keys: Keys, tables: Tables, region: str, endpoint: str) -> None:
+    def __init__(self, *, keys: SigningKeys, tables: Tables, region: str, endpoint: str) -> None:
         self._rights = GrantRegistry(keys=keys, tables=tables)
         self._client = Client(
             "iot-data",
@@ -48,7 +48,7 @@ class IotBrokerAccess:
         iot_policies.documents(grant, place=_LONGEST)  # whether there is room for it
         return await self._rights.issue(grant)
 
-    def takes(self, publish: Sequence[str], subscribe: Sequence[str]) -> bool:
+    def accepts(self, publish: Sequence[str], subscribe: Sequence[str]) -> bool:
         """As the port says: whether policies have room for it."""
         grant = Grant(
             principal="",

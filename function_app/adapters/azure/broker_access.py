@@ -24,7 +24,7 @@ from device_agent.protocol.security.grants import Grant
 from function_app.adapters.azure import topic_spaces
 from function_app.adapters.shared.grant_registry import GrantRegistry, each
 from function_app.ports.broker_access import BrokerAccessError, Credentials, ServiceCredentials
-from function_app.ports.signing_keys import Keys
+from function_app.ports.signing_keys import SigningKeys
 from function_app.ports.tables import StoreError, Tables
 
 CUTTER = "service:cutter"
@@ -47,7 +47,9 @@ class EventGridBrokerAccess:
         known: Whether a token is of the namespace's own identity, which alone may ask.
     """
 
-    def __init__(self, *, keys: Keys, tables: Tables, take: Take, known: Callable[[str], Awaitable[bool]]) -> None:
+    def __init__(
+        self, *, keys: SigningKeys, tables: Tables, take: Take, known: Callable[[str], Awaitable[bool]]
+    ) -> None:
         self.known = known
         self._rights = GrantRegistry(keys=keys, tables=tables)
         self._take = take
@@ -58,7 +60,7 @@ class EventGridBrokerAccess:
         topic_spaces.attributes(grant)  # whether there is room for it
         return await self._rights.issue(grant)
 
-    def takes(self, publish: Sequence[str], subscribe: Sequence[str]) -> bool:
+    def accepts(self, publish: Sequence[str], subscribe: Sequence[str]) -> bool:
         """As the port says, of a person: whether the topic spaces have room for it."""
         grant = Grant(
             principal="account:",

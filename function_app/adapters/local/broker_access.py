@@ -59,7 +59,7 @@ class TokenBrokerAccess:
         grants.check(grant)
         return Credentials(grant.principal, grants.issue(grant, self._signer()))
 
-    def takes(self, publish: Sequence[str], subscribe: Sequence[str]) -> bool:  # noqa: ARG002
+    def accepts(self, publish: Sequence[str], subscribe: Sequence[str]) -> bool:  # noqa: ARG002
         """As the port says: a token has no bound of its own."""
         return True
 
@@ -167,7 +167,7 @@ class MosquittoBrokerAccess:
                 raise BrokerAccessError(f"mosquitto refused to {answer.command}: {answer.error}")
         return Credentials(username, password)
 
-    def takes(self, publish: Sequence[str], subscribe: Sequence[str]) -> bool:  # noqa: ARG002
+    def accepts(self, publish: Sequence[str], subscribe: Sequence[str]) -> bool:  # noqa: ARG002
         """As the port says: a role has none."""
         return True
 

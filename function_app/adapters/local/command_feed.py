@@ -12,7 +12,7 @@ from device_agent.protocol.security import grants
 from device_agent.protocol.topics import ANY
 from function_app.adapters.mqtt.connection import Broker, MqttConnection
 from function_app.ports.broker_access import BrokerAccess, ServiceCredentials
-from function_app.ports.command_feed import Hear
+from function_app.ports.command_feed import OnMessage
 
 LIFETIME_S = 24 * 3600.0
 
@@ -21,7 +21,7 @@ class MqttOrders:
     """``Orders`` over MQTT, by a connection with rights of its own."""
 
     def __init__(self, *, host: str, port: int, access: BrokerAccess, tls: ssl.SSLContext | None = None) -> None:
-        self._hear: Hear | None = None
+        self._hear: OnMessage | None = None
         self._wanted: dict[tuple[str, str], tuple[str, ...]] = {}
         self._link = MqttConnection(
             Broker(host=host, port=port, credentials=_credentials(access), tls=tls), receive=self._arrived
@@ -32,7 +32,7 @@ class MqttOrders:
         """See ``Orders``."""
         return not self._link.trouble
 
-    async def run(self, hear: Hear) -> None:
+    async def run(self, hear: OnMessage) -> None:
         """See ``Orders``."""
         self._hear = hear
         self._link.start()

@@ -9,7 +9,7 @@ from device_agent.protocol.errors import ProtocolError
 from device_agent.protocol.manifests import robot_type as manifest
 from device_agent.protocol.manifests.robot_type import RobotType
 from device_agent.protocol.topics import is_id
-from function_app.ports.robot_catalogue import BuiltIn
+from function_app.ports.robot_catalogue import BuiltInMovement
 from function_app.ports.tables import StoreError
 
 DRAWING = "drawing.json"
@@ -24,7 +24,7 @@ class FolderCatalogue:
         self._folder = folder
         self._types: dict[str, RobotType] | None = None
         self._files: dict[str, dict[str, bytes]] = {}
-        self._movements: dict[str, dict[str, BuiltIn]] = {}
+        self._movements: dict[str, dict[str, BuiltInMovement]] = {}
 
     async def types(self) -> Mapping[str, RobotType]:
         """See ``Catalogue``."""
@@ -49,7 +49,7 @@ class FolderCatalogue:
                 raise StoreError(str(error)) from error
         return self._files[robot_type]
 
-    async def movements(self, robot_type: str) -> Mapping[str, BuiltIn]:
+    async def movements(self, robot_type: str) -> Mapping[str, BuiltInMovement]:
         """See ``Catalogue``."""
         known = (await self.types()).get(robot_type)
         if known is None:
@@ -71,7 +71,7 @@ class FolderCatalogue:
             raise StoreError(str(error)) from error
 
 
-def _read(path: Path, version: int) -> BuiltIn:
+def _read(path: Path, version: int) -> BuiltInMovement:
     try:
         source = path.read_text(encoding="utf-8")
         docstring = ast.get_docstring(ast.parse(source)) or ""
@@ -79,7 +79,7 @@ def _read(path: Path, version: int) -> BuiltIn:
         raise StoreError(f"{path}: {error}") from error
     if not is_id(path.stem):
         raise StoreError(f"{path}: a movement's name has letters, digits, _ and -, 1 to 64 of them")
-    return BuiltIn(
+    return BuiltInMovement(
         name=path.stem,
         description=docstring.partition("\n")[0],
         version=version,

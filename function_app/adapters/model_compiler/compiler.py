@@ -15,7 +15,7 @@ from pathlib import Path
 import msgspec
 
 from device_agent.protocol.manifests.robot_type import RobotType
-from function_app.ports.model_compiler import CompilerMissingError, Looked
+from function_app.ports.model_compiler import CompilerMissingError, ModelReport
 
 CPU_S = 15
 WALL_S = 30
@@ -45,7 +45,9 @@ class MujocoCompiler:
         if importlib.util.find_spec("mujoco") is None:
             raise CompilerMissingError(_MISSING)
 
-    async def check(self, robot_type: RobotType, files: Mapping[str, bytes], missing: Sequence[str] = ()) -> Looked:
+    async def check(
+        self, robot_type: RobotType, files: Mapping[str, bytes], missing: Sequence[str] = ()
+    ) -> ModelReport:
         """See ``ModelCompiler``."""
         self.require()
         folder = await asyncio.to_thread(_write, files)
@@ -56,11 +58,11 @@ class MujocoCompiler:
         if code == _NO_MUJOCO:
             raise CompilerMissingError(_MISSING)
         if code in {-signal.SIGKILL, -signal.SIGXCPU, -signal.SIGALRM}:
-            return Looked((_TOO_LONG,))
+            return ModelReport((_TOO_LONG,))
         try:
-            return msgspec.json.decode(answer, type=Looked) if code == 0 else Looked((_CRASHED,))
+            return msgspec.json.decode(answer, type=ModelReport) if code == 0 else ModelReport((_CRASHED,))
         except msgspec.DecodeError:
-            return Looked((_CRASHED,))
+            return ModelReport((_CRASHED,))
 
     def _task(self, robot_type: RobotType, missing: Sequence[str]) -> bytes:
         told = msgspec.to_builtins(robot_type)

@@ -15,7 +15,7 @@ import jwt
 import msgspec
 
 from function_app.ports.clock import Clock
-from function_app.ports.oidc_provider import OpenIdError, Subject
+from function_app.ports.oidc_provider import OidcError, Subject
 
 if TYPE_CHECKING:
     import httpx
@@ -79,7 +79,7 @@ class HttpOpenId:
         provider = await self._provider()
         says_issuer = provider.get("authorization_response_iss_parameter_supported") is True
         if issuer != self._issuer and (issuer is not None or says_issuer):
-            raise OpenIdError(f"the browser came back from {(issuer or '')[:200]!r}, not from {self._issuer}")
+            raise OidcError(f"the browser came back from {(issuer or '')[:200]!r}, not from {self._issuer}")
         form = {"grant_type": "authorization_code", "code": code, "redirect_uri": redirect, "code_verifier": verifier}
         headers: dict[str, str] = {}
         ways = provider.get("token_endpoint_auth_methods_supported") or ["client_secret_basic"]
@@ -92,27 +92,27 @@ class HttpOpenId:
         answered = await self._fetch("POST", str(provider["token_endpoint"]), data=form, headers=headers)
         token = answered.get("id_token")
         if not isinstance(token, str):
-            raise OpenIdError("the provider gave no ID token")
+            raise OidcError("the provider gave no ID token")
         return self._subject(await self._verified(token), nonce)
 
     def _subject(self, claims: Mapping[str, Any], nonce: str) -> Subject:
         """Whom a token is about that is seen to be the provider's."""
         said = claims.get("nonce")
         if not isinstance(said, str) or not hmac.compare_digest(said.encode(), nonce.encode()):
-            raise OpenIdError("the ID token is not of this sign-in: its nonce is another one")
+            raise OidcError("the ID token is not of this sign-in: its nonce is another one")
         if isinstance(claims["aud"], list) and len(claims["aud"]) > 1 and claims.get("azp") != self._client_id:
-            raise OpenIdError("the ID token was issued to another client (azp)")
+            raise OidcError("the ID token was issued to another client (azp)")
         now_s = self._clock.now_ms() / 1000
         times = [claims["exp"], claims["iat"], claims.get("nbf", 0)]
         if not all(isinstance(each, int | float) and math.isfinite(each) for each in times):
-            raise OpenIdError("the ID token's times are no numbers")
+            raise OidcError("the ID token's times are no numbers")
         if times[0] <= now_s - SKEW_S:
-            raise OpenIdError("the ID token has expired")
+            raise OidcError("the ID token has expired")
         if max(times[1:]) > now_s + SKEW_S:
-            raise OpenIdError("the ID token is from the future; set this machine's clock")
+            raise OidcError("the ID token is from the future; set this machine's clock")
         subject = claims["sub"]
         if not isinstance(subject, str) or not 0 < len(subject) <= _LONGEST_SUBJECT:
-            raise OpenIdError("the ID token names nobody (sub)")
+            raise OidcError("the ID token names nobody (sub)")
         return Subject(self._issuer, subject, _name(claims) or subject[:_LONGEST_NAME])
 
     async def _verified(self, token: str) -> dict[str, Any]:
@@ -120,7 +120,7 @@ class HttpOpenId:
             header = jwt.get_unverified_header(token)
             algorithm = str(header.get("alg"))
             if algorithm not in ALGORITHMS:
-                raise OpenIdError(f"the ID token is signed by {algorithm[:20]!r}, which proves nothing here")
+                raise OidcError(f"the ID token is signed by {algorithm[:20]!r}, which proves nothing here")
             key = await self._key(header.get("kid"), algorithm)
             claims: dict[str, Any] = jwt.decode(
                 token,
@@ -136,7 +136,7 @@ class HttpOpenId:
                 },
             )
         except jwt.PyJWTError as error:
-            raise OpenIdError(f"the ID token is refused: {error}") from error
+            raise OidcError(f"the ID token is refused: {error}") from error
         return claims
 
     async def _key(self, kid: object, algorithm: str) -> Any:
@@ -147,12 +147,12 @@ class HttpOpenId:
             fetched = await self._fetch("GET", str((await self._provider())["jwks_uri"]))
             keys = fetched.get("keys")
             if not isinstance(keys, list):
-                raise OpenIdError("the provider's keys are no list")
+                raise OidcError("the provider's keys are no list")
             self._keys = [key for key in keys if isinstance(key, dict)]
             self._keys_ms = self._clock.now_ms()
             found = self._among(kid, algorithm)
         if found is None:
-            raise OpenIdError("the ID token is signed by a key that the provider does not show")
+            raise OidcError("the ID token is signed by a key that the provider does not show")
         return found
 
     def _among(self, kid: object, algorithm: str) -> Any:
@@ -169,7 +169,7 @@ class HttpOpenId:
         try:
             return jwt.PyJWK(fitting[0], algorithm).key
         except (ValueError, TypeError, KeyError) as error:
-            raise OpenIdError(f"a key of the provider's cannot be read: {error!r}") from error
+            raise OidcError(f"a key of the provider's cannot be read: {error!r}") from error
 
     async def _provider(self) -> dict[str, Any]:
         """The provider's document about itself."""
@@ -177,12 +177,12 @@ class HttpOpenId:
             found = await self._fetch("GET", f"{self._issuer.rstrip('/')}/.well-known/openid-configuration")
             if found.get("issuer") != self._issuer:
                 said = str(found.get("issuer"))[:200]
-                raise OpenIdError(f"the provider calls itself {said!r}; TELESCOPE_OIDC_ISSUER has to say so too")
+                raise OidcError(f"the provider calls itself {said!r}; TELESCOPE_OIDC_ISSUER has to say so too")
             for name in _ADDRESSES:
                 if not _safe(found.get(name)):
-                    raise OpenIdError(f"the provider's {name} is no https address")
+                    raise OidcError(f"the provider's {name} is no https address")
             if "S256" not in (found.get("code_challenge_methods_supported") or ["S256"]):
-                raise OpenIdError("the provider knows no PKCE with S256")
+                raise OidcError("the provider knows no PKCE with S256")
             self._known, self._known_ms = found, self._clock.now_ms()
         return self._known
 
@@ -205,15 +205,15 @@ class HttpOpenId:
             ):
                 body = await _read(answer, address)
         except httpx.HTTPError as error:
-            raise OpenIdError(f"{address} cannot be used: {error or type(error).__name__}") from error
+            raise OidcError(f"{address} cannot be used: {error or type(error).__name__}") from error
         if answer.status_code != _OK:
-            raise OpenIdError(f"{address} answered {answer.status_code}: {body[:300].decode(errors='replace')!r}")
+            raise OidcError(f"{address} answered {answer.status_code}: {body[:300].decode(errors='replace')!r}")
         try:
             found = msgspec.json.decode(body)
         except (msgspec.DecodeError, UnicodeDecodeError, RecursionError) as error:
-            raise OpenIdError(f"{address} did not answer with JSON: {error}") from error
+            raise OidcError(f"{address} did not answer with JSON: {error}") from error
         if not isinstance(found, dict):
-            raise OpenIdError(f"{address} did not answer with a JSON object")
+            raise OidcError(f"{address} did not answer with a JSON object")
         return found
 
 
@@ -222,7 +222,7 @@ async def _read(answer: "httpx.Response", address: str) -> bytes:
     async for part in answer.aiter_bytes():
         parts += part
         if len(parts) > MOST_BYTES:
-            raise OpenIdError(f"{address} answered with more than {MOST_BYTES} bytes")
+            raise OidcError(f"{address} answered with more than {MOST_BYTES} bytes")
     return parts
 
 

@@ -16,7 +16,7 @@ from device_agent.protocol.errors import ProtocolError, SignatureError
 from device_agent.protocol.security import grants
 from device_agent.protocol.security.grants import Grant
 from function_app.ports.broker_access import BrokerAccessError, Credentials
-from function_app.ports.signing_keys import Keys
+from function_app.ports.signing_keys import SigningKeys
 from function_app.ports.tables import Conflict, Row, StoreError, Tables
 
 TABLE = "GrantRegistry"
@@ -56,7 +56,7 @@ class GrantRegistry:
         tables: Remember.
     """
 
-    def __init__(self, *, keys: Keys, tables: Tables) -> None:
+    def __init__(self, *, keys: SigningKeys, tables: Tables) -> None:
         self._keys = keys
         self._tables = tables
 

@@ -9,7 +9,7 @@ from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey,
 from device_agent.protocol.security import signing
 from function_app.adapters.shared import key_ring
 from function_app.adapters.shared.key_ring import Ring, RingKey
-from function_app.ports.signing_keys import LEARN_MS, OVERLAP_MS, News, Pin
+from function_app.ports.signing_keys import LEARN_MS, OVERLAP_MS, KeyAnnouncement, PinnedKey
 
 
 def wall_ms() -> int:
@@ -47,11 +47,13 @@ class RingKeys(ABC):
         """See ``Keys``."""
         return key_ring.public(tuple(key for key in (await self._ring()).keys if not key.leaked))
 
-    async def news(self) -> News:
+    async def news(self) -> KeyAnnouncement:
         """See ``Keys``."""
         return self._told(await self._ring())
 
-    async def rotate(self, *, learn_ms: int = LEARN_MS, overlap_ms: int = OVERLAP_MS, leaked: bool = False) -> News:
+    async def rotate(
+        self, *, learn_ms: int = LEARN_MS, overlap_ms: int = OVERLAP_MS, leaked: bool = False
+    ) -> KeyAnnouncement:
         """See ``Keys``."""
         new, now_ms = signing.generate(), self._now_ms()
 
@@ -93,10 +95,12 @@ class RingKeys(ABC):
     async def _change(self, change: Callable[[Ring], Ring]) -> Ring:
         """Write what ``change`` makes of the ring; what was written."""
 
-    def _told(self, ring: Ring) -> News:
+    def _told(self, ring: Ring) -> KeyAnnouncement:
         now_ms = self._now_ms()
-        pins = tuple(Pin(key.id, signing.public_key(key.public), key.serial, key.until_ms) for key in ring.live(now_ms))
-        return News(pins, ring.statements(now_ms), ring.for_devices(now_ms).id)
+        pins = tuple(
+            PinnedKey(key.id, signing.public_key(key.public), key.serial, key.until_ms) for key in ring.live(now_ms)
+        )
+        return KeyAnnouncement(pins, ring.statements(now_ms), ring.for_devices(now_ms).id)
 
     def _private(self, key: RingKey) -> Ed25519PrivateKey:
         if key.public not in self._privates:

@@ -62,7 +62,7 @@ class ActionQueue:
         """Whether there is nothing to do."""
         return not self.actions and not self.dropped
 
-    def holds(self, action: str) -> bool:
+    def contains(self, action: str) -> bool:
         """Whether ``action`` is in it in one way or the other."""
         return action in self.actions or action in self.dropped
 
@@ -70,7 +70,7 @@ class ActionQueue:
         """1 for the next one."""
         return self.actions.index(action) + 1 if action in self.actions else None
 
-    def joined(self, action: str) -> "ActionQueue":
+    def with_last(self, action: str) -> "ActionQueue":
         """With ``action`` as the last.
 
         Raises:
@@ -86,7 +86,7 @@ class ActionQueue:
         actions = tuple(other for other in self.actions if other != action)
         return replace(self, actions=actions, dropped={id_: why for id_, why in self.dropped.items() if id_ != action})
 
-    def dropping(self, actions: Collection[str], why: str) -> "ActionQueue":
+    def with_cancelled(self, actions: Collection[str], why: str) -> "ActionQueue":
         """Some of them dropped; the same object when none of these waits."""
         lost = [action for action in self.actions if action in actions]
         if not lost:
@@ -94,6 +94,6 @@ class ActionQueue:
         kept = tuple(action for action in self.actions if action not in lost)
         return replace(self, actions=kept, dropped={**self.dropped, **dict.fromkeys(lost, why)})
 
-    def halted(self, why: str) -> "ActionQueue":
+    def with_all_cancelled(self, why: str) -> "ActionQueue":
         """All of them dropped; the same object when nobody waits."""
-        return self.dropping(self.actions, why)
+        return self.with_cancelled(self.actions, why)

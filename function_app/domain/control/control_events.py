@@ -60,10 +60,10 @@ def timed_out(lease: Lease | None, now_ms: int) -> Iterator[ControlEvent]:
     """What time alone has brought: a lease that ran out, a request that nobody answered."""
     if lease is None:
         return
-    asked = lease.asked
-    if asked is not None and asked.outcome == "open" and asked.how(lease, now_ms) == "lapsed":
+    asked = lease.request
+    if asked is not None and asked.outcome == "open" and asked.current_outcome(lease, now_ms) == "lapsed":
         yield _of_request(asked, Fact.REQUEST_LAPSED, asked.expires_ms, f"Nobody answered {asked.by} in time.")
-    if lease.account and not lease.action and not lease.live(now_ms):
+    if lease.account and not lease.action and not lease.is_live(now_ms):
         message = f"The lease of {lease.holder} ran out."
         yield _of_lease(lease, Fact.EXPIRED, lease.expires_ms, message, {"holder": lease.holder})
 
@@ -79,7 +79,11 @@ def lease_changes(before: Lease | None, after: Lease, *, by: str, now_ms: int) -
     """
     if before is not None and (after.epoch != before.epoch or not after.account):
         yield from timed_out(before, now_ms)
-    elif before is not None and before.asked is not None and (after.asked is None or after.asked.id != before.asked.id):
+    elif (
+        before is not None
+        and before.request is not None
+        and (after.request is None or after.request.id != before.request.id)
+    ):
         yield from (late for late in timed_out(before, now_ms) if late.fact is Fact.REQUEST_LAPSED)
     yield from _of_change(before, after, by=by, now_ms=now_ms)
     yield from _of_asking(before, after, by=by, now_ms=now_ms)
@@ -93,13 +97,13 @@ def control_ended(before: Lease, after: Lease, *, why: str, now_ms: int) -> Cont
 
 
 def _of_change(before: Lease | None, after: Lease, *, by: str, now_ms: int) -> Iterator[ControlEvent]:
-    had = before.holder if before is not None and before.live(now_ms) else ""
+    had = before.holder if before is not None and before.is_live(now_ms) else ""
     if before is not None and after.epoch == before.epoch:
         if had and not after.account and not before.action:
             yield _of_lease(after, Fact.RELEASED, now_ms, f"{by} gave control back.", {"holder": had})
         return
     data = {"holder": after.holder} | ({"from": had} if had else {})
-    asked = after.asked
+    asked = after.request
     if not after.account:
         yield _of_lease(after, Fact.RESET_ORDERED, now_ms, f"{by} ordered the reset of Stop.", {"caller": by, **data})
     elif asked is not None and asked.outcome == "accepted" and asked.epoch == after.epoch - 1:
@@ -115,7 +119,7 @@ def _of_change(before: Lease | None, after: Lease, *, by: str, now_ms: int) -> I
 
 
 def _of_asking(before: Lease | None, after: Lease, *, by: str, now_ms: int) -> Iterator[ControlEvent]:
-    asked, existing = after.asked, before.asked if before is not None else None
+    asked, existing = after.request, before.request if before is not None else None
     if asked is None or asked == existing:
         return
     if asked.outcome == "open":

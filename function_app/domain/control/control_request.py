@@ -21,15 +21,15 @@ def request_control(
     Raises:
         Problem: ``lease-free``, ``lease-yours``, ``lease-requested``: somebody else was first.
     """
-    if lease is None or not lease.live(now_ms):
+    if lease is None or not lease.is_live(now_ms):
         detail = "Nobody controls this device. Take the lease; there is nobody to ask."
         raise Problem("lease-free", 409, "Nobody holds the lease", detail)
-    if lease.mine(caller):
+    if lease.held_by(caller):
         detail = "You control this device already, in this very session."
         raise Problem("lease-yours", 409, "The lease is yours", detail, extras={"epoch": lease.epoch})
-    existing = lease.asked
-    if existing is not None and existing.how(lease, now_ms) == "open":
-        if existing.by_me(caller):
+    existing = lease.request
+    if existing is not None and existing.current_outcome(lease, now_ms) == "open":
+        if existing.requested_by(caller):
             return lease
         detail = (
             f"{existing.by} asks for control already. Wait for the answer, or until {rfc3339(existing.expires_ms)}."
@@ -48,7 +48,7 @@ def request_control(
         expires_ms=now_ms + within_ms,
         lease_ms=lease_ms,
     )
-    return replace(lease, asked=asked)
+    return replace(lease, request=asked)
 
 
 def accept(lease: Lease | None, caller: Identity, *, request: str, now_ms: int) -> Lease:
@@ -68,7 +68,7 @@ def accept(lease: Lease | None, caller: Identity, *, request: str, now_ms: int) 
         expires_ms=now_ms + asked.lease_ms,
         lease_ms=asked.lease_ms,
         pairing=current.pairing,
-        asked=replace(asked, outcome="accepted"),
+        request=replace(asked, outcome="accepted"),
     )
 
 
@@ -81,7 +81,7 @@ def refuse(lease: Lease | None, caller: Identity, *, request: str, now_ms: int) 
     current, asked = _to_answer(lease, caller, request)
     if not _still(current, asked, "refused", now_ms):
         return current
-    return replace(current, asked=replace(asked, outcome="refused"))
+    return replace(current, request=replace(asked, outcome="refused"))
 
 
 def withdraw(lease: Lease | None, caller: Identity, *, request: str, now_ms: int) -> Lease:
@@ -91,14 +91,14 @@ def withdraw(lease: Lease | None, caller: Identity, *, request: str, now_ms: int
         Problem: ``request-unknown``, ``forbidden``, ``request-over``.
     """
     current, asked = find(lease, request)
-    if not asked.by_me(caller):
+    if not asked.requested_by(caller):
         raise forbidden("Only who asked for control may withdraw that, in the same session.")
-    how = asked.how(current, now_ms)
+    how = asked.current_outcome(current, now_ms)
     if how == "accepted":
         raise _over(how)
     if how != "open":
         return current
-    return replace(current, asked=replace(asked, outcome="withdrawn"))
+    return replace(current, request=replace(asked, outcome="withdrawn"))
 
 
 def find(lease: Lease | None, request: str) -> tuple[Lease, ControlRequest]:
@@ -107,21 +107,21 @@ def find(lease: Lease | None, request: str) -> tuple[Lease, ControlRequest]:
     Raises:
         Problem: ``request-unknown``.
     """
-    if lease is None or lease.asked is None or lease.asked.id != request:
+    if lease is None or lease.request is None or lease.request.id != request:
         raise not_found("request", request)
-    return lease, lease.asked
+    return lease, lease.request
 
 
 def _to_answer(lease: Lease | None, caller: Identity, request: str) -> tuple[Lease, ControlRequest]:
     current, asked = find(lease, request)
-    if not asked.to_me(caller):
+    if not asked.addressed_to(caller):
         raise forbidden("Only who holds the lease may answer that, in the same session.")
     return current, asked
 
 
 def _still(lease: Lease, asked: ControlRequest, wanted: Outcome, now_ms: int) -> bool:
     """Whether it can still be answered; not when it was answered so already."""
-    how = asked.how(lease, now_ms)
+    how = asked.current_outcome(lease, now_ms)
     if how not in {"open", wanted}:
         raise _over(how)
     return how == "open"

@@ -37,19 +37,19 @@ class ControlRequest:
     lease_ms: int
     outcome: Outcome = "open"
 
-    def how(self, lease: "Lease", now_ms: int) -> Outcome:
+    def current_outcome(self, lease: "Lease", now_ms: int) -> Outcome:
         """How it stands now with the request to the holder of ``lease``."""
         if self.outcome != "open":
             return self.outcome
         if now_ms >= self.expires_ms:
             return "lapsed"
-        return "open" if lease.epoch == self.epoch and lease.live(now_ms) else "ended"
+        return "open" if lease.epoch == self.epoch and lease.is_live(now_ms) else "ended"
 
-    def by_me(self, caller: Identity) -> bool:
+    def requested_by(self, caller: Identity) -> bool:
         """Whether this very sign-in session asks."""
         return self.account == caller.account and self.session == caller.session
 
-    def to_me(self, caller: Identity) -> bool:
+    def addressed_to(self, caller: Identity) -> bool:
         """Whether this very sign-in session was asked."""
         return self.holder_account == caller.account and self.holder_session == caller.session
 
@@ -74,26 +74,26 @@ class Lease:
     action: str = ""
     pairing: str = ""
     reason: str = ""
-    asked: ControlRequest | None = None
+    request: ControlRequest | None = None
 
-    def live(self, now_ms: int) -> bool:
+    def is_live(self, now_ms: int) -> bool:
         """Whether somebody holds it."""
         return bool(self.account) and now_ms < self.expires_ms
 
-    def mine(self, caller: Identity) -> bool:
+    def held_by(self, caller: Identity) -> bool:
         """Whether this very sign-in session is its holder, live or not."""
         return self.account == caller.account and self.session == caller.session
 
-    def anothers(self, caller: Identity, now_ms: int) -> bool:
+    def held_by_other(self, caller: Identity, now_ms: int) -> bool:
         """Whether somebody else holds it (another sign-in session of the same account is somebody else)."""
-        return self.live(now_ms) and not self.mine(caller)
+        return self.is_live(now_ms) and not self.held_by(caller)
 
-    def closed(self, now_ms: int) -> ControlRequest | None:
+    def closed_request(self, now_ms: int) -> ControlRequest | None:
         """The last request, which is open no longer: what it asked for ends at this moment."""
-        if self.asked is None:
+        if self.request is None:
             return None
-        how = self.asked.how(self, now_ms)
-        return replace(self.asked, outcome="ended" if how == "open" else how)
+        how = self.request.current_outcome(self, now_ms)
+        return replace(self.request, outcome="ended" if how == "open" else how)
 
 
 MIN_MS = 1_000
@@ -132,7 +132,7 @@ def acquire(
     Raises:
         Problem: ``lease-held`` by somebody else.
     """
-    taken = lease is not None and lease.anothers(caller, now_ms)
+    taken = lease is not None and lease.held_by_other(caller, now_ms)
     if lease is not None and taken and not over:
         raise lease_held(lease)
     return Lease(
@@ -145,7 +145,7 @@ def acquire(
         action=action,
         pairing=pairing,
         reason=over if taken else "",
-        asked=lease.closed(now_ms) if lease else None,
+        request=lease.closed_request(now_ms) if lease else None,
     )
 
 
@@ -165,7 +165,7 @@ def require_held(lease: Lease | None, caller: Identity, *, epoch: int, now_ms: i
     Raises:
         Problem: ``lease-lost``.
     """
-    if lease is None or lease.epoch != epoch or not lease.mine(caller) or not lease.live(now_ms):
+    if lease is None or lease.epoch != epoch or not lease.held_by(caller) or not lease.is_live(now_ms):
         extras = {"epoch": epoch, "current_epoch": lease.epoch if lease else 0}
         detail = f"Epoch {epoch} of the lease is not yours any more. Take the lease again."
         raise Problem("lease-lost", 409, "The lease is lost", detail, extras=extras)
@@ -174,14 +174,14 @@ def require_held(lease: Lease | None, caller: Identity, *, epoch: int, now_ms: i
 
 def release(lease: Lease, *, now_ms: int) -> Lease:
     """Nobody's lease; the epoch stays, so that the next one is higher."""
-    return Lease(epoch=lease.epoch, pairing=lease.pairing, asked=lease.closed(now_ms))
+    return Lease(epoch=lease.epoch, pairing=lease.pairing, request=lease.closed_request(now_ms))
 
 
 def invalidate(lease: Lease | None, *, pairing: str, now_ms: int) -> Lease:
     """Nobody's lease with the next epoch: all that was ordered under the one before is old."""
     if lease is None:
         return Lease(epoch=1, pairing=pairing)
-    return Lease(epoch=lease.epoch + 1, pairing=pairing, asked=lease.closed(now_ms))
+    return Lease(epoch=lease.epoch + 1, pairing=pairing, request=lease.closed_request(now_ms))
 
 
 def lease_held(lease: Lease) -> Problem:

@@ -45,13 +45,13 @@ class Share:
     expires_ms: int = NEVER_MS
     pairing: str = ""
 
-    def live(self, now_ms: int) -> bool:
+    def is_live(self, now_ms: int) -> bool:
         """Whether its time is not over."""
         return now_ms < self.expires_ms
 
-    def of(self, agent: Agent, now_ms: int) -> bool:
+    def applies_to(self, agent: Agent, now_ms: int) -> bool:
         """Whether it is live, and the agent still belongs to where it was shared."""
-        if not self.live(now_ms) or self.owner != agent.account:
+        if not self.is_live(now_ms) or self.owner != agent.account:
             return False
         return self.on == space_target(agent.space or "") or (bool(self.pairing) and self.pairing == agent.pairing)
 
@@ -93,7 +93,7 @@ def permissions(caller: Identity, agent: Agent, name: str, shares: Iterable[Shar
         live = [
             share
             for share in shares
-            if share.account == caller.account and share.on in {device, space} and share.of(agent, now_ms)
+            if share.account == caller.account and share.on in {device, space} and share.applies_to(agent, now_ms)
         ]
         best = max(live, key=lambda share: (_RANKS[share.role], share.expires_ms), default=None)
         whole = next((share for share in live if share.on == space), None)

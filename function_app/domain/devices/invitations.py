@@ -45,15 +45,15 @@ class Invitation:
     taken_by: str = ""
     taken_space: str = ""
 
-    def open(self, now_ms: int) -> bool:
+    def is_open(self, now_ms: int) -> bool:
         """Whether it can still be redeemed."""
         return self.uses > 0 and now_ms < self.expires_ms
 
-    def taken(self, account: str, space: str) -> "Invitation":
+    def accepted(self, account: str, space: str) -> "Invitation":
         """A transfer that has been accepted: nobody else can any more."""
         return replace(self, uses=0, taken_by=account, taken_space=space, expires_ms=NEVER_MS)
 
-    def used(self, account: str) -> "Invitation":
+    def redeemed(self, account: str) -> "Invitation":
         """With one use less."""
         return replace(self, uses=self.uses - 1, takers=(*self.takers, account))
 

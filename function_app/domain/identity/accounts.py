@@ -58,7 +58,7 @@ class Identity:
     only: tuple[str, ...] = ()
     until_ms: int = NEVER_MS
 
-    def lasting_s(self, wanted_s: int, now_ms: int) -> int:
+    def lifetime_s(self, wanted_s: int, now_ms: int) -> int:
         """For how long something is given to it that could be good for so long [s]; one second at least."""
         return max(1, min(wanted_s, (self.until_ms - now_ms) // 1000))
 

@@ -55,7 +55,7 @@ class ApiKey:
             until_ms=self.expires_ms,
         )
 
-    def opened_by(self, secret: str) -> bool:
+    def matches(self, secret: str) -> bool:
         """Whether it is this key's secret. Takes as long for any."""
         return hmac.compare_digest(self.hash, hashed(secret))
 

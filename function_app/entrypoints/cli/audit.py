@@ -41,7 +41,7 @@ async def run(functions: Functions, options: argparse.Namespace) -> int:
 
 
 async def _run(functions: Functions, options: argparse.Namespace) -> int:
-    trail = functions.trail
+    trail = functions.audit_reader
     expected = [parse_head(text) for text in getattr(options, "expect", [])]
     if None in expected:
         print("--expect is a number, a colon and 64 hexadecimal digits, as `audit head` prints it")  # noqa: T201

@@ -39,7 +39,7 @@ def handler(event: dict[str, Any], context: Any) -> Any:
     if "topic" in event:
         return loop.run_until_complete(from_iot_rule(_functions(), event))
     if event.get("source") in _SCHEDULES:
-        return loop.run_until_complete(_functions().sweep.run())
+        return loop.run_until_complete(_functions().scheduler.run_due_jobs())
     raise ValueError(f"an event with the fields {str(sorted(event))[:_SHOWN]} is for none of the functions")
 
 

@@ -50,7 +50,7 @@ async def http(req: func.HttpRequest, context: func.Context) -> func.HttpRespons
 @app.timer_trigger(schedule="*/5 * * * * *", arg_name="timer", run_on_startup=False)
 async def sweep(timer: func.TimerRequest) -> None:  # noqa: ARG001 (the host passes it by name)
     """What time brings: commands sent again, actions ended, rights expired."""
-    await _functions().sweep.run()
+    await _functions().scheduler.run_due_jobs()
 
 
 @app.function_name("ingest")

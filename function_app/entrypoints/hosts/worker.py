@@ -83,7 +83,7 @@ async def _check_models(functions: Functions) -> None:
 async def _sweep(functions: Functions) -> None:
     while True:
         try:
-            await functions.sweep.run()
+            await functions.scheduler.run_due_jobs()
         except Exception:  # noqa: BLE001 (one bad round must not end the timer)
             _log.exception("timer")
         await asyncio.sleep(SWEEP_EVERY_S)

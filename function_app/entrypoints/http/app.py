@@ -40,7 +40,7 @@ from function_app.entrypoints.http.sharing import invitations, shares
 from function_app.entrypoints.http.telemetry import blob_transfers, events, latency, series, uploads
 from function_app.ports.clock import Clock
 from function_app.ports.tables import StoreError
-from function_app.services.identity.rate_limiter import Limits
+from function_app.services.identity.rate_limiter import RateLimiter
 
 _SECURE_FOR = b"max-age=31536000"
 """A year: a browser that has once come by TLS comes no other way."""
@@ -69,7 +69,7 @@ def create_app(functions: Functions) -> FastAPI:
         lifespan=lifespan,
         redirect_slashes=False,
     )
-    caller = Caller(functions.identify, functions.api_keys, functions.limits)
+    caller = Caller(functions.authenticator, functions.api_keys, functions.rate_limiter)
     resources = (
         auth.router(functions, caller),
         me.router(functions, caller),
@@ -110,7 +110,7 @@ def create_app(functions: Functions) -> FastAPI:
     app.add_exception_handler(HTTPException, _on_http)
     # What no route knows at all; a mount would also swallow a wrong method, which is a 405.
     app.router.default = Console(functions.settings.console)
-    app.add_middleware(_Addresses, limits=functions.limits, proxies=functions.settings.trusted_proxies)
+    app.add_middleware(_Addresses, limits=functions.rate_limiter, proxies=functions.settings.trusted_proxies)
     app.add_middleware(
         _Headers,
         clock=functions.clock,
@@ -200,7 +200,7 @@ def _methods(request: Request) -> list[str]:
 class _Addresses:
     """Counts what is asked from each address, before anything else is done for it."""
 
-    def __init__(self, app: ASGIApp, *, limits: Limits, proxies: int) -> None:
+    def __init__(self, app: ASGIApp, *, limits: RateLimiter, proxies: int) -> None:
         self._app = app
         self._limits = limits
         self._proxies = proxies

@@ -50,12 +50,12 @@ def lease(found: Lease | None, who: Identity, now_ms: int) -> leases.LeaseOut | 
     """A live lease, with the open request for it."""
     if found is None:
         return None
-    asked = None if found.asked is None else control_request(found.asked, found, who, now_ms)
+    asked = None if found.request is None else control_request(found.request, found, who, now_ms)
     return leases.LeaseOut(
         holder=found.holder,
         epoch=found.epoch,
         expires_at=rfc3339(found.expires_ms),
-        mine=found.mine(who),
+        mine=found.held_by(who),
         reason=found.reason,
         request=asked if asked is not None and asked.outcome == "open" else None,
     )
@@ -67,10 +67,10 @@ def control_request(asked: ControlRequest, found: Lease, who: Identity, now_ms: 
         id=asked.id,
         by=asked.by,
         epoch=asked.epoch,
-        mine=asked.by_me(who),
+        mine=asked.requested_by(who),
         asked_at=rfc3339(asked.asked_ms),
         expires_at=rfc3339(asked.expires_ms),
-        outcome=asked.how(found, now_ms),
+        outcome=asked.current_outcome(found, now_ms),
     )
 
 

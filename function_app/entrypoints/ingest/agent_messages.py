@@ -44,14 +44,14 @@ async def tell(
             refused[place] = str(error)
     # All telemetry at once: that costs much less than one by one.
     measured = [place for place, arrived in taken.items() if arrived.topic.kind in topics.MEASURED]
-    dropped = await functions.intake.take([taken[place] for place in measured])
+    dropped = await functions.telemetry_ingest.ingest([taken[place] for place in measured])
     refused |= {measured[number]: why for number, why in dropped.items()}
     passed = [
         (messages[place][0], *arrived)
         for place, arrived in taken.items()
         if place not in refused and arrived.topic.kind != topics.LATE  # nobody looks at it as it comes
     ]
-    await functions.relay.pass_on(passed)
+    await functions.relay.publish(passed)
     return [refused.get(place) for place in range(len(messages))]
 
 

@@ -37,7 +37,7 @@ async def take_in(functions: Functions, topic: Topic, payload: bytes, *, by: Tra
     if topic.kind == topics.ACK:
         await functions.action_acks.ingest(topic, payload, by=by)
     elif topic.kind in topics.MEASURED:
-        await functions.intake.take([InboundMessage(topic, payload)])
+        await functions.telemetry_ingest.ingest([InboundMessage(topic, payload)])
     elif topic.kind in {topics.CONN, topics.DESC, topics.STATE, topics.EVENT}:
         await functions.presence.ingest(topic, payload, by=by)
 
@@ -63,4 +63,4 @@ async def ingest_telemetry(functions: Functions, messages: Sequence[tuple[str, b
         if parsed.kind in topics.MEASURED:
             arrived.append(InboundMessage(parsed, payload))
     if arrived:
-        await functions.intake.take(arrived)
+        await functions.telemetry_ingest.ingest(arrived)

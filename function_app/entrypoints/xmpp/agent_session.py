@@ -196,7 +196,7 @@ class AgentSession:
                     continue
                 passed.append((told.topic, topic, told.payload))
                 self._measured(InboundMessage(topic, told.payload))
-            await self._functions.relay.pass_on(passed)
+            await self._functions.relay.publish(passed)
 
     async def _bring(self) -> bool:
         """Bring what waits in the mailbox, for as long as the agent is whose it was; then ``False``."""
@@ -211,7 +211,7 @@ class AgentSession:
                     checked_s = loop.time()
                     if not await self._still_ours():
                         return False
-                letters = await self._functions.mailbox.waiting(self.agent, limit=AT_ONCE)
+                letters = await self._functions.mailbox.pending(self.agent, limit=AT_ONCE)
             except (StoreError, Problem) as error:
                 _log.warning("mailbox of %s: %s", self.agent.id, error)
                 await asyncio.sleep(LOOK_S)

@@ -18,7 +18,7 @@ from function_app.domain.common.ids import AGENT_LENGTH
 from function_app.domain.common.problems import Problem
 from function_app.domain.devices.devices import Agent
 from function_app.entrypoints.xmpp.agent_session import AgentSession
-from function_app.ports.command_feed import Orders
+from function_app.ports.command_feed import CommandFeed
 from function_app.ports.tables import StoreError
 from function_app.ports.xmpp_connection import XmppConnection
 from function_app.services.storage import records
@@ -41,7 +41,7 @@ class XmppGateway:
         orders: What the broker brings.
     """
 
-    def __init__(self, functions: Functions, line: XmppConnection, orders: Orders) -> None:
+    def __init__(self, functions: Functions, line: XmppConnection, orders: CommandFeed) -> None:
         self._functions = functions
         self._line = line
         self._orders = orders
@@ -249,7 +249,7 @@ class XmppGateway:
                 _log.warning("telemetry is behind: %d messages were dropped", self._dropped)
                 self._dropped = 0
             try:
-                await self._functions.intake.take(batch)
+                await self._functions.telemetry_ingest.ingest(batch)
             except Exception as error:  # noqa: BLE001 (what comes next goes on)
                 _log.warning("%d measurements were not stored: %s", len(batch), error)
 

@@ -16,7 +16,7 @@ from function_app.ports.clock import Clock
 from function_app.ports.tables import Conflict, Row, StoreError, Tables
 from function_app.services.accounts.sign_out import SignOut
 from function_app.services.audit.audit_log import AuditLog
-from function_app.services.devices.device_access import Devices
+from function_app.services.devices.device_access import DeviceAccess
 from function_app.services.identity.authenticator import RECHECK_MS, new_secret
 from function_app.services.identity.session_status import API_KEY
 from function_app.services.identity.sign_in import SignIn
@@ -38,7 +38,7 @@ _log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True, slots=True)
-class Wanted:
+class ApiKeyRequest:
     """A key to be made: as ``ApiKey``."""
 
     label: str
@@ -60,25 +60,25 @@ class ApiKeys:
         self,
         *,
         tables: Tables,
-        devices: Devices,
+        devices: DeviceAccess,
         sign_in: SignIn,
         sign_out: SignOut,
-        chain: AuditLog,
-        forget: Retention,
-        pending: Reminders,
+        audit_log: AuditLog,
+        retention: Retention,
+        reminders: Reminders,
         clock: Clock,
     ) -> None:
         self._tables = tables
         self._devices = devices
         self._sign_in = sign_in
         self._sign_out = sign_out
-        self._chain = chain
-        self._forget = forget
-        self._pending = pending
+        self._audit_log = audit_log
+        self._retention = retention
+        self._reminders = reminders
         self._clock = clock
         self._known: OrderedDict[str, _Checked] = OrderedDict()
 
-    async def make(self, caller: Identity, wanted: Wanted) -> tuple[ApiKey, str]:
+    async def make(self, caller: Identity, wanted: ApiKeyRequest) -> tuple[ApiKey, str]:
         """A new key, and the token that is shown this once.
 
         Raises:
@@ -107,16 +107,16 @@ class ApiKeys:
         )
         # Forgotten on time whatever becomes of this, and on the list before it is any use.
         due_ms = key.expires_ms + SHOWN_MS
-        await self._forget.row(records.API_KEYS, key.id, API_KEY, due_ms=due_ms)
-        await self._forget.row(records.MEMBERS, caller.account, _INDEX + key.id, due_ms=due_ms)
-        await self._pending.note(_EXPIRES + key.id, key.expires_ms)
+        await self._retention.delete_row_at(records.API_KEYS, key.id, API_KEY, due_ms=due_ms)
+        await self._retention.delete_row_at(records.MEMBERS, caller.account, _INDEX + key.id, due_ms=due_ms)
+        await self._reminders.schedule(_EXPIRES + key.id, key.expires_ms)
         about = {"name": key.label, "role": key.most.value, "only": list(only), "expires_ms": key.expires_ms}
-        async with self._chain.change(
+        async with self._audit_log.change(
             caller.account, AccountEvent.API_KEY_MADE, caller, on=f"key:{key.id}", **about
         ) as change:
             await change.noted()
             await self._tables.create(records.MEMBERS, Row(caller.account, _INDEX + key.id, {}))
-            await self._tables.create(records.API_KEYS, Row(key.id, API_KEY, records.fields(key)))
+            await self._tables.create(records.API_KEYS, Row(key.id, API_KEY, records.to_data(key)))
         return key, rules.token(key.id, secret)
 
     async def of(self, account: str) -> tuple[ApiKey, ...]:
@@ -135,7 +135,7 @@ class ApiKeys:
         key = records.read(row, ApiKey) if row else None
         if row is None or key is None or key.account != caller.account:
             raise not_found("api-key", key_id)
-        async with self._chain.change(
+        async with self._audit_log.change(
             caller.account, AccountEvent.API_KEY_REVOKED, caller, on=f"key:{key_id}"
         ) as change:
             await change.noted()
@@ -159,7 +159,7 @@ class ApiKeys:
         key = records.read(row, ApiKey) if row else None
         if key is not None and self._clock.now_ms() >= key.expires_ms:
             await self._sign_out.end(key.identity)
-        await self._pending.drop(note)
+        await self._reminders.cancel(note)
 
     async def identify(self, token: str) -> Identity:
         """Who asks by this token.
@@ -174,7 +174,7 @@ class ApiKeys:
         existing = self._known.get(parts[0])
         if existing is None or not 0 <= now_ms - existing.at_ms < RECHECK_MS:
             existing = await self._look(parts[0], now_ms)
-        if existing is None or not existing.key.opened_by(parts[1]) or now_ms >= existing.key.expires_ms:
+        if existing is None or not existing.key.matches(parts[1]) or now_ms >= existing.key.expires_ms:
             raise unauthorized(_REFUSED)
         if now_ms - existing.key.used_ms >= USED_EVERY_MS:
             existing.key = await self._used(existing.key, now_ms)
@@ -198,7 +198,7 @@ class ApiKeys:
             row = await self._tables.get(records.API_KEYS, key.id, API_KEY)
             if row is not None:
                 await self._tables.replace(
-                    records.API_KEYS, Row(row.partition, row.key, records.fields(used), row.etag)
+                    records.API_KEYS, Row(row.partition, row.key, records.to_data(used), row.etag)
                 )
         except (Conflict, StoreError) as error:
             _log.warning("the use of API key %s was not noted: %s", key.id, error)

@@ -15,11 +15,11 @@ from function_app.domain.audit.hash_chain import CLOUD, AccountEvent
 from function_app.domain.common.problems import Problem
 from function_app.domain.identity.accounts import Identity
 from function_app.ports.clock import Clock
-from function_app.ports.oidc_provider import OpenId, OpenIdError, Subject
+from function_app.ports.oidc_provider import OidcError, OidcProvider, Subject
 from function_app.ports.tables import Conflict, Row, Tables
 from function_app.services.audit.audit_log import AuditLog
 from function_app.services.identity.authenticator import new_secret
-from function_app.services.identity.sessions import From, Sessions, SignedIn
+from function_app.services.identity.sessions import Sessions, SignedIn, SignInOrigin
 from function_app.services.identity.sign_in import SignIn
 from function_app.services.sharing.invitations import Invitations, Known
 from function_app.services.storage import records
@@ -31,7 +31,7 @@ _log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True, slots=True)
-class Begun:
+class OidcRedirect:
     """Where to send the browser, and what it is to keep until it comes back."""
 
     address: str
@@ -39,7 +39,7 @@ class Begun:
 
 
 @dataclass(frozen=True, slots=True)
-class Returned:
+class OidcCallback:
     """What a browser comes back with; empty where it brought nothing.
 
     Attributes:
@@ -55,7 +55,7 @@ class Returned:
     error: str = ""
 
 
-class OpenIdSignIn:
+class OidcSignIn:
     """Signing in at one provider, where there is one.
 
     An account is made for who brings an invitation; for ``anyone`` else only where that is wanted.
@@ -65,13 +65,13 @@ class OpenIdSignIn:
         self,
         *,
         tables: Tables,
-        provider: OpenId | None,
+        provider: OidcProvider | None,
         redirect: str,
         anyone: bool,
         sign_in: SignIn,
         sessions: Sessions,
         invitations: Invitations,
-        chain: AuditLog,
+        audit_log: AuditLog,
         clock: Clock,
     ) -> None:
         self._tables = tables
@@ -81,10 +81,10 @@ class OpenIdSignIn:
         self._sign_in = sign_in
         self._sessions = sessions
         self._invitations = invitations
-        self._chain = chain
+        self._audit_log = audit_log
         self._clock = clock
 
-    async def begin(self, invitation: str = "") -> Begun:
+    async def begin(self, invitation: str = "") -> OidcRedirect:
         """Begin in one browser.
 
         Args:
@@ -99,7 +99,7 @@ class OpenIdSignIn:
         challenge = base64.urlsafe_b64encode(hashlib.sha256(verifier.encode()).digest()).rstrip(b"=").decode()
         try:
             address = await provider.address(state=state, nonce=nonce, challenge=challenge, redirect=self._redirect)
-        except OpenIdError as error:
+        except OidcError as error:
             _log.error("sign-in elsewhere: %s", error)
             detail = "The sign-in provider cannot be used now; the log of this server says why."
             raise Problem("open-id-unavailable", 503, "No sign-in elsewhere now", detail, retry_after_s=30) from error
@@ -112,9 +112,9 @@ class OpenIdSignIn:
             "expires_ms": self._clock.now_ms() + BEGUN_S * 1000,
         }
         await self._tables.create(records.SIGN_INS, Row(hashed[0], hashed, data))
-        return Begun(address, secret)
+        return OidcRedirect(address, secret)
 
-    async def finish(self, returned: Returned, whence: From) -> SignedIn:
+    async def finish(self, returned: OidcCallback, whence: SignInOrigin) -> SignedIn:
         """Sign in whoever comes back. What was begun is used up by it, whatever becomes of it.
 
         Raises:
@@ -135,7 +135,7 @@ class OpenIdSignIn:
                 redirect=self._redirect,
                 issuer=returned.issuer,
             )
-        except OpenIdError as error:
+        except OidcError as error:
             _log.error("sign-in elsewhere: %s", error)
             raise _refused() from error
         is_new = not await self._sign_in.is_known_elsewhere(subject.issuer, subject.id)
@@ -165,14 +165,16 @@ class OpenIdSignIn:
             # Somebody else was first with its last use. The account is there all the same, and empty.
             _log.warning("sign-in elsewhere: the invitation of a new account came to nothing: %s", problem.detail)
 
-    async def _refuse_stranger(self, subject: Subject, whence: From) -> NoReturn:
+    async def _refuse_stranger(self, subject: Subject, whence: SignInOrigin) -> NoReturn:
         code = "open-id-uninvited"
         _log.warning("sign-in elsewhere: %r (%r) has no account here and was not invited", subject.name, subject.id)
-        await self._chain.refused(CLOUD, AccountEvent.SIGN_IN_REFUSED, None, code=code, address=whence.address)
+        await self._audit_log.record_rejection(
+            CLOUD, AccountEvent.SIGN_IN_REFUSED, None, code=code, address=whence.address
+        )
         detail = "Nobody has invited you here. Ask somebody for an invitation, or whoever runs this server."
         raise Problem(code, 403, "Not invited", detail)
 
-    async def _begun(self, returned: Returned) -> dict[str, str]:
+    async def _begun(self, returned: OidcCallback) -> dict[str, str]:
         hashed = _hash(returned.state)
         expired = Problem(
             "open-id-expired", 403, "Begin again", "This sign-in was not begun here just now. Begin again."
@@ -188,7 +190,7 @@ class OpenIdSignIn:
             raise expired
         return {name: str(row.data.get(name, "")) for name in ("verifier", "nonce", "invitation")}
 
-    def _known(self) -> OpenId:
+    def _known(self) -> OidcProvider:
         if self._provider is None:
             detail = "Nobody signs in elsewhere at this server. Use a password or a one-time link."
             raise Problem("open-id-unknown", 404, "No sign-in elsewhere", detail)

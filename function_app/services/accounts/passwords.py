@@ -9,12 +9,12 @@ from function_app.domain.common.problems import Problem, forbidden, invalid, una
 from function_app.domain.identity.accounts import Account, Identity
 from function_app.domain.identity.passwords import normalize, weakness
 from function_app.ports.clock import Clock
-from function_app.ports.password_hasher import PasswordHashes
+from function_app.ports.password_hasher import PasswordHasher
 from function_app.ports.tables import Conflict, Row, Tables
 from function_app.services.accounts.sign_out import SignOut
 from function_app.services.audit.audit_log import AuditLog
-from function_app.services.identity.guess_limiter import Attempts, Guess, by_address
-from function_app.services.identity.sessions import From, Sessions, SignedIn
+from function_app.services.identity.guess_limiter import Guess, GuessLimiter, by_address
+from function_app.services.identity.sessions import Sessions, SignedIn, SignInOrigin
 from function_app.services.identity.sign_in import SignIn, named_partition, new_name
 from function_app.services.storage import records
 
@@ -43,24 +43,24 @@ class Passwords:
         self,
         *,
         tables: Tables,
-        hashes: PasswordHashes,
-        attempts: Attempts,
+        hasher: PasswordHasher,
+        guess_limiter: GuessLimiter,
         sign_in: SignIn,
         sessions: Sessions,
         sign_out: SignOut,
-        chain: AuditLog,
+        audit_log: AuditLog,
         clock: Clock,
     ) -> None:
         self._tables = tables
-        self._hashes = hashes
-        self._attempts = attempts
+        self._hasher = hasher
+        self._guess_limiter = guess_limiter
         self._sign_in = sign_in
         self._sessions = sessions
         self._sign_out = sign_out
-        self._chain = chain
+        self._audit_log = audit_log
         self._clock = clock
 
-    async def sign_in(self, name: str, password: str, whence: From) -> SignedIn:
+    async def sign_in(self, name: str, password: str, whence: SignInOrigin) -> SignedIn:
         """Sign in by name and password. An unknown name takes as long as a wrong password, and is answered the same.
 
         Raises:
@@ -69,7 +69,7 @@ class Passwords:
         # The address first: once it has had its tries, names that it makes up leave no rows.
         counters = {**by_address(whence.address, WRONG_TRIES_FROM), named_partition(name): WRONG_TRIES}
         try:
-            await self._attempts.count(GUESS, counters)
+            await self._guess_limiter.add_failure(GUESS, counters)
         except Problem as problem:
             await self._refused("", whence, problem.code)
             raise
@@ -77,22 +77,22 @@ class Passwords:
         account = named.id if named else ""
         row = await self._tables.get(records.ACCOUNTS, account or _NOBODY, _PASSWORD)
         stored = records.read(row, _Stored) if row else None
-        right = await self._hashes.check(stored.hash if stored else None, normalize(password))
+        right = await self._hasher.check(stored.hash if stored else None, normalize(password))
         if named is None or row is None or stored is None or not right:
             await self._refused(account, whence, WRONG)
             raise unauthorized("This name and password do not belong together.")
-        await self._attempts.uncount(GUESS, counters)
+        await self._guess_limiter.remove_failure(GUESS, counters)
         done = await self._sessions.begin(named, "password", whence)
         again = await self._tables.get(records.ACCOUNTS, account, _PASSWORD)
         if again is None or records.read(again, _Stored) != stored:
             # It was changed while this was looked at: that ended the sessions that it saw, not this one.
             await self._sign_out.end(Identity(account, named.name, done.session))
             raise unauthorized("The password was changed just now. Sign in with the new one.")
-        if self._hashes.outdated(stored.hash):
+        if self._hasher.outdated(stored.hash):
             await self._renew(again, password)
         return done
 
-    async def put(self, caller: Identity, password: str, *, old: str | None, whence: From) -> None:
+    async def put(self, caller: Identity, password: str, *, old: str | None, whence: SignInOrigin) -> None:
         """Set or change the password of one's own account; every other session of it ends.
 
         The old one has to be given, except in the first minutes after a one-time link was redeemed: whoever finds a
@@ -107,8 +107,8 @@ class Passwords:
             raise Problem("password-elsewhere", 409, "No password here", detail)
         row = await self._tables.get(records.ACCOUNTS, caller.account, _PASSWORD)
         await self._require_right(caller, row, old, whence)
-        data = records.fields(await self._store(password, caller.name))
-        async with self._chain.change(
+        data = records.to_data(await self._store(password, caller.name))
+        async with self._audit_log.change(
             caller.account, AccountEvent.PASSWORD_SET, caller, address=whence.address
         ) as change:
             await change.noted()
@@ -133,9 +133,11 @@ class Passwords:
             raise taken
         stored = await self._store(password, name)
         account = new_id(12)
-        row = await self._tables.create(records.ACCOUNTS, Row(account, _PASSWORD, records.fields(stored)))
+        row = await self._tables.create(records.ACCOUNTS, Row(account, _PASSWORD, records.to_data(stored)))
         try:
-            async with self._chain.change(account, AccountEvent.ACCOUNT_MADE, Identity(account, name, "")) as change:
+            async with self._audit_log.change(
+                account, AccountEvent.ACCOUNT_MADE, Identity(account, name, "")
+            ) as change:
                 await change.noted()
                 await self._tables.create(
                     records.ACCOUNTS, Row(named_partition(name), "account", new_name(account, name))
@@ -145,16 +147,16 @@ class Passwords:
             raise taken from conflict
         return await self._sign_in.account(name)
 
-    async def _refused(self, account: str, whence: From, code: str) -> None:
+    async def _refused(self, account: str, whence: SignInOrigin, code: str) -> None:
         """Record it with the account that was meant, or, where there is none of that name, with the cloud's own.
 
         Each wrong password, for there are few, so that a name that nobody has takes as long as one that is known.
         """
         wrong = code == WRONG
         data = {"code": code, "address": whence.address}
-        await self._chain.refused(account or CLOUD, AccountEvent.SIGN_IN_REFUSED, None, each=wrong, **data)
+        await self._audit_log.record_rejection(account or CLOUD, AccountEvent.SIGN_IN_REFUSED, None, each=wrong, **data)
 
-    async def _require_right(self, caller: Identity, row: Row | None, old: str | None, whence: From) -> None:
+    async def _require_right(self, caller: Identity, row: Row | None, old: str | None, whence: SignInOrigin) -> None:
         if old is None:
             session = await self._sessions.get(caller)
             if session is None or not session.fresh_by_link(self._clock.now_ms()):
@@ -163,23 +165,25 @@ class Passwords:
                 )
             return
         counters = {**by_address(whence.address, WRONG_TRIES_FROM), named_partition(caller.name): WRONG_TRIES}
-        await self._attempts.count(GUESS, counters)
-        if not await self._hashes.check(records.read(row, _Stored).hash if row else None, normalize(old)):
+        await self._guess_limiter.add_failure(GUESS, counters)
+        if not await self._hasher.check(records.read(row, _Stored).hash if row else None, normalize(old)):
             await self._refused(caller.account, whence, WRONG)
             raise forbidden("The old password is not right.")
-        await self._attempts.uncount(GUESS, counters)
+        await self._guess_limiter.remove_failure(GUESS, counters)
 
     async def _store(self, password: str, name: str) -> _Stored:
         password = normalize(password)
         why = weakness(password, name=name)
         if why:
             raise invalid(why, code="password-weak")
-        return _Stored(await self._hashes.make(password), self._clock.now_ms())
+        return _Stored(await self._hasher.make(password), self._clock.now_ms())
 
     async def _renew(self, row: Row, password: str) -> None:
         """The same password under today's parameters."""
-        created = _Stored(await self._hashes.make(normalize(password)), self._clock.now_ms())
+        created = _Stored(await self._hasher.make(normalize(password)), self._clock.now_ms())
         try:
-            await self._tables.replace(records.ACCOUNTS, Row(row.partition, row.key, records.fields(created), row.etag))
+            await self._tables.replace(
+                records.ACCOUNTS, Row(row.partition, row.key, records.to_data(created), row.etag)
+            )
         except Conflict:
             return  # it was changed just now

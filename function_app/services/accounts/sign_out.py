@@ -13,12 +13,12 @@ from function_app.ports.tables import Tables
 from function_app.services.audit.audit_log import AuditLog
 from function_app.services.control.leases import Leases
 from function_app.services.devices.control_rows import read_lease
-from function_app.services.devices.device_access import Devices
-from function_app.services.identity.authenticator import Identify, principal
+from function_app.services.devices.device_access import DeviceAccess
+from function_app.services.identity.authenticator import Authenticator, principal
 from function_app.services.identity.sessions import Sessions
 
 AT_ONCE = 16
-"""Devices that are looked at in the same moment."""
+"""DeviceAccess that are looked at in the same moment."""
 
 _log = logging.getLogger(__name__)
 
@@ -30,21 +30,21 @@ class SignOut:
         self,
         *,
         tables: Tables,
-        identify: Identify,
+        authenticator: Authenticator,
         sessions: Sessions,
         access: BrokerAccess,
-        devices: Devices,
+        devices: DeviceAccess,
         leases: Leases,
-        chain: AuditLog,
+        audit_log: AuditLog,
         clock: Clock,
     ) -> None:
         self._tables = tables
-        self._identify = identify
+        self._authenticator = authenticator
         self._sessions = sessions
         self._access = access
         self._devices = devices
         self._leases = leases
-        self._chain = chain
+        self._audit_log = audit_log
         self._clock = clock
 
     async def end(self, caller: Identity) -> None:
@@ -53,9 +53,9 @@ class SignOut:
         Whoever is not reached changes nothing: what the broker was told ends by itself within a quarter of an hour, a
         lease when it runs out, and until then nobody can renew either.
         """
-        async with self._chain.change(caller.account, AccountEvent.SIGNED_OUT, caller) as change:
+        async with self._audit_log.change(caller.account, AccountEvent.SIGNED_OUT, caller) as change:
             await change.noted()
-            await self._identify.sign_out(caller)
+            await self._authenticator.sign_out(caller)
             await self._sessions.drop(caller.account, caller.session)
         try:
             await self._access.revoke(principal=principal(caller))
@@ -89,7 +89,7 @@ class SignOut:
     async def _let_go(self, caller: Identity, device: Device, gate: asyncio.Semaphore) -> None:
         async with gate:
             lease = await read_lease(self._tables, device)
-            if lease is None or not lease.mine(caller) or not lease.live(self._clock.now_ms()):
+            if lease is None or not lease.held_by(caller) or not lease.is_live(self._clock.now_ms()):
                 return
             try:
                 await self._leases.release(caller, device.id, epoch=lease.epoch)

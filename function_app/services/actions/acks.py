@@ -13,11 +13,11 @@ from function_app.domain.common.ids import device_id, split_command
 from function_app.domain.common.json_depth import too_deep
 from function_app.domain.devices.devices import Transport
 from function_app.ports.clock import Clock
-from function_app.services.actions.action_store import ActionRows, StoredAction
-from function_app.services.actions.queue import Queues
+from function_app.services.actions.action_store import ActionStore, StoredAction
+from function_app.services.actions.queue import ActionQueues
 from function_app.services.messaging.delivery import CONFIRMING
 from function_app.services.messaging.mailbox import Mailbox
-from function_app.services.telemetry.latency import Latencies
+from function_app.services.telemetry.latency import LatencyStore
 
 _POLL_S = 0.02
 _SLOWEST_POLL_S = 0.2
@@ -29,9 +29,15 @@ class ActionAcks:
     """Applies acks to actions, and waits for them."""
 
     def __init__(
-        self, *, rows: ActionRows, queues: Queues, mailbox: Mailbox, latencies: Latencies, clock: Clock
+        self,
+        *,
+        action_store: ActionStore,
+        queues: ActionQueues,
+        mailbox: Mailbox,
+        latencies: LatencyStore,
+        clock: Clock,
     ) -> None:
-        self._rows = rows
+        self._action_store = action_store
         self._queues = queues
         self._mailbox = mailbox
         self._latencies = latencies
@@ -61,7 +67,7 @@ class ActionAcks:
     async def _answer(self, agent: str, ack: Ack) -> None:
         """To a command that is no action: somebody may wait for it."""
         if ack.status.terminal or ack.status in CONFIRMING:
-            await self._mailbox.answer(agent, ack)
+            await self._mailbox.store_answer(agent, ack)
 
     async def follow(
         self,
@@ -105,13 +111,13 @@ class ActionAcks:
                 async with asyncio.timeout(min(pause_s, left_s)):
                     reports.append(report(await anext(acks), self._clock.now_ms()))
                 if action.status is Status.QUEUED:  # not any more, or nobody would report about it
-                    stored = await self._rows.get(action.id) or stored
+                    stored = await self._action_store.get(action.id) or stored
                     action = _applied(stored.action, reports)
                 else:
                     action = apply_report(action, reports[-1])
             except TimeoutError:
                 pause_s = min(2 * pause_s, _SLOWEST_LOOK_S)
-                stored = await self._rows.get(stored.action.id) or stored
+                stored = await self._action_store.get(stored.action.id) or stored
                 action = _applied(stored.action, reports)
         return stored, reports
 
@@ -131,7 +137,7 @@ class ActionAcks:
         while not reached(stored.action, wanted) and (left_s := end - loop.time()) > 0:
             await asyncio.sleep(min(pause_s, left_s))
             pause_s = min(2 * pause_s, _SLOWEST_POLL_S)
-            stored = await self._rows.get(stored.action.id) or stored
+            stored = await self._action_store.get(stored.action.id) or stored
         return stored.action
 
 

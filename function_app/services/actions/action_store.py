@@ -12,7 +12,7 @@ from function_app.domain.devices.devices import Device
 from function_app.domain.identity.accounts import Identity
 from function_app.ports.tables import Row, Tables, Write
 from function_app.services.control.control_events import lease_change
-from function_app.services.devices.control_rows import Control, read_control_rows
+from function_app.services.devices.control_rows import ControlRows, read_control_rows
 from function_app.services.storage import records
 
 _PREFIX = "action:"
@@ -28,7 +28,7 @@ class StoredAction:
     waited_for: bool = False
 
 
-def place(action: str) -> tuple[str, str] | None:
+def row_location(action: str) -> tuple[str, str] | None:
     """Partition and key of an action, or ``None`` for what is no action's id."""
     parts = split_command(action)
     return None if parts is None else (parts[0], f"{_PREFIX}{parts[1]}")
@@ -36,11 +36,11 @@ def place(action: str) -> tuple[str, str] | None:
 
 def new_row(action: Action) -> Row:
     """The row of a new action."""
-    device, key = place(action.id) or (action.device, "")
-    return Row(device, key, records.fields(action))
+    device, key = row_location(action.id) or (action.device, "")
+    return Row(device, key, records.to_data(action))
 
 
-class ActionRows:
+class ActionStore:
     """Reads and changes actions."""
 
     def __init__(self, *, tables: Tables) -> None:
@@ -48,7 +48,7 @@ class ActionRows:
 
     async def get(self, action: str) -> StoredAction | None:
         """One action."""
-        where = place(action)
+        where = row_location(action)
         if where is None:
             return None
         row = await self._tables.get(records.CONTROL, *where)
@@ -99,7 +99,7 @@ class ActionRows:
             changed = change(stored.action)
             if changed is stored.action:
                 return stored
-            writes = [Write("replace", replace(stored.row, data=records.fields(changed)))]
+            writes = [Write("replace", replace(stored.row, data=records.to_data(changed)))]
             waited_for = False
             if changed.status.terminal:
                 control = await read_control_rows(self._tables, changed.device)
@@ -111,14 +111,14 @@ class ActionRows:
         return await records.retry(attempt)
 
 
-def _freed(action: Action, control: Control) -> list[Write]:
+def _freed(action: Action, control: ControlRows) -> list[Write]:
     """Give back what the action held: the slot, its place in the queue, and the lease that was given for it alone."""
     writes = []
     queue = control.queue.without(action.id)
     if control.action == action.id:
         writes.append(control.write_slot(action.device, "", action.pairing))
         if action.status is Status.FAILED:
-            queue = queue.halted(FAILED_BEFORE)
+            queue = queue.with_all_cancelled(FAILED_BEFORE)
     if queue != control.queue:
         writes.append(control.write_queue(action.device, queue))
     if control.lease is not None and control.lease.action == action.id:

@@ -11,18 +11,18 @@ from function_app.domain.identity.accounts import Identity
 from function_app.domain.identity.api_keys import key_of
 from function_app.ports.clock import Clock
 from function_app.ports.tables import Tables
-from function_app.services.actions.action_store import ActionRows, StoredAction
-from function_app.services.devices.device_access import Devices, devices_of
-from function_app.services.messaging.command_sender import Commands
+from function_app.services.actions.action_store import ActionStore, StoredAction
+from function_app.services.devices.device_access import DeviceAccess, devices_of
+from function_app.services.messaging.command_sender import CommandSender
 from function_app.services.robot_types.movements import Movements
 from function_app.services.storage import records
 
 
-class MovementChanged(Exception):  # noqa: N818 (an outcome that callers expect)
+class MovementUnavailable(Exception):  # noqa: N818 (an outcome that callers expect)
     """The script that the action pinned is gone."""
 
 
-class NoLonger(Exception):  # noqa: N818 (an outcome that callers expect)
+class PermissionEnded(Exception):  # noqa: N818 (an outcome that callers expect)
     """Who started the action may not have it carried out any more; ``why`` is one of ``DROPPED``."""
 
     def __init__(self, why: str) -> None:
@@ -30,23 +30,23 @@ class NoLonger(Exception):  # noqa: N818 (an outcome that callers expect)
         self.why = why
 
 
-class SendAction:
+class ActionDispatcher:
     """Publishes written actions: those whose turn has come, and those that nobody has answered."""
 
     def __init__(
         self,
         *,
         tables: Tables,
-        devices: Devices,
-        rows: ActionRows,
-        commands: Commands,
+        devices: DeviceAccess,
+        action_store: ActionStore,
+        command_sender: CommandSender,
         movements: Movements,
         clock: Clock,
     ) -> None:
         self._tables = tables
         self._devices = devices
-        self._rows = rows
-        self._commands = commands
+        self._action_store = action_store
+        self._command_sender = command_sender
         self._movements = movements
         self._clock = clock
 
@@ -61,22 +61,22 @@ class SendAction:
             return None
         return next((device for device in devices_of(agent) if device.id == action.device), None)
 
-    async def standing(self, action: Action) -> tuple[Identity, Device]:
+    async def current_permissions(self, action: Action) -> tuple[Identity, Device]:
         """For whom the action would begin now, and on what. It is looked up anew: it may have waited for long.
 
         Raises:
             NoLonger: The device is another's or gone, the share has ended or is a viewer's, its key has ended or
                 may do less, or whoever started it has signed out.
         """
-        caller = await self._devices.acting(Identity(action.account, action.who, action.session))
-        device, _ = (None, None) if caller is None else await self._devices.find(caller, action.device)
+        caller = await self._devices.current_identity(Identity(action.account, action.who, action.session))
+        device, _ = (None, None) if caller is None else await self._devices.find_with_link(caller, action.device)
         if caller is not None and device is not None and device.pairing == action.pairing and device.role.may_operate:
             return caller, device
         if await self.device(action) is None:
-            raise NoLonger(UNPAIRED)
+            raise PermissionEnded(UNPAIRED)
         if key_of(action.session):
-            raise NoLonger(KEY_ENDED)
-        raise NoLonger(SIGNED_OUT if caller is None else UNSHARED)
+            raise PermissionEnded(KEY_ENDED)
+        raise PermissionEnded(SIGNED_OUT if caller is None else UNSHARED)
 
     async def send(self, stored: StoredAction, device: Device) -> None:
         """Publish it and write that down.
@@ -87,8 +87,8 @@ class SendAction:
             BusUnavailable: The broker did not confirm it.
         """
         action = stored.action
-        await self.standing(action)
-        signed = await self._commands.signed(
+        await self.current_permissions(action)
+        signed = await self._command_sender.sign(
             device,
             action.id,
             await self._command(action),
@@ -97,9 +97,9 @@ class SendAction:
             issued_ms=action.issued_ms,
             ttl_ms=action.ttl_ms,
         )
-        await self._commands.publish(device, signed)
+        await self._command_sender.publish(device, signed)
         now_ms = self._clock.now_ms()
-        await self._rows.change(action.id, lambda existing: mark_published(existing, now_ms), existing=stored)
+        await self._action_store.change(action.id, lambda existing: mark_published(existing, now_ms), existing=stored)
 
     async def _command(self, action: Action) -> Task | RunMovement:
         if action.request["kind"] != "run_movement":
@@ -109,7 +109,7 @@ class SendAction:
         owner = Identity(action.pinned["author"] or action.account, action.who, "")
         source = await self._movements.pinned_source(owner, action.request["name"], action.pinned)
         if source is None:
-            raise MovementChanged
+            raise MovementUnavailable
         return RunMovement(
             **action.pinned,
             name=action.request["name"],

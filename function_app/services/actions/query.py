@@ -13,10 +13,10 @@ from function_app.ports.clock import Clock
 from function_app.ports.command_bus import BusUnavailable
 from function_app.ports.tables import Tables
 from function_app.services.actions.acks import ActionAcks
-from function_app.services.actions.action_store import ActionRows, StoredAction
+from function_app.services.actions.action_store import ActionStore, StoredAction
 from function_app.services.devices.control_rows import read_lease
-from function_app.services.devices.device_access import Devices, require_operator
-from function_app.services.messaging.command_sender import Commands
+from function_app.services.devices.device_access import DeviceAccess, require_operator
+from function_app.services.messaging.command_sender import CommandSender
 from function_app.services.messaging.delivery import Delivery
 
 
@@ -27,18 +27,18 @@ class Actions:
         self,
         *,
         tables: Tables,
-        devices: Devices,
-        rows: ActionRows,
+        devices: DeviceAccess,
+        action_store: ActionStore,
         acks: ActionAcks,
-        commands: Commands,
+        command_sender: CommandSender,
         delivery: Delivery,
         clock: Clock,
     ) -> None:
         self._tables = tables
         self._devices = devices
-        self._rows = rows
+        self._action_store = action_store
         self._acks = acks
-        self._commands = commands
+        self._command_sender = command_sender
         self._delivery = delivery
         self._clock = clock
 
@@ -50,7 +50,7 @@ class Actions:
         Raises:
             Problem: ``device-unknown``, ``cursor-invalid``.
         """
-        return await self._rows.list(await self._devices.get(caller, device), cursor=cursor, limit=limit)
+        return await self._action_store.list(await self._devices.get(caller, device), cursor=cursor, limit=limit)
 
     async def get(self, caller: Identity, action: str, *, wait_ms: int, wait_for: Literal["started", "done"]) -> Action:
         """One action, as soon as it has come as far as ``wait_for``, or as it is after ``wait_ms``.
@@ -62,7 +62,7 @@ class Actions:
         if not wait_ms or stored.action.status.terminal:
             return stored.action
         async with self._delivery.acks(device, action) as acks:
-            stored = await self._rows.get(action) or stored
+            stored = await self._action_store.get(action) or stored
             return await self._acks.follow(stored, acks, wanted=Status(wait_for), wait_ms=wait_ms)
 
     async def cancel(self, caller: Identity, action: str) -> Action:
@@ -77,7 +77,7 @@ class Actions:
             return stored.action
         cancel_id = command_id(device.id, self._clock.now_ms())
         now_ms = self._clock.now_ms()
-        marked = await self._rows.change(
+        marked = await self._action_store.change(
             action, lambda existing: _cancelling(existing, cancel_id, now_ms), existing=stored
         )
         if marked is not None and marked.action.status.terminal:
@@ -85,14 +85,14 @@ class Actions:
         lease = await read_lease(self._tables, device)
         epoch = max((marked or stored).action.epoch, lease.epoch if lease else 0)
         try:
-            await self._commands.send(device, CancelAction(action=action), caller=caller.name, epoch=epoch)
+            await self._command_sender.send(device, CancelAction(action=action), caller=caller.name, epoch=epoch)
         except BusUnavailable as error:
             raise broker_unavailable(f"{error}.") from error
         return (marked or stored).action
 
     async def _find(self, caller: Identity, action: str) -> tuple[Device, StoredAction]:
         parts = split_command(action)
-        stored = await self._rows.get(action) if parts else None
+        stored = await self._action_store.get(action) if parts else None
         if parts is None or stored is None:
             raise not_found("action", action)
         device = await self._device(caller, parts[0], action)
@@ -101,7 +101,7 @@ class Actions:
         return device, stored
 
     async def _device(self, caller: Identity, device: str, action: str) -> Device:
-        visible, _ = await self._devices.find(caller, device)
+        visible, _ = await self._devices.find_with_link(caller, device)
         if visible is None:
             raise not_found("action", action)
         return visible

@@ -20,11 +20,11 @@ from function_app.domain.identity.accounts import Identity
 from function_app.ports.clock import Clock
 from function_app.ports.command_bus import BusUnavailable
 from function_app.ports.tables import Row, Tables, Write
-from function_app.services.actions.action_store import ActionRows, StoredAction
-from function_app.services.actions.dispatcher import MovementChanged, NoLonger, SendAction
+from function_app.services.actions.action_store import ActionStore, StoredAction
+from function_app.services.actions.dispatcher import ActionDispatcher, MovementUnavailable, PermissionEnded
 from function_app.services.control.control_events import ControlEvents, lease_change
-from function_app.services.devices.control_rows import heed_device, read_control, read_control_rows
-from function_app.services.devices.device_access import Devices
+from function_app.services.devices.control_rows import apply_ended_epoch, read_control, read_control_rows
+from function_app.services.devices.device_access import DeviceAccess
 from function_app.services.storage import records
 from function_app.services.storage.reminders import Reminders
 
@@ -36,46 +36,46 @@ TIMEOUT: Final = "Its turn did not come in the time it was given. Start it again
 _log = logging.getLogger(__name__)
 
 
-class Queues:
+class ActionQueues:
     """Sees to the queues of devices."""
 
     def __init__(
         self,
         *,
         tables: Tables,
-        devices: Devices,
-        rows: ActionRows,
-        pending: Reminders,
-        sending: SendAction,
-        audit: ControlEvents,
+        devices: DeviceAccess,
+        action_store: ActionStore,
+        reminders: Reminders,
+        dispatcher: ActionDispatcher,
+        control_events: ControlEvents,
         clock: Clock,
     ) -> None:
         self._tables = tables
         self._devices = devices
-        self._rows = rows
-        self._pending = pending
-        self._sending = sending
-        self._audit = audit
+        self._action_store = action_store
+        self._reminders = reminders
+        self._dispatcher = dispatcher
+        self._control_events = control_events
         self._clock = clock
 
     async def change(
         self, action: str, change: Callable[[Action], Action], *, existing: StoredAction | None = None
     ) -> StoredAction | None:
-        """As ``ActionRows.change``; then, where others waited for its end, see to them.
+        """As ``ActionStore.change``; then, where others waited for its end, see to them.
 
         Raises:
             Problem: ``busy``.
         """
-        stored = await self._rows.change(action, change, existing=existing)
+        stored = await self._action_store.change(action, change, existing=existing)
         if stored is not None and stored.waited_for:
             await self.advance(stored.action.device)
         return stored
 
-    async def watch(self, device: str) -> None:
+    async def schedule_check(self, device: str) -> None:
         """Have the timer look at a device's queue; to be noted before something is put into it."""
-        await self._pending.note(f"{_NOTE}{device}", self._clock.now_ms() + LOOK_MS)
+        await self._reminders.schedule(f"{_NOTE}{device}", self._clock.now_ms() + LOOK_MS)
 
-    async def look(self, device: str) -> bool:
+    async def check(self, device: str) -> bool:
         """See to a device's queue; whether there is one."""
         await self.advance(device)
         return not (await read_control_rows(self._tables, device)).queue.empty
@@ -91,21 +91,21 @@ class Queues:
         except (Problem, BusUnavailable) as error:
             _log.warning("queue of %s: %s", device, error)
 
-    async def halt(self, device: str, why: str) -> None:
+    async def cancel_all(self, device: str, why: str) -> None:
         """Drop all that wait, and end them.
 
         Raises:
             Problem: ``busy``.
         """
-        await self._lose(device, lambda queue: queue.halted(why))
+        await self._lose(device, lambda queue: queue.with_all_cancelled(why))
 
-    async def drop(self, device: str, actions: Collection[str], why: str) -> None:
+    async def cancel(self, device: str, actions: Collection[str], why: str) -> None:
         """Drop some of those that wait, and end them.
 
         Raises:
             Problem: ``busy``.
         """
-        await self._lose(device, lambda queue: queue.dropping(actions, why))
+        await self._lose(device, lambda queue: queue.with_cancelled(actions, why))
 
     async def _lose(self, device: str, change: Callable[[ActionQueue], ActionQueue]) -> None:
         async def attempt() -> None:
@@ -136,7 +136,7 @@ class Queues:
             return True
         if control.action or not queue.actions:
             return False
-        stored = await self._rows.get(queue.actions[0])
+        stored = await self._action_store.get(queue.actions[0])
         if stored is None or stored.action.status is not Status.QUEUED:
             await self._tables.batch(records.CONTROL, [control.write_queue(device, queue.without(queue.actions[0]))])
             return True
@@ -145,9 +145,9 @@ class Queues:
     async def _drop(self, device: str, action: str, status: Status, code: str, message: str) -> None:
         """End one that lost its place. That takes it out of the queue; what has no row or an end already goes so."""
         now_ms = self._clock.now_ms()
-        await self._rows.change(action, lambda existing: _if_queued(existing, status, code, message, now_ms))
+        await self._action_store.change(action, lambda existing: _if_queued(existing, status, code, message, now_ms))
         control = await read_control_rows(self._tables, device)
-        if control.queue.holds(action):
+        if control.queue.contains(action):
             await self._tables.batch(records.CONTROL, [control.write_queue(device, control.queue.without(action))])
 
     async def _turn(self, stored: StoredAction) -> bool:
@@ -158,8 +158,8 @@ class Queues:
             await self._refuse(stored, Status.EXPIRED, "queue-timeout", TIMEOUT)
             return True
         try:
-            caller, device = await self._sending.standing(action)
-        except NoLonger as ended:
+            caller, device = await self._dispatcher.current_permissions(action)
+        except PermissionEnded as ended:
             status, message = DROPPED[ended.why]
             await self._refuse(stored, status, ended.why, message)
             return True
@@ -169,15 +169,17 @@ class Queues:
             if problem.code not in {"lease-held", "lease-lost"}:
                 raise
             await self._refuse(stored, Status.FAILED, problem.code, problem.detail)
-            await self._audit.refused(device, caller, "start an action that waited for its turn", problem)
+            await self._control_events.record_rejection(
+                device, caller, "start an action that waited for its turn", problem
+            )
             return True
         if started is None:
             return False
         try:
-            await self._sending.send(started, device)
-        except MovementChanged:
+            await self._dispatcher.send(started, device)
+        except MovementUnavailable:
             _log.warning("action %s: its script is gone; the timer ends it", action.id)
-        except NoLonger as ended:
+        except PermissionEnded as ended:
             _log.warning("action %s: %s; the timer ends it", action.id, ended.why)
         return False
 
@@ -186,13 +188,13 @@ class Queues:
 
         The note is written before, as for every action that the timer has to see to.
         """
-        await self._pending.note(stored.action.id, self._clock.now_ms() + RETRY_MS)
+        await self._reminders.schedule(stored.action.id, self._clock.now_ms() + RETRY_MS)
         control = await read_control(self._tables, device)
         if control.action or control.queue.position(stored.action.id) != 1:
             return None
         now_ms = self._clock.now_ms()
-        control = await heed_device(self._tables, device, control, caller, now_ms)
-        lease = run_lease(
+        control = await apply_ended_epoch(self._tables, device, control, caller, now_ms)
+        lease = action_lease(
             control.lease,
             caller,
             epoch=stored.action.epoch or None,
@@ -203,7 +205,7 @@ class Queues:
         )
         started = give_turn(stored.action, lease.epoch, now_ms)
         writes = [
-            Write("replace", replace(stored.row, data=records.fields(started))),
+            Write("replace", replace(stored.row, data=records.to_data(started))),
             control.write_slot(device.id, started.id, device.pairing),
             control.write_queue(device.id, control.queue.without(started.id)),
         ]
@@ -215,17 +217,17 @@ class Queues:
 
     async def _refuse(self, stored: StoredAction, status: Status, code: str, message: str) -> None:
         now_ms = self._clock.now_ms()
-        await self._rows.change(
+        await self._action_store.change(
             stored.action.id, lambda existing: _if_queued(existing, status, code, message, now_ms), existing=stored
         )
 
 
-def queue_of(note: str) -> str | None:
+def device_of_reminder(note: str) -> str | None:
     """The device whose queue a note of the timer is about; ``None`` where it is about something else."""
     return note.removeprefix(_NOTE) if note.startswith(_NOTE) else None
 
 
-def run_lease(
+def action_lease(
     lease: Lease | None,
     caller: Identity,
     *,
@@ -242,7 +244,7 @@ def run_lease(
     """
     if epoch is not None:
         return rules.require_held(lease, caller, epoch=epoch, now_ms=now_ms)
-    if lease is not None and lease.live(now_ms) and lease.mine(caller):
+    if lease is not None and lease.is_live(now_ms) and lease.held_by(caller):
         return lease
     return rules.acquire(lease, caller, lease_ms=lease_ms, now_ms=now_ms, pairing=pairing, action=action)
 

@@ -23,13 +23,13 @@ from function_app.ports.command_bus import BusUnavailable
 from function_app.ports.tables import Row, Tables, Write
 from function_app.services.actions import capability_check
 from function_app.services.actions.acks import ActionAcks
-from function_app.services.actions.action_store import ActionRows, StoredAction, new_row
-from function_app.services.actions.queue import Queues, run_lease
+from function_app.services.actions.action_store import ActionStore, StoredAction, new_row
+from function_app.services.actions.queue import ActionQueues, action_lease
 from function_app.services.control.control_events import ControlEvents, lease_change
-from function_app.services.devices.control_rows import Control, heed_device, read_control
-from function_app.services.devices.device_access import Devices, require_online, require_operator
-from function_app.services.messaging.command_sender import Commands
-from function_app.services.messaging.delivery import Delivery, Signed
+from function_app.services.devices.control_rows import ControlRows, apply_ended_epoch, read_control
+from function_app.services.devices.device_access import DeviceAccess, require_online, require_operator
+from function_app.services.messaging.command_sender import CommandSender
+from function_app.services.messaging.delivery import Delivery, SignedCommand
 from function_app.services.robot_types import parameter_schema as parameters
 from function_app.services.robot_types.movements import Movements
 from function_app.services.storage import records
@@ -120,27 +120,27 @@ class StartAction:
         self,
         *,
         tables: Tables,
-        devices: Devices,
+        devices: DeviceAccess,
         movements: Movements,
-        commands: Commands,
-        rows: ActionRows,
+        command_sender: CommandSender,
+        action_store: ActionStore,
         acks: ActionAcks,
-        pending: Reminders,
-        queues: Queues,
+        reminders: Reminders,
+        queues: ActionQueues,
         delivery: Delivery,
-        audit: ControlEvents,
+        control_events: ControlEvents,
         clock: Clock,
     ) -> None:
         self._tables = tables
         self._devices = devices
         self._movements = movements
-        self._commands = commands
-        self._rows = rows
+        self._command_sender = command_sender
+        self._action_store = action_store
         self._acks = acks
-        self._pending = pending
+        self._reminders = reminders
         self._queues = queues
         self._delivery = delivery
-        self._audit = audit
+        self._control_events = control_events
         self._clock = clock
 
     async def start(
@@ -175,8 +175,8 @@ class StartAction:
     async def _begin(self, caller: Identity, device_id: str, start: Start, listening: AsyncExitStack) -> "_Begun":
         if isinstance(start.asked, AskMovement):
             parameters.check(start.asked.parameters)
-        device, link = await self._devices.with_link(caller, device_id)
-        async with self._audit.refusals(device, caller, "start an action"):
+        device, link = await self._devices.get_with_link(caller, device_id)
+        async with self._control_events.recording_rejections(device, caller, "start an action"):
             return await self._at(caller, device, link, start, listening)
 
     async def _at(
@@ -189,9 +189,9 @@ class StartAction:
         require_online(link, self._clock.now_ms())
         plan = await self._plan(caller, device, start)
         ttl_ms = min(start.ttl_ms, start.timeout_ms)
-        await self._pending.note(plan.action, plan.created_ms + RETRY_MS)
+        await self._reminders.schedule(plan.action, plan.created_ms + RETRY_MS)
         if start.policy == "queue":
-            await self._queues.watch(device.id)
+            await self._queues.schedule_check(device.id)
         stored, created = await self._write(caller, plan, start, ttl_ms)
         if created and stored.action.status is Status.QUEUED:
             await self._queues.advance(device.id)
@@ -201,7 +201,7 @@ class StartAction:
         signed = await self._signed(plan, stored.action)
         acks = await listening.enter_async_context(self._delivery.acks(device, plan.action))
         try:
-            await self._commands.publish(device, signed)
+            await self._command_sender.publish(device, signed)
         except BusUnavailable:
             # It is written: the timer publishes it as soon as the broker is back, or ends it.
             return _Begun(stored, acks, undelivered=True)
@@ -214,7 +214,7 @@ class StartAction:
             Problem: ``device-unknown``, ``forbidden``.
         """
         try:
-            await self._devices.require_still(caller, device)
+            await self._devices.require_still_allowed(caller, device)
         except Problem:
             why = KEY_ENDED if caller.key else UNSHARED
             status, message = DROPPED[why]
@@ -227,7 +227,7 @@ class StartAction:
     async def _join(self, stored: StoredAction, device: Device, listening: AsyncExitStack) -> "_Begun":
         """Where nothing is to be sent: an earlier request started it, or it waits for its turn."""
         acks = await listening.enter_async_context(self._delivery.acks(device, stored.action.id))
-        return _Begun(await self._rows.get(stored.action.id) or stored, acks)
+        return _Begun(await self._action_store.get(stored.action.id) or stored, acks)
 
     async def _plan(self, caller: Identity, device: Device, start: Start) -> _Plan:
         asked, now_ms = start.asked, self._clock.now_ms()
@@ -259,11 +259,11 @@ class StartAction:
             pinned = {name: getattr(command, name) for name in PINNED}
             plan = _Plan(device, action, now_ms, request, command, pinned)
         # Before anything is written: what cannot be sent must not take the slot.
-        self._commands.check(device, action, plan.command, caller=caller.name, ttl_ms=1)
+        self._command_sender.validate(device, action, plan.command, caller=caller.name, ttl_ms=1)
         return plan
 
-    async def _signed(self, plan: _Plan, action: Action) -> Signed:
-        return await self._commands.signed(
+    async def _signed(self, plan: _Plan, action: Action) -> SignedCommand:
+        return await self._command_sender.sign(
             plan.device,
             action.id,
             plan.command,
@@ -279,7 +279,7 @@ class StartAction:
         async def attempt() -> tuple[StoredAction, bool]:
             now_ms = self._clock.now_ms()
             control = await read_control(self._tables, plan.device)
-            control = await heed_device(self._tables, plan.device, control, caller, now_ms)
+            control = await apply_ended_epoch(self._tables, plan.device, control, caller, now_ms)
             if now_ms - plan.created_ms > ABANDON_MS:
                 raise busy_store()
             earlier = await self._earlier(caller, plan.device, start)
@@ -312,7 +312,7 @@ class StartAction:
                 control.write_slot(plan.device.id, control.action if waits else plan.action, plan.device.pairing),
             ]
             if waits:
-                writes.append(control.write_queue(plan.device.id, control.queue.joined(plan.action)))
+                writes.append(control.write_queue(plan.device.id, control.queue.with_last(plan.action)))
             elif lease is not None and lease is not control.lease:
                 writes.append(control.write_lease(plan.device.id, lease))
                 writes += lease_change(
@@ -336,7 +336,7 @@ class StartAction:
         if row.data["request"] != start.fingerprint():
             detail = "This Idempotency-Key was used with another request. Use a new key for a new request."
             raise Problem("idempotency-key-reused", 422, "The key was used before", detail)
-        return await self._rows.get(row.data["action"])
+        return await self._action_store.get(row.data["action"])
 
 
 def device_busy(action: str) -> Problem:
@@ -346,7 +346,7 @@ def device_busy(action: str) -> Problem:
 
 
 def _lease(  # noqa: PLR0917 (what decides)
-    caller: Identity, control: Control, plan: _Plan, start: Start, before: str, now_ms: int
+    caller: Identity, control: ControlRows, plan: _Plan, start: Start, before: str, now_ms: int
 ) -> Lease | None:
     """The lease it runs under; ``None`` where it waits behind ``before`` without one, and gets its own at its turn.
 
@@ -358,10 +358,10 @@ def _lease(  # noqa: PLR0917 (what decides)
     waits = bool(before) and start.policy == "queue"
     if waits and start.epoch is None:
         held = control.lease
-        if held is not None and held.live(now_ms) and not held.mine(caller) and not held.action:
+        if held is not None and held.is_live(now_ms) and not held.held_by(caller) and not held.action:
             raise rules.lease_held(held)
         return None
-    lease = run_lease(
+    lease = action_lease(
         control.lease,
         caller,
         epoch=start.epoch,

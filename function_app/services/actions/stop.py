@@ -20,24 +20,24 @@ from function_app.domain.devices.devices import Device
 from function_app.domain.identity.accounts import Identity
 from function_app.ports.command_bus import BusUnavailable
 from function_app.ports.tables import StoreError
-from function_app.services.actions.queue import Queues
+from function_app.services.actions.queue import ActionQueues
 from function_app.services.control.control_events import ControlEvents
-from function_app.services.control.lease_store import LeaseRows
-from function_app.services.devices.device_access import Devices, require_operator
+from function_app.services.control.lease_store import LeaseStore
+from function_app.services.devices.device_access import DeviceAccess, require_operator
 from function_app.services.devices.spaces import Spaces
-from function_app.services.messaging.command_sender import Commands
+from function_app.services.messaging.command_sender import CommandSender
 from function_app.services.messaging.delivery import Delivery
 
 REPEAT_S: Final = 0.2
 CONFIRM_MS: Final = 1_000
 AT_ONCE: Final = 16
-"""Devices whose tables are written at the same moment when many are stopped. The Stop itself waits for nothing."""
+"""DeviceAccess whose tables are written at the same moment when many are stopped. The Stop itself waits for nothing."""
 
 _log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True, slots=True)
-class Stopped:
+class StopResult:
     """What became of Stop on one device: whether it has confirmed, or why it could not be told."""
 
     device: str
@@ -51,21 +51,21 @@ class StopDevices:
     def __init__(
         self,
         *,
-        devices: Devices,
+        devices: DeviceAccess,
         spaces: Spaces,
-        rows: LeaseRows,
-        commands: Commands,
-        queues: Queues,
+        lease_store: LeaseStore,
+        command_sender: CommandSender,
+        queues: ActionQueues,
         delivery: Delivery,
-        audit: ControlEvents,
+        control_events: ControlEvents,
     ) -> None:
         self._devices = devices
         self._spaces = spaces
-        self._rows = rows
-        self._commands = commands
+        self._lease_store = lease_store
+        self._command_sender = command_sender
         self._queues = queues
         self._delivery = delivery
-        self._audit = audit
+        self._control_events = control_events
 
     async def stop(self, caller: Identity, device_id: str, reason: str) -> bool:
         """Latch Stop; whether the device has confirmed it within a second.
@@ -77,11 +77,11 @@ class StopDevices:
             Problem: ``device-unknown``, ``forbidden``, ``broker-unavailable``: neither way was open.
         """
         device = await self._devices.get(caller, device_id)
-        async with self._audit.refusals(device, caller, "stop"):
+        async with self._control_events.recording_rejections(device, caller, "stop"):
             require_operator(device)
         return await self._stop(caller, device, reason, nullcontext())
 
-    async def stop_many(self, caller: Identity, reason: str, *, space: str | None = None) -> list[Stopped]:
+    async def stop_many(self, caller: Identity, reason: str, *, space: str | None = None) -> list[StopResult]:
         """Stop every device that ``caller`` may operate, of one space or of all; each has its own answer.
 
         All are told at the same time, and each for itself is waited for: one that is dead costs the others nothing.
@@ -111,21 +111,21 @@ class StopDevices:
             Problem: ``device-unknown``, ``forbidden``, ``busy``, ``broker-unavailable``.
         """
         device = await self._devices.get(caller, device_id)
-        async with self._audit.refusals(device, caller, "reset Stop"):
+        async with self._control_events.recording_rejections(device, caller, "reset Stop"):
             require_operator(device)
-        _, lease = await self._rows.change(
+        _, lease = await self._lease_store.change(
             caller, device, lambda lease, now_ms: rules.invalidate(lease, pairing=device.pairing, now_ms=now_ms)
         )
-        await self._devices.require_still(caller, device)
-        return await self._commands.confirmed(
+        await self._devices.require_still_allowed(caller, device)
+        return await self._command_sender.send_confirmed(
             device, ResetStop(), caller=caller.name, epoch=lease.epoch, wait_ms=CONFIRM_MS
         )
 
-    async def _one(self, caller: Identity, device: Device, reason: str, gate: asyncio.Semaphore) -> Stopped:
+    async def _one(self, caller: Identity, device: Device, reason: str, gate: asyncio.Semaphore) -> StopResult:
         try:
-            return Stopped(device.id, await self._stop(caller, device, reason, gate))
+            return StopResult(device.id, await self._stop(caller, device, reason, gate))
         except Problem as problem:
-            return Stopped(device.id, confirmed=False, problem=problem)
+            return StopResult(device.id, confirmed=False, problem=problem)
 
     async def _stop(
         self, caller: Identity, device: Device, reason: str, gate: AbstractAsyncContextManager[object]
@@ -137,7 +137,9 @@ class StopDevices:
             await asyncio.sleep(0)  # it goes before anything is signed or written
             writing = asyncio.create_task(self._write(caller, device, reason, gate))
             order = StopDevice(reason=reason)
-            return await self._commands.confirmed(device, order, caller=caller.name, epoch=0, wait_ms=CONFIRM_MS)
+            return await self._command_sender.send_confirmed(
+                device, order, caller=caller.name, epoch=0, wait_ms=CONFIRM_MS
+            )
         finally:
             plain.cancel()
             with contextlib.suppress(asyncio.CancelledError, BusUnavailable):
@@ -162,8 +164,8 @@ class StopDevices:
         message = f"{caller.name} stopped it: {reason}" if reason else f"{caller.name} stopped it."
         try:
             async with gate:
-                await self._queues.halt(device.id, STOPPED)
-                await self._audit.happened(
+                await self._queues.cancel_all(device.id, STOPPED)
+                await self._control_events.record(
                     device,
                     Fact.STOP_ORDERED,
                     message,

@@ -29,12 +29,12 @@ from function_app.domain.common.problems import Problem, busy_store
 from function_app.domain.identity.accounts import Identity
 from function_app.ports.blobs import Blobs
 from function_app.ports.clock import Clock
-from function_app.ports.signing_keys import Keys
+from function_app.ports.signing_keys import SigningKeys
 from function_app.ports.tables import Conflict, Row, StoreError, Tables, Write
 from function_app.services.storage import records
 from function_app.services.storage.reminders import Reminders
 from function_app.services.storage.retention import DAY_MS, Retention
-from function_app.services.storage.write_batcher import Batches
+from function_app.services.storage.write_batcher import WriteBatcher
 
 LOOK_MS: Final = 15_000
 """The timer looks at a chain so long after something was noted for it, at most twice that."""
@@ -105,15 +105,22 @@ class AuditLog:
     """Writes the chains. Reading and verifying them: ``services/audit_trail.py``."""
 
     def __init__(
-        self, *, tables: Tables, blobs: Blobs, keys: Keys, forget: Retention, pending: Reminders, clock: Clock
+        self,
+        *,
+        tables: Tables,
+        blobs: Blobs,
+        keys: SigningKeys,
+        retention: Retention,
+        reminders: Reminders,
+        clock: Clock,
     ) -> None:
         self._tables = tables
         self._blobs = blobs
         self._keys = keys
-        self._forget = forget
-        self._pending = pending
+        self._retention = retention
+        self._reminders = reminders
         self._clock = clock
-        self._batches = Batches(self._write, most=_AT_ONCE)
+        self._batches = WriteBatcher(self._write, most=_AT_ONCE)
         self._noted: OrderedDict[tuple[str, str, int], None] = OrderedDict()
         self._refused: OrderedDict[tuple[str, ...], int] = OrderedDict()
 
@@ -155,11 +162,11 @@ class AuditLog:
             StoreError: The tables cannot be used.
         """
         at_ms = self._clock.now_ms()
-        await self.keep(
+        await self.append(
             owner, rules.entry(what, caller, entry_id=new_id(), at_ms=at_ms, on=on, outcome=outcome, **data)
         )
 
-    async def refused(
+    async def record_rejection(
         self, owner: str, what: str, caller: Identity | None, *, on: str = "", each: bool = False, **data: Any
     ) -> None:
         """Record a refusal; the same again and again once in a while only, but where it says ``each``.
@@ -178,7 +185,7 @@ class AuditLog:
         except (StoreError, Problem) as error:
             _log.warning("audit of a refusal: %s", error)
 
-    async def keep(self, owner: str, entry: Entry) -> None:
+    async def append(self, owner: str, entry: Entry) -> None:
         """Record ``entry``; where others are in the way for long, the timer does.
 
         Raises:
@@ -189,7 +196,7 @@ class AuditLog:
         except Problem:
             await self.open(owner, entry)
 
-    async def tell(self, owner: str, entries: Sequence[Entry]) -> None:
+    async def append_all(self, owner: str, entries: Sequence[Entry]) -> None:
         """Record what comes at least once, each once by its id.
 
         Raises:
@@ -203,11 +210,11 @@ class AuditLog:
                 # Before the first id of a day, so that nothing stays that nobody forgets.
                 span = (f"{_ONCE}{day:08d}:", f"{_ONCE}{day:08d};")
                 due_ms = (self._clock.now_ms() // DAY_MS + 1) * DAY_MS + KEEP_IDS_MS
-                await self._forget.rows(records.AUDIT, owner, first=span[0], last=span[1], due_ms=due_ms)
+                await self._retention.delete_rows_at(records.AUDIT, owner, first=span[0], last=span[1], due_ms=due_ms)
             jobs.append(_Job(each.fields(), once=f"{_ONCE}{day:08d}:{each.id}"))
         await self._batches.add(owner, jobs)
 
-    async def look(self, owner: str) -> None:
+    async def check(self, owner: str) -> None:
         """The timer's look: record what was left.
 
         Raises:
@@ -220,7 +227,7 @@ class AuditLog:
         left = [row for row in page.rows if row.data["outcome"] != "unknown" or row.data["at_ms"] <= since_ms]
         await self._batches.add(owner, [_Job(dict(row.data), waiting=row) for row in left])
         if len(left) < len(page.rows) or page.cursor is not None:
-            await self._pending.note(f"{_NOTE}{owner}", now_ms + LOOK_MS)
+            await self._reminders.schedule(f"{_NOTE}{owner}", now_ms + LOOK_MS)
 
     async def anchor(self, owner: str) -> None:
         """Note the head where whoever can write the tables need not be able to.
@@ -244,7 +251,7 @@ class AuditLog:
         now_ms = self._clock.now_ms()
         due_ms = (now_ms // LOOK_MS + 2) * LOOK_MS
         if self._new(_NOTE, owner, due_ms):
-            await self._pending.note(f"{_NOTE}{owner}", due_ms)
+            await self._reminders.schedule(f"{_NOTE}{owner}", due_ms)
         return await self._tables.create(records.AUDIT, Row(owner, f"{_WAIT}{entry.id}", entry.fields()))
 
     async def close(self, owner: str, entry: Entry, waiting: Row) -> None:
@@ -339,7 +346,7 @@ class AuditLog:
         if self._new(_ANCHOR, owner, due_ms):
             with contextlib.suppress(Conflict):
                 await self._tables.create(records.AUDIT, Row(_CHAINS, owner, {}))
-            await self._pending.note(f"{_ANCHOR}{owner}", due_ms)
+            await self._reminders.schedule(f"{_ANCHOR}{owner}", due_ms)
 
 
 def record_key(seq: int) -> str:

@@ -14,7 +14,7 @@ from function_app.domain.audit.hash_chain import FIRST, Head
 from function_app.domain.common.problems import forbidden, invalid
 from function_app.domain.identity.accounts import Identity
 from function_app.ports.blobs import Blobs
-from function_app.ports.signing_keys import Keys
+from function_app.ports.signing_keys import SigningKeys
 from function_app.ports.tables import Row, Tables
 from function_app.services.audit.audit_log import anchors, record_key
 from function_app.services.storage import records
@@ -27,7 +27,7 @@ _MOST_NAMES: Final = 1_000
 
 
 @dataclass(frozen=True, slots=True)
-class Wanted:
+class AuditFilter:
     """Which records: of one kind, on one thing, of a stretch of time (``None``: all of them)."""
 
     what: str | None = None
@@ -47,7 +47,7 @@ class Wanted:
 
 
 @dataclass(frozen=True, slots=True)
-class Verdict:
+class VerificationResult:
     """How it stands with one chain. ``broken`` names the first place that is not as it was written; empty: whole."""
 
     chain: str
@@ -59,13 +59,13 @@ class Verdict:
 class AuditReader:
     """Reads and verifies."""
 
-    def __init__(self, *, tables: Tables, blobs: Blobs, keys: Keys) -> None:
+    def __init__(self, *, tables: Tables, blobs: Blobs, keys: SigningKeys) -> None:
         self._tables = tables
         self._blobs = blobs
         self._keys = keys
 
     async def read(
-        self, caller: Identity, wanted: Wanted, *, cursor: str | None, limit: int
+        self, caller: Identity, wanted: AuditFilter, *, cursor: str | None, limit: int
     ) -> tuple[list[Mapping[str, Any]], str | None]:
         """Records of one's own chain, newest first, and where the next page begins.
 
@@ -110,7 +110,7 @@ class AuditReader:
         row = await self._tables.get(records.AUDIT, chain, "head")
         return None if row is None else Head(int(row.data["seq"]), str(row.data["hash"]))
 
-    async def verify(self, chain: str, *, expected: tuple[Head, ...] = ()) -> Verdict:
+    async def verify(self, chain: str, *, expected: tuple[Head, ...] = ()) -> VerificationResult:
         """Whether a chain is as it was written.
 
         Args:
@@ -119,18 +119,18 @@ class AuditReader:
         """
         noted = await self._anchors(chain)
         if isinstance(noted, str):
-            return Verdict(chain, rules.genesis(chain), noted)
+            return VerificationResult(chain, rules.genesis(chain), noted)
         existing = {head.seq: head for head in noted} | {head.seq: head for head in expected}
         for head in (*noted, *expected):
             if existing[head.seq] != head:
-                return Verdict(chain, head, f"two different heads were noted for record {head.seq}")
+                return VerificationResult(chain, head, f"two different heads were noted for record {head.seq}")
         end = await self._tables.get(records.AUDIT, chain, "head")
         reached, broken = await self._walk(chain, end, existing)
         if not broken:
             broken = await self._end(chain, end, reached)
         if not broken and (missing := [seq for seq in existing if seq > reached.seq]):
             broken = f"record {reached.seq + 1}: it and all after it are gone; {max(missing)} were noted elsewhere"
-        return Verdict(chain, reached, broken, len(noted))
+        return VerificationResult(chain, reached, broken, len(noted))
 
     async def _walk(self, chain: str, end: Row | None, existing: Mapping[int, Head]) -> tuple[Head, str]:
         """How far the chain is whole up to ``end``, and what is wrong behind that."""

@@ -1,7 +1,7 @@
 """What happened to the control over devices, into their events and their owner's chain: nothing of it is lost.
 
 A change of a lease and the events that tell of it are one batch in the device's partition of ``Control``. From there
-they are moved to ``Events`` and to the chain (``services/audit_chain.py``) at once, by whoever makes the next change,
+they are moved to ``EventLog`` and to the chain (``services/audit_chain.py``) at once, by whoever makes the next change,
 or by the timer, which looks at a device with a lease by a note in ``Reminders``. A refusal changes nothing, so it is
 written straight there.
 """
@@ -25,7 +25,7 @@ from function_app.services.audit.audit_log import AuditLog
 from function_app.services.devices.control_rows import read_control_rows
 from function_app.services.storage import records
 from function_app.services.storage.reminders import Reminders
-from function_app.services.telemetry.event_log import Events
+from function_app.services.telemetry.event_log import EventLog
 
 LOOK_MS: Final = 15_000
 """The timer looks at a device so long after a change of its lease, in case that whoever made it was killed."""
@@ -43,19 +43,21 @@ _log = logging.getLogger(__name__)
 class ControlEvents:
     """Tells what happened."""
 
-    def __init__(self, *, tables: Tables, events: Events, chain: AuditLog, pending: Reminders, clock: Clock) -> None:
+    def __init__(
+        self, *, tables: Tables, events: EventLog, audit_log: AuditLog, reminders: Reminders, clock: Clock
+    ) -> None:
         self._tables = tables
         self._events = events
-        self._chain = chain
-        self._pending = pending
+        self._audit_log = audit_log
+        self._reminders = reminders
         self._clock = clock
         self._refused: dict[tuple[str, ...], int] = {}
 
-    async def watch(self, device: str) -> None:
+    async def schedule_check(self, device: str) -> None:
         """Have the timer look at a device's lease; to be noted before the write that changes it."""
-        await self._pending.note(f"{_NOTE}{device}", self._clock.now_ms() + LOOK_MS)
+        await self._reminders.schedule(f"{_NOTE}{device}", self._clock.now_ms() + LOOK_MS)
 
-    async def look(self, device: str) -> None:
+    async def check(self, device: str) -> None:
         """The timer's look: tell what was left, and what time has brought; note when to look again.
 
         Raises:
@@ -70,15 +72,17 @@ class ControlEvents:
         for event in late:
             await self._events.add(device, pairing, event)
         if late:
-            await self._chain.tell(await self._owner(device, pairing), [_entry(device, event, {}) for event in late])
+            await self._audit_log.append_all(
+                await self._owner(device, pairing), [_entry(device, event, {}) for event in late]
+            )
         if lease is not None:
-            ends = [lease.expires_ms] if lease.live(now_ms) else []
-            if lease.asked is not None and lease.asked.how(lease, now_ms) == "open":
-                ends.append(lease.asked.expires_ms)
+            ends = [lease.expires_ms] if lease.is_live(now_ms) else []
+            if lease.request is not None and lease.request.current_outcome(lease, now_ms) == "open":
+                ends.append(lease.request.expires_ms)
             if ends:
-                await self._pending.note(f"{_NOTE}{device}", min(ends))
+                await self._reminders.schedule(f"{_NOTE}{device}", min(ends))
 
-    async def tell(self, device: str) -> None:
+    async def publish(self, device: str) -> None:
         """Move what is noted to the device's events and its owner's chain. Safe to repeat and to be done by several.
 
         Where others are in the way for long, the timer does it.
@@ -96,7 +100,7 @@ class ControlEvents:
             owner = row.data.get("owner") or await self._owner(device, row.data["pairing"])
             owned.setdefault(owner, []).append(_entry(device, row.data["event"], row.data.get("by", {})))
         for owner, entries in owned.items():
-            await self._chain.tell(owner, entries)
+            await self._audit_log.append_all(owner, entries)
         for row in page.rows:
             with contextlib.suppress(Conflict):  # another process tells the same
                 await self._tables.delete(records.CONTROL, row)
@@ -112,7 +116,7 @@ class ControlEvents:
             return agent.account
         return next((each.account for each in agent.leaving if each.pairing == pairing), CLOUD)
 
-    async def happened(
+    async def record(
         self,
         device: Device,
         fact: Fact,
@@ -128,10 +132,10 @@ class ControlEvents:
         Raises:
             StoreError: The tables cannot be used.
         """
-        event = await self.event(device, fact, message, severity=severity, data=data)
-        await self._chain.keep(device.owner or CLOUD, _entry(device.id, event, _by(caller), outcome))
+        event = await self.add_event(device, fact, message, severity=severity, data=data)
+        await self._audit_log.append(device.owner or CLOUD, _entry(device.id, event, _by(caller), outcome))
 
-    async def event(
+    async def add_event(
         self, device: Device, fact: Fact, message: str, *, severity: Any = "info", data: Mapping[str, Any]
     ) -> Mapping[str, Any]:
         """The same among the device's events alone, for what has its record otherwise; gives the event.
@@ -144,7 +148,7 @@ class ControlEvents:
         return event
 
     @contextlib.asynccontextmanager
-    async def refusals(self, device: Device, caller: Identity, what: str) -> AsyncGenerator[None]:
+    async def recording_rejections(self, device: Device, caller: Identity, what: str) -> AsyncGenerator[None]:
         """Tell of it when what is done within is refused for want of a role or of the lease.
 
         Args:
@@ -156,10 +160,10 @@ class ControlEvents:
             yield
         except Problem as problem:
             if problem.code in REFUSALS:
-                await self.refused(device, caller, what, problem)
+                await self.record_rejection(device, caller, what, problem)
             raise
 
-    async def refused(self, device: Device, caller: Identity, what: str, problem: Problem) -> None:
+    async def record_rejection(self, device: Device, caller: Identity, what: str, problem: Problem) -> None:
         """Tell of a refusal. Whatever goes wrong with that: the refusal stands."""
         now_ms = self._clock.now_ms()
         key = (device.id, caller.session, what, problem.code)
@@ -171,7 +175,7 @@ class ControlEvents:
             del self._refused[next(iter(self._refused))]
         message = f"{caller.name} was refused to {what}: {problem.detail}"
         try:
-            await self.happened(
+            await self.record(
                 device,
                 Fact.ORDER_REFUSED,
                 message,
@@ -184,7 +188,7 @@ class ControlEvents:
             _log.warning("refusal on %s: %s", device.id, error)
 
 
-def told(
+def event_writes(
     device: str, pairing: str, facts: Iterable[ControlEvent], *, owner: str = "", caller: Identity | None = None
 ) -> list[Write]:
     """The writes that note facts, to go into one batch with the change that they tell of.
@@ -216,7 +220,7 @@ def lease_change(
 ) -> list[Write]:
     """The events of a change of a lease, to go into its batch."""
     facts = control_events.lease_changes(before, after, by=caller.name, now_ms=now_ms)
-    return told(device, after.pairing, facts, owner=owner, caller=caller)
+    return event_writes(device, after.pairing, facts, owner=owner, caller=caller)
 
 
 def _entry(device: str, event: Mapping[str, Any], by: Mapping[str, str], outcome: Outcome = "done") -> Entry:

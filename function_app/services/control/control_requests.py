@@ -16,35 +16,35 @@ from function_app.ports.clock import Clock
 from function_app.ports.command_bus import BusUnavailable
 from function_app.ports.tables import Tables
 from function_app.services.control.control_events import ControlEvents
-from function_app.services.control.lease_store import LeaseRows
+from function_app.services.control.lease_store import LeaseStore
 from function_app.services.control.leases import Leases
 from function_app.services.devices.control_rows import read_lease
-from function_app.services.devices.device_access import Devices, require_operator
-from function_app.services.messaging.command_sender import Commands
+from function_app.services.devices.device_access import DeviceAccess, require_operator
+from function_app.services.messaging.command_sender import CommandSender
 
 _log = logging.getLogger(__name__)
 
 
-class Handovers:
+class ControlRequests:
     """Requests for control. The lease's row decides; the device shows it to everybody who watches."""
 
     def __init__(
         self,
         *,
         tables: Tables,
-        devices: Devices,
+        devices: DeviceAccess,
         leases: Leases,
-        rows: LeaseRows,
-        commands: Commands,
-        audit: ControlEvents,
+        lease_store: LeaseStore,
+        command_sender: CommandSender,
+        control_events: ControlEvents,
         clock: Clock,
     ) -> None:
         self._tables = tables
         self._devices = devices
         self._leases = leases
-        self._rows = rows
-        self._commands = commands
-        self._audit = audit
+        self._lease_store = lease_store
+        self._command_sender = command_sender
+        self._control_events = control_events
         self._clock = clock
 
     async def get(self, caller: Identity, device_id: str, request: str) -> tuple[Lease, ControlRequest]:
@@ -56,7 +56,7 @@ class Handovers:
         device = await self._devices.get(caller, device_id)
         return rules.find(await read_lease(self._tables, device), request)
 
-    async def ask(
+    async def create(
         self, caller: Identity, device_id: str, *, within_ms: int, lease_ms: int, wait_ms: int
     ) -> tuple[Lease, ControlRequest, bool, bool]:
         """Ask the holder for control.
@@ -83,15 +83,15 @@ class Handovers:
                 lease, caller, request=created, within_ms=within_ms, lease_ms=lease_ms, now_ms=now_ms
             )
 
-        async with self._audit.refusals(device, caller, "ask for control"):
+        async with self._control_events.recording_rejections(device, caller, "ask for control"):
             require_operator(device)
-            _, lease = await self._rows.change(caller, device, changed)
-        asked = lease.asked
+            _, lease = await self._lease_store.change(caller, device, changed)
+        asked = lease.request
         assert asked is not None  # noqa: S101 (the rule has just written it)
         left_ms = max(1, asked.expires_ms - self._clock.now_ms())
         order = RequestControl(request=asked.id, requester=asked.by, answer_within_ms=left_ms)
         try:
-            shown = await self._commands.confirmed(
+            shown = await self._command_sender.send_confirmed(
                 device, order, caller=caller.name, epoch=lease.epoch, wait_ms=wait_ms
             )
         except Problem as problem:
@@ -111,7 +111,7 @@ class Handovers:
             Problem: ``device-unknown``, ``forbidden``, ``request-unknown``, ``request-over``, ``asker-gone``, ``busy``.
         """
         device = await self._devices.get(caller, device_id)
-        async with self._audit.refusals(device, caller, "hand control over"):
+        async with self._control_events.recording_rejections(device, caller, "hand control over"):
             require_operator(device)
             await self._require_asker(device, request)
             before, lease = await self._change(caller, device, rules.accept, request)
@@ -127,14 +127,14 @@ class Handovers:
         )
         return lease, asked, confirmed
 
-    async def refuse(self, caller: Identity, device_id: str, request: str) -> tuple[Lease, ControlRequest]:
+    async def reject(self, caller: Identity, device_id: str, request: str) -> tuple[Lease, ControlRequest]:
         """Keep control.
 
         Raises:
             Problem: ``device-unknown``, ``forbidden``, ``request-unknown``, ``request-over``, ``busy``.
         """
         device = await self._devices.get(caller, device_id)
-        async with self._audit.refusals(device, caller, "refuse control"):
+        async with self._control_events.recording_rejections(device, caller, "refuse control"):
             require_operator(device)
             before, lease = await self._change(caller, device, rules.refuse, request)
         if before is not lease:
@@ -148,7 +148,7 @@ class Handovers:
             Problem: ``device-unknown``, ``forbidden``, ``request-unknown``, ``request-over``, ``busy``.
         """
         device = await self._devices.get(caller, device_id)
-        async with self._audit.refusals(device, caller, "withdraw a request for control"):
+        async with self._control_events.recording_rejections(device, caller, "withdraw a request for control"):
             before, lease = await self._change(caller, device, rules.withdraw, request)
         if before is not lease:
             await self._drop(caller, device, lease, request)
@@ -156,31 +156,33 @@ class Handovers:
     async def _change(
         self, caller: Identity, device: Device, rule: Callable[..., Lease], request: str
     ) -> tuple[Lease | None, Lease]:
-        return await self._rows.change(
+        return await self._lease_store.change(
             caller, device, lambda lease, now_ms: rule(lease, caller, request=request, now_ms=now_ms)
         )
 
     async def _require_asker(self, device: Device, request: str) -> None:
         """Whoever asked must still be there, and one who may operate. What is over already, the rule answers."""
         lease, asked = rules.find(await read_lease(self._tables, device), request)
-        if asked.how(lease, self._clock.now_ms()) != "open":
+        if asked.current_outcome(lease, self._clock.now_ms()) != "open":
             return
-        asker = await self._devices.acting(Identity(asked.account, asked.by, asked.session))
-        result = (await self._devices.find(asker, device.id))[0] if asker is not None else None
+        asker = await self._devices.current_identity(Identity(asked.account, asked.by, asked.session))
+        result = (await self._devices.find_with_link(asker, device.id))[0] if asker is not None else None
         if result is None or not result.role.may_operate:
             raise _asker_gone(asked.by, "Control stays with you.")
 
     async def _require_asker_still(self, device: Device, lease: Lease) -> None:
         asker = Identity(lease.account, lease.holder, lease.session, key=key_of(lease.session))
         try:
-            await self._leases.require_still(asker, device)
+            await self._leases.require_still_allowed(asker, device)
         except Problem as problem:
             raise _asker_gone(lease.holder, "Nobody has control now.") from problem
 
     async def _drop(self, caller: Identity, device: Device, lease: Lease, request: str) -> None:
         """Have the device show it no longer. Where that does not arrive, its time is over there soon by itself."""
         try:
-            await self._commands.send(device, WithdrawRequest(request=request), caller=caller.name, epoch=lease.epoch)
+            await self._command_sender.send(
+                device, WithdrawRequest(request=request), caller=caller.name, epoch=lease.epoch
+            )
         except BusUnavailable as error:
             _log.warning("request for %s: %s", device.id, error)
 

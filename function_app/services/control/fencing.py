@@ -11,10 +11,10 @@ from function_app.ports.broker_access import BrokerAccess, BrokerAccessError
 from function_app.ports.clock import Clock
 from function_app.ports.command_bus import BusUnavailable
 from function_app.ports.tables import Tables
-from function_app.services.control.control_events import told
+from function_app.services.control.control_events import event_writes
 from function_app.services.devices.control_rows import read_control_rows
 from function_app.services.identity.authenticator import everything
-from function_app.services.messaging.command_sender import Commands
+from function_app.services.messaging.command_sender import CommandSender
 from function_app.services.storage import records
 
 _log = logging.getLogger(__name__)
@@ -23,13 +23,15 @@ _log = logging.getLogger(__name__)
 class ControlRevocation:
     """Ends leases from outside."""
 
-    def __init__(self, *, tables: Tables, commands: Commands, access: BrokerAccess, clock: Clock) -> None:
+    def __init__(self, *, tables: Tables, command_sender: CommandSender, access: BrokerAccess, clock: Clock) -> None:
         self._tables = tables
-        self._commands = commands
+        self._command_sender = command_sender
         self._access = access
         self._clock = clock
 
-    async def end(self, device: Device, why: str, *, account: str | None = None, until_s: float | None = None) -> bool:
+    async def revoke(
+        self, device: Device, why: str, *, account: str | None = None, until_s: float | None = None
+    ) -> bool:
         """Raise the epoch, so that the holder's setpoints and orders are old, and have the device hold.
 
         A lease that has run out is fenced too: what was ordered under it may still be on its way.
@@ -56,14 +58,14 @@ class ControlRevocation:
                 return None
             lease = Lease(epoch=existing.epoch + 1, pairing=device.pairing)
             fact = control_ended(existing, lease, why=why, now_ms=self._clock.now_ms())
-            facts = told(device.id, device.pairing, [fact], owner=device.owner)
+            facts = event_writes(device.id, device.pairing, [fact], owner=device.owner)
             await self._tables.batch(records.CONTROL, [control.write_lease(device.id, lease), *facts])
             return lease
 
         lease = await records.retry(attempt)
         return lease is None or await self._tell(device, lease, until_s)
 
-    async def repeat(self, device: Device, account: str, *, until_s: float) -> bool:
+    async def retry(self, device: Device, account: str, *, until_s: float) -> bool:
         """Tell again of the end of a lease that ``account`` had; whether it could be told, until ``until_s``.
 
         Where somebody else has control by now, the device is told of them; until it has heard that, what counts is that
@@ -102,7 +104,7 @@ class ControlRevocation:
 
     async def _release(self, device: Device, epoch: int) -> bool:
         try:
-            await self._commands.send(device, ReleaseLease(), caller="telescope", epoch=epoch)
+            await self._command_sender.send(device, ReleaseLease(), caller="telescope", epoch=epoch)
         except BusUnavailable as error:
             _log.warning("end of control of %s: %s", device.id, error)
             return False

@@ -8,16 +8,16 @@ from function_app.domain.identity.accounts import Identity
 from function_app.ports.clock import Clock
 from function_app.ports.tables import Tables
 from function_app.services.control.control_events import ControlEvents, lease_change
-from function_app.services.devices.control_rows import heed_device, read_control
+from function_app.services.devices.control_rows import apply_ended_epoch, read_control
 from function_app.services.storage import records
 
 
-class LeaseRows:
+class LeaseStore:
     """Changes leases. An action that gets a lease of its own writes it in its own batch."""
 
-    def __init__(self, *, tables: Tables, audit: ControlEvents, clock: Clock) -> None:
+    def __init__(self, *, tables: Tables, control_events: ControlEvents, clock: Clock) -> None:
         self._tables = tables
-        self._audit = audit
+        self._control_events = control_events
         self._clock = clock
 
     async def change(
@@ -40,18 +40,18 @@ class LeaseRows:
             nonlocal watched
             control = await read_control(self._tables, device)
             now_ms = self._clock.now_ms()
-            control = await heed_device(self._tables, device, control, caller, now_ms)
+            control = await apply_ended_epoch(self._tables, device, control, caller, now_ms)
             lease = change(control.lease, now_ms)
             if lease is control.lease:
                 return lease, lease
             facts = lease_change(device.id, control.lease, lease, caller=caller, now_ms=now_ms, owner=device.owner)
             if facts and not watched:
-                await self._audit.watch(device.id)
+                await self._control_events.schedule_check(device.id)
                 watched = True
             await self._tables.batch(records.CONTROL, [control.write_lease(device.id, lease), *facts])
             return control.lease, lease
 
         before, after = await records.retry(attempt)
         if watched:
-            await self._audit.tell(device.id)
+            await self._control_events.publish(device.id)
         return before, after

@@ -15,10 +15,10 @@ from function_app.ports.command_bus import BusUnavailable
 from function_app.ports.tables import Tables
 from function_app.services.control.control_events import ControlEvents
 from function_app.services.control.fencing import ControlRevocation, control_client
-from function_app.services.control.lease_store import LeaseRows
-from function_app.services.devices.control_rows import ended_at_device, read_lease
-from function_app.services.devices.device_access import Devices, require_operator, require_owner
-from function_app.services.messaging.command_sender import Commands
+from function_app.services.control.lease_store import LeaseStore
+from function_app.services.devices.control_rows import ended_by_device, read_lease
+from function_app.services.devices.device_access import DeviceAccess, require_operator, require_owner
+from function_app.services.messaging.command_sender import CommandSender
 
 _log = logging.getLogger(__name__)
 
@@ -30,21 +30,21 @@ class Leases:
         self,
         *,
         tables: Tables,
-        devices: Devices,
-        rows: LeaseRows,
-        fence: ControlRevocation,
-        commands: Commands,
+        devices: DeviceAccess,
+        lease_store: LeaseStore,
+        revocation: ControlRevocation,
+        command_sender: CommandSender,
         access: BrokerAccess,
-        audit: ControlEvents,
+        control_events: ControlEvents,
         clock: Clock,
     ) -> None:
         self._tables = tables
         self._devices = devices
-        self._rows = rows
-        self._fence = fence
-        self._commands = commands
+        self._lease_store = lease_store
+        self._revocation = revocation
+        self._command_sender = command_sender
         self._access = access
-        self._audit = audit
+        self._control_events = control_events
         self._clock = clock
 
     async def get(self, caller: Identity, device_id: str) -> Lease | None:
@@ -55,11 +55,11 @@ class Leases:
         """
         device = await self._devices.get(caller, device_id)
         lease = await read_lease(self._tables, device)
-        if lease is None or not lease.live(self._clock.now_ms()):
+        if lease is None or not lease.is_live(self._clock.now_ms()):
             return None
-        return None if await ended_at_device(self._tables, device, lease) else lease
+        return None if await ended_by_device(self._tables, device, lease) else lease
 
-    async def take(
+    async def acquire(
         self,
         caller: Identity,
         device_id: str,
@@ -91,12 +91,12 @@ class Leases:
                 return rules.acquire(lease, caller, lease_ms=for_ms, now_ms=now_ms, pairing=device.pairing, over=over)
             return rules.renew(lease, caller, epoch=epoch, lease_ms=for_ms, now_ms=now_ms)
 
-        async with self._audit.refusals(device, caller, what):
+        async with self._control_events.recording_rejections(device, caller, what):
             require_operator(device)
             if over:
                 require_owner(device)
-            before, lease = await self._rows.change(caller, device, changed)
-            await self.require_still(caller, device)
+            before, lease = await self._lease_store.change(caller, device, changed)
+            await self.require_still_allowed(caller, device)
         confirmed = await self.grant(device, lease, by=caller.name, wait_ms=wait_ms)
         if before is not None and lease.reason and epoch is None:
             await self.revoke(device, before.epoch)
@@ -113,26 +113,26 @@ class Leases:
         def changed(lease: Lease | None, now_ms: int) -> Lease:
             return rules.release(rules.require_held(lease, caller, epoch=epoch, now_ms=now_ms), now_ms=now_ms)
 
-        async with self._audit.refusals(device, caller, "give control back"):
+        async with self._control_events.recording_rejections(device, caller, "give control back"):
             require_operator(device)
-            await self._rows.change(caller, device, changed)
+            await self._lease_store.change(caller, device, changed)
         # Released it is, whoever can be told: what the device was granted ends with the time it was granted for.
         try:
-            await self._commands.send(device, ReleaseLease(), caller=caller.name, epoch=epoch)
+            await self._command_sender.send(device, ReleaseLease(), caller=caller.name, epoch=epoch)
         except BusUnavailable as error:
             _log.warning("release of %s: %s", device.id, error)
         await self.revoke(device, epoch)
 
-    async def require_still(self, caller: Identity, device: Device) -> None:
+    async def require_still_allowed(self, caller: Identity, device: Device) -> None:
         """See that whoever has just got the lease may still have it; else it has ended before the device hears of it.
 
         Raises:
             Problem: ``device-unknown``, ``forbidden``.
         """
         try:
-            await self._devices.require_still(caller, device)
+            await self._devices.require_still_allowed(caller, device)
         except Problem:
-            await self._fence.end(device, UNSHARED, account=caller.account)
+            await self._revocation.revoke(device, UNSHARED, account=caller.account)
             raise
 
     async def grant(self, device: Device, lease: Lease, *, by: str, wait_ms: int) -> bool:
@@ -142,7 +142,9 @@ class Leases:
         """
         order = GrantLease(holder=lease.holder, lease_ms=lease.lease_ms, reason=lease.reason)
         try:
-            return await self._commands.confirmed(device, order, caller=by, epoch=lease.epoch, wait_ms=wait_ms)
+            return await self._command_sender.send_confirmed(
+                device, order, caller=by, epoch=lease.epoch, wait_ms=wait_ms
+            )
         except Problem as problem:
             _log.warning("lease of %s: %s", device.id, problem.detail)
             return False

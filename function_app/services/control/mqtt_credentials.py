@@ -17,8 +17,8 @@ from function_app.ports.tables import Tables
 from function_app.services.control.control_events import ControlEvents
 from function_app.services.control.fencing import control_client
 from function_app.services.devices.control_rows import read_lease
-from function_app.services.devices.device_access import Devices, require_claimed, require_operator
-from function_app.services.identity.authenticator import principal, watch_principal
+from function_app.services.devices.device_access import DeviceAccess, require_claimed, require_operator
+from function_app.services.identity.authenticator import principal, viewer_principal
 
 WATCH_S = 15 * 60
 AGENT_S = 3600
@@ -28,7 +28,7 @@ TOPIC_BYTES = 10_000
 
 
 @dataclass(frozen=True, slots=True)
-class Issued:
+class IssuedCredentials:
     """Credentials, and the topics to use with them."""
 
     client_id: str
@@ -43,15 +43,21 @@ class MqttCredentials:
     """Issues broker credentials."""
 
     def __init__(
-        self, *, tables: Tables, devices: Devices, access: BrokerAccess, audit: ControlEvents, clock: Clock
+        self,
+        *,
+        tables: Tables,
+        devices: DeviceAccess,
+        access: BrokerAccess,
+        control_events: ControlEvents,
+        clock: Clock,
     ) -> None:
-        self._audit = audit
+        self._control_events = control_events
         self._tables = tables
         self._devices = devices
         self._access = access
         self._clock = clock
 
-    async def watch(self, caller: Identity) -> Issued:
+    async def watch(self, caller: Identity) -> IssuedCredentials:
         """To see every device that the account may see, and to stop those it may operate.
 
         Where the account has a part in a whole space, what the broker is told is said by space and stays small however
@@ -72,13 +78,13 @@ class MqttCredentials:
         await self._require(issued, self._devices.require_key(caller))
         return issued
 
-    async def _watch(self, caller: Identity, devices: list[Device]) -> Issued:
+    async def _watch(self, caller: Identity, devices: list[Device]) -> IssuedCredentials:
         watched = _watching(devices, self._access)
         seen = watched.devices
         now_ms = self._clock.now_ms()
         ends_ms = min([now_ms + WATCH_S * 1000, caller.until_ms, *(device.until_ms for device in seen)])
         grant = Grant(
-            principal=watch_principal(caller),
+            principal=viewer_principal(caller),
             client_id=f"w-{caller.session}-{new_id(10)}",
             publish=tuple(watched.publish),
             subscribe=tuple(watched.subscribe),
@@ -91,13 +97,13 @@ class MqttCredentials:
         lifetime_s = max(1, (ends_ms - now_ms) // 1000)
         return await self._issue(grant, lifetime_s, tuple(watched.stops), tuple(dict.fromkeys(subscribe)))
 
-    async def _take_back(self, issued: Issued) -> None:
+    async def _take_back(self, issued: IssuedCredentials) -> None:
         try:
             await self._access.revoke(client_id=issued.client_id)
         except BrokerAccessError as error:
             raise broker_unavailable(f"{error}.") from error
 
-    async def control(self, caller: Identity, device_id: str, epoch: int) -> Issued:
+    async def control(self, caller: Identity, device_id: str, epoch: int) -> IssuedCredentials:
         """To send setpoints under one epoch of a lease.
 
         Raises:
@@ -105,7 +111,7 @@ class MqttCredentials:
         """
         device = await self._devices.get(caller, device_id)
         now_ms = self._clock.now_ms()
-        async with self._audit.refusals(device, caller, "steer"):
+        async with self._control_events.recording_rejections(device, caller, "steer"):
             require_operator(device)
             lease = rules.require_held(await read_lease(self._tables, device), caller, epoch=epoch, now_ms=now_ms)
         # Longer than the lease, which may be renewed; not than the right to it.
@@ -120,10 +126,10 @@ class MqttCredentials:
             expires_at=now_ms // 1000 + lifetime_s,
         )
         issued = await self._issue(grant, lifetime_s, publish, ())
-        await self._require(issued, self._devices.require_still(caller, device))
+        await self._require(issued, self._devices.require_still_allowed(caller, device))
         return issued
 
-    async def _require(self, issued: Issued, still: Awaitable[object]) -> None:
+    async def _require(self, issued: IssuedCredentials, still: Awaitable[object]) -> None:
         """Take credentials back that were made while the right to them was ended: nobody found them to be cut then."""
         try:
             await still
@@ -131,7 +137,7 @@ class MqttCredentials:
             await self._take_back(issued)
             raise
 
-    async def agent(self, agent: Agent) -> Issued:
+    async def agent(self, agent: Agent) -> IssuedCredentials:
         """To speak for an agent's own devices and hear what is addressed to them.
 
         It may also hear what its space measures; which of that it does, its own configuration says.
@@ -145,12 +151,12 @@ class MqttCredentials:
 
     async def _issue(
         self, grant: Grant, lifetime_s: int, publish: tuple[str, ...], subscribe: tuple[str, ...]
-    ) -> Issued:
+    ) -> IssuedCredentials:
         try:
             credentials = await self._access.issue(grant)
         except BrokerAccessError as error:
             raise broker_unavailable(f"{error}.") from error
-        return Issued(grant.client_id, credentials, grant.expires_at * 1000, lifetime_s, publish, subscribe)
+        return IssuedCredentials(grant.client_id, credentials, grant.expires_at * 1000, lifetime_s, publish, subscribe)
 
 
 @dataclass(slots=True)
@@ -174,7 +180,7 @@ class _Watched:
         publish = list(dict.fromkeys([*self.publish, *says]))
         subscribe = list(dict.fromkeys([*self.subscribe, *hears]))
         size = sum(len(pattern) + 3 for pattern in (*publish, *subscribe))
-        if size > TOPIC_BYTES or not access.takes(publish, subscribe):
+        if size > TOPIC_BYTES or not access.accepts(publish, subscribe):
             return False
         self.publish, self.subscribe = publish, subscribe
         return True

@@ -15,7 +15,7 @@ QUEUE = "now:queue"
 
 
 @dataclass(frozen=True, slots=True)
-class Control:
+class ControlRows:
     """Lease, slot and queue as they were read, with their rows (none: not written yet)."""
 
     lease: Lease | None = None
@@ -26,7 +26,7 @@ class Control:
 
     def write_lease(self, device: str, lease: Lease) -> Write:
         """The change that puts ``lease`` in place of what was read."""
-        return self._write(device, LEASE, records.fields(lease))
+        return self._write(device, LEASE, records.to_data(lease))
 
     def write_slot(self, device: str, action: str, pairing: str) -> Write:
         """The change that gives the slot to ``action`` (empty: to nobody)."""
@@ -34,14 +34,14 @@ class Control:
 
     def write_queue(self, device: str, queue: ActionQueue) -> Write:
         """The change that puts ``queue`` in place of what was read."""
-        return self._write(device, QUEUE, records.fields(queue))
+        return self._write(device, QUEUE, records.to_data(queue))
 
     def _write(self, device: str, key: str, data: dict[str, object]) -> Write:
         row = self.rows.get(key)
         return Write("replace" if row else "create", Row(device, key, data, row.etag if row else ""))
 
 
-async def read_control(tables: Tables, device: Device) -> Control:
+async def read_control(tables: Tables, device: Device) -> ControlRows:
     """Lease, slot and queue in one read.
 
     What an earlier owner's pairing left behind is nobody's: an un-pairing that stopped half way blocks nobody.
@@ -51,7 +51,7 @@ async def read_control(tables: Tables, device: Device) -> Control:
     slot = rows.get(SLOT)
     action = slot.data["action"] if slot and slot.data["pairing"] == device.pairing else ""
     queue = _queue(rows)
-    return Control(
+    return ControlRows(
         lease=lease,
         action=action,
         slot_pairing=device.pairing,
@@ -60,11 +60,11 @@ async def read_control(tables: Tables, device: Device) -> Control:
     )
 
 
-async def read_control_rows(tables: Tables, device: str) -> Control:
+async def read_control_rows(tables: Tables, device: str) -> ControlRows:
     """Lease, slot and queue, of whatever pairing."""
     rows = await _rows(tables, device)
     slot = rows.get(SLOT)
-    return Control(
+    return ControlRows(
         lease=records.read(rows[LEASE], Lease) if LEASE in rows else None,
         action=slot.data["action"] if slot else "",
         slot_pairing=slot.data["pairing"] if slot else "",
@@ -73,19 +73,21 @@ async def read_control_rows(tables: Tables, device: str) -> Control:
     )
 
 
-async def heed_device(tables: Tables, device: Device, control: Control, caller: Identity, now_ms: int) -> Control:
+async def apply_ended_epoch(
+    tables: Tables, device: Device, control: ControlRows, caller: Identity, now_ms: int
+) -> ControlRows:
     """The same, without a lease of somebody else that the device itself has ended, as its ``state`` says.
 
     A hold, a Stop or a restart ends leases at the device. Such an epoch is never obeyed again, so what the state says
     of it stays true however old it is.
     """
     lease = control.lease
-    if lease is None or not lease.anothers(caller, now_ms) or not await ended_at_device(tables, device, lease):
+    if lease is None or not lease.held_by_other(caller, now_ms) or not await ended_by_device(tables, device, lease):
         return control
     return replace(control, lease=release(lease, now_ms=now_ms))
 
 
-async def ended_at_device(tables: Tables, device: Device, lease: Lease) -> bool:
+async def ended_by_device(tables: Tables, device: Device, lease: Lease) -> bool:
     """Whether the device has said that it will not obey this lease again."""
     row = await tables.get(records.AGENTS, device.agent, f"state:{device.name}")
     last = records.read(row, LastState) if row else None

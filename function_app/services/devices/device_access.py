@@ -16,7 +16,7 @@ from function_app.domain.identity.accounts import Account, Identity
 from function_app.ports.clock import Clock
 from function_app.ports.tables import Row, Tables
 from function_app.services.devices.control_rows import read_lease
-from function_app.services.identity.session_status import acting
+from function_app.services.identity.session_status import current_identity
 from function_app.services.storage import records
 
 T = TypeVar("T")
@@ -37,7 +37,7 @@ class DeviceView:
     lease: Lease | None
 
 
-class Devices:
+class DeviceAccess:
     """Looks devices up. What neither belongs to the account nor is shared with it does not exist for it."""
 
     def __init__(self, *, tables: Tables, clock: Clock) -> None:
@@ -50,21 +50,21 @@ class Devices:
         Raises:
             Problem: ``device-unknown``.
         """
-        result, _ = await self.with_link(caller, device)
+        result, _ = await self.get_with_link(caller, device)
         return result
 
-    async def with_link(self, caller: Identity, device: str) -> tuple[Device, Link | None]:
+    async def get_with_link(self, caller: Identity, device: str) -> tuple[Device, Link | None]:
         """One device and the last word about its agent's connection, in one read.
 
         Raises:
             Problem: ``device-unknown``.
         """
-        result, link = await self.find(caller, device)
+        result, link = await self.find_with_link(caller, device)
         if result is None:
             raise not_found("device", device)
         return result, link
 
-    async def find(self, caller: Identity, device: str) -> tuple[Device | None, Link | None]:
+    async def find_with_link(self, caller: Identity, device: str) -> tuple[Device | None, Link | None]:
         """As ``with_link``, with ``None`` for a device that does not exist for ``caller``."""
         parts = split_device(device)
         if parts is None:
@@ -80,7 +80,7 @@ class Devices:
             return None, None
         return _device(agent, spec, allowed), _of(agent, rows, "link", Link)
 
-    async def require_still(self, caller: Identity, device: Device) -> None:
+    async def require_still_allowed(self, caller: Identity, device: Device) -> None:
         """See, after something was written for ``caller``, that they may still operate the device.
 
         Whoever un-shares deletes the share first and then ends what it finds; whoever uses a share writes first and
@@ -101,14 +101,14 @@ class Devices:
         Raises:
             Problem: ``forbidden``.
         """
-        now = await self.acting(caller) if caller.key else caller
+        now = await self.current_identity(caller) if caller.key else caller
         if now is None:
             raise forbidden("This API key was revoked or has run out. Make a new one.")
         return now
 
-    async def acting(self, caller: Identity) -> Identity | None:
-        """As ``acting``: what they may do now, and ``None`` once their key or session was ended."""
-        return await acting(self._tables, caller, self._clock.now_ms())
+    async def current_identity(self, caller: Identity) -> Identity | None:
+        """As ``current_identity``: what they may do now, and ``None`` once their key or session was ended."""
+        return await current_identity(self._tables, caller, self._clock.now_ms())
 
     async def view(self, caller: Identity, device: str) -> DeviceView:
         """One device with what is known of it now.
@@ -214,7 +214,7 @@ class Devices:
             if cursor is None:
                 return result
 
-    async def owned(self, device: str) -> Device | None:
+    async def get_as_owner(self, device: str) -> Device | None:
         """A device as its owner sees it, whoever that is."""
         parts = split_device(device)
         row = await self._tables.get(records.AGENTS, parts[0], "agent") if parts else None
@@ -287,7 +287,7 @@ class Devices:
                     online=devices.online(link, seen_ms, now_ms),
                     last_seen_ms=seen_ms or None,
                     state=last.state if last else None,
-                    lease=lease if lease and lease.live(now_ms) and not _ended(lease, last) else None,
+                    lease=lease if lease and lease.is_live(now_ms) and not _ended(lease, last) else None,
                 )
             )
         return views
@@ -348,7 +348,7 @@ def devices_of(agent: Agent) -> list[Device]:
     return [_device(agent, spec) for spec in agent.devices]
 
 
-def left_devices(agent: Agent, leaving: Departure) -> list[Device]:
+def departed_devices(agent: Agent, leaving: Departure) -> list[Device]:
     """The devices that an agent has left behind, as their owner saw them."""
     before = replace(agent, account=leaving.account, space=leaving.space, pairing=leaving.pairing)
     gone = DeviceSpec("", "", "", "")

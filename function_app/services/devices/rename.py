@@ -7,17 +7,17 @@ from function_app.domain.devices.devices import Agent
 from function_app.domain.identity.accounts import Identity
 from function_app.ports.tables import Row, Tables
 from function_app.services.audit.audit_log import AuditLog
-from function_app.services.devices.device_access import Devices, require_owner
+from function_app.services.devices.device_access import DeviceAccess, require_owner
 from function_app.services.storage import records
 
 
-class Rename:
+class DeviceRename:
     """Names devices. The agent is not told: the name is the owner's, and the agent's own stays as it is."""
 
-    def __init__(self, *, tables: Tables, devices: Devices, chain: AuditLog) -> None:
+    def __init__(self, *, tables: Tables, devices: DeviceAccess, audit_log: AuditLog) -> None:
         self._tables = tables
         self._devices = devices
-        self._chain = chain
+        self._audit_log = audit_log
 
     async def rename(self, caller: Identity, device_id: str, label: str | None) -> None:
         """Call a device ``label``; ``None``: as its agent does.
@@ -26,7 +26,7 @@ class Rename:
             Problem: ``device-unknown``, ``forbidden``, ``busy``.
         """
         device = require_owner(await self._devices.get(caller, device_id))
-        async with self._chain.change(
+        async with self._audit_log.change(
             caller.account, AccountEvent.DEVICE_RENAMED, caller, on=device.id, label=label
         ) as change:
 
@@ -37,6 +37,6 @@ class Rename:
                     raise not_found("device", device.id)
                 changed = rules.rename(agent, device.name, label)
                 await change.noted()
-                await self._tables.replace(records.AGENTS, Row(agent.id, "agent", records.fields(changed), row.etag))
+                await self._tables.replace(records.AGENTS, Row(agent.id, "agent", records.to_data(changed), row.etag))
 
             await records.retry(attempt)

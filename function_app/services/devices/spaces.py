@@ -76,7 +76,7 @@ class Spaces:
     async def _shared(self, caller: Identity, space: str) -> SpaceView | None:
         row = await self._tables.get(records.SHARES, space_target(space), share_key(caller.account))
         share = records.read(row, Share) if row else None
-        if share is None or not share.live(self._clock.now_ms()):
+        if share is None or not share.is_live(self._clock.now_ms()):
             return None
         result = await self._tables.get(records.ACCOUNTS, share.owner, f"space:{space}")
         if result is None:

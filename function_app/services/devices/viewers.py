@@ -12,7 +12,7 @@ from function_app.domain.devices.devices import Device
 from function_app.domain.identity.accounts import Identity, Role
 from function_app.ports.clock import Clock
 from function_app.ports.tables import MAX_BATCH, Conflict, Row, Tables, Write
-from function_app.services.devices.device_access import Devices
+from function_app.services.devices.device_access import DeviceAccess
 from function_app.services.storage import records
 from function_app.services.storage.retention import Retention
 
@@ -26,7 +26,7 @@ _FORGOTTEN_MS: Final = 3_600_000
 
 
 @dataclass(frozen=True, slots=True)
-class Watcher:
+class Viewer:
     """One sign-in session that looks at a device.
 
     Attributes:
@@ -48,13 +48,13 @@ class Watcher:
 class Viewers:
     """Remembers and tells who watches."""
 
-    def __init__(self, *, tables: Tables, devices: Devices, forget: Retention, clock: Clock) -> None:
+    def __init__(self, *, tables: Tables, devices: DeviceAccess, retention: Retention, clock: Clock) -> None:
         self._tables = tables
         self._devices = devices
-        self._forget = forget
+        self._retention = retention
         self._clock = clock
 
-    async def watch(self, caller: Identity, device_id: str) -> list[Watcher]:
+    async def mark(self, caller: Identity, device_id: str) -> list[Viewer]:
         """Say that ``caller`` looks at a device.
 
         Returns:
@@ -66,7 +66,7 @@ class Viewers:
         device = await self._devices.get(caller, device_id)
         now_ms = self._clock.now_ms()
         page = await self._tables.query(records.WATCHERS, device.id, limit=2 * MOST)
-        rows = {row.key: (row, records.read(row, Watcher)) for row in page.rows}
+        rows = {row.key: (row, records.read(row, Viewer)) for row in page.rows}
         live = {
             key: existing
             for key, (_, existing) in rows.items()
@@ -95,12 +95,12 @@ class Viewers:
     async def _note(self, device: Device, caller: Identity, now_ms: int) -> None:
         # One note for all of an hour, and written first: nothing stays that nobody forgets.
         due_ms = (now_ms // _FORGOTTEN_MS + 2) * _FORGOTTEN_MS
-        await self._forget.rows(records.WATCHERS, device.id, first="", last=None, due_ms=due_ms)
+        await self._retention.delete_rows_at(records.WATCHERS, device.id, first="", last=None, due_ms=due_ms)
 
-        def said(existing: Watcher | None) -> Watcher:
+        def said(existing: Viewer | None) -> Viewer:
             goes_on = existing is not None and existing.expires_ms > now_ms and existing.pairing == device.pairing
             since_ms = existing.since_ms if existing is not None and goes_on else now_ms
-            return Watcher(
+            return Viewer(
                 account=caller.account,
                 session=caller.session,
                 name=caller.name,
@@ -111,7 +111,7 @@ class Viewers:
                 pairing=device.pairing,
             )
 
-        await records.upsert(self._tables, records.WATCHERS, device.id, caller.session, said, Watcher)
+        await records.upsert(self._tables, records.WATCHERS, device.id, caller.session, said, Viewer)
 
     async def _tidy(self, over: list[Row]) -> None:
         """Delete what is over, so that a device's rows stay few."""

@@ -21,7 +21,7 @@ from function_app.domain.health.faults import Fault, Report, Severity
 from function_app.domain.identity.accounts import Identity
 from function_app.ports.clock import Clock
 from function_app.ports.tables import Row, Tables
-from function_app.services.devices.device_access import Devices, DeviceView
+from function_app.services.devices.device_access import DeviceAccess, DeviceView
 from function_app.services.devices.spaces import Spaces
 from function_app.services.health.faults import Faults
 from function_app.services.robot_types.catalogue import RobotTypes
@@ -78,7 +78,7 @@ class Diagnostics:
         self,
         *,
         tables: Tables,
-        devices: Devices,
+        devices: DeviceAccess,
         faults: Faults,
         robot_types: RobotTypes,
         spaces: Spaces,
@@ -120,7 +120,7 @@ class Diagnostics:
             if minute or now != before | tried or _worse(existing, after):
                 await self._faults.settle(device, f"detector/{stream}", _reports(listed, stream, after))
                 tried.update(now)
-            data = records.fields(after)
+            data = records.to_data(after)
             if row is None:
                 await self._tables.create(records.DIAGNOSTICS, Row(_partition(device), stream, data))
             else:

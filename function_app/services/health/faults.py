@@ -19,7 +19,7 @@ from function_app.ports.clock import Clock
 from function_app.ports.tables import Conflict, Row, Tables, Write
 from function_app.services.storage import records
 from function_app.services.storage.retention import DAY_MS, Retention
-from function_app.services.telemetry.event_log import Events
+from function_app.services.telemetry.event_log import EventLog
 
 KEEP_FAULTS_MS = 365 * DAY_MS
 """Cleared faults are kept for so long, and so is the count of a code that is not raised any more."""
@@ -32,10 +32,10 @@ _CODE_SHOWN = 200
 class Faults:
     """Raises, acknowledges and clears."""
 
-    def __init__(self, *, tables: Tables, events: Events, forget: Retention, clock: Clock) -> None:
+    def __init__(self, *, tables: Tables, events: EventLog, retention: Retention, clock: Clock) -> None:
         self._tables = tables
         self._events = events
-        self._forget = forget
+        self._retention = retention
         self._clock = clock
 
     async def settle(self, device: Device, scope: str, reports: Sequence[Report]) -> None:
@@ -105,7 +105,7 @@ class Faults:
             existing = records.read(row, Fault)
             seen = rules.acknowledged(existing, by=by, now_ms=self._clock.now_ms())
             if seen is not existing:
-                write = Write("replace", Row(row.partition, row.key, records.fields(seen), row.etag))
+                write = Write("replace", Row(row.partition, row.key, records.to_data(seen), row.etag))
                 await self._write(device, seen, "acknowledged", [write])
             return seen
 
@@ -125,7 +125,7 @@ class Faults:
             existing = records.read(row, Fault)
             worse = rules.reported(existing, report)
             if worse is not existing:
-                write = Write("replace", Row(partition, key, records.fields(worse), row.etag))
+                write = Write("replace", Row(partition, key, records.to_data(worse), row.etag))
                 await self._write(device, worse, f"worsened-{worse.worse}", [write])
             return worse is not existing
         now_ms = self._clock.now_ms()
@@ -134,10 +134,10 @@ class Faults:
         count = counted.data["count"] + 1 if counted else 1
         fault = rules.raised(report, fault=new_suffix(now_ms), now_ms=now_ms, count=count)
         expires_ms = now_ms + KEEP_FAULTS_MS
-        await self._forget.row(records.FAULTS, partition, count_key, due_ms=expires_ms)
+        await self._retention.delete_row_at(records.FAULTS, partition, count_key, due_ms=expires_ms)
         number = Row(partition, count_key, {"count": count, "expires_ms": expires_ms}, counted.etag if counted else "")
         writes = [
-            Write("create", Row(partition, key, records.fields(fault))),
+            Write("create", Row(partition, key, records.to_data(fault))),
             Write("replace" if counted else "create", number),
         ]
         await self._write(device, fault, "raised", writes)
@@ -146,8 +146,8 @@ class Faults:
     async def _clear(self, device: Device, row: Row) -> None:
         now_ms = self._clock.now_ms()
         over = rules.cleared(records.read(row, Fault), now_ms=now_ms)
-        past = Row(row.partition, f"{_PAST}{over.id}", records.fields(over))
-        await self._forget.row(records.FAULTS, row.partition, past.key, due_ms=now_ms + KEEP_FAULTS_MS)
+        past = Row(row.partition, f"{_PAST}{over.id}", records.to_data(over))
+        await self._retention.delete_row_at(records.FAULTS, row.partition, past.key, due_ms=now_ms + KEEP_FAULTS_MS)
         await self._write(device, over, "cleared", [Write("delete", row), Write("create", past)])
 
     async def _write(self, device: Device, fault: Fault, step: str, writes: list[Write]) -> None:

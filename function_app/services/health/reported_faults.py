@@ -33,7 +33,7 @@ class ReportedFaults:
         self._faults = faults
         self._clock = clock
 
-    async def connected(self, agent: Agent, session: int) -> None:
+    async def on_connected(self, agent: Agent, session: int) -> None:
         """Its agent says that it is online; to be called before that is written down.
 
         Raises:
@@ -46,7 +46,7 @@ class ReportedFaults:
         for device in devices_of(agent):
             await self._faults.settle(device, _CLOUD, [])
 
-    async def said(self, agent: Agent, name: str, state: State) -> None:
+    async def on_state(self, agent: Agent, name: str, state: State) -> None:
         """A device says how it is; to be called before that is written down.
 
         Raises:
@@ -64,7 +64,7 @@ class ReportedFaults:
         if existing is None or state.faults or existing.state.get("faults"):
             await self._faults.settle(device, _DEVICE, [_reported(fault.code, fault.message) for fault in state.faults])
 
-    async def run(self, now_ms: int) -> None:
+    async def check_silent(self, now_ms: int) -> None:
         """One round: look at the agents whose time has come. Safe to repeat and to be run by many at once.
 
         Raises:

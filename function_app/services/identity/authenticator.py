@@ -17,7 +17,7 @@ from function_app.domain.common.problems import unauthorized
 from function_app.domain.devices.devices import Agent
 from function_app.domain.identity.accounts import Identity
 from function_app.ports.clock import Clock
-from function_app.ports.signing_keys import Keys
+from function_app.ports.signing_keys import SigningKeys
 from function_app.ports.tables import Conflict, Row, Tables
 from function_app.services.identity.session_status import signed_out_key
 from function_app.services.storage import records
@@ -48,12 +48,12 @@ class _Known:
     csrf: str
 
 
-class Identify:
+class Authenticator:
     """Issues and checks tokens. Verifying a signature costs 0.1 ms: what was verified is remembered until it ends."""
 
-    def __init__(self, *, tables: Tables, keys: Keys, forget: Retention, clock: Clock) -> None:
+    def __init__(self, *, tables: Tables, keys: SigningKeys, retention: Retention, clock: Clock) -> None:
         self._tables = tables
-        self._forget = forget
+        self._retention = retention
         self._keys = keys
         self._clock = clock
         self._known: OrderedDict[tuple[str, str], _Known] = OrderedDict()
@@ -76,7 +76,7 @@ class Identify:
             "name": caller.name,
             "sid": caller.session,
             "iat": now_ms // 1000,
-            "exp": now_ms // 1000 + caller.lasting_s(lifetime_s, now_ms),
+            "exp": now_ms // 1000 + caller.lifetime_s(lifetime_s, now_ms),
             "until": caller.until_ms // 1000,
             "jti": new_id(),
         }
@@ -128,7 +128,7 @@ class Identify:
         """End the session: its tokens are refused from now on, by other instances within ``RECHECK_MS``."""
         ends_ms = self._clock.now_ms() + SESSION_S * 1000
         row = Row(caller.account, signed_out_key(caller.session), {"expires_ms": ends_ms})
-        await self._forget.row(records.ACCOUNTS, row.partition, row.key, due_ms=ends_ms)
+        await self._retention.delete_row_at(records.ACCOUNTS, row.partition, row.key, due_ms=ends_ms)
         try:
             await self._tables.create(records.ACCOUNTS, row)
         except Conflict:
@@ -213,12 +213,12 @@ def principal(caller: Identity) -> str:
     return f"account:{caller.account}:{caller.session}"
 
 
-def watch_principal(caller: Identity) -> str:
-    """The part of a sign-in session that watches: it is cut apart from what steers, and by account (``watchers``)."""
+def viewer_principal(caller: Identity) -> str:
+    """The part of a sign-in session that watches: it is cut apart from what steers, and by account (``all_viewers``)."""
     return f"{principal(caller)}:watch"
 
 
-def watchers(account: str) -> str:
+def all_viewers(account: str) -> str:
     """All sessions of an account that watch, as a pattern for ``BrokerAccess.revoke``."""
     return f"account:{account}:{ANY}:watch"
 

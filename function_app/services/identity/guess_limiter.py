@@ -32,15 +32,15 @@ class _Tries:
     expires_ms: int
 
 
-class Attempts:
+class GuessLimiter:
     """Counts tries by whom or whence they come. Right ones are taken back, so only wrong ones count."""
 
-    def __init__(self, *, tables: Tables, forget: Retention, clock: Clock) -> None:
+    def __init__(self, *, tables: Tables, retention: Retention, clock: Clock) -> None:
         self._tables = tables
-        self._forget = forget
+        self._retention = retention
         self._clock = clock
 
-    async def count(self, guess: Guess, counters: Mapping[str, int]) -> None:
+    async def add_failure(self, guess: Guess, counters: Mapping[str, int]) -> None:
         """Count a try before looking, so that parallel guesses are no way around.
 
         Args:
@@ -55,11 +55,11 @@ class Attempts:
             try:
                 await self._change(guess, counter, 1, most)
             except Problem:
-                await self.uncount(guess, done)
+                await self.remove_failure(guess, done)
                 raise
             done[counter] = most
 
-    async def uncount(self, guess: Guess, counters: Mapping[str, int]) -> None:
+    async def remove_failure(self, guess: Guess, counters: Mapping[str, int]) -> None:
         """Take a try back: it was right."""
         for counter, most in counters.items():
             await self._change(guess, counter, -1, most)
@@ -78,7 +78,7 @@ class Attempts:
 
         # One note for all tries of a while, and written first: nothing stays that nobody forgets.
         due_ms = (now_ms // guess.window_ms + 2) * guess.window_ms
-        await self._forget.row(records.ATTEMPTS, counter, guess.what, due_ms=due_ms)
+        await self._retention.delete_row_at(records.ATTEMPTS, counter, guess.what, due_ms=due_ms)
         await records.upsert(self._tables, records.ATTEMPTS, counter, guess.what, counted, _Tries)
 
 

@@ -21,7 +21,7 @@ Kind = Literal["address", "account", "key", "agent"]
 _WHOSE: Final = {"address": "this address", "account": "this account", "key": "this API key", "agent": "this agent"}
 
 
-class Limits:
+class RateLimiter:
     """Counts requests."""
 
     def __init__(self, *, per_s: dict[Kind, int], clock: Clock) -> None:

@@ -12,7 +12,7 @@ API_KEY: Final = "key"
 """The key of an API key's one row."""
 
 
-async def acting(tables: Tables, caller: Identity, now_ms: int) -> Identity | None:
+async def current_identity(tables: Tables, caller: Identity, now_ms: int) -> Identity | None:
     """``caller`` with what they may do now: an API key as it stands in the tables.
 
     Returns:

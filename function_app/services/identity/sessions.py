@@ -13,7 +13,7 @@ from function_app.services.identity.authenticator import (
     API,
     SESSION,
     SESSION_S,
-    Identify,
+    Authenticator,
     new_secret,
     new_session,
 )
@@ -28,7 +28,7 @@ _ROW: Final = "session:"
 
 
 @dataclass(frozen=True, slots=True)
-class From:
+class SignInOrigin:
     """Whence somebody signs in, as far as the request tells; shown to the account alone."""
 
     address: str = ""
@@ -77,22 +77,24 @@ class SignedIn:
 class Sessions:
     """Begins sessions, and knows those that an account has."""
 
-    def __init__(self, *, tables: Tables, identify: Identify, forget: Retention, chain: AuditLog, clock: Clock) -> None:
+    def __init__(
+        self, *, tables: Tables, authenticator: Authenticator, retention: Retention, audit_log: AuditLog, clock: Clock
+    ) -> None:
         self._tables = tables
-        self._identify = identify
-        self._forget = forget
-        self._chain = chain
+        self._authenticator = authenticator
+        self._retention = retention
+        self._audit_log = audit_log
         self._clock = clock
 
-    async def begin(self, account: Account, how: How, whence: From) -> SignedIn:
+    async def begin(self, account: Account, how: How, whence: SignInOrigin) -> SignedIn:
         """A new session of somebody who has shown who they are."""
         now_ms = self._clock.now_ms()
         ends_ms = now_ms + SESSION_S * 1000
         begun = Session(new_session(), how, now_ms, ends_ms, address=whence.address, program=whence.program[:_SHOWN])
-        row = Row(account.id, _ROW + begun.id, records.fields(begun))
-        await self._forget.row(records.ACCOUNTS, row.partition, row.key, due_ms=ends_ms)
+        row = Row(account.id, _ROW + begun.id, records.to_data(begun))
+        await self._retention.delete_row_at(records.ACCOUNTS, row.partition, row.key, due_ms=ends_ms)
         caller = Identity(account.id, account.name, begun.id, until_ms=ends_ms)
-        async with self._chain.change(
+        async with self._audit_log.change(
             account.id, AccountEvent.SIGNED_IN, caller, how=how, address=whence.address
         ) as change:
             await change.noted()
@@ -101,15 +103,15 @@ class Sessions:
         return SignedIn(
             account=account,
             session=begun.id,
-            access_token=await self._identify.issue(caller, API, ACCESS_S),
-            cookie=await self._identify.issue(caller, SESSION, SESSION_S, csrf=csrf),
+            access_token=await self._authenticator.issue(caller, API, ACCESS_S),
+            cookie=await self._authenticator.issue(caller, SESSION, SESSION_S, csrf=csrf),
             csrf=csrf,
         )
 
     async def access_token(self, caller: Identity) -> tuple[str, int]:
         """The next access token of a session, and how long it is good [s]: not longer than the session."""
-        lifetime_s = caller.lasting_s(ACCESS_S, self._clock.now_ms())
-        return await self._identify.issue(caller, API, lifetime_s), lifetime_s
+        lifetime_s = caller.lifetime_s(ACCESS_S, self._clock.now_ms())
+        return await self._authenticator.issue(caller, API, lifetime_s), lifetime_s
 
     async def list(self, account: str) -> tuple[Session, ...]:
         """The sessions of an account that have not ended, the newest first."""

@@ -10,7 +10,7 @@ from function_app.ports.clock import Clock
 from function_app.ports.tables import Conflict, Row, Tables
 from function_app.services.audit.audit_log import AuditLog
 from function_app.services.identity.authenticator import new_secret
-from function_app.services.identity.sessions import From, Sessions, SignedIn
+from function_app.services.identity.sessions import Sessions, SignedIn, SignInOrigin
 from function_app.services.storage import records
 
 LINK_MS = 24 * 3600 * 1000
@@ -23,10 +23,10 @@ MOST_SPACES = 100
 class SignIn:
     """Accounts and their one-time links."""
 
-    def __init__(self, *, tables: Tables, sessions: Sessions, chain: AuditLog, clock: Clock) -> None:
+    def __init__(self, *, tables: Tables, sessions: Sessions, audit_log: AuditLog, clock: Clock) -> None:
         self._tables = tables
         self._sessions = sessions
-        self._chain = chain
+        self._audit_log = audit_log
         self._clock = clock
 
     async def account(self, name: str) -> Account:
@@ -74,8 +74,8 @@ class SignIn:
         if not spaces:
             space = Space(id=str(row.data["space"]), name=FIRST_SPACE)
             # The space last: as long as it is not there, all of this is done again.
-            await self._create(Row(account.id, "account", records.fields(account)))
-            await self._create(Row(account.id, f"space:{space.id}", records.fields(space)))
+            await self._create(Row(account.id, "account", records.to_data(account)))
+            await self._create(Row(account.id, f"space:{space.id}", records.to_data(space)))
         return account
 
     async def spaces(self, account: str) -> tuple[Space, ...]:
@@ -93,11 +93,13 @@ class SignIn:
             detail = f"An account has at most {MOST_SPACES} spaces. Use one of them."
             raise Problem("too-many-spaces", 409, "Too many spaces", detail)
         space = Space(id=new_id(12), name=name, created_ms=self._clock.now_ms())
-        async with self._chain.change(
+        async with self._audit_log.change(
             caller.account, AccountEvent.SPACE_MADE, caller, on=space.id, name=name
         ) as change:
             await change.noted()
-            await self._tables.create(records.ACCOUNTS, Row(caller.account, f"space:{space.id}", records.fields(space)))
+            await self._tables.create(
+                records.ACCOUNTS, Row(caller.account, f"space:{space.id}", records.to_data(space))
+            )
         return space
 
     async def known(self, name: str) -> Account | None:
@@ -118,7 +120,7 @@ class SignIn:
         await self._tables.create(records.SIGN_INS, Row(hashed[0], hashed, data))
         return token
 
-    async def redeem(self, token: str, whence: From | None = None) -> SignedIn:
+    async def redeem(self, token: str, whence: SignInOrigin | None = None) -> SignedIn:
         """Sign in. Of several that bring the same token one wins: whoever deletes the row.
 
         Raises:
@@ -129,7 +131,9 @@ class SignIn:
         row = await self._tables.get(records.SIGN_INS, hashed[0], hashed)
         if row is None:
             address = whence.address if whence else ""
-            await self._chain.refused(CLOUD, AccountEvent.SIGN_IN_REFUSED, None, code="link-unknown", address=address)
+            await self._audit_log.record_rejection(
+                CLOUD, AccountEvent.SIGN_IN_REFUSED, None, code="link-unknown", address=address
+            )
             raise refused
         try:
             await self._tables.delete(records.SIGN_INS, row)
@@ -138,7 +142,7 @@ class SignIn:
         if self._clock.now_ms() >= row.data["expires_ms"]:
             raise refused
         account = Account(id=row.data["account"], name=row.data["name"])
-        return await self._sessions.begin(account, "link", whence or From())
+        return await self._sessions.begin(account, "link", whence or SignInOrigin())
 
     async def _named(self, name: str) -> Row | None:
         """Rows from before names were folded are under their own spelling: by that they are found, and first."""

@@ -15,7 +15,7 @@ class Health:
     broker: str
 
 
-class CheckHealth:
+class ReadinessCheck:
     """Looks."""
 
     def __init__(self, *, tables: Tables, bus: CommandBus) -> None:

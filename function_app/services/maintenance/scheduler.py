@@ -15,14 +15,14 @@ from function_app.ports.clock import Clock
 from function_app.ports.command_bus import BusUnavailable
 from function_app.ports.tables import Conflict, Row, Tables
 from function_app.services.accounts.api_keys import ApiKeys, about_key
-from function_app.services.actions.action_store import ActionRows, StoredAction, place
-from function_app.services.actions.dispatcher import MovementChanged, NoLonger, SendAction
-from function_app.services.actions.queue import TIMEOUT, Queues, queue_of
+from function_app.services.actions.action_store import ActionStore, StoredAction, row_location
+from function_app.services.actions.dispatcher import ActionDispatcher, MovementUnavailable, PermissionEnded
+from function_app.services.actions.queue import TIMEOUT, ActionQueues, device_of_reminder
 from function_app.services.actions.start import ABANDON_MS
 from function_app.services.audit.audit_log import AuditLog, anchor_of, chain_of
 from function_app.services.control.control_events import ControlEvents, lease_of
 from function_app.services.health.reported_faults import ReportedFaults
-from function_app.services.messaging.command_sender import Commands
+from function_app.services.messaging.command_sender import CommandSender
 from function_app.services.pairing.offboarding import Offboarding, offboarding_of
 from function_app.services.robot_types.cleanup import RobotTypeCleanup
 from function_app.services.sharing.invitations import Invitations, about_transfer
@@ -50,76 +50,76 @@ class Scheduler:
         self,
         *,
         tables: Tables,
-        rows: ActionRows,
-        pending: Reminders,
-        commands: Commands,
-        sending: SendAction,
-        queues: Queues,
-        leave: Offboarding,
+        action_store: ActionStore,
+        reminders: Reminders,
+        command_sender: CommandSender,
+        dispatcher: ActionDispatcher,
+        queues: ActionQueues,
+        offboarding: Offboarding,
         sharing: Sharing,
         invitations: Invitations,
         api_keys: ApiKeys,
-        audit: ControlEvents,
-        chain: AuditLog,
+        control_events: ControlEvents,
+        audit_log: AuditLog,
         access: BrokerAccess,
-        forget: Retention,
-        conditions: ReportedFaults,
-        intake: TelemetryIngest,
+        retention: Retention,
+        reported_faults: ReportedFaults,
+        telemetry_ingest: TelemetryIngest,
         uploads: Uploads,
         robot_types: RobotTypeCleanup,
         keep_actions_ms: int,
         clock: Clock,
     ) -> None:
         self._tables = tables
-        self._rows = rows
-        self._pending = pending
-        self._commands = commands
-        self._sending = sending
+        self._action_store = action_store
+        self._reminders = reminders
+        self._command_sender = command_sender
+        self._dispatcher = dispatcher
         self._queues = queues
-        self._leave = leave
+        self._offboarding = offboarding
         self._sharing = sharing
         self._invitations = invitations
         self._api_keys = api_keys
-        self._audit = audit
-        self._chain = chain
+        self._control_events = control_events
+        self._audit_log = audit_log
         self._access = access
-        self._forget = forget
-        self._conditions = conditions
-        self._intake = intake
+        self._retention = retention
+        self._reported_faults = reported_faults
+        self._telemetry_ingest = telemetry_ingest
         self._uploads = uploads
         self._robot_types = robot_types
         self._keep_actions_ms = keep_actions_ms
         self._clock = clock
         self._turn = 0
 
-    async def run(self) -> None:
+    async def run_due_jobs(self) -> None:
         """One round. What fails is logged and comes again in the next round.
 
         Raises:
             StoreError: The tables cannot be used.
         """
         for shard in range(SHARDS):
-            for action, note in await self._pending.due(shard, self._clock.now_ms()):
+            for action, note in await self._reminders.due(shard, self._clock.now_ms()):
                 try:
                     await self._look(action, note)
                 except (Problem, BusUnavailable) as error:
                     _log.warning("action %s: %s", action, error)
         await self._forget_expired()
-        await self._forget.run(self._clock.now_ms())
+        await self._retention.delete_due(self._clock.now_ms())
         try:
-            await self._conditions.run(self._clock.now_ms())
+            await self._reported_faults.check_silent(self._clock.now_ms())
         except Problem as problem:
             _log.warning("silent devices: %s", problem.detail)
-        await self._intake.distribute_left()
+        await self._telemetry_ingest.distribute_backlog()
         await self._uploads.forget_due()
-        await self._robot_types.run()
+        await self._robot_types.run_due_jobs()
         try:
             await self._access.expire(self._clock.now_ms() / 1000)
         except BrokerAccessError as error:
             _log.warning("broker access: %s", error)
 
     async def _look(self, what: str, note: Row) -> None:
-        if device := queue_of(what):
+        if device := device_of_reminder(what):
             await self._look_at_queue(device, note)
         elif agent := offboarding_of(what):
             await self._look_at_leaver(agent, note)
@@ -130,40 +130,40 @@ class Scheduler:
         elif about_transfer(what):
             await self._invitations.go_on(what, note)
         elif device := lease_of(what):
-            await self._audit.look(device)
-            await self._pending.drop(note)
+            await self._control_events.check(device)
+            await self._reminders.cancel(note)
         elif owner := chain_of(what):
-            await self._chain.look(owner)
-            await self._pending.drop(note)
+            await self._audit_log.check(owner)
+            await self._reminders.cancel(note)
         elif owner := anchor_of(what):
-            await self._chain.anchor(owner)
-            await self._pending.drop(note)
+            await self._audit_log.anchor(owner)
+            await self._reminders.cancel(note)
         else:
             await self._look_at_action(what, note)
 
     async def _look_at_action(self, action_id: str, note: Row) -> None:
-        result = await self._rows.get(action_id)
+        result = await self._action_store.get(action_id)
         now_ms = self._clock.now_ms()
         if result is None:
             if now_ms - int(note.key.partition(":")[0]) > ORPHAN_MS:
-                await self._pending.drop(note)
+                await self._reminders.cancel(note)
             return
-        await self._audit.tell(result.action.device)
+        await self._control_events.publish(result.action.device)
         verdict = next_step(result.action, now_ms)
         if verdict in _ENDING:
             after = await self._ended(result, verdict, now_ms)
             if after is not None and after.status.terminal:
                 await self._keep_for_a_while(after)
             elif after is not None:  # something was heard of it meanwhile
-                await self._pending.note(action_id, next_check_ms(after, now_ms))
+                await self._reminders.schedule(action_id, next_check_ms(after, now_ms))
         else:
             # The next note before this one goes: a stop in between leaves two, which is one too many, not too few.
-            await self._pending.note(action_id, next_check_ms(result.action, now_ms))
+            await self._reminders.schedule(action_id, next_check_ms(result.action, now_ms))
             if verdict is NextStep.PUBLISH:
                 await self._publish(result, now_ms)
             elif verdict is NextStep.CANCEL:
                 await self._cancel(result.action)
-        await self._pending.drop(note)
+        await self._reminders.cancel(note)
 
     async def _ended(self, result: StoredAction, verdict: NextStep, now_ms: int) -> Action | None:
         """The action with its end, known or given now, unless it has come to deserve another verdict."""
@@ -183,19 +183,19 @@ class Scheduler:
 
     async def _look_at_queue(self, device: str, note: Row) -> None:
         """Whoever freed the slot may have been killed before it gave the next one its turn."""
-        if await self._queues.look(device):
-            await self._queues.watch(device)
+        if await self._queues.check(device):
+            await self._queues.schedule_check(device)
         elif self._clock.now_ms() - int(note.key.partition(":")[0]) <= ORPHAN_MS:
             return  # somebody may be about to put an action into it
-        await self._pending.drop(note)
+        await self._reminders.cancel(note)
 
     async def _look_at_leaver(self, agent: str, note: Row) -> None:
         """Whoever un-paired or moved it may have been killed, or could not reach the broker."""
-        if not await self._leave.finish(agent):
-            await self._leave.watch(agent)
+        if not await self._offboarding.finish(agent):
+            await self._offboarding.watch(agent)
         elif self._clock.now_ms() - int(note.key.partition(":")[0]) <= ORPHAN_MS:
             return  # somebody may be about to write what this is about
-        await self._pending.drop(note)
+        await self._reminders.cancel(note)
 
     async def _end(self, result: StoredAction, status: Status, code: str, message: str, now_ms: int) -> Action | None:
         verdict = next_step(result.action, now_ms)
@@ -209,35 +209,39 @@ class Scheduler:
 
     async def _keep_for_a_while(self, action: Action) -> None:
         """See that an action that has ended, and the key it was started with, will be forgotten."""
-        where = place(action.id)
+        where = row_location(action.id)
         if where is None:
             return
-        await self._forget.row(records.CONTROL, *where, due_ms=action.ended_ms + self._keep_actions_ms)
+        await self._retention.delete_row_at(records.CONTROL, *where, due_ms=action.ended_ms + self._keep_actions_ms)
         if action.once:
-            await self._forget.row(records.CONTROL, where[0], action.once, due_ms=action.created_ms + KEEP_ONCE_MS)
+            await self._retention.delete_row_at(
+                records.CONTROL, where[0], action.once, due_ms=action.created_ms + KEEP_ONCE_MS
+            )
 
     async def _publish(self, result: StoredAction, now_ms: int) -> None:
         """Send the very same command again: same id, same time of issue, so the device runs it at most once."""
-        device = await self._sending.device(result.action)
+        device = await self._dispatcher.device(result.action)
         if device is None:
             message = "The device was un-paired before the command reached it."
             await self._end(result, Status.FAILED, "unpaired", message, now_ms)
             return
         try:
-            await self._sending.send(result, device)
-        except MovementChanged:
+            await self._dispatcher.send(result, device)
+        except MovementUnavailable:
             message = "The movement's script was changed before the command could be sent. Start it again."
             await self._end(result, Status.FAILED, "movement-changed", message, now_ms)
-        except NoLonger as ended:
+        except PermissionEnded as ended:
             status, message = DROPPED[ended.why]
             await self._end(result, status, ended.why, message, now_ms)
 
     async def _cancel(self, action: Action) -> None:
-        device = await self._sending.device(action)
+        device = await self._dispatcher.device(action)
         if device is None:
             return
         try:
-            await self._commands.send(device, CancelAction(action=action.id), caller=action.who, epoch=action.epoch)
+            await self._command_sender.send(
+                device, CancelAction(action=action.id), caller=action.who, epoch=action.epoch
+            )
         except BusUnavailable as error:
             _log.warning("cancel of %s: %s", action.id, error)
 

@@ -26,7 +26,7 @@ class BrokerRelay:
         self._clock = clock
         self._rests_until_ms = 0
 
-    async def pass_on(self, told: Iterable[tuple[str, Topic, bytes]]) -> None:
+    async def publish(self, told: Iterable[tuple[str, Topic, bytes]]) -> None:
         """Publish messages, those of one topic in order, retained where the contract says so."""
         if self._clock.now_ms() < self._rests_until_ms:
             return

@@ -10,8 +10,8 @@ from function_app.domain.common.problems import broker_unavailable, invalid
 from function_app.domain.devices.devices import Device
 from function_app.ports.clock import Clock
 from function_app.ports.command_bus import BusUnavailable
-from function_app.ports.signing_keys import Keys
-from function_app.services.messaging.delivery import Delivery, Signed
+from function_app.ports.signing_keys import SigningKeys
+from function_app.services.messaging.delivery import Delivery, SignedCommand
 
 SHORT_TTL_MS = 5_000
 """Time to live of lease and stop commands: what arrives later is no longer meant."""
@@ -21,15 +21,15 @@ _ENVELOPE_BYTES = 512
 """More than signature, key, epoch and times add to a command that is checked before it has them."""
 
 
-class Commands:
+class CommandSender:
     """Builds, signs and sends."""
 
-    def __init__(self, *, delivery: Delivery, keys: Keys, clock: Clock) -> None:
+    def __init__(self, *, delivery: Delivery, keys: SigningKeys, clock: Clock) -> None:
         self._delivery = delivery
         self._keys = keys
         self._clock = clock
 
-    def check(self, device: Device, command: str, request: Request, *, caller: str, ttl_ms: int) -> None:
+    def validate(self, device: Device, command: str, request: Request, *, caller: str, ttl_ms: int) -> None:
         """Refuse what a device would drop unread, before anything is written about it.
 
         Raises:
@@ -41,9 +41,9 @@ class Commands:
         except ProtocolError as error:
             raise invalid(f"{error}.") from error
 
-    async def signed(
+    async def sign(
         self, device: Device, command: str, request: Request, *, caller: str, epoch: int, issued_ms: int, ttl_ms: int
-    ) -> Signed:
+    ) -> SignedCommand:
         """One command, ready to be sent. The same arguments make the same bytes: the device drops the double.
 
         Raises:
@@ -57,9 +57,9 @@ class Commands:
         except ProtocolError as error:
             raise invalid(f"{error}.") from error
         stop = isinstance(request, StopDevice)
-        return Signed(command, payload, issued_ms + (STOP_KEPT_MS if stop else ttl_ms), first=stop)
+        return SignedCommand(command, payload, issued_ms + (STOP_KEPT_MS if stop else ttl_ms), first=stop)
 
-    async def publish(self, device: Device, signed: Signed) -> None:
+    async def publish(self, device: Device, signed: SignedCommand) -> None:
         """Send a signed command.
 
         Raises:
@@ -79,7 +79,7 @@ class Commands:
         await self._delivery.send(device, signed)
         return signed.command
 
-    async def confirmed(self, device: Device, request: Request, *, caller: str, epoch: int, wait_ms: int) -> bool:
+    async def send_confirmed(self, device: Device, request: Request, *, caller: str, epoch: int, wait_ms: int) -> bool:
         """Sign and send a short-lived command; whether the device accepted it within ``wait_ms``.
 
         Raises:
@@ -87,7 +87,7 @@ class Commands:
         """
         signed = await self._short(device, request, caller=caller, epoch=epoch)
         try:
-            return await self._delivery.confirmed(device, signed, wait_ms=wait_ms)
+            return await self._delivery.send_confirmed(device, signed, wait_ms=wait_ms)
         except BusUnavailable as error:
             raise broker_unavailable(f"{error}.") from error
 
@@ -109,10 +109,10 @@ class Commands:
         signature = signing.sign_text(text, key, context=signing.MOVEMENT_CONTEXT)
         return replace(order, key=name, signature=signature)
 
-    async def _short(self, device: Device, request: Request, *, caller: str, epoch: int) -> Signed:
+    async def _short(self, device: Device, request: Request, *, caller: str, epoch: int) -> SignedCommand:
         now_ms = self._clock.now_ms()
         command = command_id(device.id, now_ms)
-        return await self.signed(
+        return await self.sign(
             device, command, request, caller=caller, epoch=epoch, issued_ms=now_ms, ttl_ms=SHORT_TTL_MS
         )
 

@@ -24,7 +24,7 @@ CONFIRMING = frozenset({AckStatus.ACCEPTED, AckStatus.STARTED, AckStatus.DONE})
 """Answers that say yes; the other ones that say anything are terminal."""
 
 
-class Signed(NamedTuple):
+class SignedCommand(NamedTuple):
     """A signed command, and until when it may be sent [ms since 1970]. ``first``: before all others, as Stop is."""
 
     command: str
@@ -41,7 +41,7 @@ class Delivery:
         self._relay = relay
         self._mailbox = mailbox
 
-    async def send(self, device: Device, signed: Signed) -> None:
+    async def send(self, device: Device, signed: SignedCommand) -> None:
         """Publish a command, or put it where its agent fetches it.
 
         Raises:
@@ -87,7 +87,7 @@ class Delivery:
         else:
             yield None
 
-    async def confirmed(self, device: Device, signed: Signed, *, wait_ms: int) -> bool:
+    async def send_confirmed(self, device: Device, signed: SignedCommand, *, wait_ms: int) -> bool:
         """Send a command; whether the device accepted it within ``wait_ms``.
 
         Raises:
@@ -95,7 +95,7 @@ class Delivery:
         """
         async with self.acks(device, signed.command) as acks:
             if wait_ms and (acks is None or device.transport != "mqtt"):
-                await self._mailbox.expect(device, signed.command, expires_ms=signed.expires_ms)
+                await self._mailbox.expect_answer(device, signed.command, expires_ms=signed.expires_ms)
             await self.send(device, signed)
             try:
                 async with asyncio.timeout(wait_ms / 1000):
@@ -119,7 +119,7 @@ class Delivery:
             await asyncio.gather(*ways, return_exceptions=True)
 
     async def _pass_on(self, topic: str, payload: bytes) -> None:
-        await self._relay.pass_on([(topic, topics.parse(topic), payload)])
+        await self._relay.publish([(topic, topics.parse(topic), payload)])
 
     async def _noted(self, device: Device, command: str) -> AckStatus:
         """The answer, as soon as it is in the tables."""
@@ -127,7 +127,7 @@ class Delivery:
         with self._mailbox.listen(device.agent) as bell:
             while True:
                 bell.clear()
-                status = await self._mailbox.answered(device.agent, command)
+                status = await self._mailbox.stored_answer(device.agent, command)
                 if status is not None:
                     return status
                 # Not `wait_for`: it loses the end of the time that the caller set when the bell rings in that moment.

@@ -6,9 +6,9 @@ from device_agent.protocol import RotateKey
 from function_app.domain.common.problems import Problem
 from function_app.domain.devices.devices import Agent
 from function_app.ports.command_bus import BusUnavailable
-from function_app.ports.signing_keys import Keys
+from function_app.ports.signing_keys import SigningKeys
 from function_app.services.devices.device_access import devices_of
-from function_app.services.messaging.command_sender import Commands
+from function_app.services.messaging.command_sender import CommandSender
 
 _WHO = "telescope"
 _log = logging.getLogger(__name__)
@@ -17,13 +17,13 @@ _log = logging.getLogger(__name__)
 class KeyAnnouncer:
     """The word of mouth. Agents also ask by themselves, with every request for credentials."""
 
-    def __init__(self, *, keys: Keys, commands: Commands) -> None:
+    def __init__(self, *, keys: SigningKeys, command_sender: CommandSender) -> None:
         self._keys = keys
-        self._commands = commands
+        self._command_sender = command_sender
         self._serial = 0
         self._told: set[str] = set()
 
-    async def heard(self, agent: Agent, device: str) -> None:
+    async def on_state(self, agent: Agent, device: str) -> None:
         """A device has said something: so its agent is there to be told, once by each process.
 
         Raises:
@@ -42,7 +42,7 @@ class KeyAnnouncer:
         if result is None:
             return
         try:
-            await self._commands.send(result, RotateKey(statements=news.statements), caller=_WHO, epoch=0)
+            await self._command_sender.send(result, RotateKey(statements=news.statements), caller=_WHO, epoch=0)
         except (BusUnavailable, Problem) as error:
             _log.warning("agent %s could not be told of a new key: %s", agent.id, error)
             return

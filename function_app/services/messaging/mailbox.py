@@ -47,9 +47,9 @@ class Awaited:
 class Mailbox:
     """The rows, and a bell for whoever waits in this process; others see the rows a moment later."""
 
-    def __init__(self, *, tables: Tables, forget: Retention, clock: Clock) -> None:
+    def __init__(self, *, tables: Tables, retention: Retention, clock: Clock) -> None:
         self._tables = tables
-        self._forget = forget
+        self._retention = retention
         self._clock = clock
         self._noted: dict[str, int] = {}
         self._bells: dict[str, set[asyncio.Event]] = {}
@@ -71,11 +71,11 @@ class Mailbox:
         await self._tidy_later(device.agent, expires_ms)
         with contextlib.suppress(Conflict):
             await self._tables.create(
-                records.MAILBOX, Row(device.agent, _key(command, first=first), records.fields(letter))
+                records.MAILBOX, Row(device.agent, _key(command, first=first), records.to_data(letter))
             )
         self._ring(device.agent)
 
-    async def waiting(self, agent: Agent, *, limit: int, have: Collection[str] = ()) -> list[MailboxEntry]:
+    async def pending(self, agent: Agent, *, limit: int, have: Collection[str] = ()) -> list[MailboxEntry]:
         """Commands that nobody has answered, Stop first, then the oldest first.
 
         Args:
@@ -113,14 +113,14 @@ class Mailbox:
                     await self._tables.delete(records.MAILBOX, row)
                 return
 
-    async def expect(self, device: Device, command: str, *, expires_ms: int) -> None:
+    async def expect_answer(self, device: Device, command: str, *, expires_ms: int) -> None:
         """Make a place for the answer to a command. Before it is sent: an answer without a place is not kept."""
         await self._tidy_later(device.agent, expires_ms)
-        place = Row(device.agent, _answer_key(command), records.fields(Awaited(expires_ms)))
+        place = Row(device.agent, _answer_key(command), records.to_data(Awaited(expires_ms)))
         with contextlib.suppress(Conflict):
             await self._tables.create(records.MAILBOX, place)
 
-    async def answer(self, agent: str, ack: Ack) -> None:
+    async def store_answer(self, agent: str, ack: Ack) -> None:
         """Note an answer, where a place was made for it and nothing more final stands there.
 
         Raises:
@@ -133,13 +133,13 @@ class Mailbox:
                 return
             awaited = records.read(row, Awaited)
             if awaited.status is None or (ack.status.terminal and not awaited.status.terminal):
-                data = records.fields(replace(awaited, status=ack.status))
+                data = records.to_data(replace(awaited, status=ack.status))
                 await self._tables.replace(records.MAILBOX, replace(row, data=data))
 
         await records.retry(attempt)
         self._ring(agent)
 
-    async def answered(self, agent: str, command: str) -> AckStatus | None:
+    async def stored_answer(self, agent: str, command: str) -> AckStatus | None:
         """What was noted in the place for the answer."""
         row = await self._tables.get(records.MAILBOX, agent, _answer_key(command))
         return None if row is None else records.read(row, Awaited).status
@@ -165,7 +165,7 @@ class Mailbox:
         due_ms = -(-expires_ms // _TIDY_MS) * _TIDY_MS
         if self._noted.get(agent, 0) >= due_ms:
             return
-        await self._forget.rows(records.MAILBOX, agent, first="", last=None, due_ms=due_ms)
+        await self._retention.delete_rows_at(records.MAILBOX, agent, first="", last=None, due_ms=due_ms)
         if len(self._noted) > PAGE * PAGE:
             self._noted.clear()
         self._noted[agent] = due_ms

@@ -16,7 +16,7 @@ _SLOWEST_LOOK_S = 0.25
 """Another instance may have put a command into the mailbox: then nothing but looking tells."""
 
 
-class Polling:
+class CommandPolling:
     """Polls, plain and long."""
 
     def __init__(self, *, tables: Tables, mailbox: Mailbox, clock: Clock) -> None:
@@ -31,14 +31,14 @@ class Polling:
             Problem: ``agent-unclaimed``, ``busy``.
         """
         require_claimed(agent)
-        await self.seen(agent)
+        await self.mark_online(agent)
         loop = asyncio.get_running_loop()
         end = loop.time() + wait_ms / 1000
         pause_s = _LOOK_S
         with self._mailbox.listen(agent.id) as bell:
             while True:
                 bell.clear()
-                result = await self._mailbox.waiting(agent, limit=limit, have=have)
+                result = await self._mailbox.pending(agent, limit=limit, have=have)
                 left_s = end - loop.time()
                 if result or left_s <= 0:
                     return result
@@ -47,7 +47,7 @@ class Polling:
                         await bell.wait()
                 pause_s = min(2 * pause_s, _SLOWEST_LOOK_S)
 
-    async def seen(self, agent: Agent) -> None:
+    async def mark_online(self, agent: Agent) -> None:
         """Note that the agent is there; written only now and then. Of one on MQTT its connection tells.
 
         Raises:

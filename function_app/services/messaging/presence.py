@@ -16,7 +16,7 @@ from function_app.ports.tables import Tables
 from function_app.services.health.reported_faults import ReportedFaults
 from function_app.services.messaging.key_announcer import KeyAnnouncer
 from function_app.services.storage import records
-from function_app.services.telemetry.event_log import Events
+from function_app.services.telemetry.event_log import EventLog
 
 T = TypeVar("T")
 
@@ -25,12 +25,18 @@ class PresenceIngest:
     """Writes down what arrives. Safe to repeat; what does not belong to a claimed agent is dropped."""
 
     def __init__(
-        self, *, tables: Tables, events: Events, conditions: ReportedFaults, keys: KeyAnnouncer, clock: Clock
+        self,
+        *,
+        tables: Tables,
+        events: EventLog,
+        reported_faults: ReportedFaults,
+        key_announcer: KeyAnnouncer,
+        clock: Clock,
     ) -> None:
         self._tables = tables
         self._events = events
-        self._conditions = conditions
-        self._keys = keys
+        self._reported_faults = reported_faults
+        self._key_announcer = key_announcer
         self._clock = clock
 
     async def ingest(self, topic: Topic, payload: bytes, *, by: Transport = "mqtt") -> None:
@@ -58,18 +64,18 @@ class PresenceIngest:
             presence = codec.decode(payload, Presence)
             link = Link(presence.online, presence.session, now_ms, by == "http", agent.pairing)
             if link.online:
-                await self._conditions.connected(agent, link.session)
+                await self._reported_faults.on_connected(agent, link.session)
             await records.upsert(
                 self._tables, records.AGENTS, topic.agent, "link", lambda existing: newer_link(existing, link), Link
             )
         elif topic.kind == topics.STATE:
             said = codec.decode(payload, State)
-            await self._conditions.said(agent, topic.device, said)
+            await self._reported_faults.on_state(agent, topic.device, said)
             state = LastState(msgspec.to_builtins(said), now_ms, agent.pairing)
             await records.upsert(
                 self._tables, records.AGENTS, topic.agent, f"state:{topic.device}", lambda _: state, LastState
             )
-            await self._keys.heard(agent, topic.device)
+            await self._key_announcer.on_state(agent, topic.device)
         elif topic.kind == topics.DESC and not topic.name:
             description = codec.decode(payload, Description)
             await records.upsert(

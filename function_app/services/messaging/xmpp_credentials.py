@@ -18,10 +18,10 @@ from function_app.domain.common.problems import Problem, unauthorized
 from function_app.domain.devices.devices import Agent
 from function_app.domain.identity.accounts import Identity
 from function_app.ports.clock import Clock
-from function_app.ports.signing_keys import Keys
+from function_app.ports.signing_keys import SigningKeys
 from function_app.ports.tables import Tables
-from function_app.services.devices.device_access import Devices, require_claimed
-from function_app.services.identity.authenticator import ALGORITHM, SESSION_S, XMPP, Identify, decode
+from function_app.services.devices.device_access import DeviceAccess, require_claimed
+from function_app.services.identity.authenticator import ALGORITHM, SESSION_S, XMPP, Authenticator, decode
 from function_app.services.identity.sign_in import SignIn
 from function_app.services.storage import records
 
@@ -62,7 +62,7 @@ class Admitted:
     contacts: tuple[Contact, ...]
 
 
-class XmppAccess:
+class XmppCredentials:
     """Makes and checks passwords.
 
     Args:
@@ -79,16 +79,16 @@ class XmppAccess:
         self,
         *,
         tables: Tables,
-        keys: Keys,
-        identify: Identify,
+        keys: SigningKeys,
+        authenticator: Authenticator,
         sign_in: SignIn,
-        devices: Devices,
+        devices: DeviceAccess,
         clock: Clock,
         domain: str,
     ) -> None:
         self._tables = tables
         self._keys = keys
-        self._identify = identify
+        self._authenticator = authenticator
         self._sign_in = sign_in
         self._devices = devices
         self._clock = clock
@@ -112,8 +112,8 @@ class XmppAccess:
         """
         self._require()
         now_ms = self._clock.now_ms()
-        lifetime_s = caller.lasting_s(SESSION_S, now_ms)
-        token = await self._identify.issue(caller, XMPP, lifetime_s)
+        lifetime_s = caller.lifetime_s(SESSION_S, now_ms)
+        token = await self._authenticator.issue(caller, XMPP, lifetime_s)
         return Password(caller.account, token, now_ms + lifetime_s * 1000, lifetime_s)
 
     async def cloud(self) -> Password:
@@ -154,7 +154,7 @@ class XmppAccess:
         return Admitted(user, agent.name, "agent", self._left_s(claims), contacts)
 
     async def _verify_account(self, user: str, password: str) -> Admitted:
-        caller = await self._identify.person(password, XMPP)
+        caller = await self._authenticator.person(password, XMPP)
         if caller.account != user:
             raise _refused()
         contacts = [Contact(jids.CLOUD, CLOUD_NAME)]
@@ -163,7 +163,7 @@ class XmppAccess:
             agents, cursor = await self._devices.agents(caller, cursor=cursor, limit=_PAGE)
             contacts += [Contact(agent.id, agent.name) for agent in agents if agent.transport == "xmpp"]
             if cursor is None:
-                left_s = caller.lasting_s(LOGIN_S, self._clock.now_ms())
+                left_s = caller.lifetime_s(LOGIN_S, self._clock.now_ms())
                 return Admitted(user, caller.name, "account", left_s, tuple(contacts))
 
     def _require(self) -> None:

@@ -12,7 +12,7 @@ from function_app.domain.identity.accounts import Identity
 from function_app.ports.clock import Clock
 from function_app.ports.tables import Conflict, Row, Tables
 from function_app.services.audit.audit_log import AuditLog, Change
-from function_app.services.identity.guess_limiter import Attempts, Guess, by_address
+from function_app.services.identity.guess_limiter import Guess, GuessLimiter, by_address
 from function_app.services.identity.sign_in import SignIn
 from function_app.services.pairing.offboarding import Offboarding
 from function_app.services.storage import records
@@ -30,13 +30,20 @@ class Claim:
     """Pairing by claim code. What decides is one ETag write on the agent's row."""
 
     def __init__(
-        self, *, tables: Tables, sign_in: SignIn, attempts: Attempts, leave: Offboarding, chain: AuditLog, clock: Clock
+        self,
+        *,
+        tables: Tables,
+        sign_in: SignIn,
+        guess_limiter: GuessLimiter,
+        offboarding: Offboarding,
+        audit_log: AuditLog,
+        clock: Clock,
     ) -> None:
         self._tables = tables
-        self._attempts = attempts
-        self._leave = leave
+        self._guess_limiter = guess_limiter
+        self._offboarding = offboarding
         self._sign_in = sign_in
-        self._chain = chain
+        self._audit_log = audit_log
         self._clock = clock
 
     async def claim(self, caller: Identity, text: str, space: str | None, *, address: str = "") -> Agent:
@@ -55,7 +62,7 @@ class Claim:
             raise not_found("space", space or "")
         counters = {caller.account: WRONG_TRIES, **by_address(address, WRONG_TRIES)}
         try:
-            await self._attempts.count(GUESS, counters)
+            await self._guess_limiter.add_failure(GUESS, counters)
             agent = await self._redeem(caller, parse_claim_code(text), chosen)
         except Problem as problem:
             await self._refused(caller, problem, address)
@@ -65,11 +72,11 @@ class Claim:
             unknown = Problem("claim-code-unknown", 404, "No such claim code", detail)
             await self._refused(caller, unknown, address)
             raise unknown
-        await self._attempts.uncount(GUESS, counters)
+        await self._guess_limiter.remove_failure(GUESS, counters)
         return agent
 
     async def _refused(self, caller: Identity, problem: Problem, address: str) -> None:
-        await self._chain.refused(
+        await self._audit_log.record_rejection(
             caller.account, AccountEvent.CLAIM_REFUSED, caller, code=problem.code, address=address
         )
 
@@ -80,7 +87,7 @@ class Claim:
         if result is None:
             return None
         agent = str(result.data["agent"])
-        async with self._chain.change(
+        async with self._audit_log.change(
             caller.account, AccountEvent.AGENT_CLAIMED, caller, on=agent, space=space
         ) as change:
             claimed = await records.retry(lambda: self._take(caller, code, agent, space, change))
@@ -99,7 +106,7 @@ class Claim:
         now_ms = self._clock.now_ms()
         if agent.claimed or agent.claim_code != code or now_ms >= agent.claim_expires_ms:
             return None
-        await self._leave.settle(agent)
+        await self._offboarding.settle(agent)
         await change.noted()
         claimed = devices.claim(agent, account=caller.account, space=space, pairing=new_id(), now_ms=now_ms)
         # The index first: without the agent's row behind it it shows nothing, so a stop in between leaves no harm.
@@ -107,5 +114,5 @@ class Claim:
         await records.upsert(
             self._tables, records.MEMBERS, caller.account, f"agent:{agent.id}", lambda _: member, _Member
         )
-        await self._tables.replace(records.AGENTS, Row(agent.id, "agent", records.fields(claimed), row.etag))
+        await self._tables.replace(records.AGENTS, Row(agent.id, "agent", records.to_data(claimed), row.etag))
         return claimed

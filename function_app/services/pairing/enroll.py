@@ -32,10 +32,10 @@ class Enrollment:
 class Enroll:
     """Enrolment of agents."""
 
-    def __init__(self, *, tables: Tables, leave: Offboarding, forget: Retention, clock: Clock) -> None:
+    def __init__(self, *, tables: Tables, offboarding: Offboarding, retention: Retention, clock: Clock) -> None:
         self._tables = tables
-        self._leave = leave
-        self._forget = forget
+        self._offboarding = offboarding
+        self._retention = retention
         self._clock = clock
 
     async def enroll(self, agent: str, told: Enrollment) -> Agent:
@@ -61,21 +61,23 @@ class Enroll:
                 before = record.leaving
                 record = replace(with_devices(record, told.devices), name=told.name, software=told.software)
                 if record.leaving != before:
-                    await self._leave.watch(agent)
+                    await self._offboarding.watch(agent)
             record = replace(record, transport=told.transport)
             if not record.claimed:
                 expires_ms = now_ms + CLAIM_MS
                 code = await self._new_code(agent, expires_ms)
                 forget_ms = now_ms + KEEP_UNCLAIMED_MS
-                await self._forget.row(records.AGENTS, agent, "agent", due_ms=(forget_ms // DAY_MS + 1) * DAY_MS)
+                await self._retention.delete_row_at(
+                    records.AGENTS, agent, "agent", due_ms=(forget_ms // DAY_MS + 1) * DAY_MS
+                )
                 record = replace(record, claim_code=code, claim_expires_ms=expires_ms, expires_ms=forget_ms)
-            new = Row(agent, "agent", records.fields(record), row.etag if row else "")
+            new = Row(agent, "agent", records.to_data(record), row.etag if row else "")
             await self._tables.batch(records.AGENTS, [Write("replace" if row else "create", new)])
             return record
 
         record = await records.retry(attempt)
         if record.claimed and record.leaving:
-            await self._leave.finish(agent)
+            await self._offboarding.finish(agent)
         return record
 
     async def wait(self, agent: Agent, wait_ms: int) -> Agent:

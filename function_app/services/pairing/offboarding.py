@@ -22,13 +22,13 @@ from function_app.ports.certificates import Certificates
 from function_app.ports.clock import Clock
 from function_app.ports.command_bus import BusUnavailable, CommandBus
 from function_app.ports.tables import Conflict, Row, Tables
-from function_app.services.actions.action_store import ActionRows
-from function_app.services.actions.queue import Queues
+from function_app.services.actions.action_store import ActionStore
+from function_app.services.actions.queue import ActionQueues
 from function_app.services.control.control_events import ControlEvents
 from function_app.services.control.fencing import ControlRevocation
 from function_app.services.devices.control_rows import read_control_rows
-from function_app.services.devices.device_access import left_devices
-from function_app.services.identity.authenticator import watchers
+from function_app.services.devices.device_access import departed_devices
+from function_app.services.identity.authenticator import all_viewers
 from function_app.services.storage import records
 from function_app.services.storage.reminders import Reminders
 from function_app.services.storage.retention import Retention
@@ -49,34 +49,34 @@ class Offboarding:
         self,
         *,
         tables: Tables,
-        rows: ActionRows,
-        queues: Queues,
-        pending: Reminders,
-        fence: ControlRevocation,
+        action_store: ActionStore,
+        queues: ActionQueues,
+        reminders: Reminders,
+        revocation: ControlRevocation,
         access: BrokerAccess,
         certificates: Certificates,
         bus: CommandBus,
         series: SeriesWriter,
-        forget: Retention,
-        audit: ControlEvents,
+        retention: Retention,
+        control_events: ControlEvents,
         clock: Clock,
     ) -> None:
         self._tables = tables
-        self._rows = rows
+        self._action_store = action_store
         self._queues = queues
-        self._pending = pending
-        self._fence = fence
+        self._reminders = reminders
+        self._revocation = revocation
         self._access = access
         self._certificates = certificates
         self._bus = bus
         self._series = series
-        self._forget = forget
-        self._audit = audit
+        self._retention = retention
+        self._control_events = control_events
         self._clock = clock
 
     async def watch(self, agent: str) -> None:
         """Have the timer look at an agent; to be noted before the write that has it, or a device of it, leave."""
-        await self._pending.note(f"{_NOTE}{agent}", self._clock.now_ms() + LOOK_MS)
+        await self._reminders.schedule(f"{_NOTE}{agent}", self._clock.now_ms() + LOOK_MS)
 
     async def finish(self, agent_id: str) -> bool:
         """Tidy up behind all that has left; whether everything is done.
@@ -111,12 +111,12 @@ class Offboarding:
             await self._settle(agent, leaving)
 
     async def _settle(self, agent: Agent, leaving: Departure) -> None:
-        for device in left_devices(agent, leaving):
+        for device in departed_devices(agent, leaving):
             # Before its actions end: with them would go the lease that tells that somebody has moved it.
-            await self._fence.end(device, leaving.why)
+            await self._revocation.revoke(device, leaving.why)
             await self._end_actions(device, leaving.why)
             # While the agent's row still knows whose it was.
-            await self._audit.tell(device.id)
+            await self._control_events.publish(device.id)
             await self._delete(records.AGENTS, agent.id, f"state:{device.name}", leaving)
             if leaving.why == "unpaired":
                 await self._series.forget(device.id, device.pairing)
@@ -133,16 +133,18 @@ class Offboarding:
         due_ms = self._clock.now_ms() + MARGIN_MS
         for table in (records.EVENTS, records.FAULTS, records.DIAGNOSTICS, records.LATENCY):
             partition = f"{device.id}/{device.pairing}"
-            await self._forget.rows(table, partition, first="", last=None, due_ms=due_ms)
+            await self._retention.delete_rows_at(table, partition, first="", last=None, due_ms=due_ms)
 
     async def _end_actions(self, device: Device, why: str) -> None:
         _, message = DROPPED[why]
         control = await read_control_rows(self._tables, device.id)
         if control.queue.pairing == device.pairing:
-            await self._queues.halt(device.id, why)
+            await self._queues.cancel_all(device.id, why)
         if control.action and control.slot_pairing == device.pairing:
             now_ms = self._clock.now_ms()
-            await self._rows.change(control.action, lambda action: end(action, Status.FAILED, why, message, now_ms))
+            await self._action_store.change(
+                control.action, lambda action: end(action, Status.FAILED, why, message, now_ms)
+            )
 
     async def _delete(self, table: str, partition: str, key: str, leaving: Departure) -> None:
         """Delete a row of the pairing that is left, not one that was written anew."""
@@ -187,7 +189,7 @@ class Offboarding:
             share = records.read(row, Share)
             if share.pairing != pairing:
                 continue
-            await self._access.revoke(principal=watchers(share.account))
+            await self._access.revoke(principal=all_viewers(share.account))
             with contextlib.suppress(Conflict):
                 await self._tables.delete(records.SHARES, row)
                 index = await self._tables.get(records.MEMBERS, share.account, f"share:{on}")
@@ -203,7 +205,7 @@ class Offboarding:
                 return
             agent = records.read(row, Agent)
             left = tuple(leaving for leaving in agent.leaving if leaving not in gone)
-            created = records.fields(replace(agent, leaving=left))
+            created = records.to_data(replace(agent, leaving=left))
             await self._tables.replace(records.AGENTS, Row(agent_id, "agent", created, row.etag))
 
         await records.retry(attempt)

@@ -17,11 +17,11 @@ from function_app.services.storage import records
 class Unpair:
     """Ends a pairing, or takes it to another space."""
 
-    def __init__(self, *, tables: Tables, sign_in: SignIn, leave: Offboarding, chain: AuditLog) -> None:
+    def __init__(self, *, tables: Tables, sign_in: SignIn, offboarding: Offboarding, audit_log: AuditLog) -> None:
         self._tables = tables
         self._sign_in = sign_in
-        self._leave = leave
-        self._chain = chain
+        self._offboarding = offboarding
+        self._audit_log = audit_log
 
     async def unpair(self, caller: Identity, agent_id: str) -> None:
         """End the pairing. The write on the agent's row decides; all that follows only tidies up.
@@ -32,7 +32,7 @@ class Unpair:
         Raises:
             Problem: ``agent-unknown``, ``busy``.
         """
-        async with self._chain.change(caller.account, AccountEvent.AGENT_UNPAIRED, caller, on=agent_id) as change:
+        async with self._audit_log.change(caller.account, AccountEvent.AGENT_UNPAIRED, caller, on=agent_id) as change:
             changed = await self._change(caller, agent_id, rules.unpair, change)
         await self._finish(changed)
 
@@ -49,7 +49,7 @@ class Unpair:
                 raise not_found("space", space)
             return agent if agent.space == space else rules.move(agent, space)
 
-        async with self._chain.change(
+        async with self._audit_log.change(
             caller.account, AccountEvent.AGENT_MOVED, caller, on=agent_id, space=space
         ) as change:
             changed = await self._change(caller, agent_id, moved, change)
@@ -68,14 +68,14 @@ class Unpair:
             changed = rule(agent)
             if changed is not agent:
                 if not watched:
-                    await self._leave.watch(agent_id)
+                    await self._offboarding.watch(agent_id)
                     watched = True
                 await change.noted()
-                await self._tables.replace(records.AGENTS, Row(agent_id, "agent", records.fields(changed), row.etag))
+                await self._tables.replace(records.AGENTS, Row(agent_id, "agent", records.to_data(changed), row.etag))
             return changed
 
         return await records.retry(attempt)
 
     async def _finish(self, agent: Agent) -> None:
         if agent.leaving:
-            await self._leave.finish(agent.id)
+            await self._offboarding.finish(agent.id)

@@ -16,8 +16,8 @@ from function_app.domain.common.problems import Problem, invalid, not_found
 from function_app.domain.identity.accounts import Identity
 from function_app.domain.robot_types.robot_types import TypeHead, TypeVersion
 from function_app.ports.blobs import Blobs
-from function_app.ports.model_compiler import Looked
-from function_app.ports.robot_catalogue import Catalogue
+from function_app.ports.model_compiler import ModelReport
+from function_app.ports.robot_catalogue import RobotCatalogue
 from function_app.ports.tables import Tables
 from function_app.services.robot_types.integrity import IntegritySeals, require_intact
 from function_app.services.robot_types.rows import INDEX, LOOKED, Place, place, read_head, read_version
@@ -62,8 +62,8 @@ class Model:
 class RobotTypes:
     """All robot types that an account may use."""
 
-    def __init__(self, *, tables: Tables, blobs: Blobs, catalogue: Catalogue, seals: IntegritySeals) -> None:
-        self._seals = seals
+    def __init__(self, *, tables: Tables, blobs: Blobs, catalogue: RobotCatalogue, integrity: IntegritySeals) -> None:
+        self._integrity = integrity
         self._tables = tables
         self._blobs = blobs
         self._catalogue = catalogue
@@ -103,7 +103,7 @@ class RobotTypes:
         if not head.ready:
             detail = f"No version of '{robot_type}' is ready. Look at the robot type: it says why."
             raise Problem("robot-type-not-ready", 409, "The robot type is not ready", detail)
-        await self._seals.check(where.account, robot_type, head)
+        await self._integrity.check(where.account, robot_type, head)
         return msgspec.convert(head.manifest, RobotType)
 
     async def view(self, caller: Identity, robot_type: str) -> KnownType:
@@ -149,7 +149,7 @@ class RobotTypes:
             drawing = await self._catalogue.drawing(robot_type)
             if drawing is None:
                 raise not_found("model", robot_type)
-            return _model(robot_type, msgspec.json.decode(drawing, type=Looked))
+            return _model(robot_type, msgspec.json.decode(drawing, type=ModelReport))
         await self.get(caller, robot_type)
         where, head = await self._head(caller, robot_type)
         _, version = await read_version(self._tables, where, head.ready)
@@ -166,7 +166,7 @@ class RobotTypes:
         content = await self._blobs.get(where.prefix(version.version) + LOOKED)
         if content is None:
             raise not_found("model", version.manifest["type"])
-        return _model(version.manifest["type"], msgspec.json.decode(content, type=Looked))
+        return _model(version.manifest["type"], msgspec.json.decode(content, type=ModelReport))
 
     async def archive(self, caller: Identity, robot_type: str) -> bytes:
         """All files of the version in use as a zip, in a folder of the type's name.
@@ -208,7 +208,7 @@ class RobotTypes:
         return where, head
 
 
-def _model(robot_type: str, looked: Looked) -> Model:
+def _model(robot_type: str, looked: ModelReport) -> Model:
     if looked.twin is None:
         raise not_found("model", robot_type)
     return Model(looked.twin, looked.actuators, looked.cameras)

@@ -9,16 +9,16 @@ from function_app.domain.robot_types.robot_types import TypeHead, TypeVersion
 from function_app.ports.blobs import Blobs
 from function_app.ports.clock import Clock
 from function_app.ports.tables import Conflict, Row, Tables
-from function_app.services.robot_types.model_validation import drop_files, give_verdict
+from function_app.services.robot_types.model_validation import drop_files, store_verdict
 from function_app.services.robot_types.rows import (
     CHECKS,
     LOOKS,
     VERSIONS,
     Place,
-    note_look,
     place_of,
+    preview_index,
     read_head,
-    trial_index,
+    schedule_check,
 )
 from function_app.services.robot_types.versions import GIVE_UP_MS, KEEP_LOOK_MS
 from function_app.services.storage import records
@@ -45,7 +45,7 @@ class RobotTypeCleanup:
         self._blobs = blobs
         self._clock = clock
 
-    async def run(self) -> None:
+    async def run_due_jobs(self) -> None:
         """One round. Safe to repeat and to be run by many at once: each note goes last.
 
         Raises:
@@ -96,7 +96,7 @@ class RobotTypeCleanup:
 
     async def _forget(self, where: Place) -> None:
         """Take a look off its account's list."""
-        row = await self._tables.get(records.MEMBERS, where.account, trial_index(where))
+        row = await self._tables.get(records.MEMBERS, where.account, preview_index(where))
         if row is not None:
             with contextlib.suppress(Conflict):
                 await self._tables.delete(records.MEMBERS, row)
@@ -112,19 +112,19 @@ class RobotTypeCleanup:
             if now_ms >= due_ms:
                 await self._drop(where, row, version)
             else:
-                await note_look(self._tables, where, due_ms)
+                await schedule_check(self._tables, where, due_ms)
         elif version.open:
             await self._judge(where, version, now_ms)
 
     async def _judge(self, where: Place, version: TypeVersion, now_ms: int) -> None:
         age_ms = now_ms - version.created_ms
         if age_ms < GIVE_UP_MS:
-            await note_look(self._tables, where, version.created_ms + GIVE_UP_MS)
+            await schedule_check(self._tables, where, version.created_ms + GIVE_UP_MS)
         elif version.state == "checking" and age_ms < LONGEST_MS and await self._busy(now_ms):
-            await note_look(self._tables, where, now_ms + AGAIN_MS)
+            await schedule_check(self._tables, where, now_ms + AGAIN_MS)
         else:
             why = CUT_OFF if version.state == "uploading" else NO_CHECKER
-            await give_verdict(self._tables, where, version.version, (why,), now_ms)
+            await store_verdict(self._tables, where, version.version, (why,), now_ms)
 
     async def _busy(self, now_ms: int) -> bool:
         """Whether a checker is at work: then this one's turn will come."""

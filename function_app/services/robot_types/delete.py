@@ -7,12 +7,12 @@ from function_app.domain.audit.hash_chain import AccountEvent
 from function_app.domain.common.problems import Problem, not_found
 from function_app.domain.identity.accounts import Identity
 from function_app.ports.clock import Clock
-from function_app.ports.robot_catalogue import Catalogue
+from function_app.ports.robot_catalogue import RobotCatalogue
 from function_app.ports.tables import Conflict, Row, Tables
 from function_app.services.audit.audit_log import AuditLog
-from function_app.services.devices.device_access import Devices
+from function_app.services.devices.device_access import DeviceAccess
 from function_app.services.robot_types.movements import Movements
-from function_app.services.robot_types.rows import INDEX, note_look, place, read_head
+from function_app.services.robot_types.rows import INDEX, place, read_head, schedule_check
 from function_app.services.storage import records
 
 AFTER_MS = 60_000
@@ -20,24 +20,24 @@ AFTER_MS = 60_000
 _NAMED = 5
 
 
-class DeleteRobotType:
+class RobotTypeDeletion:
     """Takes an account's own robot type out of use."""
 
     def __init__(
         self,
         *,
         tables: Tables,
-        catalogue: Catalogue,
-        devices: Devices,
+        catalogue: RobotCatalogue,
+        devices: DeviceAccess,
         movements: Movements,
-        chain: AuditLog,
+        audit_log: AuditLog,
         clock: Clock,
     ) -> None:
         self._tables = tables
         self._catalogue = catalogue
         self._devices = devices
         self._movements = movements
-        self._chain = chain
+        self._audit_log = audit_log
         self._clock = clock
 
     async def delete(self, caller: Identity, robot_type: str) -> None:
@@ -59,12 +59,16 @@ class DeleteRobotType:
             if row is None or head is None or head.deleted:
                 raise not_found("robot-type", robot_type)
             await self._require_unused(caller, robot_type)
-            await note_look(self._tables, where, self._clock.now_ms() + AFTER_MS)
+            await schedule_check(self._tables, where, self._clock.now_ms() + AFTER_MS)
             await change.noted()
             gone = replace(head, deleted=True, ready=0, manifest={})
-            await self._tables.replace(records.ROBOT_TYPES, Row(row.partition, row.key, records.fields(gone), row.etag))
+            await self._tables.replace(
+                records.ROBOT_TYPES, Row(row.partition, row.key, records.to_data(gone), row.etag)
+            )
 
-        async with self._chain.change(caller.account, AccountEvent.ROBOT_TYPE_DELETED, caller, on=robot_type) as change:
+        async with self._audit_log.change(
+            caller.account, AccountEvent.ROBOT_TYPE_DELETED, caller, on=robot_type
+        ) as change:
             await records.retry(attempt)
         if index is not None:
             with contextlib.suppress(Conflict):

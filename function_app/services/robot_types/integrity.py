@@ -10,7 +10,7 @@ from device_agent.protocol.errors import SignatureError
 from device_agent.protocol.security import signing
 from function_app.domain.common.problems import Problem
 from function_app.domain.robot_types.robot_types import Seal, TypeHead, TypeVersion
-from function_app.ports.signing_keys import Keys
+from function_app.ports.signing_keys import SigningKeys
 
 _CONTEXT = b"telescope/v1/robot-type\n"
 
@@ -18,7 +18,7 @@ _CONTEXT = b"telescope/v1/robot-type\n"
 class IntegritySeals:
     """Signs uploads, and checks what is read again."""
 
-    def __init__(self, *, keys: Keys) -> None:
+    def __init__(self, *, keys: SigningKeys) -> None:
         self._keys = keys
 
     async def sealed(

@@ -14,10 +14,10 @@ from device_agent.protocol.manifests.robot_type import MANIFEST, RobotType
 from function_app.domain.robot_types.robot_types import State, TypeVersion, with_ready
 from function_app.ports.blobs import Blobs
 from function_app.ports.clock import Clock
-from function_app.ports.model_compiler import CompilerMissingError, Looked, ModelCompiler
+from function_app.ports.model_compiler import CompilerMissingError, ModelCompiler, ModelReport
 from function_app.ports.tables import Conflict, Row, Tables, Write
 from function_app.services.robot_types.package_reader import malformed, missing
-from function_app.services.robot_types.rows import CHECKS, HEAD, LOOKED, Place, note_look, read_head, read_version
+from function_app.services.robot_types.rows import CHECKS, HEAD, LOOKED, Place, read_head, read_version, schedule_check
 from function_app.services.storage import records
 from function_app.services.storage.retention import DAY_MS
 
@@ -31,7 +31,7 @@ MAX_ERROR = 500
 _log = logging.getLogger(__name__)
 
 
-class ModelChecks:
+class ModelValidator:
     """The checker's work."""
 
     def __init__(self, *, tables: Tables, blobs: Blobs, compiler: ModelCompiler, clock: Clock) -> None:
@@ -84,23 +84,23 @@ class ModelChecks:
         _, upload = await read_version(self._tables, where, number)
         if upload is not None and upload.state == "checking":
             if note.data["tries"] > MAX_TRIES:
-                looked = Looked((f"The check was cut off {MAX_TRIES} times. Simplify the model.",))
+                looked = ModelReport((f"The check was cut off {MAX_TRIES} times. Simplify the model.",))
             else:
                 looked = await self._look(where, upload)
             # The drawing first: a version that is ready has one.
             await self._blobs.put(where.prefix(number) + LOOKED, msgspec.json.encode(looked))
             warnings = _sentences(looked.warnings)
-            await give_verdict(self._tables, where, number, looked.errors, self._clock.now_ms(), warnings=warnings)
+            await store_verdict(self._tables, where, number, looked.errors, self._clock.now_ms(), warnings=warnings)
             _, upload = await read_version(self._tables, where, number)
         if upload is None:
             await drop_files(self._blobs, where, number)  # the timer may have been here in between
 
-    async def _look(self, where: Place, upload: TypeVersion) -> Looked:
+    async def _look(self, where: Place, upload: TypeVersion) -> ModelReport:
         names = list(upload.files)
         contents = await asyncio.gather(*(self._blobs.get(where.prefix(upload.version) + name) for name in names))
         files = {name: content for name, content in zip(names, contents, strict=True) if content is not None}
         if len(files) < len(names):
-            return Looked(("A file of the upload is gone. Upload it again.",))
+            return ModelReport(("A file of the upload is gone. Upload it again.",))
         manifest = msgspec.convert(upload.manifest, RobotType)
         del files[MANIFEST]
         lost = missing(files)
@@ -117,7 +117,7 @@ async def drop_files(blobs: Blobs, where: Place, number: int) -> None:
         await blobs.delete(name)
 
 
-async def give_verdict(
+async def store_verdict(
     tables: Tables, where: Place, number: int, errors: Sequence[str], now_ms: int, *, warnings: tuple[str, ...] = ()
 ) -> None:
     """Write what was found, beside what was known before; what nobody waits for any more stays as it is.
@@ -135,11 +135,11 @@ async def give_verdict(
         wrong = _sentences((*upload.errors, *errors))
         state: State = "refused" if wrong else "ready"
         done = replace(upload, state=state, errors=wrong, warnings=warnings, checked_ms=now_ms)
-        version_row = Row(row.partition, row.key, records.fields(done), row.etag)
+        version_row = Row(row.partition, row.key, records.to_data(done), row.etag)
         writes = [Write("replace", version_row)]
         if not wrong:
-            await note_look(tables, where, now_ms + DAY_MS)
-            head_data = records.fields(with_ready(head, done))
+            await schedule_check(tables, where, now_ms + DAY_MS)
+            head_data = records.to_data(with_ready(head, done))
             writes.append(Write("replace", Row(row.partition, HEAD, head_data, head_row.etag)))
         await tables.batch(records.ROBOT_TYPES, writes)
 

@@ -19,8 +19,8 @@ from function_app.domain.identity.accounts import Identity
 from function_app.domain.robot_types.movements import Movement
 from function_app.ports.blobs import Blobs
 from function_app.ports.clock import Clock
-from function_app.ports.robot_catalogue import BuiltIn, Catalogue
-from function_app.ports.signing_keys import Keys
+from function_app.ports.robot_catalogue import BuiltInMovement, RobotCatalogue
+from function_app.ports.signing_keys import SigningKeys
 from function_app.ports.tables import Row, Tables, Write
 from function_app.services.audit.audit_log import AuditLog
 from function_app.services.robot_types.catalogue import RobotTypes
@@ -60,19 +60,19 @@ class Movements:
         *,
         tables: Tables,
         blobs: Blobs,
-        catalogue: Catalogue,
+        catalogue: RobotCatalogue,
         robot_types: RobotTypes,
-        keys: Keys,
-        forget: Retention,
-        chain: AuditLog,
+        keys: SigningKeys,
+        retention: Retention,
+        audit_log: AuditLog,
         clock: Clock,
     ) -> None:
         self._tables = tables
         self._scripts = ScriptStore(blobs=blobs, keys=keys)
         self._catalogue = catalogue
         self._types = robot_types
-        self._forget = forget
-        self._chain = chain
+        self._retention = retention
+        self._audit_log = audit_log
         self._clock = clock
         self._read: dict[str, Script] = {}
 
@@ -193,7 +193,7 @@ class Movements:
             return numbered, old is None or old.deleted
 
         on = f"{robot_type}/{name}"
-        async with self._chain.change(
+        async with self._audit_log.change(
             caller.account, AccountEvent.MOVEMENT_SAVED, caller, on=on, sha256=new.sha256
         ) as change:
             done = await records.retry(attempt)
@@ -223,10 +223,10 @@ class Movements:
                 raise not_found("movement", name)
             gone = replace(old, deleted=True, updated_ms=self._clock.now_ms())
             await change.noted()
-            await self._tables.replace(records.MOVEMENTS, Row(row.partition, row.key, records.fields(gone), row.etag))
+            await self._tables.replace(records.MOVEMENTS, Row(row.partition, row.key, records.to_data(gone), row.etag))
             return gone
 
-        async with self._chain.change(
+        async with self._audit_log.change(
             caller.account, AccountEvent.MOVEMENT_DELETED, caller, on=f"{robot_type}/{name}"
         ) as change:
             gone = await records.retry(attempt)
@@ -310,11 +310,11 @@ class Movements:
         while start is not None:
             page = await self._tables.query(records.MOVEMENTS, partition, first=start, last=last)
             blobs = [blob_name(caller, robot_type, records.read(row, Movement)) for row in page.rows]
-            await asyncio.gather(*(self._forget.blob(blob, due_ms=due_ms) for blob in blobs))
+            await asyncio.gather(*(self._retention.delete_blob_at(blob, due_ms=due_ms) for blob in blobs))
             start = page.rows[-1].key + "\0" if page.cursor is not None else None
-        await self._forget.rows(records.MOVEMENTS, partition, first=first, last=last, due_ms=due_ms)
+        await self._retention.delete_rows_at(records.MOVEMENTS, partition, first=first, last=last, due_ms=due_ms)
 
-    async def _built_in(self, robot_type: str, item: BuiltIn) -> Movement:
+    async def _built_in(self, robot_type: str, item: BuiltInMovement) -> Movement:
         script = self._read.get(item.sha256)
         if script is None:
             script = self._read[item.sha256] = read_script(item.source)
@@ -332,7 +332,7 @@ class Movements:
 
 
 def _writes(partition: str, movement: Movement, row: Row | None) -> list[Write]:
-    data = records.fields(movement)
+    data = records.to_data(movement)
     return [
         Write("replace" if row else "create", Row(partition, movement.name, data, row.etag if row else "")),
         Write("create", Row(partition, _version_key(movement.name, movement.version), data)),

@@ -13,7 +13,7 @@ from function_app.domain.identity.accounts import Identity
 from function_app.domain.robot_types.robot_types import TypeHead, TypeVersion
 from function_app.ports.blobs import Blobs
 from function_app.ports.clock import Clock
-from function_app.ports.robot_catalogue import Catalogue
+from function_app.ports.robot_catalogue import RobotCatalogue
 from function_app.ports.tables import Row, Tables, Write
 from function_app.services.robot_types.catalogue import KnownType, Model, RobotTypes
 from function_app.services.robot_types.integrity import IntegritySeals, require_intact
@@ -22,15 +22,15 @@ from function_app.services.robot_types.rows import (
     HEAD,
     TRIALS,
     Place,
-    note_look,
+    preview_index,
+    preview_place,
     read_head,
     read_version,
-    trial_index,
-    trial_place,
+    schedule_check,
     version_key,
 )
 from function_app.services.robot_types.script_metadata import read_script
-from function_app.services.robot_types.upload import UploadRobotType, require_own
+from function_app.services.robot_types.upload import RobotTypeUpload, require_own
 from function_app.services.robot_types.versions import GIVE_UP_MS, KEEP_LOOK_MS, TypeVersions, refused
 from function_app.services.storage import records
 
@@ -62,10 +62,10 @@ class RobotTypePreview:
         tables: Tables,
         blobs: Blobs,
         versions: TypeVersions,
-        catalogue: Catalogue,
+        catalogue: RobotCatalogue,
         robot_types: RobotTypes,
-        upload: UploadRobotType,
-        seals: IntegritySeals,
+        upload: RobotTypeUpload,
+        integrity: IntegritySeals,
         clock: Clock,
     ) -> None:
         self._tables = tables
@@ -74,7 +74,7 @@ class RobotTypePreview:
         self._catalogue = catalogue
         self._types = robot_types
         self._upload = upload
-        self._seals = seals
+        self._integrity = integrity
         self._clock = clock
 
     async def begin(
@@ -94,15 +94,15 @@ class RobotTypePreview:
         await require_own(self._catalogue, given.robot_type.type)
         where = Place(caller.account, f"~{new_id()}")
         now_ms = self._clock.now_ms()
-        await note_look(self._tables, where, now_ms + KEEP_LOOK_MS)
-        await note_look(self._tables, where, now_ms + GIVE_UP_MS)
+        await schedule_check(self._tables, where, now_ms + KEEP_LOOK_MS)
+        await schedule_check(self._tables, where, now_ms + GIVE_UP_MS)
         await self._list(where, now_ms)
         sizes = {name: len(content) for name, content in given.files.items()}
         fields = msgspec.to_builtins(given.robot_type)
         plain = TypeVersion(_ONLY, "uploading", fields, sizes, now_ms, errors=wrong)
-        upload = await self._seals.sealed(where.account, where.type, plain, given.files)
-        head = Row(where.partition, HEAD, records.fields(TypeHead(where.type, last=_ONLY, since=_ONLY)))
-        version = Row(where.partition, version_key(_ONLY), records.fields(upload))
+        upload = await self._integrity.sealed(where.account, where.type, plain, given.files)
+        head = Row(where.partition, HEAD, records.to_data(TypeHead(where.type, last=_ONLY, since=_ONLY)))
+        version = Row(where.partition, version_key(_ONLY), records.to_data(upload))
         await self._tables.batch(records.ROBOT_TYPES, [Write("create", head), Write("create", version)])
         await self._versions.store(where, _ONLY, given.files)
         done = await self._versions.verdict(where, _ONLY, wait_ms)
@@ -137,7 +137,7 @@ class RobotTypePreview:
         """
         where, upload = await self._find(caller, look)
         _require_good(upload)
-        seal = await self._seals.check(where.account, where.type, upload)
+        seal = await self._integrity.check(where.account, where.type, upload)
         names = list(upload.files)
         contents = await asyncio.gather(*(self._blobs.get(where.prefix(_ONLY) + name) for name in names))
         files = {name: content or b"" for name, content in zip(names, contents, strict=True)}
@@ -161,9 +161,9 @@ class RobotTypePreview:
     async def _end(self, where: Place) -> None:
         async def attempt() -> None:
             row, head = await read_head(self._tables, where)
-            await note_look(self._tables, where, self._clock.now_ms())
+            await schedule_check(self._tables, where, self._clock.now_ms())
             if row is not None and head is not None and not head.deleted:
-                gone = records.fields(replace(head, deleted=True))
+                gone = records.to_data(replace(head, deleted=True))
                 await self._tables.replace(records.ROBOT_TYPES, Row(row.partition, row.key, gone, row.etag))
 
         await records.retry(attempt)
@@ -174,11 +174,11 @@ class RobotTypePreview:
         there = sorted(page.rows, key=lambda row: row.data["created_ms"])
         for row in there[: max(0, len(there) - MAX_LOOKS + 1)]:
             await self._end(Place(where.account, "~" + row.key.removeprefix(TRIALS)))
-        row = Row(where.account, trial_index(where), {"created_ms": now_ms})
+        row = Row(where.account, preview_index(where), {"created_ms": now_ms})
         await self._tables.create(records.MEMBERS, row)
 
     async def _find(self, caller: Identity, look: str) -> tuple[Place, TypeVersion]:
-        where = trial_place(caller, look)
+        where = preview_place(caller, look)
         if where is not None:
             _, head = await read_head(self._tables, where)
             _, upload = await read_version(self._tables, where, _ONLY)

@@ -51,12 +51,12 @@ def place(caller: Identity, robot_type: str) -> Place | None:
     return Place(caller.account, robot_type) if ID.match(robot_type) else None
 
 
-def trial_place(caller: Identity, look: str) -> Place | None:
+def preview_place(caller: Identity, look: str) -> Place | None:
     """Where a look at an upload is: like a robot type, where nobody finds it who asks for robot types."""
     return Place(caller.account, _TRIAL + look) if ID.match(look) else None
 
 
-def trial_index(where: Place) -> str:
+def preview_index(where: Place) -> str:
     """Of the row that lists a look for its account."""
     return TRIALS + where.type.removeprefix(_TRIAL)
 
@@ -78,7 +78,7 @@ async def read_version(tables: Tables, where: Place, version: int) -> tuple[Row 
     return row, None if row is None else records.read(row, TypeVersion)
 
 
-async def note_look(tables: Tables, where: Place, due_ms: int) -> None:
+async def schedule_check(tables: Tables, where: Place, due_ms: int) -> None:
     """See that the type is looked at when ``due_ms`` has come; the same note twice is one."""
     try:
         await tables.create(records.MODEL_CHECKS, Row(LOOKS, f"{due_ms:013d}:{where.partition}", {}))

@@ -30,7 +30,7 @@ _ONE_OF: Final = {
 
 
 @dataclass(frozen=True, slots=True)
-class Mark:
+class LintMessage:
     """Something wrong, from one place to another: lines from 1, columns from 0, in characters."""
 
     severity: Literal["error", "warning"]
@@ -42,10 +42,10 @@ class Mark:
 
 
 @dataclass(frozen=True, slots=True)
-class Checked:
+class LintResult:
     """What a check has found; ``script`` is there where it could be saved."""
 
-    marks: tuple[Mark, ...]
+    marks: tuple[LintMessage, ...]
     script: Script | None
 
 
@@ -60,18 +60,18 @@ def names_of(robot_type: RobotType) -> dict[str, tuple[str, ...]]:
     }
 
 
-def check_script(source: str, robot_type: RobotType) -> Checked:
+def check_script(source: str, robot_type: RobotType) -> LintResult:
     """Everything that is wrong with a script for robots of this type."""
     try:
         script = read_script(source)
     except Problem as problem:
-        return Checked((_refusal(source, problem),), None)
+        return LintResult((_refusal(source, problem),), None)
     tree = ast.parse(source)
     result = sorted(_Reader(tree, names_of(robot_type)).marks(), key=lambda mark: (mark.line, mark.column))
-    return Checked(tuple(_in_characters(result[:MAX_MARKS], source)), script)
+    return LintResult(tuple(_in_characters(result[:MAX_MARKS], source)), script)
 
 
-def _refusal(source: str, problem: Problem) -> Mark:
+def _refusal(source: str, problem: Problem) -> LintMessage:
     """Where it is that a script cannot be saved."""
     try:
         tree = ast.parse(source)
@@ -80,12 +80,12 @@ def _refusal(source: str, problem: Problem) -> Mark:
         end_line, end_column = error.end_lineno or line, max(0, (error.end_offset or 0) - 1)
         if (end_line, end_column) <= (line, column):
             end_line, end_column = line, column + 1
-        return Mark("error", f"{error.msg[:1].upper()}{error.msg[1:]}.", line, column, end_line, end_column)
+        return LintMessage("error", f"{error.msg[:1].upper()}{error.msg[1:]}.", line, column, end_line, end_column)
     except (RecursionError, MemoryError, ValueError):
-        return Mark("error", problem.detail)
+        return LintMessage("error", problem.detail)
     place = next((each for each in tree.body if PARAMETERS in _bound_by(each)), None)
     if place is None:
-        return Mark("error", problem.detail)
+        return LintMessage("error", problem.detail)
     return next(_in_characters([_mark("error", place, problem.detail)], source))
 
 
@@ -101,7 +101,7 @@ class _Reader:
         self._functions = {each.name: each for each in api.functions}
         self._values = {each.name: each for each in api.values}
 
-    def marks(self) -> Iterator[Mark]:
+    def marks(self) -> Iterator[LintMessage]:
         """All of them, in no order."""
         for node in self._nodes:
             match node:
@@ -117,15 +117,15 @@ class _Reader:
                 case ast.Call():
                     yield from self._call(node)
 
-    def _module(self, node: ast.stmt, module: str) -> Iterator[Mark]:
+    def _module(self, node: ast.stmt, module: str) -> Iterator[LintMessage]:
         if module.partition(".")[0] not in self._modules:
             yield _mark("warning", node, f"A script cannot import '{module}'.")
 
-    def _name(self, node: ast.Name, name: str) -> Iterator[Mark]:
+    def _name(self, node: ast.Name, name: str) -> Iterator[LintMessage]:
         if not ({name} & (self._bound | _GIVEN_BY_PYTHON | self._functions.keys() | self._values.keys())):
             yield _mark("warning", node, f"There is no '{name}'.")
 
-    def _attribute(self, node: ast.Attribute, owner: str, attribute: str) -> Iterator[Mark]:
+    def _attribute(self, node: ast.Attribute, owner: str, attribute: str) -> Iterator[LintMessage]:
         value = self._given(owner)
         if value is None or not value.methods or attribute.startswith("__"):
             return
@@ -145,7 +145,7 @@ class _Reader:
                 return next((each for each in value.methods if each.name == name), None) if value else None
         return None
 
-    def _call(self, node: ast.Call) -> Iterator[Mark]:
+    def _call(self, node: ast.Call) -> Iterator[LintMessage]:
         call = self._called(node.func)
         if call is None:
             return
@@ -160,7 +160,7 @@ class _Reader:
             if parameter.names is not UNSET:
                 yield from self._strings(value, parameter.names)
 
-    def _strings(self, value: ast.expr, kind: str) -> Iterator[Mark]:
+    def _strings(self, value: ast.expr, kind: str) -> Iterator[LintMessage]:
         """Names that are written out and that the robot type does not have; a type that lists none may have any."""
         there = self._names.get(kind, ())
         for text in _texts(value) if there else ():
@@ -170,7 +170,7 @@ class _Reader:
                 yield _mark("warning", text, message)
 
 
-def _wrong_arguments(node: ast.Call, call: Call) -> Iterator[Mark]:
+def _wrong_arguments(node: ast.Call, call: Call) -> Iterator[LintMessage]:
     if any(each.kind == "rest" for each in call.parameters):
         return
     order = [each.name for each in call.parameters if each.kind == "positional"]
@@ -225,12 +225,12 @@ def _bound_by(node: ast.AST) -> set[str]:
     return result
 
 
-def _mark(severity: Literal["error", "warning"], node: ast.stmt | ast.expr | ast.keyword, message: str) -> Mark:
+def _mark(severity: Literal["error", "warning"], node: ast.stmt | ast.expr | ast.keyword, message: str) -> LintMessage:
     line, column = node.lineno, node.col_offset
-    return Mark(severity, message, line, column, node.end_lineno or line, node.end_col_offset or column + 1)
+    return LintMessage(severity, message, line, column, node.end_lineno or line, node.end_col_offset or column + 1)
 
 
-def _in_characters(marks: Iterable[Mark], source: str) -> Iterator[Mark]:
+def _in_characters(marks: Iterable[LintMessage], source: str) -> Iterator[LintMessage]:
     """Python's tree counts bytes of UTF-8 in a line."""
     lines = re.split(r"\r\n|\r|\n", source)
 

@@ -10,7 +10,7 @@ from function_app.domain.common.problems import Problem
 from function_app.domain.identity.accounts import Identity
 from function_app.domain.robot_types.movements import Movement
 from function_app.ports.blobs import Blobs
-from function_app.ports.signing_keys import Keys
+from function_app.ports.signing_keys import SigningKeys
 
 _KEPT = 256
 
@@ -18,7 +18,7 @@ _KEPT = 256
 class ScriptStore:
     """Scripts by account, robot type, name, version and hash: one version's deletion never takes another's script."""
 
-    def __init__(self, *, blobs: Blobs, keys: Keys) -> None:
+    def __init__(self, *, blobs: Blobs, keys: SigningKeys) -> None:
         self._blobs = blobs
         self._keys = keys
         self._kept: OrderedDict[str, str] = OrderedDict()

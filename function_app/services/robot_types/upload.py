@@ -10,13 +10,21 @@ from function_app.domain.common.problems import Problem
 from function_app.domain.identity.accounts import Identity
 from function_app.domain.robot_types.robot_types import TypeHead, TypeVersion, next_version
 from function_app.ports.clock import Clock
-from function_app.ports.robot_catalogue import Catalogue
+from function_app.ports.robot_catalogue import RobotCatalogue
 from function_app.ports.tables import Conflict, Row, Tables, Write
 from function_app.services.audit.audit_log import AuditLog, Change
 from function_app.services.robot_types.catalogue import KnownType, RobotTypes
 from function_app.services.robot_types.integrity import IntegritySeals
 from function_app.services.robot_types.package_reader import Upload, read_upload
-from function_app.services.robot_types.rows import HEAD, INDEX, Place, note_look, read_head, read_version, version_key
+from function_app.services.robot_types.rows import (
+    HEAD,
+    INDEX,
+    Place,
+    read_head,
+    read_version,
+    schedule_check,
+    version_key,
+)
 from function_app.services.robot_types.versions import GIVE_UP_MS, TypeVersions, refused
 from function_app.services.storage import records
 
@@ -24,7 +32,7 @@ MAX_OWN = 100
 """Robot types an account may have."""
 
 
-class UploadRobotType:
+class RobotTypeUpload:
     """Stores an upload and waits for the checker's verdict."""
 
     def __init__(
@@ -32,18 +40,18 @@ class UploadRobotType:
         *,
         tables: Tables,
         versions: TypeVersions,
-        catalogue: Catalogue,
+        catalogue: RobotCatalogue,
         robot_types: RobotTypes,
-        seals: IntegritySeals,
-        chain: AuditLog,
+        integrity: IntegritySeals,
+        audit_log: AuditLog,
         clock: Clock,
     ) -> None:
         self._tables = tables
         self._versions = versions
         self._catalogue = catalogue
         self._types = robot_types
-        self._seals = seals
-        self._chain = chain
+        self._integrity = integrity
+        self._audit_log = audit_log
         self._clock = clock
 
     async def upload(
@@ -64,9 +72,9 @@ class UploadRobotType:
         """As ``upload``, of files that have been read."""
         where = Place(caller.account, given.robot_type.type)
         await require_own(self._catalogue, where.type)
-        await note_look(self._tables, where, self._clock.now_ms() + GIVE_UP_MS)
+        await schedule_check(self._tables, where, self._clock.now_ms() + GIVE_UP_MS)
         await self._index(where)
-        async with self._chain.change(
+        async with self._audit_log.change(
             caller.account, AccountEvent.ROBOT_TYPE_UPLOADED, caller, on=where.type
         ) as change:
             version, new = await self._number(where, given, change)
@@ -104,9 +112,9 @@ class UploadRobotType:
                 await self._require_no_other(where, head)
             following = next_version(head, given.robot_type.version, where.type)
             plain = TypeVersion(following.last, "uploading", manifest, sizes, self._clock.now_ms())
-            upload = await self._seals.sealed(where.account, where.type, plain, given.files)
-            new_head = Row(where.partition, HEAD, records.fields(following), row.etag if row else "")
-            new_version = Row(where.partition, version_key(following.last), records.fields(upload))
+            upload = await self._integrity.sealed(where.account, where.type, plain, given.files)
+            new_head = Row(where.partition, HEAD, records.to_data(following), row.etag if row else "")
+            new_version = Row(where.partition, version_key(following.last), records.to_data(upload))
             writes = [Write("replace" if row else "create", new_head), Write("create", new_version)]
             change.data["version"] = following.last
             await change.noted()
@@ -122,7 +130,7 @@ class UploadRobotType:
             raise Problem("robot-type-checking", 409, "Still being checked", detail)
 
 
-async def require_own(catalogue: Catalogue, robot_type: str) -> None:
+async def require_own(catalogue: RobotCatalogue, robot_type: str) -> None:
     """An id that an account's own robot type may have.
 
     Raises:

@@ -4,7 +4,7 @@ At once, and not only what comes next: the lease and its epoch, what waits and w
 sessions that hear or tell the device. Whoever takes a right away means that this person shall move nothing any more,
 and a script may go on for minutes: the device holds, and nothing that waits begins by itself then.
 
-Who acts under a share looks again after something was written (``Devices.require_still``), and here is looked after the
+Who acts under a share looks again after something was written (``DeviceAccess.require_still``), and here is looked after the
 share was deleted: of the two at least one sees the other. All of it is safe to repeat.
 
 What the tables decide is done in any case. The broker is waited for a moment: whoever asked is told that it did not
@@ -26,13 +26,13 @@ from function_app.ports.broker_access import BrokerAccess, BrokerAccessError
 from function_app.ports.clock import Clock
 from function_app.ports.command_bus import BusUnavailable
 from function_app.ports.tables import Conflict, Tables
-from function_app.services.actions.action_store import ActionRows
-from function_app.services.actions.queue import Queues
+from function_app.services.actions.action_store import ActionStore
+from function_app.services.actions.queue import ActionQueues
 from function_app.services.control.fencing import ControlRevocation
 from function_app.services.devices.control_rows import read_control_rows
-from function_app.services.devices.device_access import Devices, share_key
-from function_app.services.identity.authenticator import watchers
-from function_app.services.messaging.command_sender import Commands
+from function_app.services.devices.device_access import DeviceAccess, share_key
+from function_app.services.identity.authenticator import all_viewers
+from function_app.services.messaging.command_sender import CommandSender
 from function_app.services.storage import records
 
 TELL_S: Final = 1.5
@@ -52,20 +52,20 @@ class AccessRevocation:
         self,
         *,
         tables: Tables,
-        devices: Devices,
-        rows: ActionRows,
-        queues: Queues,
-        commands: Commands,
-        fence: ControlRevocation,
+        devices: DeviceAccess,
+        action_store: ActionStore,
+        queues: ActionQueues,
+        command_sender: CommandSender,
+        revocation: ControlRevocation,
         access: BrokerAccess,
         clock: Clock,
     ) -> None:
         self._tables = tables
         self._devices = devices
-        self._rows = rows
+        self._action_store = action_store
         self._queues = queues
-        self._commands = commands
-        self._fence = fence
+        self._command_sender = command_sender
+        self._revocation = revocation
         self._access = access
         self._clock = clock
 
@@ -93,7 +93,7 @@ class AccessRevocation:
         """End the account's watching sessions: who has lost one device watches the others with new credentials."""
         try:
             async with asyncio.timeout_at(until_s):
-                await self._access.revoke(principal=watchers(account))
+                await self._access.revoke(principal=all_viewers(account))
         except (BrokerAccessError, TimeoutError) as error:
             _log.warning("sessions of %s: %s", account, str(error) or "the broker did not answer in time")
             return False
@@ -101,24 +101,24 @@ class AccessRevocation:
 
     async def _end_at(self, device: Device, account: str, until_s: float, *, again: bool) -> bool:
         caller = Identity(account, "", "")
-        result, _ = await self._devices.find(caller, device.id)
+        result, _ = await self._devices.find_with_link(caller, device.id)
         if result is not None and result.role.may_operate:
             return True
-        done = await self._fence.end(device, UNSHARED, account=account, until_s=until_s)
+        done = await self._revocation.revoke(device, UNSHARED, account=account, until_s=until_s)
         if again:
-            done = await self._fence.repeat(device, account, until_s=until_s) and done
+            done = await self._revocation.retry(device, account, until_s=until_s) and done
         return await self._end_actions(device, account, until_s) and done
 
     async def _end_actions(self, device: Device, account: str, until_s: float) -> bool:
         control = await read_control_rows(self._tables, device.id)
         waiting = []
         for action in control.queue.actions:
-            result = await self._rows.get(action)
+            result = await self._action_store.get(action)
             if result is not None and result.action.account == account:
                 waiting.append(action)
         if waiting:
-            await self._queues.drop(device.id, waiting, UNSHARED)
-        result = await self._rows.get(control.action) if control.action else None
+            await self._queues.cancel(device.id, waiting, UNSHARED)
+        result = await self._action_store.get(control.action) if control.action else None
         if result is None or result.action.account != account or result.action.pairing != device.pairing:
             return True
         # Written before it is told. Where this is not heard, the lease's release is told until it is: it holds, too.
@@ -128,7 +128,7 @@ class AccessRevocation:
         epoch = max(control.lease.epoch if control.lease else 0, result.action.epoch)
         try:
             async with asyncio.timeout_at(until_s):
-                await self._commands.send(
+                await self._command_sender.send(
                     device, CancelAction(action=result.action.id), caller="telescope", epoch=epoch
                 )
         except (BusUnavailable, TimeoutError) as error:
@@ -139,7 +139,7 @@ class AccessRevocation:
     async def _devices_on(self, share: Share) -> list[Device]:
         kind, name = split_target(share.on)
         if kind == "device":
-            device = await self._devices.owned(name)
+            device = await self._devices.get_as_owner(name)
             return [] if device is None else [device]
         owner = share.owner or await self._owner_in_index(share)
         return await self._devices.in_space(owner, name) if owner else []

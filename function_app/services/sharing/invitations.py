@@ -22,8 +22,8 @@ from function_app.ports.tables import Conflict, Row, Tables
 from function_app.services.audit.audit_log import AuditLog
 from function_app.services.identity.authenticator import new_secret
 from function_app.services.identity.sign_in import SignIn
-from function_app.services.sharing.ownership_transfer import Transfer, void
-from function_app.services.sharing.shares import Shared, Sharing, require_person, yours
+from function_app.services.sharing.ownership_transfer import OwnershipTransfer, invalidate
+from function_app.services.sharing.shares import NewShare, Sharing, own_share_error, require_person
 from function_app.services.storage import records
 from function_app.services.storage.reminders import Reminders
 from function_app.services.storage.retention import Retention
@@ -69,25 +69,25 @@ class Invitations:
         *,
         tables: Tables,
         sharing: Sharing,
-        transfer: Transfer,
+        ownership_transfer: OwnershipTransfer,
         sign_in: SignIn,
-        pending: Reminders,
-        forget: Retention,
-        chain: AuditLog,
+        reminders: Reminders,
+        retention: Retention,
+        audit_log: AuditLog,
         clock: Clock,
     ) -> None:
         self._tables = tables
         self._sharing = sharing
-        self._transfer = transfer
+        self._ownership_transfer = ownership_transfer
         self._sign_in = sign_in
-        self._pending = pending
-        self._forget = forget
-        self._chain = chain
+        self._reminders = reminders
+        self._retention = retention
+        self._audit_log = audit_log
         self._clock = clock
 
     # ------------------------------------------------------------ the owner's side
 
-    async def agent(self, caller: Identity, agent_id: str) -> Shared:
+    async def agent(self, caller: Identity, agent_id: str) -> NewShare:
         """An agent of the caller's own, to hand it over.
 
         Raises:
@@ -99,9 +99,9 @@ class Invitations:
             raise not_found("agent", agent_id)
         require_person(caller)
         owner = Account(caller.account, await self._sign_in.named(caller.account))
-        return Shared(f"agent:{agent_id}", owner, agent.name, agent.pairing)
+        return NewShare(f"agent:{agent_id}", owner, agent.name, agent.pairing)
 
-    async def space(self, caller: Identity, space: str) -> Shared:
+    async def space(self, caller: Identity, space: str) -> NewShare:
         """A space of the caller's own, to hand it over.
 
         Raises:
@@ -113,14 +113,16 @@ class Invitations:
             raise _last_space("It is this account's only space. Make another one first.")
         return shared
 
-    async def make(self, caller: Identity, shared: Shared, offer: Offer) -> tuple[str, Known]:
+    async def make(self, caller: Identity, shared: NewShare, offer: Offer) -> tuple[str, Known]:
         """A new invitation, and its secret, which nobody can be told again.
 
         Raises:
             Problem: ``already-yours``, ``too-many-invitations``.
         """
         if offer.role is Role.OWNER and offer.account == shared.owner.id:
-            raise yours("It belongs to this account already. Name another one, or none for whoever has the link.")
+            raise own_share_error(
+                "It belongs to this account already. Name another one, or none for whoever has the link."
+            )
         if len(await self.open(shared)) >= rules.MAX_INVITATIONS:
             detail = f"There are {rules.MAX_INVITATIONS} open invitations to it, the most there can be. Take one back."
             raise Problem("too-many-invitations", 409, "Too many invitations", detail)
@@ -141,18 +143,20 @@ class Invitations:
         secret = new_secret()
         existing = Known(_hash(secret), created)
         # Forgotten on time whatever happens from here on, and listed before it can be redeemed.
-        await self._forget.row(records.INVITATIONS, existing.id[0], existing.id, due_ms=created.expires_ms)
-        await self._forget.row(records.SHARES, created.on, _INDEX + existing.id, due_ms=created.expires_ms)
+        await self._retention.delete_row_at(records.INVITATIONS, existing.id[0], existing.id, due_ms=created.expires_ms)
+        await self._retention.delete_row_at(records.SHARES, created.on, _INDEX + existing.id, due_ms=created.expires_ms)
         await self._tables.create(
             records.SHARES, Row(created.on, _INDEX + existing.id, {"expires_ms": created.expires_ms})
         )
         terms = {"invitation": existing.id[:12], "role": offer.role.value, "uses": offer.uses, "for": offer.account}
-        async with self._chain.change(created.owner, AccountEvent.INVITED, caller, on=created.on, **terms) as change:
+        async with self._audit_log.change(
+            created.owner, AccountEvent.INVITED, caller, on=created.on, **terms
+        ) as change:
             await change.noted()
-            await self._tables.create(records.INVITATIONS, Row(existing.id[0], existing.id, records.fields(created)))
+            await self._tables.create(records.INVITATIONS, Row(existing.id[0], existing.id, records.to_data(created)))
         return secret, existing
 
-    async def open(self, shared: Shared) -> list[Known]:
+    async def open(self, shared: NewShare) -> list[Known]:
         """Open invitations to something, oldest first."""
         page = await self._tables.query(records.SHARES, shared.on, first=_INDEX, last="invitation;", limit=1000)
         result = [await self._get(row.key.removeprefix(_INDEX)) for row in page.rows]
@@ -162,12 +166,12 @@ class Invitations:
             for row, invitation in result
             if row is not None
             and invitation is not None
-            and invitation.open(now_ms)
+            and invitation.is_open(now_ms)
             and (invitation.owner, invitation.pairing) == (shared.owner.id, shared.pairing)
         ]
         return sorted(existing, key=lambda each: each.invitation.created_ms)
 
-    async def withdraw(self, caller: Identity, shared: Shared, invitation: str) -> None:
+    async def withdraw(self, caller: Identity, shared: NewShare, invitation: str) -> None:
         """Take an invitation back. What was redeemed stays shared.
 
         Raises:
@@ -176,13 +180,18 @@ class Invitations:
 
         async def attempt() -> None:
             row, existing = await self._get(invitation)
-            if row is None or existing is None or existing.on != shared.on or not existing.open(self._clock.now_ms()):
+            if (
+                row is None
+                or existing is None
+                or existing.on != shared.on
+                or not existing.is_open(self._clock.now_ms())
+            ):
                 raise not_found("invitation", invitation)
             await change.noted()
             await self._tables.delete(records.INVITATIONS, row)
 
         named = {"invitation": invitation[:12]}
-        async with self._chain.change(
+        async with self._audit_log.change(
             shared.owner.id, AccountEvent.INVITATION_REVOKED, caller, on=shared.on, **named
         ) as change:
             await records.retry(attempt)
@@ -205,7 +214,12 @@ class Invitations:
             Problem: ``invitation-unknown``.
         """
         row, existing = await self._get(invitation)
-        if row is None or existing is None or not existing.open(self._clock.now_ms()) or not await self._good(existing):
+        if (
+            row is None
+            or existing is None
+            or not existing.is_open(self._clock.now_ms())
+            or not await self._good(existing)
+        ):
             raise _unknown()
         return Known(row.key, existing)
 
@@ -226,13 +240,15 @@ class Invitations:
         if offered.account and offered.account != caller.account:
             raise forbidden("This invitation is for another account. Sign in as the one it was made for.")
         if offered.owner == caller.account:
-            raise yours("It belongs to this account: there is nothing to take. Send the link to somebody else.")
+            raise own_share_error(
+                "It belongs to this account: there is nothing to take. Send the link to somebody else."
+            )
         if offered.role is Role.OWNER:
             await self._take(caller, existing, space)
         else:
             await self._use(caller, existing)
             owner = Account(offered.owner, offered.by)
-            shared = Shared(offered.on, owner, offered.label, offered.pairing)
+            shared = NewShare(offered.on, owner, offered.label, offered.pairing)
             giver = Identity(offered.owner, offered.by, "")
             ends_ms = offered.ends_ms(self._clock.now_ms())
             await self._sharing.give(giver, shared, Account(caller.account, caller.name), offered.role, ends_ms)
@@ -243,7 +259,7 @@ class Invitations:
         if row is not None and existing is not None and existing.taken_by:
             with contextlib.suppress(_Void):
                 await self._carry_out(row.key, existing)
-        await self._pending.drop(note)
+        await self._reminders.cancel(note)
 
     async def _take(self, caller: Identity, existing: Known, space: str | None) -> None:
         """Accept a transfer. The write on the invitation decides; from then on the timer sees to it as well."""
@@ -260,36 +276,36 @@ class Invitations:
             raise _last_space(
                 f"It is {existing.invitation.by}'s only space by now. Ask them to make another one first."
             )
-        note = await self._pending.note(f"{_NOTE}{existing.id}", self._clock.now_ms() + LOOK_MS)
+        note = await self._reminders.schedule(f"{_NOTE}{existing.id}", self._clock.now_ms() + LOOK_MS)
 
         async def attempt() -> Invitation:
             row, created = await self._get(existing.id)
-            if row is None or created is None or not created.open(self._clock.now_ms()):
+            if row is None or created is None or not created.is_open(self._clock.now_ms()):
                 raise _unknown()
-            taken = created.taken(caller.account, goal)
+            taken = created.accepted(caller.account, goal)
             await given.noted()
             await got.noted()
             await self._tables.replace(
-                records.INVITATIONS, Row(row.partition, row.key, records.fields(taken), row.etag)
+                records.INVITATIONS, Row(row.partition, row.key, records.to_data(taken), row.etag)
             )
             return taken
 
         owner, on, to = existing.invitation.owner, existing.invitation.on, {"to": caller.account}
         async with (
-            self._chain.change(owner, AccountEvent.TRANSFERRED, caller, on=on, **to) as given,
-            self._chain.change(caller.account, AccountEvent.TRANSFERRED, caller, on=on, **to) as got,
+            self._audit_log.change(owner, AccountEvent.TRANSFERRED, caller, on=on, **to) as given,
+            self._audit_log.change(caller.account, AccountEvent.TRANSFERRED, caller, on=on, **to) as got,
         ):
             taken = await records.retry(attempt)
         try:
             await self._carry_out(existing.id, taken)
         except _Void as nothing:
-            raise void() from nothing
+            raise invalidate() from nothing
         if note is not None:
-            await self._pending.drop(note)
+            await self._reminders.cancel(note)
 
     async def _carry_out(self, invitation: str, taken: Invitation) -> None:
         try:
-            await self._transfer.carry_out(taken)
+            await self._ownership_transfer.carry_out(taken)
         except Problem as problem:
             if problem.code != "transfer-void":
                 raise
@@ -305,22 +321,22 @@ class Invitations:
             if (
                 row is None
                 or created is None
-                or not created.open(self._clock.now_ms())
+                or not created.is_open(self._clock.now_ms())
                 or caller.account in created.takers
             ):
                 raise _unknown()
-            left = created.used(caller.account)
+            left = created.redeemed(caller.account)
             await change.noted()
             if left.uses:
                 await self._tables.replace(
-                    records.INVITATIONS, Row(row.partition, row.key, records.fields(left), row.etag)
+                    records.INVITATIONS, Row(row.partition, row.key, records.to_data(left), row.etag)
                 )
             else:
                 await self._tables.delete(records.INVITATIONS, row)
                 await self._unlist(left.on, existing.id)
 
         owner, on, terms = existing.invitation.owner, existing.invitation.on, {"invitation": existing.id[:12]}
-        async with self._chain.change(owner, AccountEvent.INVITATION_REDEEMED, caller, on=on, **terms) as change:
+        async with self._audit_log.change(owner, AccountEvent.INVITATION_REDEEMED, caller, on=on, **terms) as change:
             await records.retry(attempt)
 
     async def _good(self, existing: Invitation) -> bool:

@@ -20,7 +20,7 @@ from function_app.domain.devices.invitations import Invitation
 from function_app.domain.identity.accounts import Space
 from function_app.ports.clock import Clock
 from function_app.ports.tables import Conflict, Row, Tables
-from function_app.services.devices.device_access import Devices
+from function_app.services.devices.device_access import DeviceAccess
 from function_app.services.pairing.offboarding import Offboarding
 from function_app.services.sharing.shares import Sharing
 from function_app.services.storage import records
@@ -31,14 +31,16 @@ class _Member:
     pairing: str = ""
 
 
-class Transfer:
+class OwnershipTransfer:
     """Carries out transfers that were accepted. Every step is safe to repeat."""
 
-    def __init__(self, *, tables: Tables, devices: Devices, sharing: Sharing, leave: Offboarding, clock: Clock) -> None:
+    def __init__(
+        self, *, tables: Tables, devices: DeviceAccess, sharing: Sharing, offboarding: Offboarding, clock: Clock
+    ) -> None:
         self._tables = tables
         self._devices = devices
         self._sharing = sharing
-        self._leave = leave
+        self._offboarding = offboarding
         self._clock = clock
 
     async def carry_out(self, taken: Invitation) -> None:
@@ -50,7 +52,7 @@ class Transfer:
         kind, name = split_target(taken.on)
         if kind == "agent":
             if not await self._hand_over(name, taken, pairing=taken.pairing):
-                raise void()
+                raise invalidate()
             return
         await self._carry_space(name, taken)
 
@@ -59,7 +61,7 @@ class Transfer:
         row = Row(
             taken.taken_by,
             f"space:{taken.taken_space}",
-            records.fields(Space(taken.taken_space, taken.label, self._clock.now_ms())),
+            records.to_data(Space(taken.taken_space, taken.label, self._clock.now_ms())),
         )
         with contextlib.suppress(Conflict):
             await self._tables.create(records.ACCOUNTS, row)
@@ -73,7 +75,7 @@ class Transfer:
 
     async def _hand_over(self, agent_id: str, taken: Invitation, *, pairing: str = "", space: str = "") -> bool:
         """Take an agent over, if it is still of that pairing, or in that space; whether it is the new owner's."""
-        await self._leave.watch(agent_id)
+        await self._offboarding.watch(agent_id)
 
         async def attempt() -> Agent | None:
             row = await self._tables.get(records.AGENTS, agent_id, "agent")
@@ -92,16 +94,16 @@ class Transfer:
             await records.upsert(
                 self._tables, records.MEMBERS, taken.taken_by, f"agent:{agent_id}", lambda _: member, _Member
             )
-            await self._tables.replace(records.AGENTS, Row(agent_id, "agent", records.fields(changed), row.etag))
+            await self._tables.replace(records.AGENTS, Row(agent_id, "agent", records.to_data(changed), row.etag))
             return changed
 
         agent = await records.retry(attempt)
         if agent is not None and agent.leaving:
-            await self._leave.finish(agent_id)
+            await self._offboarding.finish(agent_id)
         return agent is not None and agent.account == taken.taken_by
 
 
-def void() -> Problem:
+def invalidate() -> Problem:
     """What was offered is not the offerer's any more."""
     detail = "It has gone to somebody else, or was un-paired, since it was offered. Ask its owner for a new invitation."
     return Problem("transfer-void", 409, "It cannot be handed over", detail)

@@ -28,7 +28,7 @@ from function_app.ports.clock import Clock
 from function_app.ports.tables import Conflict, Row, Tables
 from function_app.services.audit.audit_log import AuditLog
 from function_app.services.control.control_events import ControlEvents
-from function_app.services.devices.device_access import Devices, require_owner, share_key
+from function_app.services.devices.device_access import DeviceAccess, require_owner, share_key
 from function_app.services.devices.spaces import Spaces
 from function_app.services.identity.sign_in import SignIn
 from function_app.services.sharing.access_revocation import AccessRevocation, index
@@ -46,7 +46,7 @@ _log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True, slots=True)
-class Shared:
+class NewShare:
     """What is shared or handed over, once it is seen that it is the caller's."""
 
     on: str
@@ -62,28 +62,28 @@ class Sharing:
         self,
         *,
         tables: Tables,
-        devices: Devices,
+        devices: DeviceAccess,
         spaces: Spaces,
         sign_in: SignIn,
-        unshare: AccessRevocation,
-        pending: Reminders,
-        audit: ControlEvents,
-        chain: AuditLog,
+        access_revocation: AccessRevocation,
+        reminders: Reminders,
+        control_events: ControlEvents,
+        audit_log: AuditLog,
         clock: Clock,
     ) -> None:
         self._tables = tables
         self._devices = devices
         self._spaces = spaces
         self._sign_in = sign_in
-        self._unshare = unshare
-        self._pending = pending
-        self._audit = audit
-        self._chain = chain
+        self._access_revocation = access_revocation
+        self._reminders = reminders
+        self._control_events = control_events
+        self._audit_log = audit_log
         self._clock = clock
 
     # ------------------------------------------------------------ what people ask for
 
-    async def of(self, caller: Identity, kind: Literal["device", "space"], name: str) -> Shared:
+    async def of(self, caller: Identity, kind: Literal["device", "space"], name: str) -> NewShare:
         """A device or space of the caller's own, to share it.
 
         Raises:
@@ -93,15 +93,15 @@ class Sharing:
         if kind == "space":
             view = await self._spaces.own(caller, name)
             require_person(caller)
-            return Shared(space_target(name), view.owner, view.space.name)
+            return NewShare(space_target(name), view.owner, view.space.name)
         device = await self._devices.get(caller, name)
-        async with self._audit.refusals(device, caller, "share it"):
+        async with self._control_events.recording_rejections(device, caller, "share it"):
             require_owner(device)
         require_person(caller)
         owner = Account(device.owner, await self._sign_in.named(device.owner))
-        return Shared(device_target(name), owner, device.label, device.pairing)
+        return NewShare(device_target(name), owner, device.label, device.pairing)
 
-    async def shares(self, shared: Shared) -> list[tuple[Share, str]]:
+    async def shares(self, shared: NewShare) -> list[tuple[Share, str]]:
         """With whom it is shared now, each with the account's name."""
         page = await self._tables.query(records.SHARES, shared.on, first="account:", last="account;", limit=1000)
         now_ms = self._clock.now_ms()
@@ -110,7 +110,7 @@ class Sharing:
         return sorted(zip(result, names, strict=True), key=lambda each: each[0].created_ms)
 
     async def put(
-        self, caller: Identity, shared: Shared, account: Account, role: Role, for_s: int | None
+        self, caller: Identity, shared: NewShare, account: Account, role: Role, for_s: int | None
     ) -> tuple[Share, bool, bool]:
         """Share it with an account, or change that.
 
@@ -125,12 +125,12 @@ class Sharing:
         share = self._share(shared, account.id, require_shareable(role), caller.name, expires_ms)
         return await self._write(caller, shared, account, share, keep_more=False)
 
-    async def give(self, caller: Identity, shared: Shared, account: Account, role: Role, expires_ms: int) -> Share:
+    async def give(self, caller: Identity, shared: NewShare, account: Account, role: Role, expires_ms: int) -> Share:
         """The same by an invitation, which takes nothing away from who has more already."""
         share = self._share(shared, account.id, role, caller.name, expires_ms)
         return (await self._write(caller, shared, account, share, keep_more=True))[0]
 
-    async def end(self, caller: Identity, shared: Shared, account: str) -> bool:
+    async def end(self, caller: Identity, shared: NewShare, account: str) -> bool:
         """Un-share; whether everybody has been told. Else the timer tells them as soon as the broker answers.
 
         Raises:
@@ -160,7 +160,9 @@ class Sharing:
         require_person(caller)
         row = await self._tables.get(records.SHARES, on, share_key(caller.account))
         if row is None and await self._owns(caller, on):
-            raise yours("It is this account's own, which has no share in it. To be rid of it, transfer or un-pair it.")
+            raise own_share_error(
+                "It is this account's own, which has no share in it. To be rid of it, transfer or un-pair it."
+            )
         if row is None:
             raise not_found("share", caller.account)
         return await self._end(caller, row)
@@ -181,12 +183,12 @@ class Sharing:
         kind, name = split_target(on)
         if kind == "space":
             return name in {space.id for space in await self._sign_in.spaces(caller.account)}
-        device, _ = await self._devices.find(caller, name)
+        device, _ = await self._devices.find_with_link(caller, name)
         return device is not None and device.owner == caller.account
 
     # ------------------------------------------------------------ writing
 
-    def _share(self, shared: Shared, account: str, role: Role, by: str, expires_ms: int) -> Share:
+    def _share(self, shared: NewShare, account: str, role: Role, by: str, expires_ms: int) -> Share:
         if account == shared.owner.id:
             raise invalid("It is this account's own: there is nothing to share with it. To give it away, transfer it.")
         return Share(
@@ -201,11 +203,11 @@ class Sharing:
         )
 
     async def _write(
-        self, caller: Identity, shared: Shared, account: Account, share: Share, *, keep_more: bool
+        self, caller: Identity, shared: NewShare, account: Account, share: Share, *, keep_more: bool
     ) -> tuple[Share, bool, bool]:
-        note = await self._pending.note(_note(_CHANGED, share), self._clock.now_ms() + LOOK_MS)
+        note = await self._reminders.schedule(_note(_CHANGED, share), self._clock.now_ms() + LOOK_MS)
         if share.expires_ms < NEVER_MS:
-            await self._pending.note(_note(_EXPIRES, share), share.expires_ms)
+            await self._reminders.schedule(_note(_EXPIRES, share), share.expires_ms)
         # The index first: without the share's row behind it it shows nothing.
         await index(self._tables, share)
         lowered = False
@@ -223,14 +225,14 @@ class Sharing:
             await change.noted()
             if row is None:
                 await self._tables.create(
-                    records.SHARES, Row(share.on, share_key(share.account), records.fields(share))
+                    records.SHARES, Row(share.on, share_key(share.account), records.to_data(share))
                 )
             else:
-                await self._tables.replace(records.SHARES, replace(row, data=records.fields(share)))
+                await self._tables.replace(records.SHARES, replace(row, data=records.to_data(share)))
             return share, before is None
 
         terms = {"with": account.id, "name": account.name, "role": share.role.value, "expires_ms": share.expires_ms}
-        async with self._chain.change(share.owner, AccountEvent.SHARED, caller, on=share.on, **terms) as change:
+        async with self._audit_log.change(share.owner, AccountEvent.SHARED, caller, on=share.on, **terms) as change:
             written, created = await records.retry(attempt)
         if written is share:
             message = f"{caller.name} shared it with {account.name} as {share.role}."
@@ -240,7 +242,7 @@ class Sharing:
     async def _check_room(self, on: str) -> None:
         page = await self._tables.query(records.SHARES, on, first="account:", last="account;", limit=MAX_SHARES)
         now_ms = self._clock.now_ms()
-        dead = [row for row in page.rows if not records.read(row, Share).live(now_ms)]
+        dead = [row for row in page.rows if not records.read(row, Share).is_live(now_ms)]
         if len(page.rows) - len(dead) >= MAX_SHARES:
             detail = f"It is shared with {MAX_SHARES} accounts, the most there can be. End one of these shares."
             raise Problem("too-many-shares", 409, "Too many shares", detail)
@@ -248,10 +250,10 @@ class Sharing:
     async def _end(self, caller: Identity | None, row: Row) -> bool:
         """Delete the share's row, which decides, and end what was done under it; whether everybody has been told."""
         share = records.read(row, Share)
-        note = await self._pending.note(_note(_CHANGED, share), self._clock.now_ms() + LOOK_MS)
+        note = await self._reminders.schedule(_note(_CHANGED, share), self._clock.now_ms() + LOOK_MS)
         name = await self._sign_in.named(share.account)
         on = {"on": share.on, "with": share.account, "name": name}
-        async with self._chain.change(share.owner, AccountEvent.UNSHARED, caller, **on) as change:
+        async with self._audit_log.change(share.owner, AccountEvent.UNSHARED, caller, **on) as change:
             await change.noted()
             try:
                 await self._tables.delete(records.SHARES, row)
@@ -261,7 +263,7 @@ class Sharing:
             created = await self._tables.get(records.SHARES, row.partition, row.key)
             # What time has ended, and somebody has shared anew at that moment, goes on.
             if created is not None and (
-                caller is not None or not records.read(created, Share).live(self._clock.now_ms())
+                caller is not None or not records.read(created, Share).is_live(self._clock.now_ms())
             ):
                 return await self._end(caller, created)
             return True
@@ -275,18 +277,18 @@ class Sharing:
 
     async def _settle(self, share: Share, note: Row | None) -> bool:
         """End what is over the role that is left; what could not be told the timer tells soon, until it is."""
-        done = await self._unshare.settle(share)
+        done = await self._access_revocation.settle(share)
         if not done:
-            await self._pending.note(_note(_CHANGED, share), self._clock.now_ms() + AGAIN_MS)
+            await self._reminders.schedule(_note(_CHANGED, share), self._clock.now_ms() + AGAIN_MS)
         if note is not None:
-            await self._pending.drop(note)
+            await self._reminders.cancel(note)
         return done
 
     async def _tell(self, share: Share, fact: Fact, message: str, **data: str) -> None:
         kind, name = split_target(share.on)
-        device = await self._devices.owned(name) if kind == "device" else None
+        device = await self._devices.get_as_owner(name) if kind == "device" else None
         if device is not None and device.pairing == share.pairing:
-            await self._audit.event(device, fact, message, data=data)
+            await self._control_events.add_event(device, fact, message, data=data)
 
     async def look(self, what: str, note: Row) -> None:
         """The timer's look at a share that was changed, or whose time may be over."""
@@ -294,13 +296,13 @@ class Sharing:
         on, _, account = what.removeprefix(_EXPIRES if expired else _CHANGED).rpartition("|")
         row = await self._tables.get(records.SHARES, on, share_key(account))
         share = records.read(row, Share) if row else None
-        if row is not None and share is not None and not share.live(self._clock.now_ms()):
+        if row is not None and share is not None and not share.is_live(self._clock.now_ms()):
             await self._end(None, row)
         elif not expired:
             kept = share or Share(on, account, Role.VIEWER, "", "", 0)
-            if not await self._unshare.settle(kept, again=True):
-                await self._pending.note(what, self._clock.now_ms() + AGAIN_MS)
-        await self._pending.drop(note)
+            if not await self._access_revocation.settle(kept, again=True):
+                await self._reminders.schedule(what, self._clock.now_ms() + AGAIN_MS)
+        await self._reminders.cancel(note)
 
 
 def require_person(caller: Identity) -> None:
@@ -313,7 +315,7 @@ def require_person(caller: Identity) -> None:
         raise forbidden("An API key shares nothing, gives nothing away and takes nothing. Sign in for that.")
 
 
-def yours(detail: str) -> Problem:
+def own_share_error(detail: str) -> Problem:
     """The refusal of what nobody can do with what is their own."""
     return Problem("already-yours", 409, "It is yours", detail)
 
@@ -327,8 +329,8 @@ def _note(kind: str, share: Share) -> str:
     return f"{kind}{share.on}|{share.account}"
 
 
-def _holds(share: Share, shared: Shared, now_ms: int) -> bool:
-    return share.live(now_ms) and share.owner == shared.owner.id and share.pairing == shared.pairing
+def _holds(share: Share, shared: NewShare, now_ms: int) -> bool:
+    return share.is_live(now_ms) and share.owner == shared.owner.id and share.pairing == shared.pairing
 
 
 def _more(share: Share, than: Share) -> bool:

@@ -83,7 +83,7 @@ def read(row: Row, kind: type[T]) -> T:
     return msgspec.convert(row.data, kind, strict=False)
 
 
-def fields(record: Any) -> dict[str, Any]:
+def to_data(record: Any) -> dict[str, Any]:
     """A record as the data of a row."""
     data: dict[str, Any] = msgspec.to_builtins(record)
     return data
@@ -114,7 +114,7 @@ async def upsert(  # noqa: PLR0917 (a place, a change, a type: read best in this
         record = change(None if row is None else read(row, kind))
         if record is None:
             return None
-        data = fields(record)
+        data = to_data(record)
         if row is None:
             await tables.create(table, Row(partition, key, data))
         else:

@@ -18,7 +18,7 @@ class Reminders:
     def __init__(self, *, tables: Tables) -> None:
         self._tables = tables
 
-    async def note(self, action: str, due_ms: int) -> Row | None:
+    async def schedule(self, action: str, due_ms: int) -> Row | None:
         """Look at ``action`` at ``due_ms``. The same note twice is one; whoever writes it second gets no row."""
         try:
             return await self._tables.create(records.PENDING, Row(_shard(action), f"{due_ms:013d}:{action}", {}))
@@ -30,7 +30,7 @@ class Reminders:
         page = await self._tables.query(records.PENDING, str(shard), last=f"{now_ms + 1:013d}", limit=limit)
         return [(row.key.partition(":")[2], row) for row in page.rows]
 
-    async def drop(self, note: Row) -> None:
+    async def cancel(self, note: Row) -> None:
         """Forget a note that was dealt with."""
         try:
             await self._tables.delete(records.PENDING, note)

@@ -33,7 +33,7 @@ class Retention:
         self._tables = tables
         self._blobs = blobs
 
-    async def rows(self, table: str, partition: str, *, first: str, last: str | None, due_ms: int) -> None:
+    async def delete_rows_at(self, table: str, partition: str, *, first: str, last: str | None, due_ms: int) -> None:
         """Delete the rows with ``first`` ≤ key < ``last`` once ``due_ms`` has come; the same note twice is one.
 
         Args:
@@ -45,15 +45,15 @@ class Retention:
         """
         await self._note({"table": table, "partition": partition, "first": first, "last": last}, due_ms)
 
-    async def row(self, table: str, partition: str, key: str, *, due_ms: int) -> None:
+    async def delete_row_at(self, table: str, partition: str, key: str, *, due_ms: int) -> None:
         """Delete one row, as ``rows``."""
-        await self.rows(table, partition, first=key, last=key + "\0", due_ms=due_ms)
+        await self.delete_rows_at(table, partition, first=key, last=key + "\0", due_ms=due_ms)
 
-    async def blob(self, name: str, *, due_ms: int) -> None:
+    async def delete_blob_at(self, name: str, *, due_ms: int) -> None:
         """Delete a blob once ``due_ms`` has come; the same note twice is one."""
         await self._note({"blob": name}, due_ms)
 
-    async def run(self, now_ms: int) -> None:
+    async def delete_due(self, now_ms: int) -> None:
         """One round: part of what is due. Safe to repeat and to be run by many at once.
 
         Raises:

@@ -18,7 +18,7 @@ class _Line(Generic[J]):
         self.jobs: list[tuple[J, asyncio.Future[None]]] = []
 
 
-class Batches(Generic[J]):
+class WriteBatcher(Generic[J]):
     """One batch at a time for each place; whoever comes meanwhile is in the next.
 
     Args:

@@ -16,12 +16,12 @@ _NOTED = 4096
 """Days of devices whose end a process knows to be noted."""
 
 
-class Events:
+class EventLog:
     """The events of all devices."""
 
-    def __init__(self, *, tables: Tables, forget: Retention, clock: Clock) -> None:
+    def __init__(self, *, tables: Tables, retention: Retention, clock: Clock) -> None:
         self._tables = tables
-        self._forget = forget
+        self._retention = retention
         self._clock = clock
         self._noted: dict[tuple[str, int, int], None] = {}
 
@@ -67,7 +67,7 @@ class Events:
         # Keys count down with time: the day's last moment comes first.
         first, last = (new_suffix((day + 1) * DAY_MS - 1)[:9], new_suffix(day * DAY_MS)[:9] + ";")
         due_ms = (seen_day + 1) * DAY_MS + KEEP_EVENTS_MS
-        await self._forget.rows(records.EVENTS, partition, first=first, last=last, due_ms=due_ms)
+        await self._retention.delete_rows_at(records.EVENTS, partition, first=first, last=last, due_ms=due_ms)
         self._noted[existing] = None
         if len(self._noted) > _NOTED:
             del self._noted[next(iter(self._noted))]

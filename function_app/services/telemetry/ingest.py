@@ -81,7 +81,7 @@ class TelemetryIngest:
         self._agents: dict[str, _Agent] = {}
         self._turn = 0
 
-    async def take(self, messages: Iterable[InboundMessage]) -> dict[int, str]:
+    async def ingest(self, messages: Iterable[InboundMessage]) -> dict[int, str]:
         """Take messages in: once this returns they are in their series.
 
         Returns:
@@ -114,7 +114,7 @@ class TelemetryIngest:
             await self._distribute(await self._queue(batch), batch)
         return dropped
 
-    async def distribute_left(self) -> None:
+    async def distribute_backlog(self) -> None:
         """Distribute what others have left behind: a part of the queue each time.
 
         Raises:

@@ -70,7 +70,7 @@ class Samples:
 
 
 @dataclass(frozen=True, slots=True)
-class Found:
+class LatencySeries:
     """What is known of one transport and path in a span of time; ``recent`` are its newest samples, in time's order."""
 
     transport: Transport
@@ -93,12 +93,12 @@ class _Recent:
     samples: tuple[tuple[int, float], ...] = field(default_factory=tuple)
 
 
-class Latencies:
+class LatencyStore:
     """The latency store."""
 
-    def __init__(self, *, tables: Tables, forget: Retention, clock: Clock) -> None:
+    def __init__(self, *, tables: Tables, retention: Retention, clock: Clock) -> None:
         self._tables = tables
-        self._forget = forget
+        self._retention = retention
         self._clock = clock
 
     async def add(self, device: Device, given: Samples, *, caller: str, once: str = "") -> None:
@@ -148,7 +148,7 @@ class Latencies:
         *,
         transport: Transport | None = None,
         path: Path | None = None,
-    ) -> list[Found]:
+    ) -> list[LatencySeries]:
         """What is known in ``span``: one for each transport and path that has ever had samples, by name."""
         partition = _partition(device.id, device.pairing)
         first, last = "recent:", "recent;"
@@ -160,7 +160,7 @@ class Latencies:
                 wanted.append((of_transport, of_path, records.read(row, _Recent).samples))
         sums = await asyncio.gather(*(self._sum(partition, f"{one}:{other}", span) for one, other, _ in wanted))
         return [
-            Found(cast("Transport", of_transport), cast("Path", of_path), total, recent)
+            LatencySeries(cast("Transport", of_transport), cast("Path", of_path), total, recent)
             for (of_transport, of_path, recent), total in zip(wanted, sums, strict=True)
         ]
 
@@ -222,11 +222,13 @@ class Latencies:
         """See that the hours of a new day will be forgotten, and what tells its batches apart: before there are any."""
         end_ms = day_ms + DAY_MS
         first, last = _key("hour", kind, day_ms), _key("hour", kind, end_ms)
-        await self._forget.rows(records.LATENCY, partition, first=first, last=last, due_ms=end_ms + KEEP_HOURS_MS)
+        await self._retention.delete_rows_at(
+            records.LATENCY, partition, first=first, last=last, due_ms=end_ms + KEEP_HOURS_MS
+        )
         first, last = _mark(day_ms // DAY_MS), _mark(end_ms // DAY_MS)
         # Later than this its samples are too old to be taken in again.
         due_ms = end_ms + OLDEST_MS + DAY_MS
-        await self._forget.rows(records.LATENCY, partition, first=first, last=last, due_ms=due_ms)
+        await self._retention.delete_rows_at(records.LATENCY, partition, first=first, last=last, due_ms=due_ms)
 
     async def _rows(self, partition: str, keys: Iterable[str]) -> dict[str, Row]:
         rows = await asyncio.gather(*(self._tables.get(records.LATENCY, partition, key) for key in keys))
@@ -240,7 +242,7 @@ class Latencies:
 
 
 def _write(partition: str, key: str, record: Any, old: Row | None) -> Write:
-    data = records.fields(record)
+    data = records.to_data(record)
     return Write("replace" if old else "create", Row(partition, key, data, old.etag if old else ""))
 
 

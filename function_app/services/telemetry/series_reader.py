@@ -22,9 +22,9 @@ from function_app.domain.telemetry.series import (
 )
 from function_app.ports.clock import Clock
 from function_app.ports.tables import Tables
-from function_app.services.devices.device_access import Devices
+from function_app.services.devices.device_access import DeviceAccess
 from function_app.services.storage import records
-from function_app.services.telemetry.series_writer import ABOUT, MAX_STREAMS, About, Place
+from function_app.services.telemetry.series_writer import ABOUT, MAX_STREAMS, Place, StreamInfo
 
 MAX_POINTS = 1_000
 _DIGITS = 13
@@ -83,13 +83,13 @@ class StreamView(NamedTuple):
     """A stream and what is known of all of it."""
 
     name: str
-    about: About
+    about: StreamInfo
 
 
 class SeriesReader:
     """Reads what ``SeriesWriter`` has written."""
 
-    def __init__(self, *, tables: Tables, devices: Devices, keep: RetentionPolicy, clock: Clock) -> None:
+    def __init__(self, *, tables: Tables, devices: DeviceAccess, keep: RetentionPolicy, clock: Clock) -> None:
         self._tables = tables
         self._devices = devices
         self._keep = keep
@@ -140,9 +140,9 @@ class SeriesReader:
             return await self._raw(asked)
         return part
 
-    async def _about(self, place: Place) -> About | None:
+    async def _about(self, place: Place) -> StreamInfo | None:
         row = await self._tables.get(records.SERIES, place.partition, ABOUT) if topics.is_id(place.stream) else None
-        return None if row is None else records.read(row, About)
+        return None if row is None else records.read(row, StreamInfo)
 
     async def _buckets(self, level: Level, asked: _Question) -> tuple[Part, int]:
         """A page of buckets, and how many samples are in them."""
@@ -204,7 +204,7 @@ def _extend(part: Part, samples: Samples) -> None:
             values.extend(None if math.isnan(value) else value for value in column)
 
 
-def _wanted(fields: Sequence[str] | None, about: About) -> Sequence[str]:
+def _wanted(fields: Sequence[str] | None, about: StreamInfo) -> Sequence[str]:
     if fields is None:
         return about.fields
     unknown = [name for name in fields if name not in about.fields]

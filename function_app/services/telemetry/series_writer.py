@@ -54,7 +54,7 @@ class Place(NamedTuple):
 
 
 @dataclass(frozen=True, slots=True)
-class About:
+class StreamInfo:
     """What is known of a whole stream: ``count`` samples ever, the first and the last time, names of its fields."""
 
     count: int = 0
@@ -86,9 +86,9 @@ _Windows = Sequence[tuple[int, Samples]]
 class SeriesWriter:
     """Adds samples. Safe to repeat, by any number at once, in any order."""
 
-    def __init__(self, *, tables: Tables, forget: Retention, keep: RetentionPolicy, clock: Clock) -> None:
+    def __init__(self, *, tables: Tables, retention: Retention, keep: RetentionPolicy, clock: Clock) -> None:
         self._tables = tables
-        self._forget = forget
+        self._retention = retention
         self._keep = keep
         self._clock = clock
         self._written: dict[str, _Known] = {}
@@ -119,8 +119,8 @@ class SeriesWriter:
         listed = await self._tables.query(records.SERIES, place.streams, limit=MAX_STREAMS)
         for row in listed.rows:
             partition = place._replace(stream=row.key).partition
-            await self._forget.rows(records.SERIES, partition, first="", last=None, due_ms=due_ms)
-        await self._forget.rows(records.SERIES, place.streams, first="", last=None, due_ms=due_ms)
+            await self._retention.delete_rows_at(records.SERIES, partition, first="", last=None, due_ms=due_ms)
+        await self._retention.delete_rows_at(records.SERIES, place.streams, first="", last=None, due_ms=due_ms)
 
     async def _add(self, place: Place, windows: _Windows) -> Samples:
         """A part that fits into one batch, or, where what is known already makes it too large, into several."""
@@ -146,7 +146,7 @@ class SeriesWriter:
             Conflict: Somebody else has written meanwhile.
         """
         partition = place.partition
-        about = records.read(existing.about, About) if existing.about else About()
+        about = records.read(existing.about, StreamInfo) if existing.about else StreamInfo()
         if existing.about is None and not await self._announce(place):
             return Samples()
         names = _names(about, windows)
@@ -175,7 +175,7 @@ class SeriesWriter:
         if size > _MAX_BYTES and len(windows) > 1:
             return None
         writes += (existing.write(partition, key, each.data()) for key, each in buckets.items())
-        writes.append(existing.write(partition, ABOUT, records.fields(_grown(about, new, names))))
+        writes.append(existing.write(partition, ABOUT, records.to_data(_grown(about, new, names))))
         await self._note(partition, existing, buckets)
         self._remember(partition, windows[-1][0], await self._tables.batch(records.SERIES, writes))
         return new
@@ -231,7 +231,9 @@ class SeriesWriter:
                 if kept_ms is not None:
                     first, last = series.key(level, begin_ms), series.key(level, end_ms)
                     due_ms = end_ms + kept_ms + MARGIN_MS
-                    await self._forget.rows(records.SERIES, partition, first=first, last=last, due_ms=due_ms)
+                    await self._retention.delete_rows_at(
+                        records.SERIES, partition, first=first, last=last, due_ms=due_ms
+                    )
 
 
 def _chunks(samples: Samples) -> Iterator[_Windows]:
@@ -262,7 +264,7 @@ def _into(buckets: dict[str, Bucket], existing: _Known, start_ms: int, summary: 
         buckets[key].add(summary)
 
 
-def _names(about: About, windows: _Windows) -> dict[str, None]:
+def _names(about: StreamInfo, windows: _Windows) -> dict[str, None]:
     """The stream's fields: those it has, and new ones up to the limit."""
     names = dict.fromkeys(about.fields)
     for _, window in windows:
@@ -278,8 +280,8 @@ def _only(samples: Samples, names: dict[str, None]) -> Samples:
     return Samples(samples.at_ms, {name: values for name, values in samples.columns.items() if name in names})
 
 
-def _grown(about: About, new: Samples, names: dict[str, None]) -> About:
-    return About(
+def _grown(about: StreamInfo, new: Samples, names: dict[str, None]) -> StreamInfo:
+    return StreamInfo(
         count=about.count + len(new),
         first_ms=min(about.first_ms, new.at_ms[0]) if about.count else new.at_ms[0],
         last_ms=max(about.last_ms, new.at_ms[-1]),

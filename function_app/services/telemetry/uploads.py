@@ -120,7 +120,7 @@ class Uploads:
             expires_ms=now_ms + UNREGISTERED_MS,
         )
         await self._note(device, capture.id, capture.expires_ms)
-        await self._tables.create(records.UPLOADS, Row(_partition(device), _waiting(id_), records.fields(capture)))
+        await self._tables.create(records.UPLOADS, Row(_partition(device), _waiting(id_), records.to_data(capture)))
         request = await self._blobs.presign_upload(
             capture.blob, length=capture.length, content_type=capture.content_type, lifetime_s=LIFETIME_S
         )
@@ -144,7 +144,7 @@ class Uploads:
         await self._note(device, capture.id, kept.expires_ms)
         writes = [
             Write("delete", waiting),
-            Write("create", Row(waiting.partition, _registered(capture.id), records.fields(kept))),
+            Write("create", Row(waiting.partition, _registered(capture.id), records.to_data(kept))),
         ]
         try:
             await self._tables.batch(records.UPLOADS, writes)
@@ -192,7 +192,7 @@ class Uploads:
         await self._note(device, result.capture.id, now_ms)
         # From here on it is not there, whether or not this process comes to delete it.
         ended = replace(result.capture, expires_ms=now_ms)
-        row = Row(result.row.partition, result.row.key, records.fields(ended), result.row.etag)
+        row = Row(result.row.partition, result.row.key, records.to_data(ended), result.row.etag)
         try:
             row = await self._tables.replace(records.UPLOADS, row)
             await self._blobs.delete(ended.blob)

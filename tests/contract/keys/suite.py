@@ -13,9 +13,9 @@ from device_agent.protocol import codec
 from device_agent.protocol.errors import SignatureError
 from device_agent.protocol.security import signing
 from device_agent.protocol.security.key_rotation import KEYS_CONTEXT, NewKey
-from function_app.ports.signing_keys import Keys, RotationRefused
+from function_app.ports.signing_keys import SigningKeys, RotationRefused
 
-Again = Callable[[], Awaitable[Keys]]
+Again = Callable[[], Awaitable[SigningKeys]]
 LEARN_MS, OVERLAP_MS = 1000, 5000
 
 
@@ -29,13 +29,13 @@ class Time:
         return self.ms
 
 
-async def named(keys: Keys) -> tuple[str, str]:
+async def named(keys: SigningKeys) -> tuple[str, str]:
     """Ids of the key for tokens and of that for devices."""
     current, devices = await keys.current(), await keys.for_devices()
     return signing.key_id(current.public_key()), signing.key_id(devices.public_key())
 
 
-async def rotate(keys: Keys) -> str:
+async def rotate(keys: SigningKeys) -> str:
     """The new key's id."""
     return (await keys.rotate(learn_ms=LEARN_MS, overlap_ms=OVERLAP_MS)).pins[-1].id
 
@@ -45,14 +45,14 @@ class KeysSuite:
 
     pytestmark = pytest.mark.anyio
 
-    async def test_everybody_signs_with_the_same_key(self, keys: Keys, again: Again) -> None:
+    async def test_everybody_signs_with_the_same_key(self, keys: SigningKeys, again: Again) -> None:
         first = await named(keys)
         others = await asyncio.gather(*(again() for _ in range(3)))
         assert [await named(each) for each in others] == [first] * 3
         assert set(await keys.public()) == {first[0]}
 
     async def test_a_new_key_signs_tokens_at_once_and_orders_once_it_could_be_learned(
-        self, keys: Keys, time: Time
+        self, keys: SigningKeys, time: Time
     ) -> None:
         old, _ = await named(keys)
         new = await rotate(keys)
@@ -63,7 +63,7 @@ class KeysSuite:
         assert set(await keys.public()) == {old, new}
 
     async def test_an_old_key_counts_to_the_end_of_the_overlap_and_for_what_is_stored_beyond(
-        self, keys: Keys, time: Time
+        self, keys: SigningKeys, time: Time
     ) -> None:
         old, _ = await named(keys)
         new = await rotate(keys)
@@ -76,7 +76,7 @@ class KeysSuite:
         assert (await keys.news()).statements == ()
         assert set(await keys.archive()) == {old, new}
 
-    async def test_a_statement_leads_from_the_old_key_to_the_new_one(self, keys: Keys, time: Time) -> None:
+    async def test_a_statement_leads_from_the_old_key_to_the_new_one(self, keys: SigningKeys, time: Time) -> None:
         old, _ = await named(keys)
         pinned = dict(await keys.public())
         new = await rotate(keys)
@@ -92,7 +92,7 @@ class KeysSuite:
         with pytest.raises(SignatureError):
             signing.verify(statement.encode(), pinned)
 
-    async def test_who_has_missed_one_rotation_is_led_through_both(self, keys: Keys, time: Time) -> None:
+    async def test_who_has_missed_one_rotation_is_led_through_both(self, keys: SigningKeys, time: Time) -> None:
         pinned = dict(await keys.public())
         await rotate(keys)
         time.ms += LEARN_MS
@@ -103,13 +103,13 @@ class KeysSuite:
             pinned[signing.key_id(half)] = half
         assert (await keys.news()).pins[-1].id in pinned
 
-    async def test_no_rotation_while_devices_learn_the_last_key(self, keys: Keys, time: Time) -> None:
+    async def test_no_rotation_while_devices_learn_the_last_key(self, keys: SigningKeys, time: Time) -> None:
         await rotate(keys)
         with pytest.raises(RotationRefused) as refused:
             await rotate(keys)
         assert refused.value.until_ms == time.ms + LEARN_MS
 
-    async def test_a_key_that_has_leaked_counts_for_nothing(self, keys: Keys) -> None:
+    async def test_a_key_that_has_leaked_counts_for_nothing(self, keys: SigningKeys) -> None:
         old, _ = await named(keys)
         middle = await rotate(keys)
         await keys.rotate(leaked=True)
@@ -120,7 +120,7 @@ class KeysSuite:
         assert (await keys.news()).statements == ()
         assert (await keys.news()).serial == 3
 
-    async def test_another_process_knows_a_new_key_when_it_meets_a_token_of_it(self, keys: Keys, again: Again) -> None:
+    async def test_another_process_knows_a_new_key_when_it_meets_a_token_of_it(self, keys: SigningKeys, again: Again) -> None:
         other = await again()
         await other.current()
         new = await rotate(keys)
@@ -129,7 +129,7 @@ class KeysSuite:
         assert kid in await other.public(kid)
 
     async def test_another_process_signs_with_the_new_key_after_a_while(
-        self, keys: Keys, again: Again, time: Time
+        self, keys: SigningKeys, again: Again, time: Time
     ) -> None:
         other = await again()
         await other.current()
@@ -138,7 +138,7 @@ class KeysSuite:
         self.wait_for_followers(time)
         assert await named(other) == await named(keys)
 
-    async def test_private_halves_that_nothing_is_signed_with_are_not_kept(self, keys: Keys, time: Time) -> None:
+    async def test_private_halves_that_nothing_is_signed_with_are_not_kept(self, keys: SigningKeys, time: Time) -> None:
         await rotate(keys)
         time.ms += LEARN_MS
         await rotate(keys)

@@ -5,7 +5,7 @@ from collections.abc import AsyncIterator, Iterator
 import pytest
 
 from function_app.adapters.aws.signing_keys import SecretsManagerKeys
-from function_app.ports.signing_keys import Keys
+from function_app.ports.signing_keys import SigningKeys
 from function_app.ports.tables import StoreError
 from tests.contract.keys.suite import Again, KeysSuite, Time
 from tests.harness.stores.aws import REGION, reset, start_moto, use_credentials
@@ -24,7 +24,7 @@ def endpoint() -> Iterator[str]:
 async def again(endpoint: str, time: Time) -> AsyncIterator[Again]:
     opened: list[SecretsManagerKeys] = []
 
-    async def open_() -> Keys:
+    async def open_() -> SigningKeys:
         opened.append(
             SecretsManagerKeys(
                 secret="telescope-keys",
@@ -43,7 +43,7 @@ async def again(endpoint: str, time: Time) -> AsyncIterator[Again]:
 
 
 @pytest.fixture
-async def keys(endpoint: str, again: Again) -> Keys:
+async def keys(endpoint: str, again: Again) -> SigningKeys:
     reset(endpoint)
     keys = await again()
     assert isinstance(keys, SecretsManagerKeys)

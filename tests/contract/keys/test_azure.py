@@ -15,7 +15,7 @@ import pytest
 
 from function_app.adapters.azure.client import Place
 from function_app.adapters.azure.signing_keys import KeyVaultKeys
-from function_app.ports.signing_keys import Keys
+from function_app.ports.signing_keys import SigningKeys
 from function_app.ports.tables import StoreError
 from tests.contract.keys.suite import Again, KeysSuite, Time
 from tests.harness.cloud.identity import HOST, make_certificate, start_host
@@ -109,7 +109,7 @@ def vault(tmp_path_factory: pytest.TempPathFactory) -> Iterator[FakeVault]:
 async def again(vault: FakeVault, time: Time) -> AsyncIterator[Again]:
     opened: list[KeyVaultKeys] = []
 
-    async def open_() -> Keys:
+    async def open_() -> SigningKeys:
         place = Place(url=vault.url)
         opened.append(
             KeyVaultKeys(secret="telescope-keys", place=place, now_ms=time.now_ms, look_every_ms=LOOK_MS, again_ms=0)
@@ -122,7 +122,7 @@ async def again(vault: FakeVault, time: Time) -> AsyncIterator[Again]:
 
 
 @pytest.fixture
-async def keys(vault: FakeVault, again: Again) -> Keys:
+async def keys(vault: FakeVault, again: Again) -> SigningKeys:
     vault.secrets.clear()
     keys = await again()
     assert isinstance(keys, KeyVaultKeys)

@@ -125,7 +125,7 @@ class Cloud:
 
     def sweep(self) -> None:
         """One round of the timer."""
-        self.run(self.functions.sweep.run())
+        self.run(self.functions.scheduler.run_due_jobs())
 
     def __enter__(self) -> Self:
         return self

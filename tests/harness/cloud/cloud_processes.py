@@ -29,7 +29,7 @@ from function_app.domain.common.ids import command_id
 from function_app.domain.devices.devices import Agent, Device
 from function_app.ports.broker_access import Credentials
 from function_app.services.devices.device_access import devices_of
-from function_app.services.messaging.delivery import Delivery, Signed
+from function_app.services.messaging.delivery import Delivery, SignedCommand
 from function_app.services.storage import records
 from tests.fakes.agent import Robot
 from tests.harness.agent.pinned_keys import pinned
@@ -136,10 +136,10 @@ class Ground:
         """Send anything the way commands go; its id."""
         self._last_ms = max(self._last_ms + 1, self.cloud.clock.now_ms())
         command = command_id(robot.device, self._last_ms)
-        self.deliver(robot.id, Signed(command, payload, self.cloud.clock.now_ms() + in_ms, first))
+        self.deliver(robot.id, SignedCommand(command, payload, self.cloud.clock.now_ms() + in_ms, first))
         return command
 
-    def order(self, agent: str, request: Request, *, epoch: int, key: Ed25519PrivateKey | None = None) -> Signed:
+    def order(self, agent: str, request: Request, *, epoch: int, key: Ed25519PrivateKey | None = None) -> SignedCommand:
         """A command of Anna's to an agent's only device; signed by the cloud's key where no other is given."""
         (device,) = self.devices(agent)
         now_ms = self.cloud.clock.now_ms()
@@ -155,9 +155,9 @@ class Ground:
             request=request,
         )
         payload = signing.sign(codec.encode(command), key or FileKeys(self.home / "keys").load())
-        return Signed(command.id, payload, now_ms + ORDER_MS)
+        return SignedCommand(command.id, payload, now_ms + ORDER_MS)
 
-    def deliver(self, agent: str, order: Signed) -> None:
+    def deliver(self, agent: str, order: SignedCommand) -> None:
         """Send an order to an agent's only device."""
         (device,) = self.devices(agent)
         self.cloud.run(self.delivery.send(device, order))

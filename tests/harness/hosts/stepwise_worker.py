@@ -29,7 +29,7 @@ async def main() -> None:
 
 async def _do(functions: Functions, step: dict[str, Any]) -> None:
     if step["do"] == "sweep":
-        await functions.sweep.run()
+        await functions.scheduler.run_due_jobs()
     else:
         await ingest(functions, step["topic"], base64.b64decode(step["payload"]))
 

@@ -336,7 +336,7 @@ class TestCertificates:
     ) -> None:
         devices.make(tmp_path / "tls", now=dt.datetime.now(dt.UTC))
         authority = FileCertificates(tmp_path / "tls")
-        monkeypatch.setattr(alone.functions.certify, "_certificates", authority)
+        monkeypatch.setattr(alone.functions.agent_certificates, "_certificates", authority)
         anna, robot = alone.sign_in("anna"), alone.robot()
         robot.enroll()
         key = ec.generate_private_key(ec.SECP256R1())
@@ -350,7 +350,7 @@ class TestCertificates:
         certificate = x509.load_pem_x509_certificate(made.json()["chain"].encode())
         assert certificate.subject.rfc4514_string() == f"CN={robot.id}"
 
-        leave: Any = alone.functions.unpair._leave
+        leave: Any = alone.functions.unpair._offboarding
         monkeypatch.setattr(leave, "_certificates", authority)
         assert anna.delete(f"/agents/{robot.id}").status_code == 204
         revoked = x509.load_pem_x509_crl((tmp_path / "tls" / "devices.crl").read_bytes())

@@ -33,7 +33,7 @@ def kinds(person: Person, **query: Any) -> list[str]:
 
 
 def verdict(cloud: Cloud, chain: str, *expected: Head) -> str:
-    return cloud.run(cloud.functions.trail.verify(chain, expected=expected)).broken
+    return cloud.run(cloud.functions.audit_reader.verify(chain, expected=expected)).broken
 
 
 class TestWhatIsRecorded:
@@ -68,7 +68,7 @@ class TestWhatIsRecorded:
         anna = cloud.sign_in("anna")
         assert anna.put("/accounts/me/password", {"password": "correct horse battery"}).status_code == 204
         wrong = {"name": "anna", "password": "wrong wrong wrong"}
-        before = cloud.run(cloud.functions.trail.head(CLOUD)) or Head(0, "")
+        before = cloud.run(cloud.functions.audit_reader.head(CLOUD)) or Head(0, "")
         for name in ("anna", "nobody", "anna"):
             answer = cloud.ask("POST", f"{API}/auth/password", json={**wrong, "name": name})
             assert answer.status_code == 401, answer.text
@@ -83,7 +83,7 @@ class TestWhatIsRecorded:
             "signed-in",
             "signed-out",
         ]
-        after = cloud.run(cloud.functions.trail.head(CLOUD))
+        after = cloud.run(cloud.functions.audit_reader.head(CLOUD))
         assert after is not None
         assert after.seq == before.seq + 2, "of a name that nobody has, and of a link"
         told = json.dumps(anna.get("/accounts/me/audit").json())
@@ -125,7 +125,7 @@ class TestWhatIsRecorded:
 
     def test_one_reads_it_newest_first_page_by_page_and_only_ones_own(self, cloud: Cloud) -> None:
         anna, bert = cloud.sign_in("anna"), cloud.sign_in("bert")
-        chain = cloud.functions.chain
+        chain = cloud.functions.audit_log
         for number in range(25):
             cloud.run(chain.record(anna.account, "even" if number % 2 == 0 else "odd", WHO, on=f"d{number % 5}"))
         seen: list[int] = []
@@ -149,10 +149,10 @@ class TestWhatIsRecorded:
         clock = MovingClock()
         cloud = open_cloud(clock=clock)
         for _ in range(5):
-            cloud.run(cloud.functions.chain.refused(OWNER, "sign-in-refused", None, address="192.0.2.1"))
+            cloud.run(cloud.functions.audit_log.record_rejection(OWNER, "sign-in-refused", None, address="192.0.2.1"))
         clock.advance(11)
-        cloud.run(cloud.functions.chain.refused(OWNER, "sign-in-refused", None, address="192.0.2.1"))
-        head = cloud.run(cloud.functions.trail.head(OWNER))
+        cloud.run(cloud.functions.audit_log.record_rejection(OWNER, "sign-in-refused", None, address="192.0.2.1"))
+        head = cloud.run(cloud.functions.audit_reader.head(OWNER))
         assert head is not None
         assert head.seq == 2
 
@@ -169,13 +169,13 @@ def written(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[Cloud, s
         async def write() -> None:
             for number in range(10):
                 data: dict[str, Any] = {"n": number, "text": 'ä"\\', "deep": {"list": [1, 2.5, None, True]}}
-                await cloud.functions.chain.record(OWNER, "did", WHO, on=f"d{number}", **data)
+                await cloud.functions.audit_log.record(OWNER, "did", WHO, on=f"d{number}", **data)
                 if number == 4:
-                    await cloud.functions.chain.anchor(OWNER)
-            await cloud.functions.chain.record("other", "did", WHO, on="d1")
+                    await cloud.functions.audit_log.anchor(OWNER)
+            await cloud.functions.audit_log.record("other", "did", WHO, on="d1")
 
         cloud.run(write())
-        head = cloud.run(cloud.functions.trail.head(OWNER))
+        head = cloud.run(cloud.functions.audit_reader.head(OWNER))
         assert head is not None
         with sqlite3.connect(home / "tables.sqlite", isolation_level=None) as db:
             db.execute("PRAGMA busy_timeout=5000")
@@ -293,7 +293,7 @@ class TestChanged:
         _, _, head = written
         assert "record 1: it and all after it are gone" in self.check(written, {}), "the blob store knows of five"
         with Cloud(settings(tmp_path)) as cloud:
-            chain, trail = cloud.functions.chain, cloud.functions.trail
+            chain, trail = cloud.functions.audit_log, cloud.functions.audit_reader
             for _ in range(3):
                 cloud.run(chain.record(OWNER, "did", WHO))
             with sqlite3.connect(tmp_path / "tables.sqlite", isolation_level=None) as other:
@@ -337,12 +337,12 @@ def test_what_is_sent_again_since_its_answer_was_lost_is_recorded_once(
         monkeypatch.setattr(functions.tables, "batch", losing)
 
         async def work() -> list[str]:
-            async with functions.chain.change(OWNER, "changed", WHO) as change:
+            async with functions.audit_log.change(OWNER, "changed", WHO) as change:
                 await change.noted()
-            await asyncio.gather(*(functions.chain.record(OWNER, f"did {number}", WHO) for number in range(3)))
+            await asyncio.gather(*(functions.audit_log.record(OWNER, f"did {number}", WHO) for number in range(3)))
             told = entry("told", WHO, entry_id="told", at_ms=functions.clock.now_ms())
             for _ in range(2):
-                await functions.chain.tell(OWNER, [told])
+                await functions.audit_log.append_all(OWNER, [told])
             return [record["what"] for record in await everything(functions)]
 
         assert sorted(cloud.run(work())) == ["changed", "did 0", "did 1", "did 2", "told"]
@@ -353,7 +353,7 @@ def test_what_is_sent_again_since_its_answer_was_lost_is_recorded_once(
 def test_the_timer_notes_the_head_elsewhere_every_hour_with_something_new(home: Path) -> None:
     clock = MovingClock()
     with Cloud(settings(home), clock=clock) as cloud:
-        chain, blobs = cloud.functions.chain, cloud.functions.blobs
+        chain, blobs = cloud.functions.audit_log, cloud.functions.blobs
 
         def noted() -> int:
             return (cloud.run(blobs.get(anchors(OWNER))) or b"").count(b"\n")
@@ -367,7 +367,7 @@ def test_the_timer_notes_the_head_elsewhere_every_hour_with_something_new(home: 
         clock.advance(ANCHOR_MS / 1000)
         cloud.sweep()
         assert noted() == 2
-        assert cloud.run(cloud.functions.trail.verify(OWNER)).anchors == 2
+        assert cloud.run(cloud.functions.audit_reader.verify(OWNER)).anchors == 2
 
 
 def test_the_command_says_ok_or_names_the_first_broken_record(
@@ -377,8 +377,8 @@ def test_the_command_says_ok_or_names_the_first_broken_record(
     with Cloud(settings(home)) as cloud:
         anna = cloud.sign_in("anna")
         for number in range(3):
-            cloud.run(cloud.functions.chain.record(anna.account, "did", WHO, n=number))
-        head = cloud.run(cloud.functions.trail.head(anna.account))
+            cloud.run(cloud.functions.audit_log.record(anna.account, "did", WHO, n=number))
+        head = cloud.run(cloud.functions.audit_reader.head(anna.account))
     assert main(["audit", "verify"]) == 0
     assert f"OK {anna.account} {head}" in capsys.readouterr().out
     assert main(["audit", "head", "--account", "anna"]) == 0
@@ -404,7 +404,7 @@ WRITERS = 4
 async def write_many(functions: Functions, writer: int, records: int) -> None:
     for number in range(0, records, 5):
         await asyncio.gather(
-            *(functions.chain.record(OWNER, "did", WHO, on=f"{writer}-{number + more}") for more in range(5))
+            *(functions.audit_log.record(OWNER, "did", WHO, on=f"{writer}-{number + more}") for more in range(5))
         )
 
 
@@ -426,7 +426,7 @@ async def later(functions: Functions) -> None:
     clock: Any = functions.clock
     for seconds in (2 * LOOK_MS / 1000 + 1, ABANDON_MS / 1000 + 1, 2 * LOOK_MS / 1000 + 1):
         clock.advance(seconds)
-        await functions.sweep.run()
+        await functions.scheduler.run_due_jobs()
 
 
 @pytest.mark.parametrize(("place", "records"), [("local", 20), ("azure", 5)], indirect=["place"])
@@ -445,7 +445,7 @@ def see_one_chain(place: Place, records: int) -> None:
         await later(functions)
         found = Counter(record["on"] for record in await everything(functions))
         assert found == {f"{writer}-{number}": 1 for writer in range(WRITERS) for number in range(records)}
-        assert (await functions.trail.verify(OWNER)).broken == ""
+        assert (await functions.audit_reader.verify(OWNER)).broken == ""
 
     run_here(place, look)
 
@@ -502,7 +502,7 @@ def see_that_all_is_recorded(place: Place, *, stride: int) -> None:
             for epoch in range(1, 1 + (lease.data["epoch"] if lease else 0)):
                 assert epoch in {number for _, number in told}, f"epoch {epoch} of {told}"
             assert not (await functions.tables.query(store.AUDIT, who.account, first="wait:", last="wait;")).rows
-            assert (await functions.trail.verify(who.account)).broken == ""
+            assert (await functions.audit_reader.verify(who.account)).broken == ""
 
         run_here(place, look)
         if not died:
@@ -514,9 +514,9 @@ def see_that_all_is_recorded(place: Place, *, stride: int) -> None:
 async def _changes(functions: Functions, who: Identity, agent: str, code: str) -> None:
     await functions.claim.claim(who, code, None)
     device = f"{agent}-arm"
-    lease, _ = await functions.leases.take(who, device, epoch=None, lease_ms=60_000, wait_ms=0)
+    lease, _ = await functions.leases.acquire(who, device, epoch=None, lease_ms=60_000, wait_ms=0)
     await functions.leases.release(who, device, epoch=lease.epoch)
-    await functions.leases.take(who, device, epoch=None, lease_ms=60_000, wait_ms=0)
+    await functions.leases.acquire(who, device, epoch=None, lease_ms=60_000, wait_ms=0)
     await functions.unpair.unpair(who, agent)
 
 

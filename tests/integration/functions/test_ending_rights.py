@@ -29,7 +29,7 @@ def edit(cloud: Cloud, table: str, place: tuple[str, str], kind: type[Any], **ch
     tables = cloud.functions.tables
     row = cloud.run(tables.get(table, *place))
     assert row is not None
-    cloud.run(tables.replace(table, replace(row, data=records.fields(replace(records.read(row, kind), **changes)))))
+    cloud.run(tables.replace(table, replace(row, data=records.to_data(replace(records.read(row, kind), **changes)))))
 
 
 class TestItsTurn:

@@ -49,13 +49,13 @@ def notes(cloud: Cloud, table: str = "") -> list[str]:
 
 
 def run(cloud: Cloud, now_ms: int) -> None:
-    cloud.run(cloud.functions.forget.run(now_ms))
+    cloud.run(cloud.functions.retention.delete_due(now_ms))
 
 
 class TestRows:
     def test_a_range_goes_at_its_time_and_its_neighbours_stay(self, alone: Cloud) -> None:
         put(alone, "a", "b", "b1", "c")
-        alone.run(alone.functions.forget.rows("Things", "p", first="b", last="c", due_ms=NOW_MS))
+        alone.run(alone.functions.retention.delete_rows_at("Things", "p", first="b", last="c", due_ms=NOW_MS))
         run(alone, NOW_MS - 1)
         assert left(alone) == ["a", "b", "b1", "c"]
         run(alone, NOW_MS)
@@ -64,35 +64,35 @@ class TestRows:
 
     def test_one_row_is_that_row_alone(self, alone: Cloud) -> None:
         put(alone, "b", "b1")
-        alone.run(alone.functions.forget.row("Things", "p", "b", due_ms=NOW_MS))
+        alone.run(alone.functions.retention.delete_row_at("Things", "p", "b", due_ms=NOW_MS))
         run(alone, NOW_MS)
         assert left(alone) == ["b1"]
 
     def test_without_a_last_key_it_is_the_rest_of_the_partition(self, alone: Cloud) -> None:
         put(alone, "a", "b", "zzz")
-        alone.run(alone.functions.forget.rows("Things", "p", first="b", last=None, due_ms=NOW_MS))
+        alone.run(alone.functions.retention.delete_rows_at("Things", "p", first="b", last=None, due_ms=NOW_MS))
         run(alone, NOW_MS)
         assert left(alone) == ["a"]
 
     def test_a_row_that_was_renewed_stays_until_its_own_time(self, alone: Cloud) -> None:
         put(alone, "old", expires_ms=NOW_MS)
         put(alone, "renewed", expires_ms=NOW_MS + 1)
-        alone.run(alone.functions.forget.rows("Things", "p", first="", last=None, due_ms=NOW_MS))
+        alone.run(alone.functions.retention.delete_rows_at("Things", "p", first="", last=None, due_ms=NOW_MS))
         run(alone, NOW_MS)
         assert left(alone) == ["renewed"]
-        alone.run(alone.functions.forget.rows("Things", "p", first="", last=None, due_ms=NOW_MS + 1))
+        alone.run(alone.functions.retention.delete_rows_at("Things", "p", first="", last=None, due_ms=NOW_MS + 1))
         run(alone, NOW_MS + 1)
         assert left(alone) == []
 
     def test_the_same_note_twice_is_one(self, alone: Cloud) -> None:
         for _ in range(2):
-            alone.run(alone.functions.forget.row("Things", "p", "b", due_ms=NOW_MS))
+            alone.run(alone.functions.retention.delete_row_at("Things", "p", "b", due_ms=NOW_MS))
         assert len(notes(alone)) == 1
 
     def test_many_rows_go_in_several_rounds_also_behind_many_that_stay(self, alone: Cloud) -> None:
         put(alone, *(f"a{number:04d}" for number in range(ROWS)), expires_ms=NOW_MS + 1)
         put(alone, *(f"b{number:04d}" for number in range(ROWS + 1)))
-        alone.run(alone.functions.forget.rows("Things", "p", first="", last=None, due_ms=NOW_MS))
+        alone.run(alone.functions.retention.delete_rows_at("Things", "p", first="", last=None, due_ms=NOW_MS))
         for looked in (0, ROWS, 2 * ROWS):
             assert len(left(alone)) == 2 * ROWS + 1 - max(0, looked - ROWS)
             assert len(notes(alone)) == 1
@@ -102,7 +102,7 @@ class TestRows:
 
     def test_many_notes_go_in_several_rounds(self, alone: Cloud) -> None:
         for number in range(2 * SHARDS * NOTES):
-            alone.run(alone.functions.forget.row("Things", "p", str(number), due_ms=NOW_MS))
+            alone.run(alone.functions.retention.delete_row_at("Things", "p", str(number), due_ms=NOW_MS))
         run(alone, NOW_MS)
         assert 0 < len(notes(alone)) < 2 * SHARDS * NOTES
         for _ in range(4):
@@ -111,7 +111,7 @@ class TestRows:
 
     def test_large_rows_go_too(self, alone: Cloud) -> None:
         put(alone, *(f"{number:02d}" for number in range(20)), text="x" * 200_000)
-        alone.run(alone.functions.forget.rows("Things", "p", first="", last=None, due_ms=NOW_MS))
+        alone.run(alone.functions.retention.delete_rows_at("Things", "p", first="", last=None, due_ms=NOW_MS))
         run(alone, NOW_MS)
         assert left(alone) == []
 
@@ -131,8 +131,8 @@ class TestRows:
                 await tables.replace("Things", Row("p", "a", {"expires_ms": NOW_MS + 1}, row.etag))
                 return await inner(*arguments)
 
-        alone.run(alone.functions.forget.rows("Things", "p", first="", last=None, due_ms=NOW_MS))
-        alone.run(Retention(tables=Changing(), blobs=alone.functions.blobs).run(NOW_MS))
+        alone.run(alone.functions.retention.delete_rows_at("Things", "p", first="", last=None, due_ms=NOW_MS))
+        alone.run(Retention(tables=Changing(), blobs=alone.functions.blobs).delete_due(NOW_MS))
         assert left(alone) == ["a", "b"]
         assert len(notes(alone)) == 1
         run(alone, NOW_MS)
@@ -143,8 +143,8 @@ class TestRows:
 def test_a_blob_goes_at_its_time_and_one_that_is_gone_is_no_trouble(alone: Cloud) -> None:
     blobs = alone.functions.blobs
     alone.run(blobs.put("a/b", b"content"))
-    alone.run(alone.functions.forget.blob("a/b", due_ms=NOW_MS))
-    alone.run(alone.functions.forget.blob("never/there", due_ms=NOW_MS))
+    alone.run(alone.functions.retention.delete_blob_at("a/b", due_ms=NOW_MS))
+    alone.run(alone.functions.retention.delete_blob_at("never/there", due_ms=NOW_MS))
     run(alone, NOW_MS - 1)
     assert alone.run(blobs.get("a/b")) == b"content"
     run(alone, NOW_MS)

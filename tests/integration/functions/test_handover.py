@@ -257,15 +257,15 @@ def test_who_is_no_owner_takes_nothing_over_and_a_viewer_does_not_even_ask(
 def test_who_may_no_longer_operate_is_given_nothing(held: Three, monkeypatch: pytest.MonkeyPatch) -> None:
     anna, other, robot = held
     request = asked(other, robot)
-    find = devices_service.Devices.find
+    find = devices_service.DeviceAccess.find_with_link
 
-    async def found(self: devices_service.Devices, who: Any, device: str) -> Any:
+    async def found(self: devices_service.DeviceAccess, who: Any, device: str) -> Any:
         known, link = await find(self, who, device)
         if known is not None and who.session == other.session:
             known = replace(known, role=Role.VIEWER)
         return known, link
 
-    monkeypatch.setattr(devices_service.Devices, "find", found)
+    monkeypatch.setattr(devices_service.DeviceAccess, "find_with_link", found)
     assert "stays with you" in problem(anna.post(at(robot, request, "accept")), 409, "asker-gone")["detail"]
     assert lease(anna, robot)["epoch"] == 1
 

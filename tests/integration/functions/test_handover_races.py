@@ -52,8 +52,10 @@ def prepare(place: Place, rounds: int) -> Scene:
             devices += [f"{agent}-{name}" for name in names]
         requests = []
         for device in devices[:rounds]:
-            await functions.leases.take(holder, device, epoch=None, lease_ms=600_000, wait_ms=0)
-            _, asked, _, _ = await functions.handovers.ask(asker, device, within_ms=60_000, lease_ms=600_000, wait_ms=0)
+            await functions.leases.acquire(holder, device, epoch=None, lease_ms=600_000, wait_ms=0)
+            _, asked, _, _ = await functions.control_requests.create(
+                asker, device, within_ms=60_000, lease_ms=600_000, wait_ms=0
+            )
             requests.append(asked.id)
         return Scene(account, devices[:rounds], requests)
 
@@ -65,15 +67,15 @@ async def act(functions: Functions, what: str, scene: Scene, number: int) -> Non
     holder, asker, third = (scene.who(name) for name in ("holder", "asker", "third"))
     match what:
         case "accept":
-            await functions.handovers.accept(holder, device, request, wait_ms=0)
+            await functions.control_requests.accept(holder, device, request, wait_ms=0)
         case "refuse":
-            await functions.handovers.refuse(holder, device, request)
+            await functions.control_requests.reject(holder, device, request)
         case "withdraw":
-            await functions.handovers.withdraw(asker, device, request)
+            await functions.control_requests.withdraw(asker, device, request)
         case "release":
             await functions.leases.release(holder, device, epoch=1)
         case "take over":
-            await functions.leases.take(third, device, epoch=None, lease_ms=600_000, wait_ms=0, over="why not")
+            await functions.leases.acquire(third, device, epoch=None, lease_ms=600_000, wait_ms=0, over="why not")
         case "reset":
             with mock.patch.object(stop, "CONFIRM_MS", 0):  # nobody confirms here
                 await functions.stop.reset(third, device)

@@ -79,7 +79,7 @@ async def idle(functions: Functions) -> Scene:
 
 async def running(functions: Functions) -> Scene:
     scene = await idle(functions)
-    lease, _ = await functions.leases.take(scene.who, scene.device, epoch=None, lease_ms=600_000, wait_ms=0)
+    lease, _ = await functions.leases.acquire(scene.who, scene.device, epoch=None, lease_ms=600_000, wait_ms=0)
     action, _ = await functions.start_action.start(scene.who, scene.device, asked(epoch=lease.epoch))
     return Scene(scene.who, scene.public, scene.agent, action.id, lease.epoch)
 
@@ -95,7 +95,9 @@ async def asked_for(functions: Functions) -> Scene:
     """Somebody else asks for the lease that ``who`` holds; ``action`` is the request."""
     scene = await running(functions)
     other = Identity(scene.who.account, scene.who.name, "another session")
-    _, asked, _, _ = await functions.handovers.ask(other, scene.device, within_ms=60_000, lease_ms=9_000, wait_ms=0)
+    _, asked, _, _ = await functions.control_requests.create(
+        other, scene.device, within_ms=60_000, lease_ms=9_000, wait_ms=0
+    )
     return Scene(scene.who, scene.public, scene.agent, asked.id, scene.epoch)
 
 
@@ -134,7 +136,7 @@ async def report_done(functions: Functions, scene: Scene) -> None:
 
 
 async def take(functions: Functions, scene: Scene) -> None:
-    await functions.leases.take(scene.who, scene.device, epoch=None, lease_ms=5_000, wait_ms=0)
+    await functions.leases.acquire(scene.who, scene.device, epoch=None, lease_ms=5_000, wait_ms=0)
 
 
 async def release(functions: Functions, scene: Scene) -> None:
@@ -142,7 +144,7 @@ async def release(functions: Functions, scene: Scene) -> None:
 
 
 async def pass_control(functions: Functions, scene: Scene) -> None:
-    await functions.handovers.accept(scene.who, scene.device, scene.action, wait_ms=0)
+    await functions.control_requests.accept(scene.who, scene.device, scene.action, wait_ms=0)
     lease = await functions.leases.get(scene.who, scene.device)
     assert lease is not None
     assert (lease.epoch, lease.session) == (scene.epoch + 1, "another session")
@@ -163,7 +165,7 @@ async def claim(functions: Functions, scene: Scene) -> None:
 async def time_out(functions: Functions, _scene: Scene) -> None:
     """The timer, when everything's time is over."""
     cast("SetClock", functions.clock).advance(TIMEOUT_S + QUEUE_S)
-    await functions.sweep.run()
+    await functions.scheduler.run_due_jobs()
 
 
 async def report(functions: Functions, action: str, status: AckStatus) -> None:
@@ -248,7 +250,7 @@ async def settle(functions: Functions) -> None:
     clock = cast("SetClock", functions.clock)
     for step_s in (*([1.0] * (TIMEOUT_S + QUEUE_S + 4)), *([ORPHAN_MS / 2000 + 1] * 3)):
         clock.advance(step_s)
-        await functions.sweep.run()
+        await functions.scheduler.run_due_jobs()
     notes = [key for shard in range(SHARDS) for key in await rows_of(functions, records.PENDING, str(shard))]
     # A lease that lasts longer than this has one, for its end; a chain has one for the hour.
     notes = [key for key in notes if ":anchor:" not in key]
@@ -288,7 +290,7 @@ async def look(functions: Functions, place: Place, scenes: list[Scene]) -> None:
         action, _ = await functions.start_action.start(owner, scene.device, asked())
         assert action.status.value == "published"
         await report(functions, action.id, AckStatus.DONE)
-        lease, _ = await functions.leases.take(owner, scene.device, epoch=None, lease_ms=5_000, wait_ms=0)
+        lease, _ = await functions.leases.acquire(owner, scene.device, epoch=None, lease_ms=5_000, wait_ms=0)
         assert lease.epoch > action.epoch >= max(1, scene.epoch)
 
 
@@ -358,7 +360,7 @@ async def report_some(functions: Functions, chance: random.Random, who: Two, sce
 
 
 async def control(functions: Functions, chance: random.Random, who: Two, scene: Scene) -> None:
-    lease, _ = await functions.leases.take(who[0], scene.device, epoch=None, lease_ms=3_000, wait_ms=0)
+    lease, _ = await functions.leases.acquire(who[0], scene.device, epoch=None, lease_ms=3_000, wait_ms=0)
     policy = chance.choice(("reject", "queue"))
     await functions.start_action.start(who[0], scene.device, asked(epoch=lease.epoch, policy=policy))
     await functions.leases.release(who[0], scene.device, epoch=lease.epoch)
@@ -366,7 +368,7 @@ async def control(functions: Functions, chance: random.Random, who: Two, scene: 
 
 async def pass_time(functions: Functions, chance: random.Random, who: Two, scene: Scene) -> None:
     cast("SetClock", functions.clock).advance(chance.uniform(0, 3))
-    await functions.sweep.run()
+    await functions.scheduler.run_due_jobs()
     if not chance.randrange(4):
         await functions.stop.stop(who[0], scene.device, "")
 

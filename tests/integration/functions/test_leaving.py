@@ -55,7 +55,7 @@ def retained(cloud: Cloud, broker: RunningBroker, space: str, agent: str, *names
 
 def ends(cloud: Cloud, *actions: str) -> set[tuple[str, str]]:
     """How they ended, whoever may see them."""
-    found = [cloud.run(cloud.functions.start_action._rows.get(action)) for action in actions]
+    found = [cloud.run(cloud.functions.start_action._action_store.get(action)) for action in actions]
     return {(each.action.status.value, (each.action.reason or {}).get("code", "")) for each in found if each}
 
 

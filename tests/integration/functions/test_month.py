@@ -86,7 +86,7 @@ def measured(begin_ms: int, windows: int, chance: random.Random) -> Iterator[tup
 
 def build(cloud: Cloud, place: Place, days: float) -> dict[int, Truth]:
     """Write ``days`` through the service, as time passes; the hours as they were."""
-    writer = cloud.functions.intake._writer
+    writer = cloud.functions.telemetry_ingest._writer
     begin_ms = cloud.clock.now_ms() // DAY.span_ms * DAY.span_ms - 40 * DAY.span_ms
     hours: dict[int, Truth] = {}
 

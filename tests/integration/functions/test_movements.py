@@ -289,7 +289,7 @@ class TestVersions:
         problem(anna.get(MINE, params={"version": 2}), 404, "movement-version-unknown")
         assert len(scripts(home)) == 4, "an action that was started with one may still be sent again"
         alone.clock.advance((KEPT_MS + 1_000) / 1000)
-        alone.run(alone.functions.forget.run(alone.clock.now_ms()))
+        alone.run(alone.functions.retention.delete_due(alone.clock.now_ms()))
         assert scripts(home) == ["# 1"]
         again = alone.sign_in("anna")
         assert again.get(MINE).json()["source"] == "# 1"
@@ -301,7 +301,7 @@ class TestVersions:
             anna.put(MINE, {"source": f"# {number}"})
         anna.delete(MINE)
         alone.clock.advance((KEPT_MS + 1_000) / 1000)
-        alone.run(alone.functions.forget.run(alone.clock.now_ms()))
+        alone.run(alone.functions.retention.delete_due(alone.clock.now_ms()))
         assert scripts(home) == []
         page = alone.run(alone.functions.tables.query(records.MOVEMENTS, f"{anna.account}/ur5"))
         assert [row.key for row in page.rows] == ["mine"]

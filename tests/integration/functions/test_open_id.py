@@ -18,7 +18,7 @@ import pytest
 
 from function_app.adapters.oidc.provider import HttpOpenId
 from function_app.domain.audit.hash_chain import CLOUD
-from function_app.ports.oidc_provider import OpenIdError, Subject
+from function_app.ports.oidc_provider import OidcError, Subject
 from function_app.services.storage import records
 from function_app.settings import OpenIdClient
 from tests.harness.cloud.cloud import API, BASE, Cloud, MovingClock, Person, problem, settings
@@ -356,7 +356,7 @@ def test_an_honest_token_is_believed(liar: Liar, key: SigningKey) -> None:
 )  # fmt: skip
 def test_a_token_of_other_claims_is_not(liar: Liar, key: SigningKey, changes: dict[str, Any]) -> None:
     liar.token = signed(claims(liar, **changes), key)
-    with pytest.raises(OpenIdError):
+    with pytest.raises(OidcError):
         redeem(client(liar))
 
 
@@ -380,7 +380,7 @@ def test_a_token_that_others_signed_is_not(liar: Liar, key: SigningKey, strange:
         1,
     ):
         liar.token = token
-        with pytest.raises(OpenIdError):
+        with pytest.raises(OidcError):
             redeem(client(liar))
     liar.token = good
     assert redeem(client(liar)).id == "anna"
@@ -391,7 +391,7 @@ def test_a_key_for_something_else_is_none(liar: Liar, key: SigningKey) -> None:
     for shown in ({**key.shown(), "use": "enc"}, {**key.shown(), "alg": "PS256"}, {"kid": "one", "kty": "oct"}, "x",
                   {**key.shown(), "n": "!"}, {**key.shown(), "n": 1}, {**key.shown(), "e": None}):  # fmt: skip
         liar.keys = [shown]
-        with pytest.raises(OpenIdError):
+        with pytest.raises(OidcError):
             redeem(client(liar))
 
 
@@ -402,7 +402,7 @@ def test_an_unknown_key_has_the_keys_fetched_but_not_for_ever(liar: Liar, key: S
     redeem(asked)
     liar.token = signed(claims(liar), strange, kid="two")
     for _ in range(5):
-        with pytest.raises(OpenIdError):
+        with pytest.raises(OidcError):
             redeem(asked)
     assert liar.fetched.count("/keys") == 1
     clock.advance(11)
@@ -413,7 +413,7 @@ def test_an_unknown_key_has_the_keys_fetched_but_not_for_ever(liar: Liar, key: S
     assert redeem(asked).id == "anna", "a key is kept for an hour"
     clock.advance(3_600)
     liar.token = signed(claims(liar, exp=int(time.time()) + 7_200), key)
-    with pytest.raises(OpenIdError, match="does not show"):
+    with pytest.raises(OidcError, match="does not show"):
         redeem(asked)
 
 
@@ -428,7 +428,7 @@ def test_an_unknown_key_has_the_keys_fetched_but_not_for_ever(liar: Liar, key: S
 )  # fmt: skip
 def test_a_provider_that_is_not_what_it_should_be_is_not_used(liar: Liar, changes: dict[str, Any]) -> None:
     liar.document |= changes
-    with pytest.raises(OpenIdError):
+    with pytest.raises(OidcError):
         asyncio.run(client(liar).address(state="s", nonce="n", challenge="c", redirect=REDIRECT))
     assert liar.asked == []
 
@@ -447,8 +447,8 @@ def test_a_client_without_a_secret_says_who_it_is(liar: Liar, key: SigningKey) -
 def test_a_refusal_and_too_long_an_answer_are_told_apart_from_a_token(liar: Liar, key: SigningKey) -> None:
     liar.token = signed(claims(liar), key)
     liar.status = 400
-    with pytest.raises(OpenIdError, match="answered 400"):
+    with pytest.raises(OidcError, match="answered 400"):
         redeem(client(liar))
     liar.status, liar.token = 200, "x" * 300_000
-    with pytest.raises(OpenIdError, match="more than"):
+    with pytest.raises(OidcError, match="more than"):
         redeem(client(liar))

@@ -55,7 +55,7 @@ def test_only_a_slow_hash_of_it_is_stored(cloud: Cloud, anna: Person) -> None:
 
 def test_a_hash_of_older_parameters_is_made_again(cloud: Cloud, anna: Person, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(password_hasher, "PASSES", 3)
-    hashes: Any = cloud.functions.passwords._hashes
+    hashes: Any = cloud.functions.passwords._hasher
     hashes._made = None
     assert sign_in(cloud, "anna", GOOD).status_code == 200
     row = cloud.run(cloud.functions.tables.get(records.ACCOUNTS, anna.account, "password"))

@@ -78,7 +78,7 @@ async def race(functions: Functions, prizes: Prizes, racer: int, barrier: Any, r
     once = Start(asked=START.asked, timeout_ms=60_000, once="one key")
     tries: dict[str, Any] = {
         "slot": lambda n: functions.start_action.start(same, prizes.slots[n], START),
-        "lease": lambda n: functions.leases.take(own, prizes.leases[n], epoch=None, lease_ms=60_000, wait_ms=0),
+        "lease": lambda n: functions.leases.acquire(own, prizes.leases[n], epoch=None, lease_ms=60_000, wait_ms=0),
         "claim": lambda n: functions.claim.claim(
             Identity(prizes.accounts[racer][n // WRONG_TRIES], "x", "s"), prizes.codes[n], None
         ),

@@ -199,8 +199,8 @@ def unshare_at(
     anna, bert, robot = operator
     functions = anna.cloud.functions
     target, name = {
-        "seen": (functions.start_action._pending, "note"),
-        "written": (functions.devices, "require_still"),
+        "seen": (functions.start_action._reminders, "schedule"),
+        "written": (functions.devices, "require_still_allowed"),
     }[moment]
     real = getattr(target, name)
     once = itertools.count()

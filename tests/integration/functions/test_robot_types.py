@@ -21,7 +21,7 @@ from device_agent.protocol.manifests.robot_type import RobotType
 from function_app.adapters.model_compiler.compiler import MujocoCompiler
 from function_app.entrypoints.hosts.worker import check_models
 from function_app.entrypoints.http.robot_types.schemas import MAX_UPLOAD
-from function_app.ports.model_compiler import CompilerMissingError, Looked
+from function_app.ports.model_compiler import CompilerMissingError, ModelReport
 from function_app.ports.tables import Row
 from function_app.services.robot_types.cleanup import CUT_OFF, NO_CHECKER
 from function_app.services.robot_types.delete import AFTER_MS
@@ -155,7 +155,7 @@ def check_all(cloud: Cloud) -> None:
 
 def advance(cloud: Cloud, ms: int) -> None:
     cloud.clock.advance(ms / 1000)
-    cloud.run(cloud.functions.sweep._robot_types.run())
+    cloud.run(cloud.functions.scheduler._robot_types.run_due_jobs())
 
 
 @pytest.mark.usefixtures("checker")
@@ -376,10 +376,10 @@ class TestChecker:
     ) -> None:
         compiled: list[str] = []
 
-        async def counting(__: object, robot_type: RobotType, *_: object) -> Looked:
+        async def counting(__: object, robot_type: RobotType, *_: object) -> ModelReport:
             compiled.append(robot_type.type)
             await asyncio.sleep(0.01)
-            return Looked()
+            return ModelReport()
 
         monkeypatch.setattr(MujocoCompiler, "check", counting)
         names = [f"lever-{number}" for number in range(12)]

@@ -18,7 +18,7 @@ from function_app.domain.identity.accounts import Identity
 from function_app.domain.telemetry import series
 from function_app.domain.telemetry.series import DAY, FINEST, LEVELS, RAW, RetentionPolicy, Samples
 from function_app.ports.tables import Row, StoreError, Tables
-from function_app.services.devices.device_access import Devices
+from function_app.services.devices.device_access import DeviceAccess
 from function_app.services.storage import records
 from function_app.services.storage.retention import Retention
 from function_app.services.telemetry.ingest import (
@@ -101,8 +101,8 @@ class House:
     def instance(self) -> tuple[SeriesReader, TelemetryIngest, SeriesWriter, Retention]:
         tables: Any = self.tables
         forget = Retention(tables=tables, blobs=self.blobs)
-        writer = SeriesWriter(tables=tables, forget=forget, keep=self.keep, clock=self.clock)
-        devices = Devices(tables=tables, clock=self.clock)
+        writer = SeriesWriter(tables=tables, retention=forget, keep=self.keep, clock=self.clock)
+        devices = DeviceAccess(tables=tables, clock=self.clock)
         intake = TelemetryIngest(tables=tables, writer=writer, clock=self.clock, observers=[self.observe])
         return SeriesReader(tables=tables, devices=devices, keep=self.keep, clock=self.clock), intake, writer, forget
 
@@ -341,8 +341,8 @@ async def test_a_stream_that_is_not_there_is_unknown(house: House, stream: str) 
 async def test_measurements_of_claimed_devices_are_stored(house: House) -> None:
     rows = {NOW_MS - 100 * n: {"temperature_c.elbow": 40.0 + n, "fan": 1.0} for n in range(50)}
     arrived = [message(at_ms, "health", **values) for at_ms, values in rows.items()]
-    await house.intake.take(arrived)
-    await house.intake.take(arrived[10:20])
+    await house.intake.ingest(arrived)
+    await house.intake.ingest(arrived[10:20])
     await assert_whole(house, rows)
     for shard in range(SHARDS):
         assert not (await house.tables.query(records.DATA, str(shard))).rows
@@ -368,7 +368,7 @@ async def test_joints_are_stored_under_their_names(house: House) -> None:
         tick_ms=1, at_ms=NOW_MS, sequence=1, mode=Mode.STREAMING, position_rad=(0.1, 0.2, 0.3, 0.4),
         velocity_rad_s=(1.0, 2.0, 3.0, 4.0), effort_nm=(5.0,), commanded_rad=(), loop_age_ms=12.0,
     )  # fmt: skip
-    await house.intake.take(
+    await house.intake.ingest(
         [InboundMessage(Topic("space", AGENT, "arm", topics.TELE, "joints"), codec.encode(telemetry))]
     )
     expected = {"loop_age_ms": 12.0, "effort_nm.shoulder": 5.0}
@@ -387,7 +387,7 @@ async def test_joints_are_stored_under_their_names(house: House) -> None:
     ],
 )
 async def test_what_does_not_belong_to_a_claimed_device_is_dropped(house: House, topic: Topic) -> None:
-    await house.intake.take([InboundMessage(topic, message(NOW_MS, a=1.0).payload)])
+    await house.intake.ingest([InboundMessage(topic, message(NOW_MS, a=1.0).payload)])
     assert await house.reader.streams(ANNA, DEVICE) == []
 
 
@@ -407,12 +407,12 @@ async def test_what_does_not_belong_to_a_claimed_device_is_dropped(house: House,
 )
 async def test_one_bad_message_does_not_hold_up_the_others(house: House, payload: bytes) -> None:
     bad = InboundMessage(Topic("space", AGENT, "arm", topics.TELE, "health"), payload)
-    await house.intake.take([bad, message(NOW_MS, a=1.0), bad])
+    await house.intake.ingest([bad, message(NOW_MS, a=1.0), bad])
     await assert_whole(house, {NOW_MS: {"a": 1.0}})
 
 
 async def test_a_new_owner_sees_nothing_of_the_former_one(house: House) -> None:
-    await house.intake.take([message(NOW_MS, a=1.0)])
+    await house.intake.ingest([message(NOW_MS, a=1.0)])
     await house.pair(pairing="p2", account="bert")
     bert = Identity("bert", "bert", "s2")
     assert await house.reader.streams(bert, DEVICE) == []
@@ -421,7 +421,7 @@ async def test_a_new_owner_sees_nothing_of_the_former_one(house: House) -> None:
             await house.reader.read(who, DEVICE, "health", Range())
         assert caught.value.code == code
     house.clock.at_ms += 10_000
-    await house.intake.take([message(house.clock.at_ms, b=2.0)])
+    await house.intake.ingest([message(house.clock.at_ms, b=2.0)])
     part = await house.reader.read(bert, DEVICE, "health", Range(level="raw"))
     assert (part.at_ms, list(part.values)) == ([house.clock.at_ms], ["b"])
 
@@ -432,7 +432,7 @@ async def test_what_was_left_in_the_queue_is_not_the_next_owners(house: House) -
     await house.pair(pairing="p2", account="bert")
     house.clock.at_ms += LEFT_MS + 1
     for _ in range(SHARDS):
-        await house.intake.distribute_left()
+        await house.intake.distribute_backlog()
     assert await _queued(house) == 0
     assert await house.reader.streams(Identity("bert", "bert", "s2"), DEVICE) == []
 
@@ -442,7 +442,7 @@ async def test_an_observer_that_fails_holds_nothing_up(house: House) -> None:
         raise RuntimeError("no")
 
     house.intake._observers = (fail, house.observe)
-    await house.intake.take([message(NOW_MS, a=1.0)])
+    await house.intake.ingest([message(NOW_MS, a=1.0)])
     assert len(house.seen) == 1
 
 
@@ -454,7 +454,7 @@ async def test_a_kill_between_any_two_writes_loses_and_doubles_nothing(house: Ho
         rows = {house.clock.at_ms - 3_000 * n: {"a": float(n)} for n in range(10)}
         house.tables.left, house.tables.after = number, after
         try:
-            await house.intake.take([message(at_ms, stream, **values) for at_ms, values in rows.items()])
+            await house.intake.ingest([message(at_ms, stream, **values) for at_ms, values in rows.items()])
         except Killed:
             kills += 1
         house.tables.left = None
@@ -463,7 +463,7 @@ async def test_a_kill_between_any_two_writes_loses_and_doubles_nothing(house: Ho
         house.clock.at_ms += LEFT_MS + 1
         _, intake, _, _ = house.instance()
         for _ in range(SHARDS):
-            await intake.distribute_left()
+            await intake.distribute_backlog()
         assert await _queued(house) == 0
         await assert_whole(house, rows, stream)
     assert kills > 5
@@ -474,7 +474,7 @@ async def _queued(house: House) -> int:
 
 
 async def test_what_can_never_be_distributed_is_given_up(house: House) -> None:
-    await house.intake.take([])
+    await house.intake.ingest([])
     _, intake, _, _ = house.instance()
     device = (await intake._agent(AGENT)).devices["arm"]
     await intake._queue([_Part(device, "health", series.from_rows([(NOW_MS, {"a": 1.0})]))])
@@ -486,16 +486,16 @@ async def test_what_can_never_be_distributed_is_given_up(house: House) -> None:
     for later_ms, left in ((LEFT_MS + 1, 1), (GIVE_UP_MS + 1, 0)):
         house.clock.at_ms = NOW_MS + later_ms
         for _ in range(SHARDS):
-            await intake.distribute_left()
+            await intake.distribute_backlog()
         assert await _queued(house) == left
 
 
 async def test_a_store_that_is_away_is_said(house: House) -> None:
     house.tables.left, house.tables.error = 1, StoreError("away")
     with pytest.raises(StoreError):
-        await house.intake.take([message(NOW_MS, a=1.0)])
+        await house.intake.ingest([message(NOW_MS, a=1.0)])
     house.tables.left = None
-    await house.intake.take([message(NOW_MS, a=1.0)])
+    await house.intake.ingest([message(NOW_MS, a=1.0)])
     await assert_whole(house, {NOW_MS: {"a": 1.0}})
 
 
@@ -513,7 +513,7 @@ async def test_each_level_is_kept_as_long_as_it_is_said(house: House) -> None:
     for days in range(8):
         house.clock.at_ms = end_ms + days * day_ms + 2 * 3_600_000
         for _ in range(5):
-            await forget.run(house.clock.at_ms)
+            await forget.delete_due(house.clock.at_ms)
         for level in (RAW, *LEVELS):
             part = await reader.read(ANNA, DEVICE, "health", Range(level=level.name, points=1000))
             assert bool(part.at_ms) == (days < gone.get(level.name, 1000)), (level, days)

@@ -263,7 +263,7 @@ def test_an_unpaired_agent_is_shared_with_nobody_not_even_when_it_comes_back(thr
 def test_a_role_and_a_list_of_devices_cap_what_an_identity_may(three: Three) -> None:
     anna, bert, robot = three
     share(anna, f"devices/{robot.device}", bert, "operator")
-    find = anna.cloud.functions.devices.find
+    find = anna.cloud.functions.devices.find_with_link
     for account, most, only, role in (
         (anna.account, "owner", (), "owner"),
         (anna.account, "operator", (), "operator"),
@@ -405,7 +405,7 @@ def test_a_share_that_is_extended_at_its_very_end_goes_on(
     share(anna, f"devices/{robot.device}", bert, "operator", expires_in_s=SHARED_S)
     cloud.clock.advance(SHARED_S)
     sharing, who = cloud.functions.sharing, Identity(anna.account, anna.name, anna.session)
-    real = sharing._pending.note
+    real = sharing._reminders.schedule
     times = 0
 
     async def meanwhile(what: str, due_ms: int) -> Any:
@@ -416,7 +416,7 @@ def test_a_share_that_is_extended_at_its_very_end_goes_on(
             await sharing.put(who, shared, await sharing.person("bert"), Role.OPERATOR, None)
         return await real(what, due_ms)
 
-    monkeypatch.setattr(sharing._pending, "note", meanwhile)
+    monkeypatch.setattr(sharing._reminders, "schedule", meanwhile)
     cloud.sweep()
     assert times > 1
     assert devices(bert) == {robot.device: "operator"}

@@ -173,7 +173,7 @@ def test_the_queue_of_one_device_over_two_instances_and_what_leaving_ends(clouds
             places[4]: ("failed", "unpaired"),
         }
         for row in rows:
-            one.run(one.functions.forget.row(CONTROL, robot.device, row.key, due_ms=1))
+            one.run(one.functions.retention.delete_row_at(CONTROL, robot.device, row.key, due_ms=1))
         other.sweep()
         left = one.run(one.functions.tables.query(CONTROL, robot.device, first="action:", last="action;"))
         assert left.rows == ()

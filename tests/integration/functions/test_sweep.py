@@ -150,7 +150,7 @@ def test_two_timers_at_once_do_no_harm(cloud: Cloud, pair: Pair) -> None:
     async def together() -> None:
         import asyncio
 
-        await asyncio.gather(*(cloud.functions.sweep.run() for _ in range(4)))
+        await asyncio.gather(*(cloud.functions.scheduler.run_due_jobs() for _ in range(4)))
 
     for _ in range(8):
         cloud.clock.advance(1)

@@ -110,7 +110,7 @@ class TestWatching:
         assert looks(people[4], robot) == []
         assert rows(alone, robot) == 1, "what was over is tidied up by who comes"
         clock.advance(3 * 3600)
-        alone.run(alone.functions.forget.run(clock.now_ms()))
+        alone.run(alone.functions.retention.delete_due(clock.now_ms()))
         assert rows(alone, robot) == 0
 
     def test_what_is_said_again_at_once_writes_nothing(self, alone: Cloud, clock: MovingClock) -> None:

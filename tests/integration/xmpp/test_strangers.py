@@ -110,7 +110,7 @@ class TestLogin:
             assert not client.opened
 
     def test_without_an_xmpp_server_there_are_no_passwords_and_it_says_so(self, anna: Person, site: XmppSite) -> None:
-        access = site.cloud.functions.xmpp_access
+        access = site.cloud.functions.xmpp_credentials
         domain, access._domain = access._domain, ""
         try:
             answer = anna.post("/xmpp/credentials", {"purpose": "watch"})

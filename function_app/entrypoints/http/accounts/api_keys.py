@@ -10,7 +10,7 @@ from function_app.entrypoints.http.accounts import schemas_api_keys as contract
 from function_app.entrypoints.http.framework.authentication import Caller
 from function_app.entrypoints.http.framework.responses import answer, empty, read
 from function_app.entrypoints.http.framework.routing import Routes
-from function_app.services.accounts.api_keys import Wanted
+from function_app.services.accounts.api_keys import ApiKeyRequest
 
 
 def router(functions: Functions, caller: Caller) -> Routes:
@@ -41,7 +41,7 @@ def router(functions: Functions, caller: Caller) -> Routes:
         """
         who = await caller.account(request)
         asked: contract.ApiKeyRequest = await read(request, contract.ApiKeyRequest)
-        wanted = Wanted(label=asked.name, most=Role(asked.role), only=asked.only, days=asked.days)
+        wanted = ApiKeyRequest(label=asked.name, most=Role(asked.role), only=asked.only, days=asked.days)
         key, token = await functions.api_keys.make(who, wanted)
         body = contract.ApiKeyMade(api_key=_show(key, functions.clock.now_ms()), token=token)
         return answer(body, 201, {"Cache-Control": "no-store"})

@@ -10,7 +10,7 @@ from function_app.entrypoints.http.accounts import schemas_audit as contract
 from function_app.entrypoints.http.framework.authentication import Caller
 from function_app.entrypoints.http.framework.responses import answer
 from function_app.entrypoints.http.framework.routing import Cursor, Limit, Routes
-from function_app.services.audit.audit_reader import Wanted
+from function_app.services.audit.audit_reader import AuditFilter
 
 On = Annotated[str | None, Query(max_length=200, description="Only on this device, agent, …, by its id.")]
 What = Annotated[str | None, Query(max_length=60, description="Only of this kind, such as `control-taken`.")]
@@ -42,8 +42,8 @@ def router(functions: Functions, caller: Caller) -> Routes:
         every Stop, claim, share, key and sign-in. Each record's hash covers the one before it.
         """  # noqa: D205
         who = await caller.account(request)
-        wanted = Wanted(what=what, on=on, since_ms=since, until_ms=until)
-        records, following = await functions.trail.read(who, wanted, cursor=cursor, limit=limit)
+        wanted = AuditFilter(what=what, on=on, since_ms=since, until_ms=until)
+        records, following = await functions.audit_reader.read(who, wanted, cursor=cursor, limit=limit)
         items = tuple(
             contract.AuditRecordOut(
                 seq=record["seq"],

@@ -6,7 +6,7 @@ from function_app.entrypoints.http.accounts import schemas as contract
 from function_app.entrypoints.http.framework.authentication import COOKIE
 from function_app.entrypoints.http.framework.client_address import client_address
 from function_app.entrypoints.http.framework.responses import answer
-from function_app.services.identity.sessions import From, SignedIn
+from function_app.services.identity.sessions import SignedIn, SignInOrigin
 from function_app.settings import Settings
 
 
@@ -38,9 +38,9 @@ def signed_in(settings: Settings, done: SignedIn, status: int = 200) -> Response
     return answer(body, status, {"Set-Cookie": set_session(settings, done), "Cache-Control": "no-store"})
 
 
-def whence(request: Request, settings: Settings) -> From:
+def whence(request: Request, settings: Settings) -> SignInOrigin:
     """Whence somebody signs in."""
-    return From(client_address(request, settings.trusted_proxies), request.headers.get("user-agent", ""))
+    return SignInOrigin(client_address(request, settings.trusted_proxies), request.headers.get("user-agent", ""))
 
 
 def _session(settings: Settings, value: str, lifetime_s: int) -> str:

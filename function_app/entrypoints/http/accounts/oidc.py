@@ -11,7 +11,7 @@ from function_app.entrypoints.http.accounts.cookies import secure, set_session, 
 from function_app.entrypoints.http.framework.authentication import refuse_other_sites
 from function_app.entrypoints.http.framework.responses import answer, read
 from function_app.entrypoints.http.framework.routing import PREFIX, Routes
-from function_app.services.accounts.oidc_sign_in import BEGUN_S, Begun, Returned
+from function_app.services.accounts.oidc_sign_in import BEGUN_S, OidcCallback, OidcRedirect
 from function_app.settings import Settings
 
 COOKIE = "telescope_sign_in"
@@ -86,7 +86,7 @@ def router(functions: Functions) -> Routes:
         shows, and does not send it with the next step of a way that began at another site. It need not: the page is the
         same for everybody, and what it asks for then is asked by our own site.
         """
-        returned = Returned(state, code, request.cookies.get(COOKIE, ""), iss, error)
+        returned = OidcCallback(state, code, request.cookies.get(COOKIE, ""), iss, error)
         try:
             done = await functions.open_id.finish(returned, whence(request, settings))
         except Problem as problem:
@@ -99,7 +99,7 @@ def router(functions: Functions) -> Routes:
     return routes
 
 
-def _mark(settings: Settings, begun: Begun) -> str:
+def _mark(settings: Settings, begun: OidcRedirect) -> str:
     mark = f"{COOKIE}={begun.secret}; Path={PREFIX}{_PATH}; Max-Age={BEGUN_S}; HttpOnly; SameSite=Lax"
     return mark + secure(settings)
 

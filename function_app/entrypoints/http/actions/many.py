@@ -37,7 +37,7 @@ def router(functions: Functions, caller: Caller) -> Routes:
             raise invalid("A device is named twice.")
         if not asked.epochs.keys() <= set(asked.devices):
             raise invalid("epochs names a device that devices does not.")
-        found = await functions.fleet.start(who, asked.devices, start_of(asked, once), epochs=asked.epochs)
+        found = await functions.start_many.start(who, asked.devices, start_of(asked, once), epochs=asked.epochs)
         items = await asyncio.gather(*(item(each) for each in found))
         refused = any(isinstance(each.result, Problem) for each in found)
         there = all(each.there for each in found)

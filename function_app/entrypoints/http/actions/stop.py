@@ -8,7 +8,7 @@ from function_app.entrypoints.http.framework.authentication import Caller
 from function_app.entrypoints.http.framework.responses import answer, problem_type, read_or
 from function_app.entrypoints.http.framework.routing import Routes
 from function_app.entrypoints.http.framework.schemas import Problem as Refusal
-from function_app.services.actions.stop import Stopped
+from function_app.services.actions.stop import StopResult
 
 
 def router(functions: Functions, caller: Caller) -> Routes:
@@ -74,12 +74,12 @@ def router(functions: Functions, caller: Caller) -> Routes:
     return routes
 
 
-def _all(found: list[Stopped]) -> Response:
+def _all(found: list[StopResult]) -> Response:
     items = tuple(_item(each) for each in found)
     return answer(contract.StopOut(items=items), 200 if all(item.confirmed for item in items) else 207)
 
 
-def _item(found: Stopped) -> contract.StopItem:
+def _item(found: StopResult) -> contract.StopItem:
     why = found.problem
     told = None
     if why is not None:

@@ -53,7 +53,7 @@ def _holding(routes: Routes, functions: Functions, caller: Caller) -> None:
         over = asked.reason.strip() if asked.take_over else ""
         if asked.take_over and (not over or asked.epoch is not None):
             raise invalid("take_over wants a reason, which the one who had control will read, and no epoch.")
-        lease, confirmed = await functions.leases.take(
+        lease, confirmed = await functions.leases.acquire(
             who, device, epoch=asked.epoch, lease_ms=asked.lease_ms, wait_ms=asked.wait_ms, over=over
         )
         body = contract.LeaseGranted(
@@ -96,7 +96,7 @@ def _asking(routes: Routes, functions: Functions, caller: Caller) -> None:
         """
         who = await caller.account(request)
         wanted = await read_or(request, contract.AskForControl, contract.AskForControl())
-        lease, asked, fresh, shown = await functions.handovers.ask(
+        lease, asked, fresh, shown = await functions.control_requests.create(
             who, device, within_ms=wanted.within_ms, lease_ms=wanted.lease_ms, wait_ms=wanted.wait_ms
         )
         now_ms = functions.clock.now_ms()
@@ -114,7 +114,7 @@ def _asking(routes: Routes, functions: Functions, caller: Caller) -> None:
     async def get_control_request(request: Request, device: str, request_id: str) -> Response:
         """The last one is known, whatever has become of it."""
         who = await caller.account(request)
-        lease, asked = await functions.handovers.get(who, device, request_id)
+        lease, asked = await functions.control_requests.get(who, device, request_id)
         return answer(serializers.control_request(asked, lease, who, functions.clock.now_ms()))
 
     @routes.add(
@@ -130,7 +130,9 @@ def _asking(routes: Routes, functions: Functions, caller: Caller) -> None:
         """Only by who has control. In one write the next epoch is the asker's; what moves is held."""
         who = await caller.account(request)
         wanted = await read_or(request, contract.AcceptRequest, contract.AcceptRequest())
-        lease, asked, confirmed = await functions.handovers.accept(who, device, request_id, wait_ms=wanted.wait_ms)
+        lease, asked, confirmed = await functions.control_requests.accept(
+            who, device, request_id, wait_ms=wanted.wait_ms
+        )
         now_ms = functions.clock.now_ms()
         body = contract.ControlHandedOver(
             request=serializers.control_request(asked, lease, who, now_ms), epoch=asked.epoch + 1, confirmed=confirmed
@@ -147,7 +149,7 @@ def _asking(routes: Routes, functions: Functions, caller: Caller) -> None:
     async def refuse_control_request(request: Request, device: str, request_id: str) -> Response:
         """Only by who has control."""
         who = await caller.account(request)
-        lease, asked = await functions.handovers.refuse(who, device, request_id)
+        lease, asked = await functions.control_requests.reject(who, device, request_id)
         return answer(serializers.control_request(asked, lease, who, functions.clock.now_ms()))
 
     @routes.add(
@@ -159,5 +161,5 @@ def _asking(routes: Routes, functions: Functions, caller: Caller) -> None:
     )
     async def withdraw_control_request(request: Request, device: str, request_id: str) -> Response:
         """Only by who asked. 409 when it was accepted: control is theirs then, to be given back."""
-        await functions.handovers.withdraw(await caller.account(request), device, request_id)
+        await functions.control_requests.withdraw(await caller.account(request), device, request_id)
         return empty()

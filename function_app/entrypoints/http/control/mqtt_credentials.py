@@ -11,7 +11,7 @@ from function_app.entrypoints.http.control import schemas_broker as contract
 from function_app.entrypoints.http.framework.authentication import Caller
 from function_app.entrypoints.http.framework.responses import answer, read
 from function_app.entrypoints.http.framework.routing import Routes
-from function_app.services.control.mqtt_credentials import Issued
+from function_app.services.control.mqtt_credentials import IssuedCredentials
 
 
 def router(functions: Functions, caller: Caller) -> Routes:
@@ -57,7 +57,7 @@ def router(functions: Functions, caller: Caller) -> Routes:
         )
         return answer(body, headers={"Cache-Control": "no-store"})
 
-    async def _issue(request: Request, asked: Any, agent: Agent | None) -> Issued:
+    async def _issue(request: Request, asked: Any, agent: Agent | None) -> IssuedCredentials:
         if agent is not None:
             return await functions.mqtt_credentials.agent(agent)
         who = await caller.account(request)

@@ -70,7 +70,7 @@ def _named_and_seen(routes: Routes, functions: Functions, caller: Caller) -> Non
                 mine=other.account == who.account,
                 since=rfc3339(other.since_ms),
             )
-            for other in await functions.watchers.watch(who, device)
+            for other in await functions.viewers.mark(who, device)
         )
         return answer(contract.WatchersOut(items=others, again_ms=_AGAIN_MS))
 
@@ -83,5 +83,5 @@ def _named_and_seen(routes: Routes, functions: Functions, caller: Caller) -> Non
     )
     async def unwatch_device(request: Request, device: str) -> Response:
         """Of this sign-in. Whoever says nothing is gone after 25 s too."""
-        await functions.watchers.leave(await caller.account(request), device)
+        await functions.viewers.leave(await caller.account(request), device)
         return empty()

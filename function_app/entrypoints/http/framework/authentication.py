@@ -11,8 +11,8 @@ from function_app.domain.identity.accounts import Identity
 from function_app.domain.identity.api_keys import PREFIX as KEY_PREFIX
 from function_app.entrypoints.http.framework.routing import takes_keys
 from function_app.services.accounts.api_keys import ApiKeys
-from function_app.services.identity.authenticator import API, Identify
-from function_app.services.identity.rate_limiter import Limits
+from function_app.services.identity.authenticator import API, Authenticator
+from function_app.services.identity.rate_limiter import RateLimiter
 
 COOKIE = "telescope_session"
 CSRF_HEADER = "X-CSRF-Token"
@@ -23,8 +23,8 @@ _READING = frozenset({"GET", "HEAD", "OPTIONS"})
 class Caller:
     """Finds out who makes a request."""
 
-    def __init__(self, identify: Identify, api_keys: ApiKeys, limits: Limits) -> None:
-        self._identify = identify
+    def __init__(self, authenticator: Authenticator, api_keys: ApiKeys, limits: RateLimiter) -> None:
+        self._authenticator = authenticator
         self._api_keys = api_keys
         self._limits = limits
 
@@ -41,7 +41,7 @@ class Caller:
             if not takes_keys(request.scope.get("route")):
                 raise forbidden("An API key may not do this. Sign in, and do it yourself.")
         elif token:
-            who = await self._identify.person(token, API)
+            who = await self._authenticator.person(token, API)
         else:
             who, _ = await self.page(request)
         if not is_stop(request):
@@ -61,7 +61,7 @@ class Caller:
         cookie = request.cookies.get(COOKIE)
         if not cookie:
             raise unauthorized("Give an access token (Authorization: Bearer …), or sign in.")
-        who, csrf = await self._identify.page(cookie)
+        who, csrf = await self._authenticator.page(cookie)
         if request.method not in _READING:
             shown = request.headers.get(CSRF_HEADER, "")
             if not csrf or not hmac.compare_digest(shown.encode(), csrf.encode()):
@@ -77,7 +77,7 @@ class Caller:
         Raises:
             Problem: ``unauthorized``.
         """
-        agent = await self._identify.agent(bearer(request))
+        agent = await self._authenticator.agent(bearer(request))
         self._limits.admit("agent", agent.id)
         return agent
 
@@ -87,7 +87,7 @@ class Caller:
         Raises:
             Problem: ``unauthorized``.
         """
-        return await self._identify.enrolling(bearer(request), public_key)
+        return await self._authenticator.enrolling(bearer(request), public_key)
 
 
 def refuse_other_sites(request: Request) -> None:

@@ -72,7 +72,7 @@ def router(functions: Functions, caller: Caller) -> Routes:
         asking = await _asking(request, agent)
         require_claimed(asking)
         asked: contract.MessagesRequest = await read(request, contract.MessagesRequest)
-        await functions.polling.seen(asking)  # first: what it says of itself counts more
+        await functions.polling.mark_online(asking)  # first: what it says of itself counts more
         told = [(each.topic, bytes(each.payload)) for each in asked.messages]
         results = (
             contract.ToldOut(status="stored" if why is None else "refused", detail=why and f"{why.rstrip('.')}.")

@@ -35,10 +35,10 @@ def router(functions: Functions, caller: Caller) -> Routes:
         space: str | None = None
         if isinstance(asked, AgentRequest):
             agent = await caller.agent(request)
-            given = await functions.xmpp_access.agent(agent)
+            given = await functions.xmpp_credentials.agent(agent)
             space = agent.space
         else:
-            given = await functions.xmpp_access.account(await caller.account(request))
+            given = await functions.xmpp_credentials.account(await caller.account(request))
         settings = functions.settings
         news = None if space is None else await functions.keys.news()
         body = contract.XmppCredentialsOut(
@@ -68,7 +68,7 @@ def router(functions: Functions, caller: Caller) -> Routes:
     async def xmpp_verify(request: Request) -> Response:
         """Asked by the XMPP server; who has no valid password learns nothing here."""
         asked: contract.VerifyRequest = await read(request, contract.VerifyRequest)
-        found = await functions.xmpp_access.verify(asked.user, asked.password)
+        found = await functions.xmpp_credentials.verify(asked.user, asked.password)
         body = contract.AdmittedOut(
             user=found.user,
             name=found.name,

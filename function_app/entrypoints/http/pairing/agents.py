@@ -97,7 +97,7 @@ def router(functions: Functions, caller: Caller) -> Routes:
         """Where the broker wants certificates of agents. It ends with the pairing."""
         agent = await caller.agent(request)
         asked: contract.CertificateRequest = await read(request, contract.CertificateRequest)
-        issued = await functions.certify.certify(agent, asked.request)
+        issued = await functions.agent_certificates.certify(agent, asked.request)
         return answer(contract.CertificateOut(chain=issued.chain, expires_at=rfc3339(issued.expires_ms)))
 
     @routes.add(

@@ -31,7 +31,7 @@ def router(functions: Functions, caller: Caller) -> Routes:
         """
         who = await caller.account(request)
         asked: contract.TypeLookRequest = await read(request, contract.TypeLookRequest, limit=contract.MAX_UPLOAD)
-        found = await functions.look_at_robot_type.begin(
+        found = await functions.robot_type_preview.begin(
             who, asked.manifest, asked.files, asked.movements, wait_ms=asked.wait_ms
         )
         status = 202 if found.upload.open else 201
@@ -40,7 +40,7 @@ def router(functions: Functions, caller: Caller) -> Routes:
     @routes.add("GET", _ONE, summary="How a look fares", answers={200: contract.TypePreviewOut}, problems=(404,))
     async def get_robot_type_look(request: Request, look: str) -> Response:
         """One's own."""
-        return answer(serializers.look(await functions.look_at_robot_type.get(await caller.account(request), look)))
+        return answer(serializers.look(await functions.robot_type_preview.get(await caller.account(request), look)))
 
     @routes.add(
         "GET",
@@ -51,7 +51,7 @@ def router(functions: Functions, caller: Caller) -> Routes:
     )
     async def get_robot_type_look_twin(request: Request, look: str) -> Response:
         """As of a robot type."""
-        return answer(serializers.twin(await functions.look_at_robot_type.model(await caller.account(request), look)))
+        return answer(serializers.twin(await functions.robot_type_preview.model(await caller.account(request), look)))
 
     @routes.add(
         "POST",
@@ -66,7 +66,7 @@ def router(functions: Functions, caller: Caller) -> Routes:
         """It becomes a robot type, or the next version of one, as if it were uploaded now; the look ends."""
         who = await caller.account(request)
         asked = await read_or(request, contract.SaveTypeLookRequest, contract.SaveTypeLookRequest())
-        found, new = await functions.look_at_robot_type.save(who, look, wait_ms=asked.wait_ms)
+        found, new = await functions.robot_type_preview.save(who, look, wait_ms=asked.wait_ms)
         status = 201 if new else 200
         if found.upload is not None and found.upload.open:
             status = 202
@@ -77,7 +77,7 @@ def router(functions: Functions, caller: Caller) -> Routes:
     @routes.add("DELETE", _ONE, summary="End a look", answers={204: None}, problems=(404,))
     async def delete_robot_type_look(request: Request, look: str) -> Response:
         """What it has stored goes."""
-        await functions.look_at_robot_type.drop(await caller.account(request), look)
+        await functions.robot_type_preview.drop(await caller.account(request), look)
         return empty()
 
     return routes

@@ -14,7 +14,7 @@ from function_app.entrypoints.http.framework.responses import answer, empty, rea
 from function_app.entrypoints.http.framework.routing import Routes
 from function_app.entrypoints.http.sharing import schemas as contract
 from function_app.services.sharing.invitations import Known, Offer
-from function_app.services.sharing.shares import Shared
+from function_app.services.sharing.shares import NewShare
 
 
 def router(functions: Functions, caller: Caller) -> Routes:
@@ -208,7 +208,7 @@ class _Invitations:
         await self._functions.invitations.withdraw(who, await self._of(request, kind, name), invitation)
         return empty()
 
-    async def _of(self, request: Request, kind: Kind, name: str) -> Shared:
+    async def _of(self, request: Request, kind: Kind, name: str) -> NewShare:
         who = await self._caller.account(request)
         if kind == "agent":
             return await self._functions.invitations.agent(who, name)
@@ -217,7 +217,7 @@ class _Invitations:
     async def _id(self, asked: contract.InvitationRequest | contract.TransferRequest) -> str:
         return (await self._functions.sharing.person(asked.account)).id if asked.account is not None else ""
 
-    async def _make(self, who: Identity, shared: Shared, offer: Offer) -> Response:
+    async def _make(self, who: Identity, shared: NewShare, offer: Offer) -> Response:
         secret, known = await self._functions.invitations.make(who, shared, offer)
         link = f"{self._functions.settings.public_url}/#invitation={secret}"
         body = contract.InvitationMade(**_shown(known), secret=secret, link=link)

@@ -12,7 +12,7 @@ from function_app.entrypoints.http.framework.responses import answer, empty, rea
 from function_app.entrypoints.http.framework.routing import Routes
 from function_app.entrypoints.http.telemetry import schemas_latency as contract
 from function_app.services.devices.device_access import devices_of, require_operator
-from function_app.services.telemetry.latency import Found, Path, Samples, Transport
+from function_app.services.telemetry.latency import LatencySeries, Path, Samples, Transport
 
 Key = Annotated[
     str | None,
@@ -108,7 +108,7 @@ def _samples(asked: contract.LatencyRequest | contract.AgentLatencyRequest) -> S
     return Samples(asked.transport, asked.path, tuple((sample.at_ms, sample.ms) for sample in asked.samples))
 
 
-def _show(found: Found, samples: int) -> contract.LatencyOut:
+def _show(found: LatencySeries, samples: int) -> contract.LatencyOut:
     known = found.histogram
     recent = found.recent[len(found.recent) - min(samples, len(found.recent)) :]
     measures: dict[str, Any] = dict.fromkeys(

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from function_app.domain.common.problems import Problem
 from function_app.domain.common.rate_limit import Rate, request
 from function_app.services.identity import rate_limiter
-from function_app.services.identity.rate_limiter import BURST_S, Limits
+from function_app.services.identity.rate_limiter import BURST_S, RateLimiter
 from tests.harness.cloud.cloud import API, Cloud, MovingClock, problem, settings
 
 RATE = Rate(per_s=10, burst=30)
@@ -52,7 +52,7 @@ def test_rate_zero_is_no_limit() -> None:
 
 def test_of_many_names_the_newest_are_remembered(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(rate_limiter, "KNOWN", 10)
-    known = Limits(per_s={"address": 1, "account": 1, "key": 1, "agent": 1}, clock=MovingClock())
+    known = RateLimiter(per_s={"address": 1, "account": 1, "key": 1, "agent": 1}, clock=MovingClock())
     for number in range(1000):
         known.admit("address", str(number))
     assert len(known._arrivals) == 10

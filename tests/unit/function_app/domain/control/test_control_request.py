@@ -29,13 +29,13 @@ def kinds(before: Lease | None, after: Lease, now_ms: int = START) -> list[Fact]
 
 
 def how(known: Lease, now_ms: int) -> str:
-    assert known.asked is not None
-    return known.asked.how(known, now_ms)
+    assert known.request is not None
+    return known.request.current_outcome(known, now_ms)
 
 
 def test_to_ask_changes_nothing_about_the_lease() -> None:
     asked = ask(HELD)
-    assert replace(asked, asked=None) == HELD
+    assert replace(asked, request=None) == HELD
     assert how(asked, START + 9_999) == "open"
     assert how(asked, START + 10_000) == "lapsed"
     assert ask(asked) is asked
@@ -47,7 +47,7 @@ def test_to_ask_changes_nothing_about_the_lease() -> None:
 def test_an_accepted_request_is_a_new_lease() -> None:
     given_ = control_request.accept(ask(HELD), ANNA, request="r1", now_ms=START + 5)
     assert (given_.epoch, given_.holder, given_.expires_ms, given_.pairing) == (2, "bert", START + 20_005, "p")
-    assert given_.mine(BERT)
+    assert given_.held_by(BERT)
     assert kinds(ask(HELD), given_) == [Fact.HANDED_OVER]
     assert control_request.accept(given_, ANNA, request="r1", now_ms=START + 6) is given_
 
@@ -143,7 +143,7 @@ STEPS = ("take", "over", "renew", "release", "reset", "ask", "accept", "refuse",
 
 
 def act(what: str, known: Lease | None, who: Identity, *, now_ms: int, fresh: str) -> Lease:
-    request = known.asked.id if known is not None and known.asked is not None else "none"
+    request = known.request.id if known is not None and known.request is not None else "none"
     epoch = known.epoch if known is not None else 1
     match what:
         case "take" | "over":
@@ -189,8 +189,8 @@ def test_whatever_is_done_at_once_each_request_has_one_end_and_control_passes_on
         if known is not before:
             told += lease_changes(before, known, by=who.name, now_ms=now_ms)
         _see(before, known, what, who, now_ms)
-        if known.asked is not None and (end := known.asked.how(known, now_ms)) != "open":
-            assert ends.setdefault(known.asked.id, end) == end, "it had another end before"
+        if known.request is not None and (end := known.request.current_outcome(known, now_ms)) != "open":
+            assert ends.setdefault(known.request.id, end) == end, "it had another end before"
     ids = [happened.id for happened in told]
     assert len(ids) == len(set(ids)), "told twice in two batches"
     assert not [each for each in told if each.fact is Fact.HANDED_OVER and ends[each.data["request"]] != "accepted"]
@@ -201,10 +201,10 @@ def _see(before: Lease | None, after: Lease, what: str, who: Identity, now_ms: i
         return
     assert after.epoch - before.epoch in {0, 1}
     passed = (
-        before.live(now_ms) and after.account and (after.account, after.session) != (before.account, before.session)
+        before.is_live(now_ms) and after.account and (after.account, after.session) != (before.account, before.session)
     )
     if passed:
         assert after.epoch == before.epoch + 1, "fenced"
-        assert what == "over" or (what == "accept" and before.mine(who)), "only the holder or an owner passes it on"
+        assert what == "over" or (what == "accept" and before.held_by(who)), "only the holder or an owner passes it on"
     if what in {"ask", "refuse", "withdraw"}:
-        assert replace(after, asked=None) == replace(before, asked=None)
+        assert replace(after, request=None) == replace(before, request=None)

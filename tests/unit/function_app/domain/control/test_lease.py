@@ -25,8 +25,8 @@ def take(lease: Lease | None, who: Identity, now_ms: int = START, lease_ms: int 
 def test_the_first_lease_has_epoch_1_and_ends_on_time() -> None:
     lease = take(None, ANNA)
     assert (lease.epoch, lease.holder, lease.expires_ms) == (1, "anna", START + 1_000)
-    assert lease.live(START + 999)
-    assert not lease.live(START + 1_000)
+    assert lease.is_live(START + 999)
+    assert not lease.is_live(START + 1_000)
 
 
 def test_the_holder_who_takes_again_gets_the_next_epoch() -> None:
@@ -75,8 +75,8 @@ def test_a_lease_that_never_was_is_lost() -> None:
 
 def test_a_released_lease_is_nobodys_and_keeps_its_epoch() -> None:
     free = rules.release(take(take(None, ANNA), ANNA), now_ms=START)
-    assert not free.live(START)
-    assert not any(free.mine(who) for who in EVERYBODY)
+    assert not free.is_live(START)
+    assert not any(free.held_by(who) for who in EVERYBODY)
     assert take(free, BERT).epoch == 3
 
 
@@ -113,5 +113,5 @@ def test_whatever_happens_epochs_rise_and_a_live_lease_stays_with_its_holder(ste
             assert lease is before
         if before is not None and lease is not None:
             assert lease.epoch >= before.epoch
-            if before.live(now_ms) and not before.mine(who):
+            if before.is_live(now_ms) and not before.held_by(who):
                 assert lease == before

@@ -74,7 +74,11 @@ def without_store(cloud: Cloud) -> Any:
     tables: Any = BrokenTables()
     own = cloud.functions
     presence = PresenceIngest(
-        tables=tables, events=own.events, conditions=own.conditions, keys=own.presence._keys, clock=cloud.clock
+        tables=tables,
+        events=own.events,
+        reported_faults=own.reported_faults,
+        key_announcer=own.presence._key_announcer,
+        clock=cloud.clock,
     )
     return replace(cloud.functions, presence=presence)
 
@@ -148,7 +152,7 @@ class TestTelemetry:
     @pytest.fixture
     def batches(self, cloud: Cloud, monkeypatch: pytest.MonkeyPatch) -> list[int]:
         """How many samples each write into a series had."""
-        writer, sizes = cloud.functions.intake._writer, list[int]()
+        writer, sizes = cloud.functions.telemetry_ingest._writer, list[int]()
         add = writer.add
 
         async def counted(place: Any, samples: Any) -> Any:

@@ -19,7 +19,7 @@ def test_what_would_be_checked_again_anyway_is_not_kept(tmp_path: Path) -> None:
 async def _kept(tmp_path: Path) -> None:
     clock = MovingClock()
     functions = bootstrap.build(settings.read({"TELESCOPE_HOME": str(tmp_path)}), clock=clock)
-    identify = functions.identify
+    identify = functions.authenticator
     who = Identity("account", "ann", "session", until_ms=clock.now_ms() + 3_600_000)
     early = [await identify.issue(who, API, 600) for _ in range(5)]
     for token in early:

@@ -13,7 +13,7 @@ from function_app.domain.devices.devices import Device
 from function_app.domain.identity.accounts import Role
 from function_app.ports.broker_access import ServiceCredentials
 from function_app.services.messaging.broker_relay import BrokerRelay
-from function_app.services.messaging.delivery import Delivery, Signed
+from function_app.services.messaging.delivery import Delivery, SignedCommand
 from function_app.services.messaging.mailbox import Mailbox
 from function_app.services.storage.retention import Retention
 
@@ -26,24 +26,24 @@ ARM = Device(
 class Busy(Mailbox):
     """Something happens in it just after each look."""
 
-    async def answered(self, agent: str, command: str) -> None:
+    async def stored_answer(self, agent: str, command: str) -> None:
         asyncio.get_running_loop().call_soon(self._ring, agent)
-        assert await super().answered(agent, command) is None
+        assert await super().stored_answer(agent, command) is None
 
 
 async def confirmed(folder: Path, wait_ms: int) -> bool:
     tables = SqliteTables(folder / "tables.sqlite")
     forget = Retention(tables=tables, blobs=FileBlobs(folder / "blobs"))
-    mailbox = Busy(tables=tables, forget=forget, clock=SystemClock())
+    mailbox = Busy(tables=tables, retention=forget, clock=SystemClock())
     bus = MqttCommandBus(
         Broker(host="127.0.0.1", port=1, credentials=lambda: ServiceCredentials("c", "u", "p", math.inf))
     )
-    signed = Signed("aaaaaaaaaa-arm-00000000000000000000", b"{}", SystemClock().now_ms() + 5_000)
+    signed = SignedCommand("aaaaaaaaaa-arm-00000000000000000000", b"{}", SystemClock().now_ms() + 5_000)
     try:
         async with asyncio.timeout(20):
-            return await Delivery(bus=bus, mailbox=mailbox, relay=BrokerRelay(bus=bus, clock=SystemClock())).confirmed(
-                ARM, signed, wait_ms=wait_ms
-            )
+            return await Delivery(
+                bus=bus, mailbox=mailbox, relay=BrokerRelay(bus=bus, clock=SystemClock())
+            ).send_confirmed(ARM, signed, wait_ms=wait_ms)
     finally:
         await tables.close()
 

@@ -43,9 +43,9 @@ async def flip_each(name: str, home: Path, *, stride: int) -> tuple[int, int]:
             in_files += 1
 
     # What a row keeps of it, as text. A number may be written in two ways: the same one is no change.
-    row = {"manifest": good.manifest, "seal": records.fields(good.seal)}
+    row = {"manifest": good.manifest, "seal": records.to_data(good.seal)}
     stored = json.dumps(row).encode()
-    rest = {**records.fields(good), "manifest": {}, "seal": {}}
+    rest = {**records.to_data(good), "manifest": {}, "seal": {}}
     in_rows = 0
     for place in range(0, len(stored), stride):
         for bit in (0x01, 0x10):

@@ -7,14 +7,14 @@ import pytest
 from device_agent.protocol.documents.script_api import script_api
 from device_agent.protocol.manifests import robot_type
 from device_agent.sandbox.api_document import document
-from function_app.services.robot_types.script_linter import Mark, check_script
+from function_app.services.robot_types.script_linter import LintMessage, check_script
 from tests.harness.paths import ROBOTS
 
 UR5 = robot_type.load(ROBOTS / "ur5")
 NAO = robot_type.load(ROBOTS / "nao")
 
 
-def marks(source: str, kind: robot_type.RobotType = UR5) -> tuple[Mark, ...]:
+def marks(source: str, kind: robot_type.RobotType = UR5) -> tuple[LintMessage, ...]:
     return check_script(source, kind).marks
 
 
