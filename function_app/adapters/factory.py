@@ -26,10 +26,10 @@ from function_app.ports.broker_access import BrokerAccess, BrokerAccessError
 from function_app.ports.certificates import Certificates
 from function_app.ports.clock import Clock
 from function_app.ports.command_bus import CommandBus
-from function_app.ports.device_feed import Feed, Telemetry
-from function_app.ports.oidc_provider import OpenId
-from function_app.ports.password_hasher import PasswordHashes
-from function_app.ports.robot_catalogue import Catalogue
+from function_app.ports.device_feed import DeviceFeed, TelemetryFeed
+from function_app.ports.oidc_provider import OidcProvider
+from function_app.ports.password_hasher import PasswordHasher
+from function_app.ports.robot_catalogue import RobotCatalogue
 from function_app.ports.tables import StoreError, Tables
 from function_app.settings import AwsStore, AzureStore, EventGridBus, IotBus, KeyVault, SecretsManager, Settings
 
@@ -49,12 +49,12 @@ class Adapters:
     transfers: Transfers | None
     access: BrokerAccess
     bus: CommandBus
-    feed: Feed
-    telemetry: Telemetry
-    late: Telemetry
+    feed: DeviceFeed
+    telemetry: TelemetryFeed
+    late: TelemetryFeed
     certificates: Certificates
-    password_hashes: PasswordHashes
-    catalogue: Catalogue
+    password_hashes: PasswordHasher
+    catalogue: RobotCatalogue
 
 
 def adapters(settings: Settings, clock: Clock) -> Adapters:
