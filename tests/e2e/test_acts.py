@@ -65,7 +65,7 @@ def test_the_arm_moves_to_a_pose_and_back(browser: Browser, laboratory: Machine)
         assert abs(joint(laboratory, "ur5", "elbow") - before["elbow"]) > 0.02
         # The second joint is where the robot has the frame of the first, after Denavit and Hartenberg.
         told = frame(page, 0)
-        page.get_by_text("Every joint", exact=True).click()
+        page.get_by_text("All joints", exact=True).click()
         expect(page.get_by_test_id("poses").locator("tbody tr")).to_have_count(6)
         assert frame(page, 1) == pytest.approx(told, abs=0.002)
         assert_good_page(page, "arm")

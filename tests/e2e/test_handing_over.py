@@ -59,8 +59,8 @@ def take(page: Page) -> None:
 def ask(asker: Page, holder: Page) -> None:
     take(holder)
     asker.get_by_test_id("ask-control").click()
-    expect(holder.get_by_test_id("asks")).to_contain_text("asks you for control", timeout=PATIENCE_MS)
-    expect(asker.get_by_test_id("asked")).to_contain_text("You ask demo for control", timeout=PATIENCE_MS)
+    expect(holder.get_by_test_id("asks")).to_contain_text("requests control", timeout=PATIENCE_MS)
+    expect(asker.get_by_test_id("asked")).to_contain_text("You requested control from demo", timeout=PATIENCE_MS)
 
 
 def elbow(machine: Machine) -> float:
@@ -105,7 +105,7 @@ def test_control_goes_from_hand_to_hand_and_who_watches_is_seen(two: tuple[Page,
     ask(carol, demo)
     carol.get_by_test_id("withdraw-request").press("Enter")
     expect(demo.get_by_test_id("accept-request")).to_have_count(0, timeout=PATIENCE_MS)
-    expect(carol.get_by_test_id("asked")).to_contain_text("You ask no longer", timeout=PATIENCE_MS)
+    expect(carol.get_by_test_id("asked")).to_contain_text("You withdrew your request", timeout=PATIENCE_MS)
 
     # Asked, and handed over: the one's sliders are dead, the other's move the arm without another click.
     ask(carol, demo)
@@ -113,7 +113,7 @@ def test_control_goes_from_hand_to_hand_and_who_watches_is_seen(two: tuple[Page,
     expect_state(demo, "handed")
     expect(demo.get_by_test_id("slider-elbow")).to_be_disabled()
     expect_state(carol, "mine")
-    expect(carol.get_by_test_id("asked")).to_contain_text("demo handed control to you")
+    expect(carol.get_by_test_id("asked")).to_contain_text("demo handed control over to you")
     move_the_elbow(carol, machine)
     expect(demo.get_by_test_id("slider-elbow")).to_be_disabled()
 
@@ -144,6 +144,6 @@ def test_silence_takes_control_from_nobody(two: tuple[Page, Page]) -> None:
     demo, carol = two
     carol.route("**/lease/requests", shorter)
     ask(carol, demo)
-    expect(carol.get_by_test_id("asked")).to_contain_text("did not answer in time", timeout=PATIENCE_MS)
+    expect(carol.get_by_test_id("asked")).to_contain_text("did not respond in time", timeout=PATIENCE_MS)
     expect(demo.get_by_test_id("accept-request")).to_have_count(0, timeout=PATIENCE_MS)
     demo.get_by_test_id("release-control").click()

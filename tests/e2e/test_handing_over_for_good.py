@@ -12,7 +12,7 @@ ROOM = "Annex"
 
 def offer(page: Page, to: str) -> str:
     """Fill in the form that is open, and give the link."""
-    page.get_by_label("Name of their account").fill(to)
+    page.get_by_label("Account name").fill(to)
     page.get_by_test_id("transfer-send").click()
     expect(page.get_by_test_id("invitation-link")).to_be_visible(timeout=PATIENCE_MS)
     return page.get_by_test_id("invitation-link").input_value()
@@ -35,19 +35,19 @@ def test_a_room_is_offered_taken_back_offered_anew_and_taken_over(browser: Brows
         expect(berta.get_by_test_id("signed-in")).to_be_visible(timeout=PATIENCE_MS)
         ann.goto(f"{machine.url}/#/spaces/{room}")
         ann.get_by_test_id("transfer").click()
-        expect(ann.get_by_test_id("transfer-terms")).to_contain_text("You cannot undo that")
-        ann.get_by_label("Name of their account").fill("nobody of that name")
+        expect(ann.get_by_test_id("transfer-terms")).to_contain_text("you cannot undo the transfer")
+        ann.get_by_label("Account name").fill("nobody of that name")
         ann.get_by_test_id("transfer-send").click()
         expect(ann.locator("#transfer-answer")).not_to_be_empty(timeout=PATIENCE_MS)
-        expect(ann.get_by_label("Name of their account")).to_have_value("nobody of that name")  # nothing is lost
+        expect(ann.get_by_label("Account name")).to_have_value("nobody of that name")  # nothing is lost
         assert_good_page(ann, "transfer", part="transfers")
         first = offer(ann, TO)
-        ann.get_by_role("button", name="I have it").click()
+        ann.get_by_role("button", name="Done").click()
         expect(ann.get_by_test_id("transfer")).to_be_focused()
         expect(ann.get_by_test_id("offers")).to_contain_text(f"Offered to {TO}")
         assert_good_page(ann, "transfer-open", part="transfers")
         # Taken back, its link is worth nothing.
-        ann.get_by_role("button", name=f"Take back: Offered to {TO}").click()
+        ann.get_by_role("button", name=f"Revoke: Offered to {TO}").click()
         ann.get_by_test_id("confirm-yes").click()
         expect(ann.get_by_test_id("offers")).to_have_count(0, timeout=PATIENCE_MS)
         berta.goto(first)
@@ -56,13 +56,13 @@ def test_a_room_is_offered_taken_back_offered_anew_and_taken_over(browser: Brows
         # Offered anew: nothing changes before it is accepted, and then it is hers.
         ann.get_by_test_id("transfer").click()
         berta.goto(offer(ann, TO))
-        expect(berta.get_by_test_id("terms")).to_contain_text("not undo this", timeout=PATIENCE_MS)
-        expect(berta.get_by_role("heading", level=1)).to_contain_text(f"hands {ROOM} over to you")
+        expect(berta.get_by_test_id("terms")).to_contain_text("cannot undo this", timeout=PATIENCE_MS)
+        expect(berta.get_by_role("heading", level=1)).to_contain_text(f"offers you the ownership of {ROOM}")
         assert_good_page(berta, "transfer-offered")
         assert ROOM in rooms(machine, "demo")
         berta.get_by_test_id("accept").click()
         berta.get_by_test_id("confirm-yes").click()
-        expect(berta.get_by_role("heading", level=1)).to_have_text(f"{ROOM} is yours.", timeout=PATIENCE_MS)
+        expect(berta.get_by_role("heading", level=1)).to_have_text(f"You are the owner of {ROOM}.", timeout=PATIENCE_MS)
         assert ROOM in rooms(machine, TO)
         assert ROOM not in rooms(machine, "demo")
 
@@ -74,8 +74,8 @@ def test_the_bar_above_every_page_fits_a_phone_and_says_in_the_tab_which_page_it
         person(browser, machine.sign_in_link()) as ann,
     ):
         ann.set_viewport_size({"width": 390, "height": 844})
-        parts = ann.get_by_role("navigation", name="Parts of the console").get_by_role("link")
-        expect(parts).to_have_text(["Devices", "Movements", "Robot types", "Health", "Times"], timeout=PATIENCE_MS)
+        parts = ann.get_by_role("navigation", name="Main navigation").get_by_role("link")
+        expect(parts).to_have_text(["Devices", "Movements", "Robot types", "Health", "Latency"], timeout=PATIENCE_MS)
         for part in parts.all():
             box = part.bounding_box()
             assert box is not None
@@ -90,5 +90,5 @@ def test_the_bar_above_every_page_fits_a_phone_and_says_in_the_tab_which_page_it
         ann.get_by_test_id("device-row").filter(has_text="UR5").get_by_role("link").first.click()
         expect(ann).to_have_title("Universal Robots UR5 · Telescope", timeout=PATIENCE_MS)
         ann.get_by_test_id("what-do-i-see").locator("summary").click()
-        expect(ann.get_by_test_id("what-do-i-see")).to_contain_text("stale")
+        expect(ann.get_by_test_id("what-do-i-see")).to_contain_text("Stale")
         assert_good_page(ann, "device-explained", part="what-do-i-see")

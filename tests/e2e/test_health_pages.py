@@ -75,7 +75,7 @@ def seen_and_ended(page: Page, cause: Path) -> None:
     button.focus()
     page.keyboard.press("Enter")
     expect(fault).to_have_attribute("data-state", "acknowledged", timeout=PATIENCE_MS)
-    expect(fault).to_contain_text("Seen by demo")
+    expect(fault).to_contain_text("Acknowledged by demo")
     assert page.evaluate("() => document.activeElement.closest('[data-testid=fault]') !== null"), "the focus is lost"
     assert_good_page(page, "health-fault")
     cause.unlink()
@@ -84,9 +84,9 @@ def seen_and_ended(page: Page, cause: Path) -> None:
     page.get_by_text("Past", exact=True).click()
     past = page.get_by_test_id("faults-past").get_by_test_id("fault").first
     expect(past).to_have_attribute("data-state", "cleared", timeout=PATIENCE_MS)
-    expect(past).to_contain_text("Seen by demo")
+    expect(past).to_contain_text("Acknowledged by demo")
     past.locator("summary").click()
-    expect(past.locator(".event-list")).to_contain_text("Fault seen", timeout=PATIENCE_MS)
+    expect(past.locator(".event-list")).to_contain_text("Fault acknowledged", timeout=PATIENCE_MS)
 
 
 def trend(page: Page, machine: Machine, device: str) -> None:
@@ -95,11 +95,11 @@ def trend(page: Page, machine: Machine, device: str) -> None:
     page.get_by_text("10 min", exact=True).click()
     now = page.get_by_test_id("trend-now")
     wait_until(lambda: float(now.get_attribute("data-value") or "0") > 2000, "a wild value")
-    expect(now).to_contain_text("out of its limits")
+    expect(now).to_contain_text("outside its limits")
     expect(page.get_by_test_id("trend-fault")).to_have_attribute("data-code", "co2.co2_ppm", timeout=2 * PATIENCE_MS)
     row = page.get_by_test_id("watched-row").first
     expect(row).to_have_attribute("data-field", "co2.co2_ppm")
-    expect(row).to_contain_text("Beyond a limit")
+    expect(row).to_contain_text("Limit exceeded")
     expect(row).to_contain_text("Open door or window")  # as the room's manifest advises
     chart = page.get_by_test_id("series")
     wait_until(lambda: int(chart.get_attribute("data-points") or "0") > 5, "points")

@@ -72,7 +72,7 @@ def test_an_arm_s_movement_from_keyframes_to_the_robot(drawing_browser: Browser,
         page.get_by_test_id("kf-lasts").fill("0.3")
         page.get_by_test_id("kf-lasts").press("Enter")
         problem = page.get_by_test_id("kf-problem-too-fast")
-        expect(problem).to_contain_text("too fast", timeout=PATIENCE_MS)
+        expect(problem).to_contain_text("would exceed its", timeout=PATIENCE_MS)
         expect(page.get_by_test_id("kf-run")).to_be_disabled()
         page.get_by_test_id("kf-name").fill("kf-turn")
         assert_good_page(page, "keyframes-too-fast")
@@ -228,7 +228,7 @@ def test_keyframes_are_made_for_a_robot_type_without_a_robot(browser: Browser, l
         ann.get_by_test_id("new-type").select_option("nao")
         ann.get_by_test_id("new-keyframes").click()
         ann.get_by_test_id("kf-name").fill("at_ease")
-        expect(ann.get_by_text("No robot is chosen here")).to_be_visible()
+        expect(ann.get_by_text("No robot is selected")).to_be_visible()
         for part in ("kf-run", "kf-record", "stop"):
             assert ann.get_by_test_id(part).count() == 0, f"{part}: there is no robot"
         ann.get_by_test_id("kf-save").click()

@@ -254,7 +254,7 @@ def test_one_movement_runs_on_many_robots_and_all_are_stopped_at_once(
     api.http.put(f"/robot-types/ur5/movements/{name}", json={"source": SCRIPT}).raise_for_status()
     with pages(browser, machine) as (page,):
         open_script(page, machine, name)
-        page.get_by_role("button", name="Choose all").click()
+        page.get_by_role("button", name="Select all").click()
         expect(page.get_by_test_id("many-state")).to_be_visible(timeout=PATIENCE_MS)
         page.get_by_test_id("parameter-angle_rad").fill("20")
         page.get_by_test_id("run-many").click()

@@ -85,7 +85,7 @@ def test_a_robot_is_paired_by_the_link_in_its_agents_terminal(
     with machine.api() as api, person(browser, link) as page:
         known = {device["id"] for device in api.get("/devices")["items"]}
         # Nobody is signed in: the code leaves the address and is there again afterwards. Nothing is claimed by itself.
-        expect(page.get_by_text("Sign in, and you go on from there")).to_be_visible(timeout=PATIENCE_MS)
+        expect(page.get_by_text("You followed a pairing link. Sign in to continue")).to_be_visible(timeout=PATIENCE_MS)
         assert "pair=" not in page.url
         page.goto(machine.sign_in_link())
         expect(page.get_by_test_id("claim-code")).to_have_value(link.partition("=")[2], timeout=PATIENCE_MS)
@@ -99,9 +99,9 @@ def test_a_robot_is_paired_by_the_link_in_its_agents_terminal(
         expect(page.get_by_role("alert")).to_contain_text("eight letters")
         page.get_by_test_id("claim-code").fill("zzzz zzzz")
         page.get_by_test_id("claim-space").select_option("new")
-        page.get_by_label("Name of the new space").fill("Guest room")
+        page.get_by_label("Space name").fill("Guest room")
         page.get_by_test_id("claim").press("Enter")
-        expect(page.get_by_role("alert")).to_contain_text("Nothing is paired", timeout=PATIENCE_MS)
+        expect(page.get_by_role("alert")).to_contain_text("Pairing failed", timeout=PATIENCE_MS)
         assert field(page) == "zzzz zzzz"
         assert page.get_by_test_id("claim-space").locator("option:checked").inner_text() == "Guest room"
         assert_good_page(page, "pairing-wrong")
@@ -113,7 +113,7 @@ def test_a_robot_is_paired_by_the_link_in_its_agents_terminal(
         assert "paired with demo" in terminal.text
         row = page.get_by_test_id("paired-device")
         expect(row).to_contain_text("Guest room")
-        expect(row).to_contain_text("Waiting for its first word")
+        expect(row).to_contain_text("Waiting for the first data")
         spaces = [space["name"] for space in api.get("/spaces")["items"]]
         assert spaces.count("Guest room") == 1, "the second try went into the space of the first"
 
@@ -131,6 +131,6 @@ def test_a_robot_is_paired_by_the_link_in_its_agents_terminal(
         page.get_by_role("button", name="Pair another").click()
         page.get_by_test_id("claim-code").fill(right)
         page.get_by_test_id("claim").click()
-        expect(page.get_by_role("alert")).to_contain_text("was used already", timeout=PATIENCE_MS)
+        expect(page.get_by_role("alert")).to_contain_text("already used", timeout=PATIENCE_MS)
         (paired,) = [device for device in api.get("/devices")["items"] if device["id"] not in known]
         api.http.delete(f"/agents/{paired['agent']}").raise_for_status()

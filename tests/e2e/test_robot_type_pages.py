@@ -140,14 +140,14 @@ def is_refused(page: Page) -> None:
     """What is no archive says so; then all that is wrong is told at once, each with its file and what to do."""
     torn: FilePayload = {"name": "torn.zip", "mimeType": "application/zip", "buffer": b"PK\x03\x04 and no more"}
     page.get_by_test_id("type-files").set_input_files([torn])
-    expect(page.get_by_role("alert").filter(has_text="torn.zip cannot be unpacked")).to_be_visible()
+    expect(page.get_by_role("alert").filter(has_text="torn.zip cannot be extracted")).to_be_visible()
 
     page.get_by_test_id("type-files").set_input_files([archive(BROKEN)])
     at_step(page, "wrong")
     expect(finding(page, "torn")).to_contain_text("scene.xml, line 6")
     expect(finding(page, "missing")).to_contain_text("reacher.xml, line 2")
-    expect(finding(page, "missing")).to_contain_text("Add hand.stl, or take it out of reacher.xml.")
-    expect(finding(page, "range").first).to_contain_text("joint shoulder go from -91.7° to 91.7°")
+    expect(finding(page, "missing")).to_contain_text("Add hand.stl, or remove the reference from reacher.xml.")
+    expect(finding(page, "range").first).to_contain_text("limits joint shoulder to -91.7° to 91.7°")
     expect(page.get_by_test_id("error")).to_have_count(4)
     assert "Traceback" not in page.inner_text("body")
     assert_good_page(page, "robot-type-wrong")

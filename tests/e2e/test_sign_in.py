@@ -58,7 +58,7 @@ def test_a_password_is_set_after_a_link_and_signs_in(browser: Browser, environme
     page.get_by_test_id("signed-in").click()
     page.get_by_label("New password").fill(PASSWORD)
     page.get_by_role("button", name="Set password").click()
-    expect(page.get_by_text("The password is set.")).to_be_visible(timeout=PATIENCE_MS)
+    expect(page.get_by_text("Password set.")).to_be_visible(timeout=PATIENCE_MS)
     page = page_of(browser)
     page.goto(url)
     page.get_by_test_id("sign-in-name").fill("ann")

@@ -5,7 +5,7 @@ import type { KnownTelemetry } from "../src/shared/mqtt/parse-messages";
 import { percentile, RoundTrip } from "../src/features/latency/model/round-trip";
 import { signInFailure, signInToken } from "../src/features/account/model/session";
 import { deviceTopics, matches } from "../src/shared/mqtt/topics";
-import { texts } from "../src/shared/i18n/texts";
+import { format } from "../src/shared/i18n/format";
 
 describe("the round trip", () => {
   it("counts each setpoint once, at the first telemetry that names it", () => {
@@ -76,12 +76,12 @@ describe("small things", () => {
   });
 
   it("a value that rounds to nought has no sign", () => {
-    expect(texts.number.degrees(-0.04)).toBe("0.0°");
-    expect(texts.number.degrees(-0.06)).toBe("-0.1°");
+    expect(format.degrees(-0.04)).toBe("0.0°");
+    expect(format.degrees(-0.06)).toBe("-0.1°");
   });
 
   it("ages are told in the largest fitting unit", () => {
-    expect([0, 59_000, 61_000, 3_700_000, 200_000_000].map(texts.age)).toEqual([
+    expect([0, 59_000, 61_000, 3_700_000, 200_000_000].map(format.age)).toEqual([
       "just now",
       "59 s ago",
       "1 min ago",

@@ -6,7 +6,8 @@ import { Fleet } from "../features/devices/model/device-list";
 import type { FollowedInvitation } from "../features/sharing/model/invitation-link";
 import type { FollowedCode } from "../features/pairing/model/claim-code";
 import type { Session } from "../features/account/model/session";
-import { texts } from "../shared/i18n/texts";
+import { common } from "../shared/i18n/common";
+import { texts } from "./texts";
 import { later } from "./lazy-page";
 import { Navigation } from "./navigation-bar";
 import { type At, type PageProps, ROWS } from "./page-registry";
@@ -37,7 +38,7 @@ export function App({ api, session, followed, pairing }: AppProps) {
       return (
         <main class="narrow" id="content">
           <p class="quiet" role="status">
-            {texts.session.checking}
+            {texts.checkingSession}
           </p>
         </main>
       );
@@ -94,7 +95,7 @@ function Opened(props: Omit<PageProps, keyof At>) {
   const title = ROWS.get(page)?.title ?? "";
   const name = typeof title === "string" ? title : title(at, props.fleet);
   useEffect(() => {
-    document.title = texts.titled(name);
+    document.title = texts.tabTitle(name);
     return () => {
       document.title = texts.product;
     };
@@ -107,7 +108,7 @@ async function checkSession(api: Api, session: Session): Promise<void> {
   try {
     await api.me();
   } catch (error) {
-    if (error instanceof ApiError && error.status === 401) session.ended(texts.session.ended);
+    if (error instanceof ApiError && error.status === 401) session.ended(texts.sessionEnded);
   }
 }
 
@@ -136,16 +137,16 @@ function LinkBanner({ fleet }: { fleet: Fleet }) {
           <span>{why !== "" && `${why} `}</span>
           {state === "refused" ? (
             <button type="button" onClick={() => fleet.link.renew()}>
-              {texts.link.retry}
+              {common.tryAgain}
             </button>
           ) : (
-            texts.link.again
+            texts.link.reconnecting
           )}
         </div>
       )}
       {trouble !== null && (
         <div class="banner warn">
-          {texts.link.list} {trouble}
+          {texts.link.deviceListFailed} {trouble}
         </div>
       )}
     </div>

@@ -1,7 +1,7 @@
 /** A page whose code comes when it is opened, so that the first load stays small. */
 import type { ComponentType } from "preact";
 import { useEffect, useState } from "preact/hooks";
-import { texts } from "../shared/i18n/texts";
+import { common } from "../shared/i18n/common";
 
 export interface Later<Props> {
   /** The page; it says so while it is still being loaded, and offers another try where that fails. */
@@ -37,11 +37,11 @@ export function later<Props extends object>(load: () => Promise<ComponentType<Pr
     return (
       <main class="page" id="content">
         <p class="quiet" role="status">
-          {failed ? texts.later.failed : texts.loading}
+          {failed ? common.pageFailed : common.loading}
         </p>
         {failed && (
           <button type="button" onClick={() => setTries(tries + 1)}>
-            {texts.later.again}
+            {common.tryAgain}
           </button>
         )}
       </main>

@@ -6,7 +6,7 @@ import { FollowedInvitation, invitationSecret } from "../features/sharing/model/
 import { FollowedCode, pairingCode } from "../features/pairing/model/claim-code";
 import { Session, signInFailure, signInToken } from "../features/account/model/session";
 import "../shared/ui/style.css";
-import { texts } from "../shared/i18n/texts";
+import { texts } from "./texts";
 import { App, fetchEarly } from "./app";
 import { invitationAddress, pairAddress, replaceWith } from "./routes";
 
@@ -43,8 +43,8 @@ function takeFailure(): string {
   const code = signInFailure(location.hash);
   if (code === null) return "";
   history.replaceState(null, "", `${location.pathname}${location.search}#/`);
-  if (code === "open-id-expired") return texts.session.elsewhereExpired;
-  return code === "open-id-uninvited" ? texts.session.elsewhereUninvited : texts.session.elsewhereRefused;
+  if (code === "open-id-expired") return texts.openIdExpired;
+  return code === "open-id-uninvited" ? texts.openIdUninvited : texts.openIdRefused;
 }
 
 takeInvitation();

@@ -1,7 +1,7 @@
 /** The bar above every page: the parts of the console, the account, the way out. */
 import type { Account } from "../shared/api/client";
 import type { Session } from "../features/account/model/session";
-import { texts } from "../shared/i18n/texts";
+import { texts } from "./texts";
 import { PAGES, ROWS } from "./page-registry";
 import { accountAddress, fleetAddress, route } from "./routes";
 
@@ -14,7 +14,7 @@ export function Navigation({ account, session }: { account: Account; session: Se
       <a class="brand" href={fleetAddress}>
         {texts.product}
       </a>
-      <nav aria-label={texts.parts.title}>
+      <nav aria-label={texts.sections.title}>
         {LINKS.map(({ link, pattern, part }) => (
           <a key={part} href={pattern} aria-current={part === here ? "page" : undefined}>
             {link}
@@ -25,13 +25,13 @@ export function Navigation({ account, session }: { account: Account; session: Se
         class="account"
         data-testid="signed-in"
         href={accountAddress}
-        title={texts.session.signedInAs(account.name)}
+        title={texts.signedInAs(account.name)}
         aria-current={here === "account" ? "page" : undefined}
       >
         {account.name}
       </a>
       <button type="button" class="plain" onClick={() => void session.signOut()}>
-        {texts.session.out}
+        {texts.signOut}
       </button>
     </header>
   );

@@ -8,7 +8,7 @@ import type { Account, Api } from "../shared/api/client";
 import type { Fleet } from "../features/devices/model/device-list";
 import type { FollowedInvitation } from "../features/sharing/model/invitation-link";
 import type { FollowedCode } from "../features/pairing/model/claim-code";
-import { texts } from "../shared/i18n/texts";
+import { texts } from "./texts";
 
 /** What addresses name; empty where a page's address does not. */
 export type At = Readonly<Record<"device" | "id" | "ids" | "name" | "robotType" | "space", string>>;
@@ -38,16 +38,16 @@ interface Page {
   readonly load: () => Loaded;
 }
 
-const device = (id: string, fleet: Fleet): string => fleet.devices.value?.get(id)?.info.value.label ?? texts.fleet.title;
+const device = (id: string, fleet: Fleet): string => fleet.devices.value?.get(id)?.info.value.label ?? texts.sections.devices;
 const health = async (): Loaded => (await import("../features/health/list-page")).HealthPage;
 const times = async (): Loaded => (await import("../features/latency/page")).TimesPage;
 
 export const PAGES = {
   fleet: {
     pattern: "#/",
-    title: texts.fleet.title,
+    title: texts.sections.devices,
     part: "fleet",
-    link: texts.parts.fleet,
+    link: texts.sections.devices,
     early: true,
     load: async (): Loaded => (await import("../features/devices/list-page")).FleetPage,
   },
@@ -60,13 +60,13 @@ export const PAGES = {
   },
   keyframes: {
     pattern: "#/devices/:id/keyframes/:name?",
-    title: texts.keyframes.title,
+    title: texts.pages.keyframes,
     part: "fleet",
     load: async (): Loaded => (await import("../features/keyframes/device-page")).KeyframesPage,
   },
   together: {
     pattern: "#/operate/:ids",
-    title: ({ ids }: At): string => texts.together.title(ids.split(",").length),
+    title: ({ ids }: At): string => texts.pages.multiRobot(ids.split(",").length),
     part: "fleet",
     load: async (): Loaded => (await import("../features/steering/multi-robot-page")).TogetherPage,
   },
@@ -79,15 +79,15 @@ export const PAGES = {
   },
   pair: {
     pattern: "#/pair",
-    title: texts.pair.title,
+    title: texts.pages.pair,
     part: "fleet",
     load: async (): Loaded => (await import("../features/pairing/page")).PairingPage,
   },
   movements: {
     pattern: "#/movements",
-    title: texts.library.title,
+    title: texts.sections.movements,
     part: "movements",
-    link: texts.parts.movements,
+    link: texts.sections.movements,
     load: async (): Loaded => (await import("../features/movements/library-page")).LibraryPage,
   },
   movement: {
@@ -98,15 +98,15 @@ export const PAGES = {
   },
   typeKeyframes: {
     pattern: "#/robot-types/:robotType/keyframes/:name?",
-    title: texts.keyframes.title,
+    title: texts.pages.keyframes,
     part: "movements",
     load: async (): Loaded => (await import("../features/keyframes/robot-type-page")).TypeKeyframesPage,
   },
   robotTypes: {
     pattern: "#/robot-types",
-    title: texts.robotTypes.title,
+    title: texts.sections.robotTypes,
     part: "robotTypes",
-    link: texts.parts.robotTypes,
+    link: texts.sections.robotTypes,
     load: async (): Loaded => (await import("../features/robot-types/list-page")).RobotTypesPage,
   },
   robotType: {
@@ -117,45 +117,45 @@ export const PAGES = {
   },
   addRobotType: {
     pattern: "#/add-robot-type",
-    title: texts.robotTypes.adding.title,
+    title: texts.pages.addRobotType,
     part: "robotTypes",
     load: async (): Loaded => (await import("../features/robot-types/add-page")).AddRobotTypePage,
   },
-  health: { pattern: "#/health", title: texts.parts.health, part: "health", link: texts.parts.health, load: health },
+  health: { pattern: "#/health", title: texts.sections.health, part: "health", link: texts.sections.health, load: health },
   deviceHealth: {
     pattern: "#/devices/:device/health",
-    title: (at: At, fleet: Fleet): string => texts.care.title.health(device(at.device, fleet)),
+    title: (at: At, fleet: Fleet): string => texts.pages.healthOf(device(at.device, fleet)),
     part: "health",
     load: health,
   },
   spaceHealth: {
     pattern: "#/spaces/:space/health",
-    title: ({ space }: At, fleet: Fleet): string => texts.care.title.health(fleet.spaceName(space)),
+    title: ({ space }: At, fleet: Fleet): string => texts.pages.healthOf(fleet.spaceName(space)),
     part: "health",
     load: health,
   },
-  times: { pattern: "#/times", title: texts.parts.times, part: "times", link: texts.parts.times, load: times },
+  times: { pattern: "#/times", title: texts.sections.latency, part: "times", link: texts.sections.latency, load: times },
   deviceTimes: {
     pattern: "#/devices/:device/times",
-    title: (at: At, fleet: Fleet): string => texts.care.title.times(device(at.device, fleet)),
+    title: (at: At, fleet: Fleet): string => texts.pages.latencyOf(device(at.device, fleet)),
     part: "times",
     load: times,
   },
   account: {
     pattern: "#/account",
-    title: texts.account.title,
+    title: texts.pages.account,
     part: "account",
     load: async (): Loaded => (await import("../features/account/page")).AccountPage,
   },
   activity: {
     pattern: "#/account/activity",
-    title: texts.activity.title,
+    title: texts.pages.audit,
     part: "account",
     load: async (): Loaded => (await import("../features/account/audit-page")).ActivityPage,
   },
   invitation: {
     pattern: "#/invitation",
-    title: texts.invitation.title,
+    title: texts.pages.invitation,
     part: "account",
     load: async (): Loaded => (await import("../features/sharing/invitation-page")).InvitationPage,
   },

@@ -3,7 +3,8 @@ import type { Api, Space } from "../../shared/api/client";
 import { sentence } from "../../shared/api/http";
 import type { Fleet } from "../devices/model/device-list";
 import type { ApiKey, ApiKeyMade, SharedRole } from "../sharing/model/wire-types";
-import { texts } from "../../shared/i18n/texts";
+import { common } from "../../shared/i18n/common";
+import { texts } from "./texts";
 import { AskedForm } from "../../shared/ui/inline-form";
 import { Confirm } from "../../shared/ui/confirm-button";
 import { useFocusBack } from "../../shared/hooks/use-return-focus";
@@ -68,7 +69,7 @@ export function ApiKeys({ api, fleet }: { api: Api; fleet: Fleet }) {
           onClose={() => setMaking(false)}
         />
       )}
-      {keys === null && wrong === "" && <p class="quiet">{texts.loading}</p>}
+      {keys === null && wrong === "" && <p class="quiet">{common.loading}</p>}
       {keys?.length === 0 && <p class="quiet">{texts.keys.none}</p>}
       <ul class="people" data-testid="keys">
         {keys?.map((key) => (
@@ -88,7 +89,7 @@ function KeyRow({ of: key, names, onRevoke }: { of: ApiKey; names: Names; onRevo
     only === "" ? texts.keys.everything : texts.keys.onlyThese(only),
     key.expired ? texts.keys.expired(key.expires_at) : texts.keys.until(key.expires_at),
     key.last_used_at === null ? texts.keys.unused : texts.keys.used(key.last_used_at),
-    texts.keys.made2(key.created_at),
+    texts.keys.createdAt(key.created_at),
   ];
   return (
     <li data-testid="key" data-name={key.name}>
@@ -97,7 +98,7 @@ function KeyRow({ of: key, names, onRevoke }: { of: ApiKey; names: Names; onRevo
         <span class="quiet small">{about.join(" · ")}</span>
       </span>
       {key.expired && <span class="chip bad">{texts.keys.expiredChip}</span>}
-      <span class={`chip role-${key.role}`}>{texts.role[key.role]}</span>
+      <span class={`chip role-${key.role}`}>{common.role[key.role]}</span>
       <Confirm
         label={texts.keys.revoke}
         description={texts.keys.revokeOf(key.name)}

@@ -1,7 +1,9 @@
 /** One record of the audit list in plain English. */
 import { aboutWhat } from "./model/audit-log";
 import type { AuditRecord, Role } from "../sharing/model/wire-types";
-import { texts } from "../../shared/i18n/texts";
+import { common } from "../../shared/i18n/common";
+import { format } from "../../shared/i18n/format";
+import { texts } from "./texts";
 
 /** What things are called, by the ids that records have. What is not in it is called by its id. */
 export interface Names {
@@ -11,7 +13,7 @@ export interface Names {
   keys: ReadonlyMap<string, string>;
 }
 
-const says = texts.activity.says;
+const says = texts.audit.says;
 const ID_SHOWN = 8;
 
 export function line(record: AuditRecord, names: Names): string {
@@ -57,7 +59,7 @@ export function line(record: AuditRecord, names: Names): string {
     case "invited":
       return data["role"] === "owner"
         ? says.offered(who, on)
-        : says.invited(who, on, role(data), texts.access.uses(Number(data["uses"] ?? 1)));
+        : says.invited(who, on, role(data), texts.audit.usesLeft(Number(data["uses"] ?? 1)));
     case "invitation-redeemed":
       return says.redeemed(who, on);
     case "invitation-revoked":
@@ -73,13 +75,13 @@ export function line(record: AuditRecord, names: Names): string {
     case "robot-type-deleted":
       return says.typeDeleted(who, record.on);
     default:
-      return says.other(who, texts.activity.kinds[what] ?? what, on);
+      return says.other(who, texts.audit.kinds[what] ?? what, on);
   }
 }
 
 function whoDid({ who, by_account: account }: AuditRecord): string {
   if (who !== "") return who;
-  return account === "" ? texts.activity.cloud : texts.activity.somebody;
+  return account === "" ? texts.audit.cloud : texts.audit.somebody;
 }
 
 function thing(on: string, names: Names): string {
@@ -90,7 +92,7 @@ function thing(on: string, names: Names): string {
 function other(data: AuditRecord["data"], names: Names): string {
   const id = text(data, "with");
   const name = text(data, "name");
-  return name === "" ? (names.accounts.get(id) ?? texts.activity.anAccount(id.slice(0, ID_SHOWN))) : name;
+  return name === "" ? (names.accounts.get(id) ?? texts.audit.anAccount(id.slice(0, ID_SHOWN))) : name;
 }
 
 function kept(only: unknown, names: Names): string {
@@ -100,14 +102,14 @@ function kept(only: unknown, names: Names): string {
 
 function role(data: AuditRecord["data"]): string {
   const given = text(data, "role");
-  return given in texts.role ? texts.role[given as Role] : given;
+  return given in common.role ? common.role[given as Role] : given;
 }
 
 /** Whatever has no end is kept as a time that never comes: far beyond what a calendar shows. */
 const NEVER_MS = Date.UTC(9000, 0);
 
 function until(ms: unknown): string {
-  return texts.until(typeof ms === "number" && ms < NEVER_MS ? new Date(ms).toISOString() : null);
+  return format.until(typeof ms === "number" && ms < NEVER_MS ? new Date(ms).toISOString() : null);
 }
 
 function text(data: AuditRecord["data"], name: string): string {

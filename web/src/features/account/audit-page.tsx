@@ -3,7 +3,9 @@ import type { Api, Space } from "../../shared/api/client";
 import { accountsIn, AuditReader, EVERYTHING } from "./model/audit-log";
 import type { Fleet } from "../devices/model/device-list";
 import type { ApiKey, AuditQuery, AuditRecord } from "../sharing/model/wire-types";
-import { texts } from "../../shared/i18n/texts";
+import { common } from "../../shared/i18n/common";
+import { format } from "../../shared/i18n/format";
+import { texts } from "./texts";
 import { line, type Names } from "./audit-entry-text";
 import { accountAddress } from "../../app/routes";
 import "../sharing/sharing.css";
@@ -57,9 +59,9 @@ export function ActivityPage({ api, fleet }: { api: Api; fleet: Fleet }) {
   const own = devices.filter(({ role }) => role === "owner");
   const rooms = spaces.filter(({ role }) => role === "owner");
   const subjects: [string, [string, string][]][] = [
-    [texts.activity.control, own.map(({ id, label }) => [id, label])],
+    [texts.audit.control, own.map(({ id, label }) => [id, label])],
     [
-      texts.activity.sharing,
+      texts.audit.sharing,
       [
         ...rooms.map(({ id, name }): [string, string] => [`space:${id}`, name]),
         ...own.map(({ id, label }): [string, string] => [`device:${id}`, label]),
@@ -69,9 +71,9 @@ export function ActivityPage({ api, fleet }: { api: Api; fleet: Fleet }) {
   ];
   return (
     <main class="page fleet activity" id="content">
-      <a href={accountAddress}>← {texts.activity.back}</a>
-      <h1>{texts.activity.title}</h1>
-      <p class="quiet">{texts.activity.explained}</p>
+      <a href={accountAddress}>← {texts.audit.back}</a>
+      <h1>{texts.audit.title}</h1>
+      <p class="quiet">{texts.audit.explained}</p>
       <Filters filter={filter} subjects={subjects} onChange={setFilter} />
       <Records reader={reader} names={names} filtered={filter !== ALL} />
     </main>
@@ -99,17 +101,17 @@ function Filters({ filter, subjects, onChange }: FiltersProps) {
   const set = (part: Partial<Filter>): void => onChange({ ...filter, ...part });
   return (
     <fieldset class="card filters">
-      <legend class="visually-hidden">{texts.activity.filters}</legend>
+      <legend class="visually-hidden">{texts.audit.filters}</legend>
       <div class="field">
-        <label for="audit-what">{texts.activity.kind}</label>
+        <label for="audit-what">{texts.audit.kind}</label>
         <select
           id="audit-what"
           data-testid="audit-what"
           value={filter.what}
           onChange={(event) => set({ what: event.currentTarget.value })}
         >
-          <option value="">{texts.activity.any}</option>
-          {Object.entries(texts.activity.kinds).map(([kind, name]) => (
+          <option value="">{texts.audit.any}</option>
+          {Object.entries(texts.audit.kinds).map(([kind, name]) => (
             <option key={kind} value={kind}>
               {name}
             </option>
@@ -117,9 +119,9 @@ function Filters({ filter, subjects, onChange }: FiltersProps) {
         </select>
       </div>
       <div class="field">
-        <label for="audit-on">{texts.activity.about}</label>
+        <label for="audit-on">{texts.audit.about}</label>
         <select id="audit-on" value={filter.on} onChange={(event) => set({ on: event.currentTarget.value })}>
-          <option value="">{texts.activity.any}</option>
+          <option value="">{texts.audit.any}</option>
           {subjects.map(([title, entries]) =>
             entries.length === 0 ? null : (
               <optgroup key={title} label={title}>
@@ -135,7 +137,7 @@ function Filters({ filter, subjects, onChange }: FiltersProps) {
       </div>
       {(["from", "to"] as const).map((end) => (
         <div class="field" key={end}>
-          <label for={`audit-${end}`}>{texts.activity[end]}</label>
+          <label for={`audit-${end}`}>{texts.audit[end]}</label>
           <input
             id={`audit-${end}`}
             type="date"
@@ -146,7 +148,7 @@ function Filters({ filter, subjects, onChange }: FiltersProps) {
       ))}
       {filter !== ALL && (
         <button type="button" onClick={() => onChange(ALL)}>
-          {texts.activity.reset}
+          {texts.audit.reset}
         </button>
       )}
     </fieldset>
@@ -168,22 +170,22 @@ function Records({ reader, names, filtered }: { reader: AuditReader; names: Name
       </ol>
       <p class="quiet" role="status">
         {busy
-          ? texts.loading
+          ? common.loading
           : nothing
             ? more
-              ? texts.activity.noneYet
-              : texts.activity.none
-            : trouble === "" && `${texts.activity.shown(records.length)}${more ? "" : ` · ${texts.activity.end}`}`}
+              ? texts.audit.noneYet
+              : texts.audit.none
+            : trouble === "" && `${texts.audit.shown(records.length)}${more ? "" : ` · ${texts.audit.end}`}`}
       </p>
       {trouble !== "" && (
         <p class="notice bad" role="alert">
-          {texts.activity.failed(trouble)}
+          {texts.audit.failed(trouble)}
         </p>
       )}
       {(more || trouble !== "") && (
         <p>
           <button type="button" disabled={busy} data-testid="older" onClick={() => void reader.older()}>
-            {trouble !== "" ? texts.activity.again : filtered ? texts.activity.further : texts.activity.more}
+            {trouble !== "" ? texts.audit.again : filtered ? texts.audit.further : texts.audit.more}
           </button>
         </p>
       )}
@@ -193,7 +195,7 @@ function Records({ reader, names, filtered }: { reader: AuditReader; names: Name
 
 function Line({ record, names }: { record: AuditRecord; names: Names }) {
   const { outcome, key, seq, at, on, by_account: account, session, hash } = record;
-  const words = texts.activity.key;
+  const words = texts.audit.key;
   const details = [
     [words.number, String(seq)],
     [words.on, on],
@@ -206,13 +208,13 @@ function Line({ record, names }: { record: AuditRecord; names: Names }) {
     <li data-what={record.what}>
       <details>
         <summary>
-          <time dateTime={at}>{texts.moment(at)}</time>
+          <time dateTime={at}>{format.dateTime(at)}</time>
           <span class="said">
             {line(record, names)}
-            {key !== "" && <span class="quiet"> ({texts.activity.byKey})</span>}{" "}
+            {key !== "" && <span class="quiet"> ({texts.audit.byKey})</span>}{" "}
             {outcome !== "done" && (
-              <span class={`chip ${outcome === "unknown" ? "" : "bad"}`} title={outcome === "unknown" ? texts.activity.unknownExplained : undefined}>
-                {texts.activity.outcome[outcome]}
+              <span class={`chip ${outcome === "unknown" ? "" : "bad"}`} title={outcome === "unknown" ? texts.audit.unknownExplained : undefined}>
+                {texts.audit.outcome[outcome]}
               </span>
             )}
           </span>

@@ -2,7 +2,8 @@ import { useEffect, useState } from "preact/hooks";
 import type { Api, SignInSession } from "../../shared/api/client";
 import { sentence } from "../../shared/api/http";
 import type { Fleet } from "../devices/model/device-list";
-import { texts } from "../../shared/i18n/texts";
+import { common } from "../../shared/i18n/common";
+import { texts } from "./texts";
 import { ApiKeys } from "./api-keys";
 import { Card } from "../../shared/ui/parts";
 import { activityAddress, fleetAddress } from "../../app/routes";
@@ -12,10 +13,10 @@ export function AccountPage({ api, fleet }: { api: Api; fleet: Fleet }) {
   const [changes, setChanges] = useState(0);
   return (
     <main class="page fleet" id="content">
-      <a href={fleetAddress}>← {texts.device.back}</a>
+      <a href={fleetAddress}>← {common.allDevices}</a>
       <h1>{texts.account.title}</h1>
       <p>
-        <a href={activityAddress}>{texts.activity.link}</a>
+        <a href={activityAddress}>{texts.audit.link}</a>
       </p>
       <ApiKeys api={api} fleet={fleet} />
       <PasswordForm api={api} onDone={() => setChanges((count) => count + 1)} />
@@ -116,7 +117,7 @@ function Sessions({ api }: { api: Api }) {
 
   return (
     <Card title={texts.account.sessions}>
-      {sessions === null && wrong === "" && <p class="quiet">{texts.loading}</p>}
+      {sessions === null && wrong === "" && <p class="quiet">{common.loading}</p>}
       <ul class="devices">
         {sessions?.map((session) => (
           <li key={session.id}>

@@ -3,7 +3,7 @@ import type { Api, Methods } from "../../shared/api/client";
 import { sentence } from "../../shared/api/http";
 import type { FollowedInvitation } from "../sharing/model/invitation-link";
 import { signInToken, type Session } from "./model/session";
-import { texts } from "../../shared/i18n/texts";
+import { texts } from "./texts";
 import { JoinForm } from "../sharing/join-form";
 
 interface SignInProps {
@@ -28,18 +28,18 @@ export function SignIn({ api, session, followed, pairing, why }: SignInProps) {
     <main class="narrow" id="content">
       {invited.kind === "open" ? (
         <>
-          <h1>{texts.invitation.title}</h1>
-          <p>{texts.invitation.outside}</p>
+          <h1>{texts.followed.invitation}</h1>
+          <p>{texts.followed.invitationExplained}</p>
           {methods?.password === true && <JoinForm session={session} followed={followed} secret={invited.secret} />}
           {elsewhere !== null && (
             <InvitedElsewhere api={api} followed={followed} secret={invited.secret} name={elsewhere.name} />
           )}
-          <h2>{texts.invitation.haveOne}</h2>
+          <h2>{texts.followed.haveAccount}</h2>
         </>
       ) : (
         <h1>{texts.session.title}</h1>
       )}
-      {pairing && invited.kind !== "open" && <p class="notice">{texts.pair.signInFirst}</p>}
+      {pairing && invited.kind !== "open" && <p class="notice">{texts.followed.pairing}</p>}
       {why !== "" && (
         <p class="notice bad" role="alert">
           <strong>{texts.session.failed}.</strong> {why}

@@ -4,7 +4,7 @@ import type { Fleet } from "../devices/model/device-list";
 import type { KnownDescription } from "../../shared/mqtt/parse-messages";
 import type { AnyRequest } from "../../shared/api/action-requests";
 import type { Station } from "../devices/model/device-session";
-import { texts } from "../../shared/i18n/texts";
+import { texts } from "./texts";
 import { Foldable } from "../../shared/ui/collapsible-card";
 import { Card } from "../../shared/ui/parts";
 import { whyNotAct } from "../devices/availability";
@@ -35,14 +35,14 @@ export function Acts({ fleet, station }: ActsProps) {
   const common: ActProps = { station, description, no };
   const takes = (kind: AnyRequest["kind"]): boolean => description.actions.includes(kind);
   const cards: [string, string, boolean, ComponentChildren][] = [
-    ["postures", texts.acts.postures, takes("take_posture") && description.postures.length > 0, <Postures {...common} />],
-    ["expressions", texts.acts.expressions, takes("express") && description.expressions.length > 0, <Expressions {...common} />],
-    ["behaviours", texts.acts.behaviours, takes("run_behaviour") && description.behaviours.length > 0, <Behaviours {...common} />],
-    ["speech", texts.acts.speech, takes("say"), <Speech {...common} />],
-    ["pose", texts.acts.pose, takes("move_pose"), <Pose {...common} />],
-    ["place", texts.acts.place, takes("go_to"), <Place {...common} fleet={fleet} />],
-    ["look", texts.acts.look, takes("look_at"), <Look {...common} />],
-    ["stiffness", texts.acts.stiffness, takes("set_stiffness"), <StiffnessCard {...common} />],
+    ["postures", texts.postures, takes("take_posture") && description.postures.length > 0, <Postures {...common} />],
+    ["expressions", texts.expressions, takes("express") && description.expressions.length > 0, <Expressions {...common} />],
+    ["behaviours", texts.behaviours, takes("run_behaviour") && description.behaviours.length > 0, <Behaviours {...common} />],
+    ["speech", texts.speech, takes("say"), <Speech {...common} />],
+    ["pose", texts.pose, takes("move_pose"), <Pose {...common} />],
+    ["place", texts.place, takes("go_to"), <Place {...common} fleet={fleet} />],
+    ["look", texts.look, takes("look_at"), <Look {...common} />],
+    ["stiffness", texts.stiffness, takes("set_stiffness"), <StiffnessCard {...common} />],
   ];
   return (
     <>

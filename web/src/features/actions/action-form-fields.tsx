@@ -1,6 +1,6 @@
 /** Fields of the cards that ask a robot for something. What is typed stays, whatever becomes of the request. */
 import { useId } from "preact/hooks";
-import { texts } from "../../shared/i18n/texts";
+import { format } from "../../shared/i18n/format";
 
 interface ShareProps {
   label: string;
@@ -14,7 +14,7 @@ interface ShareProps {
 /** A share, in percent. */
 export function Share({ label, value, least, onChange, testid }: ShareProps) {
   const id = useId();
-  const percent = texts.number.percent(value);
+  const percent = format.percent(value);
   return (
     <div class="act-share">
       <label for={id}>{label}</label>

@@ -3,7 +3,7 @@ import { useEffect, useMemo, useState } from "preact/hooks";
 import { degrees, radians } from "../../shared/lib/angles";
 import type { Fleet } from "../devices/model/device-list";
 import type { GoTo } from "../../shared/mqtt/protocol.generated";
-import { texts } from "../../shared/i18n/texts";
+import { texts } from "./texts";
 import { Drawing, usePlan } from "../spaces/floor-plan";
 import { ask, type ActProps } from "./action-cards";
 import { NumberField, numberOf } from "./action-form-fields";
@@ -44,15 +44,15 @@ export function Place({ station, no, fleet }: ActProps & { fleet: Fleet }) {
   return (
     <form class="act-form" onSubmit={go}>
       {plan.extent === null ? (
-        <p class="quiet">{plan.perception === null ? texts.plan.empty : texts.plan.waiting}</p>
+        <p class="quiet">{plan.perception === null ? texts.planMissing : texts.planWaiting}</p>
       ) : (
         <Drawing {...plan} extent={plan.extent} hung={[]} trails={null} target={target} onPick={pick} />
       )}
-      <p class="quiet small">{texts.acts.placeNote}</p>
+      <p class="quiet small">{texts.placeNote}</p>
       <div class="act-numbers">
-        <NumberField label={texts.acts.axes[0]} unit="m" value={x} testid="place-x" onInput={setX} />
-        <NumberField label={texts.acts.axes[1]} unit="m" value={y} testid="place-y" onInput={setY} />
-        <NumberField label={texts.acts.heading} unit="°" optional value={heading} testid="place-heading" onInput={setHeading} />
+        <NumberField label={texts.axes[0]} unit="m" value={x} testid="place-x" onInput={setX} />
+        <NumberField label={texts.axes[1]} unit="m" value={y} testid="place-y" onInput={setY} />
+        <NumberField label={texts.heading} unit="°" optional value={heading} testid="place-heading" onInput={setHeading} />
       </div>
       <div class="row">
         <button
@@ -62,7 +62,7 @@ export function Place({ station, no, fleet }: ActProps & { fleet: Fleet }) {
           disabled={target === null || headless || no !== ""}
           title={no === "" ? undefined : no}
         >
-          {texts.acts.goThere}
+          {texts.goThere}
         </button>
         <button
           type="button"
@@ -73,7 +73,7 @@ export function Place({ station, no, fleet }: ActProps & { fleet: Fleet }) {
             setHeading(mine.yawRad === null ? "" : degrees(mine.yawRad).toFixed(0));
           }}
         >
-          {texts.acts.whereItIs}
+          {texts.whereItIs}
         </button>
       </div>
     </form>

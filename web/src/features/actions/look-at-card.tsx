@@ -1,5 +1,5 @@
 import { useState } from "preact/hooks";
-import { texts } from "../../shared/i18n/texts";
+import { texts } from "./texts";
 import { ask, type ActProps } from "./action-cards";
 import { NumberField, numbersOf } from "./action-form-fields";
 
@@ -17,7 +17,7 @@ export function Look({ station, no }: ActProps) {
       }}
     >
       <div class="act-numbers">
-        {texts.acts.axes.map((axis, index) => (
+        {texts.axes.map((axis, index) => (
           <NumberField
             key={axis}
             label={axis}
@@ -28,9 +28,9 @@ export function Look({ station, no }: ActProps) {
           />
         ))}
       </div>
-      <p class="quiet small">{texts.acts.lookNote}</p>
+      <p class="quiet small">{texts.lookNote}</p>
       <button type="submit" data-testid="look" disabled={!known || no !== ""} title={no === "" ? undefined : no}>
-        {texts.acts.lookThere}
+        {texts.lookThere}
       </button>
     </form>
   );

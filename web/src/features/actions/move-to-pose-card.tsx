@@ -3,7 +3,7 @@ import { degrees, radians } from "../../shared/lib/angles";
 import type { DeviceStore } from "../devices/model/device-store";
 import { rollPitchYaw, unit } from "../twin/model/forward-kinematics";
 import type { Vector3 } from "../../shared/lib/vectors";
-import { texts } from "../../shared/i18n/texts";
+import { texts } from "./texts";
 import { Choice } from "../../shared/ui/parts";
 import { ask, type ActProps } from "./action-cards";
 import { NumberField, numbersOf, Share } from "./action-form-fields";
@@ -45,7 +45,7 @@ export function Pose({ station, description, no }: ActProps) {
     <form class="act-form" onSubmit={go}>
       <div class="row">
         <label>
-          {texts.acts.frame}{" "}
+          {texts.frame}{" "}
           <select value={frame} onChange={(event) => setFrame(event.currentTarget.value)}>
             {frames.map((name) => (
               <option key={name}>{name}</option>
@@ -53,11 +53,11 @@ export function Pose({ station, description, no }: ActProps) {
           </select>
         </label>
         <button type="button" data-testid="pose-here" disabled={!device.live.value} onClick={here}>
-          {texts.acts.here}
+          {texts.here}
         </button>
       </div>
       <div class="act-numbers">
-        {[...texts.acts.axes, ...texts.acts.turns].map((label, index) => (
+        {[...texts.axes, ...texts.turns].map((label, index) => (
           <NumberField
             key={label}
             label={label}
@@ -68,8 +68,8 @@ export function Pose({ station, description, no }: ActProps) {
           />
         ))}
       </div>
-      <Choice label={texts.acts.way} value={way} onChange={setWay} options={Object.entries(texts.acts.ways) as [Way, string][]} />
-      <Share label={texts.acts.speed} value={speed} least={0.05} onChange={setSpeed} />
+      <Choice label={texts.way} value={way} onChange={setWay} options={Object.entries(texts.ways) as [Way, string][]} />
+      <Share label={texts.speed} value={speed} least={0.05} onChange={setSpeed} />
       <button
         type="submit"
         class="primary"
@@ -77,7 +77,7 @@ export function Pose({ station, description, no }: ActProps) {
         disabled={values === null || no !== ""}
         title={no === "" ? undefined : no}
       >
-        {texts.acts.moveThere}
+        {texts.moveThere}
       </button>
     </form>
   );

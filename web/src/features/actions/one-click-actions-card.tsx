@@ -1,7 +1,7 @@
 /** What a robot shows by one button: postures, behaviours, expressions. */
 import { useState } from "preact/hooks";
 import type { AnyRequest } from "../../shared/api/action-requests";
-import { texts } from "../../shared/i18n/texts";
+import { texts } from "./texts";
 import { ask, type ActProps } from "./action-cards";
 import { Share } from "./action-form-fields";
 
@@ -40,7 +40,7 @@ export function Postures(props: ActProps) {
         testid="posture"
         request={(name) => ({ kind: "take_posture", name, speed })}
       />
-      <Share label={texts.acts.speed} value={speed} least={0.1} onChange={setSpeed} />
+      <Share label={texts.speed} value={speed} least={0.1} onChange={setSpeed} />
     </>
   );
 }
@@ -66,7 +66,7 @@ export function Expressions(props: ActProps) {
         testid="expression"
         request={(name) => ({ kind: "express", name, strength })}
       />
-      <Share label={texts.acts.strength} value={strength} least={0} onChange={setStrength} testid="strength" />
+      <Share label={texts.strength} value={strength} least={0} onChange={setStrength} testid="strength" />
     </>
   );
 }

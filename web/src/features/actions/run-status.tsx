@@ -3,7 +3,8 @@ import { useState } from "preact/hooks";
 import { ended, type ActionRunner, type Run } from "./model/action-runner";
 import type { Control } from "../control/model/lease";
 import type { DeviceStore } from "../devices/model/device-store";
-import { texts } from "../../shared/i18n/texts";
+import { format } from "../../shared/i18n/format";
+import { describeRequest, texts } from "./texts";
 import { whyNotAct } from "../devices/availability";
 
 interface RunStatusProps {
@@ -26,27 +27,27 @@ export function RunStatus({ device, control, actions }: RunStatusProps) {
     <div class={`doing ${mineRuns || others !== null ? "running" : ""} ${shown ? "" : "nothing"}`}>
       <div class={`run run-${run?.status ?? "none"}`} role="status" data-testid="action-status" data-status={run?.status ?? ""}>
         {run !== null && <Told run={run} />}
-        {others !== null && <p>{texts.acts.othersDo(others.kind, others.name ?? "")}</p>}
+        {others !== null && <p>{texts.running(others.kind, others.name ?? "")}</p>}
         {problem !== "" && <p class="field-error">{problem}</p>}
       </div>
       <div class="row">
         {(mineRuns || others !== null) && device.info.value.role !== "viewer" && (
           <button type="button" data-testid="cancel-action" onClick={cancel}>
-            {texts.movements.cancel}
+            {texts.cancel}
           </button>
         )}
         {run !== null && ended(run) && (
           <>
             <Back device={device} control={control} actions={actions} run={run} />
             <button type="button" class="plain" onClick={() => setDismissed(run.key)}>
-              {texts.acts.dismiss}
+              {texts.dismiss}
             </button>
           </>
         )}
       </div>
       {run !== null && run.output !== "" && (
         <details class="printed" open>
-          <summary>{texts.movements.output}</summary>
+          <summary>{texts.output}</summary>
           <pre class="output" tabIndex={0}>
             {run.output}
           </pre>
@@ -58,21 +59,21 @@ export function RunStatus({ device, control, actions }: RunStatusProps) {
 
 /** What was asked, the steps it has made, how far it is. */
 export function Told({ run }: { run: Run }) {
-  const name = texts.acts.asked(run.request);
+  const name = describeRequest(run.request);
   return (
     <>
       <strong>{name}</strong>
       <ol class="steps">
         {run.steps.map((step) => (
           <li key={step.status}>
-            {texts.movements.status[step.status]}
-            {step.afterMs > 0 && <span class="quiet"> {texts.number.milliseconds(step.afterMs)}</span>}
+            {texts.status[step.status]}
+            {step.afterMs > 0 && <span class="quiet"> {format.milliseconds(step.afterMs)}</span>}
           </li>
         ))}
       </ol>
       {run.progress !== null && !ended(run) && <progress value={run.progress} max={1} aria-label={name} />}
       {run.why !== "" && <p class={run.status === "done" ? "" : "field-error"}>{run.why}</p>}
-      {run.status === "unanswered" && <p class="field-error">{texts.acts.unanswered}</p>}
+      {run.status === "unanswered" && <p class="field-error">{texts.unanswered}</p>}
     </>
   );
 }
@@ -91,7 +92,7 @@ function Back({ device, control, actions, run }: RunStatusProps & { run: Run }) 
       title={no === "" ? undefined : no}
       onClick={() => void actions.start(back, control.epoch)}
     >
-      {texts.acts.back}
+      {texts.back}
     </button>
   );
 }

@@ -1,6 +1,6 @@
 import { useEffect, useRef, useState } from "preact/hooks";
 import type { ActionRunner } from "./model/action-runner";
-import { texts } from "../../shared/i18n/texts";
+import { texts } from "./texts";
 import { ask, type ActProps } from "./action-cards";
 
 const LONGEST = 2000;
@@ -29,7 +29,7 @@ export function Speech({ station, no }: ActProps) {
       }}
     >
       <label>
-        {texts.acts.say}
+        {texts.say}
         <textarea
           rows={2}
           maxLength={LONGEST}
@@ -45,12 +45,12 @@ export function Speech({ station, no }: ActProps) {
       </label>
       <div class="row">
         <label class="act-language">
-          {texts.acts.language}
+          {texts.language}
           <input
             type="text"
             list="say-languages"
             value={language}
-            placeholder={texts.acts.ownLanguage}
+            placeholder={texts.ownLanguage}
             aria-invalid={!good}
             autocapitalize="off"
             data-testid="say-language"
@@ -58,14 +58,14 @@ export function Speech({ station, no }: ActProps) {
           />
         </label>
         <datalist id="say-languages">
-          {Object.entries(texts.acts.languages).map(([code, name]) => (
+          {Object.entries(texts.languages).map(([code, name]) => (
             <option key={code} value={code}>
               {name}
             </option>
           ))}
         </datalist>
         <button type="submit" class="primary" data-testid="say" disabled={!ready} title={no === "" ? undefined : no}>
-          {texts.acts.sayIt}
+          {texts.sayIt}
         </button>
       </div>
     </form>

@@ -1,5 +1,6 @@
 import { useState } from "preact/hooks";
-import { texts } from "../../shared/i18n/texts";
+import { format } from "../../shared/i18n/format";
+import { texts } from "./texts";
 import { ask, type ActProps } from "./action-cards";
 import { Share } from "./action-form-fields";
 
@@ -16,9 +17,9 @@ export function StiffnessCard({ station, description, no }: ActProps) {
   return (
     <div class="act-form">
       <label>
-        {texts.acts.joint}{" "}
+        {texts.joint}{" "}
         <select value={joint} data-testid="stiffness-joint" onChange={(event) => setJoint(event.currentTarget.value)}>
-          <option value={ALL}>{texts.acts.allJoints}</option>
+          <option value={ALL}>{texts.allJoints}</option>
           {description.joints.map(({ name, label }) => (
             <option key={name} value={name}>
               {label}
@@ -26,8 +27,8 @@ export function StiffnessCard({ station, description, no }: ActProps) {
           ))}
         </select>
       </label>
-      <Share label={texts.acts.stiffness} value={value} least={0} onChange={setValue} testid="stiffness-value" />
-      {stands && value < 0.3 && <p class="notice warn">{texts.acts.limpWarning}</p>}
+      <Share label={texts.stiffness} value={value} least={0} onChange={setValue} testid="stiffness-value" />
+      {stands && value < 0.3 && <p class="notice warn">{texts.limpWarning}</p>}
       <div class="row">
         <button
           type="button"
@@ -36,7 +37,7 @@ export function StiffnessCard({ station, description, no }: ActProps) {
           title={no === "" ? undefined : no}
           onClick={() => set(value)}
         >
-          {value === 0 ? texts.acts.letGo : texts.acts.set}
+          {value === 0 ? texts.letGo : texts.set}
         </button>
         <button
           type="button"
@@ -48,7 +49,7 @@ export function StiffnessCard({ station, description, no }: ActProps) {
             set(1);
           }}
         >
-          {texts.acts.holdFully}
+          {texts.holdFully}
         </button>
       </div>
       <Told told={device.state.value?.stiffness ?? null} live={device.live.value} />
@@ -58,13 +59,13 @@ export function StiffnessCard({ station, description, no }: ActProps) {
 
 /** The device names only the joints that hold with less than all their strength. */
 function Told({ told, live }: { told: Readonly<Record<string, number>> | null; live: boolean }) {
-  if (told === null) return <p class="quiet small">{texts.acts.stiffnessUnknown}</p>;
+  if (told === null) return <p class="quiet small">{texts.stiffnessUnknown}</p>;
   const less = Object.entries(told);
   return (
     <p class={`small ${live ? "quiet" : "old"}`} data-testid="stiffness-told" data-less={less.length}>
       {less.length === 0
-        ? texts.acts.holdsFully
-        : texts.acts.holdsLess(less.map(([name, value]) => `${name} ${texts.number.percent(value)}`).join(", "))}
+        ? texts.holdsFully
+        : texts.holdsLess(less.map(([name, value]) => `${name} ${format.percent(value)}`).join(", "))}
     </p>
   );
 }

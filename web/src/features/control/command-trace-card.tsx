@@ -3,7 +3,10 @@ import type { Station } from "../devices/model/device-session";
 import type { Step } from "../actions/model/action-runner";
 import { clock } from "../../shared/lib/clock";
 import type { Line, LineStatus } from "./model/command-trace";
-import { texts } from "../../shared/i18n/texts";
+import { format } from "../../shared/i18n/format";
+import { describeRequest, texts as actionTexts } from "../actions/texts";
+import { texts as steeringTexts } from "../steering/texts";
+import { texts } from "./texts";
 import { Latency } from "../latency/live-latency-card";
 import { Card } from "../../shared/ui/parts";
 
@@ -13,23 +16,23 @@ const FIRST: ReadonlySet<LineStatus> = new Set(["sent", ...COLUMNS]);
 export function Times({ station }: { station: Station }) {
   const lines = station.evidence.lines.value;
   return (
-    <Card title={texts.latency.title} class="latency">
+    <Card title={texts.trace.latency} class="latency">
       <Latency device={station.device} control={station.control} />
-      <h3>{texts.evidence.title}</h3>
+      <h3>{texts.trace.title}</h3>
       {lines.length === 0 ? (
-        <p class="quiet">{texts.evidence.none}</p>
+        <p class="quiet">{texts.trace.none}</p>
       ) : (
-        <div class="scroll evidence" data-testid="evidence" tabIndex={0} role="region" aria-label={texts.evidence.title}>
+        <div class="scroll evidence" data-testid="evidence" tabIndex={0} role="region" aria-label={texts.trace.title}>
           <table>
             <thead>
               <tr>
-                <th scope="col">{texts.evidence.what}</th>
+                <th scope="col">{texts.trace.command}</th>
                 {COLUMNS.map((column) => (
                   <th key={column} scope="col">
-                    {texts.evidence.column[column]}
+                    {texts.trace.column[column]}
                   </th>
                 ))}
-                <th scope="col">{texts.evidence.column.ended}</th>
+                <th scope="col">{texts.trace.column.ended}</th>
               </tr>
             </thead>
             <tbody>
@@ -40,9 +43,14 @@ export function Times({ station }: { station: Station }) {
           </table>
         </div>
       )}
-      <p class="quiet small">{texts.evidence.explained}</p>
+      <p class="quiet small">{texts.trace.explained}</p>
     </Card>
   );
+}
+
+function endText({ status, request, why }: Line): string {
+  const reason = (steeringTexts.joints.ended as Readonly<Record<string, string>>)[why];
+  return request.kind === "stream" && reason !== undefined ? reason : actionTexts.status[status];
 }
 
 function Row({ line }: { line: Line }) {
@@ -59,24 +67,24 @@ function Row({ line }: { line: Line }) {
       {...data}
     >
       <th scope="row">
-        {texts.acts.asked(line.request)}
-        <span class="quiet small">{texts.age(Math.max(0, clock.value - line.clickedAt))}</span>
+        {describeRequest(line.request)}
+        <span class="quiet small">{format.age(Math.max(0, clock.value - line.clickedAt))}</span>
       </th>
       {COLUMNS.map((column) => (
-        <Cell key={column} step={of(column)} note={column === "observed" && line.seenBy !== null ? texts.evidence.seenBy[line.seenBy] : ""} />
+        <Cell key={column} step={of(column)} note={column === "observed" && line.seenBy !== null ? texts.trace.seenBy[line.seenBy] : ""} />
       ))}
-      <Cell step={end} note={end === undefined ? "" : texts.evidence.end(line)} bad={end !== undefined && end.status !== "done"} />
+      <Cell step={end} note={end === undefined ? "" : endText(line)} bad={end !== undefined && end.status !== "done"} />
     </tr>
   );
 }
 
 /** When, and by which way it was heard. */
 function Cell({ step, note, bad = false }: { step: Step<LineStatus> | undefined; note: string; bad?: boolean }) {
-  if (step === undefined) return <td class="quiet">{texts.number.unknown}</td>;
-  const said = [note, note === "" || note === texts.movements.status.done ? texts.evidence.heard[step.heard] : ""];
+  if (step === undefined) return <td class="quiet">{format.unknown}</td>;
+  const said = [note, note === "" || note === actionTexts.status.done ? texts.trace.heard[step.heard] : ""];
   return (
     <td>
-      {texts.number.milliseconds(step.afterMs)}
+      {format.milliseconds(step.afterMs)}
       <span class={`small ${bad ? "ended-badly" : "quiet"}`}>{said.filter((one) => one !== "").join(", ")}</span>
     </td>
   );

@@ -3,7 +3,7 @@ import type { Control } from "./model/lease";
 import type { DeviceStore } from "../devices/model/device-store";
 import type { StopSwitch } from "./model/stop";
 import type { Watching } from "./model/watchers";
-import { texts } from "../../shared/i18n/texts";
+import { texts } from "./texts";
 import "./control-bar.css";
 import { useFocusBack } from "../../shared/hooks/use-return-focus";
 import { Answer, AskButton, Asked, TakeOver } from "./handover-rows";

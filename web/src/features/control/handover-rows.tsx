@@ -5,7 +5,7 @@ import type { AskState } from "./model/control-request";
 import { clock } from "../../shared/lib/clock";
 import type { Control } from "./model/lease";
 import type { DeviceStore } from "../devices/model/device-store";
-import { texts } from "../../shared/i18n/texts";
+import { texts } from "./texts";
 
 /** Seconds that are left, for eyes: read out each second it would drown everything else. */
 function Left({ until, as }: { until: number; as: (s: number) => string }) {

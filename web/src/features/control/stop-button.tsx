@@ -1,7 +1,7 @@
 import { useState } from "preact/hooks";
 import type { DeviceStore } from "../devices/model/device-store";
 import type { StopSwitch } from "./model/stop";
-import { texts } from "../../shared/i18n/texts";
+import { texts } from "./texts";
 
 interface StopBannerProps {
   device: DeviceStore;

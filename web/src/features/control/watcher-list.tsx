@@ -1,7 +1,8 @@
 /** How many others look at a device, and who they are: as the server tells, for as long as it is heard. */
 import { onThisClock } from "../../shared/lib/clock";
 import type { Watching } from "./model/watchers";
-import { texts } from "../../shared/i18n/texts";
+import { common } from "../../shared/i18n/common";
+import { texts } from "./texts";
 import { Age } from "../../shared/ui/parts";
 
 interface WatchersButtonProps {
@@ -25,7 +26,7 @@ export function WatchersButton({ watching, open, names, onToggle }: WatchersButt
       aria-controls={names}
       onClick={onToggle}
     >
-      {texts.others.count(others.length)}
+      {texts.watchers.count(others.length)}
     </button>
   );
 }
@@ -34,11 +35,11 @@ export function WatcherNames({ watching, id }: { watching: Watching; id: string 
   const others = watching.others.value ?? [];
   if (others.length === 0) return null;
   return (
-    <ul class="bar-row watcher-names" id={id} aria-label={texts.others.title} data-testid="watcher-names">
+    <ul class="bar-row watcher-names" id={id} aria-label={texts.watchers.title} data-testid="watcher-names">
       {others.map(({ name, role, mine, since }, index) => (
         <li key={index}>
           {name} <span class="quiet small">
-            {mine ? texts.others.mine : texts.role[role].toLowerCase()}, <Age at={onThisClock(Date.parse(since))} as={texts.others.since} />
+            {mine ? texts.watchers.mine : common.role[role].toLowerCase()}, <Age at={onThisClock(Date.parse(since))} as={texts.watchers.since} />
           </span>
         </li>
       ))}

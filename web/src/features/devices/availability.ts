@@ -1,13 +1,13 @@
 /** Whether something may be asked of a device now, and if not, why. */
 import type { Control } from "../control/model/lease";
 import type { DeviceStore } from "./model/device-store";
-import { texts } from "../../shared/i18n/texts";
+import { texts } from "./texts";
 
 /** Empty where it may. */
 export function whyNot(device: DeviceStore): string {
-  if (device.info.value.role === "viewer") return texts.room.watchOnly;
-  if (device.reach.value === "offline" || device.reach.value === "unknown") return texts.room.away;
-  if (device.stopped.value) return texts.room.stopFirst;
+  if (device.info.value.role === "viewer") return texts.unavailable.viewer;
+  if (device.reach.value === "offline" || device.reach.value === "unknown") return texts.unavailable.offline;
+  if (device.stopped.value) return texts.unavailable.stopped;
   return "";
 }
 
@@ -17,10 +17,10 @@ export function whyNotAct(device: DeviceStore, control: Control): string {
   if (no !== "") return no;
   const mode = device.live.value ? device.mode.value : undefined;
   // First of all: an action that nobody had control for brings a lease of its own, and that says nothing here.
-  if (mode === "action") return texts.acts.busy;
+  if (mode === "action") return texts.unavailable.busy;
   const holder = device.holder.value;
-  if (holder !== null && !holder.mine && control.epoch === null) return texts.acts.held(holder.name);
-  if (mode === "fault") return texts.acts.fault;
-  if (mode === "streaming" && control.streamer.value?.state.value !== "idle") return texts.acts.streaming;
+  if (holder !== null && !holder.mine && control.epoch === null) return texts.unavailable.held(holder.name);
+  if (mode === "fault") return texts.unavailable.fault;
+  if (mode === "streaming" && control.streamer.value?.state.value !== "idle") return texts.unavailable.streaming;
   return "";
 }

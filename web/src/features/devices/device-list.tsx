@@ -3,7 +3,9 @@ import type { DeviceStore } from "./model/device-store";
 import type { Fleet } from "./model/device-list";
 import type { HealthLine } from "../health/model/health";
 import { isRoomDevice } from "./model/filter";
-import { texts } from "../../shared/i18n/texts";
+import { common } from "../../shared/i18n/common";
+import { format } from "../../shared/i18n/format";
+import { texts } from "./texts";
 import { HeardAge, ReachChip } from "../../shared/ui/parts";
 import { deviceAddress } from "../../app/routes";
 import { PickForTogether } from "../steering/multi-select";
@@ -51,25 +53,25 @@ function RobotRow({ device, fleet, line }: { device: DeviceStore; fleet: Fleet; 
       </a>
       <dl>
         <div>
-          <dt>{texts.fleet.status}</dt>
+          <dt>{texts.list.status}</dt>
           <dd>
             <ReachChip device={device} data-testid="online" />
           </dd>
         </div>
         <div>
-          <dt>{texts.fleet.heard}</dt>
+          <dt>{texts.list.heard}</dt>
           <dd>
             <HeardAge device={device} />
           </dd>
         </div>
         <div>
-          <dt>{texts.fleet.doing}</dt>
+          <dt>{texts.list.doing}</dt>
           <dd>
             <Doing device={device} line={line} />
           </dd>
         </div>
         <div>
-          <dt>{texts.fleet.control}</dt>
+          <dt>{texts.list.control}</dt>
           <dd>
             <Holder device={device} />
           </dd>
@@ -107,13 +109,13 @@ export function faultsOf(device: DeviceStore, line: HealthLine | undefined): num
 
 function Doing({ device, line }: { device: DeviceStore; line: HealthLine | undefined }) {
   const state = device.state.value;
-  if (state === null) return <span class="quiet">{texts.number.unknown}</span>;
+  if (state === null) return <span class="quiet">{format.unknown}</span>;
   const faults = faultsOf(device, line);
-  const what = state.action === null ? texts.mode[state.mode] : texts.acts.running(nameOf(state.action));
+  const what = state.action === null ? common.mode[state.mode] : texts.list.running(nameOf(state.action));
   return (
     <span class={device.live.value ? "" : "old"}>
       <span class={state.mode === "stopped" || state.mode === "fault" ? "chip bad" : ""}>{what}</span>
-      {faults > 0 && <span class="chip bad">{texts.fleet.faults(faults)}</span>}
+      {faults > 0 && <span class="chip bad">{texts.list.faults(faults)}</span>}
     </span>
   );
 }
@@ -124,6 +126,6 @@ function nameOf(action: { name?: string; kind: string }): string {
 
 function Holder({ device }: { device: DeviceStore }) {
   const holder = device.holder.value;
-  if (holder === null) return <>{texts.fleet.nobody}</>;
-  return <>{holder.mine ? texts.fleet.you : holder.name}</>;
+  if (holder === null) return <>{texts.list.nobody}</>;
+  return <>{holder.mine ? texts.list.you : holder.name}</>;
 }

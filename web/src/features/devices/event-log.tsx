@@ -1,15 +1,16 @@
 import { clock, onThisClock } from "../../shared/lib/clock";
 import type { DeviceStore } from "./model/device-store";
-import { texts } from "../../shared/i18n/texts";
+import { format } from "../../shared/i18n/format";
+import { texts } from "./texts";
 import { Card } from "../../shared/ui/parts";
 
 /** What lasts (faults) and what happened (events), newest first. */
 export function Events({ device }: { device: DeviceStore }) {
   const events = device.events.value;
   const faults = device.state.value?.faults ?? [];
-  const age = (atMs: number): string => texts.age(Math.max(0, clock.value - onThisClock(atMs)));
+  const age = (atMs: number): string => format.age(Math.max(0, clock.value - onThisClock(atMs)));
   return (
-    <Card title={texts.events.title} class="events">
+    <Card title={texts.cards.events} class="events">
       {faults.length > 0 && (
         <ul class="faults" aria-label={texts.events.faults}>
           {faults.map((fault) => (
@@ -20,7 +21,7 @@ export function Events({ device }: { device: DeviceStore }) {
         </ul>
       )}
       {events.length === 0 && faults.length === 0 && <p class="quiet">{texts.events.none}</p>}
-      <ul class="event-list" tabIndex={0} aria-label={texts.events.title}>
+      <ul class="event-list" tabIndex={0} aria-label={texts.cards.events}>
         {events.map((event) => (
           <li key={event.id} class={event.severity}>
             {event.message} <span class="quiet">{age(event.at_ms)}</span>

@@ -3,7 +3,8 @@ import type { Api } from "../../shared/api/client";
 import type { DeviceStore } from "./model/device-store";
 import type { Fleet } from "./model/device-list";
 import { fits, type Kinds, type Wanted, type Whose } from "./model/filter";
-import { texts } from "../../shared/i18n/texts";
+import { common } from "../../shared/i18n/common";
+import { texts } from "./texts";
 import { DeviceLists, faultsOf } from "./device-list";
 import "./list.css";
 import { Choice } from "../../shared/ui/parts";
@@ -32,12 +33,12 @@ export function FleetPage({ api, fleet }: { api: Api; fleet: Fleet }) {
   return (
     <main class="page fleet" id="content">
       <div class="fleet-head">
-        <h1>{texts.fleet.title}</h1>
+        <h1>{texts.list.title}</h1>
         <a class="elsewhere" href={pairAddress} data-testid="pair">
-          {texts.pair.open}
+          {texts.list.pair}
         </a>
       </div>
-      {devices === null && <p class="quiet">{texts.loading}</p>}
+      {devices === null && <p class="quiet">{common.loading}</p>}
       {devices?.size === 0 && <FirstSteps />}
       {all.length >= SEARCH_FROM && <Search wanted={wanted} change={setWanted} shared={shared} shown={shown.length} all={all.length} />}
       {all.length > 0 && shown.length === 0 && (

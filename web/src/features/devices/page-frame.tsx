@@ -4,7 +4,8 @@ import type { Account, Api } from "../../shared/api/client";
 import type { DeviceStore } from "./model/device-store";
 import type { Fleet } from "./model/device-list";
 import type { Station } from "./model/device-session";
-import { texts } from "../../shared/i18n/texts";
+import { common } from "../../shared/i18n/common";
+import { texts } from "./texts";
 import { ControlBar } from "../control/control-bar";
 import { HeardAge, ReachChip } from "../../shared/ui/parts";
 import { deviceAddress, fleetAddress, healthAddressOf, timesAddressOf } from "../../app/routes";
@@ -26,8 +27,8 @@ export function DeviceFrame({ id, ...rest }: DeviceFrameProps) {
   if (device !== undefined) return <Framed key={id} device={device} {...rest} />;
   return (
     <main class="narrow" id="content">
-      <p role="status">{devices === null ? texts.loading : texts.device.missing}</p>
-      <a href={fleetAddress}>{texts.device.back}</a>
+      <p role="status">{devices === null ? common.loading : common.deviceMissing}</p>
+      <a href={fleetAddress}>{common.allDevices}</a>
     </main>
   );
 }
@@ -41,24 +42,24 @@ function Framed({ api, fleet, account, device, page, children }: FramedProps) {
   if (station === undefined) return null;
   const { label } = device.info.value;
   const pages = [
-    [texts.care.operate, deviceAddress(device.id), false],
-    [texts.parts.health, healthAddressOf("device", device.id), page === "health"],
-    [texts.parts.times, timesAddressOf(device.id), page === "times"],
+    [texts.pages.device, deviceAddress(device.id), false],
+    [texts.pages.health, healthAddressOf("device", device.id), page === "health"],
+    [texts.pages.latency, timesAddressOf(device.id), page === "times"],
   ] as const;
   return (
     <>
       <ControlBar device={device} control={station.control} stop={station.stop} />
       <main class="page operate care" id="content">
         <div class="heading">
-          <a href={fleetAddress}>← {texts.device.back}</a>
-          <h1>{texts.care.title[page](label)}</h1>
+          <a href={fleetAddress}>← {common.allDevices}</a>
+          <h1>{texts.pages.title[page](label)}</h1>
           <p class="reach">
             <ReachChip device={device} data-testid="online" />
             <span class="quiet">
-              {texts.fleet.heard}: <HeardAge device={device} />
+              {texts.list.heard}: <HeardAge device={device} />
             </span>
           </p>
-          <nav class="care-pages" aria-label={texts.care.pages(label)}>
+          <nav class="care-pages" aria-label={texts.pages.of(label)}>
             {pages.map(([name, address, here]) => (
               <a key={address} href={address} aria-current={here ? "page" : undefined}>
                 {name}

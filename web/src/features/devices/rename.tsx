@@ -3,7 +3,7 @@ import { useEffect, useRef, useState } from "preact/hooks";
 import type { Api } from "../../shared/api/client";
 import type { DeviceStore } from "./model/device-store";
 import { sentence } from "../../shared/api/http";
-import { texts } from "../../shared/i18n/texts";
+import { texts } from "./texts";
 import { useFocusBack } from "../../shared/hooks/use-return-focus";
 
 export function Naming({ api, device }: { api: Api; device: DeviceStore }) {

@@ -4,7 +4,8 @@ import type { Account, Api } from "../../shared/api/client";
 import type { DeviceStore } from "./model/device-store";
 import type { Fleet } from "./model/device-list";
 import type { Station } from "./model/device-session";
-import { texts } from "../../shared/i18n/texts";
+import { common } from "../../shared/i18n/common";
+import { texts } from "./texts";
 import { Access, goToAccess } from "../sharing/access-list";
 import { Acts } from "../actions/action-cards";
 import { RunStatus } from "../actions/run-status";
@@ -43,7 +44,7 @@ export function DevicePage({ api, fleet, id, account }: DevicePageProps) {
   if (devices === null) {
     return (
       <main class="page" id="content">
-        <p class="quiet">{texts.loading}</p>
+        <p class="quiet">{common.loading}</p>
       </main>
     );
   }
@@ -51,7 +52,7 @@ export function DevicePage({ api, fleet, id, account }: DevicePageProps) {
     return (
       <main class="narrow" id="content">
         {shown.current === "" ? (
-          <p>{texts.device.missing}</p>
+          <p>{common.deviceMissing}</p>
         ) : (
           <div role="alert" class="no-access" data-testid="no-access">
             <h1>{texts.device.gone(shown.current)}</h1>
@@ -60,7 +61,7 @@ export function DevicePage({ api, fleet, id, account }: DevicePageProps) {
         )}
         <p>
           <a class="elsewhere" href={fleetAddress}>
-            {texts.device.back}
+            {common.allDevices}
           </a>
         </p>
       </main>
@@ -116,35 +117,35 @@ function Desk({ api, fleet, station, account, access }: DeskProps) {
   return (
     <div class="desk robot">
       <div class="column">
-        <Foldable name="view" title={texts.view.title} type={type} always>
+        <Foldable name="view" title={texts.cards.view} type={type} always>
           <View3D device={device} control={control} />
         </Foldable>
         {views.length > 0 && (
-          <Foldable name="camera" title={texts.watching.title} type={type}>
+          <Foldable name="camera" title={texts.cards.camera} type={type}>
             <Watching device={device} views={views} />
           </Foldable>
         )}
-        <Foldable name="plot" title={texts.plot.title} type={type}>
+        <Foldable name="plot" title={texts.cards.plot} type={type}>
           <Plot device={device} />
         </Foldable>
-        <Foldable name="poses" title={texts.poses.title} type={type}>
+        <Foldable name="poses" title={texts.cards.poses} type={type}>
           <PoseTable device={device} />
         </Foldable>
       </div>
       <div class="column">
-        <Foldable name="steer" title={texts.steer.title} type={type} always>
+        <Foldable name="steer" title={texts.cards.steering} type={type} always>
           <SteerCard station={station} onStop={() => station.stopNow()} />
         </Foldable>
-        <Foldable name="times" title={texts.latency.title} type={type}>
+        <Foldable name="times" title={texts.cards.latency} type={type}>
           <Times station={station} />
         </Foldable>
       </div>
       <div class="column">
         <Acts fleet={fleet} station={station} />
-        <Foldable name="movements" title={texts.movements.title} type={type}>
+        <Foldable name="movements" title={texts.cards.movements} type={type}>
           <Movements api={api} device={device} control={control} actions={actions} account={account.id} />
         </Foldable>
-        <Foldable name="events" title={texts.events.title} type={type}>
+        <Foldable name="events" title={texts.cards.events} type={type}>
           <Events device={device} />
         </Foldable>
         {access}
@@ -179,7 +180,7 @@ function Heading({ api, device, fleet }: { api: Api; device: DeviceStore; fleet:
   const trouble = device.trouble.value;
   return (
     <div class="heading">
-      <a href={fleetAddress}>← {texts.device.back}</a>
+      <a href={fleetAddress}>← {common.allDevices}</a>
       <h1>{info.label}</h1>
       <p class="quiet">
         {info.robot_type.replaceAll("_", " ")} · <a href={spaceAddress(info.space)}>{fleet.spaceName(info.space)}</a>
@@ -189,19 +190,19 @@ function Heading({ api, device, fleet }: { api: Api; device: DeviceStore; fleet:
         <ReachChip device={device} data-testid="online" />
         <HealthChip api={api} device={device} />
         <a class="chip" href={timesAddressOf(device.id)}>
-          {texts.parts.times}
+          {texts.pages.latency}
         </a>
         <span class="quiet">
-          {texts.fleet.heard}: <HeardAge device={device} />
+          {texts.list.heard}: <HeardAge device={device} />
         </span>
         {(device.description.value?.joints.length ?? 0) > 0 && (
           <a href={keyframesAddress(info.id)} data-testid="to-keyframes">
-            {texts.keyframes.title}
+            {texts.cards.keyframes}
           </a>
         )}
         <Naming api={api} device={device} />
         <button type="button" class="plain" onClick={goToAccess}>
-          {texts.access.title}
+          {texts.cards.access}
         </button>
       </p>
       {trouble !== null && <p class="notice warn">{texts.device.unreadable(trouble)}</p>}

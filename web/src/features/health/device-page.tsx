@@ -18,7 +18,9 @@ import {
 import type { DeviceStore } from "../devices/model/device-store";
 import { sentence } from "../../shared/api/http";
 import { quantityOf, type Quantity } from "../sensors/model/quantities";
-import { texts } from "../../shared/i18n/texts";
+import { common } from "../../shared/i18n/common";
+import { format } from "../../shared/i18n/format";
+import { texts } from "./texts";
 import { FaultItem } from "./fault-item";
 import { codes, HealthWord, useTold } from "./health-chip";
 import { Card, Choice } from "../../shared/ui/parts";
@@ -59,7 +61,7 @@ export function DeviceHealthView({ api, device }: { api: Api; device: DeviceStor
         <div ref={trend} tabIndex={-1} class="trend-place">
           {at === null ? (
             <Card title={texts.trend.title}>
-              <p class="quiet">{value === null ? texts.loading : texts.care.nothingWatched}</p>
+              <p class="quiet">{value === null ? common.loading : texts.health.nothingWatched}</p>
             </Card>
           ) : (
             <Chart api={api} device={device} at={at} fields={fields} faults={[...(value?.faults ?? []), ...past.items]} />
@@ -79,12 +81,12 @@ function Now({ device, value, trouble }: { device: DeviceStore; value: DeviceHea
     <div class="row care-sum">
       {value !== null && <HealthWord health={healthNow(value.health, told, device.reach.value)} />}
       <p role="status" data-testid="open-faults" data-count={count}>
-        {value === null && trouble === "" ? texts.loading : texts.care.open(count)}
+        {value === null && trouble === "" ? common.loading : texts.health.open(count)}
       </p>
       <button type="button" class="plain no-print" onClick={() => print()}>
-        {texts.care.print}
+        {texts.health.print}
       </button>
-      {trouble !== "" && <p class="notice bad">{texts.care.failed(trouble)}</p>}
+      {trouble !== "" && <p class="notice bad">{texts.health.failed(trouble)}</p>}
     </div>
   );
 }
@@ -137,20 +139,20 @@ function Faults({ api, device, open, past, again, show }: FaultsProps) {
   const listed = which === "open" ? standings(open ?? [], toldBy(device)) : standings(past.items, []).map((one) => ({ ...one, agreement: "same" as const }));
   return (
     <Card
-      title={texts.care.faults}
+      title={texts.health.faults}
       class="fault-card"
-      aside={<Choice label={texts.care.whichFaults} value={which} onChange={setWhich} options={Object.entries(texts.care.faultLists) as [Which, string][]} />}
+      aside={<Choice label={texts.health.whichFaults} value={which} onChange={setWhich} options={Object.entries(texts.health.faultLists) as [Which, string][]} />}
     >
-      {listed.length === 0 && <p class="quiet">{open === null ? texts.loading : texts.care.noFaults[which]}</p>}
+      {listed.length === 0 && <p class="quiet">{open === null ? common.loading : texts.health.noFaults[which]}</p>}
       <ul class="fault-list" data-testid={`faults-${which}`}>
         {listed.map((one) => (
           <FaultItem key={one.stored?.id ?? one.told?.code} api={api} device={device} standing={one} changed={again} show={show} />
         ))}
       </ul>
-      {which === "past" && past.why !== "" && <p class="notice bad">{texts.care.failed(past.why)}</p>}
+      {which === "past" && past.why !== "" && <p class="notice bad">{texts.health.failed(past.why)}</p>}
       {which === "past" && past.more && (
         <button type="button" onClick={past.older}>
-          {texts.care.older}
+          {texts.health.older}
         </button>
       )}
     </Card>
@@ -189,12 +191,12 @@ function Fields({ device, fields, at, show }: FieldsProps) {
   const description = device.description.value;
   if (fields.length === 0) return null;
   return (
-    <Card title={texts.care.watched}>
-      <div class="scroll" tabIndex={0} role="region" aria-label={texts.care.watched}>
+    <Card title={texts.health.watched}>
+      <div class="scroll" tabIndex={0} role="region" aria-label={texts.health.watched}>
         <table class="watched" data-testid="watched">
           <thead>
             <tr>
-              {texts.care.columns.map((name) => (
+              {texts.health.columns.map((name) => (
                 <th key={name} scope="col">
                   {name}
                 </th>
@@ -233,7 +235,7 @@ function Field({ device, watched, quantity, chosen, show }: FieldProps) {
   const value = newest === null ? watched.value : Number(newest.value);
   const old = newest === null || isLate(device, stream);
   const text = (one: number): string => `${shown(quantity, one)} ${quantity.unit}`.trim();
-  const span = (low: number | null, high: number | null): string => texts.care.span(low === null ? null : text(low), high === null ? null : text(high));
+  const span = (low: number | null, high: number | null): string => texts.health.span(low === null ? null : text(low), high === null ? null : text(high));
   return (
     <tr data-testid="watched-row" data-field={`${stream}.${field}`}>
       <th scope="row">
@@ -244,17 +246,17 @@ function Field({ device, watched, quantity, chosen, show }: FieldProps) {
           <p class="found">
             {findings.map((kind) => (
               <span key={kind} class="chip reach-stale">
-                {texts.care.kind[kind] ?? kind}
+                {texts.health.kind[kind] ?? kind}
               </span>
             ))}{" "}
             {advice}
           </p>
         )}
       </th>
-      <td class={old ? "old" : ""} title={old ? texts.care.storedAt(texts.moment(watched.updated_at)) : undefined}>
+      <td class={old ? "old" : ""} title={old ? texts.health.storedAt(format.dateTime(watched.updated_at)) : undefined}>
         {text(value)}
       </td>
-      <td>{watched.usual_low === null ? texts.number.unknown : span(watched.usual_low, watched.usual_high)}</td>
+      <td>{watched.usual_low === null ? format.unknown : span(watched.usual_low, watched.usual_high)}</td>
       <td>{span(watched.warning_low ?? watched.low, watched.warning_high ?? watched.high)}</td>
     </tr>
   );
@@ -285,9 +287,9 @@ function Others({ api, device, fields, at, choose }: OthersProps) {
   if (others.length === 0) return null;
   const value = at === null || watched.has(`${at.stream}/${at.field}`) ? "" : `${at.stream}/${at.field}`;
   return (
-    <Card title={texts.care.others} class="no-print">
+    <Card title={texts.health.others} class="no-print">
       <label class="field">
-        {texts.care.pickOther}
+        {texts.health.pickOther}
         <select
           value={value}
           data-testid="other-fields"
@@ -296,7 +298,7 @@ function Others({ api, device, fields, at, choose }: OthersProps) {
             if (stream !== undefined && stream !== "") choose({ stream, field: field.join("/") });
           }}
         >
-          <option value="">{texts.care.noOther}</option>
+          <option value="">{texts.health.noOther}</option>
           {others.map(([stream, left]) => (
             <optgroup key={stream} label={stream.replaceAll("_", " ")}>
               {left.map((field) => (

@@ -5,7 +5,9 @@ import { around, type Fault, type Standing, type StoredEvent } from "./model/hea
 import { onThisClock } from "../../shared/lib/clock";
 import type { DeviceStore } from "../devices/model/device-store";
 import { sentence } from "../../shared/api/http";
-import { texts } from "../../shared/i18n/texts";
+import { common } from "../../shared/i18n/common";
+import { format } from "../../shared/i18n/format";
+import { texts } from "./texts";
 import { Age } from "../../shared/ui/parts";
 
 interface FaultItemProps {
@@ -32,19 +34,19 @@ export function FaultItem({ api, device, standing, changed, show }: FaultItemPro
       data-state={stored?.state ?? "told"}
     >
       <h3 ref={head} tabIndex={-1}>
-        <span class={`chip ${CHIP[severity]}`}>{texts.care.severity[severity]}</span>{" "}
-        {texts.care.kind[stored?.kind ?? "reported"] ?? stored?.kind} <span class="quiet">{stored?.code ?? told?.code}</span>
+        <span class={`chip ${CHIP[severity]}`}>{texts.health.severity[severity]}</span>{" "}
+        {texts.health.kind[stored?.kind ?? "reported"] ?? stored?.kind} <span class="quiet">{stored?.code ?? told?.code}</span>
       </h3>
       <p>{stored?.message ?? told?.message}</p>
       {agreement !== "same" && (
         <p class="quiet small" data-testid="agreement" data-agreement={agreement}>
-          {texts.care.agreement[agreement]}
+          {texts.health.agreement[agreement]}
         </p>
       )}
       {stored === null ? (
         told !== null && (
           <p class="quiet small">
-            <Age at={onThisClock(told.since_ms)} as={texts.care.saidSince} />
+            <Age at={onThisClock(told.since_ms)} as={texts.health.saidSince} />
           </p>
         )
       ) : (
@@ -56,7 +58,7 @@ export function FaultItem({ api, device, standing, changed, show }: FaultItemPro
             )}
             {stored.stream !== "" && (
               <button type="button" onClick={() => show(stored.stream, stored.field)}>
-                {texts.care.showTrend}
+                {texts.health.showTrend}
               </button>
             )}
           </div>
@@ -69,10 +71,10 @@ export function FaultItem({ api, device, standing, changed, show }: FaultItemPro
 
 /** Raised, seen, cleared: each with its time. */
 function Life({ fault }: { fault: Fault }) {
-  const words = texts.care.life;
+  const words = texts.health.life;
   const moment = (at: string, what: string) => (
     <>
-      <strong>{what}</strong> <time dateTime={at}>{texts.moment(at)}</time>{" "}
+      <strong>{what}</strong> <time dateTime={at}>{format.dateTime(at)}</time>{" "}
       <span class="quiet">
         <Age at={onThisClock(Date.parse(at))} />
       </span>
@@ -110,7 +112,7 @@ interface AcknowledgeProps {
 function Acknowledge({ api, device, fault, done }: AcknowledgeProps) {
   const [busy, setBusy] = useState(false);
   const [why, setWhy] = useState("");
-  if (device.info.value.role === "viewer") return <span class="quiet small">{texts.care.watchOnly}</span>;
+  if (device.info.value.role === "viewer") return <span class="quiet small">{texts.health.watchOnly}</span>;
   const acknowledge = (): void => {
     setBusy(true);
     setWhy("");
@@ -122,9 +124,9 @@ function Acknowledge({ api, device, fault, done }: AcknowledgeProps) {
   return (
     <>
       <button type="button" class="primary" data-testid="acknowledge" disabled={busy} onClick={acknowledge}>
-        {busy ? texts.care.saving : texts.care.acknowledge}
+        {busy ? texts.health.saving : texts.health.acknowledge}
       </button>
-      <span class="quiet small">{texts.care.noUndo}</span>
+      <span class="quiet small">{texts.health.noUndo}</span>
       {why !== "" && (
         <span role="alert" class="field-error">
           {why}
@@ -148,20 +150,20 @@ function Around({ api, device, fault }: Pick<FaultItemProps, "api" | "device"> &
   };
   return (
     <details class="around no-print" onToggle={(event) => event.currentTarget.open && open()}>
-      <summary>{texts.care.around}</summary>
+      <summary>{texts.health.around}</summary>
       {why !== "" && <p class="notice bad">{why}</p>}
-      {events === null && why === "" && <p class="quiet">{texts.loading}</p>}
+      {events === null && why === "" && <p class="quiet">{common.loading}</p>}
       {events !== null && (
         <ul class="event-list">
           {events.slice(0, SHOWN).map((event) => (
             <li key={event.id} class={event.severity}>
               <time class="quiet" dateTime={event.at}>
-                {texts.time(Date.parse(event.at))}
+                {format.time(Date.parse(event.at))}
               </time>{" "}
-              {texts.care.event[event.kind] ?? event.kind.replaceAll("-", " ")}: {event.message}
+              {texts.health.event[event.kind] ?? event.kind.replaceAll("-", " ")}: {event.message}
             </li>
           ))}
-          {events.length === 0 && <li class="quiet">{texts.care.nothingAround}</li>}
+          {events.length === 0 && <li class="quiet">{texts.health.nothingAround}</li>}
         </ul>
       )}
     </details>

@@ -3,7 +3,7 @@ import { useEffect } from "preact/hooks";
 import type { Api } from "../../shared/api/client";
 import type { DeviceStore } from "../devices/model/device-store";
 import { openCount, toldBy, type HealthState } from "./model/health";
-import { texts } from "../../shared/i18n/texts";
+import { texts } from "./texts";
 import { usePolled, type Polled } from "../../shared/hooks/use-polling";
 import { healthAddressOf } from "../../app/routes";
 
@@ -16,7 +16,7 @@ const KIND: Readonly<Record<HealthState, string>> = { ok: "reach-online", unknow
 export function HealthWord({ health }: { health: HealthState }) {
   return (
     <span class={`chip ${KIND[health]}`} data-testid="health" data-health={health}>
-      {texts.care.health[health]}
+      {texts.health.state[health]}
     </span>
   );
 }
@@ -41,7 +41,7 @@ export function HealthChip({ api, device }: { api: Api; device: DeviceStore }) {
   const kind = count === 0 ? "" : bad ? "bad" : "reach-stale";
   return (
     <a class={`chip ${kind}`} href={healthAddressOf("device", device.id)} data-testid="health-chip" data-count={count}>
-      {texts.care.chip(count)}
+      {texts.health.chip(count)}
     </a>
   );
 }

@@ -6,7 +6,9 @@ import { healthNow, RANK, toldBy, type HealthLine, type HealthState } from "./mo
 import { onThisClock } from "../../shared/lib/clock";
 import type { DeviceStore } from "../devices/model/device-store";
 import type { Fleet } from "../devices/model/device-list";
-import { texts } from "../../shared/i18n/texts";
+import { common } from "../../shared/i18n/common";
+import { format } from "../../shared/i18n/format";
+import { texts } from "./texts";
 import { DeviceFrame } from "../devices/page-frame";
 import { DeviceHealthView } from "./device-page";
 import { codes, HealthWord, useTold } from "./health-chip";
@@ -66,11 +68,11 @@ function HealthList({ api, fleet, space }: { api: Api; fleet: Fleet; space: stri
   const spaces = [...new Set([...(devices?.values() ?? [])].map(({ info }) => info.value.space))];
   return (
     <main class="page fleet care" id="content">
-      <h1>{space === "" ? texts.care.all : texts.care.title.health(fleet.spaceName(space))}</h1>
-      <p class="quiet">{texts.care.explained}</p>
-      <nav class="care-pages" aria-label={texts.care.spaces}>
+      <h1>{space === "" ? texts.health.title : texts.health.titleOf(fleet.spaceName(space))}</h1>
+      <p class="quiet">{texts.health.explained}</p>
+      <nav class="care-pages" aria-label={texts.health.spaces}>
         <a href={healthAddress} aria-current={space === "" ? "page" : undefined}>
-          {texts.care.everywhere}
+          {texts.health.everywhere}
         </a>
         {spaces.map((id) => (
           <a key={id} href={healthAddressOf("space", id)} aria-current={space === id ? "page" : undefined}>
@@ -78,23 +80,23 @@ function HealthList({ api, fleet, space }: { api: Api; fleet: Fleet; space: stri
           </a>
         ))}
       </nav>
-      {trouble !== "" && <p class="notice bad">{texts.care.failed(trouble)}</p>}
-      {value === null && trouble === "" && <p class="quiet">{texts.loading}</p>}
+      {trouble !== "" && <p class="notice bad">{texts.health.failed(trouble)}</p>}
+      {value === null && trouble === "" && <p class="quiet">{common.loading}</p>}
       {value !== null && (
         <div class="row care-sum">
           <p role="status" data-testid="health-counts">
-            {texts.care.counts(counted.filter(([, count]) => count > 0).map(([health, count]) => `${count} ${texts.care.health[health].toLowerCase()}`))}
+            {texts.health.counts(counted.filter(([, count]) => count > 0).map(([health, count]) => `${count} ${texts.health.state[health].toLowerCase()}`))}
           </p>
-          <Choice label={texts.list.show} value={which} onChange={setWhich} options={Object.entries(texts.care.which) as [Which, string][]} />
+          <Choice label={texts.health.show} value={which} onChange={setWhich} options={Object.entries(texts.health.which) as [Which, string][]} />
         </div>
       )}
-      {value !== null && shown.length === 0 && <p>{lines.length === 0 ? texts.fleet.none : texts.care.allWell}</p>}
-      <ul class="devices" aria-label={texts.care.devices}>
+      {value !== null && shown.length === 0 && <p>{lines.length === 0 ? texts.health.noDevices : texts.health.allWell}</p>}
+      <ul class="devices" aria-label={texts.health.devices}>
         {shown.map((one) => (
           <Line key={one.line.device} shown={one} fleet={fleet} />
         ))}
       </ul>
-      {space !== "" && <a href={spaceAddress(space)}>{texts.list.planOf(fleet.spaceName(space))}</a>}
+      {space !== "" && <a href={spaceAddress(space)}>{texts.health.planOf(fleet.spaceName(space))}</a>}
     </main>
   );
 }
@@ -119,7 +121,7 @@ function Line({ shown: { line, device, health }, fleet }: { shown: Shown; fleet:
         {device !== null && <ReachChip device={device} />}
         {device !== null && device.reach.value !== "online" && (
           <span class="quiet small">
-            {texts.fleet.heard}: <HeardAge device={device} />
+            {texts.health.lastSeen}: <HeardAge device={device} />
           </span>
         )}
       </span>
@@ -128,16 +130,16 @@ function Line({ shown: { line, device, health }, fleet }: { shown: Shown; fleet:
           <p>
             {worst.message}{" "}
             <span class="quiet">
-              {texts.care.since(texts.sinceWhen(Date.parse(worst.raised_at)))}, <Age at={onThisClock(Date.parse(worst.raised_at))} />
-              {worst.acknowledged_at !== null && ` · ${texts.care.life.seen(worst.acknowledged_by)}`}
+              {texts.health.since(format.recentTime(Date.parse(worst.raised_at)))}, <Age at={onThisClock(Date.parse(worst.raised_at))} />
+              {worst.acknowledged_at !== null && ` · ${texts.health.life.seen(worst.acknowledged_by)}`}
             </span>
           </p>
         )}
         {news.map((fault) => (
           <p key={fault.code}>{fault.message}</p>
         ))}
-        {stored > 1 && <p class="quiet small">{texts.care.open(stored)}</p>}
-        {worst === null && news.length === 0 && <p class="quiet">{texts.care.nothing[health === "unknown" ? "unknown" : "ok"]}</p>}
+        {stored > 1 && <p class="quiet small">{texts.health.open(stored)}</p>}
+        {worst === null && news.length === 0 && <p class="quiet">{texts.health.nothing[health === "unknown" ? "unknown" : "ok"]}</p>}
       </div>
     </li>
   );

@@ -6,7 +6,9 @@ import type { DeviceStore } from "../devices/model/device-store";
 import { isLate, newestOf, type Fault, type Watched } from "./model/health";
 import type { Quantity } from "../sensors/model/quantities";
 import type { Recording } from "../sensors/model/stored-series";
-import { texts } from "../../shared/i18n/texts";
+import { common } from "../../shared/i18n/common";
+import { format } from "../../shared/i18n/format";
+import { texts } from "./texts";
 import { History, useRecording } from "../sensors/history-card";
 import { Card, Choice } from "../../shared/ui/parts";
 import { Figure, Limits, shown } from "../sensors/readings-card";
@@ -50,14 +52,14 @@ export function Trend({ api, device, quantity, watched, faults }: TrendProps) {
     <Card
       title={quantity.label}
       class="trend"
-      aside={<Choice label={texts.room.span} value={span} onChange={setSpan} options={Object.entries(texts.trend.spans) as [Span, string][]} />}
+      aside={<Choice label={texts.trend.span} value={span} onChange={setSpan} options={Object.entries(texts.trend.spans) as [Span, string][]} />}
     >
       <div class="row">
         <p class={`figure-now ${late ? "old" : ""}`} data-testid="trend-now" data-value={newest === null ? "" : Number(newest.value)}>
           {newest === null ? (
             <span class="quiet small">{texts.trend.notHeard}</span>
           ) : typeof newest.value === "boolean" ? (
-            <strong>{texts.room.yesNo[newest.value ? 0 : 1]}</strong>
+            <strong>{common.yesNo[newest.value ? 0 : 1]}</strong>
           ) : (
             <Figure quantity={quantity} value={newest.value} />
           )}
@@ -76,15 +78,15 @@ export function Trend({ api, device, quantity, watched, faults }: TrendProps) {
           {inSpan.map((fault) => (
             <li key={fault.id} class={fault.severity} data-testid="trend-fault" data-code={fault.code}>
               {texts.trend.fault(
-                texts.care.kind[fault.kind] ?? fault.kind,
-                texts.sinceWhen(Date.parse(fault.raised_at)),
-                fault.cleared_at === null ? null : texts.sinceWhen(Date.parse(fault.cleared_at)),
+                texts.health.kind[fault.kind] ?? fault.kind,
+                format.recentTime(Date.parse(fault.raised_at)),
+                fault.cleared_at === null ? null : format.recentTime(Date.parse(fault.cleared_at)),
               )}
             </li>
           ))}
         </ul>
       )}
-      {trouble !== "" && <p class="quiet small">{texts.room.noHistory(trouble)}</p>}
+      {trouble !== "" && <p class="quiet small">{texts.trend.noHistory(trouble)}</p>}
     </Card>
   );
 }
@@ -95,7 +97,7 @@ function usual({ usual_low: low, usual_high: high, slope_per_s: slope, limit_in_
   const said = [low === null || high === null ? texts.trend.learning : texts.trend.usual(text(low), text(high))];
   const perMinute = slope === null ? 0 : (quantity.shown(slope) - quantity.shown(0)) * 60;
   if (Math.abs(perMinute) >= 0.0005) said.push(texts.trend.slope(perMinute > 0, `${Math.abs(perMinute).toPrecision(2)} ${quantity.unit}`));
-  if (left !== null) said.push(texts.trend.limitIn(texts.lasting.about(left)));
+  if (left !== null) said.push(texts.trend.limitIn(format.duration(left)));
   return said.join(" ");
 }
 
@@ -107,7 +109,7 @@ function Rows({ recording, quantity, spanMs }: { recording: Recording; quantity:
       <p class="quiet small" role="status">
         {texts.trend.rows(Math.min(ROWS, samples.length), samples.length)}
       </p>
-      <div class="scroll rows" tabIndex={0} role="region" aria-label={texts.room.values(quantity.label)}>
+      <div class="scroll rows" tabIndex={0} role="region" aria-label={texts.trend.values(quantity.label)}>
         <table data-testid="trend-table">
           <thead>
             <tr>
@@ -121,7 +123,7 @@ function Rows({ recording, quantity, spanMs }: { recording: Recording; quantity:
           <tbody>
             {samples.slice(0, ROWS).map((one) => (
               <tr key={one.at}>
-                <th scope="row">{texts.sinceWhen(one.at)}</th>
+                <th scope="row">{format.recentTime(one.at)}</th>
                 {[one.mean, one.low, one.high].map((value, index) => (
                   <td key={index}>{`${shown(quantity, value)} ${quantity.unit}`}</td>
                 ))}

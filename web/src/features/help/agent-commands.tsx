@@ -1,5 +1,5 @@
 /** The commands that make an agent and run it, to be copied: items of a list of steps. */
-import { texts } from "../../shared/i18n/texts";
+import { texts } from "./texts";
 import { Secret } from "../../shared/ui/copy-once";
 import "../sharing/sharing.css";
 import "./help.css";
@@ -11,7 +11,7 @@ interface AgentCommandsProps {
 }
 
 export function AgentCommands({ name, type }: AgentCommandsProps) {
-  const words = texts.help.agent;
+  const words = texts.agent;
   const home = `~/${name}-agent`;
   const agent = "python -m device_agent";
   return (

@@ -1,5 +1,5 @@
 /** What who has no device yet can do: make an agent, run it, pair it; with a simulated robot where there is no other. */
-import { texts } from "../../shared/i18n/texts";
+import { texts } from "./texts";
 import { Card } from "../../shared/ui/parts";
 import { robotTypesAddress } from "../../app/routes";
 import { AgentCommands } from "./agent-commands";
@@ -9,7 +9,7 @@ import { WhatDoISee } from "./page-explainer";
 const EXAMPLE = { name: "arm", type: "ur5" };
 
 export function FirstSteps() {
-  const words = texts.help.first;
+  const words = texts.firstSteps;
   return (
     <Card title={words.title} class="first-steps">
       <p>{words.explained}</p>
@@ -21,7 +21,7 @@ export function FirstSteps() {
         {words.simulated} <a href={robotTypesAddress}>{words.types}</a>
       </p>
       <p class="quiet">{words.shared}</p>
-      <WhatDoISee page="fleet" />
+      <WhatDoISee page="devices" />
     </Card>
   );
 }

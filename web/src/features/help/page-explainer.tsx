@@ -1,13 +1,13 @@
 /** A page in few words, for who sees it for the first time; folded until it is asked for. */
-import { texts } from "../../shared/i18n/texts";
+import { texts } from "./texts";
 import "./help.css";
 
-export function WhatDoISee({ page }: { page: keyof typeof texts.help.pages }) {
+export function WhatDoISee({ page }: { page: keyof typeof texts.pages }) {
   return (
     <details class="what-do-i-see" data-testid="what-do-i-see">
-      <summary>{texts.help.what}</summary>
+      <summary>{texts.title}</summary>
       <ul>
-        {texts.help.pages[page].map((line) => (
+        {texts.pages[page].map((line) => (
           <li key={line}>{line}</li>
         ))}
       </ul>

@@ -2,7 +2,8 @@
 import type { Account, Api } from "../../shared/api/client";
 import type { DeviceStore } from "../devices/model/device-store";
 import type { Fleet } from "../devices/model/device-list";
-import { texts } from "../../shared/i18n/texts";
+import { common } from "../../shared/i18n/common";
+import { texts } from "./texts";
 import { ControlBar } from "../control/control-bar";
 import { ReachChip } from "../../shared/ui/parts";
 import { deviceAddress, fleetAddress, keyframesAddress } from "../../app/routes";
@@ -27,8 +28,8 @@ export function KeyframesPage({ api, fleet, account, id, name }: KeyframesPagePr
   if (device === undefined) {
     return (
       <main class="page" id="content">
-        <p class="quiet">{devices === null ? texts.loading : texts.device.missing}</p>
-        {devices !== null && <a href={fleetAddress}>{texts.device.back}</a>}
+        <p class="quiet">{devices === null ? common.loading : common.deviceMissing}</p>
+        {devices !== null && <a href={fleetAddress}>{common.allDevices}</a>}
       </main>
     );
   }
@@ -54,7 +55,7 @@ function OfDevice({ api, fleet, account, device, name }: OfDeviceProps) {
       <main class="page operate kf-page" id="content">
         <div class="heading">
           <a href={deviceAddress(device.id)}>← {label}</a>
-          <h1>{texts.keyframes.title}</h1>
+          <h1>{texts.title}</h1>
           <p class="quiet">
             {robotType.replaceAll("_", " ")}
             {name !== "" && ` · ${name}`}

@@ -5,7 +5,7 @@ import { begun, Drafts, Editor } from "./model/editor";
 import type { Positions, Robot } from "./model/keyframes";
 import type { KnownTwin } from "../../shared/mqtt/parse-messages";
 import type { Station } from "../devices/model/device-session";
-import { texts } from "../../shared/i18n/texts";
+import { texts } from "./texts";
 import { KeyframeCard } from "./keyframe-inspector";
 import "./keyframes.css";
 import { Record } from "./record-panel";
@@ -59,7 +59,7 @@ export function Desk(props: DeskProps) {
   useEffect(() => () => editor?.dispose(), [editor]);
   useKeys(editor);
 
-  if (editor === null) return <p class="quiet">{texts.keyframes.waiting}</p>;
+  if (editor === null) return <p class="quiet">{texts.waiting}</p>;
   const onSaved = (saved: string, at: number): void => {
     draftOf.current = saved;
     setName(saved);
@@ -72,7 +72,7 @@ export function Desk(props: DeskProps) {
     <>
       {restored && (
         <p class="notice warn kf-restored" role="status" data-testid="kf-restored">
-          {texts.keyframes.restored}{" "}
+          {texts.restored}{" "}
           <button
             type="button"
             onClick={() => {
@@ -81,11 +81,11 @@ export function Desk(props: DeskProps) {
               setRestored(false);
             }}
           >
-            {source.saved === null ? texts.keyframes.beginAnew : texts.keyframes.revert}
+            {source.saved === null ? texts.beginAnew : texts.revert}
           </button>
         </p>
       )}
-      {unkept && <p class="notice warn">{texts.keyframes.unkept}</p>}
+      {unkept && <p class="notice warn">{texts.unkept}</p>}
       <div class="desk kf-desk">
         <div class="column">
           <Twin twin={twin} device={station?.device ?? null} editor={editor} />

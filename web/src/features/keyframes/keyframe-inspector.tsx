@@ -14,7 +14,7 @@ import {
   type Positions,
 } from "./model/keyframes";
 import type { Joint } from "../../shared/mqtt/protocol.generated";
-import { texts } from "../../shared/i18n/texts";
+import { texts } from "./texts";
 import { Card } from "../../shared/ui/parts";
 import { JointRow } from "../steering/joint-slider";
 
@@ -29,16 +29,16 @@ export function KeyframeCard({ editor, measured }: KeyframeCardProps) {
   const keyframe = movement.keyframes[index];
   if (keyframe === undefined) return null;
   return (
-    <Card title={texts.keyframes.number(index + 1)} class="kf-keyframe">
+    <Card title={texts.number(index + 1)} class="kf-keyframe">
       <TimeFields key={index} editor={editor} index={index} keyframe={keyframe} />
       <button
         type="button"
         data-testid="kf-take-pose"
         disabled={measured === null}
-        title={measured === null ? texts.keyframes.notLive : undefined}
+        title={measured === null ? texts.notLive : undefined}
         onClick={() => measured !== null && editor.change(setPose(movement, index, measured, editor.robot))}
       >
-        {texts.keyframes.takePose}
+        {texts.takePose}
       </button>
       <Joints editor={editor} index={index} keyframe={keyframe} measured={measured} />
       <DeedFields editor={editor} index={index} keyframe={keyframe} />
@@ -56,20 +56,20 @@ function TimeFields({ editor, index, keyframe }: PartProps) {
   const [shifting, setShifting] = useState(true);
   const before = editor.movement.value.keyframes[index - 1];
   const set = (time: number): void => editor.change(setTime(editor.movement.value, index, time, shifting));
-  if (before === undefined) return <p class="quiet small">{texts.keyframes.first}</p>;
+  if (before === undefined) return <p class="quiet small">{texts.first}</p>;
   return (
     <div class="row kf-times">
-      <NumberField id="kf-time" label={texts.keyframes.time} value={keyframe.time_s} digits={2} onSet={set} />
+      <NumberField id="kf-time" label={texts.time} value={keyframe.time_s} digits={2} onSet={set} />
       <NumberField
         id="kf-lasts"
-        label={texts.keyframes.lasts}
+        label={texts.lasts}
         value={keyframe.time_s - before.time_s}
         digits={2}
         onSet={(lasts) => set(before.time_s + lasts)}
       />
       <label class="check">
         <input type="checkbox" checked={shifting} onChange={(event) => setShifting(event.currentTarget.checked)} />
-        {texts.keyframes.shifting}
+        {texts.shifting}
       </label>
     </div>
   );
@@ -116,7 +116,7 @@ function Joints({ editor, index, keyframe, measured }: PartProps & { measured: P
   const pose = editor.poseAtKeyframe(index);
   const wrong = new Set(editor.problems.value.flatMap(({ keyframe: at, joint }) => (at === index && joint !== null ? [joint] : [])));
   return (
-    <div class="kf-joints" role="group" aria-label={texts.keyframes.joints} tabIndex={0} onPointerUp={() => editor.settle()}>
+    <div class="kf-joints" role="group" aria-label={texts.joints} tabIndex={0} onPointerUp={() => editor.settle()}>
       {robot.joints
         .filter(({ name }) => !followers.has(name))
         .map((joint) => (
@@ -160,11 +160,11 @@ function JointOf({ editor, index, joint, here, target, measured, wrong }: JointO
         <input
           type="checkbox"
           data-testid={`kf-here-${joint.name}`}
-          aria-label={texts.keyframes.hereFor(joint.label)}
+          aria-label={texts.hereFor(joint.label)}
           checked={here}
           onChange={(event) => set(event.currentTarget.checked ? (target ?? start) : null)}
         />
-        {here ? texts.keyframes.here : texts.keyframes.passes}
+        {here ? texts.here : texts.passes}
       </label>
     </div>
   );
@@ -181,23 +181,23 @@ function DeedFields({ editor, index, keyframe }: PartProps) {
     ["express", robot.expressions],
   ] as const;
   const { say, drive, go_to: place } = keyframe;
-  if (!Object.keys(texts.keyframes.deeds).some((deed) => can(robot, deed as Deed))) return null;
+  if (!Object.keys(texts.deeds).some((deed) => can(robot, deed as Deed))) return null;
   return (
     <fieldset class="kf-deeds" onFocusOut={() => editor.settle()}>
-      <legend>{texts.keyframes.deedsTitle}</legend>
-      <p class="quiet small">{texts.keyframes.deedsNote}</p>
+      <legend>{texts.deedsTitle}</legend>
+      <p class="quiet small">{texts.deedsNote}</p>
       {named.map(
         ([deed, names]) =>
           can(robot, deed) && (
             <div class="field" key={deed}>
-              <label for={`kf-${deed}`}>{texts.keyframes.deeds[deed]}</label>
+              <label for={`kf-${deed}`}>{texts.deeds[deed]}</label>
               <select
                 id={`kf-${deed}`}
                 data-testid={`kf-${deed}`}
                 value={keyframe[deed] ?? ""}
                 onChange={(event) => set(deed, event.currentTarget.value === "" ? undefined : event.currentTarget.value)}
               >
-                <option value="">{texts.keyframes.nothing}</option>
+                <option value="">{texts.nothing}</option>
                 {names.map((name) => (
                   <option key={name}>{name}</option>
                 ))}
@@ -207,7 +207,7 @@ function DeedFields({ editor, index, keyframe }: PartProps) {
       )}
       {can(robot, "say") && (
         <div class="field">
-          <label for="kf-say">{texts.keyframes.deeds.say}</label>
+          <label for="kf-say">{texts.deeds.say}</label>
           <input
             id="kf-say"
             type="text"
@@ -228,21 +228,21 @@ function DeedFields({ editor, index, keyframe }: PartProps) {
             <div class="row">
               <NumberField
                 id="kf-forward"
-                label={texts.keyframes.forward}
+                label={texts.forward}
                 value={drive.forward_m_s}
                 digits={2}
                 onSet={(forward_m_s) => set("drive", { ...drive, forward_m_s })}
               />
               <NumberField
                 id="kf-turn"
-                label={texts.keyframes.turn}
+                label={texts.turn}
                 value={degrees(drive.turn_rad_s)}
                 digits={0}
                 onSet={(turn) => set("drive", { ...drive, turn_rad_s: round(radians(turn)) })}
               />
               <NumberField
                 id="kf-duration"
-                label={texts.keyframes.duration}
+                label={texts.duration}
                 value={drive.duration_s}
                 digits={1}
                 onSet={(duration_s) => set("drive", { ...drive, duration_s })}
@@ -255,11 +255,11 @@ function DeedFields({ editor, index, keyframe }: PartProps) {
         <Toggle deed="go_to" on={place !== undefined} onToggle={(on) => set("go_to", on ? { x_m: 0, y_m: 0 } : undefined)}>
           {place !== undefined && (
             <div class="row">
-              <NumberField id="kf-x" label={texts.keyframes.x} value={place.x_m} digits={2} onSet={(x_m) => set("go_to", { ...place, x_m })} />
-              <NumberField id="kf-y" label={texts.keyframes.y} value={place.y_m} digits={2} onSet={(y_m) => set("go_to", { ...place, y_m })} />
+              <NumberField id="kf-x" label={texts.x} value={place.x_m} digits={2} onSet={(x_m) => set("go_to", { ...place, x_m })} />
+              <NumberField id="kf-y" label={texts.y} value={place.y_m} digits={2} onSet={(y_m) => set("go_to", { ...place, y_m })} />
               <NumberField
                 id="kf-yaw"
-                label={texts.keyframes.yaw}
+                label={texts.yaw}
                 value={degrees(place.yaw_rad ?? 0)}
                 digits={0}
                 onSet={(yaw) => set("go_to", { ...place, yaw_rad: round(radians(yaw)) })}
@@ -288,7 +288,7 @@ function Toggle({ deed, on, onToggle, children }: ToggleProps) {
     <div class="field">
       <label class="check">
         <input type="checkbox" data-testid={`kf-${deed}`} checked={on} onChange={(event) => onToggle(event.currentTarget.checked)} />
-        {texts.keyframes.deeds[deed]}
+        {texts.deeds[deed]}
       </label>
       {children}
     </div>

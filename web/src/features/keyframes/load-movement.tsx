@@ -5,7 +5,8 @@ import type { Api } from "../../shared/api/client";
 import { ApiError, sentence } from "../../shared/api/http";
 import { readScript } from "./model/script-codec";
 import type { Movement } from "./model/keyframes";
-import { texts } from "../../shared/i18n/texts";
+import { common } from "../../shared/i18n/common";
+import { texts } from "./texts";
 import { movementAddress } from "../../app/routes";
 
 /** `saved` `null`: it is yet to be made. */
@@ -45,20 +46,20 @@ interface LoadedProps extends Reading {
 export function Loaded({ source, again, robotType, name, children }: LoadedProps) {
   switch (source.kind) {
     case "loading":
-      return <p class="quiet">{texts.loading}</p>;
+      return <p class="quiet">{common.loading}</p>;
     case "failed":
       return (
         <p class="notice bad" role="alert">
           {source.why}{" "}
           <button type="button" onClick={again}>
-            {texts.later.again}
+            {common.tryAgain}
           </button>
         </p>
       );
     case "by-hand":
       return (
         <p class="notice warn" role="alert" data-testid="kf-by-hand">
-          {texts.keyframes.byHand(name)} <a href={movementAddress(robotType, name)}>{texts.keyframes.toCode}</a>
+          {texts.byHand(name)} <a href={movementAddress(robotType, name)}>{texts.toCode}</a>
         </p>
       );
     case "there":

@@ -5,7 +5,7 @@ import type { DeviceStore } from "../devices/model/device-store";
 import type { Editor } from "./model/editor";
 import type { KnownTwin } from "../../shared/mqtt/parse-messages";
 import type { Positions } from "./model/keyframes";
-import { texts } from "../../shared/i18n/texts";
+import { texts } from "./texts";
 import { Card } from "../../shared/ui/parts";
 import type { LiveScene } from "../twin/scene";
 import { useScene } from "../twin/use-scene";
@@ -32,30 +32,30 @@ export function Twin({ twin, device, editor }: TwinProps) {
   const count = editor.movement.value.keyframes.length;
   return (
     <Card
-      title={texts.keyframes.twin}
+      title={texts.twin}
       class="view kf-twin"
       aside={
         <button type="button" class="plain" onClick={() => scene?.resetView()} disabled={scene === null}>
-          {texts.view.reset}
+          {texts.viewReset}
         </button>
       }
     >
       {scene !== null && <Follow scene={scene} device={device} editor={editor} />}
       <div ref={box} class="canvas-box" data-testid="kf-view" data-frames="0">
         {/* Keyed: a canvas whose context is gone cannot be drawn on again. */}
-        <canvas key={twin} ref={canvas} aria-label={texts.keyframes.twinLabel} role="img" />
-        {twin === null && <p class="over quiet">{texts.view.waiting}</p>}
+        <canvas key={twin} ref={canvas} aria-label={texts.twinLabel} role="img" />
+        {twin === null && <p class="over quiet">{texts.viewWaiting}</p>}
         {said !== "" && <p class="over notice">{said}</p>}
         <p class={`tag ${playing ? "kf-preview" : ""}`}>
-          {playing ? texts.keyframes.previewing : texts.keyframes.numberOf(editor.chosen.value + 1, count)}
+          {playing ? texts.previewing : texts.numberOf(editor.chosen.value + 1, count)}
         </p>
       </div>
       <p class="quiet small kf-legend">
         {device === null ? (
-          texts.keyframes.noRobot
+          texts.noRobot
         ) : (
           <>
-            <span class="kf-swatch" aria-hidden="true" /> {device.live.value ? texts.keyframes.ghost : texts.keyframes.noGhost}
+            <span class="kf-swatch" aria-hidden="true" /> {device.live.value ? texts.ghost : texts.noGhost}
           </>
         )}
       </p>

@@ -6,7 +6,8 @@ import type { DeviceStore } from "../devices/model/device-store";
 import type { Editor } from "./model/editor";
 import type { Keyframe } from "./model/keyframes";
 import { keyframesOf, Recorder, trim, type Take } from "./model/recording";
-import { texts } from "../../shared/i18n/texts";
+import { format } from "../../shared/i18n/format";
+import { texts } from "./texts";
 import { Card } from "../../shared/ui/parts";
 
 interface RecordProps {
@@ -37,8 +38,8 @@ export function Record({ device, editor }: RecordProps) {
   }, [recorder, device]);
   const lasts = take.samples.at(-1)?.time_s ?? 0;
   return (
-    <Card title={texts.keyframes.record} class="kf-record">
-      <p class="quiet small">{texts.keyframes.recordNote}</p>
+    <Card title={texts.record} class="kf-record">
+      <p class="quiet small">{texts.recordNote}</p>
       <div class="row">
         <button
           type="button"
@@ -47,11 +48,11 @@ export function Record({ device, editor }: RecordProps) {
           disabled={!running && !device.live.value}
           onClick={() => (running ? recorder.stop() : recorder.start())}
         >
-          {running ? texts.keyframes.stopRecording : texts.keyframes.startRecording}
+          {running ? texts.stopRecording : texts.startRecording}
         </button>
-        {running && !device.live.value && <span class="notice warn">{texts.keyframes.recordingGap}</span>}
+        {running && !device.live.value && <span class="notice warn">{texts.recordingGap}</span>}
         <span role="status" class="quiet" data-testid="kf-recorded" data-samples={take.samples.length}>
-          {take.samples.length > 0 && texts.keyframes.recorded(take.samples.length, lasts, take.gaps.length)}
+          {take.samples.length > 0 && texts.recorded(take.samples.length, lasts, take.gaps.length)}
         </span>
       </div>
       {!running && take.samples.length > 1 && (
@@ -85,9 +86,9 @@ function Trim({ take, lasts, editor, onDone }: TrimProps) {
     <>
       <Curves take={take} lasts={lasts} from={from} to={to} made={made} editor={editor} />
       <div class="kf-trim">
-        <Handle id="kf-from" label={texts.keyframes.trimFrom} value={from} most={lasts} onSet={(value) => setFrom(Math.min(value, to - 0.1))} />
-        <Handle id="kf-to" label={texts.keyframes.trimTo} value={to} most={lasts} onSet={(value) => setTo(Math.max(value, from + 0.1))} />
-        <label for="kf-tolerance">{texts.keyframes.tolerance}</label>
+        <Handle id="kf-from" label={texts.trimFrom} value={from} most={lasts} onSet={(value) => setFrom(Math.min(value, to - 0.1))} />
+        <Handle id="kf-to" label={texts.trimTo} value={to} most={lasts} onSet={(value) => setTo(Math.max(value, from + 0.1))} />
+        <label for="kf-tolerance">{texts.tolerance}</label>
         <input
           id="kf-tolerance"
           type="range"
@@ -96,20 +97,20 @@ function Trim({ take, lasts, editor, onDone }: TrimProps) {
           step={0.25}
           value={tolerance}
           data-testid="kf-tolerance"
-          aria-valuetext={texts.number.degrees(tolerance)}
+          aria-valuetext={format.degrees(tolerance)}
           onInput={(event) => setTolerance(event.currentTarget.valueAsNumber)}
         />
-        <output for="kf-tolerance">{texts.number.degrees(tolerance)}</output>
+        <output for="kf-tolerance">{format.degrees(tolerance)}</output>
       </div>
       <div class="row">
         <button type="button" class="primary" data-testid="kf-use" disabled={made.length < 2} onClick={use}>
-          {texts.keyframes.useThem(made.length)}
+          {texts.useThem(made.length)}
         </button>
         <button type="button" class="plain" onClick={onDone}>
-          {texts.keyframes.discard}
+          {texts.discard}
         </button>
       </div>
-      {take.gaps.length > 0 && <p class="notice warn">{texts.keyframes.gapNote}</p>}
+      {take.gaps.length > 0 && <p class="notice warn">{texts.gapNote}</p>}
     </>
   );
 }
@@ -134,10 +135,10 @@ function Handle({ id, label, value, most, onSet }: HandleProps) {
         step={0.05}
         value={value}
         data-testid={id}
-        aria-valuetext={texts.keyframes.seconds(value)}
+        aria-valuetext={texts.seconds(value)}
         onInput={(event) => onSet(event.currentTarget.valueAsNumber)}
       />
-      <output for={id}>{texts.keyframes.seconds(value)}</output>
+      <output for={id}>{texts.seconds(value)}</output>
     </>
   );
 }
@@ -166,7 +167,7 @@ function Curves({ take, lasts, from, to, made, editor }: CurvesProps) {
     });
   }, [take]);
   return (
-    <svg class="kf-curves" viewBox={`0 0 ${WIDTH} ${HEIGHT}`} preserveAspectRatio="none" role="img" aria-label={texts.keyframes.curves(lines.length)}>
+    <svg class="kf-curves" viewBox={`0 0 ${WIDTH} ${HEIGHT}`} preserveAspectRatio="none" role="img" aria-label={texts.curves(lines.length)}>
       {take.gaps.map((gap) => (
         <rect key={gap.from_s} class="gap" x={x(gap.from_s)} width={x(gap.to_s - gap.from_s)} y={0} height={HEIGHT} />
       ))}

@@ -2,7 +2,8 @@
 import { useCallback, useMemo } from "preact/hooks";
 import type { Api } from "../../shared/api/client";
 import { robotOf } from "../robot-types/model/robot-types";
-import { texts } from "../../shared/i18n/texts";
+import { common } from "../../shared/i18n/common";
+import { texts } from "./texts";
 import { useLoaded } from "../../shared/hooks/use-resource";
 import { movementAddress, movementsAddress, typeKeyframesAddress } from "../../app/routes";
 import { Desk } from "./editor";
@@ -24,8 +25,8 @@ export function TypeKeyframesPage({ api, robotType, name }: TypeKeyframesPagePro
   return (
     <main class="page kf-page" id="content">
       <div class="heading">
-        <a href={name === "" ? movementsAddress : movementAddress(robotType, name)}>← {name === "" ? texts.library.title : name}</a>
-        <h1>{texts.keyframes.title}</h1>
+        <a href={name === "" ? movementsAddress : movementAddress(robotType, name)}>← {name === "" ? texts.library : name}</a>
+        <h1>{texts.title}</h1>
         <p class="quiet">
           {type.value?.label ?? robotType.replaceAll("_", " ")}
           {name !== "" && ` · ${name}`}
@@ -35,7 +36,7 @@ export function TypeKeyframesPage({ api, robotType, name }: TypeKeyframesPagePro
         <p class="notice bad" role="alert">
           {trouble.trouble}{" "}
           <button type="button" onClick={trouble.again}>
-            {texts.later.again}
+            {common.tryAgain}
           </button>
         </p>
       )}

@@ -6,7 +6,8 @@ import type { Editor } from "./model/editor";
 import { LONGEST_SCRIPT, writeScript } from "./model/script-codec";
 import { MovementChanged } from "../movements/model/movement-library";
 import type { Station } from "../devices/model/device-session";
-import { texts } from "../../shared/i18n/texts";
+import { format } from "../../shared/i18n/format";
+import { texts } from "./texts";
 import { RunStatus } from "../actions/run-status";
 import { Card } from "../../shared/ui/parts";
 import { whyNotAct } from "../devices/availability";
@@ -45,7 +46,7 @@ export function Save({ api, station, editor, robotType, name, version, onSaved }
       const made = await api.library.save(robotType, wanted, source, basedOn);
       editor.saved(movement);
       onSaved(wanted, made.version);
-      setSaid(texts.keyframes.savedAs(made.version));
+      setSaid(texts.savedAs(made.version));
       return true;
     } catch (error) {
       if (error instanceof MovementChanged) setNewer(error.version);
@@ -57,10 +58,10 @@ export function Save({ api, station, editor, robotType, name, version, onSaved }
   };
 
   return (
-    <Card title={texts.keyframes.script} class="kf-save">
+    <Card title={texts.script} class="kf-save">
       <div class="row kf-names">
         <div class="field">
-          <label for="kf-name">{texts.keyframes.name}</label>
+          <label for="kf-name">{texts.name}</label>
           <input
             id="kf-name"
             type="text"
@@ -73,7 +74,7 @@ export function Save({ api, station, editor, robotType, name, version, onSaved }
           />
         </div>
         <div class="field kf-description">
-          <label for="kf-description">{texts.keyframes.description}</label>
+          <label for="kf-description">{texts.description}</label>
           <input
             id="kf-description"
             type="text"
@@ -86,32 +87,32 @@ export function Save({ api, station, editor, robotType, name, version, onSaved }
         </div>
       </div>
       <p class={named || wanted === "" ? "quiet small" : "field-error"} id="kf-name-note">
-        {texts.keyframes.nameNote}
+        {texts.nameNote}
       </p>
       <div class="row">
         <button type="button" data-testid="kf-save" disabled={busy || !named || !changed || tooLong} onClick={() => void save()}>
-          {busy ? texts.keyframes.saving : texts.keyframes.save}
+          {busy ? texts.saving : texts.save}
         </button>
         {station !== null && (
           <Run station={station} name={wanted} changed={changed} blocked={busy || !named || tooLong} errors={errors} save={save} />
         )}
       </div>
-      {station === null && <p class="quiet small">{texts.keyframes.runsOnDevice}</p>}
-      {tooLong && <p class="field-error">{texts.keyframes.tooLong}</p>}
+      {station === null && <p class="quiet small">{texts.runsOnDevice}</p>}
+      {tooLong && <p class="field-error">{texts.tooLong}</p>}
       <p role="status" data-testid="kf-said" data-version={version}>
         {said}
       </p>
       {newer !== null && (
         <p class="notice warn" role="alert">
-          {newer === 0 ? texts.keyframes.deleted : texts.keyframes.newer(newer)}{" "}
+          {newer === 0 ? texts.deleted : texts.newer(newer)}{" "}
           <button type="button" onClick={() => void save(newer)}>
-            {texts.keyframes.saveOver}
+            {texts.saveOver}
           </button>
         </p>
       )}
       {station !== null && <RunStatus device={station.device} control={station.control} actions={station.actions} />}
       <details>
-        <summary>{texts.keyframes.seeScript}</summary>
+        <summary>{texts.seeScript}</summary>
         <pre class="output kf-source" tabIndex={0} data-testid="kf-source">
           {source}
         </pre>
@@ -146,19 +147,19 @@ function Run({ station, name, changed, blocked, errors, save }: RunProps) {
         disabled={blocked || errors > 0 || why !== ""}
         onClick={() => void run()}
       >
-        {changed ? texts.keyframes.saveAndRun : texts.keyframes.run}
+        {changed ? texts.saveAndRun : texts.run}
       </button>
       <label class="kf-speed">
-        {texts.keyframes.speed}
+        {texts.speed}
         <select value={String(speed)} data-testid="kf-speed" onChange={(event) => setSpeed(Number(event.currentTarget.value))}>
           {[0.25, 0.5, 0.75, 1, 1.5, 2].map((one) => (
             <option key={one} value={String(one)}>
-              {texts.keyframes.percent(one)}
+              {format.percent(one)}
             </option>
           ))}
         </select>
       </label>
-      {errors > 0 && <p class="quiet small">{texts.keyframes.mendFirst}</p>}
+      {errors > 0 && <p class="quiet small">{texts.mendFirst}</p>}
       {errors === 0 && why !== "" && <p class="quiet small">{why}</p>}
     </>
   );

@@ -2,7 +2,7 @@
 import { useRef } from "preact/hooks";
 import type { Editor } from "./model/editor";
 import { DEEDS, setTime, SHORTEST_S, slowedAll, type Keyframe, type Positions } from "./model/keyframes";
-import { texts } from "../../shared/i18n/texts";
+import { texts } from "./texts";
 import { Card } from "../../shared/ui/parts";
 
 interface TimelineProps {
@@ -19,7 +19,7 @@ export function Timeline({ editor, measured }: TimelineProps) {
   const asked = editor.plan.value.asked(editor.at.value);
   const last = keyframes.at(-1)?.time_s ?? 0;
   return (
-    <Card title={texts.keyframes.timeline} class="kf-timeline" aside={<History editor={editor} />}>
+    <Card title={texts.timeline} class="kf-timeline" aside={<History editor={editor} />}>
       <div class="row kf-transport">
         <button
           type="button"
@@ -29,35 +29,35 @@ export function Timeline({ editor, measured }: TimelineProps) {
           disabled={keyframes.length < 2}
           onClick={() => (playing ? editor.pause() : editor.play())}
         >
-          {playing ? texts.keyframes.pause : texts.keyframes.play}
+          {playing ? texts.pause : texts.play}
         </button>
         <span class="kf-clock" data-testid="kf-clock">
-          {texts.keyframes.ofSeconds(asked, last)}
+          {texts.ofSeconds(asked, last)}
         </span>
-        <span class="quiet small">{texts.keyframes.previewOnly}</span>
+        <span class="quiet small">{texts.previewOnly}</span>
       </div>
       <Track editor={editor} asked={asked} last={last} />
       <div class="row kf-actions">
         <button type="button" data-testid="kf-add" onClick={() => editor.add(editor.poseAtKeyframe(editor.chosen.value))}>
-          {texts.keyframes.add}
+          {texts.add}
         </button>
         <button
           type="button"
           data-testid="kf-add-measured"
           disabled={measured === null}
-          title={measured === null ? texts.keyframes.notLive : undefined}
+          title={measured === null ? texts.notLive : undefined}
           onClick={() => measured !== null && editor.add(measured)}
         >
-          {texts.keyframes.addMeasured}
+          {texts.addMeasured}
         </button>
         <button type="button" data-testid="kf-duplicate" onClick={() => editor.copy()}>
-          {texts.keyframes.duplicate}
+          {texts.duplicate}
         </button>
         <button type="button" data-testid="kf-delete" disabled={keyframes.length < 2} onClick={() => editor.drop()}>
-          {texts.keyframes.remove}
+          {texts.remove}
         </button>
       </div>
-      <p class="quiet small">{texts.keyframes.timelineKeys}</p>
+      <p class="quiet small">{texts.timelineKeys}</p>
     </Card>
   );
 }
@@ -66,10 +66,10 @@ function History({ editor }: { editor: Editor }) {
   return (
     <span class="row">
       <button type="button" class="plain" data-testid="kf-undo" disabled={!editor.canUndo.value} onClick={() => editor.undo()}>
-        {texts.keyframes.undo}
+        {texts.undo}
       </button>
       <button type="button" class="plain" data-testid="kf-redo" disabled={!editor.canRedo.value} onClick={() => editor.redo()}>
-        {texts.keyframes.redo}
+        {texts.redo}
       </button>
     </span>
   );
@@ -104,7 +104,7 @@ function Track({ editor, asked, last }: { editor: Editor; asked: number; last: n
         >
           {ticks.map((tick) => (
             <span key={tick} class="kf-tick" style={at(tick)}>
-              {texts.keyframes.tick(tick)}
+              {texts.tick(tick)}
             </span>
           ))}
         </div>
@@ -124,11 +124,11 @@ function Track({ editor, asked, last }: { editor: Editor; asked: number; last: n
           class="kf-playhead"
           role="slider"
           tabIndex={0}
-          aria-label={texts.keyframes.playhead}
+          aria-label={texts.playhead}
           aria-valuemin={0}
           aria-valuemax={last}
           aria-valuenow={asked}
-          aria-valuetext={texts.keyframes.seconds(asked)}
+          aria-valuetext={texts.seconds(asked)}
           data-testid="kf-playhead"
           style={at(asked)}
           onKeyDown={(event) => {
@@ -163,11 +163,11 @@ function Marker({ editor, index, one, wrong, style, timeAt }: MarkerProps) {
       style={style}
       role="slider"
       tabIndex={0}
-      aria-label={texts.keyframes.marker(index + 1, wrong)}
+      aria-label={texts.marker(index + 1, wrong)}
       aria-valuemin={0}
       aria-valuemax={600}
       aria-valuenow={one.time_s}
-      aria-valuetext={texts.keyframes.seconds(one.time_s)}
+      aria-valuetext={texts.seconds(one.time_s)}
       aria-current={chosen}
       data-testid={`kf-marker-${index + 1}`}
       data-time={one.time_s}
@@ -204,7 +204,7 @@ function Marker({ editor, index, one, wrong, style, timeAt }: MarkerProps) {
       </span>
       {done.length > 0 && (
         <span class="kf-does" aria-hidden="true">
-          {texts.keyframes.deedMark}
+          {texts.deedMark}
         </span>
       )}
     </div>
@@ -225,17 +225,17 @@ export function Problems({ editor }: { editor: Editor }) {
   const fast = found.filter(({ what }) => what.kind === "too-fast").length;
   const labels = new Map(editor.robot.joints.map(({ name, label }) => [name, label]));
   return (
-    <Card title={texts.keyframes.checks} class="kf-problems" aside={<span class="quiet">{texts.keyframes.checked(found.length)}</span>}>
+    <Card title={texts.checks} class="kf-problems" aside={<span class="quiet">{texts.checked(found.length)}</span>}>
       <div role="status" data-testid="kf-problems" data-count={found.length}>
-        {found.length === 0 && <p class="kf-good">{texts.keyframes.allGood}</p>}
+        {found.length === 0 && <p class="kf-good">{texts.allGood}</p>}
         {found.length > 0 && (
           <ul class="kf-list">
             {found.slice(0, 12).map((problem, index) => (
               <li key={index} class={`notice ${problem.severity === "error" ? "bad" : "warn"}`} data-testid={`kf-problem-${problem.what.kind}`}>
                 <button type="button" class="plain" onClick={() => editor.choose(problem.keyframe)}>
-                  {texts.keyframes.at(problem.keyframe + 1)}
+                  {texts.at(problem.keyframe + 1)}
                 </button>
-                <span>{texts.keyframes.problem(problem, problem.joint === null ? "" : (labels.get(problem.joint) ?? problem.joint))}</span>
+                <span>{texts.problem(problem, problem.joint === null ? "" : (labels.get(problem.joint) ?? problem.joint))}</span>
                 {problem.mend !== null && (
                   <button
                     type="button"
@@ -245,14 +245,14 @@ export function Problems({ editor }: { editor: Editor }) {
                       if (next !== undefined) editor.change(next);
                     }}
                   >
-                    {texts.keyframes.mend(problem)}
+                    {texts.mend(problem)}
                   </button>
                 )}
               </li>
             ))}
           </ul>
         )}
-        {found.length > 12 && <p class="quiet">{texts.keyframes.more(found.length - 12)}</p>}
+        {found.length > 12 && <p class="quiet">{texts.more(found.length - 12)}</p>}
       </div>
       {fast > 1 && (
         <button
@@ -260,10 +260,10 @@ export function Problems({ editor }: { editor: Editor }) {
           data-testid="kf-mend-all"
           onClick={() => editor.change(slowedAll(editor.movement.value, editor.robot))}
         >
-          {texts.keyframes.mendAll}
+          {texts.mendAll}
         </button>
       )}
-      <p class="quiet small">{texts.keyframes.robotChecks}</p>
+      <p class="quiet small">{texts.robotChecks}</p>
     </Card>
   );
 }

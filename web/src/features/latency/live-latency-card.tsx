@@ -1,6 +1,7 @@
 import type { Control } from "../control/model/lease";
 import type { DeviceStore } from "../devices/model/device-store";
-import { texts } from "../../shared/i18n/texts";
+import { format } from "../../shared/i18n/format";
+import { texts } from "./texts";
 
 interface LatencyProps {
   device: DeviceStore;
@@ -13,7 +14,7 @@ export function Latency({ device, control }: LatencyProps) {
   const telemetry = device.telemetry.value;
   const age = device.telemetryAgeMs.value;
   const watchdog = device.description.value?.watchdog_ms;
-  const ms = texts.number.milliseconds;
+  const ms = format.milliseconds;
   const loopAge = telemetry !== null && telemetry.message.setpoint_sequence > 0 ? telemetry.message.loop_age_ms : null;
   return (
     <>
@@ -25,32 +26,32 @@ export function Latency({ device, control }: LatencyProps) {
         data-latest={figures?.latestMs.toFixed(2) ?? ""}
         data-samples={figures?.samples ?? 0}
       >
-        <h3>{texts.latency.roundTrip}</h3>
+        <h3>{texts.live.roundTrip}</h3>
         {figures === null ? (
-          <p class="quiet">{texts.latency.none}</p>
+          <p class="quiet">{texts.live.none}</p>
         ) : (
           <dl class="figures">
-            <Figure name={texts.latency.median} value={ms(figures.medianMs)} />
-            <Figure name={texts.latency.p95} value={ms(figures.p95Ms)} />
-            <Figure name={texts.latency.latest} value={ms(figures.latestMs)} />
+            <Figure name={texts.live.median} value={ms(figures.medianMs)} />
+            <Figure name={texts.live.p95} value={ms(figures.p95Ms)} />
+            <Figure name={texts.live.latest} value={ms(figures.latestMs)} />
           </dl>
         )}
-        <p class="quiet small">{texts.latency.explained}</p>
+        <p class="quiet small">{texts.live.explained}</p>
       </div>
       <dl class={`figures ${device.live.value ? "" : "old"}`}>
         <Figure
-          name={texts.latency.telemetryAge}
-          value={age === null ? texts.number.unknown : ms(age)}
+          name={texts.live.telemetryAge}
+          value={age === null ? format.unknown : ms(age)}
           data-testid="telemetry-age"
         />
         <Figure
-          name={texts.latency.loopAge}
-          value={loopAge === null ? texts.number.unknown : ms(loopAge)}
-          title={texts.latency.loopExplained}
+          name={texts.live.loopAge}
+          value={loopAge === null ? format.unknown : ms(loopAge)}
+          title={texts.live.loopExplained}
         />
         <Figure
-          name={texts.latency.watchdog}
-          value={watchdog === undefined || watchdog === 0 ? texts.number.unknown : ms(watchdog)}
+          name={texts.live.watchdog}
+          value={watchdog === undefined || watchdog === 0 ? format.unknown : ms(watchdog)}
         />
       </dl>
     </>

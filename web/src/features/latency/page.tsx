@@ -8,7 +8,9 @@ import { Measure } from "./model/probe";
 import { publishedFor, SOURCES, type Published } from "./model/published-figures";
 import type { Station } from "../devices/model/device-session";
 import { csv, figuresOf, lineKey, linesOf, PATHS, TRANSPORTS, type Line, type Path, type StoredTimes, type Transport } from "./model/latency-stats";
-import { texts } from "../../shared/i18n/texts";
+import { common } from "../../shared/i18n/common";
+import { format } from "../../shared/i18n/format";
+import { texts } from "./texts";
 import { DeviceFrame } from "../devices/page-frame";
 import { MeasureNow } from "./probe-panel";
 import { Card, Choice } from "../../shared/ui/parts";
@@ -20,7 +22,7 @@ const EVERY_MS = 10_000;
 const AT_ONCE = 4;
 const HOUR_MS = 3_600_000;
 
-type Span = keyof typeof texts.times.spans;
+type Span = keyof typeof texts.spans;
 const SPAN_MS: Readonly<Record<Span, number>> = { hour: HOUR_MS, day: 24 * HOUR_MS, week: 7 * 24 * HOUR_MS, month: 30 * 24 * HOUR_MS };
 
 interface TimesPageProps {
@@ -42,9 +44,9 @@ export function TimesPage({ device, ...rest }: TimesPageProps) {
   }
   return (
     <main class="page care care-times" id="content">
-      <h1>{texts.times.all}</h1>
-      <p class="quiet">{texts.times.explained}</p>
-      {devices === null ? <p class="quiet">{texts.loading}</p> : <Times api={rest.api} devices={[...devices.values()]} fresh={NONE} />}
+      <h1>{texts.title}</h1>
+      <p class="quiet">{texts.explained}</p>
+      {devices === null ? <p class="quiet">{common.loading}</p> : <Times api={rest.api} devices={[...devices.values()]} fresh={NONE} />}
     </main>
   );
 }
@@ -56,7 +58,7 @@ function OfDevice({ api, fleet, station }: { api: Api; fleet: Fleet; station: St
   const measure = useMemo(() => new Measure(api, fleet.link, device, () => control.epoch), [api, fleet, device, control]);
   return (
     <div class="care-times">
-      <p class="quiet">{texts.times.explained}</p>
+      <p class="quiet">{texts.explained}</p>
       <MeasureNow device={device} measure={measure} />
       <Times api={api} devices={[device]} fresh={measure.lines} />
     </div>
@@ -88,17 +90,17 @@ function Times({ api, devices, fresh }: { api: Api; devices: readonly DeviceStor
   const published = publishedFor(path);
   const label = (id: string): string => devices.find((device) => device.id === id)?.info.value.label ?? id;
   const name = (line: Line): string =>
-    texts.times.line(label(line.device), texts.times.transport[line.transport], path === null ? texts.times.path[line.path] : null);
+    texts.line(label(line.device), texts.transport[line.transport], path === null ? texts.path[line.path] : null);
   const count = lines.reduce((sum, { samples }) => sum + samples.length, 0);
   return (
     <>
       <fieldset class="card times-tools">
-        <legend class="visually-hidden">{texts.times.filters}</legend>
+        <legend class="visually-hidden">{texts.filters}</legend>
         {devices.length > 1 && (
           <Pick
             id="times-device"
-            label={texts.times.device}
-            all={texts.times.allDevices}
+            label={texts.device}
+            all={texts.allDevices}
             value={filter.device}
             options={devices.map((device) => [device.id, device.info.value.label])}
             onChange={(device) => setFilter({ ...filter, device })}
@@ -106,29 +108,29 @@ function Times({ api, devices, fresh }: { api: Api; devices: readonly DeviceStor
         )}
         <Pick
           id="times-path"
-          label={texts.times.part}
-          all={texts.times.allParts}
+          label={texts.part}
+          all={texts.allParts}
           value={path}
-          options={PATHS.map((one) => [one, texts.times.path[one]])}
+          options={PATHS.map((one) => [one, texts.path[one]])}
           onChange={(chosen) => setFilter({ ...filter, path: chosen })}
         />
         <Pick
           id="times-transport"
-          label={texts.times.via}
-          all={texts.times.allTransports}
+          label={texts.via}
+          all={texts.allTransports}
           value={filter.transport}
-          options={TRANSPORTS.map((one) => [one, texts.times.transport[one]])}
+          options={TRANSPORTS.map((one) => [one, texts.transport[one]])}
           onChange={(transport) => setFilter({ ...filter, transport })}
         />
-        <Choice label={texts.times.span} value={filter.span} onChange={(span) => setFilter({ ...filter, span })} options={Object.entries(texts.times.spans) as [Span, string][]} />
-        <Choice label={texts.times.axis} value={axis} onChange={setAxis} options={Object.entries(texts.times.axes) as [Axis, string][]} />
-        <Choice label={texts.times.scale} value={scale} onChange={setScale} options={Object.entries(texts.times.scales) as [Scale, string][]} />
+        <Choice label={texts.span} value={filter.span} onChange={(span) => setFilter({ ...filter, span })} options={Object.entries(texts.spans) as [Span, string][]} />
+        <Choice label={texts.axis} value={axis} onChange={setAxis} options={Object.entries(texts.axes) as [Axis, string][]} />
+        <Choice label={texts.scale} value={scale} onChange={setScale} options={Object.entries(texts.scales) as [Scale, string][]} />
       </fieldset>
-      {trouble !== "" && <p class="notice bad">{texts.times.failed(trouble)}</p>}
-      {value === null && trouble === "" && <p class="quiet">{texts.loading}</p>}
+      {trouble !== "" && <p class="notice bad">{texts.failed(trouble)}</p>}
+      {value === null && trouble === "" && <p class="quiet">{common.loading}</p>}
       {value !== null && count === 0 && (
         <p class="notice" data-testid="no-times">
-          {texts.times.none} {texts.times.how}
+          {texts.none} {texts.how}
         </p>
       )}
       <TimesPlots lines={lines} name={name} published={published} axis={axis} scale={scale} />
@@ -193,22 +195,22 @@ interface FiguresCardProps {
 }
 
 function FiguresCard({ lines, name, save: press }: FiguresCardProps) {
-  const ms = texts.number.milliseconds;
+  const ms = format.milliseconds;
   if (lines.length === 0) return null;
   return (
     <Card
-      title={texts.times.figures}
+      title={texts.figures}
       aside={
         <button type="button" data-testid="times-csv" onClick={press}>
-          {texts.times.csv}
+          {texts.csv}
         </button>
       }
     >
-      <div class="scroll" tabIndex={0} role="region" aria-label={texts.times.figures}>
+      <div class="scroll" tabIndex={0} role="region" aria-label={texts.figures}>
         <table data-testid="times-figures">
           <thead>
             <tr>
-              {texts.times.columns.map((column) => (
+              {texts.columns.map((column) => (
                 <th key={column} scope="col">
                   {column}
                 </th>
@@ -223,7 +225,7 @@ function FiguresCard({ lines, name, save: press }: FiguresCardProps) {
                   <th scope="row">
                     <span class={`key-line series-${(index % 8) + 1}`} aria-hidden="true" /> {name(line)}
                   </th>
-                  <td title={line.stored > figures.count ? texts.times.more(line.stored) : undefined}>{figures.count}</td>
+                  <td title={line.stored > figures.count ? texts.more(line.stored) : undefined}>{figures.count}</td>
                   {[figures.medianMs, figures.meanMs, figures.p95Ms, figures.p99Ms, figures.maxMs].map((value, at) => (
                     <td key={at}>{ms(value)}</td>
                   ))}
@@ -241,12 +243,12 @@ function FiguresCard({ lines, name, save: press }: FiguresCardProps) {
 function PublishedCard({ published }: { published: readonly Published[] }) {
   const sources = [...new Set(published.map(({ source }) => source))];
   return (
-    <Card title={texts.times.publishedTitle}>
-      {published.length === 0 && <p class="quiet">{texts.times.publishedNone}</p>}
+    <Card title={texts.publishedTitle}>
+      {published.length === 0 && <p class="quiet">{texts.publishedNone}</p>}
       <ul class="published">
         {published.map(({ id, ms, source }) => (
           <li key={id} data-testid="published" data-ms={ms}>
-            <strong>{`${ms} ${texts.times.milliseconds}`}</strong> {texts.times.source(texts.times.published[id] ?? id, SOURCES[source].short)}
+            <strong>{`${ms} ${texts.milliseconds}`}</strong> {texts.source(texts.published[id] ?? id, SOURCES[source].short)}
           </li>
         ))}
       </ul>
@@ -262,7 +264,7 @@ function PublishedCard({ published }: { published: readonly Published[] }) {
 function save(content: string): void {
   const link = document.createElement("a");
   link.href = URL.createObjectURL(new Blob([content], { type: "text/csv" }));
-  link.download = texts.times.csvName;
+  link.download = texts.csvName;
   link.click();
   // The browser has its own hold of it once the click was taken.
   setTimeout(() => URL.revokeObjectURL(link.href), 10_000);

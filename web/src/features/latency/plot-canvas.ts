@@ -1,7 +1,8 @@
 /** Response times as the papers plot them, and their shares. Loaded only where they are looked at. */
 import uPlot from "uplot";
 import "uplot/dist/uPlot.min.css";
-import { texts } from "../../shared/i18n/texts";
+import { format } from "../../shared/i18n/format";
+import { texts } from "./texts";
 import { colour } from "../../shared/ui/canvas-theme";
 
 /** One line: along x and along y, each in its own order. */
@@ -50,7 +51,7 @@ export function createTimesChart(box: HTMLElement, { along, log }: Options): Tim
     const axis = { stroke: colour("--quiet"), grid: { stroke: colour("--line"), width: 1 }, ticks: { stroke: colour("--line"), width: 1 } };
     // The end of a logarithmic axis is no round number.
     const inMs = (ticks: (number | null)[]): string[] =>
-      ticks.map((tick) => (tick === null ? "" : `${Number(tick.toPrecision(3))} ${texts.times.milliseconds}`));
+      ticks.map((tick) => (tick === null ? "" : `${Number(tick.toPrecision(3))} ${texts.milliseconds}`));
     const times = { ...(log ? { distr: LOG, log: 10 as const } : {}), range: (_: uPlot, low: number | null, high: number | null) => reach(low, high) };
     const stepped = uPlot.paths.stepped?.({ align: 1 });
     return new uPlot(
@@ -64,8 +65,8 @@ export function createTimesChart(box: HTMLElement, { along, log }: Options): Tim
           y: along === "ms" ? { range: [0, 100] } : times,
         },
         axes: [
-          { ...axis, space: 60, values: (_, ticks) => (along === "ms" ? inMs(ticks) : ticks.map((tick) => (along === "time" ? texts.sinceWhen(tick * 1000).slice(0, 14) : whole(tick)))) },
-          { ...axis, size: 70, values: (_, ticks) => (along === "ms" ? ticks.map((tick) => `${tick} ${texts.times.percent}`) : inMs(ticks)) },
+          { ...axis, space: 60, values: (_, ticks) => (along === "ms" ? inMs(ticks) : ticks.map((tick) => (along === "time" ? format.recentTime(tick * 1000).slice(0, 14) : whole(tick)))) },
+          { ...axis, size: 70, values: (_, ticks) => (along === "ms" ? ticks.map((tick) => `${tick} ${texts.percent}`) : inMs(ticks)) },
         ],
         series: [
           {},
@@ -143,7 +144,7 @@ function paint(plot: uPlot, references: readonly Reference[], along: Along): voi
     ctx.stroke();
     // The list beside the chart names them all; here only what does not cover the one before.
     if (upright || Math.abs(at - last) < LABEL_PX * 1.2 * ratio) continue;
-    const text = `${label}: ${ms} ${texts.times.milliseconds}`;
+    const text = `${label}: ${ms} ${texts.milliseconds}`;
     ctx.fillStyle = colour("--surface");
     ctx.fillRect(bbox.left + 2 * ratio, at - (LABEL_PX + 3) * ratio, ctx.measureText(text).width + 4 * ratio, (LABEL_PX + 2) * ratio);
     ctx.fillStyle = colour("--marker");

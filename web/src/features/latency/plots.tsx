@@ -2,13 +2,14 @@
 import { useEffect, useRef, useState } from "preact/hooks";
 import type { Published } from "./model/published-figures";
 import { shares, type Line } from "./model/latency-stats";
-import { texts } from "../../shared/i18n/texts";
+import { common } from "../../shared/i18n/common";
+import { texts } from "./texts";
 import { Card } from "../../shared/ui/parts";
 import { onColourChange, seriesColour } from "../../shared/ui/canvas-theme";
 import type { Along, Drawn, Reference, TimesChart } from "./plot-canvas";
 
-export type Axis = keyof typeof texts.times.axes;
-export type Scale = keyof typeof texts.times.scales;
+export type Axis = keyof typeof texts.axes;
+export type Scale = keyof typeof texts.scales;
 
 interface TimesPlotsProps {
   lines: readonly Line[];
@@ -19,7 +20,7 @@ interface TimesPlotsProps {
 }
 
 export function TimesPlots({ lines, name, published, axis, scale }: TimesPlotsProps) {
-  const references = published.map(({ id, ms }) => ({ label: texts.times.published[id] ?? id, ms }));
+  const references = published.map(({ id, ms }) => ({ label: texts.published[id] ?? id, ms }));
   const over = lines.map((line, index): Drawn => {
     const x = line.samples.map(({ atMs }, place) => (axis === "time" ? atMs / 1000 + place / 1e6 : place + 1));
     return { label: name(line), colour: seriesColour(index), x, y: line.samples.map(({ ms }) => ms) };
@@ -30,8 +31,8 @@ export function TimesPlots({ lines, name, published, axis, scale }: TimesPlotsPr
   });
   return (
     <div class="times-charts">
-      <TimesCard title={texts.times.overTime} along={axis} scale={scale} lines={over} references={references} />
-      <TimesCard title={texts.times.shares} along="ms" scale={scale} lines={share} references={references} />
+      <TimesCard title={texts.overTime} along={axis} scale={scale} lines={over} references={references} />
+      <TimesCard title={texts.shares} along="ms" scale={scale} lines={share} references={references} />
     </div>
   );
 }
@@ -74,7 +75,7 @@ function TimesCard({ title, along, scale, lines, references }: TimesCardProps) {
   const samples = lines.reduce((sum, { x }) => sum + x.length, 0);
   return (
     <Card title={title}>
-      {failed && <p class="notice">{texts.plot.failed}</p>}
+      {failed && <p class="notice">{common.chartFailed}</p>}
       <div
         ref={box}
         class="times-chart"
@@ -82,7 +83,7 @@ function TimesCard({ title, along, scale, lines, references }: TimesCardProps) {
         data-samples={samples}
         data-references={references.length}
         role="img"
-        aria-label={texts.times.chart(title, lines.length, samples)}
+        aria-label={texts.chart(title, lines.length, samples)}
       />
     </Card>
   );

@@ -1,7 +1,7 @@
 /** Measuring here and now, by what moves nothing. */
 import { TIMES, waysOf, type Measure } from "./model/probe";
 import type { DeviceStore } from "../devices/model/device-store";
-import { texts } from "../../shared/i18n/texts";
+import { texts } from "./texts";
 import { Card } from "../../shared/ui/parts";
 
 export function MeasureNow({ device, measure }: { device: DeviceStore; measure: Measure }) {
@@ -13,7 +13,7 @@ export function MeasureNow({ device, measure }: { device: DeviceStore; measure: 
   const done = progress === null ? 0 : ways.indexOf(progress.way) * TIMES + progress.done;
   return (
     <Card
-      title={texts.times.measure}
+      title={texts.measure}
       aside={
         progress === null ? (
           // What may be asked of a device is known once it has said what it is.
@@ -24,38 +24,38 @@ export function MeasureNow({ device, measure }: { device: DeviceStore; measure: 
             disabled={device.description.value === null}
             onClick={() => void measure.run(ways)}
           >
-            {texts.times.measure}
+            {texts.measure}
           </button>
         ) : (
           <button type="button" data-testid="measure-stop" onClick={() => measure.stop()}>
-            {texts.times.stop}
+            {texts.stop}
           </button>
         )
       }
     >
       <p class="quiet small">
-        {texts.times.measureExplained(ways.map((way) => texts.times.ways[way]))} {!ways.includes("device") && texts.times.robotNote}{" "}
-        {watches && texts.times.viewer}
+        {texts.measureExplained(ways.map((way) => texts.ways[way]))} {!ways.includes("device") && texts.robotNote}{" "}
+        {watches && texts.viewer}
       </p>
       {progress !== null && (
         <>
-          <progress max={ways.length * TIMES} value={done} aria-label={texts.times.measure} />
-          <p class="small">{texts.times.measuring(texts.times.ways[progress.way], progress.done, progress.of)}</p>
+          <progress max={ways.length * TIMES} value={done} aria-label={texts.measure} />
+          <p class="small">{texts.measuring(texts.ways[progress.way], progress.done, progress.of)}</p>
         </>
       )}
       <p class="small" role="status" data-testid="measured" data-count={count} data-busy={progress !== null}>
-        {progress === null && count > 0 && texts.times.measureDone(count)}
+        {progress === null && count > 0 && texts.measureDone(count)}
       </p>
       {why !== "" && (
         <p class="notice bad" role="alert">
-          {texts.times.ended(why)}
+          {texts.ended(why)}
         </p>
       )}
       {measure.unstored && !watches && (
         <p class="row">
-          {texts.times.notStored}
+          {texts.notStored}
           <button type="button" onClick={() => void measure.store()}>
-            {texts.times.store}
+            {texts.store}
           </button>
         </p>
       )}

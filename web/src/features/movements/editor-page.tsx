@@ -11,7 +11,8 @@ import type { Checked, Scripting } from "./model/movement-library";
 import { Manuscript } from "./model/script-draft";
 import { failureMark, placed, type Place } from "../../shared/lib/text-offsets";
 import type { Station } from "../devices/model/device-session";
-import { texts } from "../../shared/i18n/texts";
+import { common } from "../../shared/i18n/common";
+import { texts } from "./texts";
 import { Age, Card } from "../../shared/ui/parts";
 import { movementsAddress, typeKeyframesAddress } from "../../app/routes";
 import { useStations } from "../devices/device-sessions";
@@ -53,7 +54,7 @@ export function EditorPage({ api, fleet, account, robotType, name }: EditorPageP
         </div>
         {loading.kind === "loading" && (
           <p class="quiet" role="status">
-            {texts.loading}
+            {common.loading}
           </p>
         )}
         {loading.kind === "failed" && (
@@ -88,7 +89,7 @@ function AsKeyframes({ script }: { script: Manuscript }) {
     <>
       {" · "}
       <a href={typeKeyframesAddress(script.robotType, script.name)} data-testid="as-keyframes">
-        {texts.keyframes.editAs}
+        {texts.editor.asKeyframes}
       </a>
     </>
   );

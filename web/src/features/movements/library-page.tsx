@@ -4,7 +4,8 @@ import type { Api } from "../../shared/api/client";
 import type { Fleet } from "../devices/model/device-list";
 import { sentence } from "../../shared/api/http";
 import type { Movement, RobotTypeEntry } from "./model/movement-library";
-import { texts } from "../../shared/i18n/texts";
+import { common } from "../../shared/i18n/common";
+import { texts } from "./texts";
 import { Confirm } from "../../shared/ui/confirm-button";
 import { Card } from "../../shared/ui/parts";
 import { movementAddress, typeKeyframesAddress } from "../../app/routes";
@@ -61,7 +62,7 @@ export function LibraryPage({ api, fleet }: { api: Api; fleet: Fleet }) {
       </p>
       {shelves.kind === "loading" && (
         <p class="quiet" role="status">
-          {texts.loading}
+          {common.loading}
         </p>
       )}
       {shelves.kind === "failed" && (

@@ -6,7 +6,8 @@ import { sentence } from "../../shared/api/http";
 import type { Control } from "../control/model/lease";
 import type { DeviceStore } from "../devices/model/device-store";
 import type { Parameters } from "./model/movement-library";
-import { texts } from "../../shared/i18n/texts";
+import { common } from "../../shared/i18n/common";
+import { texts } from "./texts";
 import { Card } from "../../shared/ui/parts";
 import { movementAddress } from "../../app/routes";
 import { ParameterFields, useParameters } from "./parameter-form";
@@ -49,8 +50,8 @@ export function Movements({ api, device, control, actions, account }: MovementsP
     void actions.start({ kind: "run_movement", name, parameters }, control.epoch);
   return (
     <Card title={texts.movements.title} class="movements">
-      {watches && <p class="quiet">{texts.control.watches}</p>}
-      {!watches && library.kind === "loading" && <p class="quiet">{texts.loading}</p>}
+      {watches && <p class="quiet">{texts.movements.viewer}</p>}
+      {!watches && library.kind === "loading" && <p class="quiet">{common.loading}</p>}
       {library.kind === "failed" && (
         <p class="notice bad">
           {texts.movements.failed(library.why)}{" "}

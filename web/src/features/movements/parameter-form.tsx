@@ -3,7 +3,7 @@ import { useId, useMemo, useState } from "preact/hooks";
 import { keptParameters } from "../../shared/lib/local-storage";
 import type { ObjectSchema, Parameters } from "./model/movement-library";
 import { fieldsOf, fill, read, type Field, type Filled, type Wrong } from "./model/parameter-form";
-import { texts } from "../../shared/i18n/texts";
+import { texts } from "./texts";
 import { storage } from "../../shared/hooks/browser-storage";
 
 export interface ParameterValues {

@@ -8,7 +8,7 @@ import { ApiError } from "../../shared/api/http";
 import { newId } from "../../shared/lib/ids";
 import type { ObjectSchema, Parameters } from "./model/movement-library";
 import type { Station } from "../devices/model/device-session";
-import { texts } from "../../shared/i18n/texts";
+import { texts } from "./texts";
 import { Told } from "../actions/run-status";
 import { Card, ReachChip } from "../../shared/ui/parts";
 import { deviceAddress } from "../../app/routes";
@@ -49,13 +49,13 @@ export function ManyBar({ stations }: { stations: readonly Station[] }) {
         type="button"
         class="stop"
         data-testid="stop-all"
-        title={texts.stop.keyExplained}
+        title={texts.many.stopKeyExplained}
         aria-keyshortcuts="Escape"
         onClick={() => {
           for (const station of stations) station.stopNow();
         }}
       >
-        {stations.length === 1 ? texts.stop.press : texts.many.stopAll} <kbd>{texts.stop.key}</kbd>
+        {stations.length === 1 ? texts.many.stop : texts.many.stopAll} <kbd>{texts.many.stopKey}</kbd>
       </button>
     </div>
   );
@@ -207,7 +207,7 @@ function RunRow({ station }: { station: Station }) {
           </button>
         )}
         <button type="button" class="stop" aria-label={texts.many.stopOf(`${label} ${name}`)} onClick={() => station.stopNow()}>
-          {texts.stop.press}
+          {texts.many.stop}
         </button>
       </div>
       <div class={`run run-${run?.status ?? "none"}`} role="status">

@@ -3,7 +3,8 @@ import { useEffect, useRef, useState } from "preact/hooks";
 import type { Api } from "../../shared/api/client";
 import { sentence } from "../../shared/api/http";
 import type { Movement } from "./model/movement-library";
-import { texts } from "../../shared/i18n/texts";
+import { format } from "../../shared/i18n/format";
+import { texts } from "./texts";
 import { Card } from "../../shared/ui/parts";
 import { Comparison } from "./code-editor";
 
@@ -71,7 +72,7 @@ export function Versions({ api, robotType, name, newest, text, onRestore }: Vers
             <span>
               <strong>{texts.versions.one(version.version)}</strong>{" "}
               <span class="quiet small">
-                {version.built_in ? texts.library.builtIn : texts.moment(version.updated_at)}
+                {version.built_in ? texts.library.builtIn : format.dateTime(version.updated_at)}
               </span>
             </span>
             <button

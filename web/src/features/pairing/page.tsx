@@ -4,7 +4,8 @@ import type { Api, Device, Space } from "../../shared/api/client";
 import type { Fleet } from "../devices/model/device-list";
 import { ApiError, sentence } from "../../shared/api/http";
 import { readCode, type FollowedCode } from "./model/claim-code";
-import { texts } from "../../shared/i18n/texts";
+import { common } from "../../shared/i18n/common";
+import { texts } from "./texts";
 import { Naming } from "../devices/rename";
 import "./pairing.css";
 import { Card, HeardAge, ReachChip } from "../../shared/ui/parts";
@@ -21,9 +22,9 @@ export function PairingPage({ api, fleet, pairing }: PairingPageProps) {
   return (
     <main class="page pairing" id="content">
       <p>
-        <a href={fleetAddress}>← {texts.device.back}</a>
+        <a href={fleetAddress}>← {common.allDevices}</a>
       </p>
-      <h1>{texts.pair.title}</h1>
+      <h1>{texts.title}</h1>
       {paired === null ? (
         <PairForm
           api={api}
@@ -82,7 +83,7 @@ function PairForm({ api, fleet, pairing, onPaired }: PairFormProps) {
   const pair = async (): Promise<void> => {
     const read = readCode(typed);
     if (read === null) {
-      setWrong(texts.pair.malformed);
+      setWrong(texts.malformed);
       code.current?.focus();
       return;
     }
@@ -92,15 +93,15 @@ function PairForm({ api, fleet, pairing, onPaired }: PairFormProps) {
       onPaired(await fleet.claim(read, await into()));
     } catch (error) {
       const unknown = error instanceof ApiError && error.code === "claim-code-unknown";
-      setWrong(unknown ? texts.pair.unknown : sentence(error));
+      setWrong(unknown ? texts.unknown : sentence(error));
       setBusy(false);
       code.current?.focus();
     }
   };
 
   return (
-    <Card title={texts.pair.byCode}>
-      <p class="quiet">{linked === null ? texts.pair.explain : texts.pair.linked}</p>
+    <Card title={texts.byCode}>
+      <p class="quiet">{linked === null ? texts.explain : texts.linked}</p>
       <form
         class="fields"
         onSubmit={(event) => {
@@ -109,7 +110,7 @@ function PairForm({ api, fleet, pairing, onPaired }: PairFormProps) {
         }}
       >
         <div class="field">
-          <label for="claim-code">{texts.pair.code}</label>
+          <label for="claim-code">{texts.code}</label>
           <input
             id="claim-code"
             ref={code}
@@ -119,7 +120,7 @@ function PairForm({ api, fleet, pairing, onPaired }: PairFormProps) {
             autocomplete="off"
             autocapitalize="characters"
             spellcheck={false}
-            placeholder={texts.pair.example}
+            placeholder={texts.example}
             maxLength={20}
             required
             value={typed}
@@ -129,25 +130,25 @@ function PairForm({ api, fleet, pairing, onPaired }: PairFormProps) {
           />
         </div>
         <div class="field">
-          <label for="claim-space">{texts.pair.into}</label>
+          <label for="claim-space">{texts.into}</label>
           <select
             id="claim-space"
             data-testid="claim-space"
             value={space}
             onChange={(event) => setSpace(event.currentTarget.value)}
           >
-            {(spaces ?? []).length === 0 && <option value="">{texts.pair.firstSpace}</option>}
+            {(spaces ?? []).length === 0 && <option value="">{texts.firstSpace}</option>}
             {spaces?.map(({ id, name: called }, index) => (
               <option key={id} value={index === 0 && space === "" ? "" : id}>
                 {called}
               </option>
             ))}
-            <option value={NEW}>{texts.pair.newSpace}</option>
+            <option value={NEW}>{texts.newSpace}</option>
           </select>
         </div>
         {space === NEW && (
           <div class="field">
-            <label for="claim-space-name">{texts.spaces.name}</label>
+            <label for="claim-space-name">{texts.spaceName}</label>
             <input
               id="claim-space-name"
               type="text"
@@ -161,7 +162,7 @@ function PairForm({ api, fleet, pairing, onPaired }: PairFormProps) {
         )}
         <div class="row">
           <button type="submit" class="primary" data-testid="claim" disabled={busy}>
-            {busy ? texts.pair.busy : texts.pair.submit}
+            {busy ? texts.busy : texts.submit}
           </button>
           {linked !== null && (
             <button
@@ -172,7 +173,7 @@ function PairForm({ api, fleet, pairing, onPaired }: PairFormProps) {
                 setTyped("");
               }}
             >
-              {texts.pair.notThis}
+              {texts.notThis}
             </button>
           )}
         </div>
@@ -198,9 +199,9 @@ function Paired({ api, fleet, devices, onAnother }: PairedProps) {
   return (
     <section class="card" aria-labelledby="paired" data-testid="paired">
       <h2 id="paired" ref={heading} tabIndex={-1}>
-        {texts.pair.done(devices.length)}
+        {texts.done(devices.length)}
       </h2>
-      <p class="quiet">{texts.pair.doneNote}</p>
+      <p class="quiet">{texts.doneNote}</p>
       <ul class="paired-list">
         {devices.map((device) => (
           <PairedDevice key={device.id} api={api} fleet={fleet} info={device} />
@@ -208,7 +209,7 @@ function Paired({ api, fleet, devices, onAnother }: PairedProps) {
       </ul>
       <div class="row">
         <button type="button" onClick={onAnother}>
-          {texts.pair.another}
+          {texts.another}
         </button>
       </div>
     </section>
@@ -226,7 +227,7 @@ function PairedDevice({ api, fleet, info }: { api: Api; fleet: Fleet; info: Devi
       </span>
       <span role="status">
         {device === undefined || device.heardAt.value === null ? (
-          <span class="quiet small">{texts.pair.waiting}</span>
+          <span class="quiet small">{texts.waiting}</span>
         ) : (
           <>
             <ReachChip device={device} data-testid="online" />{" "}

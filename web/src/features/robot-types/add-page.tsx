@@ -4,7 +4,9 @@ import type { Api } from "../../shared/api/client";
 import { clock } from "../../shared/lib/clock";
 import { TypeDraft } from "./model/upload-draft";
 import { MANIFEST } from "./model/upload-files";
-import { texts } from "../../shared/i18n/texts";
+import { common } from "../../shared/i18n/common";
+import { format } from "../../shared/i18n/format";
+import { texts } from "./texts";
 import { Card } from "../../shared/ui/parts";
 import { robotTypeAddress, robotTypesAddress } from "../../app/routes";
 import { ChooseFiles, ChosenFiles } from "./file-picker";
@@ -17,10 +19,10 @@ import "./robot-types.css";
 export function AddRobotTypePage({ api }: { api: Api }) {
   const draft = useMemo(() => new TypeDraft(api.robotTypes), [api]);
   useEffect(() => () => draft.dispose(), [draft]);
-  const words = texts.robotTypes.adding;
+  const words = texts.adding;
   return (
     <main class="page fleet robot-types" id="content" data-testid="add-type" data-step={draft.step.value}>
-      <a href={robotTypesAddress}>← {texts.robotTypes.title}</a>
+      <a href={robotTypesAddress}>← {texts.title}</a>
       <h1>{words.title}</h1>
       {draft.step.value === "saved" ? (
         <Saved draft={draft} />
@@ -42,14 +44,14 @@ export function AddRobotTypePage({ api }: { api: Api }) {
 /** What is under way, with how long it has taken. */
 function Progress({ draft }: { draft: TypeDraft }) {
   const step = draft.step.value;
-  const words = texts.robotTypes.adding;
+  const words = texts.adding;
   const fault = draft.fault.value;
   return (
     <div role="status" data-testid="type-progress">
       {(step === "sending" || step === "checking" || step === "saving") && (
         <div class="card">
           <p>
-            {words.under[step]} <span class="quiet">{texts.robotTypes.seconds((clock.value - draft.since.value) / 1000)}</span>
+            {words.under[step]} <span class="quiet">{texts.seconds((clock.value - draft.since.value) / 1000)}</span>
           </p>
           <progress aria-label={words.under[step]} />
         </div>
@@ -60,7 +62,7 @@ function Progress({ draft }: { draft: TypeDraft }) {
           <span>{words.unsent(draft.trouble.value)}</span>
           {step === "unsent" && (
             <button type="button" onClick={() => void draft.check()}>
-              {texts.later.again}
+              {common.tryAgain}
             </button>
           )}
         </p>
@@ -70,7 +72,7 @@ function Progress({ draft }: { draft: TypeDraft }) {
 }
 
 function Outcome({ draft }: { draft: TypeDraft }) {
-  const words = texts.robotTypes.adding;
+  const words = texts.adding;
   const look = draft.look.value;
   const model = draft.model.value;
   const step = draft.step.value;
@@ -93,12 +95,12 @@ function Outcome({ draft }: { draft: TypeDraft }) {
               >
                 {words.save(look.robot_type.type)}
               </button>
-              <span class="quiet small">{words.expires(texts.moment(look.expires_at))}</span>
+              <span class="quiet small">{words.expires(format.dateTime(look.expires_at))}</span>
             </div>
           </Card>
           <div class="two">
             {model === null ? (
-              <p class="quiet">{texts.robotTypes.model.none}</p>
+              <p class="quiet">{texts.model.none}</p>
             ) : (
               <ModelView twin={model.twin} joints={look.robot_type.joints} />
             )}
@@ -112,7 +114,7 @@ function Outcome({ draft }: { draft: TypeDraft }) {
 
 function Saved({ draft }: { draft: TypeDraft }) {
   const type = draft.saved.value;
-  const words = texts.robotTypes.adding;
+  const words = texts.adding;
   if (type === null) return null;
   return (
     <>

@@ -6,7 +6,9 @@ import { readFindings } from "./model/parse-findings";
 import type { Fleet } from "../devices/model/device-list";
 import { ApiError } from "../../shared/api/http";
 import type { RobotType, TypeModel } from "./model/robot-types";
-import { texts } from "../../shared/i18n/texts";
+import { common } from "../../shared/i18n/common";
+import { format } from "../../shared/i18n/format";
+import { texts } from "./texts";
 import { Confirm } from "../../shared/ui/confirm-button";
 import { Card } from "../../shared/ui/parts";
 import { addRobotTypeAddress, deviceAddress, replaceWith, robotTypesAddress } from "../../app/routes";
@@ -31,10 +33,10 @@ export function RobotTypePage({ api, fleet, id }: TypePageProps) {
     .filter(({ robot_type: used }) => used === id);
   return (
     <main class="page fleet robot-types" id="content">
-      <a href={robotTypesAddress}>← {texts.robotTypes.title}</a>
+      <a href={robotTypesAddress}>← {texts.title}</a>
       {type === null && trouble === "" && (
         <p class="quiet" role="status">
-          {texts.loading}
+          {common.loading}
         </p>
       )}
       <Trouble said={trouble} again={again} />
@@ -44,7 +46,7 @@ export function RobotTypePage({ api, fleet, id }: TypePageProps) {
 }
 
 function Loaded({ api, type, devices }: { api: Api; type: RobotType; devices: readonly Device[] }) {
-  const words = texts.robotTypes;
+  const words = texts;
   const upload = type.upload;
   return (
     <>
@@ -81,13 +83,13 @@ function Model({ api, type }: { api: Api; type: RobotType }) {
   }, [api, type]);
   const { value, trouble, again } = useLoaded(load);
   if (trouble !== "") return <Trouble said={trouble} again={again} />;
-  if (value === null) return <p class="quiet">{texts.loading}</p>;
-  if (value === "none") return <p class="quiet">{texts.robotTypes.model.none}</p>;
+  if (value === null) return <p class="quiet">{common.loading}</p>;
+  if (value === "none") return <p class="quiet">{texts.model.none}</p>;
   return <ModelView twin={value.twin} joints={type.joints} />;
 }
 
 function Facts({ type, devices }: { type: RobotType; devices: readonly Device[] }) {
-  const words = texts.robotTypes;
+  const words = texts;
   const upload = type.upload;
   return (
     <Card title={words.facts.title}>
@@ -103,7 +105,7 @@ function Facts({ type, devices }: { type: RobotType; devices: readonly Device[] 
         {upload !== null && (
           <>
             <dt>{words.facts.uploaded}</dt>
-            <dd>{words.facts.upload(upload.version, texts.moment(upload.uploaded_at))}</dd>
+            <dd>{words.facts.upload(upload.version, format.dateTime(upload.uploaded_at))}</dd>
           </>
         )}
         <dt>{words.facts.driver}</dt>
@@ -138,7 +140,7 @@ function Facts({ type, devices }: { type: RobotType; devices: readonly Device[] 
 }
 
 function Joints({ type }: { type: RobotType }) {
-  const words = texts.robotTypes.joints;
+  const words = texts.joints;
   return (
     <Card title={words.title(type.joints.length)}>
       <div class="scroll" tabIndex={0} role="region" aria-label={words.title(type.joints.length)}>
@@ -157,9 +159,9 @@ function Joints({ type }: { type: RobotType }) {
                 <th scope="row">
                   {joint.label} <span class="quiet small">{joint.name}</span>
                 </th>
-                <td>{texts.number.degrees(degrees(joint.lower_rad))}</td>
-                <td>{texts.number.degrees(degrees(joint.upper_rad))}</td>
-                <td>{words.speed(texts.number.degrees(degrees(joint.max_velocity_rad_s)))}</td>
+                <td>{format.degrees(degrees(joint.lower_rad))}</td>
+                <td>{format.degrees(degrees(joint.upper_rad))}</td>
+                <td>{words.speed(format.degrees(degrees(joint.max_velocity_rad_s)))}</td>
               </tr>
             ))}
           </tbody>
@@ -176,7 +178,7 @@ function Movements({ api, type }: { api: Api; type: RobotType }) {
   return (
     <Card title={texts.movements.title}>
       <Trouble said={trouble} again={again} />
-      {value === null && trouble === "" && <p class="quiet">{texts.loading}</p>}
+      {value === null && trouble === "" && <p class="quiet">{common.loading}</p>}
       {value?.length === 0 && <p class="quiet">{texts.movements.none}</p>}
       {value !== null && value.length > 0 && (
         <ul class="plain-list" data-testid="type-movements">
@@ -192,7 +194,7 @@ function Movements({ api, type }: { api: Api; type: RobotType }) {
 }
 
 function Files({ api, type }: { api: Api; type: RobotType }) {
-  const words = texts.robotTypes.files;
+  const words = texts.files;
   const ready = type.state === "ready";
   return (
     <Card
@@ -215,7 +217,7 @@ function Files({ api, type }: { api: Api; type: RobotType }) {
             ) : (
               name
             )}{" "}
-            <span class="quiet small">{texts.files.size(length)}</span>
+            <span class="quiet small">{format.fileSize(length)}</span>
           </li>
         ))}
       </ul>
@@ -224,7 +226,7 @@ function Files({ api, type }: { api: Api; type: RobotType }) {
 }
 
 function Own({ api, type }: { api: Api; type: RobotType }) {
-  const words = texts.robotTypes.own_type;
+  const words = texts.owned;
   return (
     <Card title={words.title}>
       <p>

@@ -1,7 +1,8 @@
 /** Files of a robot type: dropped, or chosen as a folder, an archive or one by one. They stay until it is saved. */
 import { useRef, useState } from "preact/hooks";
 import type { TypeDraft } from "./model/upload-draft";
-import { texts } from "../../shared/i18n/texts";
+import { format } from "../../shared/i18n/format";
+import { texts } from "./texts";
 import { Card } from "../../shared/ui/parts";
 import { ArchiveError, dropped, picked, readFiles } from "./read-archive";
 
@@ -13,7 +14,7 @@ export function ChooseFiles({ draft }: { draft: TypeDraft }) {
   const [wrong, setWrong] = useState("");
   const folder = useRef<HTMLInputElement>(null);
   const files = useRef<HTMLInputElement>(null);
-  const words = texts.robotTypes.adding;
+  const words = texts.adding;
 
   const take = async (chosen: Promise<[string, File][]>): Promise<void> => {
     setWrong("");
@@ -91,7 +92,7 @@ export function ChooseFiles({ draft }: { draft: TypeDraft }) {
 export function ChosenFiles({ draft }: { draft: TypeDraft }) {
   const names = [...draft.files.value.keys()].sort();
   const left = draft.left.value;
-  const words = texts.robotTypes.adding;
+  const words = texts.adding;
   if (names.length === 0 && left.length === 0) return null;
   const wrong = new Set(draft.errors.value.map(({ file }) => file));
   return (
@@ -117,11 +118,11 @@ export function ChosenFiles({ draft }: { draft: TypeDraft }) {
 
 function FileRow({ draft, name, wrong }: { draft: TypeDraft; name: string; wrong: boolean }) {
   const input = useRef<HTMLInputElement>(null);
-  const words = texts.robotTypes.adding;
+  const words = texts.adding;
   return (
     <li data-file={name}>
       <span class="file-name">
-        {name} <span class="quiet small">{texts.files.size(draft.files.value.get(name)?.length ?? 0)}</span>{" "}
+        {name} <span class="quiet small">{format.fileSize(draft.files.value.get(name)?.length ?? 0)}</span>{" "}
         {wrong && <span class="chip bad">{words.wrong}</span>}
       </span>
       <button type="button" class="plain" aria-label={words.replaceNamed(name)} onClick={() => input.current?.click()}>

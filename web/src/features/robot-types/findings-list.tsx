@@ -1,7 +1,8 @@
 /** What is wrong with a robot type, or worth knowing: where it stands, what it is, what to do. */
 import { degrees } from "../../shared/lib/angles";
 import type { Finding } from "./model/parse-findings";
-import { texts } from "../../shared/i18n/texts";
+import { format } from "../../shared/i18n/format";
+import { texts } from "./texts";
 
 interface FindingsProps {
   findings: readonly Finding[];
@@ -10,7 +11,7 @@ interface FindingsProps {
 
 export function Findings({ findings, level }: FindingsProps) {
   if (findings.length === 0) return null;
-  const words = texts.robotTypes.findings;
+  const words = texts.findings;
   return (
     <section class={`card findings ${level}`} data-testid={`${level}s`} aria-label={words.title[level](findings.length)}>
       <h2>{words.title[level](findings.length)}</h2>
@@ -31,16 +32,16 @@ export function Findings({ findings, level }: FindingsProps) {
 }
 
 function what({ kind, said, about, range_rad }: Finding): string {
-  const words = texts.robotTypes.findings;
+  const words = texts.findings;
   if (kind === "missing") return words.missing(about);
   if (kind === "torn") return words.torn;
   if (kind === "range" && range_rad !== null) {
-    const [lower, upper] = range_rad.map((rad) => texts.number.degrees(degrees(rad)));
+    const [lower, upper] = range_rad.map((rad) => format.degrees(degrees(rad)));
     return (said.includes("actuator") ? words.motorRange : words.range)(about, lower ?? "", upper ?? "");
   }
   return said;
 }
 
 function advice({ kind, file, about }: Finding): string {
-  return texts.robotTypes.findings.advice[kind](file, about);
+  return texts.findings.advice[kind](file, about);
 }

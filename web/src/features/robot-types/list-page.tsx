@@ -3,7 +3,8 @@ import { useCallback } from "preact/hooks";
 import type { Api } from "../../shared/api/client";
 import type { Fleet } from "../devices/model/device-list";
 import type { RobotType } from "./model/robot-types";
-import { texts } from "../../shared/i18n/texts";
+import { common } from "../../shared/i18n/common";
+import { texts } from "./texts";
 import { WhatDoISee } from "../help/page-explainer";
 import { addRobotTypeAddress, robotTypeAddress } from "../../app/routes";
 import { Trouble } from "../../shared/ui/load-error";
@@ -13,7 +14,7 @@ import "./robot-types.css";
 
 export function RobotTypesPage({ api, fleet }: { api: Api; fleet: Fleet }) {
   const { value: types, trouble, again } = useLoaded(useCallback(() => api.robotTypes.list(), [api]));
-  const words = texts.robotTypes;
+  const words = texts;
   const own = types?.filter((type) => !type.built_in) ?? [];
   const builtIn = types?.filter((type) => type.built_in) ?? [];
   return (
@@ -25,10 +26,10 @@ export function RobotTypesPage({ api, fleet }: { api: Api; fleet: Fleet }) {
         </a>
       </header>
       <p class="quiet">{words.explained}</p>
-      <WhatDoISee page="types" />
+      <WhatDoISee page="robotTypes" />
       {types === null && trouble === "" && (
         <p class="quiet" role="status">
-          {texts.loading}
+          {common.loading}
         </p>
       )}
       <Trouble said={trouble} again={again} />
@@ -49,7 +50,7 @@ export function RobotTypesPage({ api, fleet }: { api: Api; fleet: Fleet }) {
 }
 
 function Types({ types, fleet, name }: { types: readonly RobotType[]; fleet: Fleet; name: string }) {
-  const words = texts.robotTypes;
+  const words = texts;
   const devices = [...(fleet.devices.value?.values() ?? [])].map(({ info }) => info.value);
   return (
     <ul class="devices" aria-label={name}>

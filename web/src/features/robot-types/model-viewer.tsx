@@ -3,7 +3,8 @@ import { useEffect, useState } from "preact/hooks";
 import { degrees, radians } from "../../shared/lib/angles";
 import type { KnownTwin } from "../../shared/mqtt/parse-messages";
 import type { Joint } from "../../shared/mqtt/protocol.generated";
-import { texts } from "../../shared/i18n/texts";
+import { format } from "../../shared/i18n/format";
+import { texts } from "./texts";
 import { Card } from "../../shared/ui/parts";
 import { useScene } from "../twin/use-scene";
 
@@ -22,7 +23,7 @@ export function ModelView({ twin, joints }: ModelViewProps) {
   const [pose, setPose] = useState<Readonly<Record<string, number>>>(rest);
   const { canvas, box, scene, said } = useScene(twin);
   useEffect(() => scene?.show(pose, null), [scene, pose]);
-  const words = texts.robotTypes.model;
+  const words = texts.model;
   return (
     <Card
       title={words.title}
@@ -33,7 +34,7 @@ export function ModelView({ twin, joints }: ModelViewProps) {
             {words.rest}
           </button>
           <button type="button" class="plain" disabled={scene === null} onClick={() => scene?.resetView()}>
-            {texts.view.reset}
+            {texts.model.reset}
           </button>
         </span>
       }
@@ -58,7 +59,7 @@ export function ModelView({ twin, joints }: ModelViewProps) {
 }
 
 function JointSlider({ joint, at_rad, onChange }: { joint: Joint; at_rad: number; onChange: (at_rad: number) => void }) {
-  const { degrees: said, wholeDegrees } = texts.number;
+  const { degrees: said, wholeDegrees } = format;
   const id = `model-joint-${joint.name}`;
   return (
     <li>
@@ -75,7 +76,7 @@ function JointSlider({ joint, at_rad, onChange }: { joint: Joint; at_rad: number
         onInput={(event) => onChange(radians(Number(event.currentTarget.value)))}
       />
       <output for={id}>{said(degrees(at_rad))}</output>
-      <span class="quiet small">{texts.robotTypes.range(wholeDegrees(degrees(joint.lower_rad)), wholeDegrees(degrees(joint.upper_rad)))}</span>
+      <span class="quiet small">{texts.range(wholeDegrees(degrees(joint.lower_rad)), wholeDegrees(degrees(joint.upper_rad)))}</span>
     </li>
   );
 }

@@ -1,14 +1,14 @@
 /** What comes after a type: an agent with a robot of it. */
-import { texts } from "../../shared/i18n/texts";
+import { texts } from "./texts";
 import { AgentCommands } from "../help/agent-commands";
 import { Card } from "../../shared/ui/parts";
 
 /** `builtIn`: the agent has the type already. */
 export function StartAgent({ type, builtIn }: { type: string; builtIn: boolean }) {
-  const words = texts.robotTypes.next;
+  const words = texts.next;
   return (
     <Card title={words.title}>
-      <p>{texts.help.agent.explained}</p>
+      <p>{words.agent}</p>
       <ol class="next-steps">
         {!builtIn && <li>{words.folder(type)}</li>}
         <AgentCommands name={type} type={type} />

@@ -1,5 +1,5 @@
 import type { RobotType } from "./model/robot-types";
-import { texts } from "../../shared/i18n/texts";
+import { texts } from "./texts";
 
 /** Whether a type can be used, and how its newest upload fares. */
 export function StateChip({ type }: { type: RobotType }) {
@@ -7,10 +7,10 @@ export function StateChip({ type }: { type: RobotType }) {
   return (
     <span class="row">
       <span class={`chip type-${type.state}`} data-testid="type-state" data-state={type.state}>
-        {texts.robotTypes.state[type.state]}
+        {texts.state[type.state]}
       </span>
       {newer !== null && (
-        <span class={`chip type-${newer.state}`}>{texts.robotTypes.newer(newer.version, texts.robotTypes.state[newer.state])}</span>
+        <span class={`chip type-${newer.state}`}>{texts.newer(newer.version, texts.state[newer.state])}</span>
       )}
     </span>
   );

@@ -2,7 +2,8 @@
 import { degrees } from "../../shared/lib/angles";
 import type { RobotType, TypeModel } from "./model/robot-types";
 import { pack, type Files } from "./model/upload-files";
-import { texts } from "../../shared/i18n/texts";
+import { format } from "../../shared/i18n/format";
+import { texts } from "./texts";
 import { Card } from "../../shared/ui/parts";
 
 interface FoundProps {
@@ -12,8 +13,8 @@ interface FoundProps {
 }
 
 export function Found({ type, model, files }: FoundProps) {
-  const words = texts.robotTypes.found;
-  const { wholeDegrees } = texts.number;
+  const words = texts.found;
+  const { wholeDegrees } = format;
   const movements = Object.keys(pack(files)?.movements ?? {});
   const lists: [string, string[]][] = [
     [
@@ -21,7 +22,7 @@ export function Found({ type, model, files }: FoundProps) {
       type.joints.map((joint) =>
         words.joint(
           joint.label,
-          texts.robotTypes.range(wholeDegrees(degrees(joint.lower_rad)), wholeDegrees(degrees(joint.upper_rad))),
+          texts.range(wholeDegrees(degrees(joint.lower_rad)), wholeDegrees(degrees(joint.upper_rad))),
         ),
       ),
     ],

@@ -5,7 +5,8 @@ import { clock, now } from "../../shared/lib/clock";
 import type { DeviceStore } from "../devices/model/device-store";
 import type { CameraFrame } from "../../shared/mqtt/camera-frame";
 import type { Instrument } from "./model/room-device-action";
-import { texts } from "../../shared/i18n/texts";
+import { format } from "../../shared/i18n/format";
+import { texts } from "./texts";
 import { contentOf } from "./use-capture-content";
 import { Age, Card } from "../../shared/ui/parts";
 import { whyNot } from "../devices/availability";
@@ -127,7 +128,7 @@ function Caption({ shown, running, rate }: { shown: Shown; running: boolean; rat
   const { kind, width, height, at } = shown;
   if (kind === "still") return <Age at={at} as={(age) => texts.camera.still(width, height, age)} />;
   if (!running) return <Age at={at} as={texts.camera.stopped} />;
-  return <>{texts.camera.live(width, height, texts.number.oneDigit(rate))}</>;
+  return <>{texts.camera.live(width, height, format.oneDigit(rate))}</>;
 }
 
 /** Decodes one picture at a time and drops those that come meanwhile: what is drawn is always the newest. */

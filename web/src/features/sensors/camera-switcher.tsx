@@ -2,7 +2,7 @@
 import { useEffect, useState } from "preact/hooks";
 import type { DeviceStore } from "../devices/model/device-store";
 import type { Fleet } from "../devices/model/device-list";
-import { texts } from "../../shared/i18n/texts";
+import { texts } from "./texts";
 import { CameraCard } from "./camera-card";
 
 interface View {
@@ -36,10 +36,10 @@ export function Watching({ device, views }: WatchingProps) {
   const view = views.find(({ key }) => key === chosen) ?? views[0];
   if (view === undefined) return null;
   const name = ({ device: of, camera }: View): string =>
-    of === device ? texts.watching.own(camera) : texts.watching.from(of.info.value.label, camera);
+    of === device ? texts.cameraSource.own(camera) : texts.cameraSource.from(of.info.value.label, camera);
   const choice = views.length > 1 && (
     <select
-      aria-label={texts.watching.choose}
+      aria-label={texts.cameraSource.choose}
       data-testid="watch-from"
       value={view.key}
       onChange={(event) => setChosen(event.currentTarget.value)}
@@ -52,6 +52,6 @@ export function Watching({ device, views }: WatchingProps) {
     </select>
   );
   return (
-    <CameraCard key={view.key} device={view.device} name={view.camera} instrument={null} title={texts.watching.title} aside={choice} />
+    <CameraCard key={view.key} device={view.device} name={view.camera} instrument={null} title={texts.cameraSource.title} aside={choice} />
   );
 }

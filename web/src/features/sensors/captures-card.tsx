@@ -3,7 +3,9 @@ import type { Upload } from "../../shared/api/client";
 import { onThisClock } from "../../shared/lib/clock";
 import type { DeviceStore } from "../devices/model/device-store";
 import type { Instrument } from "./model/room-device-action";
-import { texts } from "../../shared/i18n/texts";
+import { common } from "../../shared/i18n/common";
+import { format } from "../../shared/i18n/format";
+import { texts } from "./texts";
 import { Age, Card } from "../../shared/ui/parts";
 import { whyNot } from "../devices/availability";
 
@@ -44,7 +46,7 @@ export function Files({ device, instrument }: FilesProps) {
           ))}
         </div>
       )}
-      {uploads === null && <p class="quiet">{texts.loading}</p>}
+      {uploads === null && <p class="quiet">{common.loading}</p>}
       {uploads?.length === 0 && <p class="quiet">{texts.files.none}</p>}
       {uploads !== null && uploads.length > 0 && (
         <ul class="file-list" data-testid="files">
@@ -76,7 +78,7 @@ function File({ upload, instrument }: { upload: Upload; instrument: Instrument }
       <span class="file-name">
         {name}
         <span class="quiet small">
-          {texts.files.size(upload.length)} · <Age at={onThisClock(Date.parse(upload.at))} />
+          {format.fileSize(upload.length)} · <Age at={onThisClock(Date.parse(upload.at))} />
         </span>
       </span>
       <button type="button" aria-label={texts.files.downloadNamed(name)} onClick={() => void download()}>

@@ -4,7 +4,8 @@ import { now } from "../../shared/lib/clock";
 import type { DeviceStore } from "../devices/model/device-store";
 import type { Instrument } from "./model/room-device-action";
 import { readDepth, type DepthPicture } from "../../shared/lib/png";
-import { texts } from "../../shared/i18n/texts";
+import { format } from "../../shared/i18n/format";
+import { texts } from "./texts";
 import { contentOf } from "./use-capture-content";
 import { falseColour, NOTHING } from "../../shared/ui/colour-map";
 import { Age, Card } from "../../shared/ui/parts";
@@ -82,7 +83,7 @@ export function DepthCard({ device, instrument }: { device: DeviceStore; instrum
             class="depth-picture"
             role="img"
             tabIndex={0}
-            aria-label={texts.depth.label(texts.number.oneDigit(drawn.nearM), texts.number.oneDigit(drawn.farM))}
+            aria-label={texts.depth.label(format.oneDigit(drawn.nearM), format.oneDigit(drawn.farM))}
             onPointerMove={aim}
             onPointerDown={aim}
             onKeyDown={move}
@@ -96,11 +97,11 @@ export function DepthCard({ device, instrument }: { device: DeviceStore; instrum
       </div>
       {drawn !== null && (
         <div class="depth-scale">
-          <span>{texts.depth.read(texts.number.oneDigit(drawn.nearM))}</span>
+          <span>{texts.depth.read(format.oneDigit(drawn.nearM))}</span>
           <canvas ref={scale} width={256} height={1} aria-hidden="true" />
-          <span>{texts.depth.read(texts.number.oneDigit(drawn.farM))}</span>
+          <span>{texts.depth.read(format.oneDigit(drawn.farM))}</span>
           <output class="depth-value" data-testid="depth-value">
-            {point === null ? texts.number.unknown : reading(drawn, point)}
+            {point === null ? format.unknown : reading(drawn, point)}
           </output>
         </div>
       )}

@@ -8,7 +8,9 @@ import { newestOf } from "../health/model/health";
 import { ApiError, sentence } from "../../shared/api/http";
 import { digits, type Quantity } from "./model/quantities";
 import { Recording } from "./model/stored-series";
-import { texts } from "../../shared/i18n/texts";
+import { common } from "../../shared/i18n/common";
+import { format } from "../../shared/i18n/format";
+import { texts } from "./texts";
 import type { Marks, SeriesChart } from "../../shared/charts/series-chart";
 import { colour, onColourChange } from "../../shared/ui/canvas-theme";
 
@@ -139,7 +141,7 @@ export function History({ recording, quantity, spanMs, binary, old, marks }: His
     if (chart !== null) goTo(columns[0][nearest(columns, chart.timeAt(event.clientX))] ?? null);
   };
 
-  if (failed) return <p class="notice">{texts.plot.failed}</p>;
+  if (failed) return <p class="notice">{common.chartFailed}</p>;
   const kind = `chart series ${binary ? "binary" : ""} ${old ? "old" : ""}`;
   if (marks === undefined) return <div ref={box} class={kind} data-testid="series" role="img" />;
   return (
@@ -201,7 +203,7 @@ function said([times, means, lows, highs]: Columns, index: number, { unit }: Qua
   const places = digits(Math.max(Math.abs(mean) / 100, 0.01));
   const text = (value: number): string => `${value.toFixed(places)} ${unit}`.trim();
   const band = low === high || low === null || high === null || low === undefined || high === undefined ? null : [text(low), text(high)] as const;
-  return texts.trend.at(texts.sinceWhen(at * 1000), text(mean), band);
+  return texts.trend.at(format.recentTime(at * 1000), text(mean), band);
 }
 
 function described({ label, unit }: Quantity, seen: readonly number[]): string {

@@ -5,7 +5,7 @@ import type { DeviceStore } from "../devices/model/device-store";
 import type { Instrument } from "./model/room-device-action";
 import { readScan, type LidarScan } from "../../shared/mqtt/parse-messages";
 import type { Values } from "../spaces/model/room-perception";
-import { texts } from "../../shared/i18n/texts";
+import { texts } from "./texts";
 import { canvasBox } from "../../shared/ui/hidpi-canvas";
 import { contentOf } from "./use-capture-content";
 import { Age, Card } from "../../shared/ui/parts";

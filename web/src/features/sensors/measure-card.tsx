@@ -2,7 +2,9 @@ import { useState } from "preact/hooks";
 import type { DeviceStore } from "../devices/model/device-store";
 import type { Instrument } from "./model/room-device-action";
 import { quantityOf } from "./model/quantities";
-import { texts } from "../../shared/i18n/texts";
+import { common } from "../../shared/i18n/common";
+import { format } from "../../shared/i18n/format";
+import { texts } from "./texts";
 import { Age, Card, Choice } from "../../shared/ui/parts";
 import { shown } from "./readings-card";
 import { whyNot } from "../devices/availability";
@@ -12,7 +14,7 @@ const MOST_HZ = 50;
 /** More values of a single measurement than this would push all else away; the rest is in its own card. */
 const MOST_SHOWN = 12;
 
-type Time = keyof typeof texts.gather.times;
+type Time = keyof typeof texts.collect.times;
 
 interface GatherProps {
   device: DeviceStore;
@@ -38,11 +40,11 @@ export function Gather({ device, instrument }: GatherProps) {
   };
 
   return (
-    <Card title={texts.gather.title}>
-      <p class="quiet small">{texts.gather.explain}</p>
+    <Card title={texts.collect.title}>
+      <p class="quiet small">{texts.collect.explain}</p>
       <form class="gather" onSubmit={submit}>
         <label>
-          {texts.gather.rate}
+          {texts.collect.rate}
           <input
             type="text"
             inputMode="decimal"
@@ -54,10 +56,10 @@ export function Gather({ device, instrument }: GatherProps) {
           />
         </label>
         <Choice
-          label={texts.gather.time}
+          label={texts.collect.time}
           value={time}
           onChange={setTime}
-          options={Object.entries(texts.gather.times) as [Time, string][]}
+          options={Object.entries(texts.collect.times) as [Time, string][]}
         />
         <div class="row">
         <button
@@ -68,7 +70,7 @@ export function Gather({ device, instrument }: GatherProps) {
           disabled={!running && (!valid || no !== "" || busy !== null)}
           title={no}
         >
-          {running ? texts.gather.stop : texts.gather.start}
+          {running ? texts.collect.stop : texts.collect.start}
         </button>
         <button
           type="button"
@@ -77,19 +79,19 @@ export function Gather({ device, instrument }: GatherProps) {
           title={no}
           onClick={() => void instrument.shoot()}
         >
-          {texts.gather.once}
+          {texts.collect.once}
         </button>
         </div>
       </form>
-      {!valid && <p class="field-error">{texts.gather.badRate}</p>}
+      {!valid && <p class="field-error">{texts.collect.badRate}</p>}
       <div role="status" data-testid="gather-state" data-running={String(running)}>
         {running ? (
           <>
-            {texts.gather.running(Math.round((action.progress ?? 0) * 100))}
+            {texts.collect.running(Math.round((action.progress ?? 0) * 100))}
             <progress value={action.progress ?? 0} max={1} />
           </>
         ) : (
-          <span class="quiet">{action === null ? texts.gather.rest : texts.gather.busy}</span>
+          <span class="quiet">{action === null ? texts.collect.rest : texts.collect.busy}</span>
         )}
       </div>
       <Paces device={device} />
@@ -103,13 +105,13 @@ export function Gather({ device, instrument }: GatherProps) {
 function Paces({ device }: { device: DeviceStore }) {
   const paces = (device.description.value?.streams ?? []).flatMap(({ name }) => {
     const everyMs = device.measured(name).value?.everyMs ?? null;
-    return everyMs === null || everyMs <= 0 || device.late(name) ? [] : [texts.gather.pace(name, pace(1000 / everyMs))];
+    return everyMs === null || everyMs <= 0 || device.late(name) ? [] : [texts.collect.pace(name, pace(1000 / everyMs))];
   });
   return paces.length === 0 ? null : <p class="quiet small">{paces.join(" · ")}</p>;
 }
 
 function pace(hz: number): string {
-  return hz < 1 ? hz.toFixed(2) : texts.number.oneDigit(hz);
+  return hz < 1 ? hz.toFixed(2) : format.oneDigit(hz);
 }
 
 function Once({ device, instrument }: GatherProps) {
@@ -122,7 +124,7 @@ function Once({ device, instrument }: GatherProps) {
   return (
     <div data-testid="shot">
       <p class="quiet small">
-        <Age at={shot.at} as={texts.gather.onceTaken} />
+        <Age at={shot.at} as={texts.collect.onceTaken} />
       </p>
       <dl class="figures">
         {rows.slice(0, MOST_SHOWN).map(({ quantity, value }) => (
@@ -130,7 +132,7 @@ function Once({ device, instrument }: GatherProps) {
             <dt>{quantity.label}</dt>
             <dd>
               {typeof value === "boolean"
-                ? (texts.room.state[quantity.field] ?? texts.room.yesNo)[value ? 0 : 1]
+                ? (common.booleanState[quantity.field] ?? common.yesNo)[value ? 0 : 1]
                 : `${shown(quantity, value)} ${quantity.unit}`}
             </dd>
           </div>

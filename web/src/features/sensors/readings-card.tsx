@@ -5,7 +5,9 @@ import { onThisClock } from "../../shared/lib/clock";
 import type { DeviceStore } from "../devices/model/device-store";
 import { digits, judge, quantityOf, type Quantity } from "./model/quantities";
 import type { Recording } from "./model/stored-series";
-import { texts } from "../../shared/i18n/texts";
+import { common } from "../../shared/i18n/common";
+import { format } from "../../shared/i18n/format";
+import { texts } from "./texts";
 import { History, useRecording } from "./history-card";
 import { Age, Card, Choice } from "../../shared/ui/parts";
 
@@ -118,14 +120,14 @@ export function Figure({ quantity, value }: { quantity: Quantity; value: number 
 /** A door's contact, a motion detector: what it says, and since when it has said so. */
 function Status({ recording, field, value, loads }: { recording: Recording; field: string; value: boolean; loads: number }) {
   const since = useMemo(() => recording.since(), [recording, value, loads]);
-  const [yes, no] = texts.room.state[field] ?? texts.room.yesNo;
+  const [yes, no] = common.booleanState[field] ?? common.yesNo;
   return (
     <>
       <span class={`lamp ${value ? "lit" : ""}`} aria-hidden="true" />
       <strong>{value ? yes : no}</strong>
       {since !== null && (
         <span class="quiet">
-          {(since.atLeast ? texts.room.sinceLonger : texts.room.since)(texts.sinceWhen(since.at))}
+          {(since.atLeast ? texts.room.sinceLonger : texts.room.since)(format.recentTime(since.at))}
           {" · "}
           <Age at={onThisClock(since.at)} />
         </span>
@@ -171,7 +173,7 @@ function Table({ device, stream, quantities }: { device: DeviceStore; stream: st
               return (
                 <tr key={quantity.field}>
                   <th scope="row">{quantity.label}</th>
-                  <td>{value === undefined ? texts.number.unknown : cell(quantity, value)}</td>
+                  <td>{value === undefined ? format.unknown : cell(quantity, value)}</td>
                 </tr>
               );
             })}
@@ -183,7 +185,7 @@ function Table({ device, stream, quantities }: { device: DeviceStore; stream: st
 }
 
 function cell(quantity: Quantity, value: number | boolean): string {
-  if (typeof value === "boolean") return texts.room.yesNo[value ? 0 : 1];
+  if (typeof value === "boolean") return common.yesNo[value ? 0 : 1];
   return `${shown(quantity, value)} ${quantity.unit}`.trim();
 }
 

@@ -4,7 +4,8 @@ import type { DeviceStore } from "../devices/model/device-store";
 import type { Instrument } from "./model/room-device-action";
 import { quantityOf, type Quantity } from "./model/quantities";
 import type { Control } from "../../shared/mqtt/protocol.generated";
-import { texts } from "../../shared/i18n/texts";
+import { format } from "../../shared/i18n/format";
+import { texts } from "./texts";
 import { Card } from "../../shared/ui/parts";
 import { whyNot } from "../devices/availability";
 
@@ -70,7 +71,7 @@ function Setting({ device, instrument, control, text, disabled }: SettingProps) 
       <div class="setting-head">
         <span class="joint-name">{control.label}</span>
         <span class={`measured ${late ? "old" : ""}`} data-testid={`now-${control.name}`} data-value={now ?? ""}>
-          {texts.settings.now} {now === null ? texts.number.unknown : text(now)}
+          {texts.settings.now} {now === null ? format.unknown : text(now)}
         </span>
       </div>
       <div class="track">

@@ -1,6 +1,6 @@
 /** The content of a captured file, for who draws it. */
 import type { Taken } from "./model/room-device-action";
-import { texts } from "../../shared/i18n/texts";
+import { texts } from "./texts";
 
 /** Throws an `Error` whose message is fit for the page: the store may be elsewhere, and not let this page read. */
 export async function contentOf({ url }: Taken): Promise<Uint8Array<ArrayBuffer>> {

@@ -4,7 +4,9 @@ import { ApiError, sentence } from "../../shared/api/http";
 import type { Invitation, Person, Role, Share, SharedRole, Target } from "./model/wire-types";
 import { secondsLeft, Sharing } from "./model/shares";
 import type { Whole } from "./model/transfers";
-import { texts } from "../../shared/i18n/texts";
+import { common } from "../../shared/i18n/common";
+import { format } from "../../shared/i18n/format";
+import { texts } from "./texts";
 import { AskedForm } from "../../shared/ui/inline-form";
 import { Confirm } from "../../shared/ui/confirm-button";
 import { useFocusBack } from "../../shared/hooks/use-return-focus";
@@ -67,7 +69,7 @@ function OwnPart({ api, account, target, owner, role, onLeft }: PartProps & { ro
   };
   return (
     <Card title={texts.access.title}>
-      <p>{texts.access.owned(owner.name, texts.role[role])}</p>
+      <p>{texts.access.owned(owner.name, common.role[role])}</p>
       <Confirm
         label={texts.access.leave}
         question={texts.access.leaveSure}
@@ -119,7 +121,7 @@ function OwnersAccess({ api, target, owner, space }: PartProps) {
           <span class="person">
             {owner.name} <span class="quiet">({texts.access.you})</span>
           </span>
-          <span class="chip">{texts.role.owner}</span>
+          <span class="chip">{common.role.owner}</span>
         </li>
         {shares?.map((share) => (
           <PersonRow key={share.account.id} share={share} sharing={sharing} />
@@ -191,11 +193,11 @@ function PersonRow({ share, sharing }: { share: Share; sharing: Sharing }) {
       <span class="person">
         {name}
         <span class="quiet small">
-          {texts.until(share.expires_at)} · {texts.access.since(share.by, share.created_at)}
+          {format.until(share.expires_at)} · {texts.access.since(share.by, share.created_at)}
         </span>
       </span>
       <span class={`chip role-${share.role}`} title={texts.roleExplained[share.role]}>
-        {texts.role[share.role]}
+        {common.role[share.role]}
       </span>
       <span class="row">
         <button
@@ -251,14 +253,14 @@ function ChangeForm({ share, sharing, onDone }: ChangeFormProps) {
   const save = async (): Promise<void> => {
     const forS = seconds(lasts, secondsLeft(share.expires_at));
     if (forS === undefined) {
-      setWrong(texts.lasting.past);
+      setWrong(common.duration.past);
       return;
     }
     setBusy(true);
     setWrong("");
     try {
       const { account, role: now, expires_at: until } = await sharing.put(share.account.name, role, forS);
-      onDone(texts.access.changed(account.name, texts.role[now], texts.until(until)));
+      onDone(texts.access.changed(account.name, common.role[now], format.until(until)));
     } catch (error) {
       setWrong(sentence(error));
       setBusy(false);
@@ -311,7 +313,7 @@ function OpenLink({ invitation, sharing }: { invitation: Invitation; sharing: Sh
     <li>
       <span class="person">
         {texts.access.linkFor[role]}
-        <span class="quiet small">{[...terms, texts.until(invitation.expires_at)].join(" · ")}</span>
+        <span class="quiet small">{[...terms, format.until(invitation.expires_at)].join(" · ")}</span>
       </span>
       <Confirm
         label={texts.access.withdraw}
@@ -353,9 +355,9 @@ function ThroughSpace({ api, space }: { api: Api; space: { id: string; name: str
           <li key={share.account.id}>
             <span class="person">
               {share.account.name}
-              <span class="quiet small">{texts.until(share.expires_at)}</span>
+              <span class="quiet small">{format.until(share.expires_at)}</span>
             </span>
-            <span class={`chip role-${share.role}`}>{texts.role[share.role]}</span>
+            <span class={`chip role-${share.role}`}>{common.role[share.role]}</span>
           </li>
         ))}
       </ul>

@@ -4,7 +4,8 @@ import { ApiError, sentence } from "../../shared/api/http";
 import type { Fleet } from "../devices/model/device-list";
 import type { FollowedInvitation } from "./model/invitation-link";
 import type { Invitation } from "./model/wire-types";
-import { texts } from "../../shared/i18n/texts";
+import { common } from "../../shared/i18n/common";
+import { texts } from "./texts";
 import { Confirm } from "../../shared/ui/confirm-button";
 import { Card } from "../../shared/ui/parts";
 import { deviceAddress, fleetAddress, replaceWith, spaceAddress } from "../../app/routes";
@@ -195,20 +196,20 @@ function Joined({ api, fleet, account }: InvitationPageProps) {
   const nothing = !waiting && wrong === "" && rooms.length + things.length === 0;
   return (
     <>
-      <h1>{texts.session.signedInAs(account.name)}</h1>
+      <h1>{texts.invitation.signedInAs(account.name)}</h1>
       <p role="status">
-        {waiting ? texts.loading : nothing ? texts.invitation.joinedNothing : texts.invitation.joined}
+        {waiting ? common.loading : nothing ? texts.invitation.joinedNothing : texts.invitation.joined}
       </p>
-      {wrong !== "" && <p class="notice bad">{texts.spaces.failed(wrong)}</p>}
+      {wrong !== "" && <p class="notice bad">{texts.invitation.spacesFailed(wrong)}</p>}
       {rooms.length + things.length > 0 && (
-        <Card title={texts.fleet.title}>
+        <Card title={texts.invitation.devices}>
           <ul class="people" data-testid="shared-with-me">
             {rooms.map(({ id, name, role }) => (
               <li key={id}>
                 <a class="person" href={spaceAddress(id)}>
                   {name}
                 </a>
-                <span class={`chip role-${role}`}>{texts.role[role]}</span>
+                <span class={`chip role-${role}`}>{common.role[role]}</span>
               </li>
             ))}
             {things.map(({ id, label, role }) => (
@@ -216,7 +217,7 @@ function Joined({ api, fleet, account }: InvitationPageProps) {
                 <a class="person" href={deviceAddress(id)}>
                   {label}
                 </a>
-                <span class={`chip role-${role}`}>{texts.role[role]}</span>
+                <span class={`chip role-${role}`}>{common.role[role]}</span>
               </li>
             ))}
           </ul>

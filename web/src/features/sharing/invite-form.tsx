@@ -2,7 +2,9 @@ import { useEffect, useRef, useState } from "preact/hooks";
 import { sentence } from "../../shared/api/http";
 import type { InvitationMade, SharedRole } from "./model/wire-types";
 import type { Sharing } from "./model/shares";
-import { texts } from "../../shared/i18n/texts";
+import { common } from "../../shared/i18n/common";
+import { format } from "../../shared/i18n/format";
+import { texts } from "./texts";
 import { AccountNameField, AskedForm } from "../../shared/ui/inline-form";
 import { FOR_GOOD, LastingField, ONE_DAY, seconds } from "../../shared/ui/duration-picker";
 import { MadeLink } from "../../shared/ui/link-once";
@@ -44,7 +46,7 @@ export function InviteForm({ sharing, onClose }: InviteFormProps) {
     setDone("");
     const forS = seconds(lasts);
     if (forS === undefined) {
-      setWrong(texts.lasting.past);
+      setWrong(common.duration.past);
       return;
     }
     setBusy(true);
@@ -65,7 +67,7 @@ export function InviteForm({ sharing, onClose }: InviteFormProps) {
   };
 
   if (made !== null) {
-    const note = texts.invite.madeNote(texts.role[made.role], made.uses, texts.until(made.expires_at));
+    const note = texts.invite.madeNote(common.role[made.role], made.uses, format.until(made.expires_at));
     return <MadeLink link={made.link} note={note} onDone={onClose} />;
   }
   return (

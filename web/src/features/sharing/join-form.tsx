@@ -2,7 +2,7 @@ import { useState } from "preact/hooks";
 import { sentence } from "../../shared/api/http";
 import type { FollowedInvitation } from "./model/invitation-link";
 import type { Session } from "../account/model/session";
-import { texts } from "../../shared/i18n/texts";
+import { texts } from "./texts";
 import { Card } from "../../shared/ui/parts";
 import { invitationAddress, replaceWith } from "../../app/routes";
 

@@ -4,7 +4,8 @@ import type { Api } from "../../shared/api/client";
 import { sentence } from "../../shared/api/http";
 import type { Invitation, InvitationMade } from "./model/wire-types";
 import type { Whole } from "./model/transfers";
-import { texts } from "../../shared/i18n/texts";
+import { format } from "../../shared/i18n/format";
+import { texts } from "./texts";
 import { AccountNameField, AskedForm } from "../../shared/ui/inline-form";
 import { Confirm } from "../../shared/ui/confirm-button";
 import { useFocusBack } from "../../shared/hooks/use-return-focus";
@@ -54,7 +55,7 @@ export function Transfer({ api, of, goes }: TransferProps) {
           />
         )}
         {typeof step === "object" && (
-          <MadeLink link={step.link} note={texts.transfer.madeNote(texts.until(step.expires_at))} onDone={() => setStep("closed")} />
+          <MadeLink link={step.link} note={texts.transfer.madeNote(format.until(step.expires_at))} onDone={() => setStep("closed")} />
         )}
         {trouble !== "" && (
           <p class="notice bad" role="alert">
@@ -86,7 +87,7 @@ function OpenOffer({ offer: { account, expires_at: until }, withdraw, onGone }: 
     <li>
       <span class="person">
         {name}
-        <span class="quiet small">{texts.transfer.waits(texts.until(until))}</span>
+        <span class="quiet small">{texts.transfer.waits(format.until(until))}</span>
       </span>
       <Confirm
         label={texts.access.withdraw}

@@ -2,7 +2,8 @@ import { useEffect, useState } from "preact/hooks";
 import type { Account, Api, Space } from "../../shared/api/client";
 import { sentence } from "../../shared/api/http";
 import type { Fleet } from "../devices/model/device-list";
-import { texts } from "../../shared/i18n/texts";
+import { common } from "../../shared/i18n/common";
+import { texts } from "./texts";
 import { Access } from "../sharing/access-list";
 import { WhatDoISee } from "../help/page-explainer";
 import { Room } from "./room-view";
@@ -39,15 +40,15 @@ export function SpacePage({ api, fleet, account, id }: SpacePageProps) {
   const inIt = [...(devices?.values() ?? [])].filter(({ info }) => info.value.space === id);
   return (
     <main class="page space" id="content">
-      <a href={fleetAddress}>← {texts.device.back}</a>
+      <a href={fleetAddress}>← {common.allDevices}</a>
       {wrong !== "" && <p class="notice bad">{wrong}</p>}
-      {space === undefined && wrong === "" && <p class="quiet">{texts.loading}</p>}
+      {space === undefined && wrong === "" && <p class="quiet">{common.loading}</p>}
       {space === null && <p role="status">{texts.spaces.missing}</p>}
       {space !== undefined && space !== null && (
         <>
           <h1>{space.name}</h1>
           <p>
-            <a href={healthAddressOf("space", id)}>{texts.care.title.health(space.name)}</a>
+            <a href={healthAddressOf("space", id)}>{texts.spaces.healthOf(space.name)}</a>
           </p>
           {inIt.length === 0 ? <p class="quiet">{texts.spaces.empty}</p> : <Room fleet={fleet} id={id} />}
           <WhatDoISee page="space" />

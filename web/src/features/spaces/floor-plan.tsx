@@ -7,7 +7,9 @@ import type { DeviceStore } from "../devices/model/device-store";
 import type { Fleet } from "../devices/model/device-list";
 import { quantityOf } from "../sensors/model/quantities";
 import { apart, extent, readFloor, readPlaces, type Extent, type Floor, type Place } from "./model/room-perception";
-import { texts } from "../../shared/i18n/texts";
+import { common } from "../../shared/i18n/common";
+import { format } from "../../shared/i18n/format";
+import { texts } from "./texts";
 import { canvasBox } from "../../shared/ui/hidpi-canvas";
 import { Age, Card } from "../../shared/ui/parts";
 import { useNames } from "./floor-plan-labels";
@@ -424,8 +426,8 @@ function Who({ places, devices, receivedAt, old }: WhoProps) {
                   {device === null ? label : <a href={deviceAddress(device.id)}>{label}</a>}
                 </th>
                 <td>{texts.plan.place(metres(place.xM), metres(place.yM))}</td>
-                <td>{place.yawRad === null ? texts.number.unknown : texts.number.wholeDegrees(degrees(place.yawRad))}</td>
-                <td>{texts.age(place.ageS * 1000 + since)}</td>
+                <td>{place.yawRad === null ? format.unknown : format.wholeDegrees(degrees(place.yawRad))}</td>
+                <td>{format.age(place.ageS * 1000 + since)}</td>
               </tr>
             );
           })}
@@ -462,10 +464,10 @@ function Says({ device }: { device: DeviceStore }) {
   if (description === null || stream === undefined) return null;
   const newest = device.measured(stream).value;
   const values = Object.entries(newest?.message.values ?? {});
-  if (newest === null || values.length === 0) return <span class="quiet">{texts.number.unknown}</span>;
+  if (newest === null || values.length === 0) return <span class="quiet">{format.unknown}</span>;
   const late = device.late(stream);
   const said = (field: string, value: number | boolean): string => {
-    if (typeof value === "boolean") return (texts.room.state[field] ?? texts.room.yesNo)[value ? 0 : 1];
+    if (typeof value === "boolean") return (common.booleanState[field] ?? common.yesNo)[value ? 0 : 1];
     const quantity = quantityOf(description, stream, field);
     return `${shown(quantity, value)} ${quantity.unit}`;
   };

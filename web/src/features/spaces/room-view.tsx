@@ -1,6 +1,6 @@
 import { useEffect } from "preact/hooks";
 import type { Fleet } from "../devices/model/device-list";
-import { texts } from "../../shared/i18n/texts";
+import { texts } from "./texts";
 import { DeviceLists } from "../devices/device-list";
 import { Plan } from "./floor-plan";
 

@@ -2,7 +2,8 @@ import { useEffect, useState } from "preact/hooks";
 import type { Api, Space } from "../../shared/api/client";
 import { sentence } from "../../shared/api/http";
 import type { Fleet } from "../devices/model/device-list";
-import { texts } from "../../shared/i18n/texts";
+import { common } from "../../shared/i18n/common";
+import { texts } from "./texts";
 import { Card } from "../../shared/ui/parts";
 import { spaceAddress } from "../../app/routes";
 import "../sharing/sharing.css";
@@ -26,7 +27,7 @@ export function Spaces({ api, fleet }: { api: Api; fleet: Fleet }) {
     [...(devices?.values() ?? [])].filter(({ info }) => info.value.space === id).length;
   return (
     <Card title={texts.spaces.title} class="spaces">
-      {spaces === null && wrong === "" && <p class="quiet">{texts.loading}</p>}
+      {spaces === null && wrong === "" && <p class="quiet">{common.loading}</p>}
       {spaces?.length === 0 && <p class="quiet">{texts.spaces.none}</p>}
       <ul class="people">
         {spaces?.map(({ id, name, role, owner }) => (
@@ -38,7 +39,7 @@ export function Spaces({ api, fleet }: { api: Api; fleet: Fleet }) {
               {texts.spaces.devices(count(id))}
               {role !== "owner" && ` · ${texts.spaces.of(owner.name)}`}
             </span>
-            <span class={`chip role-${role}`}>{texts.role[role]}</span>
+            <span class={`chip role-${role}`}>{common.role[role]}</span>
           </li>
         ))}
       </ul>

@@ -2,7 +2,7 @@
 import type { Control } from "../control/model/lease";
 import type { DeviceStore } from "../devices/model/device-store";
 import type { SetpointStreamer } from "./model/setpoint-streamer";
-import { texts } from "../../shared/i18n/texts";
+import { texts } from "./texts";
 
 /** Why nothing here can move the robot now; `null` when it can. */
 export function whyBlocked(device: DeviceStore, control: Control): string | null {
@@ -11,7 +11,7 @@ export function whyBlocked(device: DeviceStore, control: Control): string | null
   if (device.stopped.value) return texts.joints.stopped;
   if (!device.live.value) return texts.joints.waiting;
   if (mode === "action") return texts.joints.busy;
-  if (control.linkStatus.value?.state !== "up") return texts.control.noWay;
+  if (control.linkStatus.value?.state !== "up") return texts.steer.noConnection;
   return null;
 }
 

@@ -4,7 +4,8 @@ import type { DeviceStore } from "../devices/model/device-store";
 import { JOG_KEYS } from "./model/keymap";
 import { rollPitchYaw, unit } from "../twin/model/forward-kinematics";
 import { direction, jogOf, sumOf, type Direction } from "./model/steerable-parts";
-import { texts } from "../../shared/i18n/texts";
+import { format } from "../../shared/i18n/format";
+import { texts } from "./texts";
 import { Choice } from "../../shared/ui/parts";
 import { useHeldPad } from "./use-gamepad";
 import { useHeld } from "./use-held-inputs";
@@ -123,13 +124,13 @@ function LivePose({ device, frame }: { device: DeviceStore; frame: string }) {
       {AXES.map((name, axis) => (
         <div key={name}>
           <dt>{name}</dt>
-          <dd>{at === undefined ? texts.number.unknown : texts.steer.metres(at[axis] ?? NaN)}</dd>
+          <dd>{at === undefined ? format.unknown : texts.steer.metres(at[axis] ?? NaN)}</dd>
         </div>
       ))}
       {TURNS.map((name, axis) => (
         <div key={name}>
           <dt>{name}</dt>
-          <dd>{turned === undefined ? texts.number.unknown : texts.number.degrees(turned[axis] ?? NaN)}</dd>
+          <dd>{turned === undefined ? format.unknown : format.degrees(turned[axis] ?? NaN)}</dd>
         </div>
       ))}
     </dl>

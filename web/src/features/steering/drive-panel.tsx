@@ -5,7 +5,8 @@ import { DRIVE_KEYS } from "./model/keymap";
 import type { BaseLimits } from "../../shared/mqtt/protocol.generated";
 import { AT_REST, driveOf, pushed, type Push } from "./model/steerable-parts";
 import type { SetpointStreamer } from "./model/setpoint-streamer";
-import { texts } from "../../shared/i18n/texts";
+import { format } from "../../shared/i18n/format";
+import { texts } from "./texts";
 import { useHeldPad } from "./use-gamepad";
 import { useHeld } from "./use-held-inputs";
 import { HoldButton } from "./hold-button";
@@ -85,7 +86,7 @@ function Velocities({ device, streamer, limits }: VelocitiesProps) {
       ? part === "turn_rad_s"
         ? texts.steer.degreesPerSecond(Math.round(degrees(value)))
         : texts.steer.metresPerSecond(value)
-      : texts.number.unknown;
+      : format.unknown;
   return (
     <table class="velocities" data-testid="velocities" data-forward={String(values["forward_m_s"] ?? "")}>
       <thead>

@@ -2,7 +2,8 @@
 import { useRef, useState } from "preact/hooks";
 import { degrees, radians } from "../../shared/lib/angles";
 import type { Joint } from "../../shared/mqtt/protocol.generated";
-import { texts } from "../../shared/i18n/texts";
+import { format } from "../../shared/i18n/format";
+import { texts } from "./texts";
 
 interface JointRowProps {
   joint: Joint;
@@ -40,18 +41,18 @@ export function JointRow({ joint, targetRad, measuredRad, onSet, old = false, ch
         data-value={measured?.toFixed(3) ?? ""}
         title={texts.joints.measured(joint.label)}
       >
-        {measured === undefined ? texts.number.unknown : texts.number.degrees(measured)}
+        {measured === undefined ? format.unknown : format.degrees(measured)}
       </span>
       <div class="track">
         <span class="limit quiet" aria-hidden="true">
-          {texts.number.wholeDegrees(lower)}
+          {format.wholeDegrees(lower)}
         </span>
         <span class="rail">
         <input
           type="range"
           data-testid={`slider-${joint.name}`}
           aria-label={texts.joints.slider(joint.label)}
-          aria-valuetext={target === undefined ? texts.number.unknown : texts.number.degrees(target)}
+          aria-valuetext={target === undefined ? format.unknown : format.degrees(target)}
           min={lower}
           max={upper}
           step="any"
@@ -70,7 +71,7 @@ export function JointRow({ joint, targetRad, measuredRad, onSet, old = false, ch
         )}
         </span>
         <span class="limit quiet" aria-hidden="true">
-          {texts.number.wholeDegrees(upper)}
+          {format.wholeDegrees(upper)}
         </span>
       </div>
     </div>
@@ -111,7 +112,7 @@ interface TargetFieldProps {
 function TargetField({ joint, target, disabled, onSet }: TargetFieldProps) {
   const [typed, setTyped] = useState<string | null>(null);
   const field = useRef<HTMLInputElement>(null);
-  const shown = target === undefined ? "" : texts.number.oneDigit(target);
+  const shown = target === undefined ? "" : format.oneDigit(target);
   const commit = (): void => {
     const value = Number(typed?.replace(",", "."));
     if (typed !== null && typed.trim() !== "" && Number.isFinite(value)) onSet(value);

@@ -7,7 +7,7 @@ import { JOINT_KEYS, jointOfKey } from "./model/keymap";
 import type { KnownTelemetry } from "../../shared/mqtt/parse-messages";
 import type { Joint } from "../../shared/mqtt/protocol.generated";
 import type { SetpointStreamer } from "./model/setpoint-streamer";
-import { texts } from "../../shared/i18n/texts";
+import { texts } from "./texts";
 import { useDrawn } from "../../shared/hooks/use-frame-signal";
 import { useHeldPad } from "./use-gamepad";
 import { JointRow } from "./joint-slider";

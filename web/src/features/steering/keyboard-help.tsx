@@ -3,7 +3,7 @@ import { signal } from "@preact/signals";
 import { useEffect, useRef } from "preact/hooks";
 import type { Held } from "./model/held-inputs";
 import type { Way } from "./model/steerable-parts";
-import { texts } from "../../shared/i18n/texts";
+import { texts } from "./texts";
 
 const STORED = "telescope-keys";
 /** Whether keys move a robot from anywhere on the page; else only while the focus is on its controls. */

@@ -4,7 +4,9 @@ import type { Account, Api } from "../../shared/api/client";
 import type { DeviceStore } from "../devices/model/device-store";
 import type { Fleet } from "../devices/model/device-list";
 import type { Station } from "../devices/model/device-session";
-import { texts } from "../../shared/i18n/texts";
+import { common } from "../../shared/i18n/common";
+import { format } from "../../shared/i18n/format";
+import { texts } from "./texts";
 import { ControlBar } from "../control/control-bar";
 import { HeardAge, ReachChip } from "../../shared/ui/parts";
 import { deviceAddress, fleetAddress } from "../../app/routes";
@@ -35,29 +37,29 @@ export function TogetherPage({ api, fleet, ids: asked, account }: TogetherPagePr
   const stoppable = devices.some(({ info }) => info.value.role !== "viewer");
   return (
     <>
-      <div class="control-bar all-bar" role="region" aria-label={texts.together.stopAll}>
+      <div class="control-bar all-bar" role="region" aria-label={texts.multiRobot.stopAll}>
         <p class="control-state" role="status" data-testid="keys-for">
-          {active !== undefined && texts.together.keysFor(active.device.info.value.label)}
+          {active !== undefined && texts.multiRobot.keysFor(active.device.info.value.label)}
         </p>
         <button
           type="button"
           class="stop"
           data-testid="stop-all"
           disabled={!stoppable}
-          title={texts.together.stopAllExplained}
+          title={texts.multiRobot.stopAllExplained}
           aria-keyshortcuts="Escape"
           onClick={stopAll}
         >
-          {texts.together.stopAll} <kbd>{texts.stop.key}</kbd>
+          {texts.multiRobot.stopAll} <kbd>{texts.multiRobot.stopKey}</kbd>
         </button>
       </div>
       <main class="page operate together" id="content">
         <div class="heading">
-          <a href={fleetAddress}>← {texts.device.back}</a>
-          <h1>{texts.together.title(devices.length)}</h1>
+          <a href={fleetAddress}>← {common.allDevices}</a>
+          <h1>{texts.multiRobot.title(devices.length)}</h1>
         </div>
-        {all === null && <p class="quiet">{texts.loading}</p>}
-        {all !== null && devices.length < ids.length && <p class="notice warn">{texts.together.missing}</p>}
+        {all === null && <p class="quiet">{common.loading}</p>}
+        {all !== null && devices.length < ids.length && <p class="notice warn">{texts.multiRobot.missing}</p>}
         <div class="stations">
           {stations.map((station) => (
             <StationPanel
@@ -103,7 +105,7 @@ function StationPanel({ station, active, onChoose, onStop }: StationPanelProps) 
         <Doing device={device} />
         {/* The same words either way: what moves under a pointer that has just gone down gets no click. */}
         <button type="button" class="choose" aria-pressed={active} data-testid="choose" onClick={onChoose}>
-          {texts.together.keysHere}
+          {texts.multiRobot.keysHere}
         </button>
       </header>
       <ControlBar device={device} control={control} stop={stop} watching={station.watching} />
@@ -118,7 +120,7 @@ function Doing({ device }: { device: DeviceStore }) {
   const state = device.state.value;
   return (
     <span class={`quiet small ${device.live.value ? "" : "old"}`}>
-      {state === null ? texts.number.unknown : texts.mode[state.mode]} · <HeardAge device={device} />
+      {state === null ? format.unknown : common.mode[state.mode]} · <HeardAge device={device} />
     </span>
   );
 }

@@ -1,7 +1,7 @@
 /** Which robots are ticked in the list, to be operated on one page. */
 import { signal } from "@preact/signals";
 import type { DeviceStore } from "../devices/model/device-store";
-import { texts } from "../../shared/i18n/texts";
+import { texts } from "./texts";
 import { togetherAddress } from "../../app/routes";
 
 const ticked = signal<readonly string[]>([]);
@@ -13,7 +13,7 @@ export function PickForTogether({ device }: { device: DeviceStore }) {
       type="checkbox"
       class="pick"
       data-testid="pick"
-      aria-label={texts.together.pick(device.info.value.label)}
+      aria-label={texts.multiRobot.pick(device.info.value.label)}
       checked={ticked.value.includes(id)}
       onChange={(event) => {
         const others = ticked.value.filter((each) => each !== id);
@@ -30,14 +30,14 @@ export function OperateTogether({ devices }: { devices: readonly DeviceStore[] }
     <div role="status">
       {ids.length > 0 && (
         <p class="row together-offer">
-          {texts.together.picked(ids.length)}
+          {texts.multiRobot.picked(ids.length)}
           {ids.length > 1 && (
             <a class="elsewhere" href={togetherAddress(ids)} data-testid="operate-together">
-              {texts.together.open}
+              {texts.multiRobot.open}
             </a>
           )}
           <button type="button" class="plain" onClick={() => (ticked.value = [])}>
-            {texts.together.none}
+            {texts.multiRobot.none}
           </button>
         </p>
       )}

@@ -3,7 +3,7 @@ import { useId, useRef, useState } from "preact/hooks";
 import type { ComponentType } from "preact";
 import type { Station } from "../devices/model/device-session";
 import { waysOf, type Way } from "./model/steerable-parts";
-import { texts } from "../../shared/i18n/texts";
+import { texts } from "./texts";
 import { Card } from "../../shared/ui/parts";
 import { StreamNote, whyBlocked } from "./blocked-notice";
 import { DrivePanel } from "./drive-panel";

@@ -2,7 +2,7 @@ import { useEffect, useState } from "preact/hooks";
 import { clamp } from "../../shared/lib/angles";
 import type { Held } from "./model/held-inputs";
 import type { Push } from "./model/steerable-parts";
-import { texts } from "../../shared/i18n/texts";
+import { texts } from "./texts";
 
 /** Nearer to the middle than this is the middle. */
 const MIDDLE = 0.1;

@@ -3,7 +3,8 @@ import { degrees } from "../../shared/lib/angles";
 import type { DeviceStore } from "../devices/model/device-store";
 import { jointFrames, rollPitchYaw, unit } from "./model/forward-kinematics";
 import type { Pose } from "../../shared/lib/vectors";
-import { texts } from "../../shared/i18n/texts";
+import { format } from "../../shared/i18n/format";
+import { texts } from "./texts";
 import { Card, Choice } from "../../shared/ui/parts";
 
 type Form = "degrees" | "quaternion";
@@ -93,7 +94,7 @@ function reckoned(device: DeviceStore): Frame[] {
 }
 
 function PoseRow({ name, pose, form }: { name: string; pose: Pose | undefined; form: Form }) {
-  const cells = pose === undefined ? [texts.number.unknown, texts.number.unknown] : poseText(pose, form);
+  const cells = pose === undefined ? [format.unknown, format.unknown] : poseText(pose, form);
   return (
     <tr>
       <th scope="row">{name}</th>

@@ -4,7 +4,8 @@ import { now } from "../../shared/lib/clock";
 import type { DeviceStore } from "../devices/model/device-store";
 import type { Quantity } from "./model/recent-telemetry";
 import type { Joint } from "../../shared/mqtt/protocol.generated";
-import { texts } from "../../shared/i18n/texts";
+import { common } from "../../shared/i18n/common";
+import { texts } from "./texts";
 import type { Chart } from "../../shared/charts/live-chart";
 import { Card, Choice } from "../../shared/ui/parts";
 import { onColourChange, seriesColour } from "../../shared/ui/canvas-theme";
@@ -82,7 +83,7 @@ export function Plot({ device }: { device: DeviceStore }) {
         />
       }
     >
-      {failed && <p class="notice">{texts.plot.failed}</p>}
+      {failed && <p class="notice">{common.chartFailed}</p>}
       <div
         ref={box}
         class={`chart ${device.live.value ? "" : "old"}`}

@@ -1,7 +1,7 @@
 import { useSignalEffect } from "@preact/signals";
 import type { Control } from "../control/model/lease";
 import type { DeviceStore } from "../devices/model/device-store";
-import { texts } from "../../shared/i18n/texts";
+import { texts } from "./texts";
 import { Card } from "../../shared/ui/parts";
 import type { LiveScene } from "./scene";
 import { useScene } from "./use-scene";

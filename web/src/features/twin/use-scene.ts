@@ -1,7 +1,7 @@
 import { useEffect, useRef, useState } from "preact/hooks";
 import type { RefObject } from "preact";
 import type { KnownTwin } from "../../shared/mqtt/parse-messages";
-import { texts } from "../../shared/i18n/texts";
+import { texts } from "./texts";
 import type { LiveScene } from "./scene";
 import { onColourChange } from "../../shared/ui/canvas-theme";
 

@@ -2,7 +2,7 @@
 import uPlot from "uplot";
 import "uplot/dist/uPlot.min.css";
 import { SPAN_MS } from "../../features/twin/model/recent-telemetry";
-import { texts } from "../i18n/texts";
+import { common } from "../i18n/common";
 import { colour } from "../ui/canvas-theme";
 
 export interface Line {
@@ -35,7 +35,7 @@ export function createChart(box: HTMLElement, lines: readonly Line[], unit: stri
         y: { range: (_, low, high) => padded(low, high, lines) },
       },
       axes: [
-        { ...axis, values: (_, ticks) => ticks.map((tick) => `${tick} ${texts.plot.seconds}`) },
+        { ...axis, values: (_, ticks) => ticks.map((tick) => `${tick} ${common.secondsUnit}`) },
         { ...axis, size: 62, values: (_, ticks) => ticks.map((tick) => `${tick} ${unit}`) },
       ],
       series: [

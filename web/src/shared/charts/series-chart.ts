@@ -2,7 +2,8 @@
 import uPlot from "uplot";
 import "uplot/dist/uPlot.min.css";
 import { digits, type Quantity } from "../../features/sensors/model/quantities";
-import { texts } from "../i18n/texts";
+import { common } from "../i18n/common";
+import { format } from "../i18n/format";
 import { colour } from "../ui/canvas-theme";
 
 /** What is drawn beside the line itself. */
@@ -101,7 +102,7 @@ function holding(to: number, times: number[], columns: (number | null)[][]): { t
 }
 
 function words(field: string): string[] {
-  const [yes, no] = texts.room.state[field] ?? texts.room.yesNo;
+  const [yes, no] = common.booleanState[field] ?? common.yesNo;
   return [no, yes];
 }
 
@@ -184,8 +185,8 @@ function widest(values: readonly string[] | null): number {
 }
 
 function shortTime(tick: number, [from, to]: [number, number]): string {
-  const text = texts.time(tick * 1000);
-  if (to - from > 2 * 86_400) return texts.day(tick * 1000);
+  const text = format.time(tick * 1000);
+  if (to - from > 2 * 86_400) return format.day(tick * 1000);
   return to - from > 1200 ? text.slice(0, 5) : text;
 }
 

@@ -1,5 +1,5 @@
 import { useRef, useState } from "preact/hooks";
-import { texts } from "../i18n/texts";
+import { common } from "../i18n/common";
 
 interface SecretProps {
   id: string;
@@ -14,12 +14,12 @@ export function Secret({ id, label, value }: SecretProps) {
   const copy = async (): Promise<void> => {
     try {
       await navigator.clipboard.writeText(value);
-      setSaid(texts.once.copied);
+      setSaid(common.copy.copied);
     } catch {
       // Browsers keep the clipboard from a page that came without TLS from another machine.
       field.current?.focus();
       field.current?.select();
-      setSaid(texts.once.byHand);
+      setSaid(common.copy.manually);
     }
   };
   return (
@@ -37,7 +37,7 @@ export function Secret({ id, label, value }: SecretProps) {
           onFocus={(event) => event.currentTarget.select()}
         />
         <button type="button" class="primary" data-testid={`${id}-copy`} onClick={() => void copy()}>
-          {texts.once.copy}
+          {common.copy.button}
         </button>
       </div>
       <p class="field-note" role="status">

@@ -1,5 +1,5 @@
 /** How long something lasts: one of a few lengths, or a date. */
-import { texts } from "../i18n/texts";
+import { common } from "../i18n/common";
 
 const LENGTHS = { hour: 3600, workday: 8 * 3600, day: 86_400, week: 7 * 86_400, month: 30 * 86_400 } as const;
 
@@ -45,14 +45,14 @@ export function LastingField({ id, label, value, choices, onChange }: LastingFie
         >
           {choices.map((choice) => (
             <option key={choice} value={choice}>
-              {texts.lasting[choice]}
+              {common.duration[choice]}
             </option>
           ))}
         </select>
         {value.choice === "date" && (
           <input
             type="datetime-local"
-            aria-label={texts.lasting.pick}
+            aria-label={common.duration.pick}
             required
             value={value.date}
             onInput={(event) => onChange({ ...value, date: event.currentTarget.value })}

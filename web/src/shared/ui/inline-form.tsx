@@ -1,6 +1,6 @@
 /** A form in its place on a page: what is asked, a button for it, one that leaves all as it is, and what came of it. */
 import type { ComponentChildren, Ref } from "preact";
-import { texts } from "../i18n/texts";
+import { common } from "../i18n/common";
 
 interface AskedFormProps {
   label: string;
@@ -38,7 +38,7 @@ export function AskedForm({ label, todo, doing, busy, wrong, done = "", onSend, 
           {busy ? doing : todo}
         </button>
         <button type="button" disabled={busy} onClick={onClose}>
-          {rest.close ?? texts.access.cancel}
+          {rest.close ?? common.form.cancel}
         </button>
       </div>
       <p id={rest.answerId} class={wrong === "" ? "field-note" : "field-error"} aria-live="polite">
@@ -52,7 +52,7 @@ export function AskedForm({ label, todo, doing, busy, wrong, done = "", onSend, 
 export function AccountNameField(props: { id: string; answerId: string; value: string; wrong: boolean; onInput: (name: string) => void }) {
   return (
     <div class="field">
-      <label for={props.id}>{texts.invite.name}</label>
+      <label for={props.id}>{common.form.accountName}</label>
       <input
         id={props.id}
         type="text"

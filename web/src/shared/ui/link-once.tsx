@@ -1,6 +1,6 @@
 /** A link that is shown this once. */
 import { useEffect, useRef } from "preact/hooks";
-import { texts } from "../i18n/texts";
+import { common } from "../i18n/common";
 import { Secret } from "./copy-once";
 
 interface MadeLinkProps {
@@ -14,15 +14,15 @@ export function MadeLink({ link, note, onDone }: MadeLinkProps) {
   const box = useRef<HTMLDivElement>(null);
   useEffect(() => box.current?.querySelector("input")?.focus(), []);
   return (
-    <div class="panel made" ref={box} role="group" aria-label={texts.invite.link}>
+    <div class="panel made" ref={box} role="group" aria-label={common.createdLink.label}>
       <p>
-        <strong>{texts.invite.made}</strong>
+        <strong>{common.createdLink.created}</strong>
       </p>
-      <Secret id="invitation-link" label={texts.invite.link} value={link} />
+      <Secret id="invitation-link" label={common.createdLink.label} value={link} />
       <p class="quiet small">{note}</p>
       <div class="row">
         <button type="button" onClick={onDone}>
-          {texts.invite.done}
+          {common.createdLink.close}
         </button>
       </div>
     </div>

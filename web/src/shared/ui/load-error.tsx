@@ -1,13 +1,13 @@
-import { texts } from "../i18n/texts";
+import { common } from "../i18n/common";
 
 /** Why something did not come, with another try; nothing where all is well. */
 export function Trouble({ said, again }: { said: string; again: () => void }) {
   if (said === "") return null;
   return (
     <p class="notice bad row" role="alert">
-      <span>{texts.robotTypes.failed(said)}</span>
+      <span>{common.loadFailed(said)}</span>
       <button type="button" onClick={again}>
-        {texts.later.again}
+        {common.tryAgain}
       </button>
     </p>
   );

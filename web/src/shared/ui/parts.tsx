@@ -4,7 +4,8 @@ import { useComputed } from "@preact/signals";
 import { useId } from "preact/hooks";
 import { clock } from "../lib/clock";
 import type { DeviceStore } from "../../features/devices/model/device-store";
-import { texts } from "../i18n/texts";
+import { common } from "../i18n/common";
+import { format } from "../i18n/format";
 import { FoldTitle } from "./collapsible-card";
 
 interface CardProps {
@@ -35,9 +36,9 @@ export function Card({ title, aside, children, ...rest }: CardProps) {
 export function ReachChip({ device, ...rest }: { device: DeviceStore; "data-testid"?: string }) {
   const reach = device.reach.value;
   return (
-    <span class={`chip reach-${reach}`} data-status={reach} title={texts.reachExplained[reach]} {...rest}>
+    <span class={`chip reach-${reach}`} data-status={reach} title={common.reachExplained[reach]} {...rest}>
       <span class="dot" aria-hidden="true" />
-      {texts.reach[reach]}
+      {common.reach[reach]}
     </span>
   );
 }
@@ -47,14 +48,14 @@ export function HeardAge({ device }: { device: DeviceStore }) {
   // A signal in the text: with two hundred devices on a page only the words that change are touched.
   const text = useComputed(() => {
     const heardAt = device.heardAt.value;
-    return heardAt === null ? texts.fleet.never : texts.age(Math.max(0, clock.value - heardAt));
+    return heardAt === null ? common.never : format.age(Math.max(0, clock.value - heardAt));
   });
   return <>{text}</>;
 }
 
 /** How long ago a moment of the page's clock was; it grows by itself. */
 export function Age({ at, as = (age) => age }: { at: number; as?: (age: string) => string }) {
-  const text = useComputed(() => as(texts.age(Math.max(0, clock.value - at))));
+  const text = useComputed(() => as(format.age(Math.max(0, clock.value - at))));
   return <>{text}</>;
 }
 

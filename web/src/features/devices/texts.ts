@@ -1,0 +1,86 @@
+export const texts = {
+  list: {
+    title: "Devices",
+    none: "No devices. Pair one with the code that its agent shows.",
+    device: "Device",
+    status: "Status",
+    heard: "Last seen",
+    doing: "Activity",
+    control: "Controlled by",
+    nobody: "–",
+    you: "you",
+    faults: (count: number): string => (count === 1 ? "1 fault" : `${count} faults`),
+    running: (name: string): string => `Running: ${name}`,
+    pair: "Pair a device",
+    search: "Search",
+    searchExample: "Name, type or room",
+    show: "Show",
+    kinds: { all: "All", robots: "Robots", sensors: "Room devices" },
+    whose: "Owner",
+    whoses: { all: "All", mine: "Mine", shared: "Shared with me" },
+    onlyTrouble: "Needs attention",
+    shown: (shown: number, all: number): string => (shown === all ? `${all} devices` : `${shown} of ${all} devices`),
+    nothing: "No devices match the filters.",
+    clear: "Clear filters",
+    robots: "Robots",
+    sensors: "Room devices",
+    plan: "Floor plan",
+    planOf: (space: string): string => `Floor plan of ${space}`,
+  },
+
+  naming: {
+    rename: "Rename",
+    renameOf: (label: string): string => `Rename ${label}`,
+    name: "Name",
+    save: "Save",
+    saving: "Saving…",
+    cancel: "Cancel",
+    called: (label: string): string => `Renamed to ${label}.`,
+    undo: "Undo",
+  },
+
+  device: {
+    gone: (label: string): string => `You no longer have access to ${label}.`,
+    goneWhy:
+      "The owner revoked your access, it expired, or the device was unpaired. Your control and actions ended immediately. Ask the owner if you need access again.",
+    simulated: "simulated",
+    unreadable: (detail: string): string => `A message of this device is invalid: ${detail}.`,
+    lastSeen: (age: string): string => `last seen ${age}`,
+  },
+
+  /** Why a device cannot be operated now. */
+  unavailable: {
+    viewer: "You are a viewer of this device. Ask its owner for operator access.",
+    offline: "The device is not connected.",
+    stopped: "The device is stopped. Reset the stop first.",
+    busy: "Another action is running. Cancel it first.",
+    held: (name: string): string => `${name} has control.`,
+    fault: "The robot reports a fault.",
+    streaming: "The robot is following your setpoints.",
+  },
+
+  cards: {
+    view: "Live view",
+    camera: "Camera",
+    plot: "Last 20 seconds",
+    poses: "Joint frames",
+    steering: "Steering",
+    latency: "Latency",
+    movements: "Movements",
+    keyframes: "Keyframes",
+    access: "Access",
+    events: "Events",
+  },
+  events: { none: "No events.", faults: "Faults" },
+
+  pages: {
+    device: "Device",
+    health: "Health",
+    latency: "Latency",
+    of: (label: string): string => `Pages of ${label}`,
+    title: {
+      health: (name: string): string => `Health of ${name}`,
+      times: (name: string): string => `Latency of ${name}`,
+    },
+  },
+};

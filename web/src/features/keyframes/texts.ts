@@ -1,0 +1,151 @@
+import type { Deed, Problem } from "./model/keyframes";
+import { format } from "../../shared/i18n/format";
+
+export const texts = {
+  title: "Keyframes",
+  library: "Movements",
+  noRobot: "The model of the robot type. No robot moves.",
+  runsOnDevice: "No robot is selected. Save the movement, then run it from its own page or from a robot's page.",
+  open: "New movement from keyframes",
+  edit: (name: string): string => `Open the keyframes of ${name}`,
+  waiting: "Waiting for the robot's description and joint positions…",
+  twin: "Movement",
+  twinLabel: "3D view of the movement, on a model of the robot",
+  viewReset: "Reset view",
+  viewWaiting: "Waiting for the robot's model…",
+  previewing: "Preview: the robot does not move",
+  numberOf: (index: number, count: number): string => `Keyframe ${index} of ${count}`,
+  ghost: "Current pose of the robot",
+  noGhost: "The robot's current pose is unknown",
+  timeline: "Timeline",
+  play: "▶ Preview",
+  pause: "❚❚ Pause",
+  previewOnly: "Moves only the model.",
+  seconds: (value: number): string => `${value.toFixed(2)} s`,
+  ofSeconds: (value: number, last: number): string => `${value.toFixed(2)} s of ${last.toFixed(2)} s`,
+  tick: (value: number): string => `${value} s`,
+  playhead: "Preview position",
+  marker: (index: number, wrong: boolean): string => `Keyframe ${index}${wrong ? ", has problems" : ""}`,
+  add: "Add",
+  addMeasured: "Add current pose",
+  duplicate: "Duplicate",
+  remove: "Delete",
+  notLive: "The robot's current pose is unknown.",
+  timelineKeys: "Drag a keyframe, or move it with the arrow keys: 0.1 s, with Shift 1 s, with Alt 0.01 s. Ctrl+Z undoes.",
+  undo: "Undo",
+  redo: "Redo",
+  checks: "Checks",
+  checked: (count: number): string => (count === 0 ? "" : format.count(count, "problem")),
+  allGood: "✓ Within all joint limits",
+  at: (index: number): string => `Keyframe ${index}`,
+  robotChecks: "The robot checks for collisions before and during the motion.",
+  mendAll: "Stretch all to the required time",
+  more: (count: number): string => `And ${count} more.`,
+  problem: ({ what }: Problem, joint: string): string => {
+    switch (what.kind) {
+      case "range":
+        return `${joint} is limited to ${format.radiansAsDegrees(what.lower_rad)} to ${format.radiansAsDegrees(what.upper_rad)}.`;
+      case "narrowed":
+        return `${joint} is limited to ${format.radiansAsDegrees(what.lower_rad)} to ${format.radiansAsDegrees(what.upper_rad)} at this position of ${what.by}.`;
+      case "mirrored":
+        return `${joint} and ${what.of} share one actuator and must have the same position.`;
+      case "unknown-joint":
+        return `This robot has no joint ${joint}.`;
+      case "unknown-name":
+        return `This robot has no “${what.name}”.`;
+      case "cannot":
+        return `This robot does not support: ${texts.deeds[what.deed].toLowerCase()}.`;
+      case "too-fast":
+        return `${joint} would exceed its ${what.by} limit before this keyframe.`;
+      case "times":
+        return "Times must increase from keyframe to keyframe.";
+      case "late-joint":
+        return `${joint} is set here for the first time; its start position is not defined.`;
+      case "too-long-text":
+        return "The text is too long: at most 500 characters.";
+    }
+  },
+  mend: ({ what }: Problem): string => {
+    switch (what.kind) {
+      case "too-fast":
+        return `Stretch to ${what.needs_s.toFixed(2)} s`;
+      case "range":
+      case "narrowed":
+        return "Move into range";
+      case "times":
+        return "Sort";
+      case "late-joint":
+        return "Add to first keyframe";
+      case "mirrored":
+      case "unknown-joint":
+      case "unknown-name":
+      case "cannot":
+      case "too-long-text":
+        return "Remove";
+    }
+  },
+  number: (index: number): string => `Keyframe ${index}`,
+  first: "Start, at 0 s. The robot moves to this pose first, at half speed.",
+  time: "Time [s]",
+  lasts: "Time since previous keyframe [s]",
+  shifting: "moves later keyframes",
+  takePose: "Use current pose",
+  joints: "Joints of this keyframe",
+  here: "set",
+  passes: "interpolated",
+  hereFor: (joint: string): string => `${joint} is set at this keyframe`,
+  deedsTitle: "Actions at this keyframe",
+  deedsNote: "Actions run one after the other; the keyframe time pauses meanwhile.",
+  nothing: "–",
+  deedMark: "✦",
+  deeds: {
+    posture: "Posture",
+    behaviour: "Behaviour",
+    express: "Expression",
+    say: "Speak",
+    drive: "Drive",
+    go_to: "Go to a position in the room",
+  } satisfies Record<Deed, string>,
+  forward: "forward [m/s]",
+  turn: "turn [°/s]",
+  duration: "duration [s]",
+  x: "x [m]",
+  y: "y [m]",
+  yaw: "yaw [°]",
+  script: "Save and run",
+  name: "Name",
+  description: "Description",
+  nameNote: "Letters, digits, - and _.",
+  save: "Save",
+  saving: "Saving…",
+  saveAndRun: "Save and run",
+  run: "Run on the robot",
+  speed: "Speed",
+  mendFirst: "Correct all problems before you run it.",
+  tooLong: "The movement exceeds the maximum script size: remove keyframes or joints.",
+  savedAs: (version: number): string => `Saved as version ${version}.`,
+  newer: (version: number): string => `Version ${version} was saved in the meantime. Your changes are not lost.`,
+  deleted: "This movement was deleted in the meantime. Your changes are not lost.",
+  saveOver: "Overwrite with mine",
+  seeScript: "Generated script",
+  record: "Record",
+  recordNote: "Records the joints while the robot moves, for example steered from another tab or by a movement. Base motion is not recorded.",
+  startRecording: "● Record",
+  stopRecording: "■ Stop recording",
+  recordingGap: "No data from the robot. The recording continues when data arrives.",
+  recorded: (samples: number, lasts: number, gaps: number): string =>
+    `${samples} samples in ${lasts.toFixed(1)} s${gaps === 0 ? "" : `, with ${format.count(gaps, "gap")}`}`,
+  gapNote: "The yellow range has no data; the movement is interpolated linearly there.",
+  curves: (count: number): string => `${count} moved joints over time`,
+  trimFrom: "Start",
+  trimTo: "End",
+  tolerance: "Tolerance",
+  useThem: (count: number): string => `Use these ${count} keyframes`,
+  discard: "Discard recording",
+  restored: "Unsaved draft restored.",
+  revert: "Revert to saved",
+  beginAnew: "Start over",
+  unkept: "This browser does not store drafts. Save before you leave.",
+  byHand: (name: string): string => `The script “${name}” contains more than keyframes, so it cannot be edited here.`,
+  toCode: "Open in the code editor",
+};
