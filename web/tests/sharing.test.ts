@@ -266,20 +266,20 @@ describe("the record of what was done", () => {
     };
     const say = (what: string, part: Partial<AuditRecord> = {}): string => line(record({ what, ...part }), names);
     const never = { role: "operator", expires_ms: 2 ** 53 };
-    expect(say("signed-in", { data: { how: "link" } })).toBe("Ann signed in by a link.");
+    expect(say("signed-in", { data: { how: "link" } })).toBe("Ann signed in with a link.");
     expect(say("shared", { on: "device:abc-arm", data: { with: "b2", ...never } })).toBe(
-      "Ann shared Arm with Bob as operator, until it is ended.",
+      "Ann shared Arm with Bob as operator, until revoked.",
     );
     expect(say("shared", { on: "space:lab", data: { with: "c3", name: "Cid", role: "viewer", expires_ms: 1e12 } })).toMatch(
       /^Ann shared Laboratory with Cid as viewer, until .*2001/,
     );
-    expect(say("unshared", { on: "device:abc-arm", data: { with: "b2" } })).toBe("Ann ended Bob’s access to Arm.");
+    expect(say("unshared", { on: "device:abc-arm", data: { with: "b2" } })).toBe("Ann removed Bob’s access to Arm.");
     expect(say("unshared", { on: "device:abc-arm", by_account: "b2", who: "Bob", data: { with: "b2" } })).toBe(
-      "Bob gave up their access to Arm.",
+      "Bob gave up access to Arm.",
     );
-    expect(say("unshared", { on: "device:gone", who: "", by_account: "", data: { with: "b2" } })).toMatch(/^Bob’s access to gone ran out/);
+    expect(say("unshared", { on: "device:gone", who: "", by_account: "", data: { with: "b2" } })).toMatch(/^Bob’s access to gone expired/);
     expect(say("api-key-made", { on: "key:k1", data: { name: "dashboard", role: "viewer", only: ["space:lab"] } })).toBe(
-      "Ann made the API key “dashboard”: viewer, only Laboratory.",
+      "Ann created the API key “dashboard”: viewer, only Laboratory.",
     );
     expect(say("api-key-revoked", { on: "key:k1" })).toBe("Ann revoked the API key “dashboard”.");
     expect(say("stop-ordered", { data: { message: "Ann ordered a stop: test" } })).toBe("Ann ordered a stop: test");
