@@ -16,7 +16,9 @@ import msgspec
 from device_agent import bootstrap, drivers, sensors
 from device_agent.cli import claim_prompt, doctor, systemd
 from device_agent.config import catalogue
-from device_agent.config.agent_config import ConfigError, Configuration, DeviceEntry, Home, HttpPolling, Pairing
+from device_agent.config.agent_config import AgentConfig, DeviceEntry, HttpPolling
+from device_agent.config.errors import ConfigError
+from device_agent.config.identity_store import IdentityStore, Pairing
 from device_agent.load_generator.options import SwarmError, add_options, plan_of
 from device_agent.ports.clock import CloudClock
 from device_agent.ports.driver import DriverError
@@ -137,21 +139,21 @@ def _parser() -> argparse.ArgumentParser:
 
 
 def _enroll(options: argparse.Namespace) -> int:
-    home = Home(options.home)
-    configuration = _configuration(options, home)
-    home.save_configuration(configuration)
-    api = bootstrap.api_of(home, configuration, CloudClock(), create=True)
+    store = IdentityStore(options.home)
+    configuration = _configuration(options, store)
+    configuration.save(store.folder)
+    api = bootstrap.api_of(store, configuration, CloudClock(), create=True)
     claim = _announce(api, configuration, qr=not options.no_qr)
     if options.no_wait and claim.code is not None:
         return 0
-    _await_claim(home, api, configuration, claim, qr=not options.no_qr)
+    _await_claim(store, api, configuration, claim, qr=not options.no_qr)
     return 0
 
 
-def _configuration(options: argparse.Namespace, home: Home) -> Configuration:
+def _configuration(options: argparse.Namespace, store: IdentityStore) -> AgentConfig:
     """What is on file, with what was said now in its place."""
     try:
-        before = home.configuration()
+        before = AgentConfig.load(store.folder)
     except ConfigError:
         before = None
     if before is None and not options.device and not options.room:
@@ -162,15 +164,15 @@ def _configuration(options: argparse.Namespace, home: Home) -> Configuration:
     if options.ca and not server.startswith("https://"):
         raise ConfigError("--ca says who may speak for an https server; this one speaks http, which nobody vouches for")
     polling = _polling(options, before.http if before else HttpPolling())
-    said = Configuration(
+    said = AgentConfig(
         server=server,
-        ca=home.pin_authority(options.ca) if options.ca else (before.ca if before else ""),
-        name=options.name or (before.name if before else home.folder.resolve().name),
+        ca=store.pin_certificate_authority(options.ca) if options.ca else (before.ca if before else ""),
+        name=options.name or (before.name if before else store.folder.resolve().name),
         transport=options.transport or (before.transport if before else factory.names()[0]),
         http=polling,
         devices=_entries(options) or (before.devices if before else ()),
     )
-    return said.keeping(before) if before else said
+    return said.with_manual_settings(before) if before else said
 
 
 def _polling(options: argparse.Namespace, before: HttpPolling) -> HttpPolling:
@@ -200,7 +202,7 @@ def _entry(text: str) -> DeviceEntry:
     return DeviceEntry(name=name, type=kind, driver=driver, label=label)
 
 
-def _announce(api: CloudClient, configuration: Configuration, *, qr: bool) -> Claim:
+def _announce(api: CloudClient, configuration: AgentConfig, *, qr: bool) -> Claim:
     claim = api.enroll(
         name=configuration.name,
         software=factory.SOFTWARE,
@@ -212,7 +214,9 @@ def _announce(api: CloudClient, configuration: Configuration, *, qr: bool) -> Cl
     return claim
 
 
-def _await_claim(home: Home, api: CloudClient, configuration: Configuration, claim: Claim, *, qr: bool) -> Pairing:
+def _await_claim(
+    store: IdentityStore, api: CloudClient, configuration: AgentConfig, claim: Claim, *, qr: bool
+) -> Pairing:
     """Wait until somebody redeems the code; a code that runs out is replaced."""
     expires_s = time.monotonic() + (claim.expires_in_s or 0)
     while True:
@@ -221,7 +225,7 @@ def _await_claim(home: Home, api: CloudClient, configuration: Configuration, cla
         if found.get("state") == "claimed":
             claimed = responses.read(found, responses.Claimed)
             pairing = factory.pairing_of(claimed)
-            home.save_pairing(pairing)
+            store.save_pairing(pairing)
             print(f"paired with {pairing.account}", flush=True)
             return pairing
         if time.monotonic() > expires_s:
@@ -233,30 +237,30 @@ def _await_claim(home: Home, api: CloudClient, configuration: Configuration, cla
 
 
 def _run(options: argparse.Namespace) -> int:
-    home = Home(options.home)
-    with home.hold():
-        if home.pairing() is None:
-            _pair(home, qr=not options.no_qr)
+    store = IdentityStore(options.home)
+    with store.lock():
+        if store.pairing() is None:
+            _pair(store, qr=not options.no_qr)
         if options.trace is not None:
             options.trace.mkdir(parents=True, exist_ok=True)
-        while _run_until_told(home, options.trace):
-            _pair(home, qr=not options.no_qr)
+        while _run_until_told(store, options.trace):
+            _pair(store, qr=not options.no_qr)
     return 0
 
 
-def _pair(home: Home, *, qr: bool) -> None:
+def _pair(store: IdentityStore, *, qr: bool) -> None:
     """Learn whose the agent is; where it is nobody's, show a code and wait to be claimed.
 
     A robot may start before its network does: where the cloud is not reached it is asked again.
     """
-    configuration = home.configuration()
+    configuration = AgentConfig.load(store.folder)
     systemd.ready("waiting to be claimed")
     before = signal.signal(signal.SIGTERM, _leave)
     try:
         while True:
-            api = bootstrap.api_of(home, configuration, CloudClock())
+            api = bootstrap.api_of(store, configuration, CloudClock())
             try:
-                _await_claim(home, api, configuration, _announce(api, configuration, qr=qr), qr=qr)
+                _await_claim(store, api, configuration, _announce(api, configuration, qr=qr), qr=qr)
             except OSError as error:
                 print(f"telescope agent: {error}; trying again in {_AGAIN_S:.0f} s", file=sys.stderr, flush=True)
                 time.sleep(_AGAIN_S)
@@ -271,11 +275,11 @@ def _leave(*_: object) -> None:
     raise SystemExit(0)
 
 
-def _run_until_told(home: Home, trace: Path | None) -> bool:
+def _run_until_told(store: IdentityStore, trace: Path | None) -> bool:
     """Run as the pairing on file says, until told to end; whether instead the pairing no longer holds."""
     ending = threading.Event()
     before = {number: signal.signal(number, lambda *_: ending.set()) for number in (signal.SIGINT, signal.SIGTERM)}
-    cell = bootstrap.build(home, trace=trace)
+    cell = bootstrap.build(store, trace=trace)
     try:
         cell.start()
         _let_control_loops_go_first()
@@ -308,7 +312,7 @@ def _let_control_loops_go_first() -> None:
 
 def _doctor(options: argparse.Namespace) -> int:
     found = []
-    for finding in doctor.examine(Home(options.home)):
+    for finding in doctor.examine(IdentityStore(options.home)):
         found.append(finding)
         if not options.json:
             print(f"{finding.level:8} {finding.check}: {finding.message}", flush=True)
@@ -325,12 +329,12 @@ def _doctor(options: argparse.Namespace) -> int:
 
 def _repin(options: argparse.Namespace) -> int:
     """As at the first enrolment, whoever is at the machine vouches for the server; the pairing stays as it is."""
-    home = Home(options.home)
-    with home.hold():
-        before = home.pairing()
+    store = IdentityStore(options.home)
+    with store.lock():
+        before = store.pairing()
         if before is None:
             raise ConfigError("this agent is not paired, so it has pinned nothing; run `python -m device_agent enroll`")
-        found = bootstrap.api_of(home, home.configuration(), CloudClock()).enrollment()
+        found = bootstrap.api_of(store, AgentConfig.load(store.folder), CloudClock()).enrollment()
         if found.get("state") != "claimed":
             raise ConfigError("the agent was un-paired; `python -m device_agent run` shows a new claim code")
         after = factory.pairing_of(responses.read(found, responses.Claimed))
@@ -340,7 +344,7 @@ def _repin(options: argparse.Namespace) -> int:
                 "pinned: it is another server, or one put back to an old state. If you trust it, un-pair the agent "
                 "there and claim it again"
             )
-        home.save_pairing(after)
+        store.save_pairing(after)
     for name in sorted(set(after.keys) - set(before.keys)):
         print(f"pinned key {name}; `rotate-keys` has named it at the server")
     print(f"obeys {len(after.keys)} of the server's keys, the newest number {after.serial}")
@@ -351,9 +355,9 @@ def _repin(options: argparse.Namespace) -> int:
 
 
 def _devices(options: argparse.Namespace) -> int:
-    home = Home(options.home)
+    store = IdentityStore(options.home)
     try:
-        for device in home.configuration().devices:
+        for device in AgentConfig.load(store.folder).devices:
             print(f"device  {device.name}: {device.type}, {device.driver or catalogue.type_of(device).driver}")
     except ConfigError as error:
         print(error)

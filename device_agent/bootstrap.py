@@ -7,9 +7,11 @@ from pathlib import Path
 import msgspec
 
 from device_agent import drivers, geometry, sensors
-from device_agent.config.agent_config import ConfigError, Configuration, DeviceEntry, Home, Pairing
+from device_agent.config.agent_config import AgentConfig, DeviceEntry
 from device_agent.config.catalogue import ROOMS, TYPES, enrolled_devices, room_device_of, type_of
 from device_agent.config.client_certificate import OwnCertificate
+from device_agent.config.errors import ConfigError
+from device_agent.config.identity_store import IdentityStore, Pairing
 from device_agent.ports.clock import CloudClock, tick_ms, wall_ms
 from device_agent.ports.driver import Driver, DriverError
 from device_agent.ports.floor_map import ObstacleMap
@@ -73,7 +75,7 @@ def try_type(folder: Path) -> None:
     """Load all of a robot type in a folder, and connect its driver, a simulated one, for a moment.
 
     Raises:
-        HomeError: The manifest is wrong.
+        ConfigError: The manifest is wrong.
         GeometryError: The model cannot be used, or the home position has no room.
         DriverError: The driver refuses it.
     """
@@ -94,7 +96,7 @@ def geometry_of(entry: DeviceEntry, kind: RobotType) -> RobotGeometry | None:
 
     Raises:
         GeometryError: The model cannot be used.
-        HomeError: The room is unknown.
+        ConfigError: The room is unknown.
     """
     scene, standing = str(entry.options.get("scene", "")), None
     if entry.room:
@@ -148,7 +150,7 @@ def instrument_of(
         faults: A folder for faults to put into simulated devices, ``{device}.toml`` each.
 
     Raises:
-        HomeError: The room is unknown, or its driver or an option.
+        ConfigError: The room is unknown, or its driver or an option.
     """
     device = room_device_of(entry)
     if device is None:
@@ -176,51 +178,55 @@ def _surroundings(room: str, neighbours: Mapping[str, RoomDriver]) -> Surroundin
         raise ConfigError(str(error)) from error
 
 
-def api_of(home: Home, configuration: Configuration, clock: CloudClock, *, create: bool = False) -> CloudClient:
+def api_of(store: IdentityStore, configuration: AgentConfig, clock: CloudClock, *, create: bool = False) -> CloudClient:
     """The agent's view of the HTTP API.
 
     Raises:
-        HomeError: There is no identity.
+        ConfigError: There is no identity.
     """
-    return CloudClient(configuration.server, home.identity(create=create), clock, ca=home.authority(configuration))
+    return CloudClient(
+        configuration.server, store.private_key(create=create), clock, ca=store.certificate_authority(configuration.ca)
+    )
 
 
-def build(home: Home, *, trace: Path | None = None) -> Cell:
+def build(store: IdentityStore, *, trace: Path | None = None) -> Cell:
     """An agent from its folder, ready to start.
 
     Args:
-        home: Enrolled and claimed.
+        store: Enrolled and claimed.
         trace: A folder into which simulated devices write what really happened, ``{device}.ndjson`` each.
 
     Raises:
-        HomeError: Not enrolled, not claimed, or a file is wrong.
+        ConfigError: Not enrolled, not claimed, or a file is wrong.
         JournalError: The journal cannot be used.
         DriverError: An unknown driver or option.
     """
-    configuration = home.configuration()
-    pairing = home.pairing()
+    configuration = AgentConfig.load(store.folder)
+    pairing = store.pairing()
     if pairing is None:
-        raise ConfigError(f"{home.folder} is not paired; run `python -m device_agent enroll` and redeem its claim code")
+        raise ConfigError(
+            f"{store.folder} is not paired; run `python -m device_agent enroll` and redeem its claim code"
+        )
     clock = CloudClock()
-    journal = Journal(home.journal)
+    journal = Journal(store.journal)
     journal.open(now_ms=wall_ms())
     journal.end_open(now_ms=wall_ms(), tick_ms=tick_ms())
-    pins = PinnedKeys(pairing, save=home.save_pairing, now_ms=clock.now_ms)
+    pins = PinnedKeys(pairing, save=store.save_pairing, now_ms=clock.now_ms)
     membership = factory.PairingMonitor(pairing, configuration, enrolled_devices(configuration), pins)
     room = ReadingCache(
         space=pairing.space,
         agent=pairing.agent,
         own=[entry.name for entry in configuration.devices],
-        named=(*configuration.sources, *_own_streams(configuration)),
+        named=(*configuration.room_sources, *_own_streams(configuration)),
     )
     wiring = factory.Wiring(
         configuration=configuration,
         pairing=pairing,
         membership=membership,
-        open_api=lambda: api_of(home, configuration, clock),
+        open_api=lambda: api_of(store, configuration, clock),
         next_session=journal.next_session,
         quiet=lambda: agent.quiet,
-        certificate=OwnCertificate(home.folder),
+        certificate=OwnCertificate(store.folder),
         now_ms=clock.now_ms,
         listen=room.topics(),
     )
@@ -228,13 +234,13 @@ def build(home: Home, *, trace: Path | None = None) -> Cell:
     transport = LatencyProbe(
         factory.make(wiring), tell=latencies.tell, at_ms=lambda: round(clock.now_ms() or wall_ms())
     )
-    outbox = _outbox(home, configuration, pairing, publish=transport.publish, quiet=lambda: agent.quiet)
+    outbox = _outbox(store, configuration, pairing, publish=transport.publish, quiet=lambda: agent.quiet)
     jail = SandboxHost(trusted=configuration.allow_unconfined_scripts)
-    uploads = HttpUploads(pairing.agent, lambda: api_of(home, configuration, clock))
+    uploads = HttpUploads(pairing.agent, lambda: api_of(store, configuration, clock))
     devices: dict[str, Device] = {}
     neighbours: dict[str, RoomDriver] = {}
     for entry in configuration.devices:
-        instrument = instrument_of(entry, neighbours, uploads, faults=home.faults)
+        instrument = instrument_of(entry, neighbours, uploads, faults=store.faults)
         if instrument is not None:
             neighbours[entry.name] = instrument.driver
         devices[entry.name] = _device(
@@ -250,20 +256,20 @@ def build(home: Home, *, trace: Path | None = None) -> Cell:
             room=room,
             jail=jail,
             trace=trace,
-            faults=home.faults,
+            faults=store.faults,
             uploads=uploads,
         )
     agent = Agent(devices, transport, outbox=outbox, room=room, address=(pairing.space, pairing.agent))
     return Cell(agent, journal, membership, jail)
 
 
-def _carrier(configuration: Configuration) -> str:
+def _carrier(configuration: AgentConfig) -> str:
     """What carries messages, as the cloud tells it apart."""
     plain = configuration.transport == "http" and configuration.http.poll == "plain"
     return "http-poll" if plain else configuration.transport
 
 
-def _own_streams(configuration: Configuration) -> Iterator[tuple[str, str]]:
+def _own_streams(configuration: AgentConfig) -> Iterator[tuple[str, str]]:
     """Device and stream of all that the agent's own room devices measure: its scripts need not name them."""
     for entry in configuration.devices:
         device = room_device_of(entry)
@@ -283,8 +289,8 @@ def _ground(neighbours: Mapping[str, RoomDriver]) -> ObstacleMap | None:
 
 
 def _outbox(
-    home: Home,
-    configuration: Configuration,
+    store: IdentityStore,
+    configuration: AgentConfig,
     pairing: Pairing,
     *,
     publish: Publish,
@@ -293,7 +299,7 @@ def _outbox(
     own = f"{topics.ROOT}/{pairing.space}/{pairing.agent}/"
     buffer = configuration.buffer
     shelf = OutboxStore(
-        home.outbox, own=own, max_bytes=round(buffer.max_mb * 1e6), max_age_ms=round(buffer.max_age_h * 3_600_000)
+        store.outbox, own=own, max_bytes=round(buffer.max_mb * 1e6), max_age_ms=round(buffer.max_age_h * 3_600_000)
     )
     teller = own + configuration.devices[0].name
     # Over the others a message is confirmed once it is stored.

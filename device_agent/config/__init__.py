@@ -1,1 +1,1 @@
-"""Config."""
+"""Configuration of the agent: settings, identity, robot types and rooms."""

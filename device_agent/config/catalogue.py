@@ -6,7 +6,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Generic, TypeVar
 
-from device_agent.config.agent_config import ConfigError, Configuration, DeviceEntry
+from device_agent.config.agent_config import AgentConfig, DeviceEntry
+from device_agent.config.errors import ConfigError
 from device_agent.protocol.errors import ProtocolError
 from device_agent.protocol.manifests import robot_type, room
 from device_agent.protocol.manifests.shipped import ROBOTS
@@ -43,7 +44,7 @@ class Catalogue(Generic[Manifest]):
         """The folder of this name.
 
         Raises:
-            HomeError: Unknown; the text lists the known ones.
+            ConfigError: Unknown; the text lists the known ones.
         """
         known = self.folders()
         if name not in known:
@@ -57,7 +58,7 @@ class Catalogue(Generic[Manifest]):
         """The manifest of this name.
 
         Raises:
-            HomeError: Unknown, or the manifest is wrong; the text lists the known ones.
+            ConfigError: Unknown, or the manifest is wrong; the text lists the known ones.
         """
         return self.load_from(self.folder(name))
 
@@ -65,7 +66,7 @@ class Catalogue(Generic[Manifest]):
         """The manifest of any folder.
 
         Raises:
-            HomeError: It is missing or wrong.
+            ConfigError: It is missing or wrong.
         """
         try:
             return self.read(folder)
@@ -87,7 +88,7 @@ def type_of(entry: DeviceEntry) -> robot_type.RobotType:
     """The robot type of a configured device; of a room's device, what the room's manifest says of it.
 
     Raises:
-        HomeError: The type or room is unknown, or the room has nothing of that name and type.
+        ConfigError: The type or room is unknown, or the room has nothing of that name and type.
     """
     if not entry.room:
         return TYPES.load(entry.type)
@@ -105,7 +106,7 @@ def room_device_of(entry: DeviceEntry) -> room.RoomDeviceManifest | None:
     """What the room's manifest says of a configured device; ``None`` where it is a robot.
 
     Raises:
-        HomeError: The room is unknown.
+        ConfigError: The room is unknown.
     """
     return ROOMS.load(entry.room).device(entry.name) if entry.room else None
 
@@ -114,7 +115,7 @@ def entries_of(name: str) -> list[DeviceEntry]:
     """What ``agent.toml`` says of all that is in a room.
 
     Raises:
-        HomeError: The room, or the type of a robot in it, is unknown.
+        ConfigError: The room, or the type of a robot in it, is unknown.
     """
     there = ROOMS.load(name)
     robots = (
@@ -125,11 +126,11 @@ def entries_of(name: str) -> list[DeviceEntry]:
     return [*robots, *devices]
 
 
-def enrolled_devices(configuration: Configuration) -> list[dict[str, str]]:
+def enrolled_devices(configuration: AgentConfig) -> list[dict[str, str]]:
     """The devices as the cloud is told of them.
 
     Raises:
-        HomeError: One is of an unknown type or room.
+        ConfigError: One is of an unknown type or room.
     """
     entries = []
     for device in configuration.devices:

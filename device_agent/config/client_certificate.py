@@ -3,7 +3,7 @@
 from collections.abc import Callable
 from pathlib import Path
 
-from device_agent.config import agent_config
+from device_agent.config import private_file
 
 _SKEW_MS = 300_000
 """The cloud dates a certificate so much before its making, for brokers whose clock is behind."""
@@ -33,7 +33,7 @@ class OwnCertificate:
             ask: Has the cloud sign a request; both are PEM.
 
         Raises:
-            HomeError: It cannot be written.
+            ConfigError: It cannot be written.
             ValueError: What the cloud gave is no certificate for this key.
         """
         if not self._good(after_ms, now_ms):
@@ -67,8 +67,8 @@ class OwnCertificate:
         if not _same(x509.load_pem_x509_certificate(chain), pem):
             raise ValueError("the cloud gave a certificate for another key")
         # Killed in between the two do not fit, which is seen, and others are made.
-        agent_config.write(self._key, pem)
-        agent_config.write(self._certificate, chain)
+        private_file.write(self._key, pem)
+        private_file.write(self._certificate, chain)
 
 
 def _same(certificate: object, key_pem: bytes) -> bool:

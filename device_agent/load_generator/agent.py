@@ -4,7 +4,7 @@ import asyncio
 import time
 from concurrent.futures import Executor
 
-from device_agent.config.agent_config import Pairing
+from device_agent.config.identity_store import Pairing
 from device_agent.load_generator.connection import Dialect, Link, OlderDialect
 from device_agent.load_generator.kinematic_arm import Shape
 from device_agent.load_generator.metrics import Metrics

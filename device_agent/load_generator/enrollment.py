@@ -10,7 +10,7 @@ from typing import TypeVar
 import msgspec
 from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
 
-from device_agent.config.agent_config import Pairing
+from device_agent.config.identity_store import Pairing
 from device_agent.load_generator.account import Account
 from device_agent.load_generator.kinematic_arm import DEVICE
 from device_agent.load_generator.options import LoadOptions, SwarmError

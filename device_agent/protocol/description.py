@@ -141,7 +141,7 @@ class Diagnostic(Struct, frozen=True, kw_only=True):
     checks: tuple[Label, ...] = ("level", "trend", "change", "outlier")
 
 
-class InterlockRule(Struct, frozen=True, kw_only=True):
+class InterlockDescription(Struct, frozen=True, kw_only=True):
     """When the room slows or holds the device: on its condition, and when its sensor was silent for ``stale_ms``.
 
     ``name`` says device, stream and condition; ``speed`` is the share that is left, 0 for ``hold``.
@@ -193,7 +193,7 @@ class Description(Struct, frozen=True, kw_only=True):
     max_loop_age_ms: Milliseconds = 0
     simulated: bool = False
     limits: tuple[Label, ...] = ()
-    interlocks: tuple[InterlockRule, ...] = ()
+    interlocks: tuple[InterlockDescription, ...] = ()
     diagnostics: Annotated[tuple[Diagnostic, ...], Meta(max_length=100)] = ()
     position_m: Vector3 | None = None
     base: BaseLimits | None = None

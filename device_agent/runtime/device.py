@@ -10,6 +10,7 @@ import logging
 import time
 from collections.abc import Callable, Sequence
 
+from device_agent.config.interlock_rule import InterlockRule
 from device_agent.ports.clock import CloudClock, tick_ms, wall_ms
 from device_agent.ports.driver import Driver, HasCameras, HasSpeaker, ReportsStreams
 from device_agent.ports.floor_map import ObstacleMap
@@ -27,7 +28,7 @@ from device_agent.runtime.actions.executor import ActionExecutor
 from device_agent.runtime.actions.script_policy import ScriptPolicy
 from device_agent.runtime.actions.speech_output import SpeechOutput
 from device_agent.runtime.authority.event_recorder import EventRecord, EventRecorder
-from device_agent.runtime.authority.interlocks import Interlock, Interlocks
+from device_agent.runtime.authority.interlocks import Interlocks
 from device_agent.runtime.authority.lease_gate import LeaseGate
 from device_agent.runtime.commands.command_processor import CommandProcessor
 from device_agent.runtime.commands.pinned_keys import PinnedKeys
@@ -94,7 +95,7 @@ class Device:
         room: ReadingCache,
         jail: Sandbox,
         owner: str = "",
-        interlocks: Sequence[Interlock] = (),
+        interlocks: Sequence[InterlockRule] = (),
         geometry: RobotGeometry | None = None,
         ground: Callable[[], ObstacleMap | None] | None = None,
         speech: Speech | None = None,
@@ -140,7 +141,7 @@ class Device:
             simulated=driver.simulated,
             limits=self._controller.limits if robot_type.joints else (),
             actions=body.tasks() if instrument is None else instrument.actions,
-            interlocks=[rule.shown for rule in interlocks],
+            interlocks=[rule.description for rule in interlocks],
             journal=journal,
             publish=publish,
             outbox=outbox,

@@ -9,8 +9,10 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from device_agent.config.agent_config import ConfigError, Configuration, Pairing
+from device_agent.config.agent_config import AgentConfig
 from device_agent.config.client_certificate import OwnCertificate
+from device_agent.config.errors import ConfigError
+from device_agent.config.identity_store import Pairing
 from device_agent.ports.transport import Transport
 from device_agent.protocol import topics
 from device_agent.runtime.commands.pinned_keys import PinnedKeys
@@ -39,7 +41,7 @@ class Wiring:
         listen: Topics of the space's other agents to hear.
     """
 
-    configuration: Configuration
+    configuration: AgentConfig
     pairing: Pairing
     membership: "PairingMonitor"
     open_api: Callable[[], CloudClient]
@@ -67,7 +69,7 @@ class PairingMonitor:
     """
 
     def __init__(
-        self, pairing: Pairing, configuration: Configuration, devices: list[dict[str, str]], pins: PinnedKeys
+        self, pairing: Pairing, configuration: AgentConfig, devices: list[dict[str, str]], pins: PinnedKeys
     ) -> None:
         self._pairing = pairing
         self._pins = pins
@@ -171,7 +173,7 @@ def make(wiring: Wiring) -> Transport:
     """The transport that ``agent.toml`` names, not yet started.
 
     Raises:
-        HomeError: There is none of this name.
+        ConfigError: There is none of this name.
     """
     name = wiring.configuration.transport
     if name not in _MAKERS:

@@ -12,8 +12,10 @@ from urllib.parse import urlsplit
 from device_agent import bootstrap
 from device_agent.cli.doctor.finding import Finding, ok, problem, warning
 from device_agent.config import catalogue
-from device_agent.config.agent_config import ConfigError, Configuration, Home, Pairing
+from device_agent.config.agent_config import AgentConfig
 from device_agent.config.client_certificate import OwnCertificate
+from device_agent.config.errors import ConfigError
+from device_agent.config.identity_store import IdentityStore, Pairing
 from device_agent.ports.clock import CloudClock, tick_ms, wall_ms
 from device_agent.runtime.commands.pinned_keys import ADVICE, PinnedKeys
 from device_agent.runtime.errors import Refused
@@ -28,12 +30,12 @@ _TLS_S = 5.0
 _SOON_DAYS = 30
 
 
-def look(home: Home, configuration: Configuration) -> Iterator[Finding]:
+def look(store: IdentityStore, configuration: AgentConfig) -> Iterator[Finding]:
     """Everything, as far as it can be reached."""
     clock = CloudClock()
     try:
-        pairing = home.pairing()
-        api = bootstrap.api_of(home, configuration, clock)
+        pairing = store.pairing()
+        api = bootstrap.api_of(store, configuration, clock)
     except ConfigError as error:
         yield problem("server", str(error), "Run `python -m device_agent enroll`.")
         return
@@ -55,7 +57,7 @@ def look(home: Home, configuration: Configuration) -> Iterator[Finding]:
         return
     yield ok("pairing", f"paired with {pairing.account}")
     yield _keys(found, pairing, clock)
-    yield from _link(home, configuration, pairing, clock)
+    yield from _link(store, configuration, pairing, clock)
 
 
 def _certificate(api: CloudClient) -> Finding:
@@ -86,7 +88,7 @@ def _certificate(api: CloudClient) -> Finding:
 
 
 def _server(
-    api: CloudClient, configuration: Configuration, clock: CloudClock
+    api: CloudClient, configuration: AgentConfig, clock: CloudClock
 ) -> Generator[Finding, None, dict[str, Any] | None]:
     """Whether it answers, and knows this agent; what it says of it."""
     began_s = time.monotonic()
@@ -147,11 +149,11 @@ def _clocks(clock: CloudClock) -> Iterator[Finding]:
         yield ok("clock", f"{abs(off_ms):.0f} ms from the server's")
 
 
-def _link(home: Home, configuration: Configuration, pairing: Pairing, clock: CloudClock) -> Iterator[Finding]:
+def _link(store: IdentityStore, configuration: AgentConfig, pairing: Pairing, clock: CloudClock) -> Iterator[Finding]:
     """Connect as the agent does; not beside one that runs, whose link that would end."""
     try:
-        with home.hold():
-            yield from _connect(home, configuration, pairing, clock)
+        with store.lock():
+            yield from _connect(store, configuration, pairing, clock)
     except ConfigError as error:
         if "already" not in str(error):
             yield problem("link", str(error), "Correct agent.toml.")
@@ -159,20 +161,22 @@ def _link(home: Home, configuration: Configuration, pairing: Pairing, clock: Clo
         yield ok("link", "the agent is running; its link is not disturbed to try it")
 
 
-def _connect(home: Home, configuration: Configuration, pairing: Pairing, clock: CloudClock) -> Iterator[Finding]:
-    journal = Journal(home.journal)
+def _connect(
+    store: IdentityStore, configuration: AgentConfig, pairing: Pairing, clock: CloudClock
+) -> Iterator[Finding]:
+    journal = Journal(store.journal)
     journal.open(now_ms=wall_ms())
-    pins = PinnedKeys(pairing, save=home.save_pairing, now_ms=clock.now_ms)
+    pins = PinnedKeys(pairing, save=store.save_pairing, now_ms=clock.now_ms)
     membership = factory.PairingMonitor(pairing, configuration, catalogue.enrolled_devices(configuration), pins)
     transport = factory.make(
         factory.Wiring(
             configuration=configuration,
             pairing=pairing,
             membership=membership,
-            open_api=lambda: bootstrap.api_of(home, configuration, clock),
+            open_api=lambda: bootstrap.api_of(store, configuration, clock),
             next_session=journal.next_session,
             quiet=lambda: True,
-            certificate=OwnCertificate(home.folder),
+            certificate=OwnCertificate(store.folder),
             now_ms=clock.now_ms,
         )
     )

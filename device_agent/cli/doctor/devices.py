@@ -9,7 +9,8 @@ from collections.abc import Iterator, Mapping
 from device_agent import bootstrap
 from device_agent.cli.doctor.finding import Finding, ok, problem, warning
 from device_agent.config import catalogue
-from device_agent.config.agent_config import ConfigError, Configuration, DeviceEntry
+from device_agent.config.agent_config import AgentConfig, DeviceEntry
+from device_agent.config.errors import ConfigError
 from device_agent.ports.driver import DriverError
 from device_agent.ports.geometry import GeometryError
 from device_agent.ports.sensor import SensorError
@@ -66,10 +67,10 @@ def _instrument(name: str, kind: str, instrument: RoomDevice) -> Finding:
     return ok(name, f"{said}: simulated; its room has what it needs")
 
 
-def room(configuration: Configuration) -> Iterator[Finding]:
+def room(configuration: AgentConfig) -> Iterator[Finding]:
     """Whether what interlocks and movements listen to can be heard."""
     own = {entry.name for entry in configuration.devices}
-    others = [f"{source}/{stream}" for source, stream in configuration.sources if source not in own]
+    others = [f"{source}/{stream}" for source, stream in configuration.room_sources if source not in own]
     if others and configuration.transport != "mqtt":
         yield problem(
             "room",
@@ -79,7 +80,7 @@ def room(configuration: Configuration) -> Iterator[Finding]:
         )
 
 
-def renderer(configuration: Configuration) -> Iterator[Finding]:
+def renderer(configuration: AgentConfig) -> Iterator[Finding]:
     """Whether MuJoCo can draw pictures. In a process of its own: without a renderer its libraries end the process."""
     used = {entry.driver or _driver_of(entry) for entry in configuration.devices}
     if "mujoco" not in used or importlib.util.find_spec("mujoco") is None:

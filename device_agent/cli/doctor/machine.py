@@ -11,7 +11,7 @@ from contextlib import closing
 from pathlib import Path
 
 from device_agent.cli.doctor.finding import Finding, ok, problem, warning
-from device_agent.config.agent_config import Home
+from device_agent.config.identity_store import IdentityStore
 from device_agent.sandbox.host import SandboxHost
 from device_agent.speech.espeak import PROGRAM
 
@@ -46,12 +46,12 @@ def user() -> Iterator[Finding]:
         yield ok("user", f"runs as an unprivileged user (uid {os.geteuid()})")
 
 
-def folder(home: Home) -> Iterator[Finding]:
+def folder(store: IdentityStore) -> Iterator[Finding]:
     """Whether the agent can use its folder, and nobody else."""
-    path = home.folder
+    path = store.folder
     if not path.is_dir():
         yield problem(
-            "folder", f"{path} does not exist", "Run `python -m device_agent enroll`, or name it with --home."
+            "folder", f"{path} does not exist", "Run `python -m device_agent enroll`, or name it with --store."
         )
         return
     if not os.access(path, os.R_OK | os.W_OK | os.X_OK):
@@ -81,9 +81,9 @@ def _too_open(path: Path) -> Iterator[Finding]:
                 yield warning("folder", f"others on this machine can read {each}", f"chmod {mode} {each}")
 
 
-def disk(home: Home) -> Iterator[Finding]:
+def disk(store: IdentityStore) -> Iterator[Finding]:
     """Room for the journal, and whether it can be read: the agent does not run without it."""
-    existing = next(each for each in (home.folder, *home.folder.resolve().parents) if each.is_dir())
+    existing = next(each for each in (store.folder, *store.folder.resolve().parents) if each.is_dir())
     free = shutil.disk_usage(existing).free
     said = f"{free / 1e9:.1f} GB free at {existing}"
     if free < _TOO_LITTLE_BYTES:
@@ -92,7 +92,7 @@ def disk(home: Home) -> Iterator[Finding]:
         yield warning("disk", said, "Make room soon: without its journal the agent obeys nothing.")
     else:
         yield ok("disk", said)
-    for database in (home.journal, home.outbox):
+    for database in (store.journal, store.outbox):
         if database.exists():
             yield _readable(database)
 

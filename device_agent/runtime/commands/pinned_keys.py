@@ -7,7 +7,8 @@ from collections.abc import Callable, Iterable, Iterator, Mapping
 from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PublicKey
 from msgspec.structs import replace
 
-from device_agent.config.agent_config import ConfigError, Pairing
+from device_agent.config.errors import ConfigError
+from device_agent.config.identity_store import Pairing
 from device_agent.protocol import codec
 from device_agent.protocol.errors import ProtocolError, SignatureError
 from device_agent.protocol.security import key_rotation, signing

@@ -13,7 +13,8 @@ import pytest
 
 from device_agent import bootstrap
 from device_agent.config import catalogue
-from device_agent.config.agent_config import Configuration, DeviceEntry, Home, HttpPolling, Pairing
+from device_agent.config.agent_config import AgentConfig, DeviceEntry, HttpPolling
+from device_agent.config.identity_store import IdentityStore, Pairing
 from device_agent.ports.clock import CloudClock
 from device_agent.protocol import Ack, AckStatus, MoveJoints, State, codec, topics
 from device_agent.transports.factory import SOFTWARE
@@ -34,19 +35,19 @@ class Resident:
 
     def __init__(self, ground: Ground, spoken: Spoken, folder: Path) -> None:
         self.ground = ground
-        self.home = Home(folder)
-        key = self.home.identity(create=True)
-        told = Configuration(
+        self.store = IdentityStore(folder)
+        key = self.store.private_key(create=True)
+        told = AgentConfig(
             server=ground.url, name="lab", devices=(DeviceEntry(name="arm", type="ur5"),), **spoken.configuration
         )
-        self.home.save_configuration(told)
+        told.save(self.store.folder)
         api = CloudClient(ground.url, key, CloudClock())
         claim = api.enroll(
             name="lab", software=SOFTWARE, transport=told.transport, devices=catalogue.enrolled_devices(told)
         )
         claimed = ground.anna.post("/agents/claim", {"code": claim.code}).json()
         found = api.enrollment()
-        self.home.save_pairing(
+        self.store.save_pairing(
             Pairing(
                 agent=found["agent"],
                 space=found["space"],
@@ -63,7 +64,7 @@ class Resident:
         self.start()
 
     def start(self) -> None:
-        self.cell = bootstrap.build(self.home)
+        self.cell = bootstrap.build(self.store)
         self.device: Any = self.cell._agent._devices["arm"]
         self.sent: list[tuple[float, tuple[float, ...]]] = []
         self.lost_s: list[float] = []

@@ -17,7 +17,7 @@ from unittest import mock
 
 from device_agent import bootstrap
 from device_agent.__main__ import main
-from device_agent.config.agent_config import Home, Pairing
+from device_agent.config.identity_store import IdentityStore, Pairing
 from device_agent.ports.clock import CloudClock, tick_ms, wall_ms
 from device_agent.protocol import (
     Ack,
@@ -47,8 +47,8 @@ class _Api:
     server = "http://nobody.invalid"
     ca = None
 
-    def __init__(self, home: Home, clock: CloudClock) -> None:
-        self._path = home.folder / _ACCESS
+    def __init__(self, store: IdentityStore, clock: CloudClock) -> None:
+        self._path = store.folder / _ACCESS
         self._clock = clock
 
     def enroll(self, **_: object) -> Any:
@@ -65,17 +65,17 @@ class OwnAgent:
     """The agent's process, the connection on which the functions would speak with it, and all that was heard.
 
     Args:
-        folder: Its home.
+        folder: Its store.
         broker: Running.
         toml: ``agent.toml`` below server and name; one device ``arm``.
     """
 
     def __init__(self, folder: Path, broker: RunningBroker, toml: str) -> None:
-        self.home = Home(folder)
+        self.store = IdentityStore(folder)
         self.key = signing.generate()
-        self.home.identity(create=True)
+        self.store.private_key(create=True)
         keys = {signing.key_id(self.key.public_key()): signing.public_text(self.key.public_key())}
-        self.home.save_pairing(Pairing(agent=AGENT, space=SPACE, account="ann", keys=keys))
+        self.store.save_pairing(Pairing(agent=AGENT, space=SPACE, account="ann", keys=keys))
         (folder / "agent.toml").write_text(f'server = "http://nobody.invalid"\nname = "arm"\n{toml}')
         self.process: subprocess.Popen[bytes] | None = None
         self.heard: list[tuple[str, bytes]] = []
@@ -93,14 +93,14 @@ class OwnAgent:
             "subscribe": grants.agent_orders(SPACE, AGENT),
             "lifetime_s": 300,
         }
-        (self.home.folder / _ACCESS).write_text(json.dumps(access))
+        (self.store.folder / _ACCESS).write_text(json.dumps(access))
         self.line: Client = broker.service()
         self.line.subscribe(*(self.topic(kind) for kind in _HEARD))
         self.line.subscribe(self.topic(topics.TELE, "+"), self.topic(topics.LATE, "+"))
 
     def start(self) -> Self:
-        command = [sys.executable, "-m", "tests.harness.agent.custom_agent", str(self.home.folder)]
-        log = (self.home.folder / "log").open("a")
+        command = [sys.executable, "-m", "tests.harness.agent.custom_agent", str(self.store.folder)]
+        log = (self.store.folder / "log").open("a")
         self.process = subprocess.Popen(command, cwd=ROOT, stdout=log, stderr=log)
         log.close()
         return self
@@ -237,5 +237,5 @@ class Sensor:
 
 
 if __name__ == "__main__":
-    with mock.patch.object(bootstrap, "api_of", lambda home, _configuration, clock, **_: _Api(home, clock)):
+    with mock.patch.object(bootstrap, "api_of", lambda store, _configuration, clock, **_: _Api(store, clock)):
         sys.exit(main(["run", "--home", sys.argv[1]]))

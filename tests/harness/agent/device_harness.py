@@ -10,6 +10,7 @@ from typing import Any
 import pytest
 from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
 
+from device_agent.config.interlock_rule import InterlockRule
 from device_agent.ports.clock import CloudClock, tick_ms, wall_ms
 from device_agent.ports.geometry import RobotGeometry
 from device_agent.ports.sandbox import Sandbox
@@ -29,7 +30,6 @@ from device_agent.protocol import (
 )
 from device_agent.protocol.manifests.robot_type import RobotType
 from device_agent.protocol.security import signing
-from device_agent.runtime.authority.interlocks import Interlock
 from device_agent.runtime.device import Device
 from device_agent.runtime.readings import ReadingCache
 from device_agent.runtime.storage.journal import Journal
@@ -50,7 +50,7 @@ class Bench:
         self,
         folder: Path,
         *,
-        interlocks: Sequence[Interlock] = (),
+        interlocks: Sequence[InterlockRule] = (),
         driver: ToyDriver | None = None,
         kind: RobotType | None = None,
         geometry: RobotGeometry | None = None,

@@ -2,7 +2,7 @@
 
 from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
 
-from device_agent.config.agent_config import Pairing
+from device_agent.config.identity_store import Pairing
 from device_agent.protocol.security import signing
 from device_agent.runtime.commands.pinned_keys import PinnedKeys
 

@@ -17,8 +17,9 @@ from typing import Any, Protocol, Self
 
 from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
 
-from device_agent.config.agent_config import Configuration, DeviceEntry, Pairing
+from device_agent.config.agent_config import AgentConfig, DeviceEntry
 from device_agent.config.client_certificate import OwnCertificate
+from device_agent.config.identity_store import Pairing
 from device_agent.ports.clock import CloudClock
 from device_agent.protocol import Command, Presence, Request, codec, topics
 from device_agent.protocol.security import signing
@@ -212,7 +213,7 @@ class Link:
         self.robot.pair(ground.anna)
         self.ear = self._stack.enter_context(ground.ear(self.robot.id))
         self.known = set(threading.enumerate())
-        told = Configuration(
+        told = AgentConfig(
             server=ground.url, name="lab", devices=(DeviceEntry(name="arm", type="ur5"),), **configuration
         )
         pairing = Pairing(agent=self.robot.id, space=self.robot.space, account="anna", keys={})

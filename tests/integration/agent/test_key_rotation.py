@@ -66,7 +66,7 @@ def test_a_live_agent_goes_on_and_the_old_key_ends(ground: Ground, resident: Res
     work(ground, resident)
     wait_until(lambda: pins.serial == 2, "the agent to learn of the new key, while it works")
     assert new in pins
-    pairing = resident.home.pairing()
+    pairing = resident.store.pairing()
     assert pairing is not None
     assert new in pairing.keys
     assert news.signing == signing.key_id(old.public_key())

@@ -27,7 +27,7 @@ not measured left no hole."""
 
 def kept(agent: OwnAgent, *, late: bool) -> list[bytes]:
     """What lies in the outbox on disk."""
-    with contextlib.closing(sqlite3.connect(agent.home.outbox, timeout=20)) as database:
+    with contextlib.closing(sqlite3.connect(agent.store.outbox, timeout=20)) as database:
         rows = database.execute("SELECT payload FROM kept WHERE late = ? ORDER BY id", (late,)).fetchall()
     return [row[0] for row in rows]
 
@@ -39,7 +39,7 @@ def kept_event(agent: OwnAgent, kind: EventKind) -> bool:
 def test_what_happened_while_the_broker_and_then_the_agent_were_dead_is_told_later(tmp_path: Path) -> None:
     with contextlib.ExitStack() as stack:
         broker = stack.enter_context(start_broker("mosquitto", tmp_path / "broker"))
-        agent = stack.enter_context(OwnAgent(tmp_path / "home", broker, TOML))
+        agent = stack.enter_context(OwnAgent(tmp_path / "store", broker, TOML))
         agent.start()
         agent.ready()
         agent.obey(GrantLease(holder="ann", lease_ms=60_000), epoch=3)
@@ -98,7 +98,7 @@ def nothing_is_done_again(agent: OwnAgent, done: str) -> None:
 
 
 def a_latched_stop_outlives_a_kill(agent: OwnAgent) -> None:
-    identity = (agent.home.folder / "identity.pem").read_bytes()
+    identity = (agent.store.folder / "identity.pem").read_bytes()
     agent.obey(StopDevice(reason="smoke"))
     agent.kill()
     agent.start()
@@ -108,4 +108,4 @@ def a_latched_stop_outlives_a_kill(agent: OwnAgent) -> None:
     refused = agent.obey(MoveJoints(position_rad={"shoulder_pan": 1.0}), epoch=4)
     assert refused.reason is not None
     assert refused.reason.code == "stopped"
-    assert (agent.home.folder / "identity.pem").read_bytes() == identity
+    assert (agent.store.folder / "identity.pem").read_bytes() == identity

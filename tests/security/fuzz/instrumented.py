@@ -11,7 +11,13 @@ MODULES: dict[str, list[str]] = {
     "script": [f"{_PROTOCOL}.codec", "device_agent.ports.script_calls", _TARGETS],
     "http": ["device_agent.ports.clock", "device_agent.transports.http.client", _TARGETS],
     "stanzas": ["xml.etree.ElementTree", "base64", f"{_PROTOCOL}.stanzas", _TARGETS],
-    "home": ["tomllib", f"{_PROTOCOL}.signing", "device_agent.config.agent_config", _TARGETS],
+    "home": [
+        "tomllib",
+        f"{_PROTOCOL}.signing",
+        "device_agent.config.agent_config",
+        "device_agent.config.identity_store",
+        _TARGETS,
+    ],
     "bodies": ["function_app.entrypoints.http.framework.responses", _TARGETS],
     "packets": ["amqtt.mqtt", "infra.embedded_broker.packets", _TARGETS],
 }

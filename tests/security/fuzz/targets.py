@@ -20,7 +20,9 @@ import msgspec
 import requests
 from amqtt.mqtt.packet import CONNECT, PUBACK, PUBLISH, SUBSCRIBE, UNSUBSCRIBE
 
-from device_agent.config.agent_config import ConfigError, Home
+from device_agent.config.agent_config import AgentConfig
+from device_agent.config.errors import ConfigError
+from device_agent.config.identity_store import IdentityStore
 from device_agent.ports import script_calls
 from device_agent.ports.clock import CloudClock
 from device_agent.protocol import codec, topics
@@ -203,18 +205,18 @@ atexit.register(shutil.rmtree, _FOLDER, ignore_errors=True)
 
 def _home(data: bytes) -> None:
     """Both files of an agent's folder."""
-    home = Home(_FOLDER)
+    store = IdentityStore(_FOLDER)
     (_FOLDER / "agent.toml").write_bytes(data)
     (_FOLDER / "pairing.json").write_bytes(data)
     with contextlib.suppress(ConfigError):
-        _check_finite(home.pairing())
+        _check_finite(store.pairing())
     try:
-        found = home.configuration()
+        found = AgentConfig.load(store.folder)
     except ConfigError:
         return
     _check_finite(found)
-    home.save_configuration(found)
-    if home.configuration() != found:
+    found.save(store.folder)
+    if AgentConfig.load(store.folder) != found:
         raise Found("the configuration is another one when it is written and read again")
 
 

@@ -12,18 +12,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from msgspec.structs import replace
 
-from device_agent.config.agent_config import (
-    Buffer,
-    ConfigError,
-    Configuration,
-    DeviceEntry,
-    Home,
-    HttpPolling,
-    Pairing,
-    RoomStream,
-)
+from device_agent.config.agent_config import AgentConfig, Buffer, DeviceEntry, HttpPolling, RoomStream
+from device_agent.config.errors import ConfigError
+from device_agent.config.identity_store import IdentityStore, Pairing
+from device_agent.config.interlock_rule import InterlockRule
 from device_agent.protocol.security import signing
-from device_agent.runtime.authority.interlocks import Interlock
 from infra.tls import server_ca
 
 ARM = DeviceEntry(name="arm", type="ur5")
@@ -42,10 +35,10 @@ VALUES: Any = st.recursive(
 def test_what_is_written_is_read_again(
     name: str, transport: str, options: dict[str, Any], tmp_path_factory: pytest.TempPathFactory
 ) -> None:
-    home = Home(tmp_path_factory.getbasetemp() / "written")
+    store = IdentityStore(tmp_path_factory.getbasetemp() / "written")
     rules = (
-        Interlock(device="abc-pir", stream="presence", field="present", equals=True),
-        Interlock(device="other", stream="joints", field="velocity_rad_s.0", above=0.5, action="slow", stale_s=1),
+        InterlockRule(device="abc-pir", stream="presence", field="present", equals=True),
+        InterlockRule(device="other", stream="joints", field="velocity_rad_s.0", above=0.5, action="slow", stale_s=1),
     )
     devices = (
         DeviceEntry(name="arm", type="ur5", options=options, interlocks=rules),
@@ -53,7 +46,7 @@ def test_what_is_written_is_read_again(
     )
     room = (RoomStream(device="abc-lamp", stream="light"),)
     polling = HttpPolling(poll="plain", poll_ms=250)
-    written = Configuration(
+    written = AgentConfig(
         server="http://s",
         name=name,
         transport=transport,
@@ -63,13 +56,13 @@ def test_what_is_written_is_read_again(
         ca="server-ca.pem" if options else "",
     )
     written = replace(written, buffer=Buffer(max_mb=2), allow_unconfined_scripts=bool(options))
-    home.save_configuration(written)
-    assert home.configuration() == written
+    written.save(store.folder)
+    assert AgentConfig.load(store.folder) == written
 
 
 def test_a_folder_written_before_there_was_a_choice_speaks_mqtt(tmp_path: Path) -> None:
     (tmp_path / "agent.toml").write_text(MINIMAL)
-    found = Home(tmp_path).configuration()
+    found = AgentConfig.load(tmp_path)
     assert (found.transport, found.http.poll) == ("mqtt", "long")
 
 
@@ -86,7 +79,7 @@ def test_a_folder_written_before_there_was_a_choice_speaks_mqtt(tmp_path: Path) 
         ("[buffer]\nmax_age_h = nan\n", "max_age_h"),
         ("[buffer]\nmeasurements_hz = 0\n", "measurements_hz"),
         ("[buffer]\nsettle_s = -1\n", "settle_s"),
-        ('[[room]]\ndevice = "pir"\nstream = "presence"\n', "'pir' is no device of this agent .arm.; name one"),
+        ('[[room]]\ndevice = "pir"\nstream = "presence"\n', "'pir' is not a device of this agent .arm.; name one"),
         (f"{INTERLOCK}[[devices.interlocks]]\nspeed = 0.5\n", "device"),
         (INTERLOCK.replace("equals = true", ""), "exactly one of above, below, equals"),
         (INTERLOCK.replace("true", "nan"), "finite"),
@@ -96,15 +89,15 @@ def test_a_folder_written_before_there_was_a_choice_speaks_mqtt(tmp_path: Path) 
 def test_what_is_wrong_is_named(tmp_path: Path, text: str, named: str) -> None:
     (tmp_path / "agent.toml").write_text(MINIMAL + text)
     with pytest.raises(ConfigError, match=named):
-        Home(tmp_path).configuration()
+        AgentConfig.load(tmp_path)
 
 
 def test_nobody_else_may_read_it(tmp_path: Path) -> None:
-    home = Home(tmp_path / "new")
-    home.identity(create=True)
-    home.save_configuration(Configuration(server="http://s", name="n", devices=(ARM,)))
-    assert stat.S_IMODE(home.folder.stat().st_mode) == 0o700
-    assert {stat.S_IMODE(path.stat().st_mode) for path in home.folder.iterdir()} == {0o600}
+    store = IdentityStore(tmp_path / "new")
+    store.private_key(create=True)
+    AgentConfig(server="http://s", name="n", devices=(ARM,)).save(store.folder)
+    assert stat.S_IMODE(store.folder.stat().st_mode) == 0o700
+    assert {stat.S_IMODE(path.stat().st_mode) for path in store.folder.iterdir()} == {0o600}
 
 
 def test_everything_of_the_room_that_is_named_is_a_source_once(tmp_path: Path) -> None:
@@ -113,107 +106,107 @@ def test_everything_of_the_room_that_is_named_is_a_source_once(tmp_path: Path) -
         + INTERLOCK
         + '[[room]]\ndevice = "a-pir"\nstream = "presence"\n[[room]]\ndevice = "arm"\nstream = "x"\n'
     )
-    assert Home(tmp_path).configuration().sources == (("a-pir", "presence"), ("arm", "x"))
+    assert AgentConfig.load(tmp_path).room_sources == (("a-pir", "presence"), ("arm", "x"))
 
 
 def test_enrolling_again_keeps_the_room_and_each_devices_interlocks() -> None:
-    rules = (Interlock(device="a-pir", stream="presence", field="present", equals=True),)
-    before = Configuration(
+    rules = (InterlockRule(device="a-pir", stream="presence", field="present", equals=True),)
+    before = AgentConfig(
         server="http://s",
         name="n",
         devices=(DeviceEntry(name="arm", type="ur5", interlocks=rules),),
         room=(RoomStream(device="a-lamp", stream="light"),),
     )
-    said = Configuration(server="http://t", name="n", devices=(ARM, DeviceEntry(name="leg", type="ur5")))
-    kept = said.keeping(before)
+    said = AgentConfig(server="http://t", name="n", devices=(ARM, DeviceEntry(name="leg", type="ur5")))
+    kept = said.with_manual_settings(before)
     assert kept.server == "http://t"
     assert [device.interlocks for device in kept.devices] == [rules, ()]
     assert kept.room == before.room
 
 
 def test_what_was_written_of_identity_and_pairing_is_read_again(tmp_path: Path) -> None:
-    home = Home(tmp_path)
-    key = home.identity(create=True)
-    assert home.identity(create=True).private_bytes_raw() == home.identity().private_bytes_raw()
-    assert home.pairing() is None
+    store = IdentityStore(tmp_path)
+    key = store.private_key(create=True)
+    assert store.private_key(create=True).private_bytes_raw() == store.private_key().private_bytes_raw()
+    assert store.pairing() is None
     keys = {signing.key_id(key.public_key()): signing.public_text(key.public_key())}
     pairing = Pairing(agent="a", space="s", account="ann", keys=keys)
-    home.save_pairing(pairing)
-    assert home.pairing() == pairing
+    store.save_pairing(pairing)
+    assert store.pairing() == pairing
     assert list(pairing.public_keys()) == list(keys)
-    home.save_pairing(None)
-    assert home.pairing() is None
+    store.save_pairing(None)
+    assert store.pairing() is None
 
 
 def test_what_is_missing_or_damaged_says_what_to_do(tmp_path: Path) -> None:
-    home = Home(tmp_path)
+    store = IdentityStore(tmp_path)
     with pytest.raises(ConfigError, match="enroll` first"):
-        home.identity()
+        store.private_key()
     with pytest.raises(ConfigError, match="enroll` first"):
-        home.configuration()
+        AgentConfig.load(store.folder)
     (tmp_path / "identity.pem").write_bytes(b"nonsense")
     with pytest.raises(ConfigError, match="cannot be read as a private key"):
-        home.identity()
+        store.private_key()
     pem = ec.generate_private_key(ec.SECP256R1()).private_bytes(
         serialization.Encoding.PEM, serialization.PrivateFormat.PKCS8, serialization.NoEncryption()
     )
     (tmp_path / "identity.pem").write_bytes(pem)
     with pytest.raises(ConfigError, match="not an Ed25519 key"):
-        home.identity()
+        store.private_key()
     (tmp_path / "pairing.json").write_bytes(b"{")
     with pytest.raises(ConfigError, match="delete it and enroll again"):
-        home.pairing()
+        store.pairing()
     (tmp_path / "agent.toml").write_text('server = "s"\nname = "n"\ndevices = []\n')
     with pytest.raises(ConfigError, match="at least one device"):
-        home.configuration()
+        AgentConfig.load(store.folder)
 
 
 def test_a_folder_that_cannot_be_written_is_named(tmp_path: Path) -> None:
     (tmp_path / "file").write_text("no folder")
     with pytest.raises(ConfigError, match="cannot be written"):
-        Home(tmp_path / "file").save_pairing(Pairing(agent="a", space="s", account="ann", keys={}))
+        IdentityStore(tmp_path / "file").save_pairing(Pairing(agent="a", space="s", account="ann", keys={}))
 
 
 def test_a_pinned_authority_is_kept_and_found(tmp_path: Path) -> None:
-    home, given = Home(tmp_path / "agent"), tmp_path / "given.pem"
+    store, given = IdentityStore(tmp_path / "agent"), tmp_path / "given.pem"
     server_ca.make(tmp_path / "tls", server_ca.names(("site.example",), ()), now=dt.datetime.now(dt.UTC))
     given.write_bytes((tmp_path / "tls" / server_ca.CA_CERTIFICATE).read_bytes())
-    plain = Configuration(server="https://s", name="n", devices=(ARM,))
-    assert home.authority(plain) is None
-    pinned = replace(plain, ca=home.pin_authority(given))
-    kept = home.authority(pinned)
+    plain = AgentConfig(server="https://s", name="n", devices=(ARM,))
+    assert store.certificate_authority(plain.ca) is None
+    pinned = replace(plain, ca=store.pin_certificate_authority(given))
+    kept = store.certificate_authority(pinned.ca)
     assert kept is not None
     assert kept.read_bytes() == given.read_bytes()
     kept.unlink()
     with pytest.raises(ConfigError, match="enroll --ca"):
-        home.authority(pinned)
+        store.certificate_authority(pinned.ca)
 
 
 @pytest.mark.parametrize("content", [b"no certificate", b"\xff\xfe", None])
 def test_what_is_no_authoritys_certificate_is_not_pinned(tmp_path: Path, content: bytes | None) -> None:
-    home, given = Home(tmp_path / "agent"), tmp_path / "given.pem"
+    store, given = IdentityStore(tmp_path / "agent"), tmp_path / "given.pem"
     if content is not None:
         given.write_bytes(content)
     with pytest.raises(ConfigError, match=r"--ca: .*given\.pem cannot be read as a certificate"):
-        home.pin_authority(given)
+        store.pin_certificate_authority(given)
 
 
 def test_a_lock_that_cannot_be_written_is_named(tmp_path: Path) -> None:
     (tmp_path / "running.lock").mkdir()
-    with pytest.raises(ConfigError, match=r"running\.lock cannot be written"), Home(tmp_path).hold():
+    with pytest.raises(ConfigError, match=r"running\.lock cannot be written"), IdentityStore(tmp_path).lock():
         pass
 
 
 def test_an_identity_that_was_open_to_others_is_closed_and_it_is_said(
     tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
-    home = Home(tmp_path / "agent")
-    home.identity(create=True)
+    store = IdentityStore(tmp_path / "agent")
+    store.private_key(create=True)
     path = tmp_path / "agent" / "identity.pem"
     path.chmod(0o644)
-    home.identity()
+    store.private_key()
     assert path.stat().st_mode & 0o777 == 0o600
     assert "enroll again" in caplog.text
     caplog.clear()
-    home.identity()
+    store.private_key()
     assert caplog.text == ""

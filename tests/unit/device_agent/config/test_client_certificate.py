@@ -11,8 +11,8 @@ from cryptography.hazmat.primitives.asymmetric import ec
 from cryptography.hazmat.primitives.serialization import Encoding
 from cryptography.x509.oid import NameOID
 
-from device_agent.config.agent_config import ConfigError
 from device_agent.config.client_certificate import OwnCertificate
+from device_agent.config.errors import ConfigError
 
 DAY_MS = 86_400_000
 BEGIN = dt.datetime(2026, 1, 1, tzinfo=dt.UTC)

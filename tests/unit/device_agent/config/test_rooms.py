@@ -8,7 +8,9 @@ from device_agent import bootstrap
 from device_agent.__main__ import main
 from device_agent.cli.doctor import devices
 from device_agent.config import catalogue
-from device_agent.config.agent_config import ConfigError, Configuration, DeviceEntry, Home
+from device_agent.config.agent_config import AgentConfig, DeviceEntry
+from device_agent.config.errors import ConfigError
+from device_agent.config.identity_store import IdentityStore
 
 ARM = DeviceEntry(name="ur5", type="ur5", room="lab")
 
@@ -22,9 +24,9 @@ def test_a_room_gives_an_entry_for_each_thing_in_it():
 
 
 def test_the_room_of_a_device_is_kept_in_its_file(tmp_path: Path):
-    home = Home(tmp_path)
-    home.save_configuration(Configuration(server="http://x", name="x", devices=(ARM,)))
-    assert home.configuration().devices == (ARM,)
+    store = IdentityStore(tmp_path)
+    AgentConfig(server="http://x", name="x", devices=(ARM,)).save(store.folder)
+    assert AgentConfig.load(store.folder).devices == (ARM,)
 
 
 @pytest.mark.parametrize(

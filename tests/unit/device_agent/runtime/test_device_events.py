@@ -9,6 +9,7 @@ from unittest import mock
 
 import pytest
 
+from device_agent.config.interlock_rule import InterlockRule
 from device_agent.protocol import (
     AckStatus,
     Description,
@@ -27,7 +28,6 @@ from device_agent.protocol import (
 )
 from device_agent.protocol.events import EventKind
 from device_agent.protocol.security import signing
-from device_agent.runtime.authority.interlocks import Interlock
 from tests.harness.agent.device_harness import Bench, eventually
 
 
@@ -217,7 +217,7 @@ def test_what_is_not_for_a_device_is_let_go_and_the_drawing_is_shown(tmp_path: P
 
 
 def test_a_room_that_is_not_known_holds_and_is_shown(tmp_path: Path) -> None:
-    rule = Interlock(device="sensors-pir", stream="presence", field="present", equals=True)
+    rule = InterlockRule(device="sensors-pir", stream="presence", field="present", equals=True)
     bench = Bench(tmp_path, interlocks=(rule,))
     bench.device.start()
     bench.device.link_changed(True)
@@ -225,7 +225,7 @@ def test_a_room_that_is_not_known_holds_and_is_shown(tmp_path: Path) -> None:
     assert acted.data["interlock"] == rule.name
     (shown,) = eventually(lambda: [state.restrictions for state in bench.heard(topics.STATE, State)][-1:])
     assert [(each.source, each.speed) for each in shown] == [(rule.name, 0.0)]
-    assert bench.heard(topics.DESC, Description)[0].interlocks == (rule.shown,)
+    assert bench.heard(topics.DESC, Description)[0].interlocks == (rule.description,)
     take_control(bench)
     refused = bench.end(bench.command(MoveJoints(position_rad={"elbow": 1.0}), epoch=1))
     assert refused.status is AckStatus.FAILED

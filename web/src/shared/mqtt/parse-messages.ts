@@ -15,7 +15,7 @@ import type {
   Event,
   Fault,
   Geometry,
-  InterlockRule,
+  InterlockDescription,
   Joint,
   JointTelemetry,
   LeaseState,
@@ -199,7 +199,7 @@ const description = object<KnownDescription>({
   scripts: optional(oneOf("sandboxed", "unavailable", "unconfined"), "unavailable"),
   scripts_note: optional(text, ""),
   interlocks: optional(
-    list(object<InterlockRule>({ name: text, action: oneOf("slow", "hold"), speed: number, stale_ms: count }), MAX_JOINTS),
+    list(object<InterlockDescription>({ name: text, action: oneOf("slow", "hold"), speed: number, stale_ms: count }), MAX_JOINTS),
     [],
   ),
   diagnostics: optional(list(diagnostic, MAX_JOINTS), []),

@@ -55,7 +55,7 @@ export interface Description {
   max_loop_age_ms?: number;
   simulated?: boolean;
   limits?: string[];
-  interlocks?: InterlockRule[];
+  interlocks?: InterlockDescription[];
   diagnostics?: Diagnostic[];
   position_m?: [number, number, number] | null;
   base?: BaseLimits | null;
@@ -124,7 +124,7 @@ export interface Control {
  *
  * `name` says device, stream and condition; `speed` is the share that is left, 0 for `hold`.
  */
-export interface InterlockRule {
+export interface InterlockDescription {
   name: string;
   action: "hold" | "slow";
   speed: number;

@@ -5,14 +5,15 @@ from typing import Any
 import msgspec
 import pytest
 
+from device_agent.config.interlock_rule import InterlockRule
 from device_agent.protocol import Measurements
 from device_agent.protocol.events import EventKind
-from device_agent.runtime.authority.interlocks import Interlock, Interlocks
+from device_agent.runtime.authority.interlocks import Interlocks, engagement
 from device_agent.runtime.readings import Reading, ReadingCache
 
 
-def rule(**fields: Any) -> Interlock:
-    return msgspec.convert({"device": "pir", "stream": "presence", "field": "present"} | fields, Interlock)
+def rule(**fields: Any) -> InterlockRule:
+    return msgspec.convert({"device": "pir", "stream": "presence", "field": "present"} | fields, InterlockRule)
 
 
 class TestRule:
@@ -27,9 +28,9 @@ class TestRule:
     )
     def test_it_acts_on_its_condition(self, fields: dict[str, Any], acting: list[float], free: list[float]) -> None:
         for value in acting:
-            assert rule(**fields).acts(Reading({"present": value}, 0.0)) == rule(**fields).condition
+            assert engagement(rule(**fields), Reading({"present": value}, 0.0)) == rule(**fields).condition
         for value in free:
-            assert rule(**fields).acts(Reading({"present": value}, 0.0)) is None
+            assert engagement(rule(**fields), Reading({"present": value}, 0.0)) is None
 
     @pytest.mark.parametrize(
         "reading",
@@ -45,7 +46,7 @@ class TestRule:
     )
     def test_it_acts_when_in_doubt(self, reading: Reading | None) -> None:
         for condition in ({"equals": True}, {"above": 0.5}, {"below": -0.5}):
-            assert rule(**condition).acts(reading)
+            assert engagement(rule(**condition), reading)
 
     @pytest.mark.parametrize(
         ("fields", "text"),
@@ -77,7 +78,7 @@ class TestRule:
 class Bench:
     """Interlocks, the room they watch, and what they did."""
 
-    def __init__(self, *rules: Interlock) -> None:
+    def __init__(self, *rules: InterlockRule) -> None:
         self.now_s = 10.0
         self.done: list[tuple[Any, ...]] = []
         self.told: list[Any] = []
@@ -110,7 +111,7 @@ NAME = "pir/presence present = true"
 
 def test_a_room_that_is_not_known_yet_holds() -> None:
     bench = Bench(rule(equals=True))
-    assert bench.step() == [(NAME, 0.0, "nothing was heard yet of pir/presence")]
+    assert bench.step() == [(NAME, 0.0, "no measurement of pir/presence has arrived")]
     assert bench.step(1.0) == [], "once"
     assert [happened.kind for happened in bench.told] == [EventKind.INTERLOCK_ENGAGED]
 

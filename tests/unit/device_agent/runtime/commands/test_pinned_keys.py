@@ -5,7 +5,8 @@ from pathlib import Path
 import pytest
 from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
 
-from device_agent.config.agent_config import ConfigError, Home, Pairing
+from device_agent.config.errors import ConfigError
+from device_agent.config.identity_store import IdentityStore, Pairing
 from device_agent.protocol import codec
 from device_agent.protocol.security import signing
 from device_agent.protocol.security.key_rotation import KEYS_CONTEXT, NewKey
@@ -28,19 +29,19 @@ def statement(
 
 
 class Kept:
-    """A home with one pinned key, and the cloud's time."""
+    """A store with one pinned key, and the cloud's time."""
 
     def __init__(self, folder: Path) -> None:
-        self.home = Home(folder)
+        self.store = IdentityStore(folder)
         self.now_ms: float | None = 1000
         keys = {name(FIRST): signing.public_text(FIRST.public_key())}
-        self.home.save_pairing(Pairing(agent="a", space="s", account="ann", keys=keys))
+        self.store.save_pairing(Pairing(agent="a", space="s", account="ann", keys=keys))
         self.pins = self.load()
 
     def load(self) -> PinnedKeys:
-        pairing = self.home.pairing()
+        pairing = self.store.pairing()
         assert pairing is not None
-        return PinnedKeys(pairing, save=self.home.save_pairing, now_ms=lambda: self.now_ms)
+        return PinnedKeys(pairing, save=self.store.save_pairing, now_ms=lambda: self.now_ms)
 
 
 @pytest.fixture
@@ -158,7 +159,7 @@ def test_what_is_told_again_by_a_key_that_was_dropped_changes_nothing(kept: Kept
     kept.pins.follow([first])
     kept.now_ms = ENDS_MS
     kept.pins.follow([statement(THIRD, SECOND, 3, ends_ms=2 * ENDS_MS)])
-    assert name(FIRST) not in kept.home.pairing().keys  # type: ignore[union-attr]
+    assert name(FIRST) not in kept.store.pairing().keys  # type: ignore[union-attr]
     kept.pins.follow([first])
     assert (set(kept.pins), kept.pins.serial) == ({name(SECOND), name(THIRD)}, 3)
 

@@ -9,6 +9,7 @@ from typing import Any
 
 import pytest
 
+from device_agent.config.interlock_rule import InterlockRule
 from device_agent.ports.sensor import Capture, Frame, SensorError
 from device_agent.ports.uploads import UploadError
 from device_agent.protocol import (
@@ -36,7 +37,6 @@ from device_agent.protocol import (
 from device_agent.protocol.codec import MAX_BYTES
 from device_agent.protocol.manifests.room import Control as RoomControl
 from device_agent.protocol.manifests.room import RoomDeviceManifest
-from device_agent.runtime.authority.interlocks import Interlock
 from device_agent.runtime.readings import ReadingCache
 from device_agent.runtime.room.room_device import RoomDevice
 from tests.harness.agent.device_harness import Bench, eventually, shown
@@ -399,7 +399,7 @@ def test_an_error_of_the_driver_is_a_fault_and_not_the_end_of_it(bench: RoomBenc
 
 
 def test_the_room_holds_a_room_device_too(tmp_path: Path) -> None:
-    rule = Interlock(device="other-zone", stream="presence", field="near", equals=1.0, stale_s=5.0)
+    rule = InterlockRule(device="other-zone", stream="presence", field="near", equals=1.0, stale_s=5.0)
     bench = RoomBench(tmp_path, interlocks=(rule,))
     try:
         refused = bench.done(SetControl(control="opening", value=0.1))

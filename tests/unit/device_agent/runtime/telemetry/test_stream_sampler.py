@@ -11,9 +11,9 @@ from typing import Any
 import msgspec
 import pytest
 
+from device_agent.config.interlock_rule import InterlockRule
 from device_agent.ports.driver import DriverError
 from device_agent.protocol import Measurements, Stream, codec, topics
-from device_agent.runtime.authority.interlocks import Interlock
 from device_agent.runtime.telemetry.stream_sampler import StreamSampler
 from tests.fakes.drivers import ToyDriver, robot_type
 from tests.harness.agent.device_harness import Bench, eventually
@@ -159,7 +159,7 @@ def test_a_script_reads_what_its_own_robot_measures(tmp_path: Path) -> None:
 
 def test_an_interlock_holds_a_robot_by_what_it_measures_itself(tmp_path: Path) -> None:
     kind = msgspec.structs.replace(robot_type(), streams=(SONAR,))
-    near = Interlock(device="arm", stream="sonar", field="distance_m", below=0.5)
+    near = InterlockRule(device="arm", stream="sonar", field="distance_m", below=0.5)
     away_m = [0.8]
     bench = Bench(tmp_path, kind=kind, driver=Gauge(sonar=lambda: {"distance_m": away_m[0]}), interlocks=[near])
     bench.device.start()
