@@ -61,7 +61,7 @@ def _pattern(machine: Machine) -> _Pattern:
     """Of the product's own arm."""
     with machine.api() as api:
         topic = api.device()["topic"]
-        issued = api.post("/mqtt/credentials", {"purpose": "watch"})
+        issued = api.post("/mqtt/credentials", {"purpose": "view"})
     login = Credentials(issued["username"], issued["password"])
     with Client(issued["client_id"], login, port=issued["tcp"]["port"]).open() as client:
         wanted = [f"{topic}/{kind}" for kind in ("desc", "desc/twin", "tele/joints")]

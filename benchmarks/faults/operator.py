@@ -42,7 +42,7 @@ class Hand:
         ground = self._ground
         granted = ground.post(f"{ground.device(STREAMED)}/lease", lease_ms=LEASE_MS, wait_ms=5000)
         self.epoch = granted["epoch"]
-        ear = self._stack.enter_context(ground.issued({"purpose": "watch"}, f"{ground.topic(STREAMED)}/tele/joints"))
+        ear = self._stack.enter_context(ground.issued({"purpose": "view"}, f"{ground.topic(STREAMED)}/tele/joints"))
         ear.hear = self._hear
         control = {"purpose": "control", "device": ground.device(STREAMED).rpartition("/")[2], "epoch": self.epoch}
         self._line = self._stack.enter_context(ground.issued(control))

@@ -42,7 +42,7 @@ class Stops:
         self._ground = ground
         self._chance = random.Random(seed)
         self._stack = contextlib.ExitStack()
-        self._line = self._stack.enter_context(ground.issued({"purpose": "watch"}))
+        self._line = self._stack.enter_context(ground.issued({"purpose": "view"}))
         self._number = 0
 
     def __enter__(self) -> Self:

@@ -135,7 +135,7 @@ class Load:
         epoch = granted["epoch"]
         try:
             control = {"purpose": "control", "device": device["id"], "epoch": epoch}
-            ear = self._connected(http, {"purpose": "watch"}, f"{device['topic']}/tele/joints")
+            ear = self._connected(http, {"purpose": "view"}, f"{device['topic']}/tele/joints")
             with ear as heard, self._connected(http, control) as line:
                 self._stream(http, lease, Streamed(device, epoch, heard, line))
         finally:
@@ -202,7 +202,7 @@ class Load:
 
     def _watch(self, http: httpx.Client, _number: int) -> None:
         """All that robots measure, for a while."""
-        with self._connected(http, {"purpose": "watch"}) as line:
+        with self._connected(http, {"purpose": "view"}) as line:
             self._ending.wait(self._hold_s)
             heard = line.heard.qsize()
             line.forget()
@@ -221,7 +221,7 @@ class Load:
                 # Always as much: an answer that grows with what was stored would look as if something leaked.
                 since_ms = round(time.time() * 1000) - _LOOKED_BACK_MS
                 api.get(f"/devices/{arm['id']}/data/{stream['name']}", resolution="10s", **{"from": since_ms})
-            assert api.http.put(f"/devices/{arm['id']}/watchers").is_success
+            assert api.http.put(f"/devices/{arm['id']}/viewers").is_success
             api.post("/auth/sign-out")
             self.count("HTTP requests", 9)
             self.count("sign-ins and sign-outs")

@@ -61,7 +61,7 @@ class Telescope:
         Raises:
             OSError: Not reached, or refused.
         """
-        return self._post("/mqtt/credentials", {"purpose": "watch"})
+        return self._post("/mqtt/credentials", {"purpose": "view"})
 
     def tls(self, given: dict[str, Any]) -> ssl.SSLContext | None:
         """How to connect to the broker that the credentials name.

@@ -198,7 +198,7 @@ class Conversation:
         self.robot.step()
         self.anna.get(path)
         assert self.again.post(f"{requests}/{first}/accept").status_code == 403
-        assert self.anna.post(f"{requests}/{first}/refuse").json()["outcome"] == "refused"
+        assert self.anna.post(f"{requests}/{first}/reject").json()["outcome"] == "rejected"
         assert self.anna.post(f"{requests}/{first}/accept", {"wait_ms": 0}).status_code == 409
         second = self.again.post(requests, asked).json()["request"]["id"]
         self.again.delete(f"{requests}/{second}")

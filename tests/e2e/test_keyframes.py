@@ -217,7 +217,7 @@ def test_the_same_editor_serves_every_robot(
         with laboratory.api() as api:
             kind = api.device(name)["robot_type"]
             source = page.get_by_test_id("kf-source").text_content()
-            assert api.post(f"/robot-types/{kind}/scripting/check", {"source": source})["marks"] == []
+            assert api.post(f"/robot-types/{kind}/scripting/check", {"source": source})["diagnostics"] == []
             assert api.http.delete(f"/robot-types/{kind}/movements/kf-look").is_success
 
 

@@ -157,7 +157,7 @@ def test_a_phone_shows_all_of_it_without_sideways_scrolling(browser: Browser, ma
 
 def credentials_of(machine: Machine) -> tuple[dict[str, Any], dict[str, Any]]:
     with machine.api() as api:
-        return api.device(), api.post("/mqtt/credentials", {"purpose": "watch"})
+        return api.device(), api.post("/mqtt/credentials", {"purpose": "view"})
 
 
 def mosquitto_sub(machine: Machine, topic: str, *more: str) -> "subprocess.CompletedProcess[str]":

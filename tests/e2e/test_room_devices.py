@@ -35,7 +35,7 @@ def api(laboratory: Machine) -> Iterator[Api]:
 @contextlib.contextmanager
 def watching(api: Api, device: dict[str, Any], *names: str) -> Iterator[Client]:
     """Somebody who may see the account's devices, listening to a class and name of one."""
-    given = api.post("/mqtt/credentials", {"purpose": "watch"})
+    given = api.post("/mqtt/credentials", {"purpose": "view"})
     login = Credentials(given["username"], given["password"])
     client = Client(given["client_id"], login, port=given["tcp"]["port"]).open()
     try:

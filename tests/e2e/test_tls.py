@@ -59,7 +59,7 @@ def test_all_of_it_speaks_tls(tmp_path: Path) -> None:
             device = api.device()
             taken = api.post(f"/devices/{device['id']}/lease", {"wait_ms": 10_000})
             assert taken["confirmed"], "the agent obeys over mqtts"
-            issued = api.post("/mqtt/credentials", {"purpose": "watch"})
+            issued = api.post("/mqtt/credentials", {"purpose": "view"})
             page = api.http.get(machine.url)
             assert page.headers["strict-transport-security"].startswith("max-age=")
             signed_in = api.http.post("/auth/sign-in", json={"link": link.partition("#sign-in=")[2]})

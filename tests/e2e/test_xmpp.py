@@ -181,7 +181,7 @@ def streaming(
     lease = api.post(f"/devices/{device['id']}/lease", {"wait_ms": 10_000})
     assert lease["confirmed"]
     given = [
-        api.post("/mqtt/credentials", {"purpose": "watch"}),
+        api.post("/mqtt/credentials", {"purpose": "view"}),
         api.post("/mqtt/credentials", {"purpose": "control", "device": device["id"], "epoch": lease["epoch"]}),
     ]
     port = machine.port + 1

@@ -91,7 +91,7 @@ describe("small things", () => {
   });
 
   it("why signing in elsewhere failed is a code, and nothing else", () => {
-    expect(signInFailure("#sign-in-failed=open-id-expired")).toBe("open-id-expired");
+    expect(signInFailure("#sign-in-failed=oidc-expired")).toBe("oidc-expired");
     for (const hash of ["", "#/", "#sign-in-failed=", "#sign-in-failed=<b>"]) expect(signInFailure(hash)).toBeNull();
   });
 

@@ -45,10 +45,10 @@ class Wire implements Link {
 
 const opened = (outcome: ControlRequest["outcome"] = "open"): ControlRequest => ({
   id: "r1",
-  by: "Bob",
+  requester: "Bob",
   epoch: 5,
   mine: true,
-  asked_at: new Date(Date.now()).toISOString(),
+  requested_at: new Date(Date.now()).toISOString(),
   expires_at: new Date(Date.now() + 30_000).toISOString(),
   outcome,
 });
@@ -95,7 +95,7 @@ class Desk extends Api {
 
   override withdrawRequest(_: string, id: string): Promise<void> {
     this.calls.push(`withdraw ${id}`);
-    return this.outcome === "accepted" ? Promise.reject(new ApiError(409, "request-over", "Accepted.")) : Promise.resolve();
+    return this.outcome === "accepted" ? Promise.reject(new ApiError(409, "control-request-closed", "Accepted.")) : Promise.resolve();
   }
 
   override answerRequest(_: string, id: string, accept: boolean): Promise<void> {
@@ -174,7 +174,7 @@ describe("who asks for control", () => {
     expect(control.epoch).toBe(6);
   });
 
-  it.each(["refused", "lapsed", "ended"] as const)("is told when it was %s, and moves nothing", async (how) => {
+  it.each(["rejected", "expired", "ended"] as const)("is told when it was %s, and moves nothing", async (how) => {
     await control.asking.ask();
     desk.outcome = how;
     await vi.advanceTimersByTimeAsync(1_000);
@@ -201,7 +201,7 @@ describe("who asks for control", () => {
     await vi.advanceTimersByTimeAsync(29_000);
     expect(control.asking.state.value.kind).toBe("open");
     await vi.advanceTimersByTimeAsync(8_000);
-    expect(control.asking.state.value).toMatchObject({ kind: "over", how: "lapsed" });
+    expect(control.asking.state.value).toMatchObject({ kind: "over", how: "expired" });
   });
 
   it("is told why asking failed", async () => {
@@ -268,7 +268,7 @@ describe("who has control", () => {
   });
 
   it("keeps it and is told where the answer came too late", async () => {
-    desk.trouble = new ApiError(409, "request-over", "It was not answered in time.");
+    desk.trouble = new ApiError(409, "control-request-closed", "It was not answered in time.");
     await control.answer(true);
     expect(control.epoch).toBe(5);
     expect(control.answered.value).toEqual({ kind: "failed", why: "It was not answered in time." });
@@ -282,9 +282,9 @@ describe("who else watches", () => {
     const said: string[] = [];
     let away = false;
     class Door extends Api {
-      override watch(): Promise<{ items: Watcher[]; again_ms: number }> {
+      override watch(): Promise<{ items: Watcher[]; refresh_ms: number }> {
         said.push("look");
-        return away ? Promise.reject(new ApiError(0, "unreachable", "No.")) : Promise.resolve({ items: [bob], again_ms: 10_000 });
+        return away ? Promise.reject(new ApiError(0, "unreachable", "No.")) : Promise.resolve({ items: [bob], refresh_ms: 10_000 });
       }
       override unwatch(): Promise<void> {
         said.push("leave");

@@ -12,7 +12,7 @@ let api: Api;
 const links: MqttLink[] = [];
 
 function open(): MqttLink {
-  const link = new MqttLink(() => api.credentials({ purpose: "watch" }));
+  const link = new MqttLink(() => api.credentials({ purpose: "view" }));
   links.push(link);
   return link;
 }

@@ -76,8 +76,8 @@ class Checker {
   fail: Error | null = null;
   #made = 0;
 
-  #type(state: "checking" | "ready" | "refused"): RobotType {
-    const upload = { version: 1, state, errors: state === "refused" ? this.errors : [], warnings: [], uploaded_at: "" };
+  #type(state: "checking" | "ready" | "rejected"): RobotType {
+    const upload = { version: 1, state, errors: state === "rejected" ? this.errors : [], warnings: [], uploaded_at: "" };
     return { type: "lever", upload } as unknown as RobotType;
   }
 
@@ -90,7 +90,7 @@ class Checker {
 
   lookAgain(id: string): Promise<Look> {
     this.open -= 1;
-    const state = this.open > 0 ? "checking" : this.errors.length > 0 ? "refused" : "ready";
+    const state = this.open > 0 ? "checking" : this.errors.length > 0 ? "rejected" : "ready";
     return Promise.resolve({ id, expires_at: "", robot_type: this.#type(state) });
   }
 

@@ -32,7 +32,7 @@ function bob(part: Partial<Share> = {}): Share {
   return {
     account: { id: "account0002", name: "Bob" },
     role: "operator",
-    by: "Ann",
+    created_by: "Ann",
     created_at: "2026-01-31T12:00:00.000Z",
     expires_at: null,
     ...part,
@@ -193,11 +193,11 @@ function record(part: Partial<AuditRecord>): AuditRecord {
   return {
     seq: 1,
     at: "2026-01-31T12:00:00.000Z",
-    what: "signed-in",
-    on: "",
+    event: "signed-in",
+    target: "",
     outcome: "done",
-    who: "Ann",
-    by_account: "account0001",
+    actor: "Ann",
+    account: "account0001",
     session: "s1",
     key: "",
     data: {},
@@ -217,7 +217,7 @@ describe("the record of what was done", () => {
     ];
     cloud.instead.set(`GET ${AUDIT}`, () => ({ status: 200, body: pages.shift() }));
     const reader = new AuditReader(api);
-    await reader.ask({ ...EVERYTHING, what: "signed-in" });
+    await reader.ask({ ...EVERYTHING, event: "signed-in" });
     expect(reader.records.value.map(({ seq }) => seq)).toEqual([90]);
     expect(reader.more.value).toBe(true);
     const last = cloud.instead.get(`GET ${AUDIT}`);
@@ -235,7 +235,7 @@ describe("the record of what was done", () => {
     const reader = new AuditReader(api);
     cloud.instead.set(`GET ${AUDIT}`, () => ({ status: 200, body: { items: [record({ seq: 1 })], cursor: null } }));
     const first = reader.ask(EVERYTHING);
-    const second = reader.ask({ ...EVERYTHING, what: "shared" });
+    const second = reader.ask({ ...EVERYTHING, event: "shared" });
     await Promise.all([first, second]);
     expect(reader.records.value).toHaveLength(1);
     expect(reader.busy.value).toBe(false);
@@ -243,9 +243,9 @@ describe("the record of what was done", () => {
 
   it("names accounts that acted or were shared with, and no API key for an account", () => {
     const names = accountsIn([
-      record({ by_account: "a1", who: "Ann" }),
-      record({ by_account: "a1", who: "Ann (dashboard)", key: "k1" }),
-      record({ by_account: "", who: "", data: { with: "b2", name: "Bob" } }),
+      record({ account: "a1", actor: "Ann" }),
+      record({ account: "a1", actor: "Ann (dashboard)", key: "k1" }),
+      record({ account: "", actor: "", data: { with: "b2", name: "Bob" } }),
     ]);
     expect([...names]).toEqual([
       ["a1", "Ann"],
@@ -264,25 +264,25 @@ describe("the record of what was done", () => {
       ]),
       keys: new Map([["k1", "dashboard"]]),
     };
-    const say = (what: string, part: Partial<AuditRecord> = {}): string => line(record({ what, ...part }), names);
+    const say = (event: string, part: Partial<AuditRecord> = {}): string => line(record({ event, ...part }), names);
     const never = { role: "operator", expires_ms: 2 ** 53 };
     expect(say("signed-in", { data: { how: "link" } })).toBe("Ann signed in with a link.");
-    expect(say("shared", { on: "device:abc-arm", data: { with: "b2", ...never } })).toBe(
+    expect(say("shared", { target: "device:abc-arm", data: { with: "b2", ...never } })).toBe(
       "Ann shared Arm with Bob as operator, until revoked.",
     );
-    expect(say("shared", { on: "space:lab", data: { with: "c3", name: "Cid", role: "viewer", expires_ms: 1e12 } })).toMatch(
+    expect(say("shared", { target: "space:lab", data: { with: "c3", name: "Cid", role: "viewer", expires_ms: 1e12 } })).toMatch(
       /^Ann shared Laboratory with Cid as viewer, until .*2001/,
     );
-    expect(say("unshared", { on: "device:abc-arm", data: { with: "b2" } })).toBe("Ann removed Bob’s access to Arm.");
-    expect(say("unshared", { on: "device:abc-arm", by_account: "b2", who: "Bob", data: { with: "b2" } })).toBe(
+    expect(say("unshared", { target: "device:abc-arm", data: { with: "b2" } })).toBe("Ann removed Bob’s access to Arm.");
+    expect(say("unshared", { target: "device:abc-arm", account: "b2", actor: "Bob", data: { with: "b2" } })).toBe(
       "Bob gave up access to Arm.",
     );
-    expect(say("unshared", { on: "device:gone", who: "", by_account: "", data: { with: "b2" } })).toMatch(/^Bob’s access to gone expired/);
-    expect(say("api-key-made", { on: "key:k1", data: { name: "dashboard", role: "viewer", only: ["space:lab"] } })).toBe(
+    expect(say("unshared", { target: "device:gone", actor: "", account: "", data: { with: "b2" } })).toMatch(/^Bob’s access to gone expired/);
+    expect(say("api-key-made", { target: "key:k1", data: { name: "dashboard", role: "viewer", only: ["space:lab"] } })).toBe(
       "Ann created the API key “dashboard”: viewer, only Laboratory.",
     );
-    expect(say("api-key-revoked", { on: "key:k1" })).toBe("Ann revoked the API key “dashboard”.");
+    expect(say("api-key-revoked", { target: "key:k1" })).toBe("Ann revoked the API key “dashboard”.");
     expect(say("stop-ordered", { data: { message: "Ann ordered a stop: test" } })).toBe("Ann ordered a stop: test");
-    expect(say("something-new", { on: "abc-arm" })).toBe("Ann: something-new, Arm.");
+    expect(say("something-new", { target: "abc-arm" })).toBe("Ann: something-new, Arm.");
   });
 });

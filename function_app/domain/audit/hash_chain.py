@@ -14,7 +14,7 @@ from typing import Any, Final, Literal
 
 from function_app.domain.identity.accounts import Identity
 
-Outcome = Literal["done", "refused", "failed", "unknown"]
+Outcome = Literal["done", "rejected", "failed", "unknown"]
 """``unknown``: whoever did it was killed in the middle; look at what it is about."""
 CLOUD: Final = "cloud"
 """The chain of what belongs to no account."""

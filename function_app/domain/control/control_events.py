@@ -61,7 +61,7 @@ def timed_out(lease: Lease | None, now_ms: int) -> Iterator[ControlEvent]:
     if lease is None:
         return
     asked = lease.request
-    if asked is not None and asked.outcome == "open" and asked.current_outcome(lease, now_ms) == "lapsed":
+    if asked is not None and asked.outcome == "open" and asked.current_outcome(lease, now_ms) == "expired":
         yield _of_request(asked, Fact.REQUEST_LAPSED, asked.expires_ms, f"Nobody answered {asked.by} in time.")
     if lease.account and not lease.action and not lease.is_live(now_ms):
         message = f"The lease of {lease.holder} ran out."
@@ -125,7 +125,7 @@ def _of_asking(before: Lease | None, after: Lease, *, by: str, now_ms: int) -> I
     if asked.outcome == "open":
         message = f"{asked.by} asked {after.holder} for control."
         yield _of_request(asked, Fact.REQUESTED, now_ms, message)
-    elif asked.outcome == "refused":
+    elif asked.outcome == "rejected":
         yield _of_request(asked, Fact.REQUEST_REFUSED, now_ms, f"{by} kept control; {asked.by} had asked for it.")
     elif asked.outcome == "withdrawn":
         yield _of_request(asked, Fact.REQUEST_WITHDRAWN, now_ms, f"{asked.by} no longer asks for control.")

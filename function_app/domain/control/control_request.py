@@ -19,14 +19,14 @@ def request_control(
     """The lease with a request of ``caller``; as it is when they ask already.
 
     Raises:
-        Problem: ``lease-free``, ``lease-yours``, ``lease-requested``: somebody else was first.
+        Problem: ``lease-free``, ``lease-already-held``, ``lease-requested``: somebody else was first.
     """
     if lease is None or not lease.is_live(now_ms):
         detail = "Nobody controls this device. Take the lease; there is nobody to ask."
         raise Problem("lease-free", 409, "Nobody holds the lease", detail)
     if lease.held_by(caller):
         detail = "You control this device already, in this very session."
-        raise Problem("lease-yours", 409, "The lease is yours", detail, extras={"epoch": lease.epoch})
+        raise Problem("lease-already-held", 409, "The lease is yours", detail, extras={"epoch": lease.epoch})
     existing = lease.request
     if existing is not None and existing.current_outcome(lease, now_ms) == "open":
         if existing.requested_by(caller):
@@ -34,7 +34,7 @@ def request_control(
         detail = (
             f"{existing.by} asks for control already. Wait for the answer, or until {rfc3339(existing.expires_ms)}."
         )
-        extras = {"by": existing.by, "expires_at": rfc3339(existing.expires_ms)}
+        extras = {"requester": existing.by, "expires_at": rfc3339(existing.expires_ms)}
         raise Problem("lease-requested", 409, "Somebody else asks already", detail, extras=extras)
     asked = ControlRequest(
         id=request,
@@ -55,7 +55,7 @@ def accept(lease: Lease | None, caller: Identity, *, request: str, now_ms: int) 
     """The lease of whoever asked, with the next epoch; as it is when that was done already.
 
     Raises:
-        Problem: ``request-unknown``, ``forbidden``, ``request-over``.
+        Problem: ``request-unknown``, ``forbidden``, ``control-request-closed``.
     """
     current, asked = _to_answer(lease, caller, request)
     if not _still(current, asked, "accepted", now_ms):
@@ -76,19 +76,19 @@ def refuse(lease: Lease | None, caller: Identity, *, request: str, now_ms: int) 
     """The lease as it is, the request refused; the same when that was done already.
 
     Raises:
-        Problem: ``request-unknown``, ``forbidden``, ``request-over``.
+        Problem: ``request-unknown``, ``forbidden``, ``control-request-closed``.
     """
     current, asked = _to_answer(lease, caller, request)
-    if not _still(current, asked, "refused", now_ms):
+    if not _still(current, asked, "rejected", now_ms):
         return current
-    return replace(current, request=replace(asked, outcome="refused"))
+    return replace(current, request=replace(asked, outcome="rejected"))
 
 
 def withdraw(lease: Lease | None, caller: Identity, *, request: str, now_ms: int) -> Lease:
     """The lease as it is, the request gone; the same when it was over already, unless it was accepted.
 
     Raises:
-        Problem: ``request-unknown``, ``forbidden``, ``request-over``.
+        Problem: ``request-unknown``, ``forbidden``, ``control-request-closed``.
     """
     current, asked = find(lease, request)
     if not asked.requested_by(caller):
@@ -129,12 +129,12 @@ def _still(lease: Lease, asked: ControlRequest, wanted: Outcome, now_ms: int) ->
 
 _ENDS: dict[Outcome, str] = {
     "accepted": "It was accepted: whoever asked has control.",
-    "refused": "It was refused: control stays where it is.",
+    "rejected": "It was refused: control stays where it is.",
     "withdrawn": "Whoever asked has withdrawn it.",
-    "lapsed": "It was not answered in time: control stays where it is. Ask again if need be.",
+    "expired": "It was not answered in time: control stays where it is. Ask again if need be.",
     "ended": "The lease that it asked for has ended. Look who has control now.",
 }
 
 
 def _over(how: Outcome) -> Problem:
-    return Problem("request-over", 409, "The request is over", _ENDS[how], extras={"outcome": how})
+    return Problem("control-request-closed", 409, "The request is over", _ENDS[how], extras={"outcome": how})

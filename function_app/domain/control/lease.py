@@ -7,7 +7,7 @@ from function_app.domain.common.problems import Problem
 from function_app.domain.common.timestamps import rfc3339
 from function_app.domain.identity.accounts import Identity
 
-Outcome = Literal["open", "accepted", "refused", "withdrawn", "lapsed", "ended"]
+Outcome = Literal["open", "accepted", "rejected", "withdrawn", "expired", "ended"]
 """Of a request for control. ``ended``: the lease that it asks for has ended otherwise; look who has control now."""
 
 
@@ -42,7 +42,7 @@ class ControlRequest:
         if self.outcome != "open":
             return self.outcome
         if now_ms >= self.expires_ms:
-            return "lapsed"
+            return "expired"
         return "open" if lease.epoch == self.epoch and lease.is_live(now_ms) else "ended"
 
     def requested_by(self, caller: Identity) -> bool:

@@ -3,7 +3,7 @@
 from dataclasses import dataclass, field, replace
 from typing import Any, Literal
 
-State = Literal["uploading", "checking", "ready", "refused"]
+State = Literal["uploading", "checking", "ready", "rejected"]
 
 
 @dataclass(frozen=True, slots=True)

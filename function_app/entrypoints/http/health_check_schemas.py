@@ -2,10 +2,10 @@
 
 from typing import Literal
 
-from function_app.entrypoints.http.framework.schemas import Answer
+from function_app.entrypoints.http.framework.schemas import Response
 
 
-class HealthOut(Answer, frozen=True, kw_only=True):
+class HealthOut(Response, frozen=True, kw_only=True):
     """``ok``, or a sentence, for each thing the functions need."""
 
     status: Literal["ok", "degraded"]

@@ -65,10 +65,10 @@ def control_request(asked: ControlRequest, found: Lease, who: Identity, now_ms: 
     """A request for control."""
     return leases.ControlRequestOut(
         id=asked.id,
-        by=asked.by,
+        requester=asked.by,
         epoch=asked.epoch,
         mine=asked.requested_by(who),
-        asked_at=rfc3339(asked.asked_ms),
+        requested_at=rfc3339(asked.asked_ms),
         expires_at=rfc3339(asked.expires_ms),
         outcome=asked.current_outcome(found, now_ms),
     )
@@ -83,7 +83,7 @@ def action(found: Action, position: int | None = None) -> actions.ActionOut:
         status=found.status.value,
         queue_position=position,
         epoch=found.epoch,
-        who=found.who,
+        caller=found.who,
         created_at=rfc3339(found.created_ms),
         deadline_at=rfc3339(found.deadline_ms),
         times={f"{status}_ms": at_ms for status, at_ms in found.times.items()},
@@ -143,15 +143,17 @@ def twin(found: Model) -> robot_types.RobotTypeTwin:
     )
 
 
-def look(found: Preview) -> robot_types.TypePreviewOut:
+def look(found: Preview) -> robot_types.RobotTypePreviewOut:
     """An upload that is looked at."""
     upload = found.upload
     known = KnownType(found.manifest, upload.version, upload.files, usable=upload.state == "ready", upload=upload)
-    return robot_types.TypePreviewOut(id=found.id, expires_at=rfc3339(found.expires_ms), robot_type=robot_type(known))
+    return robot_types.RobotTypePreviewOut(
+        id=found.id, expires_at=rfc3339(found.expires_ms), robot_type=robot_type(known)
+    )
 
 
-def _upload(upload: TypeVersion) -> robot_types.TypeUploadOut:
-    return robot_types.TypeUploadOut(
+def _upload(upload: TypeVersion) -> robot_types.RobotTypeUploadOut:
+    return robot_types.RobotTypeUploadOut(
         version=upload.version,
         state=_upload_state(upload),
         errors=() if upload.open else upload.errors,

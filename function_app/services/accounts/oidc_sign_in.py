@@ -91,7 +91,7 @@ class OidcSignIn:
             invitation: The secret of one that whoever signs in brings along.
 
         Raises:
-            Problem: ``open-id-unknown``: there is no provider; ``open-id-unavailable``; ``invitation-unknown``.
+            Problem: ``oidc-unknown``: there is no provider; ``oidc-unavailable``; ``invitation-unknown``.
         """
         provider = self._known()
         brought = (await self._invitations.look(invitation)).id if invitation else ""
@@ -102,7 +102,7 @@ class OidcSignIn:
         except OidcError as error:
             _log.error("sign-in elsewhere: %s", error)
             detail = "The sign-in provider cannot be used now; the log of this server says why."
-            raise Problem("open-id-unavailable", 503, "No sign-in elsewhere now", detail, retry_after_s=30) from error
+            raise Problem("oidc-unavailable", 503, "No sign-in elsewhere now", detail, retry_after_s=30) from error
         hashed = _hash(state)
         data = {
             "nonce": nonce,
@@ -118,9 +118,9 @@ class OidcSignIn:
         """Sign in whoever comes back. What was begun is used up by it, whatever becomes of it.
 
         Raises:
-            Problem: ``open-id-unknown``: there is no provider; ``open-id-expired``: this was not begun here, in this
-                browser, just now; ``open-id-refused``: the provider, or what came from it, does not sign them in;
-                ``open-id-uninvited``: they have no account here, and none is made for them.
+            Problem: ``oidc-unknown``: there is no provider; ``oidc-expired``: this was not begun here, in this
+                browser, just now; ``oidc-rejected``: the provider, or what came from it, does not sign them in;
+                ``oidc-uninvited``: they have no account here, and none is made for them.
         """
         provider = self._known()
         begun = await self._begun(returned)
@@ -143,7 +143,7 @@ class OidcSignIn:
         if is_new and existing is None and not self._anyone:
             await self._refuse_stranger(subject, whence)
         account = await self._sign_in.account_elsewhere(subject.issuer, subject.id, subject.name)
-        done = await self._sessions.begin(account, "open-id", whence)
+        done = await self._sessions.begin(account, "oidc", whence)
         if existing is not None:
             await self._take(Identity(account.id, account.name, done.session), existing)
         return done
@@ -166,7 +166,7 @@ class OidcSignIn:
             _log.warning("sign-in elsewhere: the invitation of a new account came to nothing: %s", problem.detail)
 
     async def _refuse_stranger(self, subject: Subject, whence: SignInOrigin) -> NoReturn:
-        code = "open-id-uninvited"
+        code = "oidc-uninvited"
         _log.warning("sign-in elsewhere: %r (%r) has no account here and was not invited", subject.name, subject.id)
         await self._audit_log.record_rejection(
             CLOUD, AccountEvent.SIGN_IN_REFUSED, None, code=code, address=whence.address
@@ -176,9 +176,7 @@ class OidcSignIn:
 
     async def _begun(self, returned: OidcCallback) -> dict[str, str]:
         hashed = _hash(returned.state)
-        expired = Problem(
-            "open-id-expired", 403, "Begin again", "This sign-in was not begun here just now. Begin again."
-        )
+        expired = Problem("oidc-expired", 403, "Begin again", "This sign-in was not begun here just now. Begin again.")
         row = await self._tables.get(records.SIGN_INS, hashed[0], hashed)
         if row is None or not hmac.compare_digest(str(row.data["secret"]), _hash(returned.secret)):
             raise expired
@@ -193,13 +191,13 @@ class OidcSignIn:
     def _known(self) -> OidcProvider:
         if self._provider is None:
             detail = "Nobody signs in elsewhere at this server. Use a password or a one-time link."
-            raise Problem("open-id-unknown", 404, "No sign-in elsewhere", detail)
+            raise Problem("oidc-unknown", 404, "No sign-in elsewhere", detail)
         return self._provider
 
 
 def _refused() -> Problem:
     detail = "The sign-in provider did not sign you in. Try again, or ask whoever runs this server: its log says why."
-    return Problem("open-id-refused", 403, "Not signed in", detail)
+    return Problem("oidc-rejected", 403, "Not signed in", detail)
 
 
 def _hash(text: str) -> str:

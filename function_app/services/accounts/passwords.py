@@ -99,12 +99,12 @@ class Passwords:
         page that is signed in does not keep the account.
 
         Raises:
-            Problem: ``password-elsewhere``, ``forbidden``, ``password-weak``, ``too-many-tries``.
+            Problem: ``password-not-managed-here``, ``forbidden``, ``password-weak``, ``too-many-tries``.
         """
         named = await self._sign_in.known(caller.name)
         if named is None or named.id != caller.account:
             detail = "This account signs in elsewhere and has no password here. Change it there."
-            raise Problem("password-elsewhere", 409, "No password here", detail)
+            raise Problem("password-not-managed-here", 409, "No password here", detail)
         row = await self._tables.get(records.ACCOUNTS, caller.account, _PASSWORD)
         await self._require_right(caller, row, old, whence)
         data = records.to_data(await self._store(password, caller.name))

@@ -149,7 +149,7 @@ class AuditLog:
             yield change
         except Problem as problem:
             change.data["code"] = problem.code
-            await change.end("failed" if problem.status >= _SERVER_ERROR else "refused")
+            await change.end("failed" if problem.status >= _SERVER_ERROR else "rejected")
             raise
         await change.end("done")
 
@@ -181,7 +181,7 @@ class AuditLog:
         self._refused[key] = now_ms
         _bound(self._refused, key)
         try:
-            await self.record(owner, what, caller, on=on, outcome="refused", **data)
+            await self.record(owner, what, caller, on=on, outcome="rejected", **data)
         except (StoreError, Problem) as error:
             _log.warning("audit of a refusal: %s", error)
 

@@ -181,7 +181,7 @@ class ControlEvents:
                 message,
                 caller=caller,
                 severity="warning",
-                outcome="refused",
+                outcome="rejected",
                 data={"caller": caller.name, "wanted": what, "code": problem.code},
             )
         except (StoreError, Problem) as error:

@@ -73,7 +73,7 @@ class ControlRequests:
             shows it.
 
         Raises:
-            Problem: ``device-unknown``, ``forbidden``, ``lease-free``, ``lease-yours``, ``lease-requested``, ``busy``.
+            Problem: ``device-unknown``, ``forbidden``, ``lease-free``, ``lease-already-held``, ``lease-requested``, ``busy``.
         """
         device = await self._devices.get(caller, device_id)
         created = new_id()
@@ -108,7 +108,7 @@ class ControlRequests:
             The lease, the request, and whether the device has confirmed within ``wait_ms``.
 
         Raises:
-            Problem: ``device-unknown``, ``forbidden``, ``request-unknown``, ``request-over``, ``asker-gone``, ``busy``.
+            Problem: ``device-unknown``, ``forbidden``, ``request-unknown``, ``control-request-closed``, ``requester-offline``, ``busy``.
         """
         device = await self._devices.get(caller, device_id)
         async with self._control_events.recording_rejections(device, caller, "hand control over"):
@@ -131,7 +131,7 @@ class ControlRequests:
         """Keep control.
 
         Raises:
-            Problem: ``device-unknown``, ``forbidden``, ``request-unknown``, ``request-over``, ``busy``.
+            Problem: ``device-unknown``, ``forbidden``, ``request-unknown``, ``control-request-closed``, ``busy``.
         """
         device = await self._devices.get(caller, device_id)
         async with self._control_events.recording_rejections(device, caller, "refuse control"):
@@ -145,7 +145,7 @@ class ControlRequests:
         """Ask no longer.
 
         Raises:
-            Problem: ``device-unknown``, ``forbidden``, ``request-unknown``, ``request-over``, ``busy``.
+            Problem: ``device-unknown``, ``forbidden``, ``request-unknown``, ``control-request-closed``, ``busy``.
         """
         device = await self._devices.get(caller, device_id)
         async with self._control_events.recording_rejections(device, caller, "withdraw a request for control"):
@@ -189,4 +189,4 @@ class ControlRequests:
 
 def _asker_gone(by: str, then: str) -> Problem:
     detail = f"{by} has signed out, or may not operate this device any more. {then}"
-    return Problem("asker-gone", 409, "Who asked is gone", detail)
+    return Problem("requester-offline", 409, "Who asked is gone", detail)

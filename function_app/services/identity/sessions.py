@@ -20,7 +20,7 @@ from function_app.services.identity.authenticator import (
 from function_app.services.storage import records
 from function_app.services.storage.retention import Retention
 
-How = Literal["link", "password", "open-id"]
+How = Literal["link", "password", "oidc"]
 FRESH_MS: Final = 10 * 60 * 1000
 """A session begun by a one-time link so lately may set a password without the old one."""
 _SHOWN: Final = 200

@@ -104,7 +104,7 @@ class RobotTypeCleanup:
     async def _look_at(self, where: Place, head: TypeHead, row: Row) -> None:
         version = records.read(row, TypeVersion)
         now_ms = self._clock.now_ms()
-        if version.state == "refused" and version.version < head.last:
+        if version.state == "rejected" and version.version < head.last:
             await self._drop(where, row, version)
         elif not head.needs(version.version):
             # Superseded ones stay for a day, for who has begun to download.

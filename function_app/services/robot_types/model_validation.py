@@ -133,7 +133,7 @@ async def store_verdict(
         if not upload.open or not head.needs(number):
             return
         wrong = _sentences((*upload.errors, *errors))
-        state: State = "refused" if wrong else "ready"
+        state: State = "rejected" if wrong else "ready"
         done = replace(upload, state=state, errors=wrong, warnings=warnings, checked_ms=now_ms)
         version_row = Row(row.partition, row.key, records.to_data(done), row.etag)
         writes = [Write("replace", version_row)]

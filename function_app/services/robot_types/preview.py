@@ -185,11 +185,11 @@ class RobotTypePreview:
             live = upload is not None and self._clock.now_ms() < upload.created_ms + KEEP_LOOK_MS
             if upload is not None and live and head is not None and not head.deleted:
                 return where, upload
-        raise not_found("look", look)
+        raise not_found("robot-type-preview", look)
 
 
 def _require_good(upload: TypeVersion) -> None:
-    if upload.state == "refused":
+    if upload.state == "rejected":
         raise refused(upload)
     if upload.state != "ready":
         raise Problem("robot-type-not-ready", 409, "Not checked yet", "The upload is still being checked.")

@@ -64,7 +64,7 @@ class RobotTypeUpload:
 
         Raises:
             Problem: ``manifest-invalid``, ``robot-type-invalid``, ``robot-type-built-in``, ``robot-types-full``,
-                ``robot-type-checking``, ``robot-type-refused`` with ``errors``.
+                ``robot-type-checking``, ``robot-type-rejected`` with ``errors``.
         """
         return await self.add(caller, read_upload(manifest, files), wait_ms=wait_ms)
 
@@ -81,7 +81,7 @@ class RobotTypeUpload:
         await self._index(where)
         await self._versions.store(where, version, given.files)
         done = await self._versions.verdict(where, version, wait_ms)
-        if done is not None and done.state == "refused":
+        if done is not None and done.state == "rejected":
             raise refused(done)
         return await self._types.view(caller, where.type), new
 

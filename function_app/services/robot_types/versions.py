@@ -65,4 +65,4 @@ class TypeVersions:
 def refused(upload: TypeVersion) -> Problem:
     """The refusal with all that is wrong."""
     detail = " ".join(upload.errors) or "The model was refused."
-    return invalid(detail, code="robot-type-refused", errors=list(upload.errors), version=upload.version)
+    return invalid(detail, code="robot-type-rejected", errors=list(upload.errors), version=upload.version)

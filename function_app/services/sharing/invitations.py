@@ -117,7 +117,7 @@ class Invitations:
         """A new invitation, and its secret, which nobody can be told again.
 
         Raises:
-            Problem: ``already-yours``, ``too-many-invitations``.
+            Problem: ``already-owner``, ``too-many-invitations``.
         """
         if offer.role is Role.OWNER and offer.account == shared.owner.id:
             raise own_share_error(
@@ -233,7 +233,7 @@ class Invitations:
 
         Raises:
             Problem: ``invitation-unknown``; ``forbidden``: it is for another account, or an API key asks;
-                ``already-yours``, ``last-space``, ``space-unknown``, ``too-many-shares``, ``transfer-void``, ``busy``.
+                ``already-owner``, ``last-space``, ``space-unknown``, ``too-many-shares``, ``transfer-impossible``, ``busy``.
         """
         require_person(caller)
         offered = existing.invitation
@@ -307,7 +307,7 @@ class Invitations:
         try:
             await self._ownership_transfer.carry_out(taken)
         except Problem as problem:
-            if problem.code != "transfer-void":
+            if problem.code != "transfer-impossible":
                 raise
             await self._delete(invitation, taken)
             raise _Void from problem

@@ -47,7 +47,7 @@ class OwnershipTransfer:
         """Do what is left of it.
 
         Raises:
-            Problem: ``busy``; ``transfer-void``: the agent is no longer whose it was offered by.
+            Problem: ``busy``; ``transfer-impossible``: the agent is no longer whose it was offered by.
         """
         kind, name = split_target(taken.on)
         if kind == "agent":
@@ -106,4 +106,4 @@ class OwnershipTransfer:
 def invalidate() -> Problem:
     """What was offered is not the offerer's any more."""
     detail = "It has gone to somebody else, or was un-paired, since it was offered. Ask its owner for a new invitation."
-    return Problem("transfer-void", 409, "It cannot be handed over", detail)
+    return Problem("transfer-impossible", 409, "It cannot be handed over", detail)

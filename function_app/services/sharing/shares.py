@@ -155,7 +155,7 @@ class Sharing:
         """Give one's own part in something of another's back; whether everybody has been told, as ``end``.
 
         Raises:
-            Problem: ``share-unknown``, ``already-yours``, ``forbidden``, ``busy``.
+            Problem: ``share-unknown``, ``already-owner``, ``forbidden``, ``busy``.
         """
         require_person(caller)
         row = await self._tables.get(records.SHARES, on, share_key(caller.account))
@@ -317,7 +317,7 @@ def require_person(caller: Identity) -> None:
 
 def own_share_error(detail: str) -> Problem:
     """The refusal of what nobody can do with what is their own."""
-    return Problem("already-yours", 409, "It is yours", detail)
+    return Problem("already-owner", 409, "It is yours", detail)
 
 
 def about_share(note: str) -> bool:

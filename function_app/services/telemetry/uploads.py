@@ -130,7 +130,7 @@ class Uploads:
         """Register what was uploaded. Safe to repeat.
 
         Raises:
-            Problem: ``upload-unknown``, ``upload-missing``, ``upload-wrong``, ``busy``.
+            Problem: ``upload-unknown``, ``upload-missing``, ``upload-mismatch``, ``busy``.
         """
         waiting = await self._tables.get(records.UPLOADS, _partition(device), _waiting(upload[:_ID]))
         if waiting is None:
@@ -232,7 +232,7 @@ class Uploads:
         """Whether its content has the hash it was said to have; what is too large to read here is not looked at.
 
         Raises:
-            Problem: ``upload-missing``, ``upload-wrong``.
+            Problem: ``upload-missing``, ``upload-mismatch``.
         """
         length = await self._blobs.size(capture.blob)
         if length is None:
@@ -249,7 +249,7 @@ class Uploads:
 
     async def _refuse(self, capture: Capture, why: str) -> NoReturn:
         await self._blobs.delete(capture.blob)
-        raise Problem("upload-wrong", 409, "Something else was uploaded", f"{why}. It was deleted; upload it again.")
+        raise Problem("upload-mismatch", 409, "Something else was uploaded", f"{why}. It was deleted; upload it again.")
 
     async def _refuse_too_many(self, device: Device) -> None:
         page = await self._tables.query(

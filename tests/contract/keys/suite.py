@@ -120,7 +120,9 @@ class KeysSuite:
         assert (await keys.news()).statements == ()
         assert (await keys.news()).serial == 3
 
-    async def test_another_process_knows_a_new_key_when_it_meets_a_token_of_it(self, keys: SigningKeys, again: Again) -> None:
+    async def test_another_process_knows_a_new_key_when_it_meets_a_token_of_it(
+        self, keys: SigningKeys, again: Again
+    ) -> None:
         other = await again()
         await other.current()
         new = await rotate(keys)

@@ -169,7 +169,7 @@ class Ground:
 
     def ear(self, agent: str) -> Client:
         """What a page hears at the broker of an agent."""
-        issued = self.anna.post("/mqtt/credentials", {"purpose": "watch"}).json()
+        issued = self.anna.post("/mqtt/credentials", {"purpose": "view"}).json()
         credentials = Credentials(issued["username"], issued["password"])
         client = self.broker.now.connect(issued["client_id"], credentials)
         filters = [pattern for pattern in issued["subscribe"] if pattern.split("/")[3] == agent]

@@ -171,7 +171,7 @@ class XmppSite:
 
     def person(self, who: Person) -> "XmppClient":
         """A person's own XMPP client."""
-        given = who.post("/xmpp/credentials", {"purpose": "watch"}).json()
+        given = who.post("/xmpp/credentials", {"purpose": "view"}).json()
         return self.client(who.account, given["password"])
 
 

@@ -250,7 +250,7 @@ def test_a_wrong_message_costs_no_other(server: Server, agent: Agent) -> None:
 def test_what_is_refused_for_ever_is_not_confirmed_and_makes_it_ask_whose_it_is(server: Server, agent: Agent) -> None:
     agent.start()
     before = agent.checks
-    server.on_tell = lambda messages: (200, {"results": [{"status": "refused", "detail": "No."} for _ in messages]})
+    server.on_tell = lambda messages: (200, {"results": [{"status": "rejected", "detail": "No."} for _ in messages]})
     delivered: list[bool] = []
     agent.transport.publish(EVENT, b'{"n":1}', qos=1, delivered=lambda: delivered.append(True))
     wait_until(lambda: agent.checks > before, "the question")

@@ -101,7 +101,7 @@ class TestCookie:
             ("POST", "/agents/claim", {"code": "BCDF-GHJK"}),
             ("PUT", "/robot-types/ur5/movements/mine", {"source": "1"}),
             ("DELETE", "/agents/abcdefgh23", None),
-            ("POST", "/mqtt/credentials", {"purpose": "watch"}),
+            ("POST", "/mqtt/credentials", {"purpose": "view"}),
             ("POST", "/devices/abcdefgh23-arm/stop", None),
         ):
             for wrong in ("", "x", "ü", other, me["csrf_token"] + "x", me["csrf_token"][:-1]):

@@ -31,7 +31,7 @@ def test_an_action_waits_until_it_has_started_and_then_until_it_is_done(pair: Pa
     assert answer.headers["location"] == f"{API}/actions/{action['id']}"
     assert action["status"] == "started"
     assert action["device"] == robot.device
-    assert action["who"] == "anna"
+    assert action["caller"] == "anna"
     assert {"published_ms", "received_ms", "accepted_ms", "started_ms"} <= set(action["times"])
     done = anna.begin("GET", f"/actions/{action['id']}", params={"wait_ms": 20_000})
     robot.report(action["id"], AckStatus.DONE, result={"reached": True}, output="there\n")

@@ -89,15 +89,15 @@ def test_a_key_may_do_what_its_description_says_and_nothing_else(
     refused = set()
     for name, (method, path, takes_keys) in operations.items():
         place = re.sub(r"{(\w+)(:path)?}", lambda found: ids.get(found[1], "x"), path).removeprefix(API)
-        body = {"json": {"purpose": "watch"}} if name == "xmpp_credentials" else {}
+        body = {"json": {"purpose": "view"}} if name == "xmpp_credentials" else {}
         answer = program.ask(method, place, **body)
         assert answer.status_code not in {401, 500}, f"{name}: {answer.text}"
         if not takes_keys:
             assert "API key" in problem(answer, 403, "forbidden")["detail"], name
             refused.add(name)
     assert {
-        "make_api_key", "revoke_api_key", "list_api_keys", "put_password", "list_sessions", "end_other_sessions",
-        "sign_out", "claim_agent", "unpair_agent", "move_agent", "make_space", "put_movement", "get_movement",
+        "create_api_key", "revoke_api_key", "list_api_keys", "put_password", "list_sessions", "end_other_sessions",
+        "sign_out", "claim_agent", "unpair_agent", "move_agent", "create_space", "put_movement", "get_movement",
         "add_robot_type", "reset_stop", "begin_upload", "xmpp_credentials",
     } <= refused  # fmt: skip
     assert not {name for name in operations if "share" in name or "invit" in name or "transfer" in name} - refused
@@ -116,7 +116,7 @@ def test_a_viewers_key_moves_and_stops_nothing(pair: Pair) -> None:
     assert program.get(f"/devices/{robot.device}").json()["role"] == "viewer"
     for path, body in (("lease", {}), ("actions", {"request": MOVE}), ("stop", {})):
         problem(program.post(f"/devices/{robot.device}/{path}", body), 403, "forbidden")
-    issued = program.post("/mqtt/credentials", {"purpose": "watch"}).json()
+    issued = program.post("/mqtt/credentials", {"purpose": "view"}).json()
     assert issued["publish"] == []
     assert issued["subscribe"]
 
@@ -135,7 +135,7 @@ def test_a_key_is_kept_to_its_devices(cloud: Cloud) -> None:
         assert [each["id"] for each in program.get("/devices").json()["items"]] == [arm]
         problem(program.get(f"/devices/{leg}"), 404, "device-unknown")
         problem(program.take(leg), 404, "device-unknown")
-        issued = program.post("/mqtt/credentials", {"purpose": "watch"}).json()
+        issued = program.post("/mqtt/credentials", {"purpose": "view"}).json()
         assert not [topic for topic in (*issued["subscribe"], *issued["publish"]) if "/leg/" in topic]
         _, whole = make(anna, "operator", f"space:{robot.space}")
         assert len(whole.get("/devices").json()["items"]) == 2
@@ -234,9 +234,9 @@ class TestRevoking:
         epoch = program.take(robot.device, lease_ms=600_000, wait_ms=10_000).json()["epoch"]
         control = {"purpose": "control", "device": robot.device, "epoch": epoch}
         given = [
-            program.post("/mqtt/credentials", {"purpose": "watch"}).json(),
+            program.post("/mqtt/credentials", {"purpose": "view"}).json(),
             program.post("/mqtt/credentials", control).json(),
-            other.post("/mqtt/credentials", {"purpose": "watch"}).json(),
+            other.post("/mqtt/credentials", {"purpose": "view"}).json(),
         ]
         lines = [broker.connect(each["client_id"], Credentials(each["username"], each["password"])) for each in given]
         assert all(line.connected.is_set() for line in lines)

@@ -29,7 +29,7 @@ WHO = Identity(OWNER, "anna", "s")
 def kinds(person: Person, **query: Any) -> list[str]:
     answer = person.get("/accounts/me/audit", params=query)
     assert answer.status_code == 200, answer.text
-    return [record["what"] for record in answer.json()["items"]]
+    return [record["event"] for record in answer.json()["items"]]
 
 
 def verdict(cloud: Cloud, chain: str, *expected: Head) -> str:
@@ -50,18 +50,18 @@ class TestWhatIsRecorded:
             problem(anna.post("/agents/claim", {"code": "BCDF-GHJK"}), 404, "claim-code-unknown")
             assert anna.delete(f"/agents/{robot.id}").status_code == 204
         items = anna.get("/accounts/me/audit").json()["items"]
-        found = [(item["what"], item["outcome"], item["session"], item["on"]) for item in reversed(items)]
+        found = [(item["event"], item["outcome"], item["session"], item["target"]) for item in reversed(items)]
         assert [each for each in found if "sign" not in each[0]] == [
             ("agent-claimed", "done", anna.session, robot.id),
             ("control-taken", "done", anna.session, device),
-            ("order-refused", "refused", again.session, device),
+            ("order-refused", "rejected", again.session, device),
             ("stop-ordered", "done", anna.session, device),
             ("stop-reset-ordered", "done", anna.session, device),
-            ("claim-refused", "refused", anna.session, ""),
+            ("claim-refused", "rejected", anna.session, ""),
             ("agent-unpaired", "done", anna.session, robot.id),
         ]
-        stop = next(item for item in items if item["what"] == "stop-ordered")
-        assert (stop["who"], stop["by_account"], stop["data"]["reason"]) == ("anna", anna.account, "look out")
+        stop = next(item for item in items if item["event"] == "stop-ordered")
+        assert (stop["actor"], stop["account"], stop["data"]["reason"]) == ("anna", anna.account, "look out")
         assert verdict(cloud, anna.account) == ""
 
     def test_who_signs_in_and_out_and_who_tries_in_vain_is_recorded_without_any_secret(self, cloud: Cloud) -> None:
@@ -99,8 +99,8 @@ class TestWhatIsRecorded:
         secret = anna.post(f"/devices/{device}/invitations", {"role": "viewer"}).json()["secret"]
         assert bert.post("/invitations/redeem", {"secret": secret}).status_code == 200
         problem(bert.take(device), 403, "forbidden")
-        items = [item for item in reversed(anna.get("/accounts/me/audit").json()["items"]) if device in item["on"]]
-        assert [(item["what"], item["who"]) for item in items] == [
+        items = [item for item in reversed(anna.get("/accounts/me/audit").json()["items"]) if device in item["target"]]
+        assert [(item["event"], item["actor"]) for item in items] == [
             ("shared", "anna"),
             ("control-taken", "bert"),
             ("unshared", "anna"),
@@ -119,8 +119,8 @@ class TestWhatIsRecorded:
         problem(anna.put("/robot-types/ur5/movements/mine", {"source": "("}), 422, "movement-invalid")
         anna.delete("/robot-types/ur5/movements/mine")
         problem(anna.delete("/robot-types/ur5/movements/mine"), 404, "movement-unknown")
-        items = anna.get("/accounts/me/audit", params={"on": "ur5/mine"}).json()["items"]
-        assert [item["what"] for item in items] == ["movement-deleted", "movement-saved", "movement-saved"]
+        items = anna.get("/accounts/me/audit", params={"target": "ur5/mine"}).json()["items"]
+        assert [item["event"] for item in items] == ["movement-deleted", "movement-saved", "movement-saved"]
         assert [item["data"]["version"] for item in items[1:]] == [2, 1]
 
     def test_one_reads_it_newest_first_page_by_page_and_only_ones_own(self, cloud: Cloud) -> None:
@@ -131,7 +131,7 @@ class TestWhatIsRecorded:
         seen: list[int] = []
         cursor = None
         while True:
-            query = {"limit": 4, "what": "even"} | ({"cursor": cursor} if cursor else {})
+            query = {"limit": 4, "event": "even"} | ({"cursor": cursor} if cursor else {})
             page = anna.get("/accounts/me/audit", params=query).json()
             seen += [item["seq"] for item in page["items"]]
             cursor = page["cursor"]
@@ -139,7 +139,7 @@ class TestWhatIsRecorded:
                 break
         assert len(seen) == 13
         assert seen == sorted(seen, reverse=True)
-        assert kinds(anna, on="d3", what="odd") == ["odd", "odd", "odd"]
+        assert kinds(anna, target="d3", event="odd") == ["odd", "odd", "odd"]
         assert kinds(anna, to=1) == []
         assert not {"even", "odd"} & set(kinds(bert))
         for cursor in ("x", "-1", "9" * 13, "\u0661"):

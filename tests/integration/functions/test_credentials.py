@@ -31,7 +31,7 @@ def test_watching_hears_every_device_of_the_account_and_no_other(
 ) -> None:
     anna, robot = pair
     with paired(cloud, "anna", "left", "right") as (_, second), paired(cloud, "bert") as (_, foreign):
-        answer = anna.post("/mqtt/credentials", {"purpose": "watch"})
+        answer = anna.post("/mqtt/credentials", {"purpose": "view"})
         issued = answer.json()
         assert answer.headers["cache-control"] == "no-store"
         bases = [f"ts/v1/{each.space}/{each.id}/{name}" for each in (robot, second) for name in each.names]
@@ -112,7 +112,7 @@ def test_an_agent_speaks_for_its_own_devices(pair: Pair) -> None:
 def test_a_person_is_no_agent_and_an_agent_no_person(cloud: Cloud, pair: Pair) -> None:
     anna, robot = pair
     problem(anna.post("/mqtt/credentials", {"purpose": "agent"}), 401, "unauthorized")
-    for body in ({"purpose": "watch"}, {"purpose": "control", "device": robot.device, "epoch": 1}):
+    for body in ({"purpose": "view"}, {"purpose": "control", "device": robot.device, "epoch": 1}):
         problem(robot.ask("POST", "/mqtt/credentials", json=body), 401, "unauthorized")
     for path in ("/devices", "/accounts/me", "/agents"):
         problem(robot.ask("GET", path), 401, "unauthorized")
@@ -120,12 +120,12 @@ def test_a_person_is_no_agent_and_an_agent_no_person(cloud: Cloud, pair: Pair) -
 
 
 def test_somebody_without_devices_may_watch_nothing(cloud: Cloud, broker: RunningBroker) -> None:
-    issued = cloud.sign_in("clara").post("/mqtt/credentials", {"purpose": "watch"}).json()
+    issued = cloud.sign_in("clara").post("/mqtt/credentials", {"purpose": "view"}).json()
     assert (issued["publish"], issued["subscribe"]) == ([], [])
     with connect(broker, issued) as client:
         assert client.subscribe("ts/v1/#") == [128]
 
 
-@pytest.mark.parametrize("body", [{}, {"purpose": "root"}, {"purpose": "control"}, {"purpose": "watch", "device": "x"}])
+@pytest.mark.parametrize("body", [{}, {"purpose": "root"}, {"purpose": "control"}, {"purpose": "view", "device": "x"}])
 def test_another_purpose_there_is_not(pair: Pair, body: dict[str, str]) -> None:
     problem(pair[0].post("/mqtt/credentials", body), 422, "invalid")

@@ -142,7 +142,7 @@ class TestGiven:
         taken = person.take(robot.device, lease_ms=600_000).json()
         assert taken["lease_ms"] <= 45_000
         control = {"purpose": "control", "device": robot.device, "epoch": taken["epoch"]}
-        for purpose in ({"purpose": "watch"}, control):
+        for purpose in ({"purpose": "view"}, control):
             assert 0 < person.post("/mqtt/credentials", purpose).json()["lifetime_s"] <= 45, purpose
 
     @pytest.mark.parametrize("broker", BROKERS, indirect=True)
@@ -155,8 +155,8 @@ class TestGiven:
         anna = cloud.sign_in("anna")
         epoch = program.take(robot.device, lease_ms=600_000).json()["epoch"]
         control = {"purpose": "control", "device": robot.device, "epoch": epoch}
-        lines = [self.connect(broker, program, purpose) for purpose in ({"purpose": "watch"}, control)]
-        hers = self.connect(broker, anna, {"purpose": "watch"})
+        lines = [self.connect(broker, program, purpose) for purpose in ({"purpose": "view"}, control)]
+        hers = self.connect(broker, anna, {"purpose": "view"})
         cloud.clock.advance(600)
         began_s = time.monotonic()
         cloud.sweep()
@@ -206,7 +206,7 @@ def test_what_a_key_asks_for_while_it_is_revoked_comes_to_nothing(
 
     monkeypatch.setattr(devices, name, meanwhile)
     if what == "credentials":
-        answer = program.post("/mqtt/credentials", {"purpose": "watch"})
+        answer = program.post("/mqtt/credentials", {"purpose": "view"})
     elif what == "control":
         answer = program.take(robot.device)
     else:

@@ -43,7 +43,7 @@ def test_they_are_shown_newest_first_page_by_page_with_both_times(cloud: Cloud, 
     newest = shown[0]
     assert newest["data"] == {"code": "expired", "epoch": 4}
     assert (newest["kind"], newest["severity"]) == ("command-rejected", "warning")
-    assert newest["at"] < newest["heard_at"]
+    assert newest["at"] < newest["received_at"]
 
 
 def test_a_cursor_of_another_list_is_refused(pair: Pair) -> None:

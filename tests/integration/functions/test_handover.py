@@ -93,7 +93,7 @@ def test_what_is_asked_for_and_accepted_is_the_askers_with_the_next_epoch(held: 
 def test_what_is_refused_stays_where_it_is_and_may_be_asked_for_again(held: Three) -> None:
     anna, other, robot = held
     request = asked(other, robot)
-    assert anna.post(at(robot, request, "refuse")).json()["outcome"] == "refused"
+    assert anna.post(at(robot, request, "reject")).json()["outcome"] == "rejected"
     wait_until(lambda: robot.heard(WithdrawRequest), "the end of the request")
     assert robot.heard(WithdrawRequest)[0].request == WithdrawRequest(request=request)
     assert lease(other, robot)["request"] is None
@@ -110,7 +110,7 @@ def test_what_is_withdrawn_is_over(held: Three) -> None:
     assert other.delete(at(robot, request)).status_code == 204
     wait_until(lambda: robot.heard(WithdrawRequest), "the end of the request")
     assert outcome(anna, robot, request) == "withdrawn"
-    over = problem(anna.post(at(robot, request, "accept")), 409, "request-over")
+    over = problem(anna.post(at(robot, request, "accept")), 409, "control-request-closed")
     assert over["outcome"] == "withdrawn"
     assert lease(anna, robot)["epoch"] == 1
     assert "control-request-withdrawn" in told(anna, robot)
@@ -120,9 +120,9 @@ def test_silence_takes_control_from_nobody(cloud: Cloud, held: Three) -> None:
     anna, other, robot = held
     request = asked(other, robot, within_ms=5_000)
     cloud.clock.advance(5)
-    assert outcome(other, robot, request) == "lapsed"
-    for verb in ("accept", "refuse"):
-        problem(anna.post(at(robot, request, verb)), 409, "request-over")
+    assert outcome(other, robot, request) == "expired"
+    for verb in ("accept", "reject"):
+        problem(anna.post(at(robot, request, verb)), 409, "control-request-closed")
     assert other.delete(at(robot, request)).status_code == 204
     now = lease(anna, robot)
     assert (now["epoch"], now["mine"], now["request"]) == (1, True, None)
@@ -143,7 +143,7 @@ def test_only_one_asks_at_a_time_and_asking_again_is_the_same_request(cloud: Clo
     again = ask(other, robot)
     assert (again.status_code, again.json()["request"]["id"]) == (200, request)
     refused = problem(ask(third, robot), 409, "lease-requested")
-    assert refused["by"] == "anna"
+    assert refused["requester"] == "anna"
     assert lease(third, robot)["request"]["id"] == request
     assert other.delete(at(robot, request)).status_code == 204
     assert asked(third, robot)
@@ -153,7 +153,7 @@ def test_only_who_was_asked_answers(cloud: Cloud, held: Three) -> None:
     _, other, robot = held
     request = asked(other, robot)
     for person in (other, cloud.sign_in("anna")):
-        for verb in ("accept", "refuse"):
+        for verb in ("accept", "reject"):
             problem(person.post(at(robot, request, verb)), 403, "forbidden")
     problem(cloud.sign_in("bert").post(at(robot, request, "accept")), 404, "device-unknown")
     assert outcome(other, robot, request) == "open"
@@ -166,14 +166,14 @@ def test_an_answer_given_twice_is_given_once(held: Three) -> None:
     again = anna.post(at(robot, request, "accept")).json()
     assert (first["epoch"], again["epoch"], again["request"]["outcome"]) == (2, 2, "accepted")
     assert [command.epoch for command in robot.heard(GrantLease)] == [1, 2]
-    problem(anna.post(at(robot, request, "refuse")), 409, "request-over")
-    problem(other.delete(at(robot, request)), 409, "request-over")
+    problem(anna.post(at(robot, request, "reject")), 409, "control-request-closed")
+    problem(other.delete(at(robot, request)), 409, "control-request-closed")
     assert lease(other, robot)["epoch"] == 2
 
 
 def test_what_nobody_holds_cannot_be_asked_for_and_ones_own_neither(held: Three) -> None:
     anna, other, robot = held
-    problem(ask(anna, robot), 409, "lease-yours")
+    problem(ask(anna, robot), 409, "lease-already-held")
     anna.delete(f"/devices/{robot.device}/lease?epoch=1")
     problem(ask(other, robot), 409, "lease-free")
     for person in (anna, other):
@@ -196,7 +196,7 @@ def test_a_request_ends_with_the_lease_that_it_asks_for_and_gives_control_to_nob
     }
     ends[how]()
     assert outcome(other, robot, request) == "ended"
-    problem(anna.post(at(robot, request, "accept")), 409, "request-over")
+    problem(anna.post(at(robot, request, "accept")), 409, "control-request-closed")
     if how == "taken again":
         assert lease(anna, robot)["mine"] is True
     else:
@@ -266,7 +266,7 @@ def test_who_may_no_longer_operate_is_given_nothing(held: Three, monkeypatch: py
         return known, link
 
     monkeypatch.setattr(devices_service.DeviceAccess, "find_with_link", found)
-    assert "stays with you" in problem(anna.post(at(robot, request, "accept")), 409, "asker-gone")["detail"]
+    assert "stays with you" in problem(anna.post(at(robot, request, "accept")), 409, "requester-offline")["detail"]
     assert lease(anna, robot)["epoch"] == 1
 
 
@@ -274,9 +274,9 @@ def test_who_has_signed_out_is_given_nothing(held: Three) -> None:
     anna, other, robot = held
     request = asked(other, robot)
     assert other.post("/auth/sign-out").status_code == 204
-    problem(anna.post(at(robot, request, "accept")), 409, "asker-gone")
+    problem(anna.post(at(robot, request, "accept")), 409, "requester-offline")
     assert lease(anna, robot)["mine"] is True
-    assert anna.post(at(robot, request, "refuse")).json()["outcome"] == "refused"
+    assert anna.post(at(robot, request, "reject")).json()["outcome"] == "rejected"
 
 
 def test_a_refusal_that_cannot_be_told_is_a_refusal_still(
@@ -369,7 +369,7 @@ def test_while_the_broker_is_away_the_tables_decide_and_nothing_is_confirmed(
     monkeypatch.setattr(cloud.functions.access, "revoke", gone)
     answer = ask(other, robot)
     assert (answer.status_code, answer.json()["confirmed"]) == (201, False)
-    assert anna.post(at(robot, answer.json()["request"]["id"], "refuse")).json()["outcome"] == "refused"
+    assert anna.post(at(robot, answer.json()["request"]["id"], "reject")).json()["outcome"] == "rejected"
     given = anna.post(at(robot, asked(other, robot), "accept")).json()
     assert (given["epoch"], given["confirmed"], given["request"]["outcome"]) == (2, False, "accepted")
     assert lease(other, robot)["mine"] is True

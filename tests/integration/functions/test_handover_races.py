@@ -23,7 +23,7 @@ RAISES = {"accept", "take over", "reset"}
 DEVICES_OF_AGENT = 20
 ENDS = {
     "control-handed-over": "accepted",
-    "control-request-refused": "refused",
+    "control-request-refused": "rejected",
     "control-request-withdrawn": "withdrawn",
 }
 
@@ -107,7 +107,7 @@ async def look(functions: Functions, scene: Scene, number: int, did: dict[str, s
     kinds = Counter(event["kind"] for event in events)
     assert [ENDS[kind] for kind in kinds if kind in ENDS] == [outcome] * (outcome in ENDS.values()), (did, kinds)
     assert (did["accept"] == "done") == (outcome == "accepted"), (did, outcome)
-    assert (did["refuse"] == "done") == (outcome == "refused"), (did, outcome)
+    assert (did["refuse"] == "done") == (outcome == "rejected"), (did, outcome)
     assert kinds["control-released"] == (did["release"] == "done")
     assert kinds["control-taken"] + kinds["control-taken-over"] == 1 + (did["take over"] == "done")
     assert max(kinds[kind] for kind in ENDS) <= 1

@@ -46,8 +46,8 @@ def test_a_link_gives_what_it_says_to_the_first_who_brings_it(cloud: Cloud, thre
     assert made["link"].endswith(f"/#invitation={made['secret']}")
     shown = {name: made[name] for name in made if name not in {"secret", "link"}}
     assert anna.get(at).json() == {"items": [shown], "cursor": None}
-    assert bert.post("/invitations/look", {"secret": made["secret"]}).json() == shown
-    assert (shown["kind"], shown["target"], shown["by"], shown["uses"]) == ("device", robot.device, "anna", 1)
+    assert bert.post("/invitations/lookup", {"secret": made["secret"]}).json() == shown
+    assert (shown["kind"], shown["target"], shown["created_by"], shown["uses"]) == ("device", robot.device, "anna", 1)
     assert redeem(bert, made).json() == shown
     assert roles(bert) == {robot.device: "operator"}
     (share,) = anna.get(f"/devices/{robot.device}/shares").json()["items"]
@@ -90,7 +90,7 @@ def test_a_link_is_no_good_once_it_is_late_withdrawn_for_another_or_void(cloud: 
         for more in ({"expires_in_s": 60}, {}, {"account": "anna"}, {"expires_in_s": 600})
     )
     problem(redeem(bert, hers), 403, "forbidden")
-    problem(redeem(anna, back), 409, "already-yours")
+    problem(redeem(anna, back), 409, "already-owner")
     assert anna.delete(f"{at}/{back['id']}").status_code == 204
     problem(anna.delete(f"{at}/{back['id']}"), 404, "invitation-unknown")
     problem(bert.delete(f"{at}/{void['id']}"), 404, "device-unknown")
@@ -99,7 +99,7 @@ def test_a_link_is_no_good_once_it_is_late_withdrawn_for_another_or_void(cloud: 
     robot.pair(anna)
     for made in (late, back, void, {"secret": "guess"}):
         told = problem(redeem(bert, made), 404, "invitation-unknown")
-        assert told == problem(bert.post("/invitations/look", {"secret": made["secret"]}), 404, "invitation-unknown")
+        assert told == problem(bert.post("/invitations/lookup", {"secret": made["secret"]}), 404, "invitation-unknown")
     assert roles(bert) == {}
     cloud.clock.advance(DAY_S)
     for _ in range(3):
@@ -188,7 +188,7 @@ def test_offers_of_a_space_have_a_list_of_their_own_that_says_for_whom_they_are(
     assert [item["id"] for item in anna.get(links).json()["items"]] == [share["id"]]
     problem(bert.get(offers), 404, "space-unknown")
     problem(bert.delete(f"{offers}/{made['id']}"), 404, "space-unknown")
-    assert bert.post("/invitations/look", {"secret": open_to_all["secret"]}).json()["account"] is None
+    assert bert.post("/invitations/lookup", {"secret": open_to_all["secret"]}).json()["account"] is None
     assert anna.delete(f"{offers}/{made['id']}").status_code == 204
     assert [item["id"] for item in anna.get(offers).json()["items"]] == [open_to_all["id"]]
     problem(redeem(bert, made), 404, "invitation-unknown")

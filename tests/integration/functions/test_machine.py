@@ -127,7 +127,7 @@ class Machine(RuleBasedStateMachine):
         action = data.draw(st.sampled_from(list(self.open)))
         for _ in range(2 if again else 1):
             answer = self.robot.tell_ack(action, status)
-            assert answer["status"] in {"stored", "refused"}, answer
+            assert answer["status"] in {"stored", "rejected"}, answer
 
     @precondition(lambda self: self.open)
     @rule(data=st.data(), name=PEOPLE)

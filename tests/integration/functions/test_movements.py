@@ -106,7 +106,11 @@ def test_a_version_is_not_saved_over_one_that_its_author_has_not_seen(anna: Pers
 
 def test_a_script_is_checked_without_being_saved_and_an_editor_learns_what_there_is(anna: Person) -> None:
     checked = anna.post(f"{UR5}/scripting/check", {"source": '"""Wave."""\nrobot.home(\n'}).json()
-    assert (checked["savable"], checked["marks"][0]["line"], checked["marks"][0]["severity"]) == (False, 2, "error")
+    assert (checked["savable"], checked["diagnostics"][0]["line"], checked["diagnostics"][0]["severity"]) == (
+        False,
+        2,
+        "error",
+    )
     good = '"""Wave."""\nPARAMETERS = {"speed": {"type": "number", "default": 1}}\nrobot.posture("x")\n'
     checked = anna.post(f"{UR5}/scripting/check", {"source": good}).json()
     assert (checked["savable"], checked["description"]) == (True, "Wave.")

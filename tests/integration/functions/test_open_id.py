@@ -89,7 +89,7 @@ class Browser:
         assert answer.status_code == 200, answer.text
         assert answer.headers["cache-control"] == "no-store"
         assert invitation not in answer.text + str(answer.headers)
-        return str(answer.json()["address"])
+        return str(answer.json()["url"])
 
     def back(self, place: httpx.URL) -> httpx.Response:
         return self.cloud.run(self.page.get(place.raw_path.decode()))
@@ -103,7 +103,7 @@ class Browser:
 
 def failed(answer: httpx.Response, why: str) -> None:
     """It leads to the page that says why, and to no session."""
-    assert (answer.status_code, answer.headers["location"]) == (303, f"{BASE}/#sign-in-failed=open-id-{why}")
+    assert (answer.status_code, answer.headers["location"]) == (303, f"{BASE}/#sign-in-failed=oidc-{why}")
     assert "set-cookie" not in answer.headers
 
 
@@ -119,7 +119,7 @@ def test_somebody_signs_in_and_is_the_same_account_the_next_time(here: Cloud) ->
     assert me["csrf_token"]
     assert len(here.run(browser.page.get(f"{API}/spaces")).json()["items"]) == 1
     (session,) = here.run(browser.page.get(f"{API}/accounts/me/sessions")).json()["items"]
-    assert (session["how"], session["mine"]) == ("open-id", True)
+    assert (session["method"], session["mine"]) == ("oidc", True)
     again.sign_in("anna")
     assert again.me().json()["id"] == me["id"]
     other.sign_in("bert")
@@ -127,7 +127,9 @@ def test_somebody_signs_in_and_is_the_same_account_the_next_time(here: Cloud) ->
     headers = {"X-CSRF-Token": me["csrf_token"]}
     body = {"password": "correct horse battery"}
     problem(
-        here.run(browser.page.put(f"{API}/accounts/me/password", json=body, headers=headers)), 409, "password-elsewhere"
+        here.run(browser.page.put(f"{API}/accounts/me/password", json=body, headers=headers)),
+        409,
+        "password-not-managed-here",
     )
 
 
@@ -154,7 +156,7 @@ class TestWhoMayCome:
         assert browser.me().status_code == 401
         assert self.accounts(closed) == before
         refused = closed.run(closed.functions.tables.query(records.AUDIT, CLOUD, first="record:", last="record;")).rows
-        assert "open-id-uninvited" in {row.data["data"].get("code") for row in refused}
+        assert "oidc-uninvited" in {row.data["data"].get("code") for row in refused}
 
     def test_who_was_invited_has_an_account_and_what_was_offered_and_comes_again(self, closed: Cloud) -> None:
         owner = closed.sign_in("anna")
@@ -210,11 +212,11 @@ def test_the_browser_is_sent_with_what_makes_the_way_back_its_own(here: Cloud, p
 
 
 def test_the_page_is_told_how_one_may_sign_in(here: Cloud, cloud: Cloud) -> None:
-    elsewhere = {"name": "The lab's", "address": START}
-    assert here.ask("GET", f"{API}/auth/methods").json() == {"link": True, "password": True, "open_id": elsewhere}
-    assert cloud.ask("GET", f"{API}/auth/methods").json() == {"link": True, "password": True, "open_id": None}
+    elsewhere = {"name": "The lab's", "url": START}
+    assert here.ask("GET", f"{API}/auth/methods").json() == {"link": True, "password": True, "oidc": elsewhere}
+    assert cloud.ask("GET", f"{API}/auth/methods").json() == {"link": True, "password": True, "oidc": None}
     for path in (START, f"{CALLBACK}?code=x&state=y"):
-        problem(cloud.ask("GET", path), 404, "open-id-unknown")
+        problem(cloud.ask("GET", path), 404, "oidc-unknown")
 
 
 def test_a_way_back_is_good_once_and_in_the_browser_that_began(here: Cloud) -> None:
@@ -236,7 +238,7 @@ def test_somebody_elses_code_signs_nobody_in(here: Cloud) -> None:
     anna, mallory = Browser(here), Browser(here)
     stolen = sign_in_there(anna.start(), "anna").params["code"]
     own = sign_in_there(mallory.start(), "mallory")
-    failed(mallory.back(own.copy_set_param("code", stolen)), "refused")
+    failed(mallory.back(own.copy_set_param("code", stolen)), "rejected")
     assert mallory.me().status_code == 401
 
 
@@ -245,7 +247,7 @@ def test_a_code_is_used_once(here: Cloud) -> None:
     first = sign_in_there(anna.start(), "anna")
     anna.back(first)
     second = sign_in_there(anna.start(), "anna")
-    failed(anna.back(second.copy_set_param("code", first.params["code"])), "refused")
+    failed(anna.back(second.copy_set_param("code", first.params["code"])), "rejected")
 
 
 def test_a_way_back_from_another_provider_is_refused(here: Cloud) -> None:
@@ -254,7 +256,7 @@ def test_a_way_back_from_another_provider_is_refused(here: Cloud) -> None:
         lambda url: url.copy_remove_param("iss"),
     ):
         browser = Browser(here)
-        failed(browser.back(change(sign_in_there(browser.start(), "anna"))), "refused")
+        failed(browser.back(change(sign_in_there(browser.start(), "anna"))), "rejected")
         assert browser.me().status_code == 401
 
 
@@ -268,7 +270,7 @@ def test_who_takes_too_long_begins_again(here: Cloud) -> None:
 def test_whom_the_provider_refuses_is_told(here: Cloud) -> None:
     browser = Browser(here)
     state = parse_qs(urlsplit(browser.start()).query)["state"][0]
-    failed(browser.back(httpx.URL(f"{REDIRECT}?error=access_denied&state={state}")), "refused")
+    failed(browser.back(httpx.URL(f"{REDIRECT}?error=access_denied&state={state}")), "rejected")
 
 
 def test_a_provider_with_new_keys_is_believed_at_once(home: Path, key: SigningKey) -> None:
@@ -290,7 +292,7 @@ def test_a_provider_with_new_keys_is_believed_at_once(home: Path, key: SigningKe
 def test_a_provider_that_is_away_is_no_fault_of_the_caller(home: Path) -> None:
     with opened(home, "http://127.0.0.1:1") as cloud:
         answer = cloud.ask("GET", START)
-        problem(answer, 503, "open-id-unavailable")
+        problem(answer, 503, "oidc-unavailable")
         assert answer.headers["retry-after"] == "30"
 
 

@@ -31,7 +31,7 @@ def stands(anna: Person, bert: Person, robot: Robot) -> None:
 def test_an_owner_cannot_leave_or_lower_themselves_and_is_told_how_to_give_it_away(three: Three, kind: str) -> None:
     anna, bert, robot = three
     at = f"/{kind}/{robot.device if kind == 'devices' else robot.space}/shares"
-    left = problem(anna.delete(f"{at}/{anna.account}"), 409, "already-yours")
+    left = problem(anna.delete(f"{at}/{anna.account}"), 409, "already-owner")
     lowered = problem(anna.post(at, {"account": "anna", "role": "viewer"}), 422, "invalid")
     for told in (left, lowered):
         assert "transfer" in told["detail"].lower()
@@ -60,9 +60,9 @@ def test_nothing_is_handed_to_its_owner(three: Three) -> None:
     anna, bert, robot = three
     anna.post("/spaces", {"name": "second"})
     for path in (f"/agents/{robot.id}/transfers", f"/spaces/{robot.space}/transfers"):
-        problem(anna.post(path, {"account": "anna"}), 409, "already-yours")
+        problem(anna.post(path, {"account": "anna"}), 409, "already-owner")
         for_anybody = anna.post(path, {}).json()
-        problem(anna.post("/invitations/redeem", {"secret": for_anybody["secret"]}), 409, "already-yours")
+        problem(anna.post("/invitations/redeem", {"secret": for_anybody["secret"]}), 409, "already-owner")
     stands(anna, bert, robot)
 
 
@@ -75,7 +75,7 @@ def test_an_invitation_that_its_maker_tries_is_not_used_up(cloud: Cloud, three: 
         else anna.post(f"/devices/{robot.device}/invitations", {"role": role})
     ).json()
     for _ in range(2):
-        problem(anna.post("/invitations/redeem", {"secret": made["secret"]}), 409, "already-yours")
+        problem(anna.post("/invitations/redeem", {"secret": made["secret"]}), 409, "already-owner")
     stands(anna, bert, robot)
     anna.delete(f"/devices/{robot.device}/lease?epoch=1")
     clara = cloud.sign_in("clara")

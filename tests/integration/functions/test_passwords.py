@@ -199,11 +199,11 @@ class TestSessions:
         body = {"name": "anna", "password": GOOD}
         phone = cloud.run(client.post(f"{API}/auth/password", json=body)).json()["session"]
         newest, first = anna.get(SESSIONS).json()["items"]
-        assert (newest["id"], newest["how"], newest["address"], newest["program"], newest["mine"]) == (
+        assert (newest["id"], newest["method"], newest["address"], newest["program"], newest["mine"]) == (
             phone, "password", "192.0.2.9", "Phone", False,
         )  # fmt: skip
-        assert (first["id"], first["how"], first["mine"]) == (anna.session, "link", True)
-        assert cloud.sign_in("bert").get(SESSIONS).json()["items"][0]["how"] == "link"
+        assert (first["id"], first["method"], first["mine"]) == (anna.session, "link", True)
+        assert cloud.sign_in("bert").get(SESSIONS).json()["items"][0]["method"] == "link"
 
     def test_one_is_ended_and_only_ones_own(self, cloud: Cloud, anna: Person) -> None:
         other, stranger = cloud.sign_in("anna"), cloud.sign_in("bert")

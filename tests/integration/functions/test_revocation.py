@@ -246,7 +246,7 @@ def test_control_is_not_handed_to_somebody_who_is_unshared_at_that_moment(
     at = f"/devices/{robot.device}/lease/requests"
     request = bert.post(at, {}).json()["request"]["id"]
     unshare_at(monkeypatch, operator, "written")
-    problem(anna.post(f"{at}/{request}/accept"), 409, "asker-gone")
+    problem(anna.post(f"{at}/{request}/accept"), 409, "requester-offline")
     assert anna.get(f"/devices/{robot.device}/lease").json()["lease"] is None
     assert [command.request.holder for command in robot.heard(GrantLease)] == ["anna"]  # type: ignore[union-attr]
 
@@ -267,7 +267,7 @@ def test_credentials_that_are_made_while_their_device_is_unshared_are_no_good(
         return given
 
     monkeypatch.setattr(access, "issue", issue)
-    problem(bert.post("/mqtt/credentials", {"purpose": "watch"}), 503, "busy")
+    problem(bert.post("/mqtt/credentials", {"purpose": "view"}), 503, "busy")
     ((grant, given),) = made
     with broker.connect(grant.client_id, given) as client:
         assert not client.connected.is_set()

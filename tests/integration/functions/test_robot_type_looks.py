@@ -26,7 +26,7 @@ from tests.integration.functions.test_robot_types import (
     stop_after,
 )
 
-LOOKS = "/robot-type-looks"
+LOOKS = "/robot-type-previews"
 _SLOW_MS = 600_000
 """No machine takes as long to compile the lever."""
 
@@ -79,12 +79,12 @@ class TestLook:
             assert all(item["built_in"] for item in anna.get("/robot-types").json()["items"])
             bert = cloud.sign_in("bert")
             for path in (at, f"{at}/twin"):
-                problem(bert.get(path), 404, "look-unknown")
-            problem(bert.post(f"{at}/save"), 404, "look-unknown")
+                problem(bert.get(path), 404, "robot-type-preview-unknown")
+            problem(bert.post(f"{at}/save"), 404, "robot-type-preview-unknown")
             problem(anna.get(f"/robot-types/~{found['id']}"), 404, "robot-type-unknown")
             saved = anna.post(f"{at}/save", {"wait_ms": 30_000})
         assert (saved.status_code, saved.json()["state"], saved.json()["version"]) == (201, "ready", 1)
-        problem(anna.get(at), 404, "look-unknown")
+        problem(anna.get(at), 404, "robot-type-preview-unknown")
         assert anna.get("/robot-types/lever/files/robot.toml").text == manifest()
         shown = anna.get("/robot-types/lever/twin").json()
         assert shown["bodies"] == twin["bodies"]
@@ -122,7 +122,7 @@ class TestFindings:
         torn = SCENE.replace("</worldbody>", "</worldbdy>")
         found = checked(cloud, anna, wide, lever__xml=model, scene__xml=torn, movements={"up": "robot.home(\n"})
         errors = found["robot_type"]["upload"]["errors"]
-        assert found["robot_type"]["upload"]["state"] == "refused"
+        assert found["robot_type"]["upload"]["state"] == "rejected"
         assert len(errors) == 5, errors
         text = "\n".join(errors)
         for words in (
@@ -133,8 +133,8 @@ class TestFindings:
             "scene.xml: mismatched tag: line 3",
         ):
             assert words in text, words
-        problem(anna.post(f"{LOOKS}/{found['id']}/save"), 422, "robot-type-refused")
-        problem(anna.get(f"{LOOKS}/{found['id']}/twin"), 422, "robot-type-refused")
+        problem(anna.post(f"{LOOKS}/{found['id']}/save"), 422, "robot-type-rejected")
+        problem(anna.get(f"{LOOKS}/{found['id']}/twin"), 422, "robot-type-rejected")
 
     def test_what_can_be_said_without_compiling_is_said_at_once_too(self, anna: Person) -> None:
         outside = LEVER.replace("<worldbody>", '<include file="/etc/passwd"/><worldbody>', 1)
@@ -178,7 +178,7 @@ class TestEnd:
         assert anna.get(f"{LOOKS}/{found['id']}").status_code == 200
         cloud.clock.advance(_SLOW_MS / 1000)
         anna = cloud.sign_in("anna")
-        problem(anna.get(f"{LOOKS}/{found['id']}"), 404, "look-unknown")
+        problem(anna.get(f"{LOOKS}/{found['id']}"), 404, "robot-type-preview-unknown")
         assert blobs(cloud), "only the timer deletes"
         advance(cloud, 1)
         assert blobs(cloud) == ()
@@ -190,7 +190,7 @@ class TestEnd:
     def test_one_that_is_ended_goes_at_once(self, cloud: Cloud, anna: Person) -> None:
         found = checked(cloud, anna)
         assert anna.delete(f"{LOOKS}/{found['id']}").status_code == 204
-        problem(anna.delete(f"{LOOKS}/{found['id']}"), 404, "look-unknown")
+        problem(anna.delete(f"{LOOKS}/{found['id']}"), 404, "robot-type-preview-unknown")
         advance(cloud, 1)
         assert blobs(cloud) == ()
 

@@ -241,11 +241,11 @@ class TestLife:
 
     def test_a_refused_version_leaves_the_one_before_in_use(self, cloud: Cloud, anna: Person) -> None:
         add(anna)
-        refused = problem(add(anna, lever__xml=LEVER.replace('"shoulder"', '"hip"')), 422, "robot-type-refused")
+        refused = problem(add(anna, lever__xml=LEVER.replace('"shoulder"', '"hip"')), 422, "robot-type-rejected")
         assert refused["version"] == 2
         assert "no joint 'shoulder'; the model has: hip" in refused["errors"][0]
         shown = anna.get("/robot-types/lever").json()
-        assert (shown["state"], shown["version"], shown["upload"]["state"]) == ("ready", 1, "refused")
+        assert (shown["state"], shown["version"], shown["upload"]["state"]) == ("ready", 1, "rejected")
         assert shown["upload"]["errors"] == refused["errors"]
         assert add(anna).json()["version"] == 3
         advance(cloud, GIVE_UP_MS)
@@ -341,9 +341,9 @@ class TestChecker:
         assert anna.get("/robot-types/lever").json()["state"] == "checking"
         advance(cloud, 1_000)
         shown = anna.get("/robot-types/lever").json()
-        assert (shown["state"], shown["upload"]["errors"]) == ("refused", [NO_CHECKER])
+        assert (shown["state"], shown["upload"]["errors"]) == ("rejected", [NO_CHECKER])
         check_all(cloud)
-        assert anna.get("/robot-types/lever").json()["state"] == "refused", "a verdict stays"
+        assert anna.get("/robot-types/lever").json()["state"] == "rejected", "a verdict stays"
         assert add(anna, wait_ms=0).json()["version"] == 2
         check_all(cloud)
         assert anna.get("/robot-types/lever").json()["state"] == "ready"
@@ -368,7 +368,7 @@ class TestChecker:
             cloud.clock.advance(LEASE_MS / 1000)
         check_all(cloud)
         shown = anna.get("/robot-types/lever").json()
-        assert shown["state"] == "refused"
+        assert shown["state"] == "rejected"
         assert "cut off" in shown["upload"]["errors"][0]
 
     def test_many_give_each_upload_one_verdict(
@@ -543,7 +543,7 @@ class TestHostileUploads:
         ],
     )
     def test_what_mujoco_refuses_is_refused_in_its_words(self, bert: Person, xml: str, words: list[str]) -> None:
-        refused = problem(add(bert, lever__xml=xml), 422, "robot-type-refused")
+        refused = problem(add(bert, lever__xml=xml), 422, "robot-type-rejected")
         text = " ".join(refused["errors"])
         for word in words:
             assert word in text
@@ -551,7 +551,7 @@ class TestHostileUploads:
 
     def test_wheels_that_its_model_does_not_have_are_refused(self, bert: Person) -> None:
         wheels = '[simulation.wheels]\nleft = "shoulder"\nright = "wheel"\nradius_m = 0.05\ntrack_m = 0.3\n'
-        refused = problem(add(bert, text=manifest() + wheels), 422, "robot-type-refused")
+        refused = problem(add(bert, text=manifest() + wheels), 422, "robot-type-rejected")
         assert refused["errors"] == [
             "lever.xml: actuator 'shoulder' is not a velocity servo on a hinge, with a control range.",
             "lever.xml: no actuator 'wheel'; the model has: shoulder.",
@@ -588,7 +588,7 @@ class TestHostileUploads:
     def test_what_only_mujoco_can_read_is_never_good(self, bert: Person) -> None:
         """Its parser takes more than ours: what ours cannot read it cannot have looked at."""
         lenient = LEVER.replace('model="lever"', 'model="&nothing;"')
-        refused = problem(add(bert, lever__xml=lenient), 422, "robot-type-refused")
+        refused = problem(add(bert, lever__xml=lenient), 422, "robot-type-rejected")
         assert "undefined entity" in refused["errors"][0]
 
     @pytest.mark.parametrize(
@@ -698,7 +698,7 @@ class TestProcesses:
         cloud.functions.model_checks._compiler = MujocoCompiler(cpu_s=1)
         check_all(cloud)
         shown = anna.get("/robot-types/lever").json()
-        assert (shown["state"], len(shown["upload"]["errors"])) == ("refused", 1)
+        assert (shown["state"], len(shown["upload"]["errors"])) == ("rejected", 1)
 
 
 def taken(cloud: Cloud) -> bool:
@@ -724,7 +724,7 @@ class TestLimits:
     ) -> None:
         monkeypatch.setattr(cloud.functions.model_checks, "_compiler", MujocoCompiler(cpu_s=2, wall_s=20))
         with checking(cloud):
-            refused = problem(add(anna, lever__xml=xml), 422, "robot-type-refused")
+            refused = problem(add(anna, lever__xml=xml), 422, "robot-type-rejected")
         assert refused["errors"]
 
     def test_a_child_that_waits_for_ever_is_ended(

@@ -20,11 +20,11 @@ NAMED = {"device", "agent", "action", "space"}
 SEEING = {
     "get_device", "get_lease", "list_actions", "get_action", "list_events", "list_faults",
     "get_latency", "list_uploads", "get_upload", "get_diagnostics", "list_space_diagnostics", "get_control_request",
-    "get_device_robot_type", "get_device_robot_type_file", "list_streams", "read_stream", "watch_device",
-    "unwatch_device",
+    "get_device_robot_type", "get_device_robot_type_file", "list_streams", "read_stream", "add_viewer",
+    "remove_viewer",
 }  # fmt: skip
 OPERATING = {
-    "take_lease", "release_lease", "ask_for_control", "accept_control_request", "refuse_control_request",
+    "take_lease", "release_lease", "request_control", "accept_control_request", "reject_control_request",
     "withdraw_control_request", "start_action", "cancel_action", "stop_device", "stop_space", "reset_stop",
     "acknowledge_fault", "add_latency", "begin_upload", "complete_upload", "list_device_movements",
     "get_device_movement",
@@ -39,7 +39,7 @@ OWN = {"unpair_agent", "move_agent", "list_agent_transfers", "transfer_agent", "
 """About agents, which do not exist for anybody but their owner."""
 BODIES: dict[str, Any] = {
     "take_lease": {},
-    "ask_for_control": {},
+    "request_control": {},
     "start_action": {"request": MOVE},
     "stop_device": {},
     "stop_space": {},
@@ -219,7 +219,7 @@ def principals(house: House, by: str) -> dict[str, Principal]:
         answer: dict[str, Any] = person.post("/mqtt/credentials", body).json()
         return answer
 
-    watch = {"purpose": "watch"}
+    watch = {"purpose": "view"}
     return {
         "stranger": Principal(issued(people["stranger"], watch), set(), set()),
         "viewer": Principal(issued(people["viewer"], watch), HEARD, set()),

@@ -48,7 +48,7 @@ def devices(person: Person) -> dict[str, str]:
 
 
 def watching(broker: RunningBroker, person: Person) -> tuple[Client, dict[str, Any]]:
-    issued = person.post("/mqtt/credentials", {"purpose": "watch"}).json()
+    issued = person.post("/mqtt/credentials", {"purpose": "view"}).json()
     client = broker.connect(issued["client_id"], Credentials(issued["username"], issued["password"]))
     assert client.connected.is_set(), client.answer
     return client, issued
@@ -67,7 +67,11 @@ def steering(broker: RunningBroker, person: Person, device: str, epoch: int) -> 
 def test_an_operator_sees_and_operates_what_is_shared_and_owns_nothing(three: Three) -> None:
     anna, bert, robot = three
     shown = share(anna, f"devices/{robot.device}", bert, "operator")
-    assert (shown["account"], shown["role"], shown["by"]) == ({"id": bert.account, "name": "bert"}, "operator", "anna")
+    assert (shown["account"], shown["role"], shown["created_by"]) == (
+        {"id": bert.account, "name": "bert"},
+        "operator",
+        "anna",
+    )
     assert shown["expires_at"] is None
     found = bert.get(f"/devices/{robot.device}").json()
     assert (found["role"], found["owner"]) == ("operator", {"id": anna.account, "name": "anna"})
@@ -310,7 +314,7 @@ def test_watching_a_shared_space_is_said_by_space(three: Three) -> None:
     anna, bert, robot = three
     for role, stops in (("viewer", 0), ("operator", 1)):
         share(anna, f"spaces/{robot.space}", bert, role, expires_in_s=60)
-        issued = bert.post("/mqtt/credentials", {"purpose": "watch"}).json()
+        issued = bert.post("/mqtt/credentials", {"purpose": "view"}).json()
         assert f"ts/v1/{robot.space}/{robot.id}/arm/state" in issued["subscribe"]
         assert len(issued["publish"]) == stops
         assert 50 <= issued["lifetime_s"] <= 60, "credentials end with the share"
@@ -326,7 +330,7 @@ def test_more_devices_than_fit_into_one_grant_are_left_out(cloud: Cloud, broker:
         page.close()
         assert 10 <= len(issued["publish"]) < 30
         share(anna, f"spaces/{many.space}", bert, "viewer")
-        heard = bert.post("/mqtt/credentials", {"purpose": "watch"}).json()["subscribe"]
+        heard = bert.post("/mqtt/credentials", {"purpose": "view"}).json()["subscribe"]
         assert sum(topic.endswith("/state") for topic in heard) == 31
 
 

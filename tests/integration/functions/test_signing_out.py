@@ -12,7 +12,7 @@ from tests.harness.network.brokers import BROKERS, Client, RunningBroker, wait_u
 
 
 def watching(broker: RunningBroker, person: Person) -> Client:
-    issued: dict[str, Any] = person.post("/mqtt/credentials", {"purpose": "watch"}).json()
+    issued: dict[str, Any] = person.post("/mqtt/credentials", {"purpose": "view"}).json()
     client = broker.connect(issued["client_id"], Credentials(issued["username"], issued["password"]))
     assert client.connected.is_set(), client.answer
     return client
@@ -28,7 +28,7 @@ def test_signing_out_ends_the_sessions_own_connections_and_nobody_elses(
         assert anna.post("/auth/sign-out").status_code == 204
         wait_until(here.disconnected.is_set, "the end of the connection")
         assert not there.disconnected.is_set()
-        assert there.subscribe(elsewhere.post("/mqtt/credentials", {"purpose": "watch"}).json()["subscribe"][0]) == [1]
+        assert there.subscribe(elsewhere.post("/mqtt/credentials", {"purpose": "view"}).json()["subscribe"][0]) == [1]
 
 
 def test_signing_out_works_while_the_broker_is_away(open_cloud: Callable[..., Cloud]) -> None:

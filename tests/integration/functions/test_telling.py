@@ -68,7 +68,7 @@ class TestTelling:
         answer = robot.tell_raw(*good, *((topic, state(8)) for topic in foreign), *bad)
         assert answer.status_code == 200, answer.text
         results = answer.json()["results"]
-        assert [result["status"] for result in results] == ["stored"] * 2 + ["refused"] * (len(foreign) + len(bad))
+        assert [result["status"] for result in results] == ["stored"] * 2 + ["rejected"] * (len(foreign) + len(bad))
         assert all(result["detail"].endswith(".") for result in results[2:])
         assert anna.get(f"/devices/{robot.device}").json()["state"]["tick_ms"] == 7
 
@@ -100,12 +100,12 @@ class TestTelling:
     def test_the_brokers_subscribers_hear_it_too_and_its_echo_changes_nothing(
         self, cloud: Cloud, broker: RunningBroker, anna: Person, robot: PollingRobot
     ) -> None:
-        issued = anna.post("/mqtt/credentials", {"purpose": "watch"}).json()
+        issued = anna.post("/mqtt/credentials", {"purpose": "view"}).json()
         from function_app.ports.broker_access import Credentials
         from tests.harness.network.brokers import Client
 
         def page(number: int) -> Client:
-            again = anna.post("/mqtt/credentials", {"purpose": "watch"}).json() if number else issued
+            again = anna.post("/mqtt/credentials", {"purpose": "view"}).json() if number else issued
             login = Credentials(again["username"], again["password"])
             client = Client(again["client_id"], login, port=broker.tcp_port).open()
             client.subscribe(robot.topic(topics.STATE), robot.topic(topics.TELE) + "/+", robot.topic(topics.EVENT))
@@ -173,7 +173,7 @@ class TestWhoMayAsk:
         problem(robot.tell_raw((robot.topic(topics.STATE), b'"' + b"x" * 1_000_000 + b'"')), 413, "too-large")
         problem(robot.tell_raw((robot.topic(topics.STATE), b"[" * 10_000 + b"]" * 10_000)), 422, "invalid")
         (result,) = robot.tell_raw((robot.topic(topics.STATE), b'"' + b"x" * 140_000 + b'"')).json()["results"]
-        assert result["status"] == "refused"
+        assert result["status"] == "rejected"
 
     def test_a_new_owner_gets_nothing_of_the_old_ones(self, cloud: Cloud, anna: Person, robot: PollingRobot) -> None:
         robot.fetch()

@@ -30,7 +30,7 @@ BODIES: dict[str, Any] = {
     "invite_to_space": {"role": "operator"},
     "transfer_agent": {},
     "transfer_space": {},
-    "tell_messages": {"messages": [{"topic": "t", "payload": {}}]},
+    "post_agent_messages": {"messages": [{"topic": "t", "payload": {}}]},
     "begin_upload": {"stream": "camera", "length": 3, "content_type": "image/png"},
     "begin_agent_upload": {"device": "arm", "stream": "camera", "length": 3, "content_type": "image/png"},
     "complete_agent_upload": {"device": "arm"},
@@ -103,10 +103,10 @@ def test_every_route_with_the_others_ids_finds_nothing_and_changes_nothing(
         "get_lease",
         "take_lease",
         "release_lease",
-        "ask_for_control",
+        "request_control",
         "get_control_request",
         "accept_control_request",
-        "refuse_control_request",
+        "reject_control_request",
         "withdraw_control_request",
         "stop_space",
         "start_action",
@@ -126,7 +126,7 @@ def test_every_route_with_the_others_ids_finds_nothing_and_changes_nothing(
         "transfer_space",
         "move_agent",
         "fetch_commands",
-        "tell_messages",
+        "post_agent_messages",
         "get_movement",
         "delete_movement",
     } <= asked
@@ -160,7 +160,7 @@ def test_lists_hold_ones_own_only(strangers: tuple[Person, Robot, str, Person, R
         assert robot.space not in text
         assert "secret" not in text
     assert [item["id"] for item in bert.get("/devices").json()["items"]] == [other.device]
-    watch = bert.post("/mqtt/credentials", {"purpose": "watch"}).json()
+    watch = bert.post("/mqtt/credentials", {"purpose": "view"}).json()
     assert not [topic for topic in (*watch["subscribe"], *watch["publish"]) if robot.space in topic]
 
 

@@ -111,12 +111,12 @@ def test_what_is_not_what_was_announced_is_not_registered(cloud: Cloud, pair: tu
     problem(send(cloud, begun, PICTURE, **{"Content-Type": "text/html"}), 403, "transfer-refused")
     problem(complete(anna, robot, begun["id"]), 409, "upload-missing")
     assert send(cloud, begun, PICTURE).status_code == 201
-    problem(complete(anna, robot, begun["id"]), 409, "upload-wrong")
+    problem(complete(anna, robot, begun["id"]), 409, "upload-mismatch")
     assert blobs(cloud) == ()
     # As a store does that takes any length.
     begun = begin(anna, robot)
     cloud.run(cloud.functions.blobs.put(f"uploads/{robot.device}/{pairing(cloud, robot)}/{begun['id']}", b"x"))
-    problem(complete(anna, robot, begun["id"]), 409, "upload-wrong")
+    problem(complete(anna, robot, begun["id"]), 409, "upload-mismatch")
     assert send(cloud, begun, PICTURE).status_code == 201
     assert complete(anna, robot, begun["id"]).status_code == 200
 
@@ -133,7 +133,7 @@ def test_an_agent_uploads_of_its_own_devices(cloud: Cloud, pair: tuple[Person, R
     begun = robot.ask("POST", path, json={**WANTED, "device": "arm"}).json()
     assert send(cloud, begun, PICTURE).status_code == 201
     done = robot.ask("POST", f"{path}/{begun['id']}/complete", json={"device": "arm"})
-    assert (done.status_code, done.json()["by"]) == (200, f"agent:{robot.id}")
+    assert (done.status_code, done.json()["created_by"]) == (200, f"agent:{robot.id}")
     assert listed(anna, robot) == [begun["id"]]
     problem(robot.ask("POST", path, json={**WANTED, "device": "leg"}), 404, "device-unknown")
     problem(robot.ask("POST", "/agents/abcdefghij/uploads", json={**WANTED, "device": "arm"}), 404, "agent-unknown")

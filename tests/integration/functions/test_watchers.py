@@ -37,7 +37,7 @@ def claimed(cloud: Cloud, owner: Person) -> Robot:
 
 
 def looks(person: Person, robot: Robot) -> list[tuple[str, str, bool]]:
-    answer = person.put(f"/devices/{robot.device}/watchers", None)
+    answer = person.put(f"/devices/{robot.device}/viewers", None)
     assert answer.status_code == 200, answer.text
     return [(other["name"], other["role"], other["mine"]) for other in answer.json()["items"]]
 
@@ -60,7 +60,7 @@ class TestWatching:
         assert looks(bert, robot) == [("anna", "owner", False), ("anna", "owner", False)]
         clock.advance(8)
         assert looks(anna, robot) == [("bert", "viewer", False)], "who says nothing is gone"
-        assert bert.delete(f"/devices/{robot.device}/watchers").status_code == 204
+        assert bert.delete(f"/devices/{robot.device}/viewers").status_code == 204
         assert looks(anna, robot) == [], "and who says so is gone at once"
 
     def test_since_when_is_from_the_first_word_without_a_pause(self, alone: Cloud, clock: MovingClock) -> None:
@@ -68,7 +68,7 @@ class TestWatching:
         robot = claimed(alone, anna)
 
         def since() -> str:
-            (other,) = again.put(f"/devices/{robot.device}/watchers", None).json()["items"]
+            (other,) = again.put(f"/devices/{robot.device}/viewers", None).json()["items"]
             return str(other["since"])
 
         looks(anna, robot)
@@ -86,7 +86,7 @@ class TestWatching:
         robot = claimed(alone, anna)
         looks(anna, robot)
         for method in (lambda path: bert.put(path, None), bert.delete):
-            problem(method(f"/devices/{robot.device}/watchers"), 404, "device-unknown")
+            problem(method(f"/devices/{robot.device}/viewers"), 404, "device-unknown")
         assert looks(anna, robot) == []
 
     def test_who_watched_an_earlier_owners_pairing_is_not_told_of(self, alone: Cloud) -> None:
@@ -142,7 +142,7 @@ class TestNaming:
         assert bert.get(f"/devices/{robot.device}").json()["label"] == "Left arm", "enrolling again changes nothing"
         problem(bert.put(f"/devices/{robot.device}/label", {"label": "Mine"}), 403, "forbidden")
         assert anna.put(f"/devices/{robot.device}/label", {"label": None}).json()["label"] == before
-        whats = [each["what"] for each in anna.get("/accounts/me/audit").json()["items"]]
+        whats = [each["event"] for each in anna.get("/accounts/me/audit").json()["items"]]
         assert whats.count("device-renamed") == 2
 
     @pytest.mark.parametrize("label", ["", " \n", "a\x00b", "x" * 81, 7])

@@ -244,7 +244,7 @@ def test_what_does_not_fit_is_left_out_and_all_that_is_named_is_there(there: The
     for device in robot.devices:
         shared = anna.post(f"/devices/{device}/shares", {"account": bert.name, "role": "operator"})
         assert shared.status_code == 201
-    issued = bert.post("/mqtt/credentials", {"purpose": "watch"}).json()
+    issued = bert.post("/mqtt/credentials", {"purpose": "view"}).json()
     heard = {topic.split("/")[4] for topic in issued["subscribe"] if topic.endswith("/state")}
     assert len(heard) == topic_spaces.DEVICES
     assert {topic.split("/")[4] for topic in issued["publish"]} == heard

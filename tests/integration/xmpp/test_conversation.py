@@ -80,7 +80,7 @@ def test_setpoints_and_stop_of_a_console_reach_it_over_the_broker(
         wait_until(lambda: len(robot.setpoints) >= 20, "every setpoint")
     assert {found for found, _ in robot.setpoints} == {topic}
     assert [codec.decode(payload, Setpoint).sequence for _, payload in robot.setpoints] == list(range(1, 21))
-    given = anna.post("/mqtt/credentials", {"purpose": "watch"}).json()
+    given = anna.post("/mqtt/credentials", {"purpose": "view"}).json()
     with broker.connect(given["client_id"], (given["username"], given["password"])) as console:  # type: ignore[arg-type]
         console.publish(robot.topic(topics.STOP), codec.encode(Stop(id="s1", caller="anna")))
         wait_until(lambda: any(stop.id == "s1" for stop in robot.stops), "the Stop")

@@ -51,7 +51,7 @@ class TestLogin:
         self, site: XmppSite, anna: Person, unheard: XmppRobot
     ) -> None:
         mine = password_of(unheard)
-        hers = anna.post("/xmpp/credentials", {"purpose": "watch"}).json()["password"]
+        hers = anna.post("/xmpp/credentials", {"purpose": "view"}).json()["password"]
         with site.robot() as other:
             other.pair(site.cloud.sign_in("bert"))
             wrong = [
@@ -73,11 +73,11 @@ class TestLogin:
 
     def test_a_password_is_good_for_nothing_else(self, site: XmppSite, anna: Person, unheard: XmppRobot) -> None:
         mine = password_of(unheard)
-        hers = anna.post("/xmpp/credentials", {"purpose": "watch"}).json()["password"]
+        hers = anna.post("/xmpp/credentials", {"purpose": "view"}).json()["password"]
         for token in (mine, hers):
             headers = {"Authorization": f"Bearer {token}"}
             for method, path in (("GET", "/devices"), ("GET", "/agents/enrollment"), ("POST", "/xmpp/credentials")):
-                answer = site.cloud.ask(method, f"/api/v1{path}", headers=headers, json={"purpose": "watch"})
+                answer = site.cloud.ask(method, f"/api/v1{path}", headers=headers, json={"purpose": "view"})
                 assert answer.status_code == 401, path
 
     def test_a_password_of_an_earlier_pairing_is_refused(self, site: XmppSite, anna: Person) -> None:
@@ -104,7 +104,7 @@ class TestLogin:
 
     def test_who_has_signed_out_does_not_come_back(self, site: XmppSite) -> None:
         carl = site.cloud.sign_in("carl")
-        hers = carl.post("/xmpp/credentials", {"purpose": "watch"}).json()["password"]
+        hers = carl.post("/xmpp/credentials", {"purpose": "view"}).json()["password"]
         assert carl.post("/auth/sign-out").status_code == 204
         with site.client(carl.account, hers) as client:
             assert not client.opened
@@ -113,7 +113,7 @@ class TestLogin:
         access = site.cloud.functions.xmpp_credentials
         domain, access._domain = access._domain, ""
         try:
-            answer = anna.post("/xmpp/credentials", {"purpose": "watch"})
+            answer = anna.post("/xmpp/credentials", {"purpose": "view"})
             assert (answer.status_code, answer.json()["type"]) == (409, "/problems/xmpp-unavailable")
         finally:
             access._domain = domain

@@ -109,7 +109,7 @@ TOPICS = tuple(
 )  # fmt: skip
 _ENROLLED = {"agent": "a", "claim_code": "AAAA-BBBB", "expires_in_s": 600.0, "state": "claimed", "keys": []}
 _LETTER = {"items": [{"id": "c", "topic": "ts/v1/s/a/d/cmd", "payload": "{}"}]}
-_RESULTS = {"results": [{"status": "stored"}, {"status": "refused", "detail": "no"}]}
+_RESULTS = {"results": [{"status": "stored"}, {"status": "rejected", "detail": "no"}]}
 _PROBLEM = {"type": "/problems/agent-unclaimed", "title": "no", "detail": "not yours"}
 _ACCESS = {
     "client_id": "a", "username": "u", "password": "p", "lifetime_s": 60, "subscribe": ["ts/v1/s/a/+/cmd"],

@@ -144,7 +144,7 @@ def keys_and_invitations(run: Run, demo: httpx.Client, bert: httpx.Client, devic
             "secret"
         ]
     redeemed = {"secret": run.secrets["invitation redeemed"]}
-    ok(bert.post("/invitations/look", json=redeemed))
+    ok(bert.post("/invitations/lookup", json=redeemed))
     ok(bert.post("/invitations/redeem", json=redeemed))
     assert bert.post("/invitations/redeem", json=redeemed).status_code == 404
     newcomer = {"invitation": run.secrets["invitation for a newcomer"], "name": "carl", "password": PASSWORD}
@@ -159,8 +159,8 @@ def control(run: Run, demo: httpx.Client, bert: httpx.Client, device: str) -> No
     ok(demo.post(f"/devices/{device}/actions", json={"request": MOVE, "epoch": epoch}))
     given = {
         "control": ok(demo.post("/mqtt/credentials", json={"purpose": "control", "device": device, "epoch": epoch})),
-        "watch": ok(demo.post("/mqtt/credentials", json={"purpose": "watch"})),
-        "watch of a guest": ok(bert.post("/mqtt/credentials", json={"purpose": "watch"})),
+        "watch": ok(demo.post("/mqtt/credentials", json={"purpose": "view"})),
+        "watch of a guest": ok(bert.post("/mqtt/credentials", json={"purpose": "view"})),
     }
     for name, issued in given.items():
         run.secrets[f"MQTT password, {name}"] = issued["password"]

@@ -109,7 +109,7 @@ def _people(cloud: Cloud) -> tuple[Robot, dict[str, dict[str, Any]]]:
         assert anna.post(f"/spaces/{robot.space}/shares", body).status_code == 201
     epoch = anna.take(robot.device, wait_ms=0).json()["epoch"]
     steer = {"purpose": "control", "device": robot.device, "epoch": epoch}
-    roles = {name: person.post("/mqtt/credentials", {"purpose": "watch"}).json() for name, person in people.items()}
+    roles = {name: person.post("/mqtt/credentials", {"purpose": "view"}).json() for name, person in people.items()}
     roles["holder"] = anna.post("/mqtt/credentials", steer).json()
     for name, agent in (("agent", robot), ("foreign agent", foreign)):
         roles[name] = agent.ask("POST", "/mqtt/credentials", json={"purpose": "agent"}).json()

@@ -99,7 +99,7 @@ def make(home: Path) -> World:
         "fault": fault,
         "upload": upload,
         "stream": "hidden",
-        "look": _look(anna),
+        "preview": _look(anna),
         "robot_type": "ur5",
         "name": MOVEMENT,
         "get_robot_type_file.name": "ur5.xml",
@@ -132,7 +132,7 @@ def make(home: Path) -> World:
         upload,
         robot.id,
         space,
-        ids["look"],
+        ids["preview"],
     }
     for caller in ("viewer key", "operator key"):
         assert world.callers[caller]("GET", "/accounts/me").status_code == 200, (
@@ -182,7 +182,7 @@ def _say(cloud: Cloud, robot: Robot, epoch: int) -> None:
     messages = [{"topic": topic, "payload": json.loads(codec.encode(message))} for topic, message in told.items()]
     answer = robot.ask("POST", f"/agents/{robot.id}/messages", json={"messages": messages})
     assert answer.status_code == 200, answer.text
-    assert '"refused"' not in answer.text, answer.text
+    assert '"rejected"' not in answer.text, answer.text
 
 
 def _look(anna: Person) -> str:
@@ -190,7 +190,7 @@ def _look(anna: Person) -> str:
     folder = ROOT / "robots" / "ur5"
     manifest = (folder / "robot.toml").read_text().replace('type = "ur5"', 'type = "mine"')
     files = {name: (folder / name).read_text() for name in ("ur5.xml", "scene.xml")}
-    return str(_made(anna.post("/robot-type-looks", {"manifest": manifest, "files": files, "wait_ms": 0}))["id"])
+    return str(_made(anna.post("/robot-type-previews", {"manifest": manifest, "files": files, "wait_ms": 0}))["id"])
 
 
 def _upload(cloud: Cloud, anna: Person, device: str) -> str:
@@ -214,26 +214,26 @@ def _bodies(device: str, space: str, epoch: int, introduction: dict[str, Any]) -
         "sign_in": {"link": "x" * 43},
         "sign_in_by_password": {"name": OWNER, "password": "wrong wrong wrong"},
         "put_password": {"password": "correct horse battery"},
-        "make_space": {"name": "Attic"},
-        "make_api_key": {"name": "app", "role": "viewer", "days": 1},
+        "create_space": {"name": "Attic"},
+        "create_api_key": {"name": "app", "role": "viewer", "days": 1},
         "enroll_agent": introduction,
-        "make_account": {"name": "new", "password": "correct horse battery", "invitation": "x" * 43},
-        "start_open_id_invited": {"invitation": "x" * 43},
+        "create_account": {"name": "new", "password": "correct horse battery", "invitation": "x" * 43},
+        "start_oidc_sign_in_with_invitation": {"invitation": "x" * 43},
         "certify": {"request": "x"},
         "claim_agent": {"code": "BCDF-GHJK"},
         "rename_device": {"label": "Elbow grease"},
         "move_agent": {"space": space},
-        "tell_messages": {"messages": [{"topic": "t", "payload": {}}]},
+        "post_agent_messages": {"messages": [{"topic": "t", "payload": {}}]},
         "share_device": {"account": "stranger", "role": "operator"},
         "share_space": {"account": "stranger", "role": "operator"},
         "invite_to_device": {"role": "operator"},
         "invite_to_space": {"role": "operator"},
         "transfer_agent": {},
         "transfer_space": {},
-        "look_at_invitation": {"secret": "x" * 43},
+        "look_up_invitation": {"secret": "x" * 43},
         "redeem_invitation": {"secret": "x" * 43},
         "take_lease": {"wait_ms": 0},
-        "ask_for_control": {"wait_ms": 0},
+        "request_control": {"wait_ms": 0},
         "accept_control_request": {"wait_ms": 0},
         "stop_device": {"reason": "x"},
         "stop_space": {"reason": "x"},

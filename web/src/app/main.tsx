@@ -43,8 +43,8 @@ function takeFailure(): string {
   const code = signInFailure(location.hash);
   if (code === null) return "";
   history.replaceState(null, "", `${location.pathname}${location.search}#/`);
-  if (code === "open-id-expired") return texts.openIdExpired;
-  return code === "open-id-uninvited" ? texts.openIdUninvited : texts.openIdRefused;
+  if (code === "oidc-expired") return texts.openIdExpired;
+  return code === "oidc-uninvited" ? texts.openIdUninvited : texts.openIdRefused;
 }
 
 takeInvitation();

@@ -330,7 +330,7 @@ export class Cloud {
       device: DEVICE,
       status: "started",
       epoch: this.epoch,
-      who: "Demo",
+      caller: "Demo",
       reason: null,
       progress: null,
       output: "",

@@ -30,10 +30,10 @@ def router(functions: Functions, caller: Caller) -> Routes:
         "/api-keys",
         summary="Make an API key",
         body=contract.ApiKeyRequest,
-        answers={201: contract.ApiKeyMade},
+        answers={201: contract.ApiKeyCreated},
         problems=(404, 409),
     )
-    async def make_api_key(request: Request) -> Response:
+    async def create_api_key(request: Request) -> Response:
         """For a program of somebody else's, which shows ``token`` as a bearer token. It is told this once.
 
         A key watches, or operates too; it never owns, shares, pairs, saves movements, resets a Stop or makes keys. It
@@ -43,7 +43,7 @@ def router(functions: Functions, caller: Caller) -> Routes:
         asked: contract.ApiKeyRequest = await read(request, contract.ApiKeyRequest)
         wanted = ApiKeyRequest(label=asked.name, most=Role(asked.role), only=asked.only, days=asked.days)
         key, token = await functions.api_keys.make(who, wanted)
-        body = contract.ApiKeyMade(api_key=_show(key, functions.clock.now_ms()), token=token)
+        body = contract.ApiKeyCreated(api_key=_show(key, functions.clock.now_ms()), token=token)
         return answer(body, 201, {"Cache-Control": "no-store"})
 
     @routes.add("DELETE", "/api-keys/{key}", summary="Revoke an API key", answers={204: None}, problems=(404,))

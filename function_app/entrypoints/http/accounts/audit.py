@@ -12,8 +12,10 @@ from function_app.entrypoints.http.framework.responses import answer
 from function_app.entrypoints.http.framework.routing import Cursor, Limit, Routes
 from function_app.services.audit.audit_reader import AuditFilter
 
-On = Annotated[str | None, Query(max_length=200, description="Only on this device, agent, …, by its id.")]
-What = Annotated[str | None, Query(max_length=60, description="Only of this kind, such as `control-taken`.")]
+Target = Annotated[
+    str | None, Query(max_length=200, description="Only records about the device, agent, … with this id.")
+]
+Event = Annotated[str | None, Query(max_length=60, description="Only records of this event, such as `control-taken`.")]
 Since = Annotated[
     int | None, Query(alias="from", ge=0, le=LAST_MS, description="From here [ms since 1970]; the beginning.")
 ]
@@ -31,8 +33,8 @@ def router(functions: Functions, caller: Caller) -> Routes:
     )
     async def read_audit(  # noqa: PLR0917 (FastAPI names them)
         request: Request,
-        on: On = None,
-        what: What = None,
+        target: Target = None,
+        event: Event = None,
         since: Since = None,
         until: Until = None,
         cursor: Cursor = None,
@@ -42,17 +44,17 @@ def router(functions: Functions, caller: Caller) -> Routes:
         every Stop, claim, share, key and sign-in. Each record's hash covers the one before it.
         """  # noqa: D205
         who = await caller.account(request)
-        wanted = AuditFilter(what=what, on=on, since_ms=since, until_ms=until)
+        wanted = AuditFilter(what=event, on=target, since_ms=since, until_ms=until)
         records, following = await functions.audit_reader.read(who, wanted, cursor=cursor, limit=limit)
         items = tuple(
             contract.AuditRecordOut(
                 seq=record["seq"],
                 at=rfc3339(record["at_ms"]),
-                what=record["what"],
-                on=record["on"],
+                event=record["what"],
+                target=record["on"],
                 outcome=record["outcome"],
-                who=record["who"],
-                by_account=record["account"],
+                actor=record["who"],
+                account=record["account"],
                 session=record["session"],
                 key=record["key"],
                 data=record["data"],

@@ -22,7 +22,7 @@ def router(functions: Functions, caller: Caller) -> Routes:
         "POST",
         "/auth/sign-in",
         summary="Sign in with a one-time link",
-        body=contract.SignInRequest,
+        body=contract.LinkSignInRequest,
         answers={200: contract.SignedIn},
         problems=(401, 403),
         caller="nobody",
@@ -30,14 +30,14 @@ def router(functions: Functions, caller: Caller) -> Routes:
     async def sign_in(request: Request) -> Response:
         """Gives an access token for programs, and sets a cookie for the page."""
         refuse_other_sites(request)
-        asked: contract.SignInRequest = await read(request, contract.SignInRequest)
+        asked: contract.LinkSignInRequest = await read(request, contract.LinkSignInRequest)
         return signed_in(settings, await functions.sign_in.redeem(asked.link, whence(request, settings)))
 
     @routes.add(
         "POST",
         "/auth/password",
         summary="Sign in with name and password",
-        body=contract.PasswordSignIn,
+        body=contract.PasswordSignInRequest,
         answers={200: contract.SignedIn},
         problems=(401, 403, 429),
         caller="nobody",
@@ -45,7 +45,7 @@ def router(functions: Functions, caller: Caller) -> Routes:
     async def sign_in_by_password(request: Request) -> Response:
         """As with a link. Wrong ones are counted by the name and by the address that asks."""
         refuse_other_sites(request)
-        asked: contract.PasswordSignIn = await read(request, contract.PasswordSignIn)
+        asked: contract.PasswordSignInRequest = await read(request, contract.PasswordSignInRequest)
         done = await functions.passwords.sign_in(asked.name, asked.password, whence(request, settings))
         return signed_in(settings, done)
 
@@ -53,18 +53,18 @@ def router(functions: Functions, caller: Caller) -> Routes:
         "POST",
         "/auth/accounts",
         summary="Make an account with an invitation",
-        body=contract.NewAccount,
+        body=contract.AccountRequest,
         answers={201: contract.SignedIn},
         problems=(403, 404, 409),
         caller="nobody",
     )
-    async def make_account(request: Request) -> Response:
+    async def create_account(request: Request) -> Response:
         """For who was invited and has no account: makes one, signs in, and redeems the invitation.
 
         Where somebody else is first with its last use the account is there all the same, and empty.
         """
         refuse_other_sites(request)
-        asked: contract.NewAccount = await read(request, contract.NewAccount)
+        asked: contract.AccountRequest = await read(request, contract.AccountRequest)
         known = await functions.invitations.look(asked.invitation)
         if known.invitation.account:
             raise forbidden("This invitation is for somebody who has an account. Sign in as the one it was made for.")
@@ -110,7 +110,7 @@ def router(functions: Functions, caller: Caller) -> Routes:
         answers={201: contract.SpaceOut},
         problems=(409,),
     )
-    async def make_space(request: Request) -> Response:
+    async def create_space(request: Request) -> Response:
         """A further room for agents."""
         who = await caller.account(request)
         asked: contract.SpaceRequest = await read(request, contract.SpaceRequest)

@@ -15,11 +15,11 @@ def router(functions: Functions, caller: Caller) -> Routes:
     """The routes."""
     routes = Routes("accounts")
 
-    @routes.add("GET", "/accounts/me", summary="Who is signed in", answers={200: contract.Me})
+    @routes.add("GET", "/accounts/me", summary="Who is signed in", answers={200: contract.AccountOut})
     async def me(request: Request) -> Response:
         """The account and sign-in session behind the token or cookie; to a page, what it shows with its cookie."""
         who, csrf = (await caller.account(request), None) if bearer(request) else await caller.page(request)
-        body = contract.Me(id=who.account, name=who.name, session=who.session, csrf_token=csrf)
+        body = contract.AccountOut(id=who.account, name=who.name, session=who.session, csrf_token=csrf)
         return answer(body, headers={"Cache-Control": "no-store"})
 
     @routes.add(
@@ -45,8 +45,8 @@ def router(functions: Functions, caller: Caller) -> Routes:
         items = tuple(
             contract.SessionOut(
                 id=each.id,
-                how=each.how,
-                since=rfc3339(each.since_ms),
+                method=each.how,
+                created_at=rfc3339(each.since_ms),
                 expires_at=rfc3339(each.expires_ms),
                 address=each.address,
                 program=each.program,

@@ -25,12 +25,14 @@ def router(functions: Functions) -> Routes:
     routes = Routes("accounts")
     settings = functions.settings
 
-    @routes.add("GET", "/auth/methods", summary="How one may sign in", answers={200: contract.Methods}, caller="nobody")
+    @routes.add(
+        "GET", "/auth/methods", summary="How one may sign in", answers={200: contract.SignInMethodsOut}, caller="nobody"
+    )
     async def sign_in_methods(_request: Request) -> Response:
         """For the page. A one-time link works everywhere."""
         known = settings.open_id
-        elsewhere = contract.Elsewhere(name=known.name, address=f"{PREFIX}{_PATH}/start") if known else None
-        return answer(contract.Methods(link=True, password=True, open_id=elsewhere))
+        elsewhere = contract.OidcProviderOut(name=known.name, url=f"{PREFIX}{_PATH}/start") if known else None
+        return answer(contract.SignInMethodsOut(link=True, password=True, oidc=elsewhere))
 
     @routes.add(
         "GET",
@@ -40,7 +42,7 @@ def router(functions: Functions) -> Routes:
         problems=(404,),
         caller="nobody",
     )
-    async def start_open_id(_request: Request) -> Response:
+    async def start_oidc_sign_in(_request: Request) -> Response:
         """Sends the browser to the OpenID Connect provider (code flow with PKCE), and marks it with a cookie.
 
         That cookie is ``SameSite=Lax``, for the browser comes back from another site, and is good for that alone.
@@ -52,22 +54,22 @@ def router(functions: Functions) -> Routes:
         "POST",
         f"{_PATH}/start",
         summary="Sign in elsewhere with an invitation",
-        body=contract.SignInElsewhere,
-        answers={200: contract.Begun},
+        body=contract.OidcSignInRequest,
+        answers={200: contract.OidcSignInOut},
         problems=(403, 404),
         caller="nobody",
     )
-    async def start_open_id_invited(request: Request) -> Response:
+    async def start_oidc_sign_in_with_invitation(request: Request) -> Response:
         """For who was invited and has no account: as above, and the account that is then made redeems the invitation.
 
-        The page goes on to ``address`` by itself: an invitation's secret belongs in no address. Who has an account
+        The page goes on to ``url`` by itself: an invitation's secret belongs in no address. Who has an account
         already is signed in, and redeems it afterwards as always.
         """
         refuse_other_sites(request)
-        asked: contract.SignInElsewhere = await read(request, contract.SignInElsewhere)
+        asked: contract.OidcSignInRequest = await read(request, contract.OidcSignInRequest)
         begun = await functions.open_id.begin(asked.invitation)
         headers = {"Set-Cookie": _mark(settings, begun), "Cache-Control": "no-store"}
-        return answer(contract.Begun(address=begun.address), headers=headers)
+        return answer(contract.OidcSignInOut(url=begun.address), headers=headers)
 
     @routes.add(
         "GET",
@@ -77,7 +79,7 @@ def router(functions: Functions) -> Routes:
         problems=(404, 422),
         caller="nobody",
     )
-    async def finish_open_id(
+    async def finish_oidc_sign_in(
         request: Request, state: Said = "", code: Said = "", iss: Said | None = None, error: Said = ""
     ) -> Response:
         """Sets the page's cookie and leads to the page; it says there why somebody was not signed in.
@@ -90,7 +92,7 @@ def router(functions: Functions) -> Routes:
         try:
             done = await functions.open_id.finish(returned, whence(request, settings))
         except Problem as problem:
-            if not problem.code.startswith("open-id-") or problem.code == "open-id-unknown":
+            if not problem.code.startswith("oidc-") or problem.code == "oidc-unknown":
                 raise
             # The mark stays: another site may lead a browser here, and does not spoil what it has begun itself.
             return _redirect(f"{settings.public_url}{_FAILED}{problem.code}")

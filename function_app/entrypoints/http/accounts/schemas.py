@@ -4,10 +4,10 @@ from typing import Annotated, Literal
 
 from msgspec import Meta
 
-from function_app.entrypoints.http.framework.schemas import Answer, Moment, Name, Request
+from function_app.entrypoints.http.framework.schemas import Moment, Name, Request, Response
 
 
-class SignInRequest(Request, frozen=True, kw_only=True):
+class LinkSignInRequest(Request, frozen=True, kw_only=True):
     """The token of a one-time link."""
 
     link: Annotated[str, Meta(min_length=1, max_length=200)]
@@ -18,7 +18,7 @@ NewPassword = Annotated[
 ]
 
 
-class PasswordSignIn(Request, frozen=True, kw_only=True):
+class PasswordSignInRequest(Request, frozen=True, kw_only=True):
     """A local account's name and password."""
 
     name: Name
@@ -32,7 +32,7 @@ class PasswordRequest(Request, frozen=True, kw_only=True):
     old_password: Annotated[str, Meta(max_length=1000)] | None = None
 
 
-class NewAccount(Request, frozen=True, kw_only=True):
+class AccountRequest(Request, frozen=True, kw_only=True):
     """An account to be made. ``name`` is what its owner signs in by, and others see."""
 
     invitation: Annotated[str, Meta(min_length=1, max_length=200)]
@@ -40,14 +40,14 @@ class NewAccount(Request, frozen=True, kw_only=True):
     password: NewPassword
 
 
-class AccountRef(Answer, frozen=True, kw_only=True):
+class AccountRef(Response, frozen=True, kw_only=True):
     """An account, as others see it."""
 
     id: str
     name: str
 
 
-class SignedIn(Answer, frozen=True, kw_only=True):
+class SignedIn(Response, frozen=True, kw_only=True):
     """A new sign-in session."""
 
     access_token: str
@@ -58,34 +58,34 @@ class SignedIn(Answer, frozen=True, kw_only=True):
     csrf_token: str
 
 
-class Elsewhere(Answer, frozen=True, kw_only=True):
+class OidcProviderOut(Response, frozen=True, kw_only=True):
     """A provider to sign in at: its name, and the address that leads there."""
 
     name: str
-    address: str
+    url: str
 
 
-class Methods(Answer, frozen=True, kw_only=True):
-    """How one may sign in. ``open_id``: at an OpenID Connect provider, where there is one."""
+class SignInMethodsOut(Response, frozen=True, kw_only=True):
+    """How one may sign in. ``oidc``: at an OpenID Connect provider, where there is one."""
 
     link: bool
     password: bool
-    open_id: Elsewhere | None
+    oidc: OidcProviderOut | None
 
 
-class SignInElsewhere(Request, frozen=True, kw_only=True):
+class OidcSignInRequest(Request, frozen=True, kw_only=True):
     """The secret of an invitation, for who was invited and has no account yet."""
 
     invitation: Annotated[str, Meta(min_length=1, max_length=200)]
 
 
-class Begun(Answer, frozen=True, kw_only=True):
+class OidcSignInOut(Response, frozen=True, kw_only=True):
     """Where a browser goes on to sign in."""
 
-    address: str
+    url: str
 
 
-class AccessToken(Answer, frozen=True, kw_only=True):
+class AccessToken(Response, frozen=True, kw_only=True):
     """The next access token of a session."""
 
     access_token: str
@@ -93,7 +93,7 @@ class AccessToken(Answer, frozen=True, kw_only=True):
     expires_in_s: int
 
 
-class Me(Answer, frozen=True, kw_only=True):
+class AccountOut(Response, frozen=True, kw_only=True):
     """Who asks. ``csrf_token``: what a page shows with its cookie; ``null`` for who comes without one."""
 
     id: str
@@ -102,26 +102,26 @@ class Me(Answer, frozen=True, kw_only=True):
     csrf_token: str | None
 
 
-class SessionOut(Answer, frozen=True, kw_only=True):
+class SessionOut(Response, frozen=True, kw_only=True):
     """A sign-in session. ``mine``: the one that asks."""
 
     id: str
-    how: Literal["link", "password", "open-id"]
-    since: Moment
+    method: Literal["link", "password", "oidc"]
+    created_at: Moment
     expires_at: Moment
     address: str
     program: str
     mine: bool
 
 
-class SessionList(Answer, frozen=True, kw_only=True):
+class SessionList(Response, frozen=True, kw_only=True):
     """Sign-in sessions, the newest first."""
 
     items: tuple[SessionOut, ...]
     cursor: str | None
 
 
-class SessionsEnded(Answer, frozen=True, kw_only=True):
+class SessionsEnded(Response, frozen=True, kw_only=True):
     """How many were ended."""
 
     ended: int
@@ -133,7 +133,7 @@ class SpaceRequest(Request, frozen=True, kw_only=True):
     name: Name
 
 
-class SpaceOut(Answer, frozen=True, kw_only=True):
+class SpaceOut(Response, frozen=True, kw_only=True):
     """A space. ``role``: what the caller may do in it; agents can be claimed into one's own."""
 
     id: str
@@ -142,7 +142,7 @@ class SpaceOut(Answer, frozen=True, kw_only=True):
     owner: AccountRef
 
 
-class SpaceList(Answer, frozen=True, kw_only=True):
+class SpaceList(Response, frozen=True, kw_only=True):
     """Spaces."""
 
     items: tuple[SpaceOut, ...]

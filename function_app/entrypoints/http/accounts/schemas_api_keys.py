@@ -5,7 +5,7 @@ from typing import Annotated, Literal
 from msgspec import Meta
 
 from function_app.domain.identity.api_keys import MOST_DAYS, MOST_ONLY
-from function_app.entrypoints.http.framework.schemas import Answer, Moment, Request
+from function_app.entrypoints.http.framework.schemas import Moment, Request, Response
 
 Target = Annotated[str, Meta(pattern="^(space:)?[A-Za-z0-9_-]{1,64}$")]
 
@@ -19,7 +19,7 @@ class ApiKeyRequest(Request, frozen=True, kw_only=True):
     days: Annotated[int, Meta(ge=1, le=MOST_DAYS)] = 90
 
 
-class ApiKeyOut(Answer, frozen=True, kw_only=True):
+class ApiKeyOut(Response, frozen=True, kw_only=True):
     """A key without its secret. ``last_used_at`` is right to the hour."""
 
     id: str
@@ -32,14 +32,14 @@ class ApiKeyOut(Answer, frozen=True, kw_only=True):
     last_used_at: Moment | None
 
 
-class ApiKeyMade(Answer, frozen=True, kw_only=True):
+class ApiKeyCreated(Response, frozen=True, kw_only=True):
     """A new key; nobody is told ``token`` again."""
 
     api_key: ApiKeyOut
     token: str
 
 
-class ApiKeyList(Answer, frozen=True, kw_only=True):
+class ApiKeyList(Response, frozen=True, kw_only=True):
     """Keys."""
 
     items: tuple[ApiKeyOut, ...]

@@ -9,7 +9,7 @@ from function_app.bootstrap import Functions
 from function_app.domain.actions.action import Action
 from function_app.entrypoints.http import serializers
 from function_app.entrypoints.http.actions import schemas as contract
-from function_app.entrypoints.http.actions.schemas_fleet import FleetRequest
+from function_app.entrypoints.http.actions.schemas_fleet import BatchActionRequest
 from function_app.entrypoints.http.framework.authentication import Caller
 from function_app.entrypoints.http.framework.responses import answer, read
 from function_app.entrypoints.http.framework.routing import PREFIX, Cursor, Limit, Routes
@@ -81,7 +81,7 @@ def router(functions: Functions, caller: Caller) -> Routes:
     return routes
 
 
-def start_of(asked: contract.ActionRequest | FleetRequest, once: str | None) -> Start:
+def start_of(asked: contract.ActionRequest | BatchActionRequest, once: str | None) -> Start:
     """What is to be started, without the lease."""
     return Start(
         asked=asked.request,

@@ -23,8 +23,8 @@ def router(functions: Functions, caller: Caller) -> Routes:
         "POST",
         "/actions",
         summary="Start an action on many devices",
-        body=contract.FleetRequest,
-        answers={200: contract.FleetOut, 202: contract.FleetOut, 207: contract.FleetOut},
+        body=contract.BatchActionRequest,
+        answers={200: contract.BatchActionOut, 202: contract.BatchActionOut, 207: contract.BatchActionOut},
     )
     async def start_actions(request: Request, once: Key = None) -> Response:
         """200: all have come as far as ``wait_for``, or have ended. 202: some are not there yet. 207: some are refused.
@@ -32,7 +32,7 @@ def router(functions: Functions, caller: Caller) -> Routes:
         The key counts for each device by itself.
         """
         who = await caller.account(request)
-        asked: contract.FleetRequest = await read(request, contract.FleetRequest)
+        asked: contract.BatchActionRequest = await read(request, contract.BatchActionRequest)
         if len(set(asked.devices)) != len(asked.devices):
             raise invalid("A device is named twice.")
         if not asked.epochs.keys() <= set(asked.devices):
@@ -41,15 +41,15 @@ def router(functions: Functions, caller: Caller) -> Routes:
         items = await asyncio.gather(*(item(each) for each in found))
         refused = any(isinstance(each.result, Problem) for each in found)
         there = all(each.there for each in found)
-        return answer(contract.FleetOut(items=tuple(items)), 207 if refused else 200 if there else 202)
+        return answer(contract.BatchActionOut(items=tuple(items)), 207 if refused else 200 if there else 202)
 
-    async def item(found: StartResult) -> contract.FleetItem:
+    async def item(found: StartResult) -> contract.BatchActionItem:
         if isinstance(found.result, Problem):
             why = found.result
             told = Refusal(type=problem_type(why), title=why.title, status=why.status, detail=why.detail)
-            return contract.FleetItem(device=found.device, status=why.status, action=None, problem=told)
+            return contract.BatchActionItem(device=found.device, status=why.status, action=None, problem=told)
         status = 200 if found.there else 202
-        return contract.FleetItem(
+        return contract.BatchActionItem(
             device=found.device, status=status, action=await show_action(functions, found.result), problem=None
         )
 

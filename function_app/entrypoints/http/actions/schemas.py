@@ -4,7 +4,7 @@ from typing import Annotated, Any, Literal
 
 from msgspec import Meta
 
-from function_app.entrypoints.http.framework.schemas import Answer, Epoch, Moment, Request, WaitMs
+from function_app.entrypoints.http.framework.schemas import Epoch, Moment, Request, Response, WaitMs
 from function_app.services.actions.start import Asked
 
 
@@ -27,14 +27,14 @@ class ActionRequest(Request, frozen=True, kw_only=True):
     wait_for: Literal["started", "done"] = "started"
 
 
-class ReasonOut(Answer, frozen=True, kw_only=True):
+class ReasonOut(Response, frozen=True, kw_only=True):
     """Why an action ended as it did."""
 
     code: str
     message: str
 
 
-class ActionOut(Answer, frozen=True, kw_only=True):
+class ActionOut(Response, frozen=True, kw_only=True):
     """An action. ``times``: ``<status>_ms`` → milliseconds since 1970. ``queue_position``: 1 is the next one.
 
     ``epoch`` is 0 while it waits for a lease of its own.
@@ -57,7 +57,7 @@ class ActionOut(Answer, frozen=True, kw_only=True):
     ]
     queue_position: int | None
     epoch: int
-    who: str
+    caller: str
     created_at: Moment
     deadline_at: Moment
     times: dict[str, int]
@@ -67,7 +67,7 @@ class ActionOut(Answer, frozen=True, kw_only=True):
     result: dict[str, Any]
 
 
-class ActionList(Answer, frozen=True, kw_only=True):
+class ActionList(Response, frozen=True, kw_only=True):
     """Actions, newest first."""
 
     items: tuple[ActionOut, ...]

@@ -7,11 +7,11 @@ from msgspec import Meta
 
 from device_agent.protocol import Id
 from function_app.entrypoints.http.actions.schemas import ActionOut
-from function_app.entrypoints.http.framework.schemas import Answer, Epoch, Problem, Request, WaitMs
+from function_app.entrypoints.http.framework.schemas import Epoch, Problem, Request, Response, WaitMs
 from function_app.services.actions.start import Asked
 
 
-class FleetRequest(Request, frozen=True, kw_only=True):
+class BatchActionRequest(Request, frozen=True, kw_only=True):
     """One action on many devices. As for one device; ``epochs``: device → the epoch of the caller's lease on it."""
 
     devices: Annotated[tuple[Id, ...], Meta(min_length=1, max_length=100)]
@@ -25,7 +25,7 @@ class FleetRequest(Request, frozen=True, kw_only=True):
     wait_for: Literal["started", "done"] = "started"
 
 
-class FleetItem(Answer, frozen=True, kw_only=True):
+class BatchActionItem(Response, frozen=True, kw_only=True):
     """What became of it on one device: the action, or why there is none; ``status`` as for one device."""
 
     device: str
@@ -34,7 +34,7 @@ class FleetItem(Answer, frozen=True, kw_only=True):
     problem: Problem | None
 
 
-class FleetOut(Answer, frozen=True, kw_only=True):
+class BatchActionOut(Response, frozen=True, kw_only=True):
     """One item for each device, in the order asked."""
 
-    items: tuple[FleetItem, ...]
+    items: tuple[BatchActionItem, ...]

@@ -1,7 +1,7 @@
 """``stop``: of a device, of a space, of all."""
 
 from device_agent.protocol import Text
-from function_app.entrypoints.http.framework.schemas import Answer, Problem, Request
+from function_app.entrypoints.http.framework.schemas import Problem, Request, Response
 
 
 class StopRequest(Request, frozen=True, kw_only=True):
@@ -10,13 +10,13 @@ class StopRequest(Request, frozen=True, kw_only=True):
     reason: Text = ""
 
 
-class Confirmed(Answer, frozen=True, kw_only=True):
+class StopConfirmation(Response, frozen=True, kw_only=True):
     """Whether the device has confirmed within a second."""
 
     confirmed: bool
 
 
-class StopItem(Answer, frozen=True, kw_only=True):
+class StopItem(Response, frozen=True, kw_only=True):
     """What became of it on one device; ``status`` and ``problem`` as for one device."""
 
     device: str
@@ -25,7 +25,7 @@ class StopItem(Answer, frozen=True, kw_only=True):
     problem: Problem | None
 
 
-class StopOut(Answer, frozen=True, kw_only=True):
+class StopOut(Response, frozen=True, kw_only=True):
     """One item for each device that the caller may operate."""
 
     items: tuple[StopItem, ...]

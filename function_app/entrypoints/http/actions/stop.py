@@ -21,26 +21,26 @@ def router(functions: Functions, caller: Caller) -> Routes:
         summary="Stop",
         body=contract.StopRequest,
         body_required=False,
-        answers={200: contract.Confirmed},
+        answers={200: contract.StopConfirmation},
         problems=(404,),
     )
     async def stop_device(request: Request, device: str) -> Response:
         """Needs no lease. Latches until it is reset."""
         who = await caller.account(request)
         asked = await read_or(request, contract.StopRequest, contract.StopRequest())
-        return answer(contract.Confirmed(confirmed=await functions.stop.stop(who, device, asked.reason)))
+        return answer(contract.StopConfirmation(confirmed=await functions.stop.stop(who, device, asked.reason)))
 
     @routes.add(
         "POST",
         "/devices/{device}/stop/reset",
         summary="Release the Stop latch",
-        answers={200: contract.Confirmed},
+        answers={200: contract.StopConfirmation},
         problems=(404,),
     )
     async def reset_stop(request: Request, device: str) -> Response:
         """Nothing resumes: control must be taken again. One device at a time, by who has looked at it."""
         who = await caller.account(request)
-        return answer(contract.Confirmed(confirmed=await functions.stop.reset(who, device)))
+        return answer(contract.StopConfirmation(confirmed=await functions.stop.reset(who, device)))
 
     @routes.add(
         "POST",

@@ -26,13 +26,17 @@ def router(functions: Functions, caller: Caller) -> Routes:
 
 def _holding(routes: Routes, functions: Functions, caller: Caller) -> None:
     @routes.add(
-        "GET", "/devices/{device}/lease", summary="Who controls it", answers={200: contract.LeaseNow}, problems=(404,)
+        "GET",
+        "/devices/{device}/lease",
+        summary="Who controls it",
+        answers={200: contract.LeaseStatus},
+        problems=(404,),
     )
     async def get_lease(request: Request, device: str) -> Response:
         """The live lease with the open request for it, or null."""
         who = await caller.account(request)
         lease = await functions.leases.get(who, device)
-        return answer(contract.LeaseNow(lease=serializers.lease(lease, who, functions.clock.now_ms())))
+        return answer(contract.LeaseStatus(lease=serializers.lease(lease, who, functions.clock.now_ms())))
 
     @routes.add(
         "POST",
@@ -83,24 +87,26 @@ def _asking(routes: Routes, functions: Functions, caller: Caller) -> None:
         "POST",
         "/devices/{device}/lease/requests",
         summary="Ask for control",
-        body=contract.AskForControl,
+        body=contract.NewControlRequest,
         body_required=False,
-        answers={200: contract.ControlAsked, 201: contract.ControlAsked},
+        answers={200: contract.ControlRequestCreated, 201: contract.ControlRequestCreated},
         problems=(404, 409),
     )
-    async def ask_for_control(request: Request, device: str) -> Response:
+    async def request_control(request: Request, device: str) -> Response:
         """Of whoever has it; the device shows it in its ``state``. Who asks already is given their request (200).
 
         Silence takes control from nobody: without an answer within ``within_ms`` it lapses. It also ends with the lease
         that it asks for. What has become of it stays readable until the next request.
         """
         who = await caller.account(request)
-        wanted = await read_or(request, contract.AskForControl, contract.AskForControl())
+        wanted = await read_or(request, contract.NewControlRequest, contract.NewControlRequest())
         lease, asked, fresh, shown = await functions.control_requests.create(
             who, device, within_ms=wanted.within_ms, lease_ms=wanted.lease_ms, wait_ms=wanted.wait_ms
         )
         now_ms = functions.clock.now_ms()
-        body = contract.ControlAsked(request=serializers.control_request(asked, lease, who, now_ms), confirmed=shown)
+        body = contract.ControlRequestCreated(
+            request=serializers.control_request(asked, lease, who, now_ms), confirmed=shown
+        )
         where = {"Location": f"{PREFIX}/devices/{device}/lease/requests/{asked.id}"}
         return answer(body, 201 if fresh else 200, where)
 
@@ -121,32 +127,32 @@ def _asking(routes: Routes, functions: Functions, caller: Caller) -> None:
         "POST",
         "/devices/{device}/lease/requests/{request_id}/accept",
         summary="Hand control over",
-        body=contract.AcceptRequest,
+        body=contract.AcceptControlRequest,
         body_required=False,
-        answers={200: contract.ControlHandedOver},
+        answers={200: contract.ControlRequestAccepted},
         problems=(404, 409),
     )
     async def accept_control_request(request: Request, device: str, request_id: str) -> Response:
         """Only by who has control. In one write the next epoch is the asker's; what moves is held."""
         who = await caller.account(request)
-        wanted = await read_or(request, contract.AcceptRequest, contract.AcceptRequest())
+        wanted = await read_or(request, contract.AcceptControlRequest, contract.AcceptControlRequest())
         lease, asked, confirmed = await functions.control_requests.accept(
             who, device, request_id, wait_ms=wanted.wait_ms
         )
         now_ms = functions.clock.now_ms()
-        body = contract.ControlHandedOver(
+        body = contract.ControlRequestAccepted(
             request=serializers.control_request(asked, lease, who, now_ms), epoch=asked.epoch + 1, confirmed=confirmed
         )
         return answer(body)
 
     @routes.add(
         "POST",
-        "/devices/{device}/lease/requests/{request_id}/refuse",
+        "/devices/{device}/lease/requests/{request_id}/reject",
         summary="Keep control",
         answers={200: contract.ControlRequestOut},
         problems=(404, 409),
     )
-    async def refuse_control_request(request: Request, device: str, request_id: str) -> Response:
+    async def reject_control_request(request: Request, device: str, request_id: str) -> Response:
         """Only by who has control."""
         who = await caller.account(request)
         lease, asked = await functions.control_requests.reject(who, device, request_id)

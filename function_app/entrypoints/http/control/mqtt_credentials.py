@@ -22,15 +22,15 @@ def router(functions: Functions, caller: Caller) -> Routes:
         "POST",
         "/mqtt/credentials",
         summary="Short-lived broker credentials",
-        body=contract.MqttRequest,
+        body=contract.MqttCredentialsRequest,
         answers={200: contract.MqttCredentialsOut},
         problems=(404, 409),
         caller="account or agent",
     )
     async def mqtt_credentials(request: Request) -> Response:
         """For watching, for sending setpoints under a lease, or for an agent's own devices."""
-        asked: Any = await read(request, contract.MqttRequest)
-        agent = await caller.agent(request) if isinstance(asked, contract.AgentRequest) else None
+        asked: Any = await read(request, contract.MqttCredentialsRequest)
+        agent = await caller.agent(request) if isinstance(asked, contract.AgentCredentialsRequest) else None
         issued = await _issue(request, asked, agent)
         wanted = agent is not None and functions.certificates.wanted
         certificate_after_ms = agent.claimed_ms if agent is not None and wanted else None
@@ -61,7 +61,7 @@ def router(functions: Functions, caller: Caller) -> Routes:
         if agent is not None:
             return await functions.mqtt_credentials.agent(agent)
         who = await caller.account(request)
-        if isinstance(asked, contract.ControlRequest):
+        if isinstance(asked, contract.ControlCredentialsRequest):
             return await functions.mqtt_credentials.control(who, asked.device, asked.epoch)
         return await functions.mqtt_credentials.watch(who)
 

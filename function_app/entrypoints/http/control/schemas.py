@@ -4,28 +4,28 @@ from typing import Annotated, Literal
 
 from msgspec import Meta
 
-from function_app.entrypoints.http.framework.schemas import Answer, Epoch, LeaseMs, Moment, Request, WaitMs
+from function_app.entrypoints.http.framework.schemas import Epoch, LeaseMs, Moment, Request, Response, WaitMs
 
 WithinMs = Annotated[int, Meta(ge=1_000, le=120_000)]
 Why = Annotated[str, Meta(max_length=200)]
 
 
-class ControlRequestOut(Answer, frozen=True, kw_only=True):
+class ControlRequestOut(Response, frozen=True, kw_only=True):
     """Somebody asks for control. ``mine``: you ask; ``epoch``: of the lease that is asked for.
 
     ``ended``: the lease that it asked for has ended otherwise; look who has control now.
     """
 
     id: str
-    by: str
+    requester: str
     epoch: int
     mine: bool
-    asked_at: Moment
+    requested_at: Moment
     expires_at: Moment
-    outcome: Literal["open", "accepted", "refused", "withdrawn", "lapsed", "ended"]
+    outcome: Literal["open", "accepted", "rejected", "withdrawn", "expired", "ended"]
 
 
-class LeaseOut(Answer, frozen=True, kw_only=True):
+class LeaseOut(Response, frozen=True, kw_only=True):
     """Who controls a device. ``reason``: why it was taken from somebody else; ``request``: the open one, if any."""
 
     holder: str
@@ -49,7 +49,7 @@ class LeaseRequest(Request, frozen=True, kw_only=True):
     reason: Why = ""
 
 
-class LeaseGranted(Answer, frozen=True, kw_only=True):
+class LeaseGranted(Response, frozen=True, kw_only=True):
     """The caller's lease. ``confirmed``: the device has acknowledged it."""
 
     epoch: int
@@ -59,13 +59,13 @@ class LeaseGranted(Answer, frozen=True, kw_only=True):
     confirmed: bool
 
 
-class LeaseNow(Answer, frozen=True, kw_only=True):
+class LeaseStatus(Response, frozen=True, kw_only=True):
     """The live lease of a device, if any."""
 
     lease: LeaseOut | None
 
 
-class AskForControl(Request, frozen=True, kw_only=True):
+class NewControlRequest(Request, frozen=True, kw_only=True):
     """How long the holder has for an answer, and for how long control is wanted."""
 
     within_ms: WithinMs = 30_000
@@ -73,20 +73,20 @@ class AskForControl(Request, frozen=True, kw_only=True):
     wait_ms: WaitMs = 1_000
 
 
-class ControlAsked(Answer, frozen=True, kw_only=True):
+class ControlRequestCreated(Response, frozen=True, kw_only=True):
     """The caller's request. ``confirmed``: the device shows it to everybody who watches."""
 
     request: ControlRequestOut
     confirmed: bool
 
 
-class AcceptRequest(Request, frozen=True, kw_only=True):
+class AcceptControlRequest(Request, frozen=True, kw_only=True):
     """How long to wait for the device."""
 
     wait_ms: WaitMs = 1_000
 
 
-class ControlHandedOver(Answer, frozen=True, kw_only=True):
+class ControlRequestAccepted(Response, frozen=True, kw_only=True):
     """The request, and the epoch that who asked has now. ``confirmed``: the device obeys it already."""
 
     request: ControlRequestOut

@@ -1,28 +1,28 @@
 """``mqtt/credentials``."""
 
 from device_agent.protocol import Id
-from function_app.entrypoints.http.framework.schemas import Answer, Epoch, Moment, Request
+from function_app.entrypoints.http.framework.schemas import Epoch, Moment, Request, Response
 
 
-class WatchRequest(Request, frozen=True, kw_only=True, tag_field="purpose", tag="watch"):
+class ViewCredentialsRequest(Request, frozen=True, kw_only=True, tag_field="purpose", tag="view"):
     """To see every device and to stop those one may operate."""
 
 
-class ControlRequest(Request, frozen=True, kw_only=True, tag_field="purpose", tag="control"):
+class ControlCredentialsRequest(Request, frozen=True, kw_only=True, tag_field="purpose", tag="control"):
     """To send setpoints under a lease."""
 
     device: Id
     epoch: Epoch
 
 
-class AgentRequest(Request, frozen=True, kw_only=True, tag_field="purpose", tag="agent"):
+class AgentCredentialsRequest(Request, frozen=True, kw_only=True, tag_field="purpose", tag="agent"):
     """To speak for an agent's own devices."""
 
 
-MqttRequest = WatchRequest | ControlRequest | AgentRequest
+MqttCredentialsRequest = ViewCredentialsRequest | ControlCredentialsRequest | AgentCredentialsRequest
 
 
-class TcpAddress(Answer, frozen=True, kw_only=True):
+class TcpAddress(Response, frozen=True, kw_only=True):
     """Where the broker takes MQTT. It wants certificates of agents that are newer than ``certificate_after_ms``."""
 
     host: str
@@ -31,7 +31,7 @@ class TcpAddress(Answer, frozen=True, kw_only=True):
     certificate_after_ms: int | None = None
 
 
-class MqttCredentialsOut(Answer, frozen=True, kw_only=True):
+class MqttCredentialsOut(Response, frozen=True, kw_only=True):
     """What to connect with, and the topics it is good for; for an agent also what is new of the cloud's keys."""
 
     client_id: str

@@ -41,30 +41,30 @@ def _named_and_seen(routes: Routes, functions: Functions, caller: Caller) -> Non
         "PUT",
         "/devices/{device}/label",
         summary="Name a device",
-        body=contract.RenameRequest,
+        body=contract.RenameDeviceRequest,
         answers={200: contract.DeviceOut},
         problems=(403, 404),
     )
     async def rename_device(request: Request, device: str) -> Response:
         """For its owner. Whoever takes it over later finds it called as its agent calls it."""
         who = await caller.account(request)
-        asked: contract.RenameRequest = await read(request, contract.RenameRequest)
+        asked: contract.RenameDeviceRequest = await read(request, contract.RenameDeviceRequest)
         label = None if asked.label is None else " ".join(asked.label.split())
         await functions.rename.rename(who, device, label)
         return answer(serializers.device(await functions.devices.view(who, device), who, functions.clock.now_ms()))
 
     @routes.add(
         "PUT",
-        "/devices/{device}/watchers",
+        "/devices/{device}/viewers",
         summary="Say that one looks at it, and learn who else does",
-        answers={200: contract.WatchersOut},
+        answers={200: contract.ViewersOut},
         problems=(404,),
     )
-    async def watch_device(request: Request, device: str) -> Response:
+    async def add_viewer(request: Request, device: str) -> Response:
         """For whoever may see it. It counts for 25 s; what is said more often than every 5 s changes nothing."""
         who = await caller.account(request)
         others = tuple(
-            contract.WatcherOut(
+            contract.ViewerOut(
                 name=other.name,
                 role=other.role.value,
                 mine=other.account == who.account,
@@ -72,16 +72,16 @@ def _named_and_seen(routes: Routes, functions: Functions, caller: Caller) -> Non
             )
             for other in await functions.viewers.mark(who, device)
         )
-        return answer(contract.WatchersOut(items=others, again_ms=_AGAIN_MS))
+        return answer(contract.ViewersOut(items=others, refresh_ms=_AGAIN_MS))
 
     @routes.add(
         "DELETE",
-        "/devices/{device}/watchers",
+        "/devices/{device}/viewers",
         summary="Say that one looks no longer",
         answers={204: None},
         problems=(404,),
     )
-    async def unwatch_device(request: Request, device: str) -> Response:
+    async def remove_viewer(request: Request, device: str) -> Response:
         """Of this sign-in. Whoever says nothing is gone after 25 s too."""
         await functions.viewers.leave(await caller.account(request), device)
         return empty()

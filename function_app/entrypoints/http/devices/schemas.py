@@ -7,13 +7,13 @@ from msgspec import Meta
 from device_agent.protocol import State
 from function_app.entrypoints.http.accounts.schemas import AccountRef
 from function_app.entrypoints.http.control.schemas import LeaseOut
-from function_app.entrypoints.http.framework.schemas import Answer, Moment, Request
+from function_app.entrypoints.http.framework.schemas import Moment, Request, Response
 
 LABEL_PATTERN = r"^[^\x00-\x08\x0e-\x1f\x7f]*[^\s\x00-\x1f\x7f][^\x00-\x08\x0e-\x1f\x7f]*$"
 """Something to read, and nothing that a terminal would obey."""
 
 
-class DeviceOut(Answer, frozen=True, kw_only=True):
+class DeviceOut(Response, frozen=True, kw_only=True):
     """A device. ``role``: what the caller may do with it; ``state``: the newest ``state`` message of the device."""
 
     id: str
@@ -32,20 +32,20 @@ class DeviceOut(Answer, frozen=True, kw_only=True):
     lease: LeaseOut | None
 
 
-class DeviceList(Answer, frozen=True, kw_only=True):
+class DeviceList(Response, frozen=True, kw_only=True):
     """Devices, agent by agent."""
 
     items: tuple[DeviceOut, ...]
     cursor: str | None
 
 
-class RenameRequest(Request, frozen=True, kw_only=True):
+class RenameDeviceRequest(Request, frozen=True, kw_only=True):
     """What a device is to be called, without the blanks around it; null: as its agent calls it."""
 
     label: Annotated[str, Meta(min_length=1, max_length=80, pattern=LABEL_PATTERN)] | None
 
 
-class WatcherOut(Answer, frozen=True, kw_only=True):
+class ViewerOut(Response, frozen=True, kw_only=True):
     """Somebody who looks at a device. ``mine``: the caller's own account, in another sign-in."""
 
     name: str
@@ -54,8 +54,8 @@ class WatcherOut(Answer, frozen=True, kw_only=True):
     since: Moment
 
 
-class WatchersOut(Answer, frozen=True, kw_only=True):
-    """Who else looks at it now, the longest first. To be asked again within ``again_ms``."""
+class ViewersOut(Response, frozen=True, kw_only=True):
+    """Who else looks at it now, the longest first. To be asked again within ``refresh_ms``."""
 
-    items: tuple[WatcherOut, ...]
-    again_ms: int
+    items: tuple[ViewerOut, ...]
+    refresh_ms: int

@@ -16,11 +16,11 @@ class Request(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """Read strictly."""
 
 
-class Answer(Struct, frozen=True, kw_only=True):
+class Response(Struct, frozen=True, kw_only=True):
     """Written as it is."""
 
 
-class Problem(Answer, frozen=True, kw_only=True):
+class Problem(Response, frozen=True, kw_only=True):
     """RFC 9457. ``type`` ends in a stable code; further members depend on it."""
 
     type: str

@@ -94,10 +94,10 @@ def _counts(summary: Summary) -> contract.FaultCounts:
     return contract.FaultCounts(**{severity.value: summary.count(severity) for severity in Severity})
 
 
-def _field(known: FieldView) -> contract.FieldOut:
+def _field(known: FieldView) -> contract.DiagnosticFieldOut:
     limits, watch = known.rule.limits, known.watch
     usual = usual_range(watch, limits)
-    return contract.FieldOut(
+    return contract.DiagnosticFieldOut(
         stream=known.stream,
         field=known.name,
         label=known.rule.label,

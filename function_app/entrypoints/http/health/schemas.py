@@ -2,13 +2,13 @@
 
 from typing import Literal
 
-from function_app.entrypoints.http.framework.schemas import Answer, Moment
+from function_app.entrypoints.http.framework.schemas import Moment, Response
 from function_app.entrypoints.http.health.schemas_faults import FaultOut
 
 Health = Literal["ok", "unknown", "warning", "fault"]
 
 
-class FieldOut(Answer, frozen=True, kw_only=True):
+class DiagnosticFieldOut(Response, frozen=True, kw_only=True):
     """One watched field, by means over ten seconds.
 
     ``baseline`` is what is usual; values are usually from ``usual_low`` to ``usual_high``, null until that is known.
@@ -36,7 +36,7 @@ class FieldOut(Answer, frozen=True, kw_only=True):
     updated_at: Moment
 
 
-class FaultCounts(Answer, frozen=True, kw_only=True):
+class FaultCounts(Response, frozen=True, kw_only=True):
     """Open faults by severity."""
 
     error: int
@@ -44,7 +44,7 @@ class FaultCounts(Answer, frozen=True, kw_only=True):
     info: int
 
 
-class DeviceDiagnostics(Answer, frozen=True, kw_only=True):
+class DeviceDiagnostics(Response, frozen=True, kw_only=True):
     """How a device is, and all that is watched of it. ``unknown``: nothing is heard of it."""
 
     device: str
@@ -54,10 +54,10 @@ class DeviceDiagnostics(Answer, frozen=True, kw_only=True):
     last_seen_at: Moment | None
     counts: FaultCounts
     faults: tuple[FaultOut, ...]
-    fields: tuple[FieldOut, ...]
+    fields: tuple[DiagnosticFieldOut, ...]
 
 
-class DeviceHealthOut(Answer, frozen=True, kw_only=True):
+class DeviceHealthOut(Response, frozen=True, kw_only=True):
     """How a device is, in short. ``worst`` is its worst open fault."""
 
     device: str
@@ -70,7 +70,7 @@ class DeviceHealthOut(Answer, frozen=True, kw_only=True):
     worst: FaultOut | None
 
 
-class DeviceHealthCounts(Answer, frozen=True, kw_only=True):
+class DeviceHealthCounts(Response, frozen=True, kw_only=True):
     """Devices of this page by health."""
 
     fault: int
@@ -79,7 +79,7 @@ class DeviceHealthCounts(Answer, frozen=True, kw_only=True):
     ok: int
 
 
-class DeviceHealthList(Answer, frozen=True, kw_only=True):
+class DeviceHealthList(Response, frozen=True, kw_only=True):
     """Devices, worst first. A page holds those of up to ``limit`` agents, by default all."""
 
     counts: DeviceHealthCounts

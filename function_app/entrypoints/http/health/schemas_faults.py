@@ -2,10 +2,10 @@
 
 from typing import Literal
 
-from function_app.entrypoints.http.framework.schemas import Answer, Moment
+from function_app.entrypoints.http.framework.schemas import Moment, Response
 
 
-class FaultOut(Answer, frozen=True, kw_only=True):
+class FaultOut(Response, frozen=True, kw_only=True):
     """Something that is or was wrong.
 
     ``kind``: ``reported`` by the device; ``silent``: nothing is heard of it; or what a detector found: ``level``, it is
@@ -33,7 +33,7 @@ class FaultOut(Answer, frozen=True, kw_only=True):
     worsened: int
 
 
-class FaultList(Answer, frozen=True, kw_only=True):
+class FaultList(Response, frozen=True, kw_only=True):
     """Open ones worst first; then the history, newest first."""
 
     items: tuple[FaultOut, ...]

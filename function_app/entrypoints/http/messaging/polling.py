@@ -60,11 +60,11 @@ def router(functions: Functions, caller: Caller) -> Routes:
         "/agents/{agent}/messages",
         summary="What this agent has to say",
         body=contract.MessagesRequest,
-        answers={200: contract.MessagesTaken},
+        answers={200: contract.MessageResults},
         problems=(404, 409),
         caller="agent",
     )
-    async def tell_messages(request: Request, agent: str) -> Response:
+    async def post_agent_messages(request: Request, agent: str) -> Response:
         """Acks, state, description, events, telemetry, as over MQTT; told to the broker's subscribers too.
 
         Each message has its own result. All may be told again: what was taken already changes nothing.
@@ -75,10 +75,10 @@ def router(functions: Functions, caller: Caller) -> Routes:
         await functions.polling.mark_online(asking)  # first: what it says of itself counts more
         told = [(each.topic, bytes(each.payload)) for each in asked.messages]
         results = (
-            contract.ToldOut(status="stored" if why is None else "refused", detail=why and f"{why.rstrip('.')}.")
+            contract.MessageResult(status="stored" if why is None else "rejected", detail=why and f"{why.rstrip('.')}.")
             for why in await tell(functions, asking, told, by="http")
         )
-        return answer(contract.MessagesTaken(results=tuple(results)))
+        return answer(contract.MessageResults(results=tuple(results)))
 
     async def _asking(request: Request, agent: str) -> Agent:
         """The agent that asks, once it is seen that the path names it."""

@@ -4,10 +4,10 @@ from typing import Annotated, Literal
 
 from msgspec import Meta, Raw
 
-from function_app.entrypoints.http.framework.schemas import Answer, Moment, Request
+from function_app.entrypoints.http.framework.schemas import Moment, Request, Response
 
 
-class CommandOut(Answer, frozen=True, kw_only=True):
+class CommandOut(Response, frozen=True, kw_only=True):
     """One command. ``payload`` is the text of the MQTT message on ``topic``, byte for byte: its signature holds."""
 
     id: str
@@ -16,13 +16,13 @@ class CommandOut(Answer, frozen=True, kw_only=True):
     expires_at: Moment
 
 
-class CommandList(Answer, frozen=True, kw_only=True):
+class CommandList(Response, frozen=True, kw_only=True):
     """Commands that wait for an answer: Stop first, then the oldest first."""
 
     items: tuple[CommandOut, ...]
 
 
-class Told(Request, frozen=True, kw_only=True):
+class AgentMessage(Request, frozen=True, kw_only=True):
     """One message: topic and payload as on MQTT."""
 
     topic: Annotated[str, Meta(min_length=1, max_length=400)]
@@ -32,17 +32,17 @@ class Told(Request, frozen=True, kw_only=True):
 class MessagesRequest(Request, frozen=True, kw_only=True):
     """Messages in the order in which they were said."""
 
-    messages: Annotated[tuple[Told, ...], Meta(min_length=1, max_length=500)]
+    messages: Annotated[tuple[AgentMessage, ...], Meta(min_length=1, max_length=500)]
 
 
-class ToldOut(Answer, frozen=True, kw_only=True):
+class MessageResult(Response, frozen=True, kw_only=True):
     """``stored``, or why not: telling it again changes nothing."""
 
-    status: Literal["stored", "refused"]
+    status: Literal["stored", "rejected"]
     detail: str | None = None
 
 
-class MessagesTaken(Answer, frozen=True, kw_only=True):
+class MessageResults(Response, frozen=True, kw_only=True):
     """One result for each message, in order."""
 
-    results: tuple[ToldOut, ...]
+    results: tuple[MessageResult, ...]

@@ -4,13 +4,13 @@ from typing import Annotated, Literal
 
 from msgspec import Meta
 
-from function_app.entrypoints.http.control.schemas_broker import AgentRequest, WatchRequest
-from function_app.entrypoints.http.framework.schemas import Answer, Moment, Request
+from function_app.entrypoints.http.control.schemas_broker import AgentCredentialsRequest, ViewCredentialsRequest
+from function_app.entrypoints.http.framework.schemas import Moment, Request, Response
 
-XmppRequest = WatchRequest | AgentRequest
+XmppCredentialsRequest = ViewCredentialsRequest | AgentCredentialsRequest
 
 
-class XmppCredentialsOut(Answer, frozen=True, kw_only=True):
+class XmppCredentialsOut(Response, frozen=True, kw_only=True):
     """Where to connect, as whom, and with whom to speak.
 
     ``cloud`` is the bare JID of whoever speaks for the cloud.
@@ -29,25 +29,25 @@ class XmppCredentialsOut(Answer, frozen=True, kw_only=True):
     signing_key: str = ""
 
 
-class VerifyRequest(Request, frozen=True, kw_only=True):
+class XmppVerifyRequest(Request, frozen=True, kw_only=True):
     """What somebody gave at a login."""
 
     user: Annotated[str, Meta(min_length=1, max_length=64)]
     password: Annotated[str, Meta(min_length=1, max_length=4096)]
 
 
-class ContactOut(Answer, frozen=True, kw_only=True):
+class XmppContactOut(Response, frozen=True, kw_only=True):
     """Somebody whom the user knows, and is known to."""
 
     user: str
     name: str
 
 
-class AdmittedOut(Answer, frozen=True, kw_only=True):
+class XmppIdentityOut(Response, frozen=True, kw_only=True):
     """Who it is, how long the connection may last, and whom they know."""
 
     user: str
     name: str
     kind: Literal["agent", "account", "cloud"]
     lifetime_s: int
-    contacts: tuple[ContactOut, ...]
+    contacts: tuple[XmppContactOut, ...]

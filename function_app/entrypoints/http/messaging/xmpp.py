@@ -7,7 +7,7 @@ from fastapi import Request, Response
 from device_agent.protocol.xmpp import jids
 from function_app.bootstrap import Functions
 from function_app.domain.common.timestamps import rfc3339
-from function_app.entrypoints.http.control.schemas_broker import AgentRequest
+from function_app.entrypoints.http.control.schemas_broker import AgentCredentialsRequest
 from function_app.entrypoints.http.framework.authentication import Caller
 from function_app.entrypoints.http.framework.responses import answer, read
 from function_app.entrypoints.http.framework.routing import Routes
@@ -24,16 +24,16 @@ def router(functions: Functions, caller: Caller) -> Routes:
         "POST",
         "/xmpp/credentials",
         summary="Credentials for the XMPP server",
-        body=contract.XmppRequest,
+        body=contract.XmppCredentialsRequest,
         answers={200: contract.XmppCredentialsOut},
         problems=(409,),
         caller="account or agent",
     )
     async def xmpp_credentials(request: Request) -> Response:
         """For an agent that said ``xmpp`` when it enrolled; or to watch one's agents with any XMPP client."""
-        asked: Any = await read(request, contract.XmppRequest)
+        asked: Any = await read(request, contract.XmppCredentialsRequest)
         space: str | None = None
-        if isinstance(asked, AgentRequest):
+        if isinstance(asked, AgentCredentialsRequest):
             agent = await caller.agent(request)
             given = await functions.xmpp_credentials.agent(agent)
             space = agent.space
@@ -60,21 +60,21 @@ def router(functions: Functions, caller: Caller) -> Routes:
         "POST",
         "/xmpp/verify",
         summary="Whether somebody may log in at the XMPP server",
-        body=contract.VerifyRequest,
-        answers={200: contract.AdmittedOut},
+        body=contract.XmppVerifyRequest,
+        answers={200: contract.XmppIdentityOut},
         problems=(401, 409),
         caller="nobody",
     )
     async def xmpp_verify(request: Request) -> Response:
         """Asked by the XMPP server; who has no valid password learns nothing here."""
-        asked: contract.VerifyRequest = await read(request, contract.VerifyRequest)
+        asked: contract.XmppVerifyRequest = await read(request, contract.XmppVerifyRequest)
         found = await functions.xmpp_credentials.verify(asked.user, asked.password)
-        body = contract.AdmittedOut(
+        body = contract.XmppIdentityOut(
             user=found.user,
             name=found.name,
             kind=found.kind,
             lifetime_s=found.lifetime_s,
-            contacts=tuple(contract.ContactOut(user=each.user, name=each.name) for each in found.contacts),
+            contacts=tuple(contract.XmppContactOut(user=each.user, name=each.name) for each in found.contacts),
         )
         return answer(body, headers=_NOT_KEPT)
 

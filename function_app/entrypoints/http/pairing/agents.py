@@ -32,7 +32,7 @@ def router(functions: Functions, caller: Caller) -> Routes:
         "/agents/enroll",
         summary="Make an agent known",
         body=contract.EnrollRequest,
-        answers={200: contract.Enrolled, 201: contract.Enrolled},
+        answers={200: contract.EnrollmentOut, 201: contract.EnrollmentOut},
         problems=(409,),
         caller="agent",
     )
@@ -46,9 +46,9 @@ def router(functions: Functions, caller: Caller) -> Routes:
         told = Enrollment(asked.name, asked.public_key, asked.software, specs, asked.transport)
         done = await functions.enroll.enroll(agent, told)
         if done.claimed:
-            return answer(contract.Enrolled(agent=done.id, claim_code=None, expires_at=None, expires_in_s=0))
+            return answer(contract.EnrollmentOut(agent=done.id, claim_code=None, expires_at=None, expires_in_s=0))
         left_ms = max(0, done.claim_expires_ms - functions.clock.now_ms())
-        body = contract.Enrolled(
+        body = contract.EnrollmentOut(
             agent=done.id,
             claim_code=format_claim_code(done.claim_code),
             expires_at=rfc3339(done.claim_expires_ms),
@@ -74,7 +74,7 @@ def router(functions: Functions, caller: Caller) -> Routes:
             space=agent.space,
             account=await _account(functions, agent),
             keys=tuple(
-                contract.KeyOut(
+                contract.SigningKeyOut(
                     id=pin.id, public=signing.public_text(pin.key), serial=pin.serial, until_ms=pin.until_ms
                 )
                 for pin in news.pins
@@ -105,7 +105,7 @@ def router(functions: Functions, caller: Caller) -> Routes:
         "/agents/claim",
         summary="Claim an agent with the code it shows",
         body=contract.ClaimRequest,
-        answers={200: contract.Claimed},
+        answers={200: contract.ClaimOut},
         problems=(404, 429),
     )
     async def claim_agent(request: Request) -> Response:
@@ -120,7 +120,7 @@ def router(functions: Functions, caller: Caller) -> Routes:
         )
         views = await functions.devices.of_agent(who, agent.id)
         found = tuple(serializers.device(view, who, functions.clock.now_ms()) for view in views)
-        return answer(contract.Claimed(agent=agent.id, space=agent.space or "", devices=found))
+        return answer(contract.ClaimOut(agent=agent.id, space=agent.space or "", devices=found))
 
     @routes.add("GET", "/agents", summary="The account's agents", answers={200: contract.AgentList}, problems=(422,))
     async def list_agents(request: Request, cursor: Cursor = None, limit: Limit = 100) -> Response:
@@ -134,14 +134,14 @@ def router(functions: Functions, caller: Caller) -> Routes:
         "PUT",
         "/agents/{agent}/space",
         summary="Move an agent to another space",
-        body=contract.MoveRequest,
+        body=contract.MoveAgentRequest,
         answers={200: contract.AgentOut},
         problems=(404,),
     )
     async def move_agent(request: Request, agent: str) -> Response:
         """Its history stays; what its devices do ends, control is lost, and its broker connection is cut."""
         who = await caller.account(request)
-        asked: contract.MoveRequest = await read(request, contract.MoveRequest)
+        asked: contract.MoveAgentRequest = await read(request, contract.MoveAgentRequest)
         return answer(_shown(await functions.unpair.move(who, agent, asked.space)))
 
     @routes.add("DELETE", "/agents/{agent}", summary="Un-pair an agent", answers={204: None}, problems=(404,))

@@ -7,7 +7,7 @@ from msgspec import Meta
 from device_agent.protocol import Id, Label
 from function_app.entrypoints.http.accounts.schemas import AccountRef
 from function_app.entrypoints.http.devices.schemas import DeviceOut
-from function_app.entrypoints.http.framework.schemas import Answer, DeviceName, Moment, Name, Request
+from function_app.entrypoints.http.framework.schemas import DeviceName, Moment, Name, Request, Response
 
 
 class DeviceIn(Request, frozen=True, kw_only=True):
@@ -32,7 +32,7 @@ class EnrollRequest(Request, frozen=True, kw_only=True):
     ] = "mqtt"
 
 
-class Enrolled(Answer, frozen=True, kw_only=True):
+class EnrollmentOut(Response, frozen=True, kw_only=True):
     """``claim_code`` is null once the agent is claimed."""
 
     agent: str
@@ -41,7 +41,7 @@ class Enrolled(Answer, frozen=True, kw_only=True):
     expires_in_s: int
 
 
-class KeyOut(Answer, frozen=True, kw_only=True):
+class SigningKeyOut(Response, frozen=True, kw_only=True):
     """A public key (Ed25519, base64url), its id and place in their order; it counts until ``until_ms`` (0: on)."""
 
     id: str
@@ -50,7 +50,7 @@ class KeyOut(Answer, frozen=True, kw_only=True):
     until_ms: int
 
 
-class EnrollmentState(Answer, frozen=True, kw_only=True):
+class EnrollmentState(Response, frozen=True, kw_only=True):
     """Whether an agent is claimed, and the keys whose commands it is to obey.
 
     ``key_statements`` lead from a key that is pinned already to the newest; ``signing_key`` signs commands now.
@@ -60,7 +60,7 @@ class EnrollmentState(Answer, frozen=True, kw_only=True):
     state: Literal["waiting", "claimed"]
     space: str | None
     account: AccountRef | None
-    keys: tuple[KeyOut, ...]
+    keys: tuple[SigningKeyOut, ...]
     key_statements: tuple[str, ...]
     signing_key: str
 
@@ -71,7 +71,7 @@ class CertificateRequest(Request, frozen=True, kw_only=True):
     request: Annotated[str, Meta(min_length=1, max_length=4096)]
 
 
-class CertificateOut(Answer, frozen=True, kw_only=True):
+class CertificateOut(Response, frozen=True, kw_only=True):
     """What the agent is to show to the broker, in PEM."""
 
     chain: str
@@ -85,13 +85,13 @@ class ClaimRequest(Request, frozen=True, kw_only=True):
     space: Id | None = None
 
 
-class MoveRequest(Request, frozen=True, kw_only=True):
+class MoveAgentRequest(Request, frozen=True, kw_only=True):
     """The space to move an agent to, one of the account's."""
 
     space: Id
 
 
-class AgentOut(Answer, frozen=True, kw_only=True):
+class AgentOut(Response, frozen=True, kw_only=True):
     """An agent of the account."""
 
     id: str
@@ -103,14 +103,14 @@ class AgentOut(Answer, frozen=True, kw_only=True):
     claimed_at: Moment
 
 
-class AgentList(Answer, frozen=True, kw_only=True):
+class AgentList(Response, frozen=True, kw_only=True):
     """Agents."""
 
     items: tuple[AgentOut, ...]
     cursor: str | None
 
 
-class Claimed(Answer, frozen=True, kw_only=True):
+class ClaimOut(Response, frozen=True, kw_only=True):
     """What was claimed."""
 
     agent: str

@@ -1,4 +1,4 @@
-"""``robot-type-looks``: a robot type before it is saved."""
+"""``robot-type-previews``: a robot type before it is saved."""
 
 from fastapi import Request, Response
 
@@ -9,7 +9,7 @@ from function_app.entrypoints.http.framework.responses import answer, empty, rea
 from function_app.entrypoints.http.framework.routing import PREFIX, Routes
 from function_app.entrypoints.http.robot_types import schemas as contract
 
-_ONE = "/robot-type-looks/{look}"
+_ONE = "/robot-type-previews/{preview}"
 
 
 def router(functions: Functions, caller: Caller) -> Routes:
@@ -18,29 +18,31 @@ def router(functions: Functions, caller: Caller) -> Routes:
 
     @routes.add(
         "POST",
-        "/robot-type-looks",
+        "/robot-type-previews",
         summary="Look at a robot type before it is saved",
-        body=contract.TypeLookRequest,
-        answers={201: contract.TypePreviewOut, 202: contract.TypePreviewOut},
+        body=contract.RobotTypePreviewRequest,
+        answers={201: contract.RobotTypePreviewOut, 202: contract.RobotTypePreviewOut},
         problems=(409,),
     )
-    async def add_robot_type_look(request: Request) -> Response:
+    async def add_robot_type_preview(request: Request) -> Response:
         """Compiled and compared with its manifest as an upload is. 201: there is a verdict; 202: look at it again.
 
         Four of an account are kept, each for half an hour.
         """
         who = await caller.account(request)
-        asked: contract.TypeLookRequest = await read(request, contract.TypeLookRequest, limit=contract.MAX_UPLOAD)
+        asked: contract.RobotTypePreviewRequest = await read(
+            request, contract.RobotTypePreviewRequest, limit=contract.MAX_UPLOAD
+        )
         found = await functions.robot_type_preview.begin(
             who, asked.manifest, asked.files, asked.movements, wait_ms=asked.wait_ms
         )
         status = 202 if found.upload.open else 201
-        return answer(serializers.look(found), status, {"Location": f"{PREFIX}/robot-type-looks/{found.id}"})
+        return answer(serializers.look(found), status, {"Location": f"{PREFIX}/robot-type-previews/{found.id}"})
 
-    @routes.add("GET", _ONE, summary="How a look fares", answers={200: contract.TypePreviewOut}, problems=(404,))
-    async def get_robot_type_look(request: Request, look: str) -> Response:
+    @routes.add("GET", _ONE, summary="How a look fares", answers={200: contract.RobotTypePreviewOut}, problems=(404,))
+    async def get_robot_type_preview(request: Request, preview: str) -> Response:
         """One's own."""
-        return answer(serializers.look(await functions.robot_type_preview.get(await caller.account(request), look)))
+        return answer(serializers.look(await functions.robot_type_preview.get(await caller.account(request), preview)))
 
     @routes.add(
         "GET",
@@ -49,24 +51,26 @@ def router(functions: Functions, caller: Caller) -> Routes:
         answers={200: contract.RobotTypeTwin},
         problems=(404, 409, 422),
     )
-    async def get_robot_type_look_twin(request: Request, look: str) -> Response:
+    async def get_robot_type_preview_twin(request: Request, preview: str) -> Response:
         """As of a robot type."""
-        return answer(serializers.twin(await functions.robot_type_preview.model(await caller.account(request), look)))
+        return answer(
+            serializers.twin(await functions.robot_type_preview.model(await caller.account(request), preview))
+        )
 
     @routes.add(
         "POST",
         _ONE + "/save",
         summary="Save what is looked at",
-        body=contract.SaveTypeLookRequest,
+        body=contract.SaveRobotTypePreviewRequest,
         body_required=False,
         answers={200: contract.RobotTypeOut, 201: contract.RobotTypeOut, 202: contract.RobotTypeOut},
         problems=(404, 409),
     )
-    async def save_robot_type_look(request: Request, look: str) -> Response:
+    async def save_robot_type_preview(request: Request, preview: str) -> Response:
         """It becomes a robot type, or the next version of one, as if it were uploaded now; the look ends."""
         who = await caller.account(request)
-        asked = await read_or(request, contract.SaveTypeLookRequest, contract.SaveTypeLookRequest())
-        found, new = await functions.robot_type_preview.save(who, look, wait_ms=asked.wait_ms)
+        asked = await read_or(request, contract.SaveRobotTypePreviewRequest, contract.SaveRobotTypePreviewRequest())
+        found, new = await functions.robot_type_preview.save(who, preview, wait_ms=asked.wait_ms)
         status = 201 if new else 200
         if found.upload is not None and found.upload.open:
             status = 202
@@ -75,9 +79,9 @@ def router(functions: Functions, caller: Caller) -> Routes:
         )
 
     @routes.add("DELETE", _ONE, summary="End a look", answers={204: None}, problems=(404,))
-    async def delete_robot_type_look(request: Request, look: str) -> Response:
+    async def delete_robot_type_preview(request: Request, preview: str) -> Response:
         """What it has stored goes."""
-        await functions.robot_type_preview.drop(await caller.account(request), look)
+        await functions.robot_type_preview.drop(await caller.account(request), preview)
         return empty()
 
     return routes

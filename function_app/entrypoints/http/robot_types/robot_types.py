@@ -36,7 +36,7 @@ def router(functions: Functions, caller: Caller) -> Routes:
     async def add_robot_type(request: Request) -> Response:
         """MuJoCo compiles it and compares it with the manifest. 201 and 200: it is ready, new or the next version.
 
-        202: no verdict yet; look at it again. 422 ``robot-type-refused``: ``errors`` says what is wrong.
+        202: no verdict yet; look at it again. 422 ``robot-type-rejected``: ``errors`` says what is wrong.
         """
         who = await caller.account(request)
         asked: contract.RobotTypeRequest = await read(request, contract.RobotTypeRequest, limit=contract.MAX_UPLOAD)

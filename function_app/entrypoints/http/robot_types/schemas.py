@@ -6,15 +6,15 @@ from msgspec import Meta, field
 
 from device_agent.protocol import Body, Joint, Stream
 from device_agent.protocol.description import MimicJoint, PositionDependentLimit
-from function_app.entrypoints.http.framework.schemas import Answer, Moment, Request, WaitMs
+from function_app.entrypoints.http.framework.schemas import Moment, Request, Response, WaitMs
 from function_app.services.robot_types.package_reader import MAX_FILES, MAX_MANIFEST
 
 MAX_UPLOAD = 8_500_000
 """Bytes of a request that uploads a robot type: the files' 6 MB as base64, and the rest."""
-State = Literal["checking", "ready", "refused"]
+State = Literal["checking", "ready", "rejected"]
 
 
-class TypeUploadOut(Answer, frozen=True, kw_only=True):
+class RobotTypeUploadOut(Response, frozen=True, kw_only=True):
     """The newest upload. ``errors`` are those of the manifest's check and MuJoCo's own; ``warnings`` refuse nothing."""
 
     version: int
@@ -24,7 +24,7 @@ class TypeUploadOut(Answer, frozen=True, kw_only=True):
     uploaded_at: Moment
 
 
-class RobotTypeOut(Answer, frozen=True, kw_only=True):
+class RobotTypeOut(Response, frozen=True, kw_only=True):
     """What every robot of one type has in common, in the version in use: the newest one that was found good.
 
     ``state`` is ``ready`` as soon as there is one; until then everything is of the newest upload. ``files``: name →
@@ -51,10 +51,10 @@ class RobotTypeOut(Answer, frozen=True, kw_only=True):
     built_in: bool
     state: State
     files: dict[str, int]
-    upload: TypeUploadOut | None
+    upload: RobotTypeUploadOut | None
 
 
-class RobotTypeList(Answer, frozen=True, kw_only=True):
+class RobotTypeList(Response, frozen=True, kw_only=True):
     """Robot types by id."""
 
     items: tuple[RobotTypeOut, ...]
@@ -72,7 +72,7 @@ class RobotTypeRequest(Request, frozen=True, kw_only=True):
     wait_ms: WaitMs = 10_000
 
 
-class RobotTypeTwin(Answer, frozen=True, kw_only=True):
+class RobotTypeTwin(Response, frozen=True, kw_only=True):
     """The model as a page can draw it: ``device`` and ``bodies`` as in ``desc/twin``, here for every robot of a type.
 
     ``actuators`` are the model's, ``cameras`` those of its scene.
@@ -88,7 +88,7 @@ MAX_SCRIPTS = 20
 """Movements that can be looked at with a robot type."""
 
 
-class TypeLookRequest(Request, frozen=True, kw_only=True):
+class RobotTypePreviewRequest(Request, frozen=True, kw_only=True):
     """As to add a robot type. ``movements``: name → script; they are looked at, and not stored."""
 
     manifest: Annotated[str, Meta(min_length=1, max_length=MAX_MANIFEST)]
@@ -97,7 +97,7 @@ class TypeLookRequest(Request, frozen=True, kw_only=True):
     wait_ms: WaitMs = 10_000
 
 
-class TypePreviewOut(Answer, frozen=True, kw_only=True):
+class RobotTypePreviewOut(Response, frozen=True, kw_only=True):
     """An upload that is looked at before it is saved; nobody else sees it, and it goes by itself.
 
     ``robot_type`` is as it would be; its ``upload`` says whether it is good.
@@ -108,7 +108,7 @@ class TypePreviewOut(Answer, frozen=True, kw_only=True):
     robot_type: RobotTypeOut
 
 
-class SaveTypeLookRequest(Request, frozen=True, kw_only=True):
+class SaveRobotTypePreviewRequest(Request, frozen=True, kw_only=True):
     """Waits at most ``wait_ms`` for the verdict."""
 
     wait_ms: WaitMs = 10_000

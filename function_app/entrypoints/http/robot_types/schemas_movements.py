@@ -5,12 +5,12 @@ from typing import Annotated
 from msgspec import Meta
 
 from device_agent.protocol import Label
-from function_app.entrypoints.http.framework.schemas import Answer, Moment, Request
+from function_app.entrypoints.http.framework.schemas import Moment, Request, Response
 from function_app.services.robot_types.parameter_schema import ObjectSchema
 from function_app.services.robot_types.script_metadata import MAX_SOURCE
 
 
-class SignatureOut(Answer, frozen=True, kw_only=True):
+class SignatureOut(Response, frozen=True, kw_only=True):
     """Ed25519 over ``telescope/v1/movement``, a line feed, and ``signed`` (UTF-8).
 
     ``signed`` is robot type, name, version and SHA-256, a line each. ``signature`` and ``public`` are base64url;
@@ -23,7 +23,7 @@ class SignatureOut(Answer, frozen=True, kw_only=True):
     signature: str
 
 
-class MovementOut(Answer, frozen=True, kw_only=True):
+class MovementOut(Response, frozen=True, kw_only=True):
     """One version of a movement. Without a ``parameters_schema`` a script takes whatever it is given."""
 
     name: str
@@ -42,7 +42,7 @@ class MovementSource(MovementOut, frozen=True, kw_only=True):
     signature: SignatureOut
 
 
-class MovementList(Answer, frozen=True, kw_only=True):
+class MovementList(Response, frozen=True, kw_only=True):
     """Movements by name, or versions of one, newest first."""
 
     items: tuple[MovementOut, ...]

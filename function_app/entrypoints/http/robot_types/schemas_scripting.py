@@ -5,24 +5,24 @@ from typing import Annotated, Literal
 from msgspec import Meta
 
 from device_agent.protocol.documents.script_api import ScriptApi
-from function_app.entrypoints.http.framework.schemas import Answer, Request
+from function_app.entrypoints.http.framework.schemas import Request, Response
 from function_app.services.robot_types.parameter_schema import ObjectSchema
 
 
-class ScriptingOut(Answer, frozen=True, kw_only=True):
+class ScriptingOut(Response, frozen=True, kw_only=True):
     """What a script finds, and ``names``: ``joints``, ``frames``, ``postures`` … → those of the robot type."""
 
     api: ScriptApi
     names: dict[str, tuple[str, ...]]
 
 
-class CheckRequest(Request, frozen=True, kw_only=True):
+class ScriptCheckRequest(Request, frozen=True, kw_only=True):
     """A script as it stands."""
 
     source: Annotated[str, Meta(max_length=200_000)]
 
 
-class MarkOut(Answer, frozen=True, kw_only=True):
+class ScriptDiagnosticOut(Response, frozen=True, kw_only=True):
     """What is wrong, and where: lines from 1, columns from 0, in characters (not bytes, not UTF-16).
 
     With an ``error`` it cannot be saved; with a ``warning`` it can, and would most likely fail at the robot.
@@ -36,10 +36,10 @@ class MarkOut(Answer, frozen=True, kw_only=True):
     end_column: int
 
 
-class CheckOut(Answer, frozen=True, kw_only=True):
+class ScriptCheckOut(Response, frozen=True, kw_only=True):
     """``savable``: no error. What the script says about itself is known then."""
 
-    marks: tuple[MarkOut, ...]
+    diagnostics: tuple[ScriptDiagnosticOut, ...]
     savable: bool
     description: str
     parameters_schema: ObjectSchema | None

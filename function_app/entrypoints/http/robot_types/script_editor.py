@@ -37,19 +37,19 @@ def router(functions: Functions, caller: Caller) -> Routes:
         "POST",
         _SCRIPTING + "/check",
         summary="Check a script",
-        body=contract.CheckRequest,
-        answers={200: contract.CheckOut},
+        body=contract.ScriptCheckRequest,
+        answers={200: contract.ScriptCheckOut},
         problems=(404, 409),
     )
     async def check_movement(request: Request, robot_type: str) -> Response:
         """What is wrong with it, with the places; nothing is saved, and nothing of it runs."""
         found = await functions.robot_types.get(await caller.account(request), robot_type)
-        asked: contract.CheckRequest = await read(request, contract.CheckRequest)
+        asked: contract.ScriptCheckRequest = await read(request, contract.ScriptCheckRequest)
         checked = check_script(asked.source, found)
         schema = checked.script.schema if checked.script else None
         return answer(
-            contract.CheckOut(
-                marks=tuple(contract.MarkOut(**asdict(mark)) for mark in checked.marks),
+            contract.ScriptCheckOut(
+                diagnostics=tuple(contract.ScriptDiagnosticOut(**asdict(mark)) for mark in checked.marks),
                 savable=checked.script is not None,
                 description=checked.script.description if checked.script else "",
                 parameters_schema=None if schema is None else msgspec.convert(schema, ObjectSchema),

@@ -27,16 +27,16 @@ def router(functions: Functions, caller: Caller) -> Routes:
 
     @routes.add(
         "POST",
-        "/invitations/look",
+        "/invitations/lookup",
         summary="What an invitation offers",
-        body=contract.LookRequest,
+        body=contract.InvitationLookupRequest,
         answers={200: contract.InvitationOut},
         problems=(404,),
     )
-    async def look_at_invitation(request: Request) -> Response:
+    async def look_up_invitation(request: Request) -> Response:
         """For whoever has its secret. A wrong, used, expired and withdrawn one are answered alike."""
         await caller.account(request)
-        asked: contract.LookRequest = await read(request, contract.LookRequest)
+        asked: contract.InvitationLookupRequest = await read(request, contract.InvitationLookupRequest)
         return answer(contract.InvitationOut(**_shown(await functions.invitations.look(asked.secret))))
 
     @routes.add(
@@ -73,7 +73,7 @@ def _of_devices(routes: Routes, invitations: "_Invitations") -> None:
         at,
         summary="Share a device by link",
         body=contract.InvitationRequest,
-        answers={201: contract.InvitationMade},
+        answers={201: contract.InvitationCreated},
         problems=(404, 409),
     )
     async def invite_to_device(request: Request, device: str) -> Response:
@@ -101,7 +101,7 @@ def _of_spaces(routes: Routes, invitations: "_Invitations") -> None:
         at,
         summary="Share a space by link",
         body=contract.InvitationRequest,
-        answers={201: contract.InvitationMade},
+        answers={201: contract.InvitationCreated},
         problems=(404, 409),
     )
     async def invite_to_space(request: Request, space: str) -> Response:
@@ -129,7 +129,7 @@ def _of_whole_spaces(routes: Routes, invitations: "_Invitations") -> None:
         at,
         summary="Offer a space to another account",
         body=contract.TransferRequest,
-        answers={201: contract.InvitationMade},
+        answers={201: contract.InvitationCreated},
         problems=(404, 409),
     )
     async def transfer_space(request: Request, space: str) -> Response:
@@ -157,7 +157,7 @@ def _of_agents(routes: Routes, invitations: "_Invitations") -> None:
         at,
         summary="Offer an agent to another account",
         body=contract.TransferRequest,
-        answers={201: contract.InvitationMade},
+        answers={201: contract.InvitationCreated},
         problems=(404, 409),
     )
     async def transfer_agent(request: Request, agent: str) -> Response:
@@ -220,7 +220,7 @@ class _Invitations:
     async def _make(self, who: Identity, shared: NewShare, offer: Offer) -> Response:
         secret, known = await self._functions.invitations.make(who, shared, offer)
         link = f"{self._functions.settings.public_url}/#invitation={secret}"
-        body = contract.InvitationMade(**_shown(known), secret=secret, link=link)
+        body = contract.InvitationCreated(**_shown(known), secret=secret, link=link)
         return answer(body, 201, headers={"Cache-Control": "no-store"})
 
 

@@ -6,7 +6,7 @@ from msgspec import Meta
 
 from device_agent.protocol import Id
 from function_app.entrypoints.http.accounts.schemas import AccountRef
-from function_app.entrypoints.http.framework.schemas import Answer, Moment, Name, Request
+from function_app.entrypoints.http.framework.schemas import Moment, Name, Request, Response
 
 SharedRole = Literal["operator", "viewer"]
 ForS = Annotated[int, Meta(ge=10, le=10 * 366 * 86_400, description="How long it lasts [s]; null: until it is ended.")]
@@ -20,23 +20,23 @@ class ShareRequest(Request, frozen=True, kw_only=True):
     expires_in_s: ForS | None = None
 
 
-class ShareOut(Answer, frozen=True, kw_only=True):
-    """One account's part. ``by``: who shared it."""
+class ShareOut(Response, frozen=True, kw_only=True):
+    """One account's part. ``created_by``: who shared it."""
 
     account: AccountRef
     role: SharedRole
-    by: str
+    created_by: str
     created_at: Moment
     expires_at: Moment | None
 
 
-class ShareEnding(Answer, frozen=True, kw_only=True):
+class ShareRevocation(Response, frozen=True, kw_only=True):
     """The share has ended and control with it; ``detail``: who could not be told yet, and what becomes of that."""
 
     detail: str
 
 
-class ShareList(Answer, frozen=True, kw_only=True):
+class ShareList(Response, frozen=True, kw_only=True):
     """Shares, oldest first: all of them."""
 
     items: tuple[ShareOut, ...]
@@ -68,7 +68,7 @@ class TransferRequest(Request, frozen=True, kw_only=True):
     account: Name | None = None
 
 
-class InvitationOut(Answer, frozen=True, kw_only=True):
+class InvitationOut(Response, frozen=True, kw_only=True):
     """An open invitation. ``role`` ``owner``: a transfer. ``share_s``: how long the part will last; null: no end.
 
     ``account``: who alone may redeem it, in lists, which are the owner's; null: whoever has the secret.
@@ -79,28 +79,28 @@ class InvitationOut(Answer, frozen=True, kw_only=True):
     target: str
     label: str
     role: Literal["owner", "operator", "viewer"]
-    by: str
+    created_by: str
     uses: int
     share_s: int | None
     expires_at: Moment
     account: AccountRef | None = None
 
 
-class InvitationMade(InvitationOut, frozen=True, kw_only=True):
+class InvitationCreated(InvitationOut, frozen=True, kw_only=True):
     """With its secret, which is told this once, and a link to the console that carries it."""
 
     secret: str
     link: str
 
 
-class InvitationList(Answer, frozen=True, kw_only=True):
+class InvitationList(Response, frozen=True, kw_only=True):
     """Open invitations, oldest first: all of them."""
 
     items: tuple[InvitationOut, ...]
     cursor: str | None
 
 
-class LookRequest(Request, frozen=True, kw_only=True):
+class InvitationLookupRequest(Request, frozen=True, kw_only=True):
     """The secret of an invitation."""
 
     secret: Secret

@@ -79,7 +79,7 @@ def router(functions: Functions, caller: Caller) -> Routes:
         "DELETE",
         "/devices/{device}/shares/{account}",
         summary="Un-share a device",
-        answers={202: contract.ShareEnding, 204: None},
+        answers={202: contract.ShareRevocation, 204: None},
         problems=(404, 409),
     )
     async def unshare_device(request: Request, device: str, account: str) -> Response:
@@ -93,7 +93,7 @@ def router(functions: Functions, caller: Caller) -> Routes:
         "DELETE",
         "/spaces/{space}/shares/{account}",
         summary="Un-share a space",
-        answers={202: contract.ShareEnding, 204: None},
+        answers={202: contract.ShareRevocation, 204: None},
         problems=(404, 409),
     )
     async def unshare_space(request: Request, space: str, account: str) -> Response:
@@ -131,7 +131,7 @@ class _Shares:
             told = await sharing.leave(who, f"{kind}:{name}")
         else:
             told = await sharing.end(who, await sharing.of(who, kind, name), account)
-        return empty() if told else answer(contract.ShareEnding(detail=_UNTOLD), 202)
+        return empty() if told else answer(contract.ShareRevocation(detail=_UNTOLD), 202)
 
 
 def show(share: Share, name: str) -> contract.ShareOut:
@@ -139,7 +139,7 @@ def show(share: Share, name: str) -> contract.ShareOut:
     return contract.ShareOut(
         account=AccountRef(id=share.account, name=name),
         role=_ROLES[share.role],
-        by=share.by,
+        created_by=share.by,
         created_at=rfc3339(share.created_ms),
         expires_at=None if share.expires_ms >= NEVER_MS else rfc3339(share.expires_ms),
     )

@@ -34,7 +34,7 @@ def router(functions: Functions, caller: Caller) -> Routes:
                 message=event["message"],
                 data=event["data"],
                 at=rfc3339(event["at_ms"]),
-                heard_at=rfc3339(event["seen_ms"]),
+                received_at=rfc3339(event["seen_ms"]),
             )
             for event in events
         )

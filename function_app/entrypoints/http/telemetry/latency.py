@@ -121,7 +121,7 @@ def _show(found: LatencySeries, samples: int) -> contract.LatencyOut:
         transport=found.transport,
         path=found.path,
         count=known.count,
-        bins=tuple(contract.Bin(above_ms=low, up_to_ms=high, count=count) for low, high, count in known.bins()),
+        bins=tuple(contract.LatencyBin(above_ms=low, up_to_ms=high, count=count) for low, high, count in known.bins()),
         at_ms=tuple(at_ms for at_ms, _ in recent),
         ms=tuple(ms for _, ms in recent),
         **measures,

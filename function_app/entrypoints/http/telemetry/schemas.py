@@ -2,12 +2,12 @@
 
 from typing import Literal
 
-from function_app.entrypoints.http.framework.schemas import Answer, Moment
+from function_app.entrypoints.http.framework.schemas import Moment, Response
 
 Resolution = Literal["raw", "10s", "1min", "10min", "1h", "6h", "1d"]
 
 
-class StreamOut(Answer, frozen=True, kw_only=True):
+class StreamOut(Response, frozen=True, kw_only=True):
     """A stream of measurements: how many samples it has had since the device was paired, and when."""
 
     name: str
@@ -17,14 +17,14 @@ class StreamOut(Answer, frozen=True, kw_only=True):
     fields: tuple[str, ...]
 
 
-class StreamList(Answer, frozen=True, kw_only=True):
+class StreamList(Response, frozen=True, kw_only=True):
     """The streams of a device, by name: all of them."""
 
     items: tuple[StreamOut, ...]
     cursor: str | None
 
 
-class ColumnOut(Answer, frozen=True, kw_only=True):
+class ColumnOut(Response, frozen=True, kw_only=True):
     """One field, a value for each of ``at_ms``; null where it was not measured.
 
     Of ``raw`` samples ``mean`` is the value itself, and the others are empty.
@@ -37,7 +37,7 @@ class ColumnOut(Answer, frozen=True, kw_only=True):
     count: tuple[int, ...] = ()
 
 
-class DataOut(Answer, frozen=True, kw_only=True):
+class DataOut(Response, frozen=True, kw_only=True):
     """A page of a stream, in columns. ``at_ms``: times of samples, or the beginnings of stretches of ``span_ms``."""
 
     stream: str

@@ -2,11 +2,11 @@
 
 from typing import Any, Literal
 
-from function_app.entrypoints.http.framework.schemas import Answer, Moment
+from function_app.entrypoints.http.framework.schemas import Moment, Response
 
 
-class EventOut(Answer, frozen=True, kw_only=True):
-    """A fact that happened. ``at`` is the clock of whoever tells it, ``heard_at`` the cloud's."""
+class EventOut(Response, frozen=True, kw_only=True):
+    """A fact that happened. ``at`` is the clock of whoever tells it, ``received_at`` the cloud's."""
 
     id: str
     kind: str
@@ -14,10 +14,10 @@ class EventOut(Answer, frozen=True, kw_only=True):
     message: str
     data: dict[str, Any]
     at: Moment
-    heard_at: Moment
+    received_at: Moment
 
 
-class EventList(Answer, frozen=True, kw_only=True):
+class EventList(Response, frozen=True, kw_only=True):
     """Newest first."""
 
     items: tuple[EventOut, ...]

@@ -4,7 +4,7 @@ from typing import Annotated
 
 from msgspec import Meta
 
-from function_app.entrypoints.http.framework.schemas import Answer, DeviceName, Moment, Request
+from function_app.entrypoints.http.framework.schemas import DeviceName, Moment, Request, Response
 from function_app.services.telemetry.latency import Path, Transport
 
 Sent = Annotated[int, Meta(ge=0, le=2**53, description="when, by the sender's clock [ms since 1970, UTC]")]
@@ -38,7 +38,7 @@ class AgentLatencyRequest(Request, frozen=True, kw_only=True):
     samples: Samples
 
 
-class Bin(Answer, frozen=True, kw_only=True):
+class LatencyBin(Response, frozen=True, kw_only=True):
     """How many were longer than ``above_ms`` and not longer than ``up_to_ms``."""
 
     above_ms: float
@@ -46,7 +46,7 @@ class Bin(Answer, frozen=True, kw_only=True):
     count: int
 
 
-class LatencyOut(Answer, frozen=True, kw_only=True):
+class LatencyOut(Response, frozen=True, kw_only=True):
     """One transport and path. Percentiles are within 1 % of the exact ones; null without samples in the span.
 
     ``at_ms`` and ``ms`` are the newest samples as they came, of whatever span, at most 1,000, in time's order.
@@ -62,12 +62,12 @@ class LatencyOut(Answer, frozen=True, kw_only=True):
     p90_ms: float | None
     p95_ms: float | None
     p99_ms: float | None
-    bins: tuple[Bin, ...]
+    bins: tuple[LatencyBin, ...]
     at_ms: tuple[int, ...]
     ms: tuple[float, ...]
 
 
-class LatencyList(Answer, frozen=True, kw_only=True):
+class LatencyList(Response, frozen=True, kw_only=True):
     """By transport and path. ``since`` and ``until`` is the span asked for, widened to whole hours or days (UTC)."""
 
     since: Moment

@@ -5,7 +5,7 @@ from typing import Annotated
 from msgspec import Meta
 
 from device_agent.protocol import Id
-from function_app.entrypoints.http.framework.schemas import Answer, DeviceName, Moment, Request
+from function_app.entrypoints.http.framework.schemas import DeviceName, Moment, Request, Response
 from function_app.ports.blobs import MAX_UPLOAD_BYTES
 
 _WORD = r"[A-Za-z0-9!#$&^_.+-]{1,60}"
@@ -39,7 +39,7 @@ class AgentCompleteRequest(Request, frozen=True, kw_only=True):
     device: DeviceName
 
 
-class UploadBegun(Answer, frozen=True, kw_only=True):
+class UploadStarted(Response, frozen=True, kw_only=True):
     """Send the content to ``url`` with ``method`` and exactly these headers, then complete the upload."""
 
     id: str
@@ -49,7 +49,7 @@ class UploadBegun(Answer, frozen=True, kw_only=True):
     expires_at: Moment
 
 
-class UploadOut(Answer, frozen=True, kw_only=True):
+class UploadOut(Response, frozen=True, kw_only=True):
     """A registered capture. ``verified``: its content was seen to have the hash that was announced."""
 
     id: str
@@ -60,18 +60,18 @@ class UploadOut(Answer, frozen=True, kw_only=True):
     length: int
     sha256: str | None
     verified: bool
-    by: str
+    created_by: str
     stored_at: Moment
     expires_at: Moment
 
 
-class UploadFound(UploadOut, frozen=True, kw_only=True):
+class UploadWithUrl(UploadOut, frozen=True, kw_only=True):
     """A capture, and where it can be read for an hour."""
 
     url: str
 
 
-class UploadList(Answer, frozen=True, kw_only=True):
+class UploadList(Response, frozen=True, kw_only=True):
     """Captures, newest first."""
 
     items: tuple[UploadOut, ...]

@@ -34,7 +34,7 @@ def _for_accounts(routes: Routes, functions: Functions, caller: Caller) -> None:
         "/devices/{device}/uploads",
         summary="Begin an upload",
         body=contract.UploadRequest,
-        answers={201: contract.UploadBegun},
+        answers={201: contract.UploadStarted},
         problems=(404, 409),
     )
     async def begin_upload(request: Request, device: str) -> Response:
@@ -73,14 +73,14 @@ def _for_accounts(routes: Routes, functions: Functions, caller: Caller) -> None:
         "GET",
         "/devices/{device}/uploads/{upload}",
         summary="One capture",
-        answers={200: contract.UploadFound},
+        answers={200: contract.UploadWithUrl},
         problems=(404,),
     )
     async def get_upload(request: Request, device: str, upload: str) -> Response:
         """With an address from which it can be read."""
         found = await functions.devices.get(await caller.account(request), device)
         capture, url = await functions.uploads.get(found, upload)
-        return answer(contract.UploadFound(url=url, **_show(capture)), headers={"Cache-Control": "no-store"})
+        return answer(contract.UploadWithUrl(url=url, **_show(capture)), headers={"Cache-Control": "no-store"})
 
     @routes.add(
         "DELETE",
@@ -102,7 +102,7 @@ def _for_agents(routes: Routes, functions: Functions, caller: Caller) -> None:
         "/agents/{agent}/uploads",
         summary="Begin an agent's upload",
         body=contract.AgentUploadRequest,
-        answers={201: contract.UploadBegun},
+        answers={201: contract.UploadStarted},
         problems=(404, 409),
         caller="agent",
     )
@@ -153,7 +153,7 @@ async def _begin(functions: Functions, device: Device, asked: contract.UploadReq
         sha256=asked.sha256 or "",
     )
     capture, upload = await functions.uploads.begin(device, wanted, by=by)
-    body = contract.UploadBegun(
+    body = contract.UploadStarted(
         id=capture.id,
         method=upload.method,
         url=upload.url,
@@ -173,7 +173,7 @@ def _show(capture: Capture) -> dict[str, Any]:
         "length": capture.length,
         "sha256": capture.sha256 or None,
         "verified": capture.verified,
-        "by": capture.by,
+        "created_by": capture.by,
         "stored_at": rfc3339(capture.stored_ms),
         "expires_at": rfc3339(capture.expires_ms),
     }

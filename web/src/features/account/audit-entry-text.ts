@@ -17,13 +17,13 @@ const says = texts.audit.says;
 const ID_SHOWN = 8;
 
 export function line(record: AuditRecord, names: Names): string {
-  const { what, data } = record;
+  const { event, data } = record;
   const message = data["message"];
   // What is told of control over a device says so itself.
   if (typeof message === "string") return message;
   const who = whoDid(record);
-  const on = thing(record.on, names);
-  switch (what) {
+  const on = thing(record.target, names);
+  switch (event) {
     case "signed-in":
       return says.signedIn(who, says.how[text(data, "how")] ?? "");
     case "sign-in-refused":
@@ -37,7 +37,7 @@ export function line(record: AuditRecord, names: Names): string {
     case "api-key-made":
       return says.keyMade(who, text(data, "name"), role(data), kept(data["only"], names));
     case "api-key-revoked":
-      return says.keyRevoked(who, names.keys.get(aboutWhat(record.on)[1]) ?? "");
+      return says.keyRevoked(who, names.keys.get(aboutWhat(record.target)[1]) ?? "");
     case "space-made":
       return says.spaceMade(who, text(data, "name"));
     case "agent-claimed":
@@ -53,8 +53,8 @@ export function line(record: AuditRecord, names: Names): string {
     case "shared":
       return says.shared(who, on, other(data, names), role(data), until(data["expires_ms"]));
     case "unshared":
-      if (record.who === "") return says.ranOut(on, other(data, names));
-      if (data["with"] === record.by_account) return says.left(who, on);
+      if (record.actor === "") return says.ranOut(on, other(data, names));
+      if (data["with"] === record.account) return says.left(who, on);
       return says.unshared(who, on, other(data, names));
     case "invited":
       return data["role"] === "owner"
@@ -67,20 +67,20 @@ export function line(record: AuditRecord, names: Names): string {
     case "transferred":
       return says.transferred(who, on);
     case "movement-saved":
-      return says.movementSaved(who, record.on);
+      return says.movementSaved(who, record.target);
     case "movement-deleted":
-      return says.movementDeleted(who, record.on);
+      return says.movementDeleted(who, record.target);
     case "robot-type-uploaded":
-      return says.typeUploaded(who, record.on);
+      return says.typeUploaded(who, record.target);
     case "robot-type-deleted":
-      return says.typeDeleted(who, record.on);
+      return says.typeDeleted(who, record.target);
     default:
-      return says.other(who, texts.audit.kinds[what] ?? what, on);
+      return says.other(who, texts.audit.kinds[event] ?? event, on);
   }
 }
 
-function whoDid({ who, by_account: account }: AuditRecord): string {
-  if (who !== "") return who;
+function whoDid({ actor, account }: AuditRecord): string {
+  if (actor !== "") return actor;
   return account === "" ? texts.audit.cloud : texts.audit.somebody;
 }
 

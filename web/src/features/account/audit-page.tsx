@@ -26,8 +26,8 @@ function query({ what, on, from, to }: Filter): AuditQuery {
   const start = (date: string): number => new Date(`${date}T00:00`).getTime();
   return {
     ...EVERYTHING,
-    what,
-    on,
+    event: what,
+    target: on,
     sinceMs: from === "" ? null : start(from),
     untilMs: to === "" ? null : start(to) + DAY_MS,
   };
@@ -83,9 +83,9 @@ export function ActivityPage({ api, fleet }: { api: Api; fleet: Fleet }) {
 /** Of keys that are there, and of those that records tell of. */
 function keyNames(keys: readonly ApiKey[], records: readonly AuditRecord[]): ReadonlyMap<string, string> {
   const names = new Map(keys.map(({ id, name }) => [id, name]));
-  for (const { what, on, data } of records) {
+  for (const { event, target, data } of records) {
     const { name } = data;
-    if (what === "api-key-made" && typeof name === "string") names.set(on.replace(/^key:/, ""), name);
+    if (event === "api-key-made" && typeof name === "string") names.set(target.replace(/^key:/, ""), name);
   }
   return names;
 }
@@ -194,18 +194,18 @@ function Records({ reader, names, filtered }: { reader: AuditReader; names: Name
 }
 
 function Line({ record, names }: { record: AuditRecord; names: Names }) {
-  const { outcome, key, seq, at, on, by_account: account, session, hash } = record;
+  const { outcome, key, seq, at, target, account, session, hash } = record;
   const words = texts.audit.key;
   const details = [
     [words.number, String(seq)],
-    [words.on, on],
+    [words.on, target],
     [words.account, account],
     [words.session, session],
     [words.key, key],
     [words.hash, hash],
   ] as const;
   return (
-    <li data-what={record.what}>
+    <li data-what={record.event}>
       <details>
         <summary>
           <time dateTime={at}>{format.dateTime(at)}</time>

@@ -121,7 +121,7 @@ function Sessions({ api }: { api: Api }) {
       <ul class="devices">
         {sessions?.map((session) => (
           <li key={session.id}>
-            {texts.account.session(texts.account.how[session.how], new Date(session.since).toLocaleString("en"))}{" "}
+            {texts.account.session(texts.account.how[session.method], new Date(session.created_at).toLocaleString("en"))}{" "}
             <span class="quiet">
               {session.address} {session.program}
             </span>{" "}

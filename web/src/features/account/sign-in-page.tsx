@@ -20,9 +20,9 @@ export function SignIn({ api, session, followed, pairing, why }: SignInProps) {
   const [methods, setMethods] = useState<Methods | null>(null);
   useEffect(() => {
     // Where that cannot be read, what always works is offered.
-    api.methods().then(setMethods, () => setMethods({ password: true, open_id: null }));
+    api.methods().then(setMethods, () => setMethods({ password: true, oidc: null }));
   }, [api]);
-  const elsewhere = methods?.open_id ?? null;
+  const elsewhere = methods?.oidc ?? null;
   const invited = followed.state.value;
   return (
     <main class="narrow" id="content">
@@ -47,7 +47,7 @@ export function SignIn({ api, session, followed, pairing, why }: SignInProps) {
       )}
       {elsewhere !== null && invited.kind !== "open" && (
         <p>
-          <a class="elsewhere" data-testid="sign-in-elsewhere" href={elsewhere.address}>
+          <a class="elsewhere" data-testid="sign-in-elsewhere" href={elsewhere.url}>
             {texts.session.elsewhere(elsewhere.name)}
           </a>
         </p>

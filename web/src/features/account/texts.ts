@@ -39,7 +39,7 @@ export const texts = {
     changed: "Password set.",
     sessions: "Active sessions",
     session: (how: string, since: string): string => `By ${how}, since ${since}`,
-    how: { link: "link", password: "password", "open-id": "your identity provider" },
+    how: { link: "link", password: "password", "oidc": "your identity provider" },
     this: "this session",
     end: "End",
     endOthers: "End all other sessions",
@@ -111,7 +111,7 @@ export const texts = {
     again: "Try again",
     shown: (count: number): string => (count === 1 ? "1 entry" : `${count} entries`),
     details: "Details",
-    outcome: { done: "", refused: "rejected", failed: "failed", unknown: "interrupted" } satisfies Record<Outcome, string>,
+    outcome: { done: "", rejected: "rejected", failed: "failed", unknown: "interrupted" } satisfies Record<Outcome, string>,
     unknownExplained: "The operation was interrupted before its outcome was recorded. Check the affected device or account.",
     byKey: "with an API key",
     somebody: "Unknown account",
@@ -160,7 +160,7 @@ export const texts = {
     /** One sentence for each kind whose record has no text of its own. */
     says: {
       signedIn: (caller: string, how: string): string => `${caller} signed in ${how}.`,
-      how: { link: "with a link", password: "with a password", "open-id": "with the identity provider" } as Readonly<Record<string, string>>,
+      how: { link: "with a link", password: "with a password", "oidc": "with the identity provider" } as Readonly<Record<string, string>>,
       refusedSignIn: "A sign-in was rejected.",
       signedOut: (caller: string): string => `${caller} signed out.`,
       keyEnded: (caller: string): string => `All sessions of ${caller} ended.`,

@@ -41,9 +41,9 @@ export const texts = {
     effect: "If you hand over, the robot holds its position. Without a response, you keep control.",
     over: {
       accepted: (holder: string): string => `${holder} handed control over to you.`,
-      refused: (holder: string): string => `${holder} keeps control.`,
+      rejected: (holder: string): string => `${holder} keeps control.`,
       withdrawn: (): string => "You withdrew your request.",
-      lapsed: (holder: string): string => `${holder} did not respond in time and keeps control.`,
+      expired: (holder: string): string => `${holder} did not respond in time and keeps control.`,
       ended: (holder: string): string => `${holder} no longer has control. You can take it if it is available.`,
     } satisfies Record<Ended, (holder: string) => string>,
     kept: (by: string): string => `You keep control; ${by} was notified.`,

@@ -183,7 +183,7 @@ function Code({ api, fleet, script, stations, checked, onChecked }: CodeProps) {
           const found = await api.library.check(script.robotType, text);
           onChecked({ of: text, found });
           setUnchecked("");
-          const all = [...found.marks.map((mark) => placed(text, mark)), ...(failure.current.of === text ? failure.current.places : [])];
+          const all = [...found.diagnostics.map((mark) => placed(text, mark)), ...(failure.current.of === text ? failure.current.places : [])];
           setPlaces(all);
           return all;
         } catch (error) {

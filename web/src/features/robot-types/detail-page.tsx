@@ -55,7 +55,7 @@ function Loaded({ api, type, devices }: { api: Api; type: RobotType; devices: re
         <StateChip type={type} />
       </header>
       <p>{type.description}</p>
-      {upload?.state === "refused" && <Findings findings={readFindings(upload.errors)} level="error" />}
+      {upload?.state === "rejected" && <Findings findings={readFindings(upload.errors)} level="error" />}
       {upload !== null && <Findings findings={readFindings(upload.warnings)} level="warning" />}
       <div class="two">
         {type.state === "ready" ? <Model api={api} type={type} /> : <p class="quiet">{words.model.notReady}</p>}

@@ -9,7 +9,7 @@ export const texts = {
   noneOwn: "You have no robot types. Add one from its files.",
   column: { version: "Version", joints: "Joints", users: "Used by", state: "Status" },
   users: (count: number): string => (count === 0 ? "no devices" : format.count(count, "device")),
-  state: { checking: "Validating", ready: "Ready", refused: "Rejected" },
+  state: { checking: "Validating", ready: "Ready", rejected: "Rejected" },
   newer: (version: number, state: string): string => `Version ${version}: ${state.toLowerCase()}`,
   range: (from: string, to: string): string => `${from} to ${to}`,
   seconds: (s: number): string => (s < 1 ? "" : `${Math.floor(s)} s`),

@@ -193,7 +193,7 @@ function PersonRow({ share, sharing }: { share: Share; sharing: Sharing }) {
       <span class="person">
         {name}
         <span class="quiet small">
-          {format.until(share.expires_at)} · {texts.access.since(share.by, share.created_at)}
+          {format.until(share.expires_at)} · {texts.access.since(share.created_by, share.created_at)}
         </span>
       </span>
       <span class={`chip role-${share.role}`} title={texts.roleExplained[share.role]}>

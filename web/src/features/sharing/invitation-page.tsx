@@ -92,8 +92,8 @@ function Offer({ api, fleet, account, followed, secret, away, onAccepted }: Offe
     offer === null
       ? texts.invitation.title
       : hands
-        ? texts.invitation.hands(offer.by, offer.label)
-        : texts.invitation.offers(offer.by, offer.label);
+        ? texts.invitation.hands(offer.created_by, offer.label)
+        : texts.invitation.offers(offer.created_by, offer.label);
   return (
     <>
       <h1>{title}</h1>

@@ -30,16 +30,16 @@ export interface Account {
   session: string;
 }
 
-/** How one may sign in here; `open_id`: at a provider elsewhere. */
+/** How one may sign in here; `oidc`: at an OpenID Connect provider. */
 export interface Methods {
   password: boolean;
-  open_id: { name: string; address: string } | null;
+  oidc: { name: string; url: string } | null;
 }
 
 export interface SignInSession {
   id: string;
-  how: "link" | "password" | "open-id";
-  since: string;
+  method: "link" | "password" | "oidc";
+  created_at: string;
   address: string;
   program: string;
   mine: boolean;
@@ -48,12 +48,12 @@ export interface SignInSession {
 /** Somebody asks for control. `ended`: the lease that it asked for has ended otherwise. */
 export interface ControlRequest {
   id: string;
-  by: string;
+  requester: string;
   epoch: number;
   mine: boolean;
-  asked_at: string;
+  requested_at: string;
   expires_at: string;
-  outcome: "open" | "accepted" | "refused" | "withdrawn" | "lapsed" | "ended";
+  outcome: "open" | "accepted" | "rejected" | "withdrawn" | "expired" | "ended";
 }
 
 export interface Lease {
@@ -109,7 +109,7 @@ export interface Action {
   device: string;
   status: ActionStatus;
   epoch: number;
-  who: string;
+  caller: string;
   reason: Reason | null;
   progress: number | null;
   output: string;
@@ -152,7 +152,7 @@ export interface Credentials {
   websocket_url: string;
 }
 
-export type Purpose = { purpose: "watch" } | { purpose: "control"; device: string; epoch: number };
+export type Purpose = { purpose: "view" } | { purpose: "control"; device: string; epoch: number };
 
 export interface Space {
   id: string;
@@ -202,8 +202,8 @@ export class Api {
 
   /** Where a browser goes on to sign in elsewhere, with an invitation for who has no account yet. */
   async beginElsewhere(invitation: string): Promise<string> {
-    const begun = await this.#http.call<{ address: string }>("POST", "/auth/oidc/start", { body: { invitation } });
-    return begun.address;
+    const begun = await this.#http.call<{ url: string }>("POST", "/auth/oidc/start", { body: { invitation } });
+    return begun.url;
   }
 
   methods(): Promise<Methods> {
@@ -277,7 +277,7 @@ export class Api {
   }
 
   lookAtInvitation(secret: string): Promise<Invitation> {
-    return this.#http.call("POST", "/invitations/look", { body: { secret } });
+    return this.#http.call("POST", "/invitations/lookup", { body: { secret } });
   }
 
   redeemInvitation(secret: string, space: string | null): Promise<Invitation> {
@@ -299,8 +299,8 @@ export class Api {
   /** One page of what was done in the account, the newest first. */
   audit(query: AuditQuery, cursor: string | null, limit: number): Promise<AuditPage> {
     const asked = new URLSearchParams({ limit: String(limit) });
-    if (query.what !== "") asked.set("what", query.what);
-    if (query.on !== "") asked.set("on", query.on);
+    if (query.event !== "") asked.set("event", query.event);
+    if (query.target !== "") asked.set("target", query.target);
     if (query.sinceMs !== null) asked.set("from", String(query.sinceMs));
     if (query.untilMs !== null) asked.set("to", String(query.untilMs));
     if (cursor !== null) asked.set("cursor", cursor);
@@ -350,7 +350,7 @@ export class Api {
 
   /** Give who asks the control that this session holds, or keep it. */
   async answerRequest(device: string, id: string, accept: boolean): Promise<void> {
-    await this.#http.call("POST", `${requests(device)}/${id}/${accept ? "accept" : "refuse"}`);
+    await this.#http.call("POST", `${requests(device)}/${id}/${accept ? "accept" : "reject"}`);
   }
 
   async withdrawRequest(device: string, id: string, leaving = false): Promise<void> {
@@ -358,12 +358,12 @@ export class Api {
   }
 
   /** Say that this page looks at a device, and hear who else does. */
-  watch(device: string): Promise<{ items: Watcher[]; again_ms: number }> {
-    return this.#http.call("PUT", `/devices/${device}/watchers`);
+  watch(device: string): Promise<{ items: Watcher[]; refresh_ms: number }> {
+    return this.#http.call("PUT", `/devices/${device}/viewers`);
   }
 
   async unwatch(device: string): Promise<void> {
-    await this.#http.call("DELETE", `/devices/${device}/watchers`, { keepalive: true });
+    await this.#http.call("DELETE", `/devices/${device}/viewers`, { keepalive: true });
   }
 
   /** `null`: call it as its agent does. */

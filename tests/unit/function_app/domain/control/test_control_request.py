@@ -37,7 +37,7 @@ def test_to_ask_changes_nothing_about_the_lease() -> None:
     asked = ask(HELD)
     assert replace(asked, request=None) == HELD
     assert how(asked, START + 9_999) == "open"
-    assert how(asked, START + 10_000) == "lapsed"
+    assert how(asked, START + 10_000) == "expired"
     assert ask(asked) is asked
     short = lease.renew(HELD, ANNA, epoch=1, lease_ms=5_000, now_ms=START)
     assert how(ask(short), START + 5_000) == "ended", "with the lease that it asks for"
@@ -57,12 +57,12 @@ def test_an_accepted_request_is_a_new_lease() -> None:
     [
         (lambda: ask(None), "lease-free"),
         (lambda: ask(HELD, now_ms=START + 60_000), "lease-free"),
-        (lambda: ask(HELD, ANNA), "lease-yours"),
+        (lambda: ask(HELD, ANNA), "lease-already-held"),
         (lambda: ask(ask(HELD), CLEO, request="r2"), "lease-requested"),
         (lambda: act("accept", None, ANNA, now_ms=START, fresh=""), "request-unknown"),
         (lambda: act("accept", ask(HELD), CLEO, now_ms=START, fresh=""), "forbidden"),
         (lambda: act("withdraw", ask(HELD), ANNA, now_ms=START, fresh=""), "forbidden"),
-        (lambda: act("accept", ask(HELD), ANNA, now_ms=START + 10_000, fresh=""), "request-over"),
+        (lambda: act("accept", ask(HELD), ANNA, now_ms=START + 10_000, fresh=""), "control-request-closed"),
     ],
 )
 def test_what_cannot_be_is_refused(what: Any, code: str) -> None:
@@ -86,7 +86,7 @@ def test_only_the_lease_that_was_in_force_when_it_was_asked_is_handed_over() -> 
     assert how(again, START + 1) == "ended"
     with pytest.raises(Problem) as refused:
         control_request.accept(again, ANNA, request="r1", now_ms=START + 1)
-    assert (refused.value.code, refused.value.extras) == ("request-over", {"outcome": "ended"})
+    assert (refused.value.code, refused.value.extras) == ("control-request-closed", {"outcome": "ended"})
 
 
 @pytest.mark.parametrize(

@@ -39,7 +39,7 @@ BY_PROMISE = {
     "GET /devices/{device}/lease/requests/{request_id}",
     "DELETE /devices/{device}/lease/requests/{request_id}",
     "POST /devices/{device}/lease/requests/{request_id}/accept",
-    "POST /devices/{device}/lease/requests/{request_id}/refuse",
+    "POST /devices/{device}/lease/requests/{request_id}/reject",
     "POST /spaces/{space}/stop",
     "POST /stop",
     "GET /robot-types",

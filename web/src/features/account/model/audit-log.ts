@@ -8,7 +8,7 @@ const PAGE = 50;
 /** Where a filter lets little through, pages come empty: so many are asked for before the reader is asked. */
 const PAGES_AT_ONCE = 5;
 
-export const EVERYTHING: AuditQuery = { what: "", on: "", sinceMs: null, untilMs: null };
+export const EVERYTHING: AuditQuery = { event: "", target: "", sinceMs: null, untilMs: null };
 
 export class AuditReader {
   readonly #api: Api;
@@ -64,9 +64,9 @@ export class AuditReader {
 /** Names of accounts, as far as these records tell them. */
 export function accountsIn(records: readonly AuditRecord[]): ReadonlyMap<string, string> {
   const names = new Map<string, string>();
-  for (const { by_account: id, who, key, data } of records) {
+  for (const { account: id, actor, key, data } of records) {
     // With a key the name says the key's too.
-    if (id !== "" && who !== "" && key === "") names.set(id, who);
+    if (id !== "" && actor !== "" && key === "") names.set(id, actor);
     const { with: other, name } = data;
     if (typeof other === "string" && typeof name === "string" && name !== "") names.set(other, name);
   }

@@ -115,7 +115,7 @@ export class Asking {
     } catch (error) {
       // Another request has come after it: that its lease has ended is all that is known.
       const gone = error instanceof ApiError && error.status === 404;
-      outcome = gone ? "ended" : now() > asked.until + AFTER_MS ? "lapsed" : "open";
+      outcome = gone ? "ended" : now() > asked.until + AFTER_MS ? "expired" : "open";
     }
     if (this.#state.value !== asked) return;
     if (outcome === "open") {

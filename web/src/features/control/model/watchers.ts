@@ -33,7 +33,7 @@ export class Watching {
   async #say(): Promise<void> {
     let inMs = AGAIN_MS;
     try {
-      const { items, again_ms: wanted } = await this.#api.watch(this.#id);
+      const { items, refresh_ms: wanted } = await this.#api.watch(this.#id);
       if (!this.#on) return;
       this.#others.value = items;
       inMs = Math.min(BOUNDS_MS[1], Math.max(BOUNDS_MS[0], wanted));

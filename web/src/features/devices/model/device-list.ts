@@ -25,7 +25,7 @@ export class Fleet {
 
   constructor(api: Api, link?: Link) {
     this.#api = api;
-    this.link = link ?? new MqttLink(() => api.credentials({ purpose: "watch" }));
+    this.link = link ?? new MqttLink(() => api.credentials({ purpose: "view" }));
     void this.refresh();
     this.#timer = setInterval(() => void this.refresh(), REFRESH_MS);
     this.#forget = this.#askWhenCut();

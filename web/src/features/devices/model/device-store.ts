@@ -164,7 +164,7 @@ export class DeviceStore {
       return request ? { id: request.id, by: request.requester, until: this.#stateAt + request.expires_in_ms } : null;
     }
     const request = lease?.request ?? null;
-    return request === null ? null : { id: request.id, by: request.by, until: onThisClock(Date.parse(request.expires_at)) };
+    return request === null ? null : { id: request.id, by: request.requester, until: onThisClock(Date.parse(request.expires_at)) };
   });
 
   constructor(info: Device, api: Api, link: Link) {

@@ -46,7 +46,7 @@ export interface RobotTypeEntry {
   label: string;
   kind: string;
   built_in: boolean;
-  state: "checking" | "ready" | "refused";
+  state: "checking" | "ready" | "rejected";
 }
 
 /** What is wrong with a script: lines from 1, columns from 0, in characters. An `error` keeps it from being saved. */
@@ -60,7 +60,7 @@ export interface Mark {
 }
 
 export interface Checked {
-  marks: Mark[];
+  diagnostics: Mark[];
   savable: boolean;
   description: string;
   parameters_schema: ObjectSchema | null;

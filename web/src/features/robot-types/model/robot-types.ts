@@ -4,7 +4,7 @@ import { readTwin, type KnownTwin } from "../../../shared/mqtt/parse-messages";
 import type { Robot } from "../../keyframes/model/keyframes";
 import type { Joint, MimicJoint, PositionDependentLimit } from "../../../shared/mqtt/protocol.generated";
 
-export type TypeState = "checking" | "ready" | "refused";
+export type TypeState = "checking" | "ready" | "rejected";
 
 export interface TypeUpload {
   version: number;
@@ -129,24 +129,24 @@ export class RobotTypes {
 
   /** Upload for a look; the verdict is asked for afterwards. */
   look(folder: TypeFolder): Promise<Look> {
-    return this.#http.call("POST", "/robot-type-looks", { body: { ...folder, wait_ms: 0 }, waitMs: SENDING_MS });
+    return this.#http.call("POST", "/robot-type-previews", { body: { ...folder, wait_ms: 0 }, waitMs: SENDING_MS });
   }
 
   lookAgain(id: string): Promise<Look> {
-    return this.#http.call("GET", `/robot-type-looks/${id}`);
+    return this.#http.call("GET", `/robot-type-previews/${id}`);
   }
 
   lookModel(id: string): Promise<TypeModel> {
-    return this.#model(`/robot-type-looks/${id}/twin`);
+    return this.#model(`/robot-type-previews/${id}/twin`);
   }
 
   save(id: string): Promise<RobotType> {
     const body = { wait_ms: VERDICT_MS };
-    return this.#http.call("POST", `/robot-type-looks/${id}/save`, { body, waitMs: VERDICT_MS });
+    return this.#http.call("POST", `/robot-type-previews/${id}/save`, { body, waitMs: VERDICT_MS });
   }
 
   async drop(id: string): Promise<void> {
-    await this.#http.call("DELETE", `/robot-type-looks/${id}`, { keepalive: true });
+    await this.#http.call("DELETE", `/robot-type-previews/${id}`, { keepalive: true });
   }
 
   async #model(path: string): Promise<TypeModel> {

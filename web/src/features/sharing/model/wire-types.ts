@@ -17,7 +17,7 @@ export interface Target {
 export interface Share {
   account: Person;
   role: SharedRole;
-  by: string;
+  created_by: string;
   created_at: string;
   /** `null`: until it is ended. */
   expires_at: string | null;
@@ -30,7 +30,7 @@ export interface Invitation {
   target: string;
   label: string;
   role: Role;
-  by: string;
+  created_by: string;
   uses: number;
   /** How long the part lasts from when it is taken [s]; `null`: until it is ended. */
   share_s: number | null;
@@ -75,16 +75,16 @@ export interface ApiKeyMade {
   token: string;
 }
 
-export type Outcome = "done" | "refused" | "failed" | "unknown";
+export type Outcome = "done" | "rejected" | "failed" | "unknown";
 
 export interface AuditRecord {
   seq: number;
   at: string;
-  what: string;
-  on: string;
+  event: string;
+  target: string;
   outcome: Outcome;
-  who: string;
-  by_account: string;
+  actor: string;
+  account: string;
   session: string;
   key: string;
   data: Record<string, unknown>;
@@ -98,9 +98,9 @@ export interface AuditPage {
 
 /** Empty and `null`: everything. */
 export interface AuditQuery {
-  what: string;
+  event: string;
   /** As the record names it: a device's id, `device:<id>` and `space:<id>` of shares, `key:<id>`. */
-  on: string;
+  target: string;
   sinceMs: number | null;
   untilMs: number | null;
 }
