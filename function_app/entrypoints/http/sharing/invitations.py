@@ -233,7 +233,7 @@ def _shown(known: Known) -> dict[str, Any]:
         "target": target,
         "label": offered.label,
         "role": offered.role.value,
-        "by": offered.by,
+        "created_by": offered.by,
         "uses": offered.uses,
         "share_s": offered.share_s or None,
         "expires_at": rfc3339(offered.expires_ms),
