@@ -14,7 +14,6 @@ from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from function_app.bootstrap import Functions
 from function_app.domain.common.problems import Problem, invalid, store_unavailable
-from function_app.entrypoints.http import health_check
 from function_app.entrypoints.http.accounts import api_keys, audit, auth, me, oidc
 from function_app.entrypoints.http.actions import actions, many, stop
 from function_app.entrypoints.http.console import Console
@@ -32,7 +31,7 @@ from function_app.entrypoints.http.framework.routing import (
     VERSION,
     schemas,
 )
-from function_app.entrypoints.http.health import diagnostics, faults
+from function_app.entrypoints.http.health import diagnostics, faults, health_check
 from function_app.entrypoints.http.messaging import polling, xmpp
 from function_app.entrypoints.http.pairing import agents
 from function_app.entrypoints.http.robot_types import device_library, movements, previews, robot_types, script_editor

@@ -6,7 +6,7 @@ from fastapi import Query, Request, Response
 
 from function_app.bootstrap import Functions
 from function_app.domain.common.timestamps import LAST_MS, rfc3339
-from function_app.entrypoints.http.accounts import schemas_audit as contract
+from function_app.entrypoints.http.accounts import schemas
 from function_app.entrypoints.http.framework.authentication import Caller
 from function_app.entrypoints.http.framework.responses import answer
 from function_app.entrypoints.http.framework.routing import Cursor, Limit, Routes
@@ -29,7 +29,7 @@ def router(functions: Functions, caller: Caller) -> Routes:
     routes = Routes("accounts")
 
     @routes.add(
-        "GET", "/accounts/me/audit", summary="Who did what", answers={200: contract.AuditList}, problems=(403, 422)
+        "GET", "/accounts/me/audit", summary="Who did what", answers={200: schemas.AuditList}, problems=(403, 422)
     )
     async def read_audit(  # noqa: PLR0917 (FastAPI names them)
         request: Request,
@@ -47,7 +47,7 @@ def router(functions: Functions, caller: Caller) -> Routes:
         wanted = AuditFilter(what=event, on=target, since_ms=since, until_ms=until)
         records, following = await functions.audit_reader.read(who, wanted, cursor=cursor, limit=limit)
         items = tuple(
-            contract.AuditRecordOut(
+            schemas.AuditRecordOut(
                 seq=record["seq"],
                 at=rfc3339(record["at_ms"]),
                 event=record["what"],
@@ -62,6 +62,6 @@ def router(functions: Functions, caller: Caller) -> Routes:
             )
             for record in records
         )
-        return answer(contract.AuditList(items=items, cursor=following))
+        return answer(schemas.AuditList(items=items, cursor=following))
 
     return routes

@@ -2,10 +2,11 @@
 
 from fastapi import Request, Response
 
-from function_app.entrypoints.http.accounts import schemas as contract
+from function_app.entrypoints.http.accounts import schemas
 from function_app.entrypoints.http.framework.authentication import COOKIE
 from function_app.entrypoints.http.framework.client_address import client_address
 from function_app.entrypoints.http.framework.responses import answer
+from function_app.entrypoints.http.framework.schemas import AccountRef
 from function_app.services.identity.sessions import SignedIn, SignInOrigin
 from function_app.settings import Settings
 
@@ -27,11 +28,11 @@ def secure(settings: Settings) -> str:
 
 def signed_in(settings: Settings, done: SignedIn, status: int = 200) -> Response:
     """An access token for programs, and a cookie for the page."""
-    body = contract.SignedIn(
+    body = schemas.SignedIn(
         access_token=done.access_token,
         token_type="Bearer",  # noqa: S106 (a scheme's name)
         expires_in_s=done.expires_in_s,
-        account=contract.AccountRef(id=done.account.id, name=done.account.name),
+        account=AccountRef(id=done.account.id, name=done.account.name),
         session=done.session,
         csrf_token=done.csrf,
     )

@@ -6,7 +6,7 @@ from fastapi import Query, Request, Response
 
 from function_app.bootstrap import Functions
 from function_app.domain.common.problems import Problem
-from function_app.entrypoints.http.accounts import schemas as contract
+from function_app.entrypoints.http.accounts import schemas
 from function_app.entrypoints.http.accounts.cookies import secure, set_session, whence
 from function_app.entrypoints.http.framework.authentication import refuse_other_sites
 from function_app.entrypoints.http.framework.responses import answer, read
@@ -26,13 +26,13 @@ def router(functions: Functions) -> Routes:
     settings = functions.settings
 
     @routes.add(
-        "GET", "/auth/methods", summary="How one may sign in", answers={200: contract.SignInMethodsOut}, caller="nobody"
+        "GET", "/auth/methods", summary="How one may sign in", answers={200: schemas.SignInMethodsOut}, caller="nobody"
     )
     async def sign_in_methods(_request: Request) -> Response:
         """For the page. A one-time link works everywhere."""
         known = settings.open_id
-        elsewhere = contract.OidcProviderOut(name=known.name, url=f"{PREFIX}{_PATH}/start") if known else None
-        return answer(contract.SignInMethodsOut(link=True, password=True, oidc=elsewhere))
+        elsewhere = schemas.OidcProviderOut(name=known.name, url=f"{PREFIX}{_PATH}/start") if known else None
+        return answer(schemas.SignInMethodsOut(link=True, password=True, oidc=elsewhere))
 
     @routes.add(
         "GET",
@@ -54,8 +54,8 @@ def router(functions: Functions) -> Routes:
         "POST",
         f"{_PATH}/start",
         summary="Sign in elsewhere with an invitation",
-        body=contract.OidcSignInRequest,
-        answers={200: contract.OidcSignInOut},
+        body=schemas.OidcSignInRequest,
+        answers={200: schemas.OidcSignInOut},
         problems=(403, 404),
         caller="nobody",
     )
@@ -66,10 +66,10 @@ def router(functions: Functions) -> Routes:
         already is signed in, and redeems it afterwards as always.
         """
         refuse_other_sites(request)
-        asked: contract.OidcSignInRequest = await read(request, contract.OidcSignInRequest)
+        asked: schemas.OidcSignInRequest = await read(request, schemas.OidcSignInRequest)
         begun = await functions.open_id.begin(asked.invitation)
         headers = {"Set-Cookie": _mark(settings, begun), "Cache-Control": "no-store"}
-        return answer(contract.OidcSignInOut(url=begun.address), headers=headers)
+        return answer(schemas.OidcSignInOut(url=begun.address), headers=headers)
 
     @routes.add(
         "GET",

@@ -1,10 +1,11 @@
-"""``auth``, ``accounts``, ``spaces``."""
+"""Requests and responses of accounts, sign-in, spaces, API keys and the audit log."""
 
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 from msgspec import Meta
 
-from function_app.entrypoints.http.framework.schemas import Moment, Name, Request, Response
+from function_app.domain.identity.api_keys import MOST_DAYS, MOST_ONLY
+from function_app.entrypoints.http.framework.schemas import AccountRef, Moment, Name, Request, Response
 
 
 class LinkSignInRequest(Request, frozen=True, kw_only=True):
@@ -38,13 +39,6 @@ class AccountRequest(Request, frozen=True, kw_only=True):
     invitation: Annotated[str, Meta(min_length=1, max_length=200)]
     name: Annotated[str, Meta(pattern=r"^[^\s\x00-\x1f\x7f]([^\x00-\x1f\x7f]{0,58}[^\s\x00-\x1f\x7f])?$")]
     password: NewPassword
-
-
-class AccountRef(Response, frozen=True, kw_only=True):
-    """An account, as others see it."""
-
-    id: str
-    name: str
 
 
 class SignedIn(Response, frozen=True, kw_only=True):
@@ -146,4 +140,70 @@ class SpaceList(Response, frozen=True, kw_only=True):
     """Spaces."""
 
     items: tuple[SpaceOut, ...]
+    cursor: str | None
+
+
+Target = Annotated[str, Meta(pattern="^(space:)?[A-Za-z0-9_-]{1,64}$")]
+
+
+class ApiKeyRequest(Request, frozen=True, kw_only=True):
+    """A key to be made. ``only``: devices by id, spaces as ``space:<id>``; empty: all that the account may see."""
+
+    name: Annotated[str, Meta(min_length=1, max_length=60)]
+    role: Literal["operator", "viewer"]
+    only: Annotated[tuple[Target, ...], Meta(max_length=MOST_ONLY)] = ()
+    days: Annotated[int, Meta(ge=1, le=MOST_DAYS)] = 90
+
+
+class ApiKeyOut(Response, frozen=True, kw_only=True):
+    """A key without its secret. ``last_used_at`` is right to the hour."""
+
+    id: str
+    name: str
+    role: str
+    only: tuple[str, ...]
+    created_at: Moment
+    expires_at: Moment
+    expired: bool
+    last_used_at: Moment | None
+
+
+class ApiKeyCreated(Response, frozen=True, kw_only=True):
+    """A new key; nobody is told ``token`` again."""
+
+    api_key: ApiKeyOut
+    token: str
+
+
+class ApiKeyList(Response, frozen=True, kw_only=True):
+    """Keys."""
+
+    items: tuple[ApiKeyOut, ...]
+    cursor: str | None
+
+
+class AuditRecordOut(Response, frozen=True, kw_only=True):
+    """What somebody did, as it is recorded. ``hash`` covers it and the hash of the record before it.
+
+    ``account``, ``session`` and ``key`` (an API key) identify the actor. All are empty if the cloud itself
+    or an unknown caller acted.
+    """
+
+    seq: int
+    at: Moment
+    event: str
+    target: str
+    outcome: Literal["done", "rejected", "failed", "unknown"]
+    actor: str
+    account: str
+    session: str
+    key: str
+    data: dict[str, Any]
+    hash: str
+
+
+class AuditList(Response, frozen=True, kw_only=True):
+    """Newest first. Where few of many records were asked for, a page may be short, or empty, and have a cursor."""
+
+    items: tuple[AuditRecordOut, ...]
     cursor: str | None

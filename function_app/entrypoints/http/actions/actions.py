@@ -7,9 +7,9 @@ from fastapi import Header, Query, Request, Response
 
 from function_app.bootstrap import Functions
 from function_app.domain.actions.action import Action
-from function_app.entrypoints.http import serializers
-from function_app.entrypoints.http.actions import schemas as contract
-from function_app.entrypoints.http.actions.schemas_fleet import BatchActionRequest
+from function_app.entrypoints.http.actions import schemas
+from function_app.entrypoints.http.actions.schemas import BatchActionRequest
+from function_app.entrypoints.http.actions.serializers import action_out
 from function_app.entrypoints.http.framework.authentication import Caller
 from function_app.entrypoints.http.framework.responses import answer, read
 from function_app.entrypoints.http.framework.routing import PREFIX, Cursor, Limit, Routes
@@ -27,21 +27,21 @@ def router(functions: Functions, caller: Caller) -> Routes:
     """The routes."""
     routes = Routes("actions")
 
-    async def shown(found: Action) -> contract.ActionOut:
+    async def shown(found: Action) -> schemas.ActionOut:
         return await show_action(functions, found)
 
     @routes.add(
         "POST",
         "/devices/{device}/actions",
         summary="Start an action",
-        body=contract.ActionRequest,
-        answers={200: contract.ActionOut, 202: contract.ActionOut},
+        body=schemas.ActionRequest,
+        answers={200: schemas.ActionOut, 202: schemas.ActionOut},
         problems=(404, 409),
     )
     async def start_action(request: Request, device: str, once: Key = None) -> Response:
         """200: it has come as far as ``wait_for``, or has ended. 202: it waits or is under way; ask at its address."""
         who = await caller.account(request)
-        asked: contract.ActionRequest = await read(request, contract.ActionRequest)
+        asked: schemas.ActionRequest = await read(request, schemas.ActionRequest)
         start = replace(start_of(asked, once), epoch=asked.epoch)
         found, there = await functions.start_action.start(who, device, start)
         where = {"Location": f"{PREFIX}/actions/{found.id}"}
@@ -51,7 +51,7 @@ def router(functions: Functions, caller: Caller) -> Routes:
         "GET",
         "/devices/{device}/actions",
         summary="A device's actions, newest first",
-        answers={200: contract.ActionList},
+        answers={200: schemas.ActionList},
         problems=(404, 422),
     )
     async def list_actions(request: Request, device: str, cursor: Cursor = None, limit: Limit = 100) -> Response:
@@ -59,20 +59,16 @@ def router(functions: Functions, caller: Caller) -> Routes:
         who = await caller.account(request)
         found, following = await functions.actions.list(who, device, cursor=cursor, limit=limit)
         positions = await functions.queues.positions(found)
-        items = tuple(serializers.action(each, positions.get(each.id)) for each in found)
-        return answer(contract.ActionList(items=items, cursor=following))
+        items = tuple(action_out(each, positions.get(each.id)) for each in found)
+        return answer(schemas.ActionList(items=items, cursor=following))
 
-    @routes.add(
-        "GET", "/actions/{action}", summary="One action", answers={200: contract.ActionOut}, problems=(404, 422)
-    )
+    @routes.add("GET", "/actions/{action}", summary="One action", answers={200: schemas.ActionOut}, problems=(404, 422))
     async def get_action(request: Request, action: str, wait_ms: Wait = 0, wait_for: WaitFor = "done") -> Response:
         """As soon as it has come as far as ``wait_for``, or as it is after ``wait_ms``."""
         who = await caller.account(request)
         return answer(await shown(await functions.actions.get(who, action, wait_ms=wait_ms, wait_for=wait_for)))
 
-    @routes.add(
-        "POST", "/actions/{action}/cancel", summary="Cancel", answers={202: contract.ActionOut}, problems=(404,)
-    )
+    @routes.add("POST", "/actions/{action}/cancel", summary="Cancel", answers={202: schemas.ActionOut}, problems=(404,))
     async def cancel_action(request: Request, action: str) -> Response:
         """Asks the device to end it; one that waits for its turn ends at once. It has ended when its status says so."""
         who = await caller.account(request)
@@ -81,7 +77,7 @@ def router(functions: Functions, caller: Caller) -> Routes:
     return routes
 
 
-def start_of(asked: contract.ActionRequest | BatchActionRequest, once: str | None) -> Start:
+def start_of(asked: schemas.ActionRequest | BatchActionRequest, once: str | None) -> Start:
     """What is to be started, without the lease."""
     return Start(
         asked=asked.request,
@@ -95,6 +91,6 @@ def start_of(asked: contract.ActionRequest | BatchActionRequest, once: str | Non
     )
 
 
-async def show_action(functions: Functions, found: Action) -> contract.ActionOut:
+async def show_action(functions: Functions, found: Action) -> schemas.ActionOut:
     """An action with its place in the queue, if it has one."""
-    return serializers.action(found, (await functions.queues.positions([found])).get(found.id))
+    return action_out(found, (await functions.queues.positions([found])).get(found.id))

@@ -6,7 +6,7 @@ from fastapi import Request, Response
 
 from function_app.bootstrap import Functions
 from function_app.domain.common.problems import Problem, invalid
-from function_app.entrypoints.http.actions import schemas_fleet as contract
+from function_app.entrypoints.http.actions import schemas
 from function_app.entrypoints.http.actions.actions import Key, show_action, start_of
 from function_app.entrypoints.http.framework.authentication import Caller
 from function_app.entrypoints.http.framework.responses import answer, problem_type, read
@@ -23,8 +23,8 @@ def router(functions: Functions, caller: Caller) -> Routes:
         "POST",
         "/actions",
         summary="Start an action on many devices",
-        body=contract.BatchActionRequest,
-        answers={200: contract.BatchActionOut, 202: contract.BatchActionOut, 207: contract.BatchActionOut},
+        body=schemas.BatchActionRequest,
+        answers={200: schemas.BatchActionOut, 202: schemas.BatchActionOut, 207: schemas.BatchActionOut},
     )
     async def start_actions(request: Request, once: Key = None) -> Response:
         """200: all have come as far as ``wait_for``, or have ended. 202: some are not there yet. 207: some are refused.
@@ -32,7 +32,7 @@ def router(functions: Functions, caller: Caller) -> Routes:
         The key counts for each device by itself.
         """
         who = await caller.account(request)
-        asked: contract.BatchActionRequest = await read(request, contract.BatchActionRequest)
+        asked: schemas.BatchActionRequest = await read(request, schemas.BatchActionRequest)
         if len(set(asked.devices)) != len(asked.devices):
             raise invalid("A device is named twice.")
         if not asked.epochs.keys() <= set(asked.devices):
@@ -41,15 +41,15 @@ def router(functions: Functions, caller: Caller) -> Routes:
         items = await asyncio.gather(*(item(each) for each in found))
         refused = any(isinstance(each.result, Problem) for each in found)
         there = all(each.there for each in found)
-        return answer(contract.BatchActionOut(items=tuple(items)), 207 if refused else 200 if there else 202)
+        return answer(schemas.BatchActionOut(items=tuple(items)), 207 if refused else 200 if there else 202)
 
-    async def item(found: StartResult) -> contract.BatchActionItem:
+    async def item(found: StartResult) -> schemas.BatchActionItem:
         if isinstance(found.result, Problem):
             why = found.result
             told = Refusal(type=problem_type(why), title=why.title, status=why.status, detail=why.detail)
-            return contract.BatchActionItem(device=found.device, status=why.status, action=None, problem=told)
+            return schemas.BatchActionItem(device=found.device, status=why.status, action=None, problem=told)
         status = 200 if found.there else 202
-        return contract.BatchActionItem(
+        return schemas.BatchActionItem(
             device=found.device, status=status, action=await show_action(functions, found.result), problem=None
         )
 

@@ -7,8 +7,8 @@ from fastapi import Query, Request, Response
 from function_app.bootstrap import Functions
 from function_app.domain.common.problems import invalid
 from function_app.domain.common.timestamps import rfc3339
-from function_app.entrypoints.http import serializers
-from function_app.entrypoints.http.control import schemas as contract
+from function_app.entrypoints.http.control import schemas
+from function_app.entrypoints.http.control.serializers import control_request_out, lease_out
 from function_app.entrypoints.http.framework.authentication import Caller
 from function_app.entrypoints.http.framework.responses import answer, empty, read_or
 from function_app.entrypoints.http.framework.routing import PREFIX, Routes
@@ -29,22 +29,22 @@ def _holding(routes: Routes, functions: Functions, caller: Caller) -> None:
         "GET",
         "/devices/{device}/lease",
         summary="Who controls it",
-        answers={200: contract.LeaseStatus},
+        answers={200: schemas.LeaseStatus},
         problems=(404,),
     )
     async def get_lease(request: Request, device: str) -> Response:
         """The live lease with the open request for it, or null."""
         who = await caller.account(request)
         lease = await functions.leases.get(who, device)
-        return answer(contract.LeaseStatus(lease=serializers.lease(lease, who, functions.clock.now_ms())))
+        return answer(schemas.LeaseStatus(lease=lease_out(lease, who, functions.clock.now_ms())))
 
     @routes.add(
         "POST",
         "/devices/{device}/lease",
         summary="Take, renew or take over control",
-        body=contract.LeaseRequest,
+        body=schemas.LeaseRequest,
         body_required=False,
-        answers={200: contract.LeaseGranted},
+        answers={200: schemas.LeaseGranted},
         problems=(404, 409),
     )
     async def take_lease(request: Request, device: str) -> Response:
@@ -53,14 +53,14 @@ def _holding(routes: Routes, functions: Functions, caller: Caller) -> None:
         ``take_over`` takes it from whoever holds it: what moves is held, and they read the ``reason``. Owners only.
         """
         who = await caller.account(request)
-        asked = await read_or(request, contract.LeaseRequest, contract.LeaseRequest())
+        asked = await read_or(request, schemas.LeaseRequest, schemas.LeaseRequest())
         over = asked.reason.strip() if asked.take_over else ""
         if asked.take_over and (not over or asked.epoch is not None):
             raise invalid("take_over wants a reason, which the one who had control will read, and no epoch.")
         lease, confirmed = await functions.leases.acquire(
             who, device, epoch=asked.epoch, lease_ms=asked.lease_ms, wait_ms=asked.wait_ms, over=over
         )
-        body = contract.LeaseGranted(
+        body = schemas.LeaseGranted(
             epoch=lease.epoch,
             holder=lease.holder,
             expires_at=rfc3339(lease.expires_ms),
@@ -87,9 +87,9 @@ def _asking(routes: Routes, functions: Functions, caller: Caller) -> None:
         "POST",
         "/devices/{device}/lease/requests",
         summary="Ask for control",
-        body=contract.NewControlRequest,
+        body=schemas.NewControlRequest,
         body_required=False,
-        answers={200: contract.ControlRequestCreated, 201: contract.ControlRequestCreated},
+        answers={200: schemas.ControlRequestCreated, 201: schemas.ControlRequestCreated},
         problems=(404, 409),
     )
     async def request_control(request: Request, device: str) -> Response:
@@ -99,14 +99,12 @@ def _asking(routes: Routes, functions: Functions, caller: Caller) -> None:
         that it asks for. What has become of it stays readable until the next request.
         """
         who = await caller.account(request)
-        wanted = await read_or(request, contract.NewControlRequest, contract.NewControlRequest())
+        wanted = await read_or(request, schemas.NewControlRequest, schemas.NewControlRequest())
         lease, asked, fresh, shown = await functions.control_requests.create(
             who, device, within_ms=wanted.within_ms, lease_ms=wanted.lease_ms, wait_ms=wanted.wait_ms
         )
         now_ms = functions.clock.now_ms()
-        body = contract.ControlRequestCreated(
-            request=serializers.control_request(asked, lease, who, now_ms), confirmed=shown
-        )
+        body = schemas.ControlRequestCreated(request=control_request_out(asked, lease, who, now_ms), confirmed=shown)
         where = {"Location": f"{PREFIX}/devices/{device}/lease/requests/{asked.id}"}
         return answer(body, 201 if fresh else 200, where)
 
@@ -114,34 +112,34 @@ def _asking(routes: Routes, functions: Functions, caller: Caller) -> None:
         "GET",
         "/devices/{device}/lease/requests/{request_id}",
         summary="What became of a request for control",
-        answers={200: contract.ControlRequestOut},
+        answers={200: schemas.ControlRequestOut},
         problems=(404,),
     )
     async def get_control_request(request: Request, device: str, request_id: str) -> Response:
         """The last one is known, whatever has become of it."""
         who = await caller.account(request)
         lease, asked = await functions.control_requests.get(who, device, request_id)
-        return answer(serializers.control_request(asked, lease, who, functions.clock.now_ms()))
+        return answer(control_request_out(asked, lease, who, functions.clock.now_ms()))
 
     @routes.add(
         "POST",
         "/devices/{device}/lease/requests/{request_id}/accept",
         summary="Hand control over",
-        body=contract.AcceptControlRequest,
+        body=schemas.AcceptControlRequest,
         body_required=False,
-        answers={200: contract.ControlRequestAccepted},
+        answers={200: schemas.ControlRequestAccepted},
         problems=(404, 409),
     )
     async def accept_control_request(request: Request, device: str, request_id: str) -> Response:
         """Only by who has control. In one write the next epoch is the asker's; what moves is held."""
         who = await caller.account(request)
-        wanted = await read_or(request, contract.AcceptControlRequest, contract.AcceptControlRequest())
+        wanted = await read_or(request, schemas.AcceptControlRequest, schemas.AcceptControlRequest())
         lease, asked, confirmed = await functions.control_requests.accept(
             who, device, request_id, wait_ms=wanted.wait_ms
         )
         now_ms = functions.clock.now_ms()
-        body = contract.ControlRequestAccepted(
-            request=serializers.control_request(asked, lease, who, now_ms), epoch=asked.epoch + 1, confirmed=confirmed
+        body = schemas.ControlRequestAccepted(
+            request=control_request_out(asked, lease, who, now_ms), epoch=asked.epoch + 1, confirmed=confirmed
         )
         return answer(body)
 
@@ -149,14 +147,14 @@ def _asking(routes: Routes, functions: Functions, caller: Caller) -> None:
         "POST",
         "/devices/{device}/lease/requests/{request_id}/reject",
         summary="Keep control",
-        answers={200: contract.ControlRequestOut},
+        answers={200: schemas.ControlRequestOut},
         problems=(404, 409),
     )
     async def reject_control_request(request: Request, device: str, request_id: str) -> Response:
         """Only by who has control."""
         who = await caller.account(request)
         lease, asked = await functions.control_requests.reject(who, device, request_id)
-        return answer(serializers.control_request(asked, lease, who, functions.clock.now_ms()))
+        return answer(control_request_out(asked, lease, who, functions.clock.now_ms()))
 
     @routes.add(
         "DELETE",

@@ -4,8 +4,8 @@ from fastapi import Request, Response
 
 from function_app.bootstrap import Functions
 from function_app.domain.common.timestamps import rfc3339
-from function_app.entrypoints.http import serializers
-from function_app.entrypoints.http.devices import schemas as contract
+from function_app.entrypoints.http.devices import schemas
+from function_app.entrypoints.http.devices.serializers import device_out
 from function_app.entrypoints.http.framework.authentication import Caller
 from function_app.entrypoints.http.framework.responses import answer, empty, read
 from function_app.entrypoints.http.framework.routing import Cursor, Limit, Routes
@@ -18,19 +18,19 @@ def router(functions: Functions, caller: Caller) -> Routes:
     """The routes."""
     routes = Routes("devices")
 
-    @routes.add("GET", "/devices", summary="Devices one may see", answers={200: contract.DeviceList}, problems=(422,))
+    @routes.add("GET", "/devices", summary="Devices one may see", answers={200: schemas.DeviceList}, problems=(422,))
     async def list_devices(request: Request, cursor: Cursor = None, limit: Limit = 100) -> Response:
         """With presence, newest state and lease. A page holds the devices of up to ``limit`` agents."""
         who = await caller.account(request)
         views, following = await functions.devices.views(who, cursor=cursor, limit=limit)
-        items = tuple(serializers.device(view, who, functions.clock.now_ms()) for view in views)
-        return answer(contract.DeviceList(items=items, cursor=following))
+        items = tuple(device_out(view, who, functions.clock.now_ms()) for view in views)
+        return answer(schemas.DeviceList(items=items, cursor=following))
 
-    @routes.add("GET", "/devices/{device}", summary="One device", answers={200: contract.DeviceOut}, problems=(404,))
+    @routes.add("GET", "/devices/{device}", summary="One device", answers={200: schemas.DeviceOut}, problems=(404,))
     async def get_device(request: Request, device: str) -> Response:
         """With presence, newest state and lease."""
         who = await caller.account(request)
-        return answer(serializers.device(await functions.devices.view(who, device), who, functions.clock.now_ms()))
+        return answer(device_out(await functions.devices.view(who, device), who, functions.clock.now_ms()))
 
     _named_and_seen(routes, functions, caller)
     return routes
@@ -41,30 +41,30 @@ def _named_and_seen(routes: Routes, functions: Functions, caller: Caller) -> Non
         "PUT",
         "/devices/{device}/label",
         summary="Name a device",
-        body=contract.RenameDeviceRequest,
-        answers={200: contract.DeviceOut},
+        body=schemas.RenameDeviceRequest,
+        answers={200: schemas.DeviceOut},
         problems=(403, 404),
     )
     async def rename_device(request: Request, device: str) -> Response:
         """For its owner. Whoever takes it over later finds it called as its agent calls it."""
         who = await caller.account(request)
-        asked: contract.RenameDeviceRequest = await read(request, contract.RenameDeviceRequest)
+        asked: schemas.RenameDeviceRequest = await read(request, schemas.RenameDeviceRequest)
         label = None if asked.label is None else " ".join(asked.label.split())
         await functions.rename.rename(who, device, label)
-        return answer(serializers.device(await functions.devices.view(who, device), who, functions.clock.now_ms()))
+        return answer(device_out(await functions.devices.view(who, device), who, functions.clock.now_ms()))
 
     @routes.add(
         "PUT",
         "/devices/{device}/viewers",
         summary="Say that one looks at it, and learn who else does",
-        answers={200: contract.ViewersOut},
+        answers={200: schemas.ViewersOut},
         problems=(404,),
     )
     async def add_viewer(request: Request, device: str) -> Response:
         """For whoever may see it. It counts for 25 s; what is said more often than every 5 s changes nothing."""
         who = await caller.account(request)
         others = tuple(
-            contract.ViewerOut(
+            schemas.ViewerOut(
                 name=other.name,
                 role=other.role.value,
                 mine=other.account == who.account,
@@ -72,7 +72,7 @@ def _named_and_seen(routes: Routes, functions: Functions, caller: Caller) -> Non
             )
             for other in await functions.viewers.mark(who, device)
         )
-        return answer(contract.ViewersOut(items=others, refresh_ms=_AGAIN_MS))
+        return answer(schemas.ViewersOut(items=others, refresh_ms=_AGAIN_MS))
 
     @routes.add(
         "DELETE",

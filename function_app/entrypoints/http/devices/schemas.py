@@ -5,9 +5,8 @@ from typing import Annotated, Literal
 from msgspec import Meta
 
 from device_agent.protocol import State
-from function_app.entrypoints.http.accounts.schemas import AccountRef
 from function_app.entrypoints.http.control.schemas import LeaseOut
-from function_app.entrypoints.http.framework.schemas import Moment, Request, Response
+from function_app.entrypoints.http.framework.schemas import AccountRef, Moment, Request, Response
 
 LABEL_PATTERN = r"^[^\x00-\x08\x0e-\x1f\x7f]*[^\s\x00-\x1f\x7f][^\x00-\x08\x0e-\x1f\x7f]*$"
 """Something to read, and nothing that a terminal would obey."""

@@ -27,3 +27,10 @@ class Problem(Response, frozen=True, kw_only=True):
     title: str
     status: int
     detail: str
+
+
+class AccountRef(Response, frozen=True, kw_only=True):
+    """An account, as others see it."""
+
+    id: str
+    name: str

@@ -9,8 +9,8 @@ from function_app.domain.health.faults import Severity
 from function_app.entrypoints.http.framework.authentication import Caller
 from function_app.entrypoints.http.framework.responses import answer
 from function_app.entrypoints.http.framework.routing import Cursor, Limit, Routes
-from function_app.entrypoints.http.health import schemas as contract
-from function_app.entrypoints.http.health.faults import show as show_fault
+from function_app.entrypoints.http.health import schemas
+from function_app.entrypoints.http.health.serializers import fault_out
 from function_app.services.health.diagnostics import FieldView, Summary
 
 
@@ -22,21 +22,21 @@ def router(functions: Functions, caller: Caller) -> Routes:
         "GET",
         "/devices/{device}/diagnostics",
         summary="How a device is",
-        answers={200: contract.DeviceDiagnostics},
+        answers={200: schemas.DeviceDiagnostics},
         problems=(404,),
     )
     async def get_diagnostics(request: Request, device: str) -> Response:
         """Open faults, and each measurement beside what is usual, allowed and to be expected."""
         who = await caller.account(request)
         summary, fields = await functions.diagnostics.of_device(who, device)
-        body = contract.DeviceDiagnostics(
+        body = schemas.DeviceDiagnostics(
             device=summary.view.device.id,
             label=summary.view.device.label,
             health=summary.health.value,
             online=summary.view.online,
             last_seen_at=_moment(summary.view.last_seen_ms),
             counts=_counts(summary),
-            faults=tuple(show_fault(fault) for fault in summary.faults),
+            faults=tuple(fault_out(fault) for fault in summary.faults),
             fields=tuple(_field(field) for field in fields),
         )
         return answer(body)
@@ -45,7 +45,7 @@ def router(functions: Functions, caller: Caller) -> Routes:
         "GET",
         "/diagnostics",
         summary="How all devices are",
-        answers={200: contract.DeviceHealthList},
+        answers={200: schemas.DeviceHealthList},
         problems=(422,),
     )
     async def list_diagnostics(request: Request, cursor: Cursor = None, limit: Limit = 1000) -> Response:
@@ -58,7 +58,7 @@ def router(functions: Functions, caller: Caller) -> Routes:
         "GET",
         "/spaces/{space}/diagnostics",
         summary="How a space's devices are",
-        answers={200: contract.DeviceHealthList},
+        answers={200: schemas.DeviceHealthList},
         problems=(404, 422),
     )
     async def list_space_diagnostics(
@@ -72,10 +72,10 @@ def router(functions: Functions, caller: Caller) -> Routes:
     return routes
 
 
-def _list(found: list[Summary], cursor: str | None) -> contract.DeviceHealthList:
+def _list(found: list[Summary], cursor: str | None) -> schemas.DeviceHealthList:
     counted = {health.value: sum(one.health is health for one in found) for health in Health}
     items = tuple(
-        contract.DeviceHealthOut(
+        schemas.DeviceHealthOut(
             device=one.view.device.id,
             label=one.view.device.label,
             space=one.view.device.space,
@@ -83,21 +83,21 @@ def _list(found: list[Summary], cursor: str | None) -> contract.DeviceHealthList
             online=one.view.online,
             last_seen_at=_moment(one.view.last_seen_ms),
             counts=_counts(one),
-            worst=show_fault(one.faults[0]) if one.faults else None,
+            worst=fault_out(one.faults[0]) if one.faults else None,
         )
         for one in found
     )
-    return contract.DeviceHealthList(counts=contract.DeviceHealthCounts(**counted), items=items, cursor=cursor)
+    return schemas.DeviceHealthList(counts=schemas.DeviceHealthCounts(**counted), items=items, cursor=cursor)
 
 
-def _counts(summary: Summary) -> contract.FaultCounts:
-    return contract.FaultCounts(**{severity.value: summary.count(severity) for severity in Severity})
+def _counts(summary: Summary) -> schemas.FaultCounts:
+    return schemas.FaultCounts(**{severity.value: summary.count(severity) for severity in Severity})
 
 
-def _field(known: FieldView) -> contract.DiagnosticFieldOut:
+def _field(known: FieldView) -> schemas.DiagnosticFieldOut:
     limits, watch = known.rule.limits, known.watch
     usual = usual_range(watch, limits)
-    return contract.DiagnosticFieldOut(
+    return schemas.DiagnosticFieldOut(
         stream=known.stream,
         field=known.name,
         label=known.rule.label,

@@ -11,7 +11,7 @@ from function_app.domain.devices.devices import Agent
 from function_app.entrypoints.http.framework.authentication import Caller
 from function_app.entrypoints.http.framework.responses import answer, read
 from function_app.entrypoints.http.framework.routing import Routes
-from function_app.entrypoints.http.messaging import schemas as contract
+from function_app.entrypoints.http.messaging import schemas
 from function_app.entrypoints.ingest.agent_messages import tell
 from function_app.services.devices.device_access import require_claimed
 
@@ -30,7 +30,7 @@ def router(functions: Functions, caller: Caller) -> Routes:
         "GET",
         "/agents/{agent}/commands",
         summary="Commands that wait for this agent",
-        answers={200: contract.CommandList},
+        answers={200: schemas.CommandList},
         problems=(404, 409, 422),
         caller="agent",
     )
@@ -45,7 +45,7 @@ def router(functions: Functions, caller: Caller) -> Routes:
         asking = await _asking(request, agent)
         found = await functions.polling.commands(asking, wait_ms=wait_ms, limit=limit, have=frozenset(have))
         items = tuple(
-            contract.CommandOut(
+            schemas.CommandOut(
                 id=letter.command,
                 topic=letter.topic,
                 payload=letter.payload.decode(),
@@ -53,14 +53,14 @@ def router(functions: Functions, caller: Caller) -> Routes:
             )
             for letter in found
         )
-        return answer(contract.CommandList(items=items), headers={"Cache-Control": "no-store"})
+        return answer(schemas.CommandList(items=items), headers={"Cache-Control": "no-store"})
 
     @routes.add(
         "POST",
         "/agents/{agent}/messages",
         summary="What this agent has to say",
-        body=contract.MessagesRequest,
-        answers={200: contract.MessageResults},
+        body=schemas.MessagesRequest,
+        answers={200: schemas.MessageResults},
         problems=(404, 409),
         caller="agent",
     )
@@ -71,14 +71,14 @@ def router(functions: Functions, caller: Caller) -> Routes:
         """
         asking = await _asking(request, agent)
         require_claimed(asking)
-        asked: contract.MessagesRequest = await read(request, contract.MessagesRequest)
+        asked: schemas.MessagesRequest = await read(request, schemas.MessagesRequest)
         await functions.polling.mark_online(asking)  # first: what it says of itself counts more
         told = [(each.topic, bytes(each.payload)) for each in asked.messages]
         results = (
-            contract.MessageResult(status="stored" if why is None else "rejected", detail=why and f"{why.rstrip('.')}.")
+            schemas.MessageResult(status="stored" if why is None else "rejected", detail=why and f"{why.rstrip('.')}.")
             for why in await tell(functions, asking, told, by="http")
         )
-        return answer(contract.MessageResults(results=tuple(results)))
+        return answer(schemas.MessageResults(results=tuple(results)))
 
     async def _asking(request: Request, agent: str) -> Agent:
         """The agent that asks, once it is seen that the path names it."""

@@ -7,11 +7,11 @@ from fastapi import Request, Response
 from device_agent.protocol.xmpp import jids
 from function_app.bootstrap import Functions
 from function_app.domain.common.timestamps import rfc3339
-from function_app.entrypoints.http.control.schemas_broker import AgentCredentialsRequest
+from function_app.entrypoints.http.control.schemas import AgentCredentialsRequest
 from function_app.entrypoints.http.framework.authentication import Caller
 from function_app.entrypoints.http.framework.responses import answer, read
 from function_app.entrypoints.http.framework.routing import Routes
-from function_app.entrypoints.http.messaging import schemas_xmpp as contract
+from function_app.entrypoints.http.messaging import schemas
 
 _NOT_KEPT = {"Cache-Control": "no-store"}
 
@@ -24,14 +24,14 @@ def router(functions: Functions, caller: Caller) -> Routes:
         "POST",
         "/xmpp/credentials",
         summary="Credentials for the XMPP server",
-        body=contract.XmppCredentialsRequest,
-        answers={200: contract.XmppCredentialsOut},
+        body=schemas.XmppCredentialsRequest,
+        answers={200: schemas.XmppCredentialsOut},
         problems=(409,),
         caller="account or agent",
     )
     async def xmpp_credentials(request: Request) -> Response:
         """For an agent that said ``xmpp`` when it enrolled; or to watch one's agents with any XMPP client."""
-        asked: Any = await read(request, contract.XmppCredentialsRequest)
+        asked: Any = await read(request, schemas.XmppCredentialsRequest)
         space: str | None = None
         if isinstance(asked, AgentCredentialsRequest):
             agent = await caller.agent(request)
@@ -41,7 +41,7 @@ def router(functions: Functions, caller: Caller) -> Routes:
             given = await functions.xmpp_credentials.account(await caller.account(request))
         settings = functions.settings
         news = None if space is None else await functions.keys.news()
-        body = contract.XmppCredentialsOut(
+        body = schemas.XmppCredentialsOut(
             jid=f"{given.user}@{settings.xmpp_domain}",
             password=given.password,
             expires_at=rfc3339(given.expires_ms),
@@ -60,21 +60,21 @@ def router(functions: Functions, caller: Caller) -> Routes:
         "POST",
         "/xmpp/verify",
         summary="Whether somebody may log in at the XMPP server",
-        body=contract.XmppVerifyRequest,
-        answers={200: contract.XmppIdentityOut},
+        body=schemas.XmppVerifyRequest,
+        answers={200: schemas.XmppIdentityOut},
         problems=(401, 409),
         caller="nobody",
     )
     async def xmpp_verify(request: Request) -> Response:
         """Asked by the XMPP server; who has no valid password learns nothing here."""
-        asked: contract.XmppVerifyRequest = await read(request, contract.XmppVerifyRequest)
+        asked: schemas.XmppVerifyRequest = await read(request, schemas.XmppVerifyRequest)
         found = await functions.xmpp_credentials.verify(asked.user, asked.password)
-        body = contract.XmppIdentityOut(
+        body = schemas.XmppIdentityOut(
             user=found.user,
             name=found.name,
             kind=found.kind,
             lifetime_s=found.lifetime_s,
-            contacts=tuple(contract.XmppContactOut(user=each.user, name=each.name) for each in found.contacts),
+            contacts=tuple(schemas.XmppContactOut(user=each.user, name=each.name) for each in found.contacts),
         )
         return answer(body, headers=_NOT_KEPT)
 

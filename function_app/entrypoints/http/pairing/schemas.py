@@ -5,9 +5,8 @@ from typing import Annotated, Literal
 from msgspec import Meta
 
 from device_agent.protocol import Id, Label
-from function_app.entrypoints.http.accounts.schemas import AccountRef
 from function_app.entrypoints.http.devices.schemas import DeviceOut
-from function_app.entrypoints.http.framework.schemas import DeviceName, Moment, Name, Request, Response
+from function_app.entrypoints.http.framework.schemas import AccountRef, DeviceName, Moment, Name, Request, Response
 
 
 class DeviceIn(Request, frozen=True, kw_only=True):

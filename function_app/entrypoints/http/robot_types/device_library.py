@@ -5,12 +5,12 @@ from fastapi import Request, Response
 from device_agent.protocol.security import signing
 from function_app.bootstrap import Functions
 from function_app.domain.identity.accounts import Identity
-from function_app.entrypoints.http import serializers
 from function_app.entrypoints.http.framework.authentication import Caller
 from function_app.entrypoints.http.framework.responses import answer, content
 from function_app.entrypoints.http.framework.routing import Cursor, Limit, Routes
-from function_app.entrypoints.http.robot_types import schemas_movements as contract
+from function_app.entrypoints.http.robot_types import schemas
 from function_app.entrypoints.http.robot_types.schemas import RobotTypeOut
+from function_app.entrypoints.http.robot_types.serializers import movement_out, movement_source_out, robot_type_out
 from function_app.services.devices.device_access import require_operator
 
 
@@ -28,7 +28,7 @@ def router(functions: Functions, caller: Caller) -> Routes:
     async def get_device_robot_type(request: Request, device: str) -> Response:
         """As its owner has it: one's own of the same name may be another."""
         found = await functions.devices.get(await caller.account(request), device)
-        return answer(serializers.robot_type(await functions.robot_types.view(_owner(found.owner), found.robot_type)))
+        return answer(robot_type_out(await functions.robot_types.view(_owner(found.owner), found.robot_type)))
 
     @routes.add(
         "GET",
@@ -47,7 +47,7 @@ def router(functions: Functions, caller: Caller) -> Routes:
         "GET",
         "/devices/{device}/movements",
         summary="Movements that can be run on a device",
-        answers={200: contract.MovementList},
+        answers={200: schemas.MovementList},
         problems=(403, 404, 409, 422),
     )
     async def list_device_movements(
@@ -58,15 +58,13 @@ def router(functions: Functions, caller: Caller) -> Routes:
         items, following = await functions.movements.list(
             _owner(found.owner), found.robot_type, cursor=cursor, limit=limit
         )
-        return answer(
-            contract.MovementList(items=tuple(serializers.movement(each) for each in items), cursor=following)
-        )
+        return answer(schemas.MovementList(items=tuple(movement_out(each) for each in items), cursor=following))
 
     @routes.add(
         "GET",
         "/devices/{device}/movements/{name}",
         summary="One movement that can be run on a device, with its source",
-        answers={200: contract.MovementSource},
+        answers={200: schemas.MovementSource},
         problems=(403, 404, 409),
     )
     async def get_device_movement(request: Request, device: str, name: str) -> Response:
@@ -74,7 +72,7 @@ def router(functions: Functions, caller: Caller) -> Routes:
         found = require_operator(await functions.devices.get(await caller.account(request), device))
         movement, source = await functions.movements.get(_owner(found.owner), found.robot_type, name)
         public = signing.public_text((await functions.keys.public())[movement.key])
-        return answer(serializers.movement_source(found.robot_type, movement, source, public))
+        return answer(movement_source_out(found.robot_type, movement, source, public))
 
     return routes
 

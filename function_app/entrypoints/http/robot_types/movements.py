@@ -6,11 +6,11 @@ from fastapi import Query, Request, Response
 
 from device_agent.protocol.security import signing
 from function_app.bootstrap import Functions
-from function_app.entrypoints.http import serializers
 from function_app.entrypoints.http.framework.authentication import Caller
 from function_app.entrypoints.http.framework.responses import answer, empty, read
 from function_app.entrypoints.http.framework.routing import Cursor, Limit, Routes
-from function_app.entrypoints.http.robot_types import schemas_movements as contract
+from function_app.entrypoints.http.robot_types import schemas
+from function_app.entrypoints.http.robot_types.serializers import movement_out, movement_source_out
 from function_app.services.robot_types import parameter_schema
 from function_app.services.robot_types.movements import Draft
 
@@ -26,22 +26,20 @@ def router(functions: Functions, caller: Caller) -> Routes:
         "GET",
         _MOVEMENTS,
         summary="Movements of a robot type",
-        answers={200: contract.MovementList},
+        answers={200: schemas.MovementList},
         problems=(404, 409, 422),
     )
     async def list_movements(request: Request, robot_type: str, cursor: Cursor = None, limit: Limit = 100) -> Response:
         """Built-in ones and the account's own, by name."""
         who = await caller.account(request)
         found, following = await functions.movements.list(who, robot_type, cursor=cursor, limit=limit)
-        return answer(
-            contract.MovementList(items=tuple(serializers.movement(each) for each in found), cursor=following)
-        )
+        return answer(schemas.MovementList(items=tuple(movement_out(each) for each in found), cursor=following))
 
     @routes.add(
         "GET",
         _MOVEMENTS + "/{name}",
         summary="One movement with its source",
-        answers={200: contract.MovementSource},
+        answers={200: schemas.MovementSource},
         problems=(404, 409, 422),
     )
     async def get_movement(request: Request, robot_type: str, name: str, version: Version = None) -> Response:
@@ -49,13 +47,13 @@ def router(functions: Functions, caller: Caller) -> Routes:
         who = await caller.account(request)
         found, source = await functions.movements.get(who, robot_type, name, version)
         public = signing.public_text((await functions.keys.archive())[found.key])
-        return answer(serializers.movement_source(robot_type, found, source, public))
+        return answer(movement_source_out(robot_type, found, source, public))
 
     @routes.add(
         "GET",
         _MOVEMENTS + "/{name}/versions",
         summary="All versions of a movement, newest first",
-        answers={200: contract.MovementList},
+        answers={200: schemas.MovementList},
         problems=(404, 409, 422),
     )
     async def list_movement_versions(
@@ -64,29 +62,27 @@ def router(functions: Functions, caller: Caller) -> Routes:
         """The built-in one that it shadows comes last."""
         who = await caller.account(request)
         found, following = await functions.movements.versions(who, robot_type, name, cursor=cursor, limit=limit)
-        return answer(
-            contract.MovementList(items=tuple(serializers.movement(each) for each in found), cursor=following)
-        )
+        return answer(schemas.MovementList(items=tuple(movement_out(each) for each in found), cursor=following))
 
     @routes.add(
         "PUT",
         _MOVEMENTS + "/{name}",
         summary="Save a movement",
-        body=contract.MovementRequest,
-        answers={200: contract.MovementOut, 201: contract.MovementOut},
+        body=schemas.MovementRequest,
+        answers={200: schemas.MovementOut, 201: schemas.MovementOut},
         problems=(404, 409),
     )
     async def put_movement(request: Request, robot_type: str, name: str) -> Response:
         """A new version of the account's own; it shadows a built-in one of the same name."""
         who = await caller.account(request)
-        asked: contract.MovementRequest = await read(request, contract.MovementRequest)
+        asked: schemas.MovementRequest = await read(request, schemas.MovementRequest)
         schema = None
         if asked.parameters_schema is not None:
             parameter_schema.check_schema(asked.parameters_schema)
             schema = parameter_schema.plain(asked.parameters_schema)
         draft = Draft(asked.source, asked.description, schema, asked.based_on)
         found, new = await functions.movements.put(who, robot_type, name, draft)
-        return answer(serializers.movement(found), 201 if new else 200)
+        return answer(movement_out(found), 201 if new else 200)
 
     @routes.add(
         "DELETE",

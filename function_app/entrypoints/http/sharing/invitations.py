@@ -8,11 +8,11 @@ from function_app.bootstrap import Functions
 from function_app.domain.common.timestamps import rfc3339
 from function_app.domain.devices.access import Kind, split_target
 from function_app.domain.identity.accounts import Identity, Role
-from function_app.entrypoints.http.accounts.schemas import AccountRef
 from function_app.entrypoints.http.framework.authentication import Caller
 from function_app.entrypoints.http.framework.responses import answer, empty, read
 from function_app.entrypoints.http.framework.routing import Routes
-from function_app.entrypoints.http.sharing import schemas as contract
+from function_app.entrypoints.http.framework.schemas import AccountRef
+from function_app.entrypoints.http.sharing import schemas
 from function_app.services.sharing.invitations import Known, Offer
 from function_app.services.sharing.shares import NewShare
 
@@ -29,31 +29,31 @@ def router(functions: Functions, caller: Caller) -> Routes:
         "POST",
         "/invitations/lookup",
         summary="What an invitation offers",
-        body=contract.InvitationLookupRequest,
-        answers={200: contract.InvitationOut},
+        body=schemas.InvitationLookupRequest,
+        answers={200: schemas.InvitationOut},
         problems=(404,),
     )
     async def look_up_invitation(request: Request) -> Response:
         """For whoever has its secret. A wrong, used, expired and withdrawn one are answered alike."""
         await caller.account(request)
-        asked: contract.InvitationLookupRequest = await read(request, contract.InvitationLookupRequest)
-        return answer(contract.InvitationOut(**_shown(await functions.invitations.look(asked.secret))))
+        asked: schemas.InvitationLookupRequest = await read(request, schemas.InvitationLookupRequest)
+        return answer(schemas.InvitationOut(**_shown(await functions.invitations.look(asked.secret))))
 
     @routes.add(
         "POST",
         "/invitations/redeem",
         summary="Redeem an invitation, or accept a transfer",
-        body=contract.RedeemRequest,
-        answers={200: contract.InvitationOut},
+        body=schemas.RedeemRequest,
+        answers={200: schemas.InvitationOut},
         problems=(404, 409),
     )
     async def redeem_invitation(request: Request) -> Response:
         """Of several who bring the last use at once one gets it. Gives what it offered."""
         who = await caller.account(request)
-        asked: contract.RedeemRequest = await read(request, contract.RedeemRequest)
+        asked: schemas.RedeemRequest = await read(request, schemas.RedeemRequest)
         known = await functions.invitations.look(asked.secret)
         await functions.invitations.redeem(who, known, space=asked.space)
-        return answer(contract.InvitationOut(**_shown(known)))
+        return answer(schemas.InvitationOut(**_shown(known)))
 
     return routes
 
@@ -62,7 +62,7 @@ def _of_devices(routes: Routes, invitations: "_Invitations") -> None:
     at = "/devices/{device}/invitations"
 
     @routes.add(
-        "GET", at, summary="Open invitations to a device", answers={200: contract.InvitationList}, problems=(403, 404)
+        "GET", at, summary="Open invitations to a device", answers={200: schemas.InvitationList}, problems=(403, 404)
     )
     async def list_device_invitations(request: Request, device: str) -> Response:
         """Those that can still be redeemed, without their secrets. For its owner."""
@@ -72,8 +72,8 @@ def _of_devices(routes: Routes, invitations: "_Invitations") -> None:
         "POST",
         at,
         summary="Share a device by link",
-        body=contract.InvitationRequest,
-        answers={201: contract.InvitationCreated},
+        body=schemas.InvitationRequest,
+        answers={201: schemas.InvitationCreated},
         problems=(404, 409),
     )
     async def invite_to_device(request: Request, device: str) -> Response:
@@ -90,7 +90,7 @@ def _of_spaces(routes: Routes, invitations: "_Invitations") -> None:
     at = "/spaces/{space}/invitations"
 
     @routes.add(
-        "GET", at, summary="Open invitations to a space", answers={200: contract.InvitationList}, problems=(403, 404)
+        "GET", at, summary="Open invitations to a space", answers={200: schemas.InvitationList}, problems=(403, 404)
     )
     async def list_space_invitations(request: Request, space: str) -> Response:
         """Those that can still be redeemed, without their secrets. For its owner."""
@@ -100,8 +100,8 @@ def _of_spaces(routes: Routes, invitations: "_Invitations") -> None:
         "POST",
         at,
         summary="Share a space by link",
-        body=contract.InvitationRequest,
-        answers={201: contract.InvitationCreated},
+        body=schemas.InvitationRequest,
+        answers={201: schemas.InvitationCreated},
         problems=(404, 409),
     )
     async def invite_to_space(request: Request, space: str) -> Response:
@@ -118,7 +118,7 @@ def _of_whole_spaces(routes: Routes, invitations: "_Invitations") -> None:
     at = "/spaces/{space}/transfers"
 
     @routes.add(
-        "GET", at, summary="Open transfers of a space", answers={200: contract.InvitationList}, problems=(403, 404)
+        "GET", at, summary="Open transfers of a space", answers={200: schemas.InvitationList}, problems=(403, 404)
     )
     async def list_space_transfers(request: Request, space: str) -> Response:
         """Those that can still be accepted, without their secrets. For its owner."""
@@ -128,8 +128,8 @@ def _of_whole_spaces(routes: Routes, invitations: "_Invitations") -> None:
         "POST",
         at,
         summary="Offer a space to another account",
-        body=contract.TransferRequest,
-        answers={201: contract.InvitationCreated},
+        body=schemas.TransferRequest,
+        answers={201: schemas.InvitationCreated},
         problems=(404, 409),
     )
     async def transfer_space(request: Request, space: str) -> Response:
@@ -146,7 +146,7 @@ def _of_agents(routes: Routes, invitations: "_Invitations") -> None:
     at = "/agents/{agent}/transfers"
 
     @routes.add(
-        "GET", at, summary="Open transfers of an agent", answers={200: contract.InvitationList}, problems=(403, 404)
+        "GET", at, summary="Open transfers of an agent", answers={200: schemas.InvitationList}, problems=(403, 404)
     )
     async def list_agent_transfers(request: Request, agent: str) -> Response:
         """Those that can still be accepted, without their secrets. For its owner."""
@@ -156,8 +156,8 @@ def _of_agents(routes: Routes, invitations: "_Invitations") -> None:
         "POST",
         at,
         summary="Offer an agent to another account",
-        body=contract.TransferRequest,
-        answers={201: contract.InvitationCreated},
+        body=schemas.TransferRequest,
+        answers={201: schemas.InvitationCreated},
         problems=(404, 409),
     )
     async def transfer_agent(request: Request, agent: str) -> Response:
@@ -179,14 +179,14 @@ class _Invitations:
 
     async def invite(self, request: Request, kind: Literal["device", "space"], name: str) -> Response:
         who = await self._caller.account(request)
-        asked: contract.InvitationRequest = await read(request, contract.InvitationRequest)
+        asked: schemas.InvitationRequest = await read(request, schemas.InvitationRequest)
         shared = await self._functions.sharing.of(who, kind, name)
         offer = Offer(Role(asked.role), asked.uses, asked.expires_in_s, asked.share_s or 0, await self._id(asked))
         return await self._make(who, shared, offer)
 
     async def transfer(self, request: Request, kind: Literal["agent", "space"], name: str) -> Response:
         who = await self._caller.account(request)
-        asked: contract.TransferRequest = await read(request, contract.TransferRequest)
+        asked: schemas.TransferRequest = await read(request, schemas.TransferRequest)
         whole = self._functions.invitations.agent if kind == "agent" else self._functions.invitations.space
         shared = await whole(who, name)
         return await self._make(who, shared, Offer(Role.OWNER, 1, asked.expires_in_s, account=await self._id(asked)))
@@ -195,10 +195,10 @@ class _Invitations:
         found = await self._functions.invitations.open(await self._of(request, kind, name))
         wanted = [known for known in found if (known.invitation.role is Role.OWNER) == transfers]
         items = [
-            contract.InvitationOut(**_shown(known), account=await self._only(known.invitation.account))
+            schemas.InvitationOut(**_shown(known), account=await self._only(known.invitation.account))
             for known in wanted
         ]
-        return answer(contract.InvitationList(items=tuple(items), cursor=None))
+        return answer(schemas.InvitationList(items=tuple(items), cursor=None))
 
     async def _only(self, account: str) -> AccountRef | None:
         return AccountRef(id=account, name=await self._functions.sign_in.named(account)) if account else None
@@ -214,13 +214,13 @@ class _Invitations:
             return await self._functions.invitations.agent(who, name)
         return await self._functions.sharing.of(who, kind, name)
 
-    async def _id(self, asked: contract.InvitationRequest | contract.TransferRequest) -> str:
+    async def _id(self, asked: schemas.InvitationRequest | schemas.TransferRequest) -> str:
         return (await self._functions.sharing.person(asked.account)).id if asked.account is not None else ""
 
     async def _make(self, who: Identity, shared: NewShare, offer: Offer) -> Response:
         secret, known = await self._functions.invitations.make(who, shared, offer)
         link = f"{self._functions.settings.public_url}/#invitation={secret}"
-        body = contract.InvitationCreated(**_shown(known), secret=secret, link=link)
+        body = schemas.InvitationCreated(**_shown(known), secret=secret, link=link)
         return answer(body, 201, headers={"Cache-Control": "no-store"})
 
 

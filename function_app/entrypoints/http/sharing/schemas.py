@@ -5,8 +5,7 @@ from typing import Annotated, Literal
 from msgspec import Meta
 
 from device_agent.protocol import Id
-from function_app.entrypoints.http.accounts.schemas import AccountRef
-from function_app.entrypoints.http.framework.schemas import Moment, Name, Request, Response
+from function_app.entrypoints.http.framework.schemas import AccountRef, Moment, Name, Request, Response
 
 SharedRole = Literal["operator", "viewer"]
 ForS = Annotated[int, Meta(ge=10, le=10 * 366 * 86_400, description="How long it lasts [s]; null: until it is ended.")]

@@ -8,18 +8,18 @@ from function_app.bootstrap import Functions
 from function_app.domain.common.timestamps import NEVER_MS, rfc3339
 from function_app.domain.devices.access import Share
 from function_app.domain.identity.accounts import Role
-from function_app.entrypoints.http.accounts.schemas import AccountRef
 from function_app.entrypoints.http.framework.authentication import Caller
 from function_app.entrypoints.http.framework.responses import answer, empty, read
 from function_app.entrypoints.http.framework.routing import Routes
-from function_app.entrypoints.http.sharing import schemas as contract
+from function_app.entrypoints.http.framework.schemas import AccountRef
+from function_app.entrypoints.http.sharing import schemas
 
 Kind = Literal["device", "space"]
 _UNTOLD: Final = (
     "The share has ended, and control under it. The broker did not answer: live sessions are cut, and the device is "
     "told, as soon as it does."
 )
-_ROLES: Final[dict[Role, contract.SharedRole]] = {Role.OPERATOR: "operator", Role.VIEWER: "viewer"}
+_ROLES: Final[dict[Role, schemas.SharedRole]] = {Role.OPERATOR: "operator", Role.VIEWER: "viewer"}
 
 
 def router(functions: Functions, caller: Caller) -> Routes:
@@ -30,7 +30,7 @@ def router(functions: Functions, caller: Caller) -> Routes:
         "GET",
         "/devices/{device}/shares",
         summary="With whom a device is shared",
-        answers={200: contract.ShareList},
+        answers={200: schemas.ShareList},
         problems=(403, 404),
     )
     async def list_device_shares(request: Request, device: str) -> Response:
@@ -41,7 +41,7 @@ def router(functions: Functions, caller: Caller) -> Routes:
         "GET",
         "/spaces/{space}/shares",
         summary="With whom a space is shared",
-        answers={200: contract.ShareList},
+        answers={200: schemas.ShareList},
         problems=(403, 404),
     )
     async def list_space_shares(request: Request, space: str) -> Response:
@@ -52,8 +52,8 @@ def router(functions: Functions, caller: Caller) -> Routes:
         "POST",
         "/devices/{device}/shares",
         summary="Share a device",
-        body=contract.ShareRequest,
-        answers={200: contract.ShareOut, 201: contract.ShareOut, 202: contract.ShareOut},
+        body=schemas.ShareRequest,
+        answers={200: schemas.ShareOut, 201: schemas.ShareOut, 202: schemas.ShareOut},
         problems=(404, 409),
     )
     async def share_device(request: Request, device: str) -> Response:
@@ -67,8 +67,8 @@ def router(functions: Functions, caller: Caller) -> Routes:
         "POST",
         "/spaces/{space}/shares",
         summary="Share a space",
-        body=contract.ShareRequest,
-        answers={200: contract.ShareOut, 201: contract.ShareOut, 202: contract.ShareOut},
+        body=schemas.ShareRequest,
+        answers={200: schemas.ShareOut, 201: schemas.ShareOut, 202: schemas.ShareOut},
         problems=(404, 409),
     )
     async def share_space(request: Request, space: str) -> Response:
@@ -79,7 +79,7 @@ def router(functions: Functions, caller: Caller) -> Routes:
         "DELETE",
         "/devices/{device}/shares/{account}",
         summary="Un-share a device",
-        answers={202: contract.ShareRevocation, 204: None},
+        answers={202: schemas.ShareRevocation, 204: None},
         problems=(404, 409),
     )
     async def unshare_device(request: Request, device: str, account: str) -> Response:
@@ -93,7 +93,7 @@ def router(functions: Functions, caller: Caller) -> Routes:
         "DELETE",
         "/spaces/{space}/shares/{account}",
         summary="Un-share a space",
-        answers={202: contract.ShareRevocation, 204: None},
+        answers={202: schemas.ShareRevocation, 204: None},
         problems=(404, 409),
     )
     async def unshare_space(request: Request, space: str, account: str) -> Response:
@@ -113,11 +113,11 @@ class _Shares:
     async def list(self, request: Request, kind: Kind, name: str) -> Response:
         shared = await self._functions.sharing.of(await self._caller.account(request), kind, name)
         found = await self._functions.sharing.shares(shared)
-        return answer(contract.ShareList(items=tuple(show(share, named) for share, named in found), cursor=None))
+        return answer(schemas.ShareList(items=tuple(show(share, named) for share, named in found), cursor=None))
 
     async def put(self, request: Request, kind: Kind, name: str) -> Response:
         who = await self._caller.account(request)
-        asked: contract.ShareRequest = await read(request, contract.ShareRequest)
+        asked: schemas.ShareRequest = await read(request, schemas.ShareRequest)
         shared = await self._functions.sharing.of(who, kind, name)
         person = await self._functions.sharing.person(asked.account)
         sharing = self._functions.sharing
@@ -131,12 +131,12 @@ class _Shares:
             told = await sharing.leave(who, f"{kind}:{name}")
         else:
             told = await sharing.end(who, await sharing.of(who, kind, name), account)
-        return empty() if told else answer(contract.ShareRevocation(detail=_UNTOLD), 202)
+        return empty() if told else answer(schemas.ShareRevocation(detail=_UNTOLD), 202)
 
 
-def show(share: Share, name: str) -> contract.ShareOut:
+def show(share: Share, name: str) -> schemas.ShareOut:
     """A share."""
-    return contract.ShareOut(
+    return schemas.ShareOut(
         account=AccountRef(id=share.account, name=name),
         role=_ROLES[share.role],
         created_by=share.by,

@@ -7,7 +7,7 @@ from function_app.domain.common.timestamps import rfc3339
 from function_app.entrypoints.http.framework.authentication import Caller
 from function_app.entrypoints.http.framework.responses import answer
 from function_app.entrypoints.http.framework.routing import Cursor, Limit, Routes
-from function_app.entrypoints.http.telemetry import schemas_events as contract
+from function_app.entrypoints.http.telemetry import schemas
 
 
 def router(functions: Functions, caller: Caller) -> Routes:
@@ -18,7 +18,7 @@ def router(functions: Functions, caller: Caller) -> Routes:
         "GET",
         "/devices/{device}/events",
         summary="What happened",
-        answers={200: contract.EventList},
+        answers={200: schemas.EventList},
         problems=(404, 422),
     )
     async def list_events(request: Request, device: str, cursor: Cursor = None, limit: Limit = 100) -> Response:
@@ -27,7 +27,7 @@ def router(functions: Functions, caller: Caller) -> Routes:
         found = await functions.devices.get(who, device)
         events, following = await functions.events.read(found, cursor=cursor, limit=limit)
         items = tuple(
-            contract.EventOut(
+            schemas.EventOut(
                 id=event["id"],
                 kind=event["kind"],
                 severity=event["severity"],
@@ -38,6 +38,6 @@ def router(functions: Functions, caller: Caller) -> Routes:
             )
             for event in events
         )
-        return answer(contract.EventList(items=items, cursor=following))
+        return answer(schemas.EventList(items=items, cursor=following))
 
     return routes

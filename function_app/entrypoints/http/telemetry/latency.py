@@ -10,7 +10,7 @@ from function_app.domain.common.timestamps import rfc3339
 from function_app.entrypoints.http.framework.authentication import Caller
 from function_app.entrypoints.http.framework.responses import answer, empty, read
 from function_app.entrypoints.http.framework.routing import Routes
-from function_app.entrypoints.http.telemetry import schemas_latency as contract
+from function_app.entrypoints.http.telemetry import schemas
 from function_app.services.devices.device_access import devices_of, require_operator
 from function_app.services.telemetry.latency import LatencySeries, Path, Samples, Transport
 
@@ -40,14 +40,14 @@ def router(functions: Functions, caller: Caller) -> Routes:
         "POST",
         "/devices/{device}/latency",
         summary="Add an operator's samples",
-        body=contract.LatencyRequest,
+        body=schemas.LatencyRequest,
         answers={204: None},
         problems=(404,),
     )
     async def add_latency(request: Request, device: str, once: Key = None) -> Response:
         """Times that the operator's side has measured, on its own clock alone. Who only watches adds none."""
         who = await caller.account(request)
-        asked: contract.LatencyRequest = await read(request, contract.LatencyRequest)
+        asked: schemas.LatencyRequest = await read(request, schemas.LatencyRequest)
         found = require_operator(await functions.devices.get(who, device))
         await functions.latencies.add(found, _samples(asked), caller=f"account:{who.account}", once=once or "")
         return empty()
@@ -56,7 +56,7 @@ def router(functions: Functions, caller: Caller) -> Routes:
         "POST",
         "/agents/{agent}/latency",
         summary="Add an agent's samples",
-        body=contract.AgentLatencyRequest,
+        body=schemas.AgentLatencyRequest,
         answers={204: None},
         problems=(404,),
         caller="agent",
@@ -64,7 +64,7 @@ def router(functions: Functions, caller: Caller) -> Routes:
     async def add_agent_latency(request: Request, agent: str, once: Key = None) -> Response:
         """Called by an agent: times that it has measured for one of its devices, on its own clock alone."""
         known = await caller.agent(request)
-        asked: contract.AgentLatencyRequest = await read(request, contract.AgentLatencyRequest)
+        asked: schemas.AgentLatencyRequest = await read(request, schemas.AgentLatencyRequest)
         if known.id != agent or not known.claimed:
             raise not_found("agent", agent)
         device = next((found for found in devices_of(known) if found.name == asked.device), None)
@@ -77,7 +77,7 @@ def router(functions: Functions, caller: Caller) -> Routes:
         "GET",
         "/devices/{device}/latency",
         summary="How long things take",
-        answers={200: contract.LatencyList},
+        answers={200: schemas.LatencyList},
         problems=(404, 422),
     )
     async def get_latency(  # noqa: PLR0917 (FastAPI names them)
@@ -94,7 +94,7 @@ def router(functions: Functions, caller: Caller) -> Routes:
         found = await functions.devices.get(who, device)
         span = functions.latencies.span(since, until)
         items = await functions.latencies.find(found, span, transport=transport, path=path)
-        body = contract.LatencyList(
+        body = schemas.LatencyList(
             since=rfc3339(span.first_ms),
             until=rfc3339(span.last_ms),
             items=tuple(_show(item, samples) for item in items),
@@ -104,11 +104,11 @@ def router(functions: Functions, caller: Caller) -> Routes:
     return routes
 
 
-def _samples(asked: contract.LatencyRequest | contract.AgentLatencyRequest) -> Samples:
+def _samples(asked: schemas.LatencyRequest | schemas.AgentLatencyRequest) -> Samples:
     return Samples(asked.transport, asked.path, tuple((sample.at_ms, sample.ms) for sample in asked.samples))
 
 
-def _show(found: LatencySeries, samples: int) -> contract.LatencyOut:
+def _show(found: LatencySeries, samples: int) -> schemas.LatencyOut:
     known = found.histogram
     recent = found.recent[len(found.recent) - min(samples, len(found.recent)) :]
     measures: dict[str, Any] = dict.fromkeys(
@@ -117,11 +117,11 @@ def _show(found: LatencySeries, samples: int) -> contract.LatencyOut:
     if known.count:
         measures = {"mean_ms": known.mean_ms, "min_ms": known.min_ms, "max_ms": known.max_ms}
         measures |= {f"p{percent}_ms": known.quantile(percent / 100) for percent in (50, 90, 95, 99)}
-    return contract.LatencyOut(
+    return schemas.LatencyOut(
         transport=found.transport,
         path=found.path,
         count=known.count,
-        bins=tuple(contract.LatencyBin(above_ms=low, up_to_ms=high, count=count) for low, high, count in known.bins()),
+        bins=tuple(schemas.LatencyBin(above_ms=low, up_to_ms=high, count=count) for low, high, count in known.bins()),
         at_ms=tuple(at_ms for at_ms, _ in recent),
         ms=tuple(ms for _, ms in recent),
         **measures,

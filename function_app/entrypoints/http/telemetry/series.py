@@ -9,7 +9,7 @@ from function_app.domain.common.timestamps import LAST_MS, rfc3339
 from function_app.entrypoints.http.framework.authentication import Caller
 from function_app.entrypoints.http.framework.responses import answer
 from function_app.entrypoints.http.framework.routing import Routes
-from function_app.entrypoints.http.telemetry import schemas as contract
+from function_app.entrypoints.http.telemetry import schemas
 from function_app.services.telemetry.series_reader import MAX_POINTS, Part, Range
 
 Since = Annotated[
@@ -22,7 +22,7 @@ Points = Annotated[int, Query(ge=1, le=MAX_POINTS, description="At most so many 
 Fields = Annotated[str | None, Query(max_length=4_000, description="Only these fields, with commas between.")]
 Cursor = Annotated[str | None, Query(max_length=40, description="Where the page before ended.")]
 Resolution = Annotated[
-    contract.Resolution | None, Query(description="How fine; without it, as fine as `points` allow on one page.")
+    schemas.Resolution | None, Query(description="How fine; without it, as fine as `points` allow on one page.")
 ]
 
 
@@ -34,14 +34,14 @@ def router(functions: Functions, caller: Caller) -> Routes:
         "GET",
         "/devices/{device}/data",
         summary="What a device measures",
-        answers={200: contract.StreamList},
+        answers={200: schemas.StreamList},
         problems=(404,),
     )
     async def list_streams(request: Request, device: str) -> Response:
         """Its streams since it was paired."""
         views = await functions.series.streams(await caller.account(request), device)
         items = tuple(
-            contract.StreamOut(
+            schemas.StreamOut(
                 name=view.name,
                 samples=view.about.count,
                 first_at=rfc3339(view.about.first_ms),
@@ -50,13 +50,13 @@ def router(functions: Functions, caller: Caller) -> Routes:
             )
             for view in views
         )
-        return answer(contract.StreamList(items=items, cursor=None))
+        return answer(schemas.StreamList(items=items, cursor=None))
 
     @routes.add(
         "GET",
         "/devices/{device}/data/{stream}",
         summary="A stretch of a stream",
-        answers={200: contract.DataOut},
+        answers={200: schemas.DataOut},
         problems=(404, 422),
     )
     async def read_stream(  # noqa: PLR0917 (FastAPI names them)
@@ -85,19 +85,19 @@ def router(functions: Functions, caller: Caller) -> Routes:
     return routes
 
 
-def _show(stream: str, part: Part) -> contract.DataOut:
-    columns = {name: contract.ColumnOut(mean=tuple(values)) for name, values in part.values.items()}
+def _show(stream: str, part: Part) -> schemas.DataOut:
+    columns = {name: schemas.ColumnOut(mean=tuple(values)) for name, values in part.values.items()}
     for name, summaries in part.summaries.items():
-        columns[name] = contract.ColumnOut(
+        columns[name] = schemas.ColumnOut(
             mean=tuple(each and each.mean for each in summaries),
             min=tuple(each and each.low for each in summaries),
             max=tuple(each and each.high for each in summaries),
             last=tuple(each and each.last for each in summaries),
             count=tuple(each.samples if each else 0 for each in summaries),
         )
-    return contract.DataOut(
+    return schemas.DataOut(
         stream=stream,
-        resolution=cast("contract.Resolution", part.level.name),
+        resolution=cast("schemas.Resolution", part.level.name),
         span_ms=part.level.span_ms,
         from_ms=part.first_ms,
         to_ms=part.last_ms,

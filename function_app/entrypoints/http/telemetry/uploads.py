@@ -11,7 +11,7 @@ from function_app.domain.devices.devices import Agent, Device
 from function_app.entrypoints.http.framework.authentication import Caller
 from function_app.entrypoints.http.framework.responses import answer, empty, read
 from function_app.entrypoints.http.framework.routing import Cursor, Limit, Routes
-from function_app.entrypoints.http.telemetry import schemas_uploads as contract
+from function_app.entrypoints.http.telemetry import schemas
 from function_app.services.devices.device_access import devices_of, require_operator, require_owner
 from function_app.services.telemetry.uploads import LIFETIME_S, Announced, Capture
 
@@ -33,54 +33,54 @@ def _for_accounts(routes: Routes, functions: Functions, caller: Caller) -> None:
         "POST",
         "/devices/{device}/uploads",
         summary="Begin an upload",
-        body=contract.UploadRequest,
-        answers={201: contract.UploadStarted},
+        body=schemas.UploadRequest,
+        answers={201: schemas.UploadStarted},
         problems=(404, 409),
     )
     async def begin_upload(request: Request, device: str) -> Response:
         """Gives an address, to which the content goes past this API. Complete the upload after that."""
         found, name = await operated(request, device)
-        asked: contract.UploadRequest = await read(request, contract.UploadRequest)
+        asked: schemas.UploadRequest = await read(request, schemas.UploadRequest)
         return await _begin(functions, found, asked, f"account:{name}")
 
     @routes.add(
         "POST",
         "/devices/{device}/uploads/{upload}/complete",
         summary="Register what was uploaded",
-        answers={200: contract.UploadOut},
+        answers={200: schemas.UploadOut},
         problems=(404, 409),
     )
     async def complete_upload(request: Request, device: str, upload: str) -> Response:
         """Checks that it is there, and is what was announced. Safe to repeat."""
         found, _ = await operated(request, device)
-        return answer(contract.UploadOut(**_show(await functions.uploads.complete(found, upload))))
+        return answer(schemas.UploadOut(**_show(await functions.uploads.complete(found, upload))))
 
     @routes.add(
         "GET",
         "/devices/{device}/uploads",
         summary="Captures of a device",
-        answers={200: contract.UploadList},
+        answers={200: schemas.UploadList},
         problems=(404, 422),
     )
     async def list_uploads(request: Request, device: str, cursor: Cursor = None, limit: Limit = 100) -> Response:
         """Registered ones, newest first."""
         found = await functions.devices.get(await caller.account(request), device)
         captures, following = await functions.uploads.list(found, cursor=cursor, limit=limit)
-        items = tuple(contract.UploadOut(**_show(capture)) for capture in captures)
-        return answer(contract.UploadList(items=items, cursor=following))
+        items = tuple(schemas.UploadOut(**_show(capture)) for capture in captures)
+        return answer(schemas.UploadList(items=items, cursor=following))
 
     @routes.add(
         "GET",
         "/devices/{device}/uploads/{upload}",
         summary="One capture",
-        answers={200: contract.UploadWithUrl},
+        answers={200: schemas.UploadWithUrl},
         problems=(404,),
     )
     async def get_upload(request: Request, device: str, upload: str) -> Response:
         """With an address from which it can be read."""
         found = await functions.devices.get(await caller.account(request), device)
         capture, url = await functions.uploads.get(found, upload)
-        return answer(contract.UploadWithUrl(url=url, **_show(capture)), headers={"Cache-Control": "no-store"})
+        return answer(schemas.UploadWithUrl(url=url, **_show(capture)), headers={"Cache-Control": "no-store"})
 
     @routes.add(
         "DELETE",
@@ -101,32 +101,32 @@ def _for_agents(routes: Routes, functions: Functions, caller: Caller) -> None:
         "POST",
         "/agents/{agent}/uploads",
         summary="Begin an agent's upload",
-        body=contract.AgentUploadRequest,
-        answers={201: contract.UploadStarted},
+        body=schemas.AgentUploadRequest,
+        answers={201: schemas.UploadStarted},
         problems=(404, 409),
         caller="agent",
     )
     async def begin_agent_upload(request: Request, agent: str) -> Response:
         """Called by an agent, for one of its devices."""
         known = await caller.agent(request)
-        asked: contract.AgentUploadRequest = await read(request, contract.AgentUploadRequest)
+        asked: schemas.AgentUploadRequest = await read(request, schemas.AgentUploadRequest)
         return await _begin(functions, _own(known, agent, asked.device), asked, f"agent:{known.id}")
 
     @routes.add(
         "POST",
         "/agents/{agent}/uploads/{upload}/complete",
         summary="Register what an agent has uploaded",
-        body=contract.AgentCompleteRequest,
-        answers={200: contract.UploadOut},
+        body=schemas.AgentCompleteRequest,
+        answers={200: schemas.UploadOut},
         problems=(404, 409),
         caller="agent",
     )
     async def complete_agent_upload(request: Request, agent: str, upload: str) -> Response:
         """Called by an agent. Safe to repeat."""
         known = await caller.agent(request)
-        asked: contract.AgentCompleteRequest = await read(request, contract.AgentCompleteRequest)
+        asked: schemas.AgentCompleteRequest = await read(request, schemas.AgentCompleteRequest)
         capture = await functions.uploads.complete(_own(known, agent, asked.device), upload)
-        return answer(contract.UploadOut(**_show(capture)))
+        return answer(schemas.UploadOut(**_show(capture)))
 
 
 def _own(known: Agent, agent: str, name: str) -> Device:
@@ -143,7 +143,7 @@ def _own(known: Agent, agent: str, name: str) -> Device:
     return device
 
 
-async def _begin(functions: Functions, device: Device, asked: contract.UploadRequest, by: str) -> Response:
+async def _begin(functions: Functions, device: Device, asked: schemas.UploadRequest, by: str) -> Response:
     wanted = Announced(
         stream=asked.stream,
         length=asked.length,
@@ -153,7 +153,7 @@ async def _begin(functions: Functions, device: Device, asked: contract.UploadReq
         sha256=asked.sha256 or "",
     )
     capture, upload = await functions.uploads.begin(device, wanted, by=by)
-    body = contract.UploadStarted(
+    body = schemas.UploadStarted(
         id=capture.id,
         method=upload.method,
         url=upload.url,

@@ -4,9 +4,9 @@ from fastapi import Request, Response
 
 from function_app.bootstrap import Functions
 from function_app.domain.common.problems import store_unavailable
-from function_app.entrypoints.http import health_check_schemas as contract
 from function_app.entrypoints.http.framework.responses import answer
 from function_app.entrypoints.http.framework.routing import VERSION, Routes
+from function_app.entrypoints.http.health import schemas
 
 
 def router(functions: Functions) -> Routes:
@@ -14,14 +14,14 @@ def router(functions: Functions) -> Routes:
     routes = Routes("health")
 
     @routes.add(
-        "GET", "/health", summary="Whether the functions can work", answers={200: contract.HealthOut}, caller="nobody"
+        "GET", "/health", summary="Whether the functions can work", answers={200: schemas.HealthOut}, caller="nobody"
     )
     async def health(_request: Request) -> Response:
         """503 when the tables cannot be used; a broker that is away is said, and comes back by itself."""
         found = await functions.health.check()
         if found.tables != "ok":
             raise store_unavailable(found.tables)
-        body = contract.HealthOut(
+        body = schemas.HealthOut(
             status="ok" if found.broker == "ok" else "degraded",
             version=VERSION,
             tables=found.tables,

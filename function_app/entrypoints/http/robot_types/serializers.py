@@ -1,0 +1,115 @@
+"""Robot types, previews and movements as the API shows them."""
+
+from typing import Any
+
+import msgspec
+
+from device_agent.protocol.manifests.robot_type import RobotType
+from function_app.domain.common.timestamps import rfc3339
+from function_app.domain.robot_types.movements import Movement
+from function_app.domain.robot_types.robot_types import TypeVersion
+from function_app.entrypoints.http.robot_types import schemas
+from function_app.services.robot_types.catalogue import KnownType, Model
+from function_app.services.robot_types.parameter_schema import ObjectSchema
+from function_app.services.robot_types.preview import Preview
+from function_app.services.robot_types.script_store import signed_text
+
+
+def robot_type_out(robot_type: KnownType) -> schemas.RobotTypeOut:
+    """A robot type in its newest usable version, with its newest upload."""
+    manifest, upload = robot_type.manifest, robot_type.upload
+    return schemas.RobotTypeOut(
+        type=manifest.type,
+        label=manifest.label,
+        kind=manifest.kind,
+        version=robot_type.version,
+        description=manifest.description,
+        driver=manifest.driver,
+        joints=manifest.joints,
+        frames=manifest.frames,
+        capabilities=manifest.capabilities,
+        home_rad=manifest.home_rad,
+        mimic_joints=manifest.mimic_joints,
+        position_dependent_limits=manifest.position_dependent_limits,
+        postures=tuple(manifest.postures),
+        expressions=tuple(manifest.expressions),
+        behaviours=tuple(manifest.behaviours),
+        actions=_actions(manifest),
+        streams=manifest.streams,
+        built_in=robot_type.built_in,
+        state="ready" if robot_type.usable or upload is None else _upload_state(upload),
+        files=robot_type.files,
+        upload=None if upload is None else _upload(upload),
+    )
+
+
+def _actions(manifest: RobotType) -> tuple[str, ...]:
+    """Action kinds that the manifest alone shows. A driver or the room's floor may add or exclude kinds."""
+    has = {
+        "move_joints": bool(manifest.joints),
+        "say": "speech" in manifest.capabilities,
+        "express": bool(manifest.expressions),
+        "take_posture": bool(manifest.postures),
+        "run_behaviour": bool(manifest.behaviours),
+        "drive": manifest.base is not None,
+        "go_to": manifest.base is not None,
+    }
+    return tuple(kind for kind, supported in has.items() if supported)
+
+
+def twin_out(model: Model) -> schemas.RobotTypeTwin:
+    """The geometry of a robot type, for drawing."""
+    return schemas.RobotTypeTwin(
+        device=model.twin.device, bodies=model.twin.bodies, actuators=model.actuators, cameras=model.cameras
+    )
+
+
+def preview_out(preview: Preview) -> schemas.RobotTypePreviewOut:
+    """A preview: an upload that is validated and not saved."""
+    upload = preview.upload
+    robot_type = KnownType(
+        preview.manifest, upload.version, upload.files, usable=upload.state == "ready", upload=upload
+    )
+    return schemas.RobotTypePreviewOut(
+        id=preview.id, expires_at=rfc3339(preview.expires_ms), robot_type=robot_type_out(robot_type)
+    )
+
+
+def _upload(upload: TypeVersion) -> schemas.RobotTypeUploadOut:
+    return schemas.RobotTypeUploadOut(
+        version=upload.version,
+        state=_upload_state(upload),
+        errors=() if upload.open else upload.errors,
+        warnings=upload.warnings,
+        uploaded_at=rfc3339(upload.created_ms),
+    )
+
+
+def _upload_state(upload: TypeVersion) -> schemas.State:
+    return "checking" if upload.state == "uploading" else upload.state
+
+
+def movement_out(movement: Movement) -> schemas.MovementOut:
+    """A movement without its source."""
+    return schemas.MovementOut(**_movement(movement))
+
+
+def movement_source_out(robot_type: str, movement: Movement, source: str, public: str) -> schemas.MovementSource:
+    """A movement with its source. ``public`` is the public key that verifies the signature."""
+    signature = schemas.SignatureOut(
+        key=movement.key, public=public, signed=signed_text(robot_type, movement), signature=movement.signature
+    )
+    return schemas.MovementSource(**_movement(movement), source=source, signature=signature)
+
+
+def _movement(movement: Movement) -> dict[str, Any]:
+    schema = movement.parameters_schema
+    return {
+        "name": movement.name,
+        "description": movement.description,
+        "version": movement.version,
+        "sha256": movement.sha256,
+        "updated_at": rfc3339(movement.updated_ms),
+        "built_in": movement.built_in,
+        "parameters_schema": None if schema is None else msgspec.convert(schema, ObjectSchema),
+    }
