@@ -14,7 +14,7 @@ Exchange = Callable[[], float | None]
 SHARES: Final = {"p50": 0.5, "p95": 0.95, "p99": 0.99, "most": 1.0}
 
 
-def in_turns(
+def measure_interleaved(
     paths: Mapping[str, Exchange], *, rounds: int, each: int, warm_up: int = 20, pause_s: float = 0.0
 ) -> dict[str, list[float]]:
     """Time several paths so that what else the machine does falls on all of them alike.

@@ -35,7 +35,7 @@ PAYLOAD: Final = json.dumps({"text": "x" * 139}).encode()
 """150 bytes of JSON, as in the facts that these figures are to be compared with."""
 
 
-class Stand:
+class MeasuredProduct:
     """One started product. ``start`` gives one.
 
     Attributes:
@@ -62,14 +62,18 @@ class Stand:
     def rights(self, *, publish: tuple[str, ...] = (), subscribe: tuple[str, ...] = ()) -> tuple[str, str, str]:
         """Client id, user name and password of a new client with exactly these rights."""
         self._number += 1
-        return rights(self._cloud, f"bench-{self._number}", publish, subscribe)
+        return broker_credentials(self._cloud, f"bench-{self._number}", publish, subscribe)
 
-    def line(self, *, publish: tuple[str, ...] = (), subscribe: tuple[str, ...] = (), qos: int = 0) -> "Line":
+    def line(self, *, publish: tuple[str, ...] = (), subscribe: tuple[str, ...] = (), qos: int = 0) -> "MqttClient":
         """A connected client that has subscribed."""
-        return Line(self.mqtt_port, *self.rights(publish=publish, subscribe=subscribe), subscribe=subscribe, qos=qos)
+        return MqttClient(
+            self.mqtt_port, *self.rights(publish=publish, subscribe=subscribe), subscribe=subscribe, qos=qos
+        )
 
 
-def rights(cloud: Cloud, name: str, publish: tuple[str, ...], subscribe: tuple[str, ...]) -> tuple[str, str, str]:
+def broker_credentials(
+    cloud: Cloud, name: str, publish: tuple[str, ...], subscribe: tuple[str, ...]
+) -> tuple[str, str, str]:
     """Client id, user name and password of a client with exactly these rights, for two hours."""
     grant = Grant(
         principal=f"account:{name}",
@@ -83,7 +87,7 @@ def rights(cloud: Cloud, name: str, publish: tuple[str, ...], subscribe: tuple[s
     return name, issued.username, issued.password
 
 
-class Line:
+class MqttClient:
     """A warm paho client, as an app would have one. ``with`` closes it.
 
     Attributes:
@@ -127,7 +131,7 @@ class Line:
             self.client.loop_stop()
 
 
-class _Seen(msgspec.Struct):
+class _TelemetryFields(msgspec.Struct):
     """What a hand needs to know of telemetry."""
 
     tick_ms: int
@@ -136,7 +140,7 @@ class _Seen(msgspec.Struct):
     setpoint_sequence: int
 
 
-class Hand:
+class StreamingOperator:
     """An operator who holds one robot's joints where they are, setpoint by setpoint. ``with`` gives control up.
 
     Args:
@@ -148,13 +152,13 @@ class Hand:
         heard: The newest telemetry, as it came.
     """
 
-    def __init__(self, stand: Stand, name: str = "ur5") -> None:
+    def __init__(self, stand: MeasuredProduct, name: str = "ur5") -> None:
         self._stand = stand
         self.sent = self.heard = b""
         self.device = stand.api.device(name)
         self._path = f"/devices/{self.device['id']}/lease"
         self._seen = threading.Condition()
-        self._newest: _Seen | None = None
+        self._newest: _TelemetryFields | None = None
         self._sequence = 0
         self._next_s = 0.0
         self._ending = threading.Event()
@@ -195,7 +199,7 @@ class Hand:
                 raise TimeoutError(f"setpoint {self._sequence} is not seen again in telemetry")
         return (time.perf_counter() - began) * 1000
 
-    def act(self, caller: "Caller") -> float:
+    def act(self, caller: "HttpConnection") -> float:
         """An action to where the arm is, until it has started [ms]; it ends by itself, which is waited for after that.
 
         Raises:
@@ -212,7 +216,7 @@ class Hand:
         caller.ask("GET", f"/api/v1/actions/{started['id']}?wait_ms=10000")
         return took_ms
 
-    def _latest(self) -> _Seen:
+    def _latest(self) -> _TelemetryFields:
         if self._newest is None:
             raise TimeoutError("the robot tells nothing")
         return self._newest
@@ -222,7 +226,7 @@ class Hand:
         return newest is not None and newest.epoch == self.epoch and newest.setpoint_sequence >= self._sequence
 
     def _hear(self, payload: bytes) -> None:
-        newest = codec.decode(payload, _Seen)
+        newest = codec.decode(payload, _TelemetryFields)
         with self._seen:
             self._newest, self.heard = newest, payload
             self._seen.notify()
@@ -241,7 +245,7 @@ class Hand:
         self.line.__exit__()
 
 
-class Caller:
+class HttpConnection:
     """One warm HTTP connection of the standard library: the client that costs least. ``with`` closes it."""
 
     def __init__(self, port: int, headers: dict[str, str] | None = None) -> None:
@@ -267,18 +271,18 @@ class Caller:
 
 
 @contextlib.contextmanager
-def start(home: Path, kind: BrokerKind, **more: str) -> Iterator[Stand]:
+def start(home: Path, kind: BrokerKind, **more: str) -> Iterator[MeasuredProduct]:
     """The product with one simulated UR5, and this broker; ``more`` are settings."""
     with start_machine(home, port=0, TELESCOPE_BROKER=kind, **more) as machine:
         if machine.process.poll() is not None:
             raise RuntimeError("".join(machine.lines))
         given = {"TELESCOPE_HOME": str(home), "TELESCOPE_PORT": str(machine.port), "TELESCOPE_BROKER": kind, **more}
         with Cloud(settings.read(given)) as cloud:
-            yield Stand(machine, kind, cloud)
+            yield MeasuredProduct(machine, kind, cloud)
 
 
 @contextlib.contextmanager
-def peer(module: str, *arguments: str) -> Iterator["subprocess.Popen[str]"]:
+def start_peer(module: str, *arguments: str) -> Iterator["subprocess.Popen[str]"]:
     """A program beside the product that says ``ready`` when it is, to the end of the ``with``."""
     with subprocess.Popen(
         [sys.executable, "-m", module, *arguments], cwd=ROOT, stdout=subprocess.PIPE, text=True

@@ -13,7 +13,7 @@ from typing import Final
 from playwright.sync_api import Browser, CDPSession, Page
 
 from benchmarks.console.frames import TAKE_FRAMES, WATCH_FRAMES
-from benchmarks.console.minimal_agents import crowd
+from benchmarks.console.minimal_agents import pair_minimal_agents
 from device_agent.ports.clock import tick_ms, wall_ms
 from device_agent.protocol import Mode, State, codec, topics
 from tests.fakes.agent import Robot
@@ -64,7 +64,7 @@ def speak(robot: Robot, name: str, mode: Mode) -> None:
 
 def show_list(browser: Browser, machine: Machine, count: int) -> bool:
     """Look at the list; whether it is there, and is searched, in time."""
-    with crowd(machine, count) as robots, pages(browser, machine) as (page,):
+    with pair_minimal_agents(machine, count) as robots, pages(browser, machine) as (page,):
         everyone = [(robot, name) for robot in robots for name in robot.names]
         for robot, name in everyone:
             speak(robot, name, Mode.IDLE)

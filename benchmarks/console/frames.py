@@ -13,7 +13,7 @@ from typing import Any, Final
 
 from playwright.sync_api import Browser, CDPSession, Page, expect
 
-from benchmarks.console.kinematic_arms import puppets
+from benchmarks.console.kinematic_arms import start_kinematic_arms
 from tests.harness.browser.browser import PATIENCE_MS, pages
 from tests.harness.browser.product import Machine
 from tests.harness.network.brokers import wait_until
@@ -60,7 +60,7 @@ DRAWN: Final = (
 
 
 @dataclass(frozen=True)
-class Kept:
+class MemorySample:
     """What a page holds on to, after everything else was collected."""
 
     heap_mb: float
@@ -71,15 +71,15 @@ class Kept:
         return f"{self.heap_mb:.2f} MB, {self.nodes} nodes, {self.listeners} listeners"
 
 
-def kept(session: CDPSession) -> Kept:
+def memory_samples(session: CDPSession) -> MemorySample:
     """Collect garbage, and look."""
     session.send("HeapProfiler.collectGarbage")
     heap = session.send("Runtime.getHeapUsage")["usedSize"]
     counted = session.send("Memory.getDOMCounters")
-    return Kept(heap / 1e6, counted["nodes"], counted["jsEventListeners"])
+    return MemorySample(heap / 1e6, counted["nodes"], counted["jsEventListeners"])
 
 
-def steady(every_minute: Sequence[Kept]) -> bool:
+def steady(every_minute: Sequence[MemorySample]) -> bool:
     """Print what memory did since the first minute; whether it stays."""
     first, last = every_minute[0], every_minute[-1]
     slope = 0.0
@@ -102,7 +102,7 @@ def open_together(page: Page, machine: Machine, ids: Sequence[str]) -> None:
 
 def show_fleet(browser: Browser, machine: Machine, minutes: float) -> bool:
     """Look at ten arms; whether frames come in time and memory stays."""
-    with puppets(machine, ROBOTS) as ids, pages(browser, machine) as (page,):
+    with start_kinematic_arms(machine, ROBOTS) as ids, pages(browser, machine) as (page,):
         session = page.context.new_cdp_session(page)
         page.evaluate(WATCH_FRAMES)
         began_s = time.monotonic()
@@ -111,18 +111,18 @@ def show_fleet(browser: Browser, machine: Machine, minutes: float) -> bool:
         _show_frames("while opening, not counted", page.evaluate(TAKE_FRAMES))
         time.sleep(WARM_UP_S)
         _show_frames(f"the {WARM_UP_S:.0f} s after, not counted", page.evaluate(TAKE_FRAMES))
-        print(f"at the start of the minute: {kept(session)}")
+        print(f"at the start of the minute: {memory_samples(session)}")
         before = sum(page.evaluate(DRAWN))
         page.evaluate(TAKE_FRAMES)  # to collect garbage takes its time, and is the benchmark's doing
         time.sleep(60)
         taken = page.evaluate(TAKE_FRAMES)
         drawn = sum(page.evaluate(DRAWN)) - before
         quick = _show_minute(taken, drawn / 60)
-        every_minute = [kept(session)]
+        every_minute = [memory_samples(session)]
         print(f"after minute 1: {every_minute[0]}", flush=True)
         for minute in range(2, round(minutes) + 1):
             time.sleep(60)
-            every_minute.append(kept(session))
+            every_minute.append(memory_samples(session))
             print(f"after minute {minute}: {every_minute[-1]}", flush=True)
         return steady(every_minute) and quick
 

@@ -14,7 +14,7 @@ from typing import Final
 
 import msgspec
 
-from benchmarks.console.minimal_agents import crowd
+from benchmarks.console.minimal_agents import pair_minimal_agents
 from device_agent.ports.clock import tick_ms, wall_ms
 from device_agent.protocol import Description, JointTelemetry, Mode, State, Twin, codec, topics
 from function_app.ports.broker_access import Credentials
@@ -40,10 +40,10 @@ class _Pattern:
 
 
 @contextlib.contextmanager
-def puppets(machine: Machine, count: int) -> Iterator[list[str]]:
+def start_kinematic_arms(machine: Machine, count: int) -> Iterator[list[str]]:
     """So many arms of the demo account, measured ``RATE_HZ`` times a second; their devices' ids."""
     over = threading.Event()
-    with crowd(machine, count, AGENT_HAS) as robots:
+    with pair_minimal_agents(machine, count, AGENT_HAS) as robots:
         pattern = _pattern(machine)
         everyone = [(robot, name) for robot in robots for name in robot.names]
         for robot, name in everyone:

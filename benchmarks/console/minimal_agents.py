@@ -46,7 +46,7 @@ class _Owner:
 
 
 @contextlib.contextmanager
-def crowd(machine: Machine, count: int, each: int = AGENT_HAS) -> Iterator[list[Robot]]:
+def pair_minimal_agents(machine: Machine, count: int, each: int = AGENT_HAS) -> Iterator[list[Robot]]:
     """Agents with so many devices between them, paired with the demo account and connected."""
     with contextlib.ExitStack() as stack, machine.api() as api:
         functions = _Functions(machine)

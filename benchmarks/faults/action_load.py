@@ -8,7 +8,7 @@ from typing import Final, Self
 import httpx
 import msgspec
 
-from benchmarks.faults.processes import ORDERED, Ground
+from benchmarks.faults.processes import ORDERED, ProductProcesses
 
 STEP_RAD: Final = 0.002
 """Order number n brings the wrist to n times this: so the record says whose move it was."""
@@ -19,7 +19,7 @@ _AGAIN_S: Final = 0.2
 _REST_S: Final = 0.1
 
 
-class Order(msgspec.Struct):
+class RequestedAction(msgspec.Struct):
     """One order.
 
     Attributes:
@@ -36,7 +36,7 @@ class Order(msgspec.Struct):
     done_ms: float = 0.0
 
 
-class Orders:
+class ActionLoad:
     """Gives them until the end of the ``with``.
 
     Attributes:
@@ -44,13 +44,13 @@ class Orders:
         given: All so far.
     """
 
-    def __init__(self, ground: Ground) -> None:
+    def __init__(self, ground: ProductProcesses) -> None:
         self._ground = ground
         self._http = httpx.Client(base_url=ground.api, timeout=3, headers=dict(ground.http.headers))
         self._ending = threading.Event()
         self._thread = threading.Thread(target=self._run)
         self.fault = "none"
-        self.given: list[Order] = []
+        self.given: list[RequestedAction] = []
 
     def __enter__(self) -> Self:
         self._thread.start()
@@ -77,12 +77,12 @@ class Orders:
         number = 0
         while not self._ending.is_set():
             number += 1
-            order = Order(number, self.fault, time.monotonic() * 1000)
+            order = RequestedAction(number, self.fault, time.monotonic() * 1000)
             self.given.append(order)
             self._give(order)
             self._ending.wait(_REST_S)
 
-    def _give(self, order: Order) -> None:
+    def _give(self, order: RequestedAction) -> None:
         """With the same key until there is an answer: a client's retry must start nothing twice."""
         body = {
             "request": {"kind": "move_joints", "position_rad": {"wrist_3": order.number * STEP_RAD}},
@@ -108,7 +108,7 @@ class Orders:
                 return
             self._ending.wait(_AGAIN_S)
 
-    def _follow(self, order: Order) -> None:
+    def _follow(self, order: RequestedAction) -> None:
         try:
             answer = self._http.get(f"/actions/{order.action}", params={"wait_ms": 1000})
         except httpx.HTTPError:
@@ -118,18 +118,18 @@ class Orders:
             self._note(order, answer.json())
 
     @staticmethod
-    def _note(order: Order, action: Mapping[str, str]) -> None:
+    def _note(order: RequestedAction, action: Mapping[str, str]) -> None:
         order.action, order.status = action["id"], action["status"]
         if order.status == "done":
             order.done_ms = time.monotonic() * 1000
 
 
-def lost(orders: list[Order]) -> list[Order]:
+def lost(orders: list[RequestedAction]) -> list[RequestedAction]:
     """Those that were accepted and have no end."""
     return [each for each in orders if each.action and each.status not in _ENDS]
 
 
-def doubled(orders: list[Order], begun: Mapping[str, int]) -> list[Order]:
+def duplicated(orders: list[RequestedAction], begun: Mapping[str, int]) -> list[RequestedAction]:
     """Those that have begun more than once. ``begun``: action → how often."""
     return [each for each in orders if begun.get(each.action, 0) > 1]
 

@@ -10,9 +10,9 @@ from typing import Final
 
 import msgspec
 
-from benchmarks.faults.action_load import Orders, went_back
-from benchmarks.faults.operator import FULL, Hand
-from benchmarks.faults.processes import ORDERED, STREAMED, Ground
+from benchmarks.faults.action_load import ActionLoad, went_back
+from benchmarks.faults.operator import FULL, FaultOperator
+from benchmarks.faults.processes import ORDERED, STREAMED, ProductProcesses
 from tests.faults import cuts
 from tests.faults.cuts import Bench, Mend
 from tests.faults.judge import Verdict, judge
@@ -43,7 +43,7 @@ _RECOVERS_S: Final = 60.0
 _LOOK_MS: Final = 400.0
 
 
-class Found(msgspec.Struct, frozen=True, kw_only=True):
+class FaultResult(msgspec.Struct, frozen=True, kw_only=True):
     """One round.
 
     Attributes:
@@ -62,10 +62,10 @@ class Found(msgspec.Struct, frozen=True, kw_only=True):
     undone: int = 0
 
 
-class Rounds(Bench):
+class FaultRuns(Bench):
     """Makes one round of a fault at a time."""
 
-    def __init__(self, ground: Ground, orders: Orders, *, seed: int) -> None:
+    def __init__(self, ground: ProductProcesses, orders: ActionLoad, *, seed: int) -> None:
         super().__init__(ground, seed=seed)
         self.ground = ground
         self.orders = orders
@@ -90,7 +90,7 @@ class Rounds(Bench):
         self.arms = [self.arm, self._wrist]
         super().close()
 
-    def round(self, fault: str) -> Found:
+    def round(self, fault: str) -> FaultResult:
         """One of them, to its recovery."""
         self.orders.fault = fault
         verdict, undone = None, 0
@@ -102,7 +102,7 @@ class Rounds(Bench):
             self._kill_agent()
         else:
             verdict = self._while_wrong(*self._faults[fault], noted=fault == _DISK_FULL)
-        return Found(
+        return FaultResult(
             fault=fault,
             broker=self.ground.kind,
             stop_ms=None if verdict is None else round(verdict.cut_ms if fault in _TOLD else verdict.rest_ms, 1),
@@ -174,7 +174,7 @@ class Rounds(Bench):
         began_ms = now_ms()
         with (
             self.ground.allowed("bench-again", publish=(topic,), subscribe=(topic,)) as line,
-            Hand(self.ground, FULL, shuffled=True) as hand,
+            FaultOperator(self.ground, FULL, shuffled=True) as hand,
         ):
             heard: list[bytes] = []
             line.hear = heard.append

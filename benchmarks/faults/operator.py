@@ -6,7 +6,7 @@ import time
 from typing import Final, Self
 
 from benchmarks.baseline.product import LEASE_MS, PATIENCE_S
-from benchmarks.faults.processes import STREAMED, Ground
+from benchmarks.faults.processes import STREAMED, ProductProcesses
 from device_agent.protocol import JointTarget, JointTelemetry, Setpoint, codec
 from tests.harness.network.brokers import wait_until
 
@@ -20,7 +20,7 @@ _MOVES_RAD: Final = 5e-4
 """In a period of 8 ms: 0.06 rad/s."""
 
 
-class Hand:
+class FaultOperator:
     """Has control and streams until the end of the ``with``.
 
     Args:
@@ -29,7 +29,7 @@ class Hand:
         shuffled: Whether each setpoint is sent twice, and every second pair the wrong way round.
     """
 
-    def __init__(self, ground: Ground, speed_rad_s: float, *, shuffled: bool = False) -> None:
+    def __init__(self, ground: ProductProcesses, speed_rad_s: float, *, shuffled: bool = False) -> None:
         self._ground = ground
         self._speed_rad_s = speed_rad_s
         self._shuffled = shuffled

@@ -7,8 +7,8 @@ from typing import Any
 
 import httpx
 
-from benchmarks.baseline.product import Line, rights
-from benchmarks.faults.recorder import Noted
+from benchmarks.baseline.product import MqttClient, broker_credentials
+from benchmarks.faults.recorder import Recorder
 from function_app import settings
 from tests.faults.stack import Stack
 from tests.harness.cloud.cloud import Cloud
@@ -22,7 +22,7 @@ STREAMED, ORDERED = "arm0", "arm1"
 _WATCHDOG_S = 0.3
 
 
-class Ground(Stack):
+class ProductProcesses(Stack):
     """As ``Stack``; the agent's link goes through a network as well (`tests.harness.network.delay`).
 
     Attributes:
@@ -36,7 +36,7 @@ class Ground(Stack):
     def __init__(self, kind: BrokerKind) -> None:
         super().__init__(kind, 2, watchdog_s=_WATCHDOG_S)
         self.kind = kind
-        self.noted = Noted(self.home / "noted.socket")
+        self.noted = Recorder(self.home / "noted.socket")
         self._closing.callback(self.noted.close)
 
     def begin(self) -> None:
@@ -62,17 +62,21 @@ class Ground(Stack):
         return f"ts/v1/{self.space}/{self.agent_id}/{name}"
 
     @contextlib.contextmanager
-    def issued(self, wanted: dict[str, Any], *topics: str) -> Iterator[Line]:
+    def issued(self, wanted: dict[str, Any], *topics: str) -> Iterator[MqttClient]:
         """A client with credentials as people get them."""
         given = self.post("/mqtt/credentials", **wanted)
         who = (given["client_id"], given["username"], given["password"])
-        with Line(self.port + 1, *who, subscribe=topics, qos=0) as line:
+        with MqttClient(self.port + 1, *who, subscribe=topics, qos=0) as line:
             yield line
 
     @contextlib.contextmanager
-    def allowed(self, name: str, *, publish: tuple[str, ...] = (), subscribe: tuple[str, ...] = ()) -> Iterator[Line]:
+    def allowed(
+        self, name: str, *, publish: tuple[str, ...] = (), subscribe: tuple[str, ...] = ()
+    ) -> Iterator[MqttClient]:
         """A client with exactly these rights, as nobody gets them."""
-        with Line(self.port + 1, *rights(self.cloud, name, publish, subscribe), subscribe=subscribe, qos=1) as line:
+        with MqttClient(
+            self.port + 1, *broker_credentials(self.cloud, name, publish, subscribe), subscribe=subscribe, qos=1
+        ) as line:
             yield line
 
     def restart_agent_without_proxies(self) -> None:
@@ -88,9 +92,9 @@ class Ground(Stack):
 
 
 @contextlib.contextmanager
-def start(kind: BrokerKind) -> Iterator[Ground]:
+def start(kind: BrokerKind) -> Iterator[ProductProcesses]:
     """The product with two arms, until the end of the ``with``."""
-    ground = Ground(kind)
+    ground = ProductProcesses(kind)
     try:
         ground.begin()
         yield ground

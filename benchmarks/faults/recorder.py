@@ -28,7 +28,7 @@ class Period(NamedTuple):
     sequence: int
 
 
-class Noted:
+class Recorder:
     """Listens until it is closed.
 
     Attributes:

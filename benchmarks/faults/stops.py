@@ -8,8 +8,8 @@ from typing import Final, Self
 
 import msgspec
 
-from benchmarks.faults.operator import FULL, SLOW_RAD_S, Hand
-from benchmarks.faults.processes import STREAMED, Ground
+from benchmarks.faults.operator import FULL, SLOW_RAD_S, FaultOperator
+from benchmarks.faults.processes import STREAMED, ProductProcesses
 from benchmarks.faults.recorder import Period
 from device_agent.protocol import Stop, codec
 from tests.faults.stack import now_ms
@@ -24,7 +24,7 @@ _FULL_S: Final = 0.35
 _PERIODS_S: Final = 0.008
 
 
-class Stopped(msgspec.Struct, frozen=True, kw_only=True):
+class StopResult(msgspec.Struct, frozen=True, kw_only=True):
     """One Stop. Times from just before it was sent [ms]."""
 
     broker: str
@@ -35,10 +35,10 @@ class Stopped(msgspec.Struct, frozen=True, kw_only=True):
     zero_ms: float
 
 
-class Stops:
+class StopRuns:
     """Makes them, over a link without proxies. ``with`` closes what it has opened."""
 
-    def __init__(self, ground: Ground, *, seed: int) -> None:
+    def __init__(self, ground: ProductProcesses, *, seed: int) -> None:
         self._ground = ground
         self._chance = random.Random(seed)
         self._stack = contextlib.ExitStack()
@@ -51,10 +51,10 @@ class Stops:
     def __exit__(self, *_: object) -> None:
         self._stack.close()
 
-    def make(self, way: str, speed: str) -> Stopped:
+    def make(self, way: str, speed: str) -> StopResult:
         """One of them, in motion as it is asked for, and its reset."""
         send = self._send if way == MESSAGE else self._call
-        with Hand(self._ground, SPEEDS[speed]) as hand:
+        with FaultOperator(self._ground, SPEEDS[speed]) as hand:
             hand.await_motion()
             time.sleep((_FULL_S if speed == "full speed" else 0.1) + self._chance.uniform(0, 3 * _PERIODS_S))
             sent_ms = now_ms()
@@ -63,7 +63,7 @@ class Stops:
         before = [each for each in self._ground.noted.since(STREAMED, sent_ms - 30) if each.at_ms <= sent_ms]
         answer = self._ground.owner.post(f"{self._ground.device(STREAMED)}/stop/reset")
         answer.raise_for_status()
-        return judged(before, periods, sent_ms=sent_ms, broker=self._ground.kind, way=way, speed=speed)
+        return evaluate(before, periods, sent_ms=sent_ms, broker=self._ground.kind, way=way, speed=speed)
 
     def _until_rest(self, sent_ms: float) -> list[Period]:
         deadline_s = time.monotonic() + _RESTS_WITHIN_S
@@ -84,15 +84,15 @@ class Stops:
         self._ground.post(f"{self._ground.device(STREAMED)}/stop", reason="bench")
 
 
-def judged(
+def evaluate(
     before: list[Period], periods: list[Period], *, sent_ms: float, broker: str, way: str, speed: str
-) -> Stopped:
+) -> StopResult:
     """From the last periods before it was sent, and those after until rest."""
     braking = next(each for each in periods if each.mode == "stopped")
     moving = [each for each in periods if each.at_ms >= braking.at_ms and each.moved_rad > _STILL_RAD]
     after_ms = moving[-1].at_ms if moving else 0.0
     zero = next(each for each in periods if each.at_ms >= max(after_ms + 1e-6, braking.at_ms))
-    return Stopped(
+    return StopResult(
         broker=broker,
         way=way,
         speed=speed,
@@ -102,12 +102,12 @@ def judged(
     )
 
 
-def series(stops: Stops, each: int, say: Callable[[str], None]) -> list[Stopped]:
+def series(stops: StopRuns, each: int, say: Callable[[str], None]) -> list[StopResult]:
     """So many of each speed and way, in turns."""
-    found: list[Stopped] = []
+    found: list[StopResult] = []
     for number in range(each):
         for speed in SPEEDS:
             found += [stops.make(way, speed) for way in (MESSAGE, CALL)]
         if number % 10 == 9:  # noqa: PLR2004 (now and then)
-            say(f"{len(found)} Stops")
+            say(f"{len(found)} StopRuns")
     return found

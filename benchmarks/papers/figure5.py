@@ -11,9 +11,9 @@ from pathlib import Path
 from typing import Any, Final, NamedTuple
 
 from benchmarks.baseline.interleaved import median
-from benchmarks.baseline.product import Caller, Hand
+from benchmarks.baseline.product import HttpConnection, StreamingOperator
 from benchmarks.reporting.report import Cell, Chart, Claim, Report, Table, percentile
-from benchmarks.tracing.traced_product import Watched, start
+from benchmarks.tracing.traced_product import TracedProduct, start
 
 RTT_MS: Final = 15
 PRINTED: Final = (86.0, 259.0)
@@ -113,13 +113,15 @@ def _say(say: Callable[[str], None], found: Found, where: str) -> None:
     say(f"Fig. 5: {where}: " + ", ".join(said))
 
 
-def _at(stand: Watched, robot: Robot, where: str, *, rtt_ms: int, count: int, asks: Sequence[str] = REQUESTS) -> Found:
+def _at(
+    stand: TracedProduct, robot: Robot, where: str, *, rtt_ms: int, count: int, asks: Sequence[str] = REQUESTS
+) -> Found:
     """These requests in turns."""
     stand.place(rtt_ms=rtt_ms)
     found: Found = {}
     missed = 0
     _keep_movement(stand, robot)
-    with Hand(stand, robot.name) as hand, stand.caller() as caller:
+    with StreamingOperator(stand, robot.name) as hand, stand.caller() as caller:
         operator = _Operator(caller, hand, robot)
         for name in [*asks] * (count + _WARM_UP):
             try:
@@ -133,7 +135,7 @@ def _at(stand: Watched, robot: Robot, where: str, *, rtt_ms: int, count: int, as
     return {key: each[_WARM_UP:] for key, each in found.items()}
 
 
-def _once(stand: Watched, robot: Robot, begin: Begin) -> Sample:
+def _once(stand: TracedProduct, robot: Robot, begin: Begin) -> Sample:
     """One request at a robot at rest."""
     stand.marks.drain()
     stand.marks.until(f"rests:{robot.name}", since_ns=time.monotonic_ns(), within_s=_WITHIN_S)
@@ -147,7 +149,7 @@ def _once(stand: Watched, robot: Robot, begin: Begin) -> Sample:
     return Sample((moves_ns - began_ns) / 1e6, (fast_ns - began_ns) / 1e6)
 
 
-def _keep_movement(stand: Watched, robot: Robot) -> None:
+def _keep_movement(stand: TracedProduct, robot: Robot) -> None:
     """Store the script, as a person does."""
     with stand.machine.api() as person:
         path = f"/robot-types/{robot.name}/movements/{_NAME}"
@@ -157,7 +159,7 @@ def _keep_movement(stand: Watched, robot: Robot) -> None:
 class _Operator:
     """Who asks one robot, in each of three ways, to turn its joint to and fro."""
 
-    def __init__(self, caller: Caller, hand: Hand, robot: Robot) -> None:
+    def __init__(self, caller: HttpConnection, hand: StreamingOperator, robot: Robot) -> None:
         self._caller = caller
         self._hand = hand
         self._robot = robot

@@ -9,8 +9,16 @@ from functools import partial
 from pathlib import Path
 from typing import Final
 
-from benchmarks.baseline.interleaved import Exchange, in_turns
-from benchmarks.baseline.product import PATIENCE_S, PAYLOAD, Caller, Hand, Line, Stand, start
+from benchmarks.baseline.interleaved import Exchange, measure_interleaved
+from benchmarks.baseline.product import (
+    PATIENCE_S,
+    PAYLOAD,
+    HttpConnection,
+    MeasuredProduct,
+    MqttClient,
+    StreamingOperator,
+    start,
+)
 from benchmarks.reporting.report import Cell, Chart, Claim, Report, Table, percentile
 from device_agent.ports.clock import CloudClock
 from device_agent.protocol.security import signing
@@ -43,22 +51,22 @@ def measure(report: Report, *, quick: bool, say: Callable[[str], None]) -> None:
         with start(Path(folder), "mosquitto", **wanted) as stand, paths(stand) as found:
             announce = found.pop(ANNOUNCED)
             # A thousand of the one that is claimed, however quick the run: its worst is of a thousand.
-            taken = in_turns({ANNOUNCED: announce}, rounds=_ROUNDS, each=50)
-            taken |= in_turns(found, rounds=rounds, each=each)
+            taken = measure_interleaved({ANNOUNCED: announce}, rounds=_ROUNDS, each=50)
+            taken |= measure_interleaved(found, rounds=rounds, each=each)
     judge(report, taken)
     for claim in report.claims[-2:]:
         say(claim.line())
 
 
 @contextlib.contextmanager
-def paths(stand: Stand) -> Iterator[dict[str, Exchange]]:
+def paths(stand: MeasuredProduct) -> Iterator[dict[str, Exchange]]:
     """All exchanges, warm, with a client that has 15 ms of round trip to the cloud and its broker."""
     with contextlib.ExitStack() as stack:
         way = stack.enter_context(start_delay(stand.machine.port, stand.mqtt_port, rtt_ms=RTT_MS))
         web, mqtt = way.ports[stand.machine.port], way.ports[stand.mqtt_port]
-        caller = stack.enter_context(Caller(web, {"Authorization": f"Bearer {stand.token}"}))
-        line = stack.enter_context(Line(mqtt, *stand.rights(publish=(_TOPIC,)), subscribe=(), qos=1))
-        hand = stack.enter_context(Hand(stand))
+        caller = stack.enter_context(HttpConnection(web, {"Authorization": f"Bearer {stand.token}"}))
+        line = stack.enter_context(MqttClient(mqtt, *stand.rights(publish=(_TOPIC,)), subscribe=(), qos=1))
+        hand = stack.enter_context(StreamingOperator(stand))
 
         def read() -> None:
             caller.ask("GET", f"/api/v1/devices/{hand.device['id']}")
@@ -74,7 +82,7 @@ def paths(stand: Stand) -> Iterator[dict[str, Exchange]]:
         }
 
 
-def _announce(stand: Stand, server: str) -> Exchange:
+def _announce(stand: MeasuredProduct, server: str) -> Exchange:
     """An agent of a room that is paired, as the real one does it: with its own client, and signed by its own key."""
     api = CloudClient(server, signing.generate(), CloudClock())
 

@@ -18,7 +18,7 @@ from collections.abc import Mapping
 from typing import Any, Final
 
 from benchmarks.baseline.interleaved import Exchange
-from benchmarks.baseline.product import PATIENCE_S, Caller
+from benchmarks.baseline.product import PATIENCE_S, HttpConnection
 from benchmarks.papers.exchanges import SETPOINT
 from device_agent.protocol import AckStatus
 from tests.harness.cloud.cloud_processes import Ground
@@ -94,7 +94,7 @@ class _Receiver(PollingRobot):
         super().obey(message)
 
 
-def held(stack: contextlib.ExitStack, ports: Mapping[int, int], ground: Ground) -> Exchange:
+def long_poll(stack: contextlib.ExitStack, ports: Mapping[int, int], ground: Ground) -> Exchange:
     """Our own HTTP transport: an account's action through the functions, until the agent that waits for it has it."""
     port = ports[ground.endpoints["server"].port]
     robot = _Receiver(Site(f"http://{HOST}:{port}"))
@@ -105,7 +105,7 @@ def held(stack: contextlib.ExitStack, ports: Mapping[int, int], ground: Ground) 
     device = robot.device
     wait_until(lambda: ground.anna.get(f"/devices/{device}").json()["online"], "the robot to be online")
     key = ground.anna.post("/api-keys", {"name": device, "role": "operator", "days": 1}).json()["token"]
-    caller = stack.enter_context(Caller(port, {"Authorization": f"Bearer {key}"}))
+    caller = stack.enter_context(HttpConnection(port, {"Authorization": f"Bearer {key}"}))
     body = json.dumps({"request": {"kind": "move_joints", "position_rad": {"elbow": 0.1}}}).encode()
 
     def exchange() -> float:

@@ -9,8 +9,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
 
-from benchmarks.baseline.interleaved import SHARES, Exchange, in_turns, median
-from benchmarks.baseline.product import free_port, peer
+from benchmarks.baseline.interleaved import SHARES, Exchange, measure_interleaved, median
+from benchmarks.baseline.product import free_port, start_peer
 from benchmarks.papers import exchanges, http_polling
 from benchmarks.reporting.report import Cell, Chart, Claim, Report, Table, percentile
 from tests.harness.cloud.cloud_processes import Ground, start_ground
@@ -89,7 +89,7 @@ def measure(report: Report, *, quick: bool, say: Callable[[str], None]) -> None:
     found: dict[Condition, dict[str, list[float]]] = {}
     with tempfile.TemporaryDirectory() as folder, servers(Path(folder)) as there:
         for condition in conditions(quick=quick):
-            found[condition] = at(there, condition, quick=quick)
+            found[condition] = with_condition(there, condition, quick=quick)
             say(
                 f"Table 2: {condition.name}: "
                 + ", ".join(f"{name} {median(each):.4g}" for name, each in found[condition].items())
@@ -103,15 +103,15 @@ def servers(folder: Path) -> Iterator[Servers]:
     unlimited = {"TELESCOPE_RATE_ADDRESS": "0", "TELESCOPE_RATE_KEY": "0", "TELESCOPE_RATE_AGENT": "0"}
     web, relay = free_port(), free_port()
     with contextlib.ExitStack() as stack:
-        stack.enter_context(peer("benchmarks.papers.relays", "web", str(web)))
-        stack.enter_context(peer("benchmarks.papers.relays", "socket", str(relay)))
+        stack.enter_context(start_peer("benchmarks.papers.relays", "web", str(web)))
+        stack.enter_context(start_peer("benchmarks.papers.relays", "socket", str(relay)))
         prosody = stack.enter_context(start_prosody(folder / "prosody", f"http://{HOST}:{web}/verify"))
         amqtt = stack.enter_context(start_broker("amqtt", folder / "amqtt"))
         ground = stack.enter_context(start_ground("mosquitto", folder / "ground", unlimited))
         yield Servers(ground, amqtt, prosody.port, web, relay)
 
 
-def at(there: Servers, condition: Condition, *, quick: bool) -> dict[str, list[float]]:
+def with_condition(there: Servers, condition: Condition, *, quick: bool) -> dict[str, list[float]]:
     """All ways in turns over one network; who polls waits meanwhile. A quick run leaves MQTT over WebSocket out."""
     with contextlib.ExitStack() as stack:
         ports: Mapping[int, int] = {port: port for port in there.ports}
@@ -119,12 +119,12 @@ def at(there: Servers, condition: Condition, *, quick: bool) -> dict[str, list[f
             way = stack.enter_context(start_delay(*there.ports, rtt_ms=condition.rtt_ms))
             ports = way.ports
         ways = _ways(stack, ports, there, quick=quick)
-        slow: dict[str, Exchange] = {HELD: http_polling.held(stack, ports, there.ground)}
+        slow: dict[str, Exchange] = {HELD: http_polling.long_poll(stack, ports, there.ground)}
         if condition.loss:
             way.set(rtt_ms=condition.rtt_ms, loss=condition.loss)
         waiting = _poll(stack, ports[there.web])
-        found = in_turns(ways, rounds=ROUNDS, each=condition.each, warm_up=3)
-        found |= in_turns(slow, rounds=ROUNDS, each=max(2, condition.each // 5), warm_up=1)
+        found = measure_interleaved(ways, rounds=ROUNDS, each=condition.each, warm_up=3)
+        found |= measure_interleaved(slow, rounds=ROUNDS, each=max(2, condition.each // 5), warm_up=1)
         return found | {name: each.result() for name, each in waiting.items()}
 
 

@@ -14,7 +14,7 @@ NAMES: Final = tuple(joint.name for joint in KIND.joints)
 HOME_RAD: Final = tuple(KIND.home_rad[name] for name in NAMES)
 
 
-class Arm:
+class PeerArm:
     """What a setpoint asks is applied at once, and told at once. No lease, no limits, no watchdog, no stop."""
 
     def __init__(self) -> None:

@@ -11,7 +11,7 @@ from typing import Any, Final
 
 from benchmarks.baseline.echo_servers import HOST
 from benchmarks.baseline.interleaved import Exchange
-from benchmarks.baseline.product import PATIENCE_S, PERIOD_S, free_port, peer
+from benchmarks.baseline.product import PATIENCE_S, PERIOD_S, free_port, start_peer
 from benchmarks.peers.arm import HOME_RAD, NAMES, setpoint
 from benchmarks.peers.robots import CONTROL, JOINTS, METHOD, ROS_TYPE, zenoh_peer
 from device_agent.protocol import JointTelemetry, codec
@@ -23,7 +23,7 @@ _DATA: Final = 1
 """Their first byte, where they bring a message."""
 
 
-class Operator:
+class PeerOperator:
     """Paces itself as our own page does, and waits for what comes on the other channel.
 
     Args:
@@ -81,7 +81,7 @@ def rosbridge() -> Iterator[Exchange]:
     import roslibpy
 
     port = free_port()
-    with peer(_PROGRAM, "bridge", str(port)), peer(_PROGRAM, "rosbridge", str(port)):
+    with start_peer(_PROGRAM, "bridge", str(port)), start_peer(_PROGRAM, "rosbridge", str(port)):
         ros = roslibpy.Ros(host=HOST, port=port)
         ros.run()
         control = roslibpy.Topic(ros, "/" + CONTROL, ROS_TYPE)
@@ -92,7 +92,7 @@ def rosbridge() -> Iterator[Exchange]:
             stamp = {"secs": now_ms // 1000, "nsecs": now_ms % 1000 * 1_000_000}
             control.publish({"header": {"seq": sequence, "stamp": stamp}, "name": NAMES, "position": HOME_RAD})
 
-        operator = Operator(send)
+        operator = PeerOperator(send)
         roslibpy.Topic(ros, "/" + JOINTS, ROS_TYPE).subscribe(lambda told: operator.hear(told["header"]["seq"]))
         yield operator.settle()
         ros.close()
@@ -104,9 +104,9 @@ def zenoh() -> Iterator[Exchange]:
     import zenoh as library
 
     port = free_port()
-    with peer(_PROGRAM, "zenoh", str(port)), library.open(zenoh_peer(connect=port)) as session:
+    with start_peer(_PROGRAM, "zenoh", str(port)), library.open(zenoh_peer(connect=port)) as session:
         control = session.declare_publisher(CONTROL, express=True)
-        operator = Operator(lambda sequence: control.put(_asked(sequence)))
+        operator = PeerOperator(lambda sequence: control.put(_asked(sequence)))
         session.declare_subscriber(JOINTS, lambda told: operator.hear(_applied(told.payload.to_bytes())))
         yield operator.settle()
 
@@ -118,9 +118,9 @@ def grpc() -> Iterator[Exchange]:
 
     port = free_port()
     asked: queue.SimpleQueue[bytes | None] = queue.SimpleQueue()
-    with peer(_PROGRAM, "grpc", str(port)), library.insecure_channel(f"{HOST}:{port}") as channel:
+    with start_peer(_PROGRAM, "grpc", str(port)), library.insecure_channel(f"{HOST}:{port}") as channel:
         told = channel.stream_stream("/" + "/".join(METHOD))(iter(asked.get, None), wait_for_ready=True)
-        operator = Operator(lambda sequence: asked.put(_asked(sequence)))
+        operator = PeerOperator(lambda sequence: asked.put(_asked(sequence)))
 
         def listen() -> None:
             with contextlib.suppress(library.RpcError):  # the stream's end
@@ -144,7 +144,7 @@ def foxglove() -> Iterator[Exchange]:
 
     port = free_port()
     with (
-        peer(_PROGRAM, "foxglove", str(port)),
+        start_peer(_PROGRAM, "foxglove", str(port)),
         connect(
             f"ws://{HOST}:{port}", subprotocols=[Subprotocol("foxglove.sdk.v1")], compression=None, close_timeout=1
         ) as line,
@@ -153,7 +153,7 @@ def foxglove() -> Iterator[Exchange]:
         mine = {"id": _OURS, "topic": f"/{CONTROL}", "encoding": "json", "schemaName": ""}
         line.send(json.dumps({"op": "advertise", "channels": [mine]}))
         line.send(json.dumps({"op": "subscribe", "subscriptions": [{"id": _OURS, "channelId": channel}]}))
-        operator = Operator(lambda sequence: line.send(struct.pack("<BI", _DATA, _OURS) + _asked(sequence)))
+        operator = PeerOperator(lambda sequence: line.send(struct.pack("<BI", _DATA, _OURS) + _asked(sequence)))
 
         def listen() -> None:
             with contextlib.suppress(ConnectionClosed):

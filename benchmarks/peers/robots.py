@@ -12,20 +12,20 @@ from typing import Any, Final
 
 from benchmarks.baseline.echo_servers import HOST
 from benchmarks.peers import bridge
-from benchmarks.peers.arm import NAMES, Arm
+from benchmarks.peers.arm import NAMES, PeerArm
 from device_agent.protocol import JointTarget, JointTelemetry, Setpoint
 
 CONTROL: Final = "arm/control"
 JOINTS: Final = "arm/joints"
 ROS_TYPE: Final = "sensor_msgs/JointState"
-METHOD: Final = ("bench.Arm", "Drive")
+METHOD: Final = ("bench.PeerArm", "Drive")
 
 
 def rosbridge(port: int) -> None:
     """A robot's program with ``roslibpy``; both messages are ``JointState``."""
     import roslibpy
 
-    arm, ros = Arm(), roslibpy.Ros(host=HOST, port=port)
+    arm, ros = PeerArm(), roslibpy.Ros(host=HOST, port=port)
     ros.run()
     joints = roslibpy.Topic(ros, "/" + JOINTS, ROS_TYPE)
     control = roslibpy.Topic(ros, "/" + CONTROL, ROS_TYPE)
@@ -57,7 +57,7 @@ def zenoh(port: int) -> None:
     import zenoh as library
 
     with library.open(zenoh_peer(listen=port)) as session:
-        arm, joints = Arm(), session.declare_publisher(JOINTS, express=True)
+        arm, joints = PeerArm(), session.declare_publisher(JOINTS, express=True)
         session.declare_subscriber(CONTROL, lambda asked: joints.put(arm.obey(asked.payload.to_bytes())))
         _ready()
 
@@ -80,7 +80,7 @@ def grpc(port: int) -> None:
     async def serve() -> None:
         import grpc as library
 
-        arm = Arm()
+        arm = PeerArm()
 
         async def drive(asked: AsyncIterator[bytes], _context: Any) -> AsyncIterator[bytes]:
             async for payload in asked:
@@ -103,7 +103,7 @@ def foxglove(port: int) -> None:
     import foxglove as library
     from foxglove.websocket import Capability
 
-    arm, joints = Arm(), library.Channel(f"/{JOINTS}", message_encoding="json")
+    arm, joints = PeerArm(), library.Channel(f"/{JOINTS}", message_encoding="json")
 
     class Listener(library.ServerListener):  # type: ignore[misc]
         def on_message_data(self, client: Any, client_channel_id: int, data: bytes) -> None:

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any, Final
 
 from benchmarks import suites
-from benchmarks.reporting.report import Chart, Report, Table, load, shown
+from benchmarks.reporting.report import Chart, Report, Table, format_cell, load
 
 ROOT: Final = Path(__file__).resolve().parents[2]
 PAGE: Final = ROOT / "docs" / "results" / "benchmarks.md"
@@ -68,7 +68,7 @@ def _table(table: Table) -> str:
         f"**{table.title}**\n",
         "| " + " | ".join(table.columns) + " |",
         "| --- |" + " ---: |" * (len(table.columns) - 1),
-        *("| " + " | ".join(map(shown, row)) + " |" for row in table.rows),
+        *("| " + " | ".join(map(format_cell, row)) + " |" for row in table.rows),
     ]
     return "\n".join(lines) + "\n" + (f"\n{table.note}\n" if table.note else "")
 

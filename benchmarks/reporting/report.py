@@ -122,7 +122,7 @@ def percentile(samples: Sequence[float], share: float) -> float:
     return ordered[min(round(share * (len(ordered) - 1)), len(ordered) - 1)]
 
 
-def shown(value: Cell) -> str:
+def format_cell(value: Cell) -> str:
     """A cell as text: three digits, no more."""
     if value is None:
         return "–"

@@ -1,7 +1,7 @@
 """The agent's own program, with one more driver, ``light``, and somebody who looks at its control loops.
 
 ``python -m benchmarks.scale.agent RATE_HZ -- …``: what follows is what ``device_agent`` takes. For each line with
-seconds on standard input it watches for so long, and prints what it has seen as JSON behind ``seen``: ``Seen``.
+seconds on standard input it watches for so long, and prints what it has seen as JSON behind ``seen``: ``LoopStatistics``.
 """
 
 import sys
@@ -22,7 +22,7 @@ LIGHT: Final = "light"
 DIVIDER: Final = "--"
 
 
-class Seen(msgspec.Struct):
+class LoopStatistics(msgspec.Struct):
     """Of all control loops together: how much later than a period each decision came after the one before [ms]."""
 
     robots: int
@@ -32,7 +32,7 @@ class Seen(msgspec.Struct):
     late_most_ms: float
 
 
-class Watcher:
+class LoopObserver:
     """Notes when each loop decides."""
 
     def __init__(self) -> None:
@@ -64,12 +64,12 @@ class Watcher:
         if last_s is not None:
             self.late_ms.append((now_s - last_s - self.periods_s.get(controller, 0.0)) * 1000)
 
-    def watch(self, seconds: float) -> Seen:
+    def watch(self, seconds: float) -> LoopStatistics:
         """From now on."""
         self.late_ms = []
         time.sleep(seconds)
         late = list(self.late_ms) or [float("inf")]
-        return Seen(len(self._last), len(late), percentile(late, 0.5), percentile(late, 0.99), max(late))
+        return LoopStatistics(len(self._last), len(late), percentile(late, 0.5), percentile(late, 0.99), max(late))
 
     def answer(self) -> None:
         """What is asked on standard input."""
@@ -81,7 +81,7 @@ def main(rate_hz: float, arguments: Sequence[str]) -> int:
     """The agent's exit code."""
     drivers._BUILT_IN[LIGHT] = "benchmarks.scale.light_driver"  # type: ignore[index] # noqa: SLF001 (of the bench alone)
     control_loop.IDLE_RATE_HZ = rate_hz
-    watcher = Watcher()
+    watcher = LoopObserver()
     watcher.install()
     threading.Thread(target=watcher.answer, daemon=True).start()
     return agent.main(arguments)

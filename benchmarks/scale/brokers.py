@@ -12,8 +12,8 @@ import msgspec
 
 from benchmarks.reporting.report import Cell, Claim, Table
 from benchmarks.scale.processes import processor_s
-from benchmarks.scale.publishers import Fleet, Robot, Told
-from benchmarks.scale.subscriber import Ear, Heard
+from benchmarks.scale.publishers import PublisherOptions, PublisherResult, Robot
+from benchmarks.scale.subscriber import SubscriberOptions, SubscriberResult
 from tests.harness.network.brokers import BrokerKind, RunningBroker, start_broker
 from tests.harness.paths import ROOT
 
@@ -36,8 +36,8 @@ class Run(msgspec.Struct):
 
     kind: BrokerKind
     rate_hz: float
-    told: Told
-    heard: Heard
+    told: PublisherResult
+    heard: SubscriberResult
     broker_s: float
 
     @property
@@ -65,7 +65,11 @@ def measure(*, quick: bool, say: Callable[[str], None]) -> list[Run]:
     """Both brokers at the rate that is claimed; unless ``quick`` at higher ones too, until one does not carry it."""
     found = []
     for kind, rate_hz in RATES_HZ.items():
-        with tempfile.TemporaryDirectory() as folder, start_broker(kind, Path(folder)) as broker, crowd(broker) as ask:
+        with (
+            tempfile.TemporaryDirectory() as folder,
+            start_broker(kind, Path(folder)) as broker,
+            publishers_of(broker) as ask,
+        ):
             ask(rate_hz, 1.0)
             found.append(ask(rate_hz, 8.0 if quick else 15.0))
             say(f"{kind}: {found[-1].told.sent} messages, lost {found[-1].lost}, p99 {found[-1].heard.p99_ms:.2f} ms")
@@ -77,7 +81,7 @@ def measure(*, quick: bool, say: Callable[[str], None]) -> list[Run]:
 
 
 @contextlib.contextmanager
-def crowd(broker: RunningBroker) -> Iterator[Callable[[float, float], Run]]:
+def publishers_of(broker: RunningBroker) -> Iterator[Callable[[float, float], Run]]:
     """Robots and their subscriber, connected; asks them for a rate and seconds."""
     robots = []
     for number in range(ROBOTS):
@@ -86,13 +90,13 @@ def crowd(broker: RunningBroker) -> Iterator[Callable[[float, float], Run]]:
         robots.append(Robot(name, issued.username, issued.password, topic))
     listens = "ts/v1/lab/+/+/tele/+"
     issued = broker.issue(broker.grant("ear", subscribe=(listens,)))
-    ear = Ear(broker.tcp_port, "ear", issued.username, issued.password, listens)
-    with program("ear", ear) as listener, program("fleet", Fleet(broker.tcp_port, robots)) as fleet:
+    ear = SubscriberOptions(broker.tcp_port, "ear", issued.username, issued.password, listens)
+    with program("ear", ear) as listener, program("fleet", PublisherOptions(broker.tcp_port, robots)) as fleet:
 
         def ask(rate_hz: float, seconds: float) -> Run:
             before_s = processor_s(broker.process.pid)
-            told = msgspec.json.decode(answer(fleet, f"{rate_hz} {seconds}"), type=Told)
-            heard = msgspec.json.decode(answer(listener, "now"), type=Heard)
+            told = msgspec.json.decode(answer(fleet, f"{rate_hz} {seconds}"), type=PublisherResult)
+            heard = msgspec.json.decode(answer(listener, "now"), type=SubscriberResult)
             return Run(broker.kind, rate_hz, told, heard, processor_s(broker.process.pid) - before_s)
 
         yield ask

@@ -17,10 +17,10 @@ from typing import Any, Final
 import msgspec
 
 from benchmarks.baseline.echo_servers import HOST
-from benchmarks.baseline.product import PATIENCE_S, Stand, free_port, peer, start
+from benchmarks.baseline.product import PATIENCE_S, MeasuredProduct, free_port, start, start_peer
 from benchmarks.reporting.report import Cell, Chart, Claim, Table
 from benchmarks.scale.brokers import answer, program
-from benchmarks.scale.http_load import Answered, Askers, Request
+from benchmarks.scale.http_load import HttpLoad, HttpLoadResult, Request
 from benchmarks.scale.processes import processor_s
 from tests.harness.paths import ROOT
 
@@ -42,7 +42,7 @@ class Load(msgspec.Struct):
 
     processes: int
     what: str
-    answered: Answered
+    answered: HttpLoadResult
     server_s: float
 
     def row(self) -> list[Cell]:
@@ -58,7 +58,7 @@ class Load(msgspec.Struct):
 Ask = Callable[[float], Load]
 
 
-class Site:
+class FunctionsUnderTest:
     """A started product and more processes of its functions.
 
     Args:
@@ -66,7 +66,7 @@ class Site:
         stack: Ends what is started.
     """
 
-    def __init__(self, stand: Stand, stack: contextlib.ExitStack) -> None:
+    def __init__(self, stand: MeasuredProduct, stack: contextlib.ExitStack) -> None:
         self._stand = stand
         self._stack = stack
         self.device: dict[str, Any] = stand.api.device()
@@ -93,18 +93,18 @@ class Site:
 
 def clients(stack: contextlib.ExitStack, what: str, ports: list[int], pids: list[int], requests: list[Request]) -> Ask:
     """Clients of some servers."""
-    asker = stack.enter_context(program("askers", Askers(ports, CONNECTIONS, requests)))
+    asker = stack.enter_context(program("askers", HttpLoad(ports, CONNECTIONS, requests)))
 
     def ask(seconds: float) -> Load:
         before_s = sum(map(processor_s, pids))
-        answered = msgspec.json.decode(answer(asker, str(seconds)), type=Answered)
+        answered = msgspec.json.decode(answer(asker, str(seconds)), type=HttpLoadResult)
         return Load(len(ports), what, answered, sum(map(processor_s, pids)) - before_s)
 
     return ask
 
 
 @contextlib.contextmanager
-def _functions(stand: Stand, port: int) -> Iterator["subprocess.Popen[bytes]"]:
+def _functions(stand: MeasuredProduct, port: int) -> Iterator["subprocess.Popen[bytes]"]:
     """One more process of the functions over the product's store, once it answers."""
     first = stand.machine.port
     environment = (
@@ -139,7 +139,7 @@ def _healthy(port: int) -> bool:
         return False
 
 
-def measure(site: Site, *, quick: bool, say: Callable[[str], None]) -> tuple[list[Load], list[Load]]:
+def measure(site: FunctionsUnderTest, *, quick: bool, say: Callable[[str], None]) -> tuple[list[Load], list[Load]]:
     """Reads by one process and those of the bare application beside them, in turns; then by more processes."""
     seconds, rounds = (1.5, 3) if quick else (2.5, 5)
     with contextlib.ExitStack() as stack:
@@ -149,7 +149,7 @@ def measure(site: Site, *, quick: bool, say: Callable[[str], None]) -> tuple[lis
         for _ in range(rounds):
             for what, ask in turns.items():
                 found[what].append(ask(seconds))
-    best, more = [middle(loads) for loads in found.values()], []
+    best, more = [median_of(loads) for loads in found.values()], []
     for load in best:
         say(f"{load.what}: {load.answered.per_s:.0f} requests/s, p99 {load.answered.p99_ms:.1f} ms")
     for count in PROCESSES[1:]:
@@ -164,22 +164,22 @@ def measure(site: Site, *, quick: bool, say: Callable[[str], None]) -> tuple[lis
 
 
 @contextlib.contextmanager
-def started() -> Iterator[tuple[Stand, Site]]:
+def started() -> Iterator[tuple[MeasuredProduct, FunctionsUnderTest]]:
     """The product with one simulated UR5 over mosquitto, as fast as it is asked."""
     with contextlib.ExitStack() as stack:
         home = Path(stack.enter_context(tempfile.TemporaryDirectory()))
         stand = stack.enter_context(start(home, "mosquitto", **UNLIMITED))
-        yield stand, Site(stand, stack)
+        yield stand, FunctionsUnderTest(stand, stack)
 
 
 def bare(stack: contextlib.ExitStack, length: int) -> Ask:
     """The bare application: as many bytes of JSON, by the same framework and server."""
     port = free_port()
-    process = stack.enter_context(peer("benchmarks.baseline.echo_servers", "http", str(port)))
+    process = stack.enter_context(start_peer("benchmarks.baseline.echo_servers", "http", str(port)))
     return clients(stack, BARE, [port], [process.pid], [Request("GET", f"/sized/{length}")])
 
 
-def middle(loads: list[Load]) -> Load:
+def median_of(loads: list[Load]) -> Load:
     """The run in the middle, by requests a second."""
     wanted = statistics.median_low([load.answered.per_s for load in loads])
     return next(load for load in loads if load.answered.per_s == wanted)

@@ -1,7 +1,7 @@
 """HTTP clients that cost little: ``python -m benchmarks.scale.http_load``, a program of its own.
 
-Reads one line of JSON, ``Askers``, connects, prints ``ready``. For each further line with seconds, all connections ask
-one request after the other for so long; then it prints what came back as JSON: ``Answered``.
+Reads one line of JSON, ``HttpLoad``, connects, prints ``ready``. For each further line with seconds, all connections ask
+one request after the other for so long; then it prints what came back as JSON: ``HttpLoadResult``.
 """
 
 import asyncio
@@ -35,7 +35,7 @@ class Request(msgspec.Struct):
         return f"{self.method} {self.path} HTTP/1.1\r\nHost: {HOST}\r\n{login}{kind}\r\n".encode() + body
 
 
-class Askers(msgspec.Struct):
+class HttpLoad(msgspec.Struct):
     """So many connections, spread over the ports. Each has its part of the requests, or all where there are fewer."""
 
     ports: list[int]
@@ -43,7 +43,7 @@ class Askers(msgspec.Struct):
     requests: list[Request]
 
 
-class Answered(msgspec.Struct):
+class HttpLoadResult(msgspec.Struct):
     """What came back; ``refused`` counts all but 2xx by status, ``refusal`` is the last of them."""
 
     count: int
@@ -57,7 +57,7 @@ class Answered(msgspec.Struct):
     took_s: float
 
 
-class Line(asyncio.Protocol):
+class RawHttpConnection(asyncio.Protocol):
     """One connection, one request at a time."""
 
     def __init__(self, requests: list[bytes]) -> None:
@@ -120,7 +120,7 @@ class Line(asyncio.Protocol):
         self._transport.write(request)
 
 
-async def ask(lines: list[Line], seconds: float) -> Answered:
+async def send_request(lines: list[RawHttpConnection], seconds: float) -> HttpLoadResult:
     """All at once, each as fast as it is answered."""
     spent_s, began_s = time.process_time(), time.perf_counter()
     for line in lines:
@@ -132,7 +132,7 @@ async def ask(lines: list[Line], seconds: float) -> Answered:
     for line in lines:
         for status, count in line.refused.items():
             refused[status] = refused.get(status, 0) + count
-    return Answered(
+    return HttpLoadResult(
         count=len(taken),
         per_s=len(taken) / took_s,
         p50_ms=percentile(taken or [0.0], 0.5) * 1000,
@@ -148,16 +148,16 @@ async def ask(lines: list[Line], seconds: float) -> Answered:
 async def run() -> None:
     """Until standard input ends."""
     loop = asyncio.get_running_loop()
-    asked = msgspec.json.decode(sys.stdin.readline(), type=Askers)
+    asked = msgspec.json.decode(sys.stdin.readline(), type=HttpLoad)
     requests, lines = [each.encode() for each in asked.requests], []
     for number in range(asked.connections):
         own = requests[number :: asked.connections] or requests
         port = asked.ports[number % len(asked.ports)]
-        _, line = await loop.create_connection(lambda own=own: Line(own), HOST, port)  # type: ignore[misc]
+        _, line = await loop.create_connection(lambda own=own: RawHttpConnection(own), HOST, port)  # type: ignore[misc]
         lines.append(line)
     print("ready", flush=True)
     while seconds := await asyncio.to_thread(sys.stdin.readline):
-        print(msgspec.json.encode(await ask(lines, float(seconds))).decode(), flush=True)
+        print(msgspec.json.encode(await send_request(lines, float(seconds))).decode(), flush=True)
 
 
 if __name__ == "__main__":

@@ -13,13 +13,13 @@ from typing import Any, Final
 
 import msgspec
 
-from benchmarks.baseline.product import PATIENCE_S, Stand
+from benchmarks.baseline.product import PATIENCE_S, MeasuredProduct
 from benchmarks.reporting.report import Cell, Table
 from benchmarks.scale.brokers import answer, program
-from benchmarks.scale.functions import Load, Site
+from benchmarks.scale.functions import FunctionsUnderTest, Load
 from benchmarks.scale.http_load import Request
 from benchmarks.scale.processes import processor_s, resident_mb
-from benchmarks.scale.subscriber import Ear, Heard
+from benchmarks.scale.subscriber import SubscriberOptions, SubscriberResult
 from device_agent.load_generator.kinematic_arm import DEVICE
 from device_agent.protocol import topics
 from tests.harness.browser.product import Api
@@ -39,13 +39,13 @@ COLUMNS: Final = [
 ]  # fmt: skip
 
 
-class Swarmed(msgspec.Struct):
+class LoadTestResult(msgspec.Struct):
     """One run. ``figures`` is what the swarm says of itself."""
 
     known_s: float
     connects_per_s: float
     figures: dict[str, Any]
-    heard: Heard
+    heard: SubscriberResult
     broker_percent: float
     broker_mb: float
     functions_mb: float
@@ -87,7 +87,7 @@ class Swarmed(msgspec.Struct):
         }
 
 
-class Swarm:
+class LoadTest:
     """A swarm that lives for some seconds, with a subscriber beside it.
 
     Args:
@@ -95,7 +95,7 @@ class Swarm:
         home: Where its keys are: the next one of the same home is known already.
     """
 
-    def __init__(self, stand: Stand, home: Path) -> None:
+    def __init__(self, stand: MeasuredProduct, home: Path) -> None:
         self._stand = stand
         self._home = home
 
@@ -120,10 +120,12 @@ class Swarm:
                 process.terminate()
                 process.communicate()  # it says goodbye
 
-    def run(self, count: int, rate_hz: float, gap_s: float, seconds: float) -> Swarmed:
+    def run(self, count: int, rate_hz: float, gap_s: float, seconds: float) -> LoadTestResult:
         """From the first key to the last word."""
         everything = topics.device(topics.ANY, topics.ANY, DEVICE, topics.TELE, topics.ANY)
-        ear = Ear(self._stand.mqtt_port, *self._stand.rights(subscribe=(everything,)), everything, wall=True)
+        ear = SubscriberOptions(
+            self._stand.mqtt_port, *self._stand.rights(subscribe=(everything,)), everything, wall=True
+        )
         broker = self._stand.machine.pid("infra.mosquitto")
         load, began_s = os.getloadavg()[0], time.monotonic()
         with program("ear", ear) as listener, self.living(count, rate_hz, seconds, gap_s) as process:
@@ -134,8 +136,8 @@ class Swarm:
             megabytes = resident_mb(broker), resident_mb(self._stand.machine.pid("function_app serve"))
             process.wait(PATIENCE_S + count * gap_s + seconds)
             percent = 100 * (processor_s(broker) - before_s) / (time.monotonic() - all_s)
-            heard = msgspec.json.decode(answer(listener, "now"), type=Heard)
-        return Swarmed(
+            heard = msgspec.json.decode(answer(listener, "now"), type=SubscriberResult)
+        return LoadTestResult(
             known_s=known_s,
             connects_per_s=count / (progress.all_s - progress.first_s) if progress.all_s else 0.0,
             figures=json.loads((self._home / "figures.json").read_text()),
@@ -175,11 +177,13 @@ class _Progress:
         return self._process.stdout.readline()
 
 
-def actions(site: Site, stand: Stand, home: Path, *, seconds: float, processes: tuple[int, ...]) -> list[Load]:
+def actions(
+    site: FunctionsUnderTest, stand: MeasuredProduct, home: Path, *, seconds: float, processes: tuple[int, ...]
+) -> list[Load]:
     """As many as are taken, by so many processes, for the arms of a swarm, which are where they are asked to be."""
     found = []
     longest_s = len(processes) * (seconds + 1) + PATIENCE_S
-    with contextlib.ExitStack() as stack, Swarm(stand, home).living(ARMS, ARMS_HZ, longest_s, 0.02) as process:
+    with contextlib.ExitStack() as stack, LoadTest(stand, home).living(ARMS, ARMS_HZ, longest_s, 0.02) as process:
         _Progress(process, ARMS).wait()
         devices = _there(stand)
         request = {"kind": "move_joints", "position_rad": {"joint_1": 0.0}}
@@ -193,7 +197,7 @@ def actions(site: Site, stand: Stand, home: Path, *, seconds: float, processes: 
     return found
 
 
-def _there(stand: Stand) -> list[str]:
+def _there(stand: MeasuredProduct) -> list[str]:
     """Ids of the arms that are online: others of an earlier swarm are known too."""
     found: list[str] = []
     query: dict[str, Any] = {"limit": 1000}
@@ -206,7 +210,7 @@ def _there(stand: Stand) -> list[str]:
             query["cursor"] = page["cursor"]
 
 
-def table(runs: list[Swarmed]) -> Table:
+def table(runs: list[LoadTestResult]) -> Table:
     """What was found."""
     note = """`python -m device_agent swarm`: agents that are real ones on the wire, in one process, without
 physics, at the product over mosquitto; one subscriber to all that they measure. *Made known*: keys, enrolment

@@ -11,7 +11,7 @@ from benchmarks.baseline.echo_servers import HOST
 from benchmarks.baseline.product import PATIENCE_S
 from benchmarks.reporting.report import Cell, Table
 from benchmarks.scale import mqtt_packets
-from benchmarks.scale.functions import Site
+from benchmarks.scale.functions import FunctionsUnderTest
 from benchmarks.scale.http_load import Request
 from benchmarks.scale.processes import resident_mb
 from tests.harness.network.brokers import BROKERS, BrokerKind, start_broker
@@ -20,7 +20,7 @@ COLUMNS: Final = ["", "connections", "MB", "kB a connection"]
 _ANSWER: Final = 65_536
 
 
-def measure(site: Site, *, quick: bool, say: Callable[[str], None]) -> Table:
+def measure(site: FunctionsUnderTest, *, quick: bool, say: Callable[[str], None]) -> Table:
     """Connections that do nothing, more and more of them."""
     steps = (100,) if quick else (100, 200, 400)
     rows: list[list[Cell]] = []
@@ -54,7 +54,7 @@ def broker(kind: BrokerKind, steps: tuple[int, ...]) -> list[list[Cell]]:
         return _rows(kind, running.process.pid, steps, grow)
 
 
-def functions(site: Site, steps: tuple[int, ...]) -> list[list[Cell]]:
+def functions(site: FunctionsUnderTest, steps: tuple[int, ...]) -> list[list[Cell]]:
     """One process of the functions."""
     with contextlib.ExitStack() as stack:
         lines: list[socket.socket] = []

@@ -1,7 +1,7 @@
 """Robots that only tell: ``python -m benchmarks.scale.publishers``, a program of its own for as many connections as asked.
 
-Reads one line of JSON, ``Fleet``, connects, prints ``ready``. Then for each line with a rate and seconds it publishes,
-and prints what it did as JSON: ``Told``. A broker that takes nothing any more makes it late.
+Reads one line of JSON, ``PublisherOptions``, connects, prints ``ready``. Then for each line with a rate and seconds it publishes,
+and prints what it did as JSON: ``PublisherResult``. A broker that takes nothing any more makes it late.
 """
 
 import random
@@ -31,14 +31,14 @@ class Robot(msgspec.Struct):
     topic: str
 
 
-class Fleet(msgspec.Struct):
+class PublisherOptions(msgspec.Struct):
     """All of them."""
 
     port: int
     robots: list[Robot]
 
 
-class Told(msgspec.Struct):
+class PublisherResult(msgspec.Struct):
     """What was done. ``late_ms``: 99 % of the messages went out within this after they were due."""
 
     sent: int
@@ -71,7 +71,7 @@ def telemetry() -> bytes:
     return codec.encode(told)
 
 
-def publish(lines: list[tuple[socket.socket, str]], rate_hz: float, seconds: float) -> Told:
+def publish(lines: list[tuple[socket.socket, str]], rate_hz: float, seconds: float) -> PublisherResult:
     """All of them in turn, each ``rate_hz`` times a second."""
     before, after = telemetry().split(SENT + b"-1.0")
     made = [(line, mqtt_packets.text(topic) + before + SENT) for line, topic in lines]
@@ -90,7 +90,7 @@ def publish(lines: list[tuple[socket.socket, str]], rate_hz: float, seconds: flo
         line.sendall(packet)
         size = len(packet)
         late.append(now_s - due_s)
-    return Told(
+    return PublisherResult(
         sent=count,
         late_ms=percentile(late, 0.99) * 1000,
         took_s=clock() - began_s,
@@ -101,7 +101,7 @@ def publish(lines: list[tuple[socket.socket, str]], rate_hz: float, seconds: flo
 
 def main() -> None:
     """Until standard input ends."""
-    fleet = msgspec.json.decode(sys.stdin.readline(), type=Fleet)
+    fleet = msgspec.json.decode(sys.stdin.readline(), type=PublisherOptions)
     lines = [
         (mqtt_packets.connect(fleet.port, each.client, each.user, each.password), each.topic) for each in fleet.robots
     ]

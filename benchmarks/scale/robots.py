@@ -12,9 +12,9 @@ from typing import Final, Literal
 
 import msgspec
 
-from benchmarks.baseline.product import Stand
+from benchmarks.baseline.product import MeasuredProduct
 from benchmarks.reporting.report import Cell, Chart, Table
-from benchmarks.scale.agent import DIVIDER, LIGHT, Seen
+from benchmarks.scale.agent import DIVIDER, LIGHT, LoopStatistics
 from benchmarks.scale.processes import processor_s, resident_mb
 from tests.harness.browser.product import Api
 from tests.harness.paths import ROOT
@@ -44,14 +44,14 @@ COLUMNS: Final = [
 ]  # fmt: skip
 
 
-class Crew(msgspec.Struct):
+class AgentProcess(msgspec.Struct):
     """Robots of one agent, or of some agents beside each other; what is late is that of the latest of them."""
 
     kind: Kind
     rate_hz: float
     agents: int
     count: int
-    seen: Seen
+    seen: LoopStatistics
     percent: float
     mb: float
 
@@ -70,9 +70,9 @@ class Crew(msgspec.Struct):
         ]  # fmt: skip
 
 
-def measure(stand: Stand, *, quick: bool, say: Callable[[str], None]) -> list[Crew]:
+def measure(stand: MeasuredProduct, *, quick: bool, say: Callable[[str], None]) -> list[AgentProcess]:
     """More and more robots, until they are late."""
-    found: list[Crew] = []
+    found: list[AgentProcess] = []
     for kind, rate_hz, agents, counts in QUICK if quick else WHOLE:
         for count in counts:
             found.append(crew(stand, kind, rate_hz, agents, count))
@@ -85,7 +85,7 @@ def measure(stand: Stand, *, quick: bool, say: Callable[[str], None]) -> list[Cr
     return found
 
 
-def crew(stand: Stand, kind: Kind, rate_hz: float, agents: int, count: int) -> Crew:
+def crew(stand: MeasuredProduct, kind: Kind, rate_hz: float, agents: int, count: int) -> AgentProcess:
     """Agents with so many each, watched for some seconds."""
     with contextlib.ExitStack() as stack:
         homes = [Path(stack.enter_context(tempfile.TemporaryDirectory())) for _ in range(agents)]
@@ -94,21 +94,21 @@ def crew(stand: Stand, kind: Kind, rate_hz: float, agents: int, count: int) -> C
         processes = [stack.enter_context(running(home, rate_hz)) for home in homes]
         pool = stack.enter_context(ThreadPoolExecutor(agents))
 
-        def together(seconds: float) -> list[Seen]:
+        def together(seconds: float) -> list[LoopStatistics]:
             return list(pool.map(lambda process: watch(process, seconds), processes))
 
         together(_SETTLE_S)
         before_s, began_s = sum(processor_s(each.pid) for each in processes), time.monotonic()
         seen = max(together(_WATCH_S), key=lambda each: each.late_p99_ms)
         percent = 100 * (sum(processor_s(each.pid) for each in processes) - before_s) / (time.monotonic() - began_s)
-        return Crew(kind, rate_hz, agents, count, seen, percent, resident_mb(processes[0].pid))
+        return AgentProcess(kind, rate_hz, agents, count, seen, percent, resident_mb(processes[0].pid))
 
 
-def pair(stand: Stand, home: Path, kind: Kind, count: int) -> None:
+def pair(stand: MeasuredProduct, home: Path, kind: Kind, count: int) -> None:
     """Enrolled, and claimed by the demo account: a key of the API may not."""
     driver = f":{LIGHT}" if kind == "light" else ""
     devices = [word for number in range(count) for word in ("--device", f"arm_{number}=ur5{driver}")]
-    server = ("--server", stand.machine.url, "--name", "Crew", "--no-wait", "--no-qr")
+    server = ("--server", stand.machine.url, "--name", "AgentProcess", "--no-wait", "--no-qr")
     made = subprocess.run(
         [*program(20.0), "enroll", "--home", str(home), *server, *devices],
         cwd=ROOT, capture_output=True, text=True, check=True, stdin=subprocess.DEVNULL,
@@ -144,12 +144,12 @@ def running(home: Path, rate_hz: float) -> Iterator["subprocess.Popen[str]"]:
             process.terminate()
 
 
-def watch(process: "subprocess.Popen[str]", seconds: float) -> Seen:
+def watch(process: "subprocess.Popen[str]", seconds: float) -> LoopStatistics:
     """What its loops do from now on."""
     assert process.stdin is not None
     process.stdin.write(f"{seconds}\n")
     process.stdin.flush()
-    return msgspec.json.decode(said(process, "seen").partition(" ")[2], type=Seen)
+    return msgspec.json.decode(said(process, "seen").partition(" ")[2], type=LoopStatistics)
 
 
 def said(process: "subprocess.Popen[str]", beginning: str) -> str:
@@ -161,7 +161,7 @@ def said(process: "subprocess.Popen[str]", beginning: str) -> str:
     raise RuntimeError(f"the agent ended with {process.wait()}")
 
 
-def chart(found: list[Crew]) -> Chart | None:
+def chart(found: list[AgentProcess]) -> Chart | None:
     """How late they come, where there is more than one number of them."""
     one = [each for each in found if each.agents == 1 and each.rate_hz == CHARTED_HZ]
     counts = sorted({each.count for each in one})
@@ -181,9 +181,9 @@ def chart(found: list[Crew]) -> Chart | None:
     )
 
 
-def ceilings(found: list[Crew]) -> list[str]:
+def ceilings(found: list[AgentProcess]) -> list[str]:
     """Where more than one number of them was tried, the most that were in time."""
-    tried: dict[tuple[int, Kind, float], list[Crew]] = {}
+    tried: dict[tuple[int, Kind, float], list[AgentProcess]] = {}
     for each in found:
         tried.setdefault((each.agents, each.kind, each.rate_hz), []).append(each)
     return [
@@ -194,7 +194,7 @@ def ceilings(found: list[Crew]) -> list[str]:
     ]
 
 
-def table(found: list[Crew]) -> Table:
+def table(found: list[AgentProcess]) -> Table:
     """What was found."""
     alone = {each.kind: each.mb for each in found if each.count == 1}
     note = """An agent of the product with so many UR5, none of them moving: *light* ones are where they were

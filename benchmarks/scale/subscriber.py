@@ -1,7 +1,7 @@
 """One subscriber: ``python -m benchmarks.scale.subscriber``, a program of its own.
 
-Reads one line of JSON, ``Ear``, subscribes, prints ``ready``. For each further line, once nothing more has come for a
-moment, prints what has come since the line before as JSON: ``Heard``.
+Reads one line of JSON, ``SubscriberOptions``, subscribes, prints ``ready``. For each further line, once nothing more has come for a
+moment, prints what has come since the line before as JSON: ``SubscriberResult``.
 """
 
 import sys
@@ -21,7 +21,7 @@ MEASURED: Final = b'"at_ms":'
 """Before the moment of a measurement on the wall clock [ms]."""
 
 
-class Ear(msgspec.Struct):
+class SubscriberOptions(msgspec.Struct):
     """Who listens to what."""
 
     port: int
@@ -33,7 +33,7 @@ class Ear(msgspec.Struct):
     """Whether messages tell when they were measured, by the wall clock, and not when they were sent, by the other."""
 
 
-class Heard(msgspec.Struct):
+class SubscriberResult(msgspec.Struct):
     """What has come; ``ms`` from its publisher's clock to here, by share."""
 
     count: int
@@ -46,7 +46,7 @@ class Heard(msgspec.Struct):
 class Listener:
     """Takes in what comes, in a thread of its own."""
 
-    def __init__(self, asked: Ear) -> None:
+    def __init__(self, asked: SubscriberOptions) -> None:
         self._clock, self._mark = (time.time, MEASURED) if asked.wall else (time.monotonic, SENT)
         self._line = mqtt_packets.connect(asked.port, asked.client, asked.user, asked.password)
         mqtt_packets.subscribe(self._line, asked.topic)
@@ -64,7 +64,7 @@ class Listener:
                 if kind & 0xF0 == mqtt_packets.PUBLISH:
                     self._taken.append(now_ms - said_ms(body, self._mark))
 
-    def heard(self) -> Heard:
+    def heard(self) -> SubscriberResult:
         """Since the last time."""
         known = -1
         while known != len(self._taken):
@@ -73,7 +73,7 @@ class Listener:
         taken, self._taken = self._taken, []
         spent_s, self._spent_s = time.process_time() - self._spent_s, time.process_time()
         found = taken or [0.0]
-        return Heard(len(taken), percentile(found, 0.5), percentile(found, 0.99), max(found), spent_s)
+        return SubscriberResult(len(taken), percentile(found, 0.5), percentile(found, 0.99), max(found), spent_s)
 
 
 def said_ms(body: bytes, mark: bytes) -> float:
@@ -83,7 +83,7 @@ def said_ms(body: bytes, mark: bytes) -> float:
 
 def main() -> None:
     """Until standard input ends."""
-    listener = Listener(msgspec.json.decode(sys.stdin.readline(), type=Ear))
+    listener = Listener(msgspec.json.decode(sys.stdin.readline(), type=SubscriberOptions))
     print("ready", flush=True)
     for _ in sys.stdin:
         print(msgspec.json.encode(listener.heard()).decode(), flush=True)

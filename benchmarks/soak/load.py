@@ -10,7 +10,7 @@ from typing import Any, Final, Self
 
 import httpx
 
-from benchmarks.baseline.product import LEASE_MS, PATIENCE_S, Line, Stand
+from benchmarks.baseline.product import LEASE_MS, PATIENCE_S, MeasuredProduct, MqttClient
 from device_agent.protocol import JointTarget, JointTelemetry, Setpoint, codec
 from device_agent.protocol.manifests import robot_type
 from tests.harness.browser.product import Api
@@ -43,7 +43,7 @@ class Load:
         errors: What went wrong, by name; nothing is expected to.
     """
 
-    def __init__(self, stand: Stand, *, hold_s: float) -> None:
+    def __init__(self, stand: MeasuredProduct, *, hold_s: float) -> None:
         self._stand = stand
         self._hold_s = hold_s
         self._ending = threading.Event()
@@ -106,12 +106,12 @@ class Load:
         return found
 
     @contextlib.contextmanager
-    def _connected(self, http: httpx.Client, wanted: dict[str, Any], *topics: str) -> Iterator[Line]:
+    def _connected(self, http: httpx.Client, wanted: dict[str, Any], *topics: str) -> Iterator[MqttClient]:
         """A client with credentials of its own, that hears these topics; a watcher without any hears all it may."""
         issued = self._ask(http, "POST", "/mqtt/credentials", wanted)
         filters = topics or tuple(issued["subscribe"])
         who = (issued["client_id"], issued["username"], issued["password"])
-        with Line(self._stand.mqtt_port, *who, subscribe=filters[:_AT_ONCE], qos=0) as line:
+        with MqttClient(self._stand.mqtt_port, *who, subscribe=filters[:_AT_ONCE], qos=0) as line:
             line.client.on_disconnect = self._dropped
             for first in range(_AT_ONCE, len(filters), _AT_ONCE):
                 line.client.subscribe([(each, 0) for each in filters[first : first + _AT_ONCE]])
@@ -137,14 +137,14 @@ class Load:
             control = {"purpose": "control", "device": device["id"], "epoch": epoch}
             ear = self._connected(http, {"purpose": "view"}, f"{device['topic']}/tele/joints")
             with ear as heard, self._connected(http, control) as line:
-                self._stream(http, lease, Streamed(device, epoch, heard, line))
+                self._stream(http, lease, StreamingResult(device, epoch, heard, line))
         finally:
             self._ask(http, "DELETE", lease, epoch=epoch)
         self.count("leases taken and given back")
         if number % 2 == 0:
             self._move(http, device, {"kind": "run_movement", "name": "wave"})
 
-    def _stream(self, http: httpx.Client, lease: str, arm: "Streamed") -> None:
+    def _stream(self, http: httpx.Client, lease: str, arm: "StreamingResult") -> None:
         ends_s, renew_s = time.monotonic() + self._hold_s, time.monotonic() + _RENEW_S
         while (now_s := time.monotonic()) < ends_s and not self._ending.is_set():
             arm.send(now_s)
@@ -228,10 +228,10 @@ class Load:
         self._ending.wait(self._hold_s / 4)
 
 
-class Streamed:
+class StreamingResult:
     """The arm under one lease, swung gently by one wrist."""
 
-    def __init__(self, device: dict[str, Any], epoch: int, heard: Line, line: Line) -> None:
+    def __init__(self, device: dict[str, Any], epoch: int, heard: MqttClient, line: MqttClient) -> None:
         joints = robot_type.load(ROOT / "robots" / device["robot_type"]).joints
         self._names = [each.name for each in joints]
         self._topic = f"{device['topic']}/ctl/{epoch}"

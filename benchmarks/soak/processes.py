@@ -44,7 +44,7 @@ class Sample(msgspec.Struct, frozen=True, kw_only=True):
     threads: int
 
 
-class Watch:
+class ProcessWatcher:
     """Samples a product's processes until the end of the ``with``.
 
     Args:

@@ -26,7 +26,7 @@ class Slope(msgspec.Struct, frozen=True):
     high: float
 
 
-class Held(msgspec.Struct, frozen=True, kw_only=True):
+class DescriptorTrend(msgspec.Struct, frozen=True, kw_only=True):
     """One part over the time after warm-up; ``first`` and ``last`` are the lowest tenths of its first and last ones.
 
     Low, since a script that runs has descriptors of its own: a leak raises what is there while least runs.
@@ -77,7 +77,7 @@ def drawn_together(at_s: Sequence[float], values: Sequence[float]) -> tuple[list
     ]
 
 
-def after_warm_up(samples: Iterable[Sample], warm_up_s: float, *, end_share: float = 0.1) -> list[Held]:
+def after_warm_up(samples: Iterable[Sample], warm_up_s: float, *, end_share: float = 0.1) -> list[DescriptorTrend]:
     """What each part held, and at last all of them together. ``end_share``: of its samples, first and last."""
     samples = list(samples)
     samples += together(samples)
@@ -95,7 +95,7 @@ def after_warm_up(samples: Iterable[Sample], warm_up_s: float, *, end_share: flo
         rss, own = [each.rss_mb for each in mine], [each.own_mb for each in mine]
         descriptors, threads = [each.descriptors for each in mine], [each.threads for each in mine]
         found.append(
-            Held(
+            DescriptorTrend(
                 part=part,
                 rss=theil_sen(*drawn_together(at_s, rss)),
                 own=theil_sen(*drawn_together(at_s, own)),

@@ -4,10 +4,10 @@ import math
 from collections.abc import Callable, Iterable
 from typing import Final
 
-from benchmarks.faults.action_load import Orders, doubled, lost
-from benchmarks.faults.fault_runs import Found, Rounds
+from benchmarks.faults.action_load import ActionLoad, duplicated, lost
+from benchmarks.faults.fault_runs import FaultResult, FaultRuns
 from benchmarks.faults.processes import start
-from benchmarks.faults.stops import CALL, MESSAGE, SPEEDS, Stopped, Stops, series
+from benchmarks.faults.stops import CALL, MESSAGE, SPEEDS, StopResult, StopRuns, series
 from benchmarks.reporting.report import Cell, Chart, Claim, Report, Table, percentile
 from device_agent.protocol.manifests import robot_type
 from tests.harness.network.brokers import BROKERS
@@ -60,14 +60,14 @@ just as long as has passed since the one before, so nothing moves faster for it.
 
 def run(*, quick: bool, say: Callable[[str], None]) -> Report:
     """Both brokers; a quick run breaks half of the things over the one, the others over the other."""
-    found: list[Found] = []
-    stops: list[Stopped] = []
+    found: list[FaultResult] = []
+    stops: list[StopResult] = []
     orders: dict[tuple[str, str], tuple[int, int, int]] = {}
     for number, kind in enumerate(BROKERS):
         say(f"{kind}: starting")
         with start(kind) as ground:
-            with Orders(ground) as given:
-                rounds = Rounds(ground, given, seed=number)
+            with ActionLoad(ground) as given:
+                rounds = FaultRuns(ground, given, seed=number)
                 chosen = rounds.names[number::2] if quick else rounds.names * _ROUNDS
                 for fault in chosen:
                     found.append(rounds.round(fault))
@@ -78,10 +78,10 @@ def run(*, quick: bool, say: Callable[[str], None]) -> Report:
             for fault in {each.fault for each in given.given}:
                 mine = [each for each in given.given if each.fault == fault]
                 accepted = sum(bool(each.action) for each in mine)
-                orders[kind, fault] = accepted, len(lost(mine)), len(doubled(mine, ground.noted.begun))
+                orders[kind, fault] = accepted, len(lost(mine)), len(duplicated(mine, ground.noted.begun))
             orders[kind, _RECORD] = 0, 0, again
             ground.restart_agent_without_proxies()
-            with Stops(ground, seed=number) as made:
+            with StopRuns(ground, seed=number) as made:
                 stops += series(made, _QUICK_STOPS if quick else _STOPS, say)
     report = Report(suite="faults", title="Faults", about=[_ABOUT], quick=quick)
     report.tables = [faults_table(found, orders), stops_table(stops), _TRIED]
@@ -90,7 +90,7 @@ def run(*, quick: bool, say: Callable[[str], None]) -> Report:
     return report
 
 
-def _told(found: Found) -> str:
+def _told(found: FaultResult) -> str:
     stop = "" if found.stop_ms is None else f"rest after {found.stop_ms:.0f} ms, "
     return f"{found.broker}: {found.fault}: {stop}recovered in {found.recovery_s:.1f} s"
 
@@ -99,7 +99,7 @@ Counted = dict[tuple[str, str], tuple[int, int, int]]
 """Broker and fault → orders that were accepted, lost, doubled."""
 
 
-def faults_table(found: list[Found], orders: Counted) -> Table:
+def faults_table(found: list[FaultResult], orders: Counted) -> Table:
     """A row for each fault and broker."""
     columns = ["fault", "broker", "rounds", "stop ms: most", "recovery s: most", "orders", "lost", "doubled"]
     rows: list[list[Cell]] = []
@@ -118,11 +118,11 @@ def faults_table(found: list[Found], orders: Counted) -> Table:
     return Table(title="What breaks", columns=columns, rows=rows, note=_FAULTS_NOTE)
 
 
-def _select(stops: Iterable[Stopped], **wanted: str) -> list[Stopped]:
+def _select(stops: Iterable[StopResult], **wanted: str) -> list[StopResult]:
     return [each for each in stops if all(getattr(each, name) == value for name, value in wanted.items())]
 
 
-def stops_table(stops: list[Stopped]) -> Table:
+def stops_table(stops: list[StopResult]) -> Table:
     """A row for each speed, way and broker."""
     columns = [
         "arm", "way", "broker", "n", "at rad/s", "braking ms: p50", "p99", "most", "zero ms: p50", "p99", "most"
@@ -150,17 +150,17 @@ def _note() -> str:
     )
 
 
-def _chart(stops: list[Stopped]) -> Chart:
+def _chart(stops: list[StopResult]) -> Chart:
     series: dict[str, list[float | None]] = {"braking begins, all": [each.braking_ms for each in stops]}
     for speed in SPEEDS:
         series[f"zero, {speed}"] = [each.zero_ms for each in _select(stops, speed=speed)]
     return Chart(
         title="From Stop to braking, and to zero commanded velocity", kind="cdf", x_label="ms",
-        y_label="share of Stops", x=[], series=series,
+        y_label="share of StopRuns", x=[], series=series,
     )  # fmt: skip
 
 
-def claims(found: list[Found], stops: list[Stopped], orders: Counted) -> list[Claim]:
+def claims(found: list[FaultResult], stops: list[StopResult], orders: Counted) -> list[Claim]:
     """What is promised."""
     made: list[Claim] = []
     for way in (MESSAGE, CALL):

@@ -9,8 +9,18 @@ from pathlib import Path
 from typing import Final
 
 from benchmarks.baseline.echo_servers import HOST
-from benchmarks.baseline.interleaved import Exchange, in_turns, median, table
-from benchmarks.baseline.product import PATIENCE_S, PAYLOAD, PERIOD_S, Caller, Hand, Stand, free_port, peer, start
+from benchmarks.baseline.interleaved import Exchange, measure_interleaved, median, table
+from benchmarks.baseline.product import (
+    PATIENCE_S,
+    PAYLOAD,
+    PERIOD_S,
+    HttpConnection,
+    MeasuredProduct,
+    StreamingOperator,
+    free_port,
+    start,
+    start_peer,
+)
 from benchmarks.reporting.report import Claim, Report, Table
 from tests.harness.network.brokers import BROKERS
 
@@ -63,7 +73,7 @@ def run(*, quick: bool, say: Callable[[str], None]) -> Report:
     for kind in BROKERS:
         say(f"{kind}: starting")
         with tempfile.TemporaryDirectory() as folder, start(Path(folder), kind) as stand, paths(stand) as found:
-            taken = in_turns(found, rounds=rounds, each=each, pause_s=PERIOD_S)
+            taken = measure_interleaved(found, rounds=rounds, each=each, pause_s=PERIOD_S)
         _judge(report, kind, taken)
         for claim in report.claims[-2:]:
             say(claim.line())
@@ -91,19 +101,19 @@ def _judge(report: Report, kind: str, taken: dict[str, list[float]]) -> None:
 
 
 @contextlib.contextmanager
-def paths(stand: Stand) -> Iterator[dict[str, Exchange]]:
+def paths(stand: MeasuredProduct) -> Iterator[dict[str, Exchange]]:
     """All exchanges, warm."""
     with contextlib.ExitStack() as stack:
         tcp, web = free_port(), free_port()
-        stack.enter_context(peer("benchmarks.baseline.echo_servers", "tcp", str(tcp)))
-        stack.enter_context(peer("benchmarks.baseline.echo_servers", "http", str(web)))
+        stack.enter_context(start_peer("benchmarks.baseline.echo_servers", "tcp", str(tcp)))
+        stack.enter_context(start_peer("benchmarks.baseline.echo_servers", "http", str(web)))
         found: dict[str, Exchange] = {"TCP": _tcp(stack, tcp), "HTTP": _http(stack, web)}
-        hand = stack.enter_context(Hand(stand))
+        hand = stack.enter_context(StreamingOperator(stand))
         hand.exchange()
         found["MQTT, QoS 0"] = mqtt(stack, stand, 0, hand.sent, len(hand.heard))
         found["MQTT, QoS 1"] = mqtt(stack, stand, 1)
         found["setpoint"] = hand.exchange
-        caller = stack.enter_context(Caller(stand.machine.port, {"Authorization": f"Bearer {stand.token}"}))
+        caller = stack.enter_context(HttpConnection(stand.machine.port, {"Authorization": f"Bearer {stand.token}"}))
         found["action"] = partial(hand.act, caller)
         yield found
 
@@ -122,7 +132,7 @@ def _tcp(stack: contextlib.ExitStack, port: int) -> Exchange:
 
 
 def _http(stack: contextlib.ExitStack, port: int) -> Exchange:
-    caller = stack.enter_context(Caller(port))
+    caller = stack.enter_context(HttpConnection(port))
 
     def exchange() -> None:
         caller.ask("POST", "/echo", PAYLOAD)
@@ -131,13 +141,13 @@ def _http(stack: contextlib.ExitStack, port: int) -> Exchange:
 
 
 def mqtt(
-    stack: contextlib.ExitStack, stand: Stand, qos: int, payload: bytes = PAYLOAD, answer_bytes: int = 0
+    stack: contextlib.ExitStack, stand: MeasuredProduct, qos: int, payload: bytes = PAYLOAD, answer_bytes: int = 0
 ) -> Exchange:
     """To another process and back, with clients as bare as ours are; the answer is what was sent, or longer."""
     there, back = (f"{topic}/{qos}" for topic in _TOPICS)
     rights = stand.rights(publish=(back,), subscribe=(there,))
     stack.enter_context(
-        peer(
+        start_peer(
             "benchmarks.baseline.echo_servers",
             "mqtt",
             str(stand.mqtt_port),

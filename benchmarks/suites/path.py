@@ -8,10 +8,10 @@ from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Final
 
-from benchmarks.baseline.product import Caller, Hand
+from benchmarks.baseline.product import HttpConnection, StreamingOperator
 from benchmarks.reporting.report import Cell, Chart, Report, Table, percentile
-from benchmarks.tracing.timestamps import Mark
-from benchmarks.tracing.traced_product import Watched, start
+from benchmarks.tracing.timestamps import Timestamp
+from benchmarks.tracing.traced_product import TracedProduct, start
 from tests.harness.network.brokers import BROKERS
 
 ROBOT: Final = "ur5"
@@ -76,10 +76,10 @@ Parts = list[dict[str, float]]
 """Of each exchange: part → how long it took [ms]."""
 
 
-def take(stand: Watched, count: int) -> dict[str, Parts]:
+def take(stand: TracedProduct, count: int) -> dict[str, Parts]:
     """So many actions and setpoints, in turns; what was too slow to be told in its order is left out."""
     found: dict[str, Parts] = {"action": [], "first motion": [], "setpoint": []}
-    with Hand(stand, ROBOT) as hand, stand.caller() as caller:
+    with StreamingOperator(stand, ROBOT) as hand, stand.caller() as caller:
         home_rad = hand.target_rad[JOINT]
         for index in range(count + _WARM_UP):
             to_rad = home_rad + (0.0 if index % 2 else SWINGS_RAD)
@@ -99,7 +99,7 @@ def take(stand: Watched, count: int) -> dict[str, Parts]:
     return found
 
 
-def _act(stand: Watched, caller: Caller, hand: Hand, to_rad: float) -> Iterator[Mark]:
+def _act(stand: TracedProduct, caller: HttpConnection, hand: StreamingOperator, to_rad: float) -> Iterator[Timestamp]:
     """An action to its end."""
     request = {"kind": "move_joints", "position_rad": {JOINT: to_rad}}
     asked = {"request": request, "epoch": hand.epoch, "wait_for": "started", "wait_ms": 10_000}
@@ -108,25 +108,25 @@ def _act(stand: Watched, caller: Caller, hand: Hand, to_rad: float) -> Iterator[
     stand.marks.until(f"rests:{ROBOT}", since_ns=time.monotonic_ns(), within_s=_WITHIN_S)
     time.sleep(random.uniform(0.0, 0.01))  # at any phase of the control loop
     began_ns = time.monotonic_ns()
-    yield Mark(ASKED, began_ns)
+    yield Timestamp(ASKED, began_ns)
     started = caller.ask("POST", f"/api/v1/devices/{hand.device['id']}/actions", body)
-    yield Mark(ANSWERED, time.monotonic_ns())
+    yield Timestamp(ANSWERED, time.monotonic_ns())
     yield from stand.marks.until(f"moves:{ROBOT}", since_ns=began_ns, within_s=_WITHIN_S)
     caller.ask("GET", f"/api/v1/actions/{started['id']}?wait_ms=10000")
 
 
-def _set(stand: Watched, hand: Hand) -> list[Mark]:
+def _set(stand: TracedProduct, hand: StreamingOperator) -> list[Timestamp]:
     """One setpoint, until it is seen again."""
     stand.marks.drain()
     began_ns = time.monotonic_ns()
     took_ms = hand.exchange()
-    answered = Mark(ANSWERED, time.monotonic_ns())
+    answered = Timestamp(ANSWERED, time.monotonic_ns())
     # Where the last was a moment ago, `exchange` has waited first.
-    asked = Mark(ASKED, max(began_ns, answered.at_ns - round(took_ms * 1e6)))
+    asked = Timestamp(ASKED, max(began_ns, answered.at_ns - round(took_ms * 1e6)))
     return [asked, *stand.marks.drain(), answered]
 
 
-def parts(marks: Sequence[Mark], steps: Steps) -> dict[str, float] | None:
+def parts(marks: Sequence[Timestamp], steps: Steps) -> dict[str, float] | None:
     """How long each part took [ms]; ``None`` where one of the marks is missing.
 
     Each step's mark is the first of its name after the mark of the step before.

@@ -6,8 +6,8 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Final
 
-from benchmarks.baseline.interleaved import Exchange, in_turns, median, table
-from benchmarks.baseline.product import Hand, start
+from benchmarks.baseline.interleaved import Exchange, measure_interleaved, median, table
+from benchmarks.baseline.product import StreamingOperator, start
 from benchmarks.peers import operators, safety
 from benchmarks.reporting.report import Chart, Claim, Report, percentile
 from tests.harness.network.brokers import BROKERS
@@ -38,7 +38,7 @@ def run(*, quick: bool, say: Callable[[str], None]) -> Report:
     say("starting everything")
     with paths() as found:
         say("taking turns")
-        taken = in_turns(found, rounds=rounds, each=each)
+        taken = measure_interleaved(found, rounds=rounds, each=each)
     report = Report(suite="peers", title="Peers at the same work", quick=quick, about=[_ABOUT, _HOW])
     report.tables += [table("Setpoint → applied → seen again", taken, against=OURS), safety.table()]
     report.charts.append(_chart(taken))
@@ -74,7 +74,7 @@ def paths() -> Iterator[dict[str, Exchange]]:
         for kind in reversed(BROKERS):
             home = Path(stack.enter_context(tempfile.TemporaryDirectory()))
             stand = stack.enter_context(start(home, kind))
-            found[f"Telescope, {kind}"] = stack.enter_context(Hand(stand)).exchange
+            found[f"Telescope, {kind}"] = stack.enter_context(StreamingOperator(stand)).exchange
         for name, open_peer in PEERS.items():
             found[name] = stack.enter_context(open_peer())
         yield found

@@ -33,7 +33,7 @@ def run(*, quick: bool, say: Callable[[str], None]) -> Report:
         crews = robots.measure(stand, quick=quick, say=say)
         report.tables.append(robots.table(crews))
         report.charts += [drawn] if (drawn := robots.chart(crews)) else []
-        swarm = load_tests.Swarm(stand, Path(folder))
+        swarm = load_tests.LoadTest(stand, Path(folder))
         runs = []
         for count, rate_hz, gap_s in load_tests.QUICK if quick else load_tests.WHOLE:
             runs.append(swarm.run(count, rate_hz, gap_s, 5.0 if quick else 8.0))

@@ -10,8 +10,8 @@ from typing import Final
 from benchmarks.baseline.product import start
 from benchmarks.reporting.report import QUICK, Chart, Claim, Report, Table, load
 from benchmarks.soak.load import Load
-from benchmarks.soak.processes import PARTS, TOGETHER, Sample, Watch
-from benchmarks.soak.trends import Held, after_warm_up, drawn_together
+from benchmarks.soak.processes import PARTS, TOGETHER, ProcessWatcher, Sample
+from benchmarks.soak.trends import DescriptorTrend, after_warm_up, drawn_together
 
 MINUTES: Final = "SOAK_MINUTES"
 """The environment variable for another length of the whole run [min]."""
@@ -56,7 +56,7 @@ def run(*, quick: bool, say: Callable[[str], None]) -> Report:
     with (
         tempfile.TemporaryDirectory() as folder,
         start(Path(folder), "amqtt", TELESCOPE_ROOM="lab", TELESCOPE_TRACE="") as stand,
-        Watch(stand.machine.process.pid, every_s=1.0 if quick else 5.0, file=SERIES) as watch,
+        ProcessWatcher(stand.machine.process.pid, every_s=1.0 if quick else 5.0, file=SERIES) as watch,
         Load(stand, hold_s=4.0 if quick else 20.0) as people,
     ):
         began_s = time.monotonic()
@@ -82,7 +82,7 @@ def progress(samples: list[Sample], people: Load) -> str:
     return f"{held}; {people.done['HTTP requests']} requests, {people.done['actions']} actions{errors}"
 
 
-def claims(held: list[Held], people: Load, for_s: float) -> list[Claim]:
+def claims(held: list[DescriptorTrend], people: Load, for_s: float) -> list[Claim]:
     """Of a whole run."""
     (product,) = [each for each in held if each.part == TOGETHER]
     worst = max((each for each in held if each is not product), key=lambda each: each.own.percent_per_h)
@@ -115,7 +115,7 @@ def claims(held: list[Held], people: Load, for_s: float) -> list[Claim]:
     ]
 
 
-def _quick_claims(held: list[Held], people: Load) -> list[Claim]:
+def _quick_claims(held: list[DescriptorTrend], people: Load) -> list[Claim]:
     """What the last whole run has found, and what not quite a minute can tell."""
     whole = load("soak")
     found = []
@@ -136,7 +136,7 @@ def _quick_claims(held: list[Held], people: Load) -> list[Claim]:
     ]
 
 
-def _memory(held: list[Held], for_s: float) -> Table:
+def _memory(held: list[DescriptorTrend], for_s: float) -> Table:
     columns = ["part", "own MB", "own %/h", "95 %", "resident MB", "resident %/h", "95 %"]
     rows: list[list[str | float | int | None]] = [
         [
@@ -149,7 +149,7 @@ def _memory(held: list[Held], for_s: float) -> Table:
     return Table(title=f"Memory over {for_s / 60:.0f} min", columns=columns, rows=rows, note=_NOTE)
 
 
-def _descriptors(held: list[Held]) -> Table:
+def _descriptors(held: list[DescriptorTrend]) -> Table:
     columns = ["part", "descriptors: first", "last", "most", "threads: first", "last"]
     rows: list[list[str | float | int | None]] = [
         [

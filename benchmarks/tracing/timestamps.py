@@ -1,6 +1,6 @@
 """Moments in other programs of this machine, by the one clock that all its processes share (``CLOCK_MONOTONIC``).
 
-Whoever measures opens ``Marks`` and names its port in ``TELESCOPE_BENCH_MARKS``; a program that was started by
+Whoever measures opens ``TimestampReceiver`` and names its port in ``TELESCOPE_BENCH_MARKS``; a program that was started by
 ``benchmarks.tracing.traced_programs`` tells it what happens. A mark goes as a datagram on loopback: it is there when the sender's next
 line runs, and costs some ten microseconds.
 """
@@ -17,14 +17,14 @@ VARIABLE: Final = "TELESCOPE_BENCH_MARKS"
 _MOST_BYTES: Final = 200
 
 
-class Mark(NamedTuple):
+class Timestamp(NamedTuple):
     """Something happened."""
 
     name: str
     at_ns: int
 
 
-class Marks:
+class TimestampReceiver:
     """Hears marks. ``with`` closes it."""
 
     def __init__(self) -> None:
@@ -34,23 +34,23 @@ class Marks:
         self.settings: dict[str, str] = {VARIABLE: str(self._socket.getsockname()[1])}
         """For the environment of the program that is to tell."""
 
-    def drain(self) -> list[Mark]:
+    def drain(self) -> list[Timestamp]:
         """All that were told since the last call, in the order of their times."""
-        found: list[Mark] = []
+        found: list[Timestamp] = []
         while True:
             try:
                 name, at_ns = self._socket.recv(_MOST_BYTES).decode().split()
             except BlockingIOError:
                 return sorted(found, key=lambda mark: mark.at_ns)
-            found.append(Mark(name, int(at_ns)))
+            found.append(Timestamp(name, int(at_ns)))
 
-    def until(self, name: str, *, since_ns: int, within_s: float) -> list[Mark]:
+    def until(self, name: str, *, since_ns: int, within_s: float) -> list[Timestamp]:
         """Wait for this one; all that were told from then on.
 
         Raises:
             TimeoutError: It is not told.
         """
-        found: list[Mark] = []
+        found: list[Timestamp] = []
         deadline_s = time.monotonic() + within_s
         while not any(mark.name == name for mark in found):
             left_s = deadline_s - time.monotonic()
@@ -67,7 +67,7 @@ class Marks:
         self._socket.close()
 
 
-class Teller:
+class TimestampSender:
     """Tells marks to who listens at the port in the environment."""
 
     def __init__(self) -> None:

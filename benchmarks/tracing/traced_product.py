@@ -4,9 +4,9 @@ import contextlib
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 
-from benchmarks.baseline.product import Caller, Stand
+from benchmarks.baseline.product import HttpConnection, MeasuredProduct
 from benchmarks.tracing import traced_programs
-from benchmarks.tracing.timestamps import Marks
+from benchmarks.tracing.timestamps import TimestampReceiver
 from function_app import settings
 from tests.harness.browser.product import Machine, free_ports, start_program
 from tests.harness.cloud.cloud import Cloud
@@ -14,14 +14,14 @@ from tests.harness.network.brokers import BrokerKind
 from tests.harness.network.delay import Way, start_delay
 
 
-class Watched(Stand):
-    """As ``Stand``. ``start`` gives one.
+class TracedProduct(MeasuredProduct):
+    """As ``MeasuredProduct``. ``start`` gives one.
 
     Attributes:
         marks: What its programs tell.
     """
 
-    def __init__(self, machine: Machine, kind: BrokerKind, cloud: Cloud, *, marks: Marks, way: Way) -> None:
+    def __init__(self, machine: Machine, kind: BrokerKind, cloud: Cloud, *, marks: TimestampReceiver, way: Way) -> None:
         super().__init__(machine, kind, cloud)
         self.marks = marks
         self._way = way
@@ -37,14 +37,14 @@ class Watched(Stand):
         """Where the operator reaches the broker."""
         return self._way.ports[super().mqtt_port] if self._far else super().mqtt_port
 
-    def caller(self) -> Caller:
+    def caller(self) -> HttpConnection:
         """The operator's warm connection to the API."""
         port = self._way.ports[self.machine.port] if self._far else self.machine.port
-        return Caller(port, {"Authorization": f"Bearer {self.token}"})
+        return HttpConnection(port, {"Authorization": f"Bearer {self.token}"})
 
 
 @contextlib.contextmanager
-def start(home: Path, kind: BrokerKind, joints: Mapping[str, str], **more: str) -> Iterator[Watched]:
+def start(home: Path, kind: BrokerKind, joints: Mapping[str, str], **more: str) -> Iterator[TracedProduct]:
     """The product with a robot alone in a scene of its own, or with ``TELESCOPE_ROOM`` in ``more`` all of a room.
 
     The agent reaches cloud and broker through a delay, of no time as long as nobody is ``place``d.
@@ -57,7 +57,7 @@ def start(home: Path, kind: BrokerKind, joints: Mapping[str, str], **more: str) 
     """
     port = free_ports()
     with contextlib.ExitStack() as stack:
-        marks = stack.enter_context(Marks())
+        marks = stack.enter_context(TimestampReceiver())
         way = stack.enter_context(start_delay(port, port + 1, rtt_ms=0))
         wanted = {
             "TELESCOPE_BROKER": kind,
@@ -74,4 +74,4 @@ def start(home: Path, kind: BrokerKind, joints: Mapping[str, str], **more: str) 
             raise RuntimeError("".join(machine.lines))
         given = {"TELESCOPE_HOME": str(home), "TELESCOPE_PORT": str(machine.port), **wanted}
         cloud = stack.enter_context(Cloud(settings.read(given)))
-        yield Watched(machine, kind, cloud, marks=marks, way=way)
+        yield TracedProduct(machine, kind, cloud, marks=marks, way=way)

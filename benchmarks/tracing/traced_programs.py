@@ -17,7 +17,7 @@ from functools import wraps
 from pathlib import Path
 from typing import Any, Final
 
-from benchmarks.tracing.timestamps import Teller
+from benchmarks.tracing.timestamps import TimestampSender
 
 DEVICE: Final = "TELESCOPE_BENCH_DEVICE"
 JOINTS: Final = "TELESCOPE_BENCH_JOINTS"
@@ -63,7 +63,7 @@ def functions(arguments: Sequence[str]) -> int:
     from function_app.services.messaging.command_sender import CommandSender
     from function_app.services.storage import records
 
-    tell = Teller().tell
+    tell = TimestampSender().tell
 
     def to_control(name: str) -> Tell:
         return lambda _self, table, *_: tell(name) if table == records.CONTROL else None
@@ -140,7 +140,7 @@ def agent(arguments: Sequence[str]) -> int:
     """As ``python -m device_agent``."""
     from device_agent import __main__ as program
 
-    tell = Teller().tell
+    tell = TimestampSender().tell
     _reroute(_pairs(WAYS, "="))
     _tell_messages(tell)
     _tell_control(tell)

@@ -6,9 +6,9 @@ from pathlib import Path
 import pytest
 from playwright.sync_api import Browser, Page, expect
 
-from benchmarks.console.frames import ROBOTS, kept, open_together
-from benchmarks.console.kinematic_arms import puppets
-from benchmarks.console.minimal_agents import crowd
+from benchmarks.console.frames import ROBOTS, memory_samples, open_together
+from benchmarks.console.kinematic_arms import start_kinematic_arms
+from benchmarks.console.minimal_agents import pair_minimal_agents
 from tests.harness.browser.browser import PATIENCE_MS, pages
 from tests.harness.browser.product import Machine, start_machine
 from tests.harness.network.brokers import wait_until
@@ -44,17 +44,17 @@ def shows_nothing_of_who_says_nothing(page: Page, machine: Machine, silent: str,
 
 def test_ten_robots_are_shown_as_they_say_and_memory_stays(own_machine: Machine, drawing_browser: Browser) -> None:
     with (
-        crowd(own_machine, 1) as (silent,),
-        puppets(own_machine, ROBOTS) as ids,
+        pair_minimal_agents(own_machine, 1) as (silent,),
+        start_kinematic_arms(own_machine, ROBOTS) as ids,
         pages(drawing_browser, own_machine) as (page,),
     ):
         open_together(page, own_machine, ids)
         wait_until(lambda: len(pans(page)) == ROBOTS and "" not in pans(page), "the joints of each")
         session = page.context.new_cdp_session(page)
-        before, at = kept(session), pans(page)
+        before, at = memory_samples(session), pans(page)
         wait_until(lambda: all(now != was for now, was in zip(pans(page), at, strict=True)), "each to move")
         page.wait_for_timeout(SHOWN_MS)
-        after = kept(session)
+        after = memory_samples(session)
         assert after.heap_mb < KEEPS * before.heap_mb, f"{before}, then {after}"
         assert after.nodes < KEEPS * before.nodes, f"{before}, then {after}"
         assert after.listeners < KEEPS * before.listeners, f"{before}, then {after}"

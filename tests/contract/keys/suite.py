@@ -13,7 +13,7 @@ from device_agent.protocol import codec
 from device_agent.protocol.errors import SignatureError
 from device_agent.protocol.security import signing
 from device_agent.protocol.security.key_rotation import KEYS_CONTEXT, NewKey
-from function_app.ports.signing_keys import SigningKeys, RotationRefused
+from function_app.ports.signing_keys import RotationRefused, SigningKeys
 
 Again = Callable[[], Awaitable[SigningKeys]]
 LEARN_MS, OVERLAP_MS = 1000, 5000

@@ -2,16 +2,16 @@
 
 import socket
 
-from benchmarks.faults.action_load import STEP_RAD, Order, doubled, lost, went_back
-from benchmarks.faults.fault_runs import Found
-from benchmarks.faults.recorder import Noted, Period
-from benchmarks.faults.stops import CALL, MESSAGE, SPEEDS, Stopped, judged
+from benchmarks.faults.action_load import STEP_RAD, RequestedAction, duplicated, lost, went_back
+from benchmarks.faults.fault_runs import FaultResult
+from benchmarks.faults.recorder import Period, Recorder
+from benchmarks.faults.stops import CALL, MESSAGE, SPEEDS, StopResult, evaluate
 from benchmarks.suites.faults import claims, faults_table, stops_table
 from tests.harness.network.brokers import wait_until
 
 
-def order(number: int, status: str, action: str = "a") -> Order:
-    return Order(number, "none", 0.0, action and f"{action}{number}", status)
+def order(number: int, status: str, action: str = "a") -> RequestedAction:
+    return RequestedAction(number, "none", 0.0, action and f"{action}{number}", status)
 
 
 def rest(*numbers: float) -> list[float]:
@@ -25,7 +25,7 @@ def test_an_accepted_order_without_an_end_is_lost_and_a_refused_one_is_not() -> 
 
 def test_an_order_that_began_twice_is_doubled() -> None:
     given = [order(1, "done"), order(2, "done"), order(3, "", action="")]
-    assert doubled(given, {"a1": 1, "a2": 2}) == [given[1]]
+    assert duplicated(given, {"a1": 1, "a2": 2}) == [given[1]]
 
 
 def test_a_move_that_is_done_again_after_a_later_one_is_seen_in_the_record() -> None:
@@ -42,9 +42,9 @@ def periods(*moved: float, braking_from: int) -> list[Period]:
     ]
 
 
-def stopped(found: list[Period], **more: str) -> Stopped:
+def stopped(found: list[Period], **more: str) -> StopResult:
     before = [Period(992.0, "streaming", 0.008, 1, 1)]
-    return judged(before, found, sent_ms=1000.0, **{"broker": "amqtt", "way": MESSAGE, "speed": "full speed", **more})
+    return evaluate(before, found, sent_ms=1000.0, **{"broker": "amqtt", "way": MESSAGE, "speed": "full speed", **more})
 
 
 def test_braking_is_the_first_period_under_the_stop_and_zero_the_first_without_motion() -> None:
@@ -63,7 +63,8 @@ def test_an_arm_at_rest_has_zero_where_it_is_stopped() -> None:
 
 def test_a_thing_that_moves_again_breaks_the_claim_of_rest() -> None:
     found = [
-        Found(fault="x", broker="amqtt", stop_ms=280.0, recovery_s=1.0, moved_again=again) for again in (False, True)
+        FaultResult(fault="x", broker="amqtt", stop_ms=280.0, recovery_s=1.0, moved_again=again)
+        for again in (False, True)
     ]
     stops = [
         stopped(periods(0.0, 0.0, braking_from=0), way=way, speed=speed) for way in (MESSAGE, CALL) for speed in SPEEDS
@@ -78,7 +79,7 @@ def test_a_thing_that_moves_again_breaks_the_claim_of_rest() -> None:
 
 
 def test_the_agent_is_heard(tmp_path) -> None:
-    noted = Noted(tmp_path / "s")
+    noted = Recorder(tmp_path / "s")
     with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as line:
         for text in ("begun arm1 x", "period arm0 10.5 streaming 0.001 3 7", "period arm0 18.5 stopped 0.002 3 7"):
             line.sendto(text.encode(), str(tmp_path / "s"))

@@ -6,17 +6,17 @@ from contextlib import ExitStack, closing
 import pytest
 
 from benchmarks.suites.path import ANSWERED, ASKED, parts, whole
-from benchmarks.tracing.timestamps import Mark, Marks, Teller
+from benchmarks.tracing.timestamps import Timestamp, TimestampReceiver, TimestampSender
 
 STEPS = (("in", "there"), ("out", "work"), (ANSWERED, "back"))
 
 
 def test_what_is_told_is_heard_at_once_with_its_time(monkeypatch: pytest.MonkeyPatch) -> None:
     with ExitStack() as stack:
-        marks = stack.enter_context(Marks())
+        marks = stack.enter_context(TimestampReceiver())
         for name, value in marks.settings.items():
             monkeypatch.setenv(name, value)
-        teller = stack.enter_context(closing(Teller()))
+        teller = stack.enter_context(closing(TimestampSender()))
         began_ns = time.monotonic_ns()
         teller.tell("one")
         teller.tell("two")
@@ -36,13 +36,13 @@ def test_what_is_told_is_heard_at_once_with_its_time(monkeypatch: pytest.MonkeyP
 
 def test_parts_run_from_each_step_to_the_next_and_add_up() -> None:
     marks = [
-        Mark("out", 500_000),  # of an exchange before
-        Mark(ASKED, 1_000_000),
-        Mark("in", 3_000_000),
-        Mark("else", 3_500_000),
-        Mark("out", 6_000_000),
-        Mark("in", 7_000_000),
-        Mark(ANSWERED, 10_000_000),
+        Timestamp("out", 500_000),  # of an exchange before
+        Timestamp(ASKED, 1_000_000),
+        Timestamp("in", 3_000_000),
+        Timestamp("else", 3_500_000),
+        Timestamp("out", 6_000_000),
+        Timestamp("in", 7_000_000),
+        Timestamp(ANSWERED, 10_000_000),
     ]
     found = parts(marks, STEPS)
     assert found == {"there": 2.0, "work": 3.0, "back": 4.0}
@@ -50,5 +50,7 @@ def test_parts_run_from_each_step_to_the_next_and_add_up() -> None:
 
 
 def test_what_was_not_told_whole_has_no_parts() -> None:
-    assert parts([Mark(ASKED, 0), Mark("in", 1), Mark(ANSWERED, 2)], STEPS) is None
-    assert parts([Mark(ASKED, 0), Mark("out", 1), Mark("in", 2), Mark(ANSWERED, 3)], STEPS) is None, "in another order"
+    assert parts([Timestamp(ASKED, 0), Timestamp("in", 1), Timestamp(ANSWERED, 2)], STEPS) is None
+    assert (
+        parts([Timestamp(ASKED, 0), Timestamp("out", 1), Timestamp("in", 2), Timestamp(ANSWERED, 3)], STEPS) is None
+    ), "in another order"

@@ -3,9 +3,9 @@
 import pytest
 
 from benchmarks import suites
-from benchmarks.baseline.interleaved import in_turns, table
+from benchmarks.baseline.interleaved import measure_interleaved, table
 from benchmarks.reporting import page
-from benchmarks.reporting.report import Claim, Report, Table, load, percentile, save, shown
+from benchmarks.reporting.report import Claim, Report, Table, format_cell, load, percentile, save
 
 
 def report(*claims: Claim) -> Report:
@@ -51,7 +51,7 @@ def test_percentiles_are_samples() -> None:
     assert [percentile([4.0, 1.0, 3.0, 2.0, 5.0], share) for share in (0.0, 0.5, 1.0)] == [1.0, 3.0, 5.0]
     with pytest.raises(ValueError, match="no sample"):
         percentile([], 0.5)
-    assert [shown(each) for each in (0.123456, 12.3456, 123.456, 1e6, 12_000, None)] == [
+    assert [format_cell(each) for each in (0.123456, 12.3456, 123.456, 1e6, 12_000, None)] == [
         "0.123", "12.3", "123", "1000000", "12,000", "–"
     ]  # fmt: skip
 
@@ -63,7 +63,9 @@ def test_paths_take_turns_and_may_tell_their_own_time() -> None:
         order.append(name)
         return own
 
-    found = in_turns({"a": lambda: path("a", 2.0), "b": lambda: path("b", None)}, rounds=3, each=2, warm_up=1)
+    found = measure_interleaved(
+        {"a": lambda: path("a", 2.0), "b": lambda: path("b", None)}, rounds=3, each=2, warm_up=1
+    )
     assert found["a"] == [2.0] * 6
     assert len(found["b"]) == 6
     assert sorted(order[2:6]) == ["a", "a", "b", "b"], "each has its turn in each round"

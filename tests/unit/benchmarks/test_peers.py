@@ -38,7 +38,7 @@ def test_an_exchange_waits_for_its_own_answer() -> None:
         late.append(threading.Timer(0.1, operator.hear, [sequence]))
         late[-1].start()
 
-    operator = operators.Operator(send)
+    operator = operators.PeerOperator(send)
     assert operator.exchange() >= 95
     assert len(late) == 1
 
@@ -46,7 +46,7 @@ def test_an_exchange_waits_for_its_own_answer() -> None:
 def test_an_exchange_without_an_answer_ends_the_run(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(operators, "PATIENCE_S", 0.05)
     with pytest.raises(TimeoutError, match="setpoint 1"):
-        operators.Operator(lambda _: None).exchange()
+        operators.PeerOperator(lambda _: None).exchange()
 
 
 def test_each_row_says_something_of_each_peer() -> None:

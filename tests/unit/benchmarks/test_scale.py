@@ -6,14 +6,14 @@ import os
 import pytest
 
 from benchmarks.scale import brokers, functions, mqtt_packets
-from benchmarks.scale.agent import Seen, Watcher
+from benchmarks.scale.agent import LoopObserver, LoopStatistics
 from benchmarks.scale.brokers import Run
 from benchmarks.scale.functions import Load
-from benchmarks.scale.http_load import Answered, Line, Request
+from benchmarks.scale.http_load import HttpLoadResult, RawHttpConnection, Request
 from benchmarks.scale.processes import family, processor_s, resident_mb
-from benchmarks.scale.publishers import SENT, Told, telemetry
-from benchmarks.scale.robots import Crew, ceilings
-from benchmarks.scale.subscriber import MEASURED, Heard, said_ms
+from benchmarks.scale.publishers import SENT, PublisherResult, telemetry
+from benchmarks.scale.robots import AgentProcess, ceilings
+from benchmarks.scale.subscriber import MEASURED, SubscriberResult, said_ms
 from device_agent.protocol import JointTelemetry, codec
 
 
@@ -46,8 +46,8 @@ def test_a_rate_is_carried_when_nothing_is_lost_or_late(
     run = Run(
         "amqtt",
         20.0,
-        Told(sent=10, late_ms=late_ms, took_s=1.0, processor_s=0.1, message_bytes=900),
-        Heard(heard, 0.1, p99_ms, 60.0, 0.1),
+        PublisherResult(sent=10, late_ms=late_ms, took_s=1.0, processor_s=0.1, message_bytes=900),
+        SubscriberResult(heard, 0.1, p99_ms, 60.0, 0.1),
         0.2,
     )
     assert run.carried is carried
@@ -57,8 +57,8 @@ def test_a_rate_is_carried_when_nothing_is_lost_or_late(
 
 
 def test_a_rate_that_the_robots_themselves_did_not_keep_is_not_carried() -> None:
-    told = Told(sent=10, late_ms=60.0, took_s=1.0, processor_s=0.1, message_bytes=900)
-    assert not Run("amqtt", 20.0, told, Heard(10, 0.1, 1.0, 2.0, 0.1), 0.2).carried
+    told = PublisherResult(sent=10, late_ms=60.0, took_s=1.0, processor_s=0.1, message_bytes=900)
+    assert not Run("amqtt", 20.0, told, SubscriberResult(10, 0.1, 1.0, 2.0, 0.1), 0.2).carried
 
 
 class Transport(asyncio.Transport):
@@ -71,8 +71,8 @@ class Transport(asyncio.Transport):
 
 
 def test_a_client_asks_on_when_an_answer_is_whole_and_counts_refusals_apart() -> None:
-    async def ask() -> Line:
-        line, transport = Line([b"second", b"first"]), Transport()
+    async def ask() -> RawHttpConnection:
+        line, transport = RawHttpConnection([b"second", b"first"]), Transport()
         line.connection_made(transport)
         line.begin(1e12)
         line.data_received(b"HTTP/1.1 200 OK\r\nContent-Len")
@@ -98,7 +98,7 @@ def test_a_request_is_one_that_a_server_reads() -> None:
 
 
 def load(what: str, per_s: float) -> Load:
-    answered = Answered(
+    answered = HttpLoadResult(
         count=10,
         per_s=per_s,
         p50_ms=1.0,
@@ -115,11 +115,11 @@ def load(what: str, per_s: float) -> Load:
 def test_reads_are_compared_with_the_bare_application() -> None:
     claims = functions.claims([load(functions.LIST, 300), load(functions.ONE, 500), load(functions.BARE, 1000)])
     assert [(claim.seen, claim.holds) for claim in claims] == [(0.3, False), (0.5, True)]
-    assert functions.middle([load("a", 3), load("a", 1), load("a", 2)]).answered.per_s == 2
+    assert functions.median_of([load("a", 3), load("a", 1), load("a", 2)]).answered.per_s == 2
 
 
 def test_lateness_is_what_a_period_took_more_than_it_should() -> None:
-    watcher = Watcher()
+    watcher = LoopObserver()
     watcher.periods_s = {1: 3600.0}
     watcher.note(1)
     watcher.note(2)
@@ -131,15 +131,15 @@ def test_lateness_is_what_a_period_took_more_than_it_should() -> None:
 
 
 def test_memory_of_a_robot_is_what_more_of_them_take() -> None:
-    crew = Crew("light", 50.0, 1, 5, Seen(5, 100, 0.1, 7.9, 20.0), 10.0, 140.0)
+    crew = AgentProcess("light", 50.0, 1, 5, LoopStatistics(5, 100, 0.1, 7.9, 20.0), 10.0, 140.0)
     assert crew.in_time
     assert crew.row(100.0)[-1] == 10.0
     assert crew.row(None)[-1] is None
 
 
 def test_the_most_that_were_in_time_are_named() -> None:
-    def crew(agents: int, count: int, late_ms: float) -> Crew:
-        return Crew("light", 50.0, agents, count, Seen(count, 100, 0.1, late_ms, 20.0), 10.0, 140.0)
+    def crew(agents: int, count: int, late_ms: float) -> AgentProcess:
+        return AgentProcess("light", 50.0, agents, count, LoopStatistics(count, 100, 0.1, late_ms, 20.0), 10.0, 140.0)
 
     found = ceilings([crew(1, 8, 1.0), crew(1, 16, 7.9), crew(1, 32, 8.1), crew(2, 16, 9.0)])
     assert found == ["Of one agent's, 16 light ones were in time at 50 Hz."]

@@ -7,7 +7,7 @@ import time
 
 import pytest
 
-from benchmarks.soak.processes import CHILDREN, STARTER, TOGETHER, Sample, Watch, look
+from benchmarks.soak.processes import CHILDREN, STARTER, TOGETHER, ProcessWatcher, Sample, look
 from benchmarks.soak.trends import after_warm_up, drawn_together, theil_sen
 
 
@@ -74,7 +74,7 @@ def test_a_process_and_those_below_it_are_looked_at() -> None:
 
 def test_samples_are_in_the_file_before_the_run_ends(tmp_path) -> None:
     file = tmp_path / "new" / "soak.csv"
-    with Watch(os.getpid(), every_s=0.01, file=file) as watch:
+    with ProcessWatcher(os.getpid(), every_s=0.01, file=file) as watch:
         deadline_s = time.monotonic() + 60
         while len(file.read_text().splitlines() if file.exists() else ()) < 3:
             assert time.monotonic() < deadline_s
