@@ -1,41 +1,54 @@
-"""The README's own words, run as they stand; only addresses and the folder are those of the test's machine."""
+"""The commands of README.md and use-the-api.md, and the example programs, against a running product."""
 
 import os
 import re
 import signal
 import subprocess
-import time
+import sys
+from collections.abc import Iterator
 from pathlib import Path
 
-from tests.harness.browser.product import Machine
+import pytest
+
+from tests.harness.browser.product import Api, Machine
+from tests.harness.documents import SERVER, block
 from tests.harness.network.brokers import wait_until
 from tests.harness.paths import ROOT
 
+README = ROOT / "README.md"
+API_GUIDE = ROOT / "docs" / "guides" / "use-the-api.md"
+SCRIPTS = ROOT / "docs" / "reference" / "scripts.md"
+EXAMPLES = ROOT / "examples"
+_AWAIT_ONLINE = """for _ in $(seq 200); do
+    curl -sS -H "Authorization: Bearer $TOKEN" "$API/devices/$AGENT-second" | grep -q '"online": *true' && break
+    sleep 0.1
+done"""
 
-def block(name: str, machine: Machine, home: Path) -> str:
-    found = re.search(rf"<!-- runs: {name} -->\n```sh\n(.*?)```", (ROOT / "README.md").read_text(), re.DOTALL)
-    assert found, f"the README has no block '{name}'"
-    text = found[1].replace("127.0.0.1:8080", f"127.0.0.1:{machine.port}").replace("8081", str(machine.port + 1))
+
+def commands(page: Path, name: str, machine: Machine, home: Path) -> str:
+    """A block of a page with the addresses and the folder of the test."""
+    text = block(page, "runs", name).replace(SERVER, machine.url).replace("8081", str(machine.port + 1))
     return text.replace(".telescope/", f"{home}/").replace("credentials.json", str(home / "credentials.json"))
 
 
 def test_curl_pairs_a_second_robot_and_runs_a_movement_on_it(machine: Machine, tmp_path: Path) -> None:
-    said = tmp_path / "agent.log"
-    with said.open("w") as log:
+    output = tmp_path / "agent.log"
+    with output.open("w") as log:
         agent = subprocess.Popen(
-            ["bash", "-e", "-c", block("agent", machine, tmp_path)],
+            ["bash", "-e", "-c", commands(README, "agent", machine, tmp_path)],
             cwd=ROOT,
             stdout=log,
             stderr=log,
             start_new_session=True,
         )
     try:
-        wait_until(lambda: "claim code" in said.read_text(), "the claim code")
-        code = re.search(r"claim code (\S+)", said.read_text())
+        wait_until(lambda: "claim code" in output.read_text(), "the claim code")
+        code = re.search(r"claim code (\S+)", output.read_text())
         assert code
-        script = "\n".join(block(name, machine, tmp_path) for name in ("curl", "mqtt"))
-        # A person reads the code and types; the agent has long been up by then.
-        script = script.replace('post "devices/', f'{_AWAIT}\npost "devices/', 1)
+        pages = [(README, "curl"), (API_GUIDE, "mqtt"), (API_GUIDE, "control")]
+        script = "\n".join(commands(page, name, machine, tmp_path) for page, name in pages)
+        # A person reads the code and types; the agent has long been online by then.
+        script = script.replace('post "devices/', f'{_AWAIT_ONLINE}\npost "devices/', 1)
         done = subprocess.run(
             ["bash", "-euo", "pipefail", "-c", script],
             cwd=ROOT,
@@ -45,23 +58,70 @@ def test_curl_pairs_a_second_robot_and_runs_a_movement_on_it(machine: Machine, t
             timeout=110,
             check=False,
         )
-        assert done.returncode == 0, done.stdout + done.stderr + said.read_text()
+        assert done.returncode == 0, done.stdout + done.stderr + output.read_text()
         assert '"status":"done"' in done.stdout.replace(" ", "")
         assert done.stdout.count('"position_rad"') >= 5
+        assert '"epoch"' in done.stdout
     finally:
         os.killpg(agent.pid, signal.SIGTERM)
         agent.wait(20)
     with machine.api() as api:
         second = next(each for each in api.get("/devices")["items"] if each["name"] == "second")
-        deadline_s = time.monotonic() + 20
-        while second["online"] and time.monotonic() < deadline_s:
-            second = api.get(f"/devices/{second['id']}")
-            time.sleep(0.1)
-        assert not second["online"]
+        wait_until(lambda: not api.get(f"/devices/{second['id']}")["online"], "the agent to be offline")
         api.http.delete(f"/agents/{second['agent']}").raise_for_status()
 
 
-_AWAIT = """for _ in $(seq 200); do
-    curl -sS -H "Authorization: Bearer $TOKEN" "$API/devices/$AGENT-second" | grep -q '"online": *true' && break
-    sleep 0.1
-done"""
+@pytest.fixture(scope="module")
+def api(machine: Machine) -> Iterator[Api]:
+    with machine.api() as api:
+        yield api
+
+
+def run_example(machine: Machine, api: Api, *arguments: str) -> str:
+    """Run a program of ``examples/`` with an API key of an operator; returns its output."""
+    del api  # signed in, so the account exists
+    environment = os.environ | {"TELESCOPE_HOME": str(machine.home)}
+    key = subprocess.run(
+        [sys.executable, "-m", "function_app", "api-key", "--name", "examples", "--role", "operator"],
+        cwd=ROOT,
+        env=environment,
+        capture_output=True,
+        text=True,
+        check=True,
+    ).stdout.strip()
+    done = subprocess.run(
+        [sys.executable, str(EXAMPLES / arguments[0]), *arguments[1:]],
+        cwd=ROOT,
+        env=environment | {"TELESCOPE_URL": machine.url, "TELESCOPE_TOKEN": key},
+        capture_output=True,
+        text=True,
+        timeout=110,
+        check=False,
+    )
+    assert done.returncode == 0, done.stdout + done.stderr
+    return done.stdout
+
+
+@pytest.mark.parametrize(
+    ("program", "arguments", "expected"),
+    [
+        ("list_and_move.py", ("ur5", "wave"), "wave: done"),
+        ("watch_telemetry.py", ("ur5", "--samples", "3"), "elbow"),
+        ("stream_setpoints.py", ("ur5", "wrist_3", "0.2"), "reached"),
+    ],
+)
+def test_each_example_program_runs(
+    machine: Machine, api: Api, program: str, arguments: tuple[str, ...], expected: str
+) -> None:
+    device = api.device("ur5")
+    assert device["online"]
+    assert expected in run_example(machine, api, program, *arguments)
+
+
+@pytest.mark.parametrize("name", ["nod", "greet"])
+def test_example_movements_run(api: Api, name: str) -> None:
+    source = (EXAMPLES / "nod.py").read_text() if name == "nod" else block(SCRIPTS, "file", "movements/greet.py")
+    api.http.put(f"/robot-types/ur5/movements/{name}", json={"source": source}).raise_for_status()
+    body = {"request": {"kind": "run_movement", "name": name}, "wait_ms": 30_000, "wait_for": "done"}
+    assert api.post(f"/devices/{api.device('ur5')['id']}/actions", body)["status"] == "done"
+    api.http.delete(f"/robot-types/ur5/movements/{name}").raise_for_status()

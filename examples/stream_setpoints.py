@@ -1,0 +1,59 @@
+"""Move one joint with streamed setpoints. Usage: ``python examples/stream_setpoints.py DEVICE JOINT POSITION_RAD``.
+
+Takes the lease, streams setpoints that echo the newest telemetry tick, and releases the lease. The robot stops by
+itself 300 ms after the last setpoint.
+"""
+
+import json
+import queue
+import sys
+import time
+
+from telescope_client import call, connect_to_broker, find_device, topic
+
+PERIOD_S = 0.025
+TIMEOUT_S = 20.0
+TOLERANCE_RAD = 0.02
+
+name, joint, position = sys.argv[1:]
+target_rad = float(position)
+device = find_device(name)
+lease = call("POST", f"/devices/{device['id']}/lease", {})
+messages: queue.Queue[tuple[str, bytes]] = queue.Queue()
+watcher = connect_to_broker({"purpose": "view"})
+watcher.on_message = lambda _client, _userdata, message: messages.put((message.topic, message.payload))
+watcher.on_connect = lambda *_: watcher.subscribe([(topic(device, "desc"), 1), (topic(device, "tele/joints"), 0)])
+watcher.loop_start()
+control = connect_to_broker({"purpose": "control", "device": device["id"], "epoch": lease["epoch"]})
+control.loop_start()
+
+joints: list[str] = []
+sequence = 0
+deadline_s = time.monotonic() + TIMEOUT_S
+try:
+    while True:
+        if time.monotonic() > deadline_s:
+            sys.exit(f"{joint} did not reach {target_rad} rad")
+        source, payload = messages.get(timeout=TIMEOUT_S)
+        message = json.loads(payload)
+        if source.endswith("/desc"):
+            joints = [each["name"] for each in message["joints"]]
+        if source.endswith("/desc") or not joints:
+            continue
+        if abs(message["position_rad"][joints.index(joint)] - target_rad) < TOLERANCE_RAD:
+            print(f"{joint} reached {target_rad} rad; loop age {message['loop_age_ms']:.0f} ms")
+            break
+        sequence += 1
+        setpoint = {
+            "epoch": lease["epoch"],
+            "sequence": sequence,
+            "echo_tick_ms": message["tick_ms"],
+            "sent_ms": time.time() * 1000,
+            "target": {"kind": "joints", "position_rad": {joint: target_rad}},
+        }
+        control.publish(topic(device, f"ctl/{lease['epoch']}"), json.dumps(setpoint), qos=0)
+        time.sleep(PERIOD_S)
+finally:
+    call("DELETE", f"/devices/{device['id']}/lease?epoch={lease['epoch']}")
+    control.disconnect()
+    watcher.disconnect()
