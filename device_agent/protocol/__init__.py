@@ -1,13 +1,15 @@
-"""The messages of the wire contract, one struct each: ``reports`` from an agent, ``orders`` to it.
+"""Wire contract between operators, the cloud and agents: all messages, as strict ``msgspec`` structs.
 
-Times: ``at_ms`` is the sender's wall clock [ms since 1970, UTC], to show and to store; ``tick_ms`` is the agent's
-monotonic clock [ms], the only one that safety reads. Quaternions are (w, x, y, z).
+``at_ms`` is the sender's wall clock [ms since 1970, UTC], for display and storage. ``tick_ms`` is the agent's monotonic
+clock [ms]; safety checks read no other clock. Quaternions are (w, x, y, z). The package depends on msgspec,
+cryptography and pyjwt only.
 """
 
 from typing import Any
 
 import msgspec
 
+from device_agent.protocol.acks import TERMINAL, Ack, AckStatus, Reason
 from device_agent.protocol.commands import (
     LANGUAGE_PATTERN,
     SHIPPED,
@@ -46,34 +48,21 @@ from device_agent.protocol.commands import (
     WithdrawRequest,
 )
 from device_agent.protocol.description import (
-    TERMINAL,
-    Ack,
-    AckStatus,
-    ActionState,
     BaseLimits,
     Body,
     Control,
     Description,
     Diagnostic,
-    Event,
-    Fault,
     Geometry,
     InterlockDescription,
     Joint,
-    JointTelemetry,
-    LeaseState,
-    Measurements,
-    Mode,
-    OpenRequest,
-    Presence,
-    Reason,
-    Restriction,
-    State,
-    StopLatch,
+    MimicJoint,
+    PositionDependentLimit,
     Stream,
     Twin,
     TwinJoint,
 )
+from device_agent.protocol.events import Event, EventKind
 from device_agent.protocol.fields import (
     FIELD_PATTERN,
     MAX_VALUES,
@@ -88,6 +77,18 @@ from device_agent.protocol.fields import (
     Text,
     Vector3,
 )
+from device_agent.protocol.state import (
+    ActionState,
+    Fault,
+    LeaseState,
+    Mode,
+    OpenRequest,
+    Presence,
+    Restriction,
+    State,
+    StopLatch,
+)
+from device_agent.protocol.telemetry import JointTelemetry, Measurements
 
 __all__ = [
     "FIELD_PATTERN",
@@ -111,6 +112,7 @@ __all__ = [
     "Drive",
     "DriveTarget",
     "Event",
+    "EventKind",
     "Express",
     "Fault",
     "Field",
@@ -129,11 +131,13 @@ __all__ = [
     "LookAt",
     "Measurements",
     "Milliseconds",
+    "MimicJoint",
     "Mode",
     "MoveJoints",
     "MovePose",
     "OpenRequest",
     "Pose",
+    "PositionDependentLimit",
     "Presence",
     "Quaternion",
     "Reason",
@@ -169,7 +173,7 @@ __all__ = [
 
 
 def schema_components() -> tuple[dict[str, Any], dict[str, Any]]:
-    """JSON Schema of every message: ``(references by name, definitions)``, for the generated documents."""
+    """JSON Schema of every message: references by name, and definitions."""
     kinds = (Presence, Description, Twin, State, JointTelemetry, Measurements, Event, Ack, Command, Setpoint, Stop)
     references, definitions = msgspec.json.schema_components(kinds, ref_template="#/components/schemas/{name}")
     return dict(zip((kind.__name__ for kind in kinds), references, strict=True)), definitions

@@ -1,15 +1,15 @@
-"""Pictures at ``cam/{name}``: a header of 20 bytes, then the JPEG. The only messages that are not JSON.
+"""Camera frames at ``cam/{name}``: a header of 20 bytes, then the JPEG. The only messages that are not JSON.
 
-| bytes | what |
+| bytes | content |
 | --- | --- |
 | 0…1 | ``TS`` |
 | 2 | version, 1 |
-| 3 | how the picture is encoded: 1 is JPEG |
-| 4…7 | sequence: counts up from one start of the agent to the next |
-| 8…15 | ``tick_ms``: when it was taken, on the agent's monotonic clock [ms] |
-| 16…17, 18…19 | width and height in pixels |
+| 3 | encoding; 1: JPEG |
+| 4…7 | sequence; starts anew with each start of the agent |
+| 8…15 | ``tick_ms``: time of exposure on the agent's monotonic clock [ms] |
+| 16…17, 18…19 | width and height [pixels] |
 
-All numbers without sign, the highest byte first (in a browser ``DataView`` without a second thought).
+All numbers are unsigned and big-endian, the default of ``DataView`` in a browser.
 """
 
 import struct
@@ -21,11 +21,11 @@ from device_agent.protocol.errors import ProtocolError
 _HEADER = struct.Struct(">2sBBIQHH")
 _MAGIC, _VERSION, _JPEG = b"TS", 1, 1
 HEADER_BYTES = _HEADER.size
-_MOST = 2**32
+_SEQUENCE_MODULUS = 2**32
 
 
 class CameraFrame(NamedTuple):
-    """One picture. ``tick_ms``: when it was taken, on the agent's own clock; ``width`` and ``height`` in pixels."""
+    """One frame. ``tick_ms``: time of exposure on the agent's monotonic clock; ``width`` and ``height`` in pixels."""
 
     sequence: int
     tick_ms: int
@@ -35,29 +35,31 @@ class CameraFrame(NamedTuple):
 
 
 def encode(frame: CameraFrame) -> bytes:
-    """One picture as it travels.
+    """Encode one frame.
 
     Raises:
-        ProtocolError: It is longer than a message may be, or its size does not fit the header.
+        ProtocolError: The frame exceeds the maximum message size, or a number does not fit the header.
     """
     if HEADER_BYTES + len(frame.jpeg) > MAX_BYTES:
-        raise ProtocolError(f"a picture of {len(frame.jpeg)} bytes; {MAX_BYTES - HEADER_BYTES} is the most")
+        raise ProtocolError(f"the frame has {len(frame.jpeg)} bytes; the limit is {MAX_BYTES - HEADER_BYTES}")
     try:
-        header = _HEADER.pack(_MAGIC, _VERSION, _JPEG, frame.sequence % _MOST, frame.tick_ms, frame.width, frame.height)
+        header = _HEADER.pack(
+            _MAGIC, _VERSION, _JPEG, frame.sequence % _SEQUENCE_MODULUS, frame.tick_ms, frame.width, frame.height
+        )
     except struct.error as error:
-        raise ProtocolError(f"a picture of {frame.width} x {frame.height} at {frame.tick_ms} ms: {error}") from error
+        raise ProtocolError(f"frame of {frame.width} x {frame.height} at {frame.tick_ms} ms: {error}") from error
     return header + frame.jpeg
 
 
 def decode(payload: bytes) -> CameraFrame:
-    """A picture that arrived.
+    """Decode a received frame.
 
     Raises:
-        ProtocolError: It is none of this version.
+        ProtocolError: The payload is not a frame of this version.
     """
     if not HEADER_BYTES <= len(payload) <= MAX_BYTES:
-        raise ProtocolError(f"a picture of {len(payload)} bytes is none")
+        raise ProtocolError(f"a payload of {len(payload)} bytes is not a camera frame")
     magic, version, kind, sequence, tick_ms, width, height = _HEADER.unpack_from(payload)
     if (magic, version, kind) != (_MAGIC, _VERSION, _JPEG):
-        raise ProtocolError("the header is not that of a picture of version 1")
+        raise ProtocolError("the header is not that of a camera frame of version 1")
     return CameraFrame(sequence, tick_ms, width, height, payload[HEADER_BYTES:])

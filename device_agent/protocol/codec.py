@@ -1,7 +1,7 @@
-"""JSON on the wire, strict and finite.
+"""Strict JSON encoding and decoding of messages, with finite numbers only.
 
-NaN and infinities never pass: the decoder refuses the literals and numbers out of range, and the encoder refuses to
-write them (``msgspec`` would silently write ``null``).
+The decoder rejects NaN, infinities and out-of-range numbers. The encoder raises instead of writing ``null`` for them,
+as ``msgspec`` would.
 """
 
 import math
@@ -12,9 +12,9 @@ import msgspec
 from device_agent.protocol.errors import ProtocolError
 
 MAX_BYTES = 128 * 1024
-"""Largest message that AWS IoT Core takes (facts: brokers)."""
+"""Maximum message size of AWS IoT Core."""
 MAX_RETAINED_BYTES = 64 * 1024
-"""Largest retained message that Event Grid takes."""
+"""Maximum retained message size of Azure Event Grid."""
 
 T = TypeVar("T")
 _encoder = msgspec.json.Encoder()
@@ -22,27 +22,28 @@ _decoders: dict[Any, msgspec.json.Decoder[Any]] = {}
 
 
 def encode(message: Any, *, limit: int = MAX_BYTES) -> bytes:
-    """One message as JSON.
+    """Encode one message as JSON.
 
     Raises:
-        ProtocolError: It holds a NaN or an infinity, or is longer than ``limit`` bytes.
+        ProtocolError: The message holds a NaN or an infinity, or is longer than ``limit`` bytes.
     """
     payload = _encoder.encode(message)
-    if b"null" in payload and not _finite(message):  # which is what it has made of such a number
-        raise ProtocolError(f"{type(message).__name__} holds a number that is not finite")
+    if b"null" in payload and not _finite(message):  # msgspec writes null for them
+        raise ProtocolError(f"{type(message).__name__} contains a number that is not finite")
     if len(payload) > limit:
-        raise ProtocolError(f"{type(message).__name__} is {len(payload)} bytes, {limit} is the most")
+        raise ProtocolError(f"{type(message).__name__} has {len(payload)} bytes; the limit is {limit}")
     return payload
 
 
 def decode(payload: bytes, kind: type[T]) -> T:
-    """A message of the given type.
+    """Decode a message of the given type.
 
     Raises:
-        ProtocolError: Not JSON, not this type, not finite, or longer than ``MAX_BYTES``; the text says which field.
+        ProtocolError: The payload is not JSON, not of this type, not finite or longer than ``MAX_BYTES``. The message
+            names the field.
     """
     if len(payload) > MAX_BYTES:
-        raise ProtocolError(f"message of {len(payload)} bytes, {MAX_BYTES} is the most")
+        raise ProtocolError(f"the message has {len(payload)} bytes; the limit is {MAX_BYTES}")
     decoder = _decoders.get(kind)
     if decoder is None:
         decoder = _decoders[kind] = msgspec.json.Decoder(kind, strict=True)

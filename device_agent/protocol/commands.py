@@ -1,6 +1,6 @@
-"""What travels towards a robot: signed commands, streamed setpoints, Stop.
+"""Messages to a device: signed commands, streamed setpoints and Stop.
 
-Unknown fields are refused: an old agent must not obey half of a newer order.
+Unknown fields are rejected: an older agent must not execute part of a newer command.
 """
 
 from typing import Annotated, Any
@@ -11,17 +11,17 @@ from device_agent.protocol.fields import Count, Id, JointPositions, Label, Milli
 from device_agent.protocol.security.key_rotation import MAX_STATEMENTS, Statement
 
 LANGUAGE_PATTERN = r"([A-Za-z]{1,8}(-[A-Za-z0-9]{1,8})*)?"
-"""As in BCP 47: ``en``, ``sk``, ``en-GB``; or nothing."""
+"""Language tag as in BCP 47 (``en``, ``sk``, ``en-GB``), or empty."""
 
 
-class _Order(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True, tag_field="kind"):
-    """What is asked; its ``kind`` says which."""
+class _Request(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True, tag_field="kind"):
+    """Base of all requests; the tag ``kind`` names the request."""
 
 
-class GrantLease(_Order, frozen=True, kw_only=True, tag="grant_lease"):
-    """Control of the device now belongs to ``holder``, for ``lease_ms`` from the moment of arrival. Also renews.
+class GrantLease(_Request, frozen=True, kw_only=True, tag="grant_lease"):
+    """``holder`` has control for ``lease_ms`` from the time of arrival. Also renews a lease.
 
-    ``reason``: why it was taken from somebody else, for that person to read.
+    ``reason``: why control was taken from another operator; shown to that operator.
     """
 
     holder: Label
@@ -29,34 +29,37 @@ class GrantLease(_Order, frozen=True, kw_only=True, tag="grant_lease"):
     reason: Text = ""
 
 
-class ReleaseLease(_Order, frozen=True, kw_only=True, tag="release_lease"):
-    """Nobody controls the device any more; what moves is brought to a hold."""
+class ReleaseLease(_Request, frozen=True, kw_only=True, tag="release_lease"):
+    """Ends the lease; motion is brought to a hold."""
 
 
-class RequestControl(_Order, frozen=True, kw_only=True, tag="ask_lease"):
-    """Show the holder, and everybody, that somebody asks for control. Changes nothing else; lapses by itself."""
+class RequestControl(_Request, frozen=True, kw_only=True, tag="ask_lease"):
+    """Shows all viewers that ``requester`` asks for control. Changes nothing else and expires by itself."""
 
     request: Id
     requester: Label
     answer_within_ms: Annotated[int, Meta(ge=1, le=3_600_000)]
 
 
-class WithdrawRequest(_Order, frozen=True, kw_only=True, tag="drop_request"):
-    """Nobody asks any more: refused, or withdrawn."""
+class WithdrawRequest(_Request, frozen=True, kw_only=True, tag="drop_request"):
+    """Removes a request for control that was refused or withdrawn."""
 
     request: Id
 
 
 SHIPPED = "telescope"
-"""The author of movements that come with Telescope's own robot types. No account's id: those are longer."""
+"""Author of movements that ship with Telescope. Not a valid account id: those are longer."""
 
 
-class RunMovement(_Order, frozen=True, kw_only=True, tag="run_movement"):
-    """Run one movement script. The source must hash to ``sha256`` (hex).
+class RunMovement(_Request, frozen=True, kw_only=True, tag="run_movement"):
+    """Runs one movement script. The source must hash to ``sha256`` (hex).
 
-    ``signature`` is the one that was made, with the cloud's key ``key``, when the movement was saved: over robot type,
-    name, version and hash. ``author`` is the account that saved it, or ``SHIPPED``: each author counts versions by
-    itself, and a device never runs an older one than it has. It is ended after ``timeout_ms``.
+    Attributes:
+        author: Account that saved the movement, or ``SHIPPED``. Versions are counted per author, and a device never
+            runs an older version than before.
+        key: Id of the cloud's key that signed the movement when it was saved.
+        signature: Signature over robot type, name, version and hash.
+        timeout_ms: The script is terminated after this time [ms].
     """
 
     robot_type: Id
@@ -75,19 +78,23 @@ Speed = Annotated[float, Meta(gt=0, le=1, description="share of each joint's vel
 Share = Annotated[float, Meta(ge=0, le=1)]
 
 
-class MoveJoints(_Order, frozen=True, kw_only=True, tag="move_joints"):
-    """Move to joint positions and end there; ``plan``: around what is in between."""
+class MoveJoints(_Request, frozen=True, kw_only=True, tag="move_joints"):
+    """Move to joint positions. ``plan``: avoid obstacles."""
 
     position_rad: JointPositions
     speed: Speed = 0.5
     plan: bool = False
 
 
-class MovePose(_Order, frozen=True, kw_only=True, tag="move_pose"):
-    """Bring a frame to a pose in the robot's base frame and end there; no frame: the last of the device's.
+class MovePose(_Request, frozen=True, kw_only=True, tag="move_pose"):
+    """Move a frame to a pose in the robot's base frame.
 
-    The orientation is a quaternion (w, x, y, z), or roll, pitch and yaw about the base's axes; with neither the frame
-    keeps its own. ``straight``: on a straight line. ``plan``: around what is in between.
+    Attributes:
+        quaternion: Target orientation (w, x, y, z).
+        rpy_rad: Target roll, pitch and yaw about the axes of the base; without either orientation, it is kept.
+        frame: Frame to move; empty for the device's last frame.
+        straight: Move on a straight line.
+        plan: Avoid obstacles.
     """
 
     position_m: Vector3
@@ -99,49 +106,49 @@ class MovePose(_Order, frozen=True, kw_only=True, tag="move_pose"):
     plan: bool = False
 
 
-class Say(_Order, frozen=True, kw_only=True, tag="say"):
-    """Speak ``text``, and end when it is said; ``language`` as ``en`` or ``sk``, or empty for the robot's own."""
+class Say(_Request, frozen=True, kw_only=True, tag="say"):
+    """Speak ``text``; ends when speech ends. ``language``: ``en``, ``sk`` …; empty for the robot's default."""
 
     text: Annotated[str, Meta(min_length=1, max_length=2000)]
     language: Annotated[str, Meta(pattern=f"^{LANGUAGE_PATTERN}$")] = ""
 
 
-class Express(_Order, frozen=True, kw_only=True, tag="express"):
-    """Show one of the device's expressions; ``strength`` 0 is home."""
+class Express(_Request, frozen=True, kw_only=True, tag="express"):
+    """Show an expression of the device; ``strength`` 0 is the home position."""
 
     name: Id
     strength: Share = 1.0
 
 
-class TakePosture(_Order, frozen=True, kw_only=True, tag="take_posture"):
-    """Move to one of the device's postures."""
+class TakePosture(_Request, frozen=True, kw_only=True, tag="take_posture"):
+    """Move to a posture of the device."""
 
     name: Id
     speed: Speed = 0.5
 
 
-class RunBehaviour(_Order, frozen=True, kw_only=True, tag="run_behaviour"):
-    """Run one of the device's behaviours to its end."""
+class RunBehaviour(_Request, frozen=True, kw_only=True, tag="run_behaviour"):
+    """Run a behaviour of the device to its end."""
 
     name: Id
 
 
-class SetStiffness(_Order, frozen=True, kw_only=True, tag="set_stiffness"):
-    """Let joints hold with ``value`` of their strength, 0: limp; no joints: all. It lasts beyond the action."""
+class SetStiffness(_Request, frozen=True, kw_only=True, tag="set_stiffness"):
+    """Set the holding strength of joints to the share ``value``; 0: limp. No joints: all. Outlasts the action."""
 
     value: Share
     joints: Annotated[tuple[Label, ...], Meta(max_length=128)] = ()
 
 
-class LookAt(_Order, frozen=True, kw_only=True, tag="look_at"):
+class LookAt(_Request, frozen=True, kw_only=True, tag="look_at"):
     """Turn the gaze to a point x, y, z in the robot's base frame [m]."""
 
     position_m: Vector3
     speed: Speed = 0.5
 
 
-class Drive(_Order, frozen=True, kw_only=True, tag="drive"):
-    """Move the base at a velocity for a time, then stand; ``turn_rad_s`` is counter-clockwise."""
+class Drive(_Request, frozen=True, kw_only=True, tag="drive"):
+    """Drive the base at a velocity for a time, then stop; ``turn_rad_s`` is counter-clockwise."""
 
     forward_m_s: float = 0.0
     left_m_s: float = 0.0
@@ -149,73 +156,73 @@ class Drive(_Order, frozen=True, kw_only=True, tag="drive"):
     duration_s: Annotated[float, Meta(gt=0, le=60)] = 1.0
 
 
-class GoTo(_Order, frozen=True, kw_only=True, tag="go_to"):
-    """Go to a place in the room, around what stands there now; ``yaw_rad``: how to stand, counter-clockwise from x."""
+class GoTo(_Request, frozen=True, kw_only=True, tag="go_to"):
+    """Navigate to a position in the room around obstacles; ``yaw_rad``: final heading, counter-clockwise from x."""
 
     x_m: float
     y_m: float
     yaw_rad: float | None = None
 
 
-class CollectData(_Order, frozen=True, kw_only=True, tag="gather"):
-    """Measure these streams of a room device at this rate for a time, then again as before; no streams: all."""
+class CollectData(_Request, frozen=True, kw_only=True, tag="gather"):
+    """Measure streams of a room device at another rate for a time; no streams: all."""
 
     streams: Annotated[tuple[Id, ...], Meta(max_length=16)] = ()
     rate_hz: Annotated[float, Meta(ge=0.001, le=50)]
     duration_s: Annotated[float, Meta(gt=0, le=86_400)]
 
 
-class TakePicture(_Order, frozen=True, kw_only=True, tag="shoot"):
-    """Measure these streams of a room device once, now; no streams: all. The result has the ``values``."""
+class TakePicture(_Request, frozen=True, kw_only=True, tag="shoot"):
+    """Measure streams of a room device once, now; no streams: all. The result contains the ``values``."""
 
     streams: Annotated[tuple[Id, ...], Meta(max_length=16)] = ()
 
 
-class CaptureRaw(_Order, frozen=True, kw_only=True, tag="capture"):
-    """Take a raw picture or scan and store it; the result names the ``upload``."""
+class CaptureRaw(_Request, frozen=True, kw_only=True, tag="capture"):
+    """Capture raw data and upload it; the result names the ``upload``."""
 
     name: Id
 
 
-class SetControl(_Order, frozen=True, kw_only=True, tag="set_control"):
-    """Set a control of a room device, within its limits and in its unit; the result says what was ``applied``."""
+class SetControl(_Request, frozen=True, kw_only=True, tag="set_control"):
+    """Set a control of a room device, within its limits and in its unit. The result contains the ``applied`` value."""
 
     control: Id
     value: float
 
 
 RoomTask = CollectData | TakePicture | CaptureRaw | SetControl
-"""What is done with devices of a room."""
+"""Actions of a room device."""
 RobotTask = MoveJoints | MovePose | Say | Express | TakePosture | RunBehaviour | SetStiffness | LookAt | Drive | GoTo
 """Actions of a robot. A movement script makes the same requests with the same messages."""
 Task = RobotTask | RoomTask
 """Actions that the API passes to a device unchanged."""
 
 
-class CancelAction(_Order, frozen=True, kw_only=True, tag="cancel_action"):
-    """End the named action; the device holds where it is."""
+class CancelAction(_Request, frozen=True, kw_only=True, tag="cancel_action"):
+    """Cancel the named action; the device holds its position."""
 
     action: Id
 
 
-class StopDevice(_Order, frozen=True, kw_only=True, tag="stop_device"):
+class StopDevice(_Request, frozen=True, kw_only=True, tag="stop_device"):
     """Latch Stop."""
 
     reason: Text = ""
 
 
-class ResetStop(_Order, frozen=True, kw_only=True, tag="reset_stop"):
-    """Release the Stop latch. Nothing resumes.
+class ResetStop(_Request, frozen=True, kw_only=True, tag="reset_stop"):
+    """Reset the Stop latch. Motion does not resume.
 
-    It brings an epoch of its own, which ends with it: what was ordered before the reset is never obeyed after it, and a
-    reset that comes late, or again, is older than the latch that it finds.
+    The command carries an epoch of its own, which ends with it. The device therefore rejects commands issued before the
+    reset, and a delayed or repeated reset is older than a newer latch.
     """
 
 
-class RotateKey(_Order, frozen=True, kw_only=True, tag="follow_key"):
-    """The cloud has new keys: statements that lead to the newest, oldest first (``device_agent.protocol.security.key_rotation``).
+class RotateKey(_Request, frozen=True, kw_only=True, tag="follow_key"):
+    """Statements that lead to the cloud's newest keys, oldest first (``security.key_rotation``).
 
-    Changes nothing else, and takes the device from nobody.
+    Changes nothing else and does not affect the lease.
     """
 
     statements: Annotated[tuple[Statement, ...], Meta(min_length=1, max_length=MAX_STATEMENTS)]
@@ -236,10 +243,10 @@ Request = (
 
 
 class Command(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """``cmd``: a request to a device; travels inside ``signing.Signed``.
+    """``cmd``: a request to a device; the body of ``signing.Signed``.
 
-    ``space``, ``agent`` and ``device`` bind it to one device, ``epoch`` to one lease; it runs at most once per
-    ``id`` and never later than ``issued_at_ms + ttl_ms`` on the cloud's clock, which the agent reads as an offset to
+    ``space``, ``agent`` and ``device`` bind it to one device, ``epoch`` binds it to one lease. It runs at most once per
+    ``id`` and never after ``issued_at_ms + ttl_ms`` on the cloud's clock; the agent tracks the offset of that clock to
     its own monotonic clock.
     """
 
@@ -254,16 +261,16 @@ class Command(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     request: Request
 
 
-class JointTarget(_Order, frozen=True, kw_only=True, tag="joints"):
-    """Go to these joint positions, as fast as limits allow."""
+class JointTarget(_Request, frozen=True, kw_only=True, tag="joints"):
+    """Move to joint positions as fast as the limits allow."""
 
     position_rad: JointPositions
 
 
-class JogTarget(_Order, frozen=True, kw_only=True, tag="jog"):
-    """Move a frame at this velocity while setpoints are fresh; no frame: the last of the device's.
+class JogTarget(_Request, frozen=True, kw_only=True, tag="jog"):
+    """Move a frame at a velocity while setpoints are fresh; no frame: the device's last frame.
 
-    Along and about the axes of the robot's base, or with ``tool`` those of the frame itself.
+    Velocities are along and about the axes of the robot's base, or with ``tool`` those of the frame itself.
     """
 
     linear_m_s: Vector3 = (0.0, 0.0, 0.0)
@@ -272,8 +279,8 @@ class JogTarget(_Order, frozen=True, kw_only=True, tag="jog"):
     tool: bool = False
 
 
-class DriveTarget(_Order, frozen=True, kw_only=True, tag="drive"):
-    """Move the base at this velocity while setpoints are fresh; ``turn_rad_s`` is counter-clockwise."""
+class DriveTarget(_Request, frozen=True, kw_only=True, tag="drive"):
+    """Drive the base at a velocity while setpoints are fresh; ``turn_rad_s`` is counter-clockwise."""
 
     forward_m_s: float = 0.0
     left_m_s: float = 0.0
@@ -281,10 +288,12 @@ class DriveTarget(_Order, frozen=True, kw_only=True, tag="drive"):
 
 
 class Setpoint(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """``ctl/{epoch}``: one streamed setpoint. The newest wins; ``sequence`` starts at 1 in each lease.
+    """``ctl/{epoch}``: one streamed setpoint. The newest is used; ``sequence`` starts at 1 in each lease.
 
-    ``echo_tick_ms`` is ``tick_ms`` of the last telemetry the operator saw: its age on the robot's own clock is the
-    loop age. ``sent_ms`` is any clock of the operator's [ms]; telemetry echoes it.
+    Attributes:
+        echo_tick_ms: ``tick_ms`` of the newest telemetry that the operator has received. Its age on the robot's own
+            clock is the loop age.
+        sent_ms: Time of sending on any clock of the operator [ms]; telemetry echoes it.
     """
 
     epoch: Count
@@ -295,7 +304,7 @@ class Setpoint(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
 
 
 class Stop(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """``stop``: latch Stop now. Needs no lease and no signature: the broker lets only those publish it who may."""
+    """``stop``: latch Stop now. Needs no lease and no signature; the broker restricts the publishers."""
 
     id: Id
     caller: Label

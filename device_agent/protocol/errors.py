@@ -1,9 +1,9 @@
-"""What reading a message can say."""
+"""Errors of the wire contract."""
 
 
 class ProtocolError(ValueError):
-    """A topic or message that the contract does not allow. Its text is fit for the person or program that sent it."""
+    """A topic or message violates the wire contract. The message may be shown to its sender."""
 
 
 class SignatureError(ProtocolError):
-    """A message that nobody we trust has signed, or that was changed after signing."""
+    """A message was not signed by a pinned key, or was modified after signing."""

@@ -1,56 +1,77 @@
-"""What an agent tells as ``event``: the kinds, each a fact that happened. ``Event.data`` is named at each.
+"""Events of a device. Readers ignore unknown fields.
 
-Together they are the device's audit trail: every change of authority and every refusal is among them. A flood makes
-no flood of events: what is refused again and again is told once, then every few seconds with its ``count``.
+Together they are the device's audit trail: they include every change of authority and every rejection. Repeated
+rejections are reported once, and then every few seconds with their ``count``.
 """
 
 from enum import StrEnum
+from typing import Any, Literal
+
+from msgspec import Struct
+
+from device_agent.protocol.fields import Id, Label, Milliseconds, Text
+
+
+class Event(Struct, frozen=True, kw_only=True):
+    """``event``: a fact that happened, in the past tense. The cloud stores it."""
+
+    id: Id
+    device: Id
+    at_ms: Milliseconds
+    kind: Label
+    severity: Literal["info", "warning", "error"]
+    message: Text
+    data: dict[str, Any] = {}
 
 
 class EventKind(StrEnum):
-    """In the past tense. ``code`` is that of the refusal, as acks have it; ``count`` how many an event stands for."""
+    """Kinds of events; each docstring names the keys of ``Event.data``.
+
+    ``code`` is a reason code as in acknowledgements. ``count`` is the number of occurrences that an event represents.
+    """
 
     AGENT_STARTED = "agent-started"
-    """The agent (re)started; all leases of before have ended. ``epoch``, ``stopped``."""
+    """The agent started; all earlier leases have ended. ``epoch``, ``stopped``."""
     AGENT_STOPPED = "agent-stopped"
-    """The agent was shut down in order."""
+    """The agent shut down in an orderly way."""
     LEASE_GRANTED = "lease-granted"
     """A signed lease took effect. ``epoch``, ``holder``."""
     LEASE_ENDED = "lease-ended"
-    """A lease ended; its epoch is not obeyed again. ``epoch``, ``holder``, ``code``."""
+    """A lease ended; the device no longer accepts its epoch. ``epoch``, ``holder``, ``code``."""
     STOP_LATCHED = "stop-latched"
     """Stop latched. ``caller``, ``reason``."""
     STOP_RESET = "stop-reset"
-    """The Stop latch was released. ``caller``."""
+    """The Stop latch was reset. ``caller``."""
     MOTION_HELD = "motion-held"
-    """Something that moved was brought to rest. ``code``, ``epoch``."""
+    """Motion was brought to a hold. ``code``, ``epoch``."""
     ACTION_LOST = "action-lost"
-    """A running action lost the device. ``code``, ``epoch``."""
+    """A running action lost control of the device. ``code``, ``epoch``."""
     SPEECH_STARTED = "speech-started"
-    """The device began to speak. ``text``, ``language``."""
+    """The device started to speak. ``text``, ``language``."""
     SCRIPTS_UNAVAILABLE = "scripts-unavailable"
-    """The agent started on a machine that cannot lock movement scripts in: none runs. ``reason``."""
+    """The agent started on a machine that cannot confine movement scripts; no script runs. ``reason``."""
     SCRIPTS_UNCONFINED = "scripts-unconfined"
-    """The same, and its owner lets them run nevertheless. ``reason``."""
+    """As ``scripts-unavailable``, but the agent's owner allows scripts to run unconfined. ``reason``."""
     DRIVER_FAILED = "driver-failed"
-    """The hardware or simulation did not answer, or the control loop failed."""
+    """The hardware or simulation does not respond, or the control loop failed."""
     DRIVER_RECOVERED = "driver-recovered"
-    """It answers again."""
+    """The hardware or simulation responds again."""
     COMMAND_REJECTED = "command-rejected"
-    """A command was not obeyed. ``code``; where it could be read ``command``, ``request``, ``caller``, ``epoch``."""
+    """A command was rejected. ``code``; if readable also ``command``, ``request``, ``caller``, ``epoch``."""
     SETPOINTS_REJECTED = "setpoints-rejected"
-    """Streamed setpoints were not obeyed. ``code``, ``count``."""
+    """Streamed setpoints were rejected. ``code``, ``count``."""
     STOP_REJECTED = "stop-rejected"
-    """A Stop could not be read. ``code``, ``count``."""
+    """A Stop message could not be read. ``code``, ``count``."""
     INTERLOCK_ENGAGED = "interlock-engaged"
-    """The room slowed or held the device. ``interlock``, ``action``, ``reason``: ``present``, ``stale``, …"""
+    """An interlock slowed or held the device. ``interlock``, ``action``, ``reason``."""
     INTERLOCK_CLEARED = "interlock-cleared"
-    """The room lets the device go again; nothing resumes by itself. ``interlock``."""
+    """An interlock no longer restricts the device; motion does not resume by itself. ``interlock``."""
     JOURNAL_FAILED = "journal-failed"
-    """The journal could not be written: what follows from it was not done."""
+    """The journal could not be written; the agent did not perform what depends on it."""
     EVENTS_DROPPED = "events-dropped"
-    """More happened at once than could be told. ``count``."""
+    """More events occurred at once than could be sent. ``count``."""
     BUFFER_DROPPED = "buffer-dropped"
-    """Kept off line beyond the bound and dropped, oldest first. ``measurements``, ``events``."""
+    """Messages stored during a disconnection exceeded the limit; the oldest were dropped. ``measurements``,
+    ``events``."""
     BUFFER_FAILED = "buffer-failed"
-    """The disk did not take what was to be kept. ``code``."""
+    """Messages could not be stored on disk. ``code``."""

@@ -1,4 +1,4 @@
-"""The small types of which messages, manifests and scripts' calls are made."""
+"""Field types of messages, manifests and script calls."""
 
 from typing import Annotated
 
@@ -16,7 +16,7 @@ Field = Annotated[
     str, Meta(pattern=f"^{FIELD_PATTERN}$", description="letters, digits, _, - and dots, 1 to 80 of them")
 ]
 MAX_VALUES = 128
-"""Values in one message of measurements."""
+"""Maximum number of values in one ``Measurements`` message."""
 Vector3 = tuple[float, float, float]
 Quaternion = tuple[float, float, float, float]
 Pose = Annotated[
@@ -25,5 +25,5 @@ Pose = Annotated[
 ]
 JointPositions = Annotated[
     dict[str, float],
-    Meta(min_length=1, max_length=128, description="joint name → position [rad]; joints not named keep their target"),
+    Meta(min_length=1, max_length=128, description="joint name → position [rad]; other joints keep their target"),
 ]

@@ -1,6 +1,6 @@
 """Topics: ``ts/v1/{space}/{agent}/{device}/{class}[/{name}]``, and ``ts/v1/{space}/{agent}/conn`` for presence.
 
-Seven levels at most and no leading slash, so that every broker of DESIGN §4 takes them.
+At most seven levels and no leading slash, so that every supported broker accepts them.
 """
 
 import re
@@ -27,19 +27,19 @@ STOP = "stop"
 
 CLASSES = frozenset({DESC, STATE, TELE, LATE, CAM, EVENT, CMD, ACK, CTL, STOP})
 MEASURED = frozenset({TELE, LATE})
-"""What carries measurements: as they are made, and what could not be sent then. Only the first is live."""
+"""Classes that carry measurements: live, and delayed by a disconnection."""
 _NAME_REQUIRED = frozenset({TELE, LATE, CAM, CTL})
 _NAME_ALLOWED = _NAME_REQUIRED | {DESC}
 ANY = "+"
 
 JOINTS = "joints"
-"""Name under ``tele`` of the stream of all joints (``JointTelemetry``); all others carry ``Measurements``."""
+"""Name of the joint stream under ``tele`` (``JointTelemetry``); all other streams carry ``Measurements``."""
 TWIN = "twin"
-"""Name under ``desc`` of the retained drawing of the device (``Twin``)."""
+"""Name of the retained device model under ``desc`` (``Twin``)."""
 
 
 class Topic(NamedTuple):
-    """One parsed topic. ``device`` is empty for an agent's presence, ``name`` where the class has none."""
+    """One parsed topic. ``device`` is empty for an agent's presence; ``name`` is empty if the class has none."""
 
     space: str
     agent: str
@@ -49,7 +49,7 @@ class Topic(NamedTuple):
 
 
 def is_id(text: str) -> bool:
-    """Whether ``text`` may stand as an id in a topic, a URL and a table key."""
+    """Whether ``text`` is a valid id in topics, URLs and table keys."""
     return _ID.match(text) is not None
 
 
@@ -64,9 +64,9 @@ def device(space: str, agent: str, name: str, kind: str, stream: str = "") -> st
     Args:
         space: Id of the space, or ``+`` in a filter.
         agent: Id of the agent, or ``+`` in a filter.
-        name: The device's name at its agent, or ``+`` in a filter.
+        name: Name of the device at its agent, or ``+`` in a filter.
         kind: One of ``CLASSES``.
-        stream: The last level, for classes that have one: a stream, a camera, the epoch of a lease.
+        stream: Last level, for classes that have one: a stream, a camera or the epoch of a lease.
     """
     base = f"{ROOT}/{space}/{agent}/{name}/{kind}"
     return f"{base}/{stream}" if stream else base
@@ -74,7 +74,7 @@ def device(space: str, agent: str, name: str, kind: str, stream: str = "") -> st
 
 @lru_cache(maxsize=1024)
 def parse(topic: str) -> Topic:
-    """Read a topic that arrived. The same few arrive again and again.
+    """Parse a received topic. Cached, because the same topics repeat.
 
     Raises:
         ProtocolError: The text is not a topic of this contract.
@@ -92,19 +92,19 @@ def parse(topic: str) -> Topic:
 
 
 def matches(pattern: str, topic: str) -> bool:
-    """Whether an MQTT filter covers a topic or another filter: never lets a filter reach further than ``pattern``.
+    """Whether an MQTT filter covers a topic, or the whole of another filter.
 
-    ``+`` in ``topic`` is covered only by ``+`` or ``#`` in ``pattern``; ``#`` only by ``#``. As MQTT says (4.7.2), a
-    wildcard at the first level does not cover topics that start with ``$``.
+    Only ``+`` or ``#`` in ``pattern`` covers ``+`` in ``topic``; only ``#`` covers ``#``. A wildcard at the first level
+    does not cover topics that start with ``$`` (MQTT 4.7.2).
     """
-    wanted, given = pattern.split("/"), topic.split("/")
-    if given[0].startswith("$") and wanted[0] in (ANY, "#"):
+    filter_levels, levels = pattern.split("/"), topic.split("/")
+    if levels[0].startswith("$") and filter_levels[0] in (ANY, "#"):
         return False
-    for index, level in enumerate(wanted):
+    for index, level in enumerate(filter_levels):
         if level == "#":
             return True
-        if index >= len(given):
+        if index >= len(levels):
             return False
-        if given[index] == "#" or (level != ANY and level != given[index]):
+        if levels[index] == "#" or (level != ANY and level != levels[index]):
             return False
-    return len(wanted) == len(given)
+    return len(filter_levels) == len(levels)

@@ -96,7 +96,7 @@ def configuration(
         f"plugin_paths = {{ {_lua(MODULES)} }}",
         'log = { warn = "*console" }',
         "-- Nagle's algorithm costs 44 ms for each small message. Of who is silent for so long our module decides.",
-        f"network_settings = {{ nagle = false, read_timeout = {stanzas.DEAD_S:g} }}",
+        f"network_settings = {{ nagle = false, read_timeout = {stanzas.TIMEOUT_S:g} }}",
         f"modules_enabled = {{ {', '.join(_lua(name) for name in modules)} }}",
         "-- Nothing leaves for other servers, and nothing is kept for somebody who is away: a late order is no order.",
         'modules_disabled = { "s2s", "s2s_auth_certs", "offline" }',

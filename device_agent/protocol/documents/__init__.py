@@ -1,1 +1,1 @@
-"""Documents."""
+"""Generated documents: the AsyncAPI description and the script API."""

@@ -1,6 +1,6 @@
-"""The published contract: an AsyncAPI 3 document made from ``messages`` and ``topics``.
+"""Generates the AsyncAPI 3 document of the wire contract.
 
-``python -m device_agent.protocol.documents.asyncapi`` prints it; ``make contract`` keeps ``docs/asyncapi.json`` equal to it.
+``python -m device_agent.protocol.documents.asyncapi`` prints it; ``make contract`` updates ``docs/asyncapi.json``.
 """
 
 import inspect
@@ -28,7 +28,7 @@ _CHANNELS = (
         "presence", f"{topics.ROOT}/{{space}}/{{agent}}/conn", "Presence", 1, True, "Online or offline; also the will."
     ),
     _Channel("description", f"{_DEVICE}/desc", "Description", 1, True, "What the device is and can do."),
-    _Channel("twin", f"{_DEVICE}/desc/twin", "Twin", 1, True, "The drawing for live views."),
+    _Channel("twin", f"{_DEVICE}/desc/twin", "Twin", 1, True, "Model for live views."),
     _Channel(
         "state", f"{_DEVICE}/state", "State", 1, True, "Current condition: on change and every 30 s, at most 1 Hz."
     ),
@@ -38,7 +38,7 @@ _CHANNELS = (
         "JointTelemetry",
         0,
         False,
-        "All joints: 20 Hz at rest, 50 Hz in motion, with each setpoint while they come.",
+        "All joints: 20 Hz at rest, 50 Hz in motion, and at each setpoint while streaming.",
     ),
     _Channel(
         "measurements",
@@ -46,7 +46,7 @@ _CHANNELS = (
         "Measurements",
         0,
         False,
-        "Named values measured at one moment; every stream but `joints`.",
+        "Named values measured at one moment; all streams except `joints`.",
     ),
     _Channel(
         "late_joints",
@@ -54,7 +54,7 @@ _CHANNELS = (
         "JointTelemetry",
         1,
         False,
-        "Joints measured while the link was down, thinned, with their own times; for the series, never for live views.",
+        "Joints measured while the link was down, thinned, with their own times. Not live.",
     ),
     _Channel(
         "late_measurements",
@@ -62,11 +62,11 @@ _CHANNELS = (
         "Measurements",
         1,
         False,
-        "As `late_joints`; every stream but `joints`.",
+        "As `late_joints`; all streams except `joints`.",
     ),
-    _Channel("camera", f"{_DEVICE}/cam/{{camera}}", "CameraFrame", 0, False, "A picture: header, then JPEG."),
+    _Channel("camera", f"{_DEVICE}/cam/{{camera}}", "CameraFrame", 0, False, "A camera frame: header, then JPEG."),
     _Channel("event", f"{_DEVICE}/event", "Event", 1, False, "A fact that happened; stored."),
-    _Channel("ack", f"{_DEVICE}/ack", "Ack", 1, False, "The answer to one command."),
+    _Channel("ack", f"{_DEVICE}/ack", "Ack", 1, False, "The response to one command."),
     _Channel("command", f"{_DEVICE}/cmd", "Signed", 1, False, "A signed request; `body` is a Command.", to_agent=True),
     _Channel(
         "setpoint",
@@ -88,17 +88,17 @@ _CHANNELS = (
     ),
 )
 _PARAMETERS = {
-    "space": "Id of the space, the room and its people's data.",
+    "space": "Id of the space.",
     "agent": "Id of the agent; also its MQTT client id.",
     "device": "The device's name at its agent.",
     "camera": "Name of the camera.",
-    "stream": "Name of the stream, any but `joints`.",
+    "stream": "Name of the stream, except `joints`.",
     "epoch": "Epoch of the lease under which the setpoints are sent.",
 }
 
 
 def document() -> dict[str, Any]:
-    """The contract as AsyncAPI 3.0, seen from the agent: it sends what devices say, receives what they are told."""
+    """The wire contract as AsyncAPI 3.0, from the agent's view: it sends device messages and receives commands."""
     references, schemas = protocol.schema_components()
     references["Signed"] = {"$ref": "#/components/schemas/Signed"}
     schemas["Signed"] = {
@@ -113,17 +113,17 @@ def document() -> dict[str, Any]:
         "required": ["key", "signature", "body"],
         "additionalProperties": False,
     }
-    picture = inspect.cleandoc(camera_frames.__doc__ or "")
-    references["CameraFrame"] = {"type": "string", "format": "binary", "description": picture}
+    frame_format = inspect.cleandoc(camera_frames.__doc__ or "")
+    references["CameraFrame"] = {"type": "string", "format": "binary", "description": frame_format}
     return {
         "asyncapi": "3.0.0",
         "info": {
             "title": "Telescope, wire contract",
             "version": "1.0.0",
             "description": (
-                "MQTT topics and messages between robots, their operators and the cloud. JSON, finite numbers only, "
-                f"at most {codec.MAX_BYTES // 1024} KB a message and {codec.MAX_RETAINED_BYTES // 1024} KB a retained "
-                f"one. Ids match `{topics.ID_PATTERN}`."
+                "MQTT topics and messages between robots, their operators and the cloud. JSON, finite numbers only, at "
+                f"most {codec.MAX_BYTES // 1024} KB per message and {codec.MAX_RETAINED_BYTES // 1024} KB if "
+                f"retained. Ids match `{topics.ID_PATTERN}`."
             ),
         },
         "defaultContentType": "application/json",

@@ -1,6 +1,6 @@
-"""What a movement script may use, as a document: for editors, and for checks that run nothing.
+"""The API of movement scripts as a document, for editors and linters.
 
-``script_api.json`` is written by ``python -m device_agent.sandbox.api_document`` out of the code that scripts meet.
+``python -m device_agent.sandbox.api_document`` generates ``script_api.json`` from the code that scripts use.
 """
 
 from functools import cache
@@ -12,11 +12,11 @@ from msgspec import UNSET, Struct, UnsetType
 
 DOCUMENT: Final = Path(__file__).with_name("script_api.json")
 Names = Literal["joints", "frames", "postures", "expressions", "behaviours", "devices"]
-"""What the strings of an argument are names of."""
+"""Kind of names that a string argument takes."""
 
 
 class Parameter(Struct, frozen=True, kw_only=True, omit_defaults=True):
-    """One parameter of a call. ``default`` is Python; without one it must be given."""
+    """One parameter of a call. ``default`` is Python source; a parameter without default is required."""
 
     name: str
     kind: Literal["positional", "keyword", "rest"]
@@ -26,7 +26,7 @@ class Parameter(Struct, frozen=True, kw_only=True, omit_defaults=True):
 
 
 class Call(Struct, frozen=True, kw_only=True, omit_defaults=True):
-    """A function or a method. ``doc`` is one line, ``details`` its whole docstring."""
+    """A function or method. ``doc`` is the first line of its docstring, ``details`` the whole."""
 
     name: str
     signature: str
@@ -36,7 +36,7 @@ class Call(Struct, frozen=True, kw_only=True, omit_defaults=True):
 
 
 class Value(Struct, frozen=True, kw_only=True, omit_defaults=True):
-    """A name that is no function; ``attributes`` and ``methods`` where it has any."""
+    """A name that is not a function, with its ``attributes`` and ``methods``."""
 
     name: str
     type: str
@@ -46,7 +46,7 @@ class Value(Struct, frozen=True, kw_only=True, omit_defaults=True):
 
 
 class ScriptApi(Struct, frozen=True, kw_only=True):
-    """Everything that a script finds beside Python's own names; ``modules`` is what it may import."""
+    """All names available to a script besides Python's builtins; ``modules`` lists the importable modules."""
 
     values: tuple[Value, ...]
     functions: tuple[Call, ...]
@@ -55,5 +55,5 @@ class ScriptApi(Struct, frozen=True, kw_only=True):
 
 @cache
 def script_api() -> ScriptApi:
-    """The document."""
+    """The shipped document."""
     return msgspec.json.decode(DOCUMENT.read_bytes(), type=ScriptApi)

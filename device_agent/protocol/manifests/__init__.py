@@ -1,1 +1,1 @@
-"""Manifests."""
+"""Manifests of robot types (``robot.toml``) and rooms (``room.toml``)."""

@@ -1,6 +1,6 @@
-"""The parts of a robot type's manifest that say how joints hang together and what the robot can show.
+"""Joint couplings, postures, expressions, behaviours and simulation data of a robot type's manifest.
 
-All of it is data, so that a real robot has it as well as a simulated one.
+All of it is data, so that it applies to real and simulated robots.
 """
 
 import math
@@ -19,40 +19,42 @@ from device_agent.protocol.manifests.toml import check_known, check_positive
 Positions = Annotated[dict[str, float], Meta(min_length=1, max_length=128)]
 """Joint name → position [rad]."""
 Leg = tuple[Label, Label, Label, Label, Label, Label]
-LONGEST_TEXT = 500
-_LONGEST_BEHAVIOUR_S = 300.0
-_SAME = 1e-9
-_TIED_RAD = 1e-6
+MAX_TEXT = 500
+_MAX_BEHAVIOUR_S = 300.0
+_EPSILON = 1e-9
+_COUPLING_TOLERANCE_RAD = 1e-6
 
 
 class MimicJoint(description.MimicJoint, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """As a manifest has it."""
+    """Mimic joint of a manifest."""
 
 
 class PositionDependentLimit(description.PositionDependentLimit, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """As a manifest has it."""
+    """Position-dependent limit of a manifest."""
 
 
 class Keyframe(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """One moment of a behaviour.
+    """One keyframe of a behaviour.
 
     Attributes:
-        time_s: When the joints are to be there, counted from its beginning; as soon as they can be when that is later.
-        position_rad: Joint name → position [rad]; joints not named keep their target. Empty: nothing moves.
-        say: What the robot begins to say when it sets out for this keyframe.
+        time_s: Time of arrival since the start [s]; later if the joints cannot be there in time.
+        position_rad: Joint name → position [rad]; other joints keep their target. Empty: no motion.
+        say: Text that the robot starts to speak when it departs for this keyframe.
     """
 
     time_s: float
     position_rad: Annotated[dict[str, float], Meta(max_length=128)] = {}
-    say: Annotated[str, Meta(max_length=LONGEST_TEXT)] = ""
+    say: Annotated[str, Meta(max_length=MAX_TEXT)] = ""
 
 
 class Wheels(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """Two driven wheels.
 
     Attributes:
-        left: Actuator of the left wheel in the model, a velocity servo; ``right``: of the other.
-        radius_m: Of each wheel; ``track_m``: from one to the other [m].
+        left: Velocity servo of the left wheel in the model.
+        right: Velocity servo of the right wheel in the model.
+        radius_m: Wheel radius [m].
+        track_m: Distance between the wheels [m].
     """
 
     left: Label
@@ -62,15 +64,16 @@ class Wheels(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
 
 
 class Walk(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """An assisted walk on two legs, from home.
+    """Assisted bipedal walk, from the home position.
 
     Attributes:
-        left: Joints of the left leg: hip yaw, hip roll, hip pitch, knee, ankle pitch, ankle roll; ``right``: the same.
-        soles: Sites under the left and the right ankle, on the sole.
-        step_s: Time of one step of one foot [s].
-        lift_m: How high a foot goes [m].
-        support_n: The most that draws the torso along its course [N].
-        support_nm: The most that holds it upright [N m].
+        left: Joints of the left leg: hip yaw, hip roll, hip pitch, knee, ankle pitch, ankle roll.
+        right: The same of the right leg.
+        soles: Sites on the left and the right sole, below the ankle.
+        step_s: Duration of one step [s].
+        lift_m: Height of the swing foot [m].
+        support_n: Maximum assisting force along the path [N].
+        support_nm: Maximum assisting torque that keeps the torso upright [N m].
     """
 
     left: Leg
@@ -83,12 +86,13 @@ class Walk(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
 
 
 class Battery(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """What a robot without a cable lives on.
+    """Battery of a robot.
 
     Attributes:
-        capacity_wh: When it is new [Wh].
-        full_v: Voltage when it is full; ``empty_v``: when it is empty [V].
-        idle_w: What the robot takes while nothing moves [W].
+        capacity_wh: Capacity when new [Wh].
+        full_v: Voltage when full [V].
+        empty_v: Voltage when empty [V].
+        idle_w: Power without motion [W].
     """
 
     capacity_wh: float
@@ -98,26 +102,25 @@ class Battery(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
 
 
 class Simulation(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """What only a simulation needs to know. No limit stands here: those hold for real metal too."""
+    """Data that only a simulation needs. Limits are not among them: they apply to real robots too."""
 
     wheels: Wheels | None = None
     walk: Walk | None = None
     battery: Battery | None = None
 
 
-class Abilities(Struct, frozen=True, kw_only=True):
-    """What a manifest says besides limits: see ``robot_type.RobotType``, which is one.
+class Capabilities(Struct, frozen=True, kw_only=True):
+    """Part of a manifest besides limits; ``robot_type.RobotType`` extends it.
 
     Attributes:
-        mirrors: Joints that one motor moves together.
-        narrowing: Joints whose range depends on another's position.
-        postures: Name → joint positions [rad]; joints not named stay.
-        expressions: Name → joint positions [rad] at strength 1; less is so much of the way from home.
-        visemes: Name → joint positions of a mouth shape [rad], for speech, by the names of ``runtime/mouth.py``:
-            ``sil``, ``PP``, ``FF``, ``TH``, ``DD``, ``kk``, ``CH``, ``SS``, ``nn``, ``RR``, ``aa``, ``E``, ``ih``,
-            ``oh``, ``ou``. For one that is missing the nearest serves.
-        behaviours: Name → keyframes, in the order of their times.
-        simulation: What only a simulation needs to know.
+        mimic_joints: Joints that follow other joints.
+        position_dependent_limits: Joints whose range depends on another joint.
+        postures: Name → joint positions [rad]; other joints keep their position.
+        expressions: Name → joint positions [rad] at strength 1; a lower strength interpolates from home.
+        visemes: Viseme → joint positions [rad], for speech: ``sil``, ``PP``, ``FF``, ``TH``, ``DD``, ``kk``, ``CH``,
+            ``SS``, ``nn``, ``RR``, ``aa``, ``E``, ``ih``, ``oh``, ``ou``. The nearest one replaces a missing viseme.
+        behaviours: Name → keyframes in ascending time.
+        simulation: Data for simulation.
     """
 
     mimic_joints: tuple[MimicJoint, ...] = ()
@@ -129,28 +132,28 @@ class Abilities(Struct, frozen=True, kw_only=True):
     simulation: Simulation | None = None
 
 
-def check(abilities: Abilities, joints: Sequence[Joint], home_rad: Mapping[str, float]) -> None:
-    """Refuse what contradicts itself, or the joints.
+def check(capabilities: Capabilities, joints: Sequence[Joint], home_rad: Mapping[str, float]) -> None:
+    """Reject contradictions within the manifest and with the joints.
 
     Raises:
-        ProtocolError: The text names what is wrong, and the joints there are.
+        ProtocolError: The message names the mistake and the known joints.
     """
     known = {joint.name: joint for joint in joints}
-    _check_mirrors(abilities.mimic_joints, known)
-    _check_narrowing(abilities, known)
-    allowed = _Allowed(abilities, known, home_rad)
-    allowed.check("home_rad", home_rad)
+    _check_mimic_joints(capabilities.mimic_joints, known)
+    _check_position_dependent_limits(capabilities, known)
+    checker = _PositionChecker(capabilities, known, home_rad)
+    checker.check("home_rad", home_rad)
     for word, group in (
-        ("posture", abilities.postures),
-        ("expression", abilities.expressions),
-        ("viseme", abilities.visemes),
+        ("posture", capabilities.postures),
+        ("expression", capabilities.expressions),
+        ("viseme", capabilities.visemes),
     ):
         for name, position_rad in group.items():
-            allowed.check(f"{word} '{name}'", position_rad)
-    for name, keyframes in abilities.behaviours.items():
-        _check_keyframes(f"behaviour '{name}'", keyframes, allowed)
-    if abilities.simulation is not None:
-        _check_simulation(abilities.simulation, known)
+            checker.check(f"{word} '{name}'", position_rad)
+    for name, keyframes in capabilities.behaviours.items():
+        _check_keyframes(f"behaviour '{name}'", keyframes, checker)
+    if capabilities.simulation is not None:
+        _check_simulation(capabilities.simulation, known)
 
 
 def _check_simulation(simulation: Simulation, known: Mapping[str, Joint]) -> None:
@@ -165,80 +168,81 @@ def _check_simulation(simulation: Simulation, known: Mapping[str, Joint]) -> Non
         legs = (*simulation.walk.left, *simulation.walk.right)
         check_known("simulation.walk", "joint", legs, known)
         if len(set(legs)) < len(legs):
-            raise ProtocolError("simulation.walk: no joint can be named twice")
+            raise ProtocolError("simulation.walk: a joint is named twice")
     if simulation.battery is not None and simulation.battery.empty_v > simulation.battery.full_v:
         raise ProtocolError("simulation.battery: empty_v must not be above full_v")
 
 
-def _check_mirrors(mirrors: Sequence[MimicJoint], known: Mapping[str, Joint]) -> None:
-    followers = [mirror.joint for mirror in mirrors]
-    for mirror in mirrors:
-        where = f"mimic_joints: '{mirror.joint}'"
-        check_known("mimic_joints", "joint", (mirror.joint, mirror.mimics), known)
-        if followers.count(mirror.joint) > 1:
-            raise ProtocolError(f"{where} mirrors two joints")
-        if mirror.mimics in followers:
+def _check_mimic_joints(mimic_joints: Sequence[MimicJoint], known: Mapping[str, Joint]) -> None:
+    followers = [mimic.joint for mimic in mimic_joints]
+    for mimic in mimic_joints:
+        where = f"mimic_joints: '{mimic.joint}'"
+        check_known("mimic_joints", "joint", (mimic.joint, mimic.mimics), known)
+        if followers.count(mimic.joint) > 1:
+            raise ProtocolError(f"{where} follows two joints")
+        if mimic.mimics in followers:
             raise ProtocolError(
-                f"{where} mirrors '{mirror.mimics}', which is a mirror itself; name the joint that counts"
+                f"{where} follows '{mimic.mimics}', which is a mimic joint itself; name the driven joint"
             )
-        if mirror.multiplier == 0 or not math.isfinite(mirror.multiplier):
-            raise ProtocolError(f"{where}: multiplier is {mirror.multiplier}; it must be finite and not 0")
-        follower, leader = known[mirror.joint], known[mirror.mimics]
-        lower, upper = sorted((leader.lower_rad * mirror.multiplier, leader.upper_rad * mirror.multiplier))
-        if lower < follower.lower_rad - _SAME or upper > follower.upper_rad + _SAME:
-            raise ProtocolError(f"{where} cannot follow over all of the range of '{mirror.mimics}'")
+        if mimic.multiplier == 0 or not math.isfinite(mimic.multiplier):
+            raise ProtocolError(f"{where}: multiplier is {mimic.multiplier}; it must be finite and not 0")
+        follower, leader = known[mimic.joint], known[mimic.mimics]
+        lower, upper = sorted((leader.lower_rad * mimic.multiplier, leader.upper_rad * mimic.multiplier))
+        if lower < follower.lower_rad - _EPSILON or upper > follower.upper_rad + _EPSILON:
+            raise ProtocolError(f"{where} cannot follow over the whole range of '{mimic.mimics}'")
         for field in ("max_velocity_rad_s", "max_acceleration_rad_s2", "max_jerk_rad_s3"):
-            if getattr(leader, field) * abs(mirror.multiplier) > getattr(follower, field) * (1 + _SAME):
-                raise ProtocolError(f"{where}: its {field} is too low to follow '{mirror.mimics}'")
+            if getattr(leader, field) * abs(mimic.multiplier) > getattr(follower, field) * (1 + _EPSILON):
+                raise ProtocolError(f"{where}: its {field} is too low to follow '{mimic.mimics}'")
 
 
-def _check_narrowing(abilities: Abilities, known: Mapping[str, Joint]) -> None:
-    followers = {mirror.joint for mirror in abilities.mimic_joints}
-    narrowed = [narrowing.joint for narrowing in abilities.position_dependent_limits]
-    for narrowing in abilities.position_dependent_limits:
-        where = f"position_dependent_limits of '{narrowing.joint}'"
-        check_known("position_dependent_limits", "joint", (narrowing.joint, narrowing.depends_on), known)
-        if narrowed.count(narrowing.joint) > 1:
-            raise ProtocolError(f"{where} stands there twice")
-        if narrowing.depends_on in narrowed:
-            raise ProtocolError(f"{where}: '{narrowing.depends_on}' is narrowed itself")
-        if followers & {narrowing.joint, narrowing.depends_on}:
-            raise ProtocolError(f"{where}: a mirror cannot stand there; name the joint that counts")
-        if not all(math.isfinite(value) for row in narrowing.table for value in row):
-            raise ProtocolError(f"{where}: all numbers of its table must be finite")
-        places = [row[0] for row in narrowing.table]
-        if any(later <= earlier for earlier, later in pairwise(places)):
-            raise ProtocolError(f"{where}: positions of '{narrowing.depends_on}' must rise from row to row")
-        by, joint = known[narrowing.depends_on], known[narrowing.joint]
-        if places[0] > by.lower_rad or places[-1] < by.upper_rad:
+def _check_position_dependent_limits(capabilities: Capabilities, known: Mapping[str, Joint]) -> None:
+    followers = {mimic.joint for mimic in capabilities.mimic_joints}
+    limited = [limit.joint for limit in capabilities.position_dependent_limits]
+    for limit in capabilities.position_dependent_limits:
+        where = f"position_dependent_limits of '{limit.joint}'"
+        check_known("position_dependent_limits", "joint", (limit.joint, limit.depends_on), known)
+        if limited.count(limit.joint) > 1:
+            raise ProtocolError(f"{where} is listed twice")
+        if limit.depends_on in limited:
+            raise ProtocolError(f"{where}: '{limit.depends_on}' has a position-dependent limit itself")
+        if followers & {limit.joint, limit.depends_on}:
+            raise ProtocolError(f"{where}: a mimic joint cannot have or determine a limit; name the driven joint")
+        if not all(math.isfinite(value) for row in limit.table for value in row):
+            raise ProtocolError(f"{where}: all numbers of the table must be finite")
+        positions = [row[0] for row in limit.table]
+        if any(later <= earlier for earlier, later in pairwise(positions)):
+            raise ProtocolError(f"{where}: positions of '{limit.depends_on}' must rise from row to row")
+        leader, joint = known[limit.depends_on], known[limit.joint]
+        if positions[0] > leader.lower_rad or positions[-1] < leader.upper_rad:
             raise ProtocolError(
-                f"{where}: its table must reach from {by.lower_rad} to {by.upper_rad}, the range of '{narrowing.depends_on}'"
+                f"{where}: the table must cover {leader.lower_rad} to {leader.upper_rad}, "
+                f"the range of '{limit.depends_on}'"
             )
-        for place, lower, upper in narrowing.table:
+        for position, lower, upper in limit.table:
             if not joint.lower_rad <= lower < upper <= joint.upper_rad:
                 raise ProtocolError(
-                    f"{where}: at {place} the range must rise and lie in {joint.lower_rad} to {joint.upper_rad}"
+                    f"{where}: at {position} the range must rise and lie in {joint.lower_rad} to {joint.upper_rad}"
                 )
 
 
-def _check_keyframes(where: str, keyframes: Sequence[Keyframe], allowed: "_Allowed") -> None:
+def _check_keyframes(where: str, keyframes: Sequence[Keyframe], checker: "_PositionChecker") -> None:
     reached_s = 0.0
     for number, keyframe in enumerate(keyframes, 1):
-        if not reached_s <= keyframe.time_s <= _LONGEST_BEHAVIOUR_S:  # false for NaN
+        if not reached_s <= keyframe.time_s <= _MAX_BEHAVIOUR_S:  # false for NaN
             raise ProtocolError(
                 f"{where}: time_s of keyframe {number} is {keyframe.time_s}; times must rise from 0, "
-                f"to {_LONGEST_BEHAVIOUR_S:.0f} at most"
+                f"to {_MAX_BEHAVIOUR_S:.0f} at most"
             )
         reached_s = keyframe.time_s
-        allowed.check(f"{where}, keyframe {number}", keyframe.position_rad)
+        checker.check(f"{where}, keyframe {number}", keyframe.position_rad)
 
 
-class _Allowed:
-    """Where joints may be, by name; where a place does not say, they are taken to be at home."""
+class _PositionChecker:
+    """Checks joint positions against ranges and couplings; unnamed joints count as at home."""
 
-    def __init__(self, abilities: Abilities, known: Mapping[str, Joint], home_rad: Mapping[str, float]) -> None:
-        self._mirrors = abilities.mimic_joints
-        self._narrowing = abilities.position_dependent_limits
+    def __init__(self, capabilities: Capabilities, known: Mapping[str, Joint], home_rad: Mapping[str, float]) -> None:
+        self._mimic_joints = capabilities.mimic_joints
+        self._limits = capabilities.position_dependent_limits
         self._known = known
         self._home_rad = home_rad
 
@@ -250,19 +254,21 @@ class _Allowed:
                 raise ProtocolError(
                     f"{where}: '{name}' is {value}, outside of its range {joint.lower_rad} to {joint.upper_rad}"
                 )
-        for mirror in self._mirrors:
-            given = position_rad.get(mirror.joint)
-            leads = position_rad.get(mirror.mimics)
-            if given is not None and leads is not None and abs(given - leads * mirror.multiplier) > _TIED_RAD:
-                raise ProtocolError(f"{where}: '{mirror.joint}' must be {mirror.multiplier} times '{mirror.mimics}'")
-        for narrowing in self._narrowing:
-            if narrowing.joint in position_rad:
-                lower, upper = narrowing.at(
-                    position_rad.get(narrowing.depends_on, self._home_rad[narrowing.depends_on])
-                )
-                value = position_rad[narrowing.joint]
-                if not lower - _SAME <= value <= upper + _SAME:
+        for mimic in self._mimic_joints:
+            follower = position_rad.get(mimic.joint)
+            leader = position_rad.get(mimic.mimics)
+            if (
+                follower is not None
+                and leader is not None
+                and abs(follower - leader * mimic.multiplier) > _COUPLING_TOLERANCE_RAD
+            ):
+                raise ProtocolError(f"{where}: '{mimic.joint}' must be {mimic.multiplier} times '{mimic.mimics}'")
+        for limit in self._limits:
+            if limit.joint in position_rad:
+                lower, upper = limit.at(position_rad.get(limit.depends_on, self._home_rad[limit.depends_on]))
+                value = position_rad[limit.joint]
+                if not lower - _EPSILON <= value <= upper + _EPSILON:
                     raise ProtocolError(
-                        f"{where}: '{narrowing.joint}' is {value}, but goes from {lower:.4f} to {upper:.4f} "
-                        f"where '{narrowing.depends_on}' is"
+                        f"{where}: '{limit.joint}' is {value}, outside of its range {lower:.4f} to {upper:.4f} "
+                        f"at the position of '{limit.depends_on}'"
                     )

@@ -1,4 +1,4 @@
-"""A robot type's manifest, ``robots/<type>/robot.toml``: read by agents (limits, model) and the cloud (catalogue)."""
+"""Manifest of a robot type, ``robots/<type>/robot.toml``; read by agents (limits, model) and the cloud (catalogue)."""
 
 import math
 from collections.abc import Sequence
@@ -7,33 +7,32 @@ from typing import Annotated, Literal
 
 from msgspec import Meta, Struct
 
-from device_agent.protocol import Id, Joint, Label, Stream, Text, Vector3
-from device_agent.protocol import description as reports
+from device_agent.protocol import Id, Joint, Label, Stream, Text, Vector3, description
 from device_agent.protocol.errors import ProtocolError
-from device_agent.protocol.manifests import capabilities as abilities
-from device_agent.protocol.manifests import toml
+from device_agent.protocol.manifests import capabilities, toml
 
 MANIFEST = "robot.toml"
 MOVEMENTS = "movements"
 MAX_PERIOD_MS = 1000
-MOST_PICTURES_HZ = 10.0
-"""Of one camera of a robot: pictures are for people, and take the link and the machine from what moves it."""
+MAX_CAMERA_HZ = 10.0
+"""Maximum frame rate of a robot's camera [Hz]. Frames share link and processor with motion control."""
 MAX_JOINTS = 128
-"""Most that a ``JointPositions`` names."""
+"""Maximum number of joints in ``JointPositions``."""
 
 
-class Diagnostic(reports.Diagnostic, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """How some measurements are to be judged, as a manifest says it."""
+class Diagnostic(description.Diagnostic, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """Diagnostic of a manifest; see ``description.Diagnostic``."""
 
     checks: tuple[Literal["level", "trend", "change", "outlier"], ...] = ("level", "trend", "change", "outlier")
 
 
 class Workspace(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """A box in the robot's base frame that some of its frames never leave.
+    """Box in the robot's base frame that some frames never leave.
 
     Attributes:
-        lower_m: The box's lowest corner; ``upper_m``: its highest [m].
-        frames: The frames that stay inside.
+        lower_m: Lowest corner [m].
+        upper_m: Highest corner [m].
+        frames: Frames that stay inside.
     """
 
     lower_m: Vector3
@@ -42,15 +41,17 @@ class Workspace(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
 
 
 class Base(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """What a robot that drives or walks can do.
+    """Limits of a mobile base.
 
     Attributes:
-        max_linear_m_s: Speed over the floor, in each direction [m/s].
-        max_angular_rad_s: Turning [rad/s].
-        max_linear_acceleration_m_s2: When speeding up [m/s²]; ``max_angular_acceleration_rad_s2``: the same of turning.
-        braking_linear_m_s2: For a hold or a Stop [m/s²]; ``braking_angular_rad_s2``: the same of turning.
-        radius_m: How far it reaches from its middle, with the room it wants to keep on its way [m].
-        sideways: Whether it goes sideways, as legs and some wheels do.
+        max_linear_m_s: Maximum speed in each direction [m/s].
+        max_angular_rad_s: Maximum turning speed [rad/s].
+        max_linear_acceleration_m_s2: Maximum acceleration [m/s²].
+        max_angular_acceleration_rad_s2: Maximum angular acceleration [rad/s²].
+        braking_linear_m_s2: Deceleration for a hold or a Stop [m/s²].
+        braking_angular_rad_s2: Angular deceleration for a hold or a Stop [rad/s²].
+        radius_m: Radius of the base including the clearance for navigation [m].
+        sideways: Whether the base moves sideways, as legs and omnidirectional wheels do.
     """
 
     max_linear_m_s: float
@@ -64,43 +65,42 @@ class Base(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
 
 
 class Gaze(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """What a robot looks with.
+    """Frames and joints with which the robot looks at a point.
 
     Attributes:
-        frame: One of the type's ``frames``: of a camera, of a face.
-        also: More such frames, that look at the same point: the other eye. Each needs a joint of its own.
-        axis: The direction in which it looks, in each of these frames.
-        joints: Those that turn it.
+        frame: Frame of a camera or a face, one of the type's ``frames``.
+        additional_frames: Frames that look at the same point, for example the other eye. Each needs a joint of its own.
+        axis: Viewing direction in each of these frames.
+        joints: Joints that turn the gaze.
     """
 
     frame: Label
-    also: Annotated[tuple[Label, ...], Meta(max_length=3)] = ()
+    additional_frames: Annotated[tuple[Label, ...], Meta(max_length=3)] = ()
     axis: Vector3 = (1.0, 0.0, 0.0)
     joints: Annotated[tuple[Label, ...], Meta(min_length=1)]
 
 
-class RobotType(abilities.Abilities, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """What every robot of one type has in common; with what ``Abilities`` lists.
+class RobotType(capabilities.Capabilities, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """Properties of all robots of one type, including ``Capabilities``.
 
     Attributes:
-        type: Id of the type, the folder's name.
-        version: Rises with each change that robots or movements could notice.
+        type: Id of the type, equal to the folder's name.
+        version: Rises with each change that affects robots or movements.
         model: MJCF file of the robot alone, relative to the folder.
-        scene: MJCF file of the robot in a small world of its own.
-        driver: Name of the driver that runs it when the agent's configuration names none.
+        scene: MJCF file of the robot in a small world.
+        driver: Driver used if the agent's configuration names none.
         period_ms: Control period [ms].
-        joints: In the order in which telemetry lists them; names are those of the model's joints and actuators.
-        frames: Names of sites or bodies of the model whose pose telemetry carries.
-        home_rad: Joint name → position [rad] at start.
-        braking_rad_s2: Deceleration for a hold or a Stop [rad/s²], every joint; above ``max_acceleration_rad_s2``.
-        diagnostics: How its measurements are to be judged; the first that fits a field counts.
-        cameras: What it sees through, and how many pictures a second, at most ``MOST_PICTURES_HZ``. A simulated robot's
-            model has cameras of these names.
-        streaming_speed: Share of each joint's velocity limit that streamed setpoints may use, 0…1.
-        margin_m: How near the robot may come to itself and to what stands around it [m].
-        workspace: Where some of its frames stay.
-        base: What it can do when it drives or walks; without it, it stays where it is.
-        gaze: What it looks with, where that is turned by joints.
+        joints: Joints in the order of the telemetry, named as in the model.
+        frames: Sites or bodies of the model whose pose telemetry includes.
+        home_rad: Start position: joint name → position [rad].
+        braking_rad_s2: Deceleration of every joint for a hold or a Stop [rad/s²]; above ``max_acceleration_rad_s2``.
+        diagnostics: How the cloud evaluates measurements; the first match of a field applies.
+        cameras: Cameras and their frame rates, at most ``MAX_CAMERA_HZ``. A simulated model has cameras of these names.
+        streaming_speed: Share of each joint's velocity limit for streamed setpoints, 0…1.
+        margin_m: Minimum clearance to itself and to obstacles [m].
+        workspace: Box that some frames never leave.
+        base: Limits of a mobile base; ``None`` for a fixed robot.
+        gaze: Frames and joints of the gaze.
     """
 
     type: Id
@@ -128,19 +128,19 @@ class RobotType(abilities.Abilities, frozen=True, kw_only=True, forbid_unknown_f
 
 
 def load(folder: Path) -> RobotType:
-    """Read and check the manifest of a robot folder.
+    """Read and check the manifest of a robot type's folder.
 
     Raises:
-        ProtocolError: Missing, not TOML, or a field is wrong; the text names file and field.
+        ProtocolError: The manifest is missing or wrong. The message names file and field.
     """
     return toml.load(folder / MANIFEST, parse, named="type")
 
 
 def parse(text: str) -> RobotType:
-    """Read a manifest from TOML text.
+    """Parse a manifest from TOML text.
 
     Raises:
-        ProtocolError: Not TOML, a field is wrong, or fields contradict each other.
+        ProtocolError: The text is not TOML, a field is wrong, or fields contradict each other.
     """
     robot_type = toml.convert(text, RobotType)
     _check_figures(robot_type)
@@ -152,7 +152,7 @@ def parse(text: str) -> RobotType:
     for joint in robot_type.joints:
         if not joint.lower_rad <= robot_type.home_rad[joint.name] <= joint.upper_rad:
             raise ProtocolError(f"home_rad of '{joint.name}' is outside its range")
-    abilities.check(robot_type, robot_type.joints, robot_type.home_rad)
+    capabilities.check(robot_type, robot_type.joints, robot_type.home_rad)
     if robot_type.gaze is not None:
         _check_gaze(robot_type.gaze, robot_type)
     check_diagnostics(robot_type.diagnostics)
@@ -160,10 +160,10 @@ def parse(text: str) -> RobotType:
 
 
 def check_diagnostics(diagnostics: Sequence[Diagnostic]) -> None:
-    """Refuse limits that contradict each other.
+    """Require finite limits in ascending order.
 
     Raises:
-        ProtocolError: They are not finite, or do not rise; the text names the fields.
+        ProtocolError: The limits are not. The message names the fields.
     """
     for diagnostic in diagnostics:
         given = (diagnostic.low, diagnostic.warning_low, diagnostic.warning_high, diagnostic.high)
@@ -173,11 +173,11 @@ def check_diagnostics(diagnostics: Sequence[Diagnostic]) -> None:
 
 
 def _check_figures(robot_type: RobotType) -> None:
-    """Refuse figures with which nothing could be controlled."""
+    """Reject limits that cannot be controlled."""
     if not 1 <= robot_type.period_ms <= MAX_PERIOD_MS:
         raise ProtocolError(f"period_ms is {robot_type.period_ms}; it must be 1 to {MAX_PERIOD_MS}")
     if len(robot_type.joints) > MAX_JOINTS:
-        raise ProtocolError(f"{len(robot_type.joints)} joints; {MAX_JOINTS} is the most")
+        raise ProtocolError(f"{len(robot_type.joints)} joints; the limit is {MAX_JOINTS}")
     if not 0 < robot_type.streaming_speed <= 1:
         raise ProtocolError(f"streaming_speed is {robot_type.streaming_speed}; it must be above 0 and at most 1")
     toml.check_positive("braking_rad_s2", robot_type.braking_rad_s2)
@@ -202,9 +202,9 @@ def _check_cameras(cameras: Sequence[Stream]) -> None:
         raise ProtocolError("two cameras have the same name")
     for camera in cameras:
         toml.check_positive(f"rate_hz of camera '{camera.name}'", camera.rate_hz)
-        if camera.rate_hz > MOST_PICTURES_HZ:
+        if camera.rate_hz > MAX_CAMERA_HZ:
             raise ProtocolError(
-                f"camera '{camera.name}': {camera.rate_hz:g} pictures a second; {MOST_PICTURES_HZ:g} is the most"
+                f"camera '{camera.name}': rate_hz is {camera.rate_hz:g}; the limit is {MAX_CAMERA_HZ:g}"
             )
 
 
@@ -212,14 +212,14 @@ def _check_workspace(box: Workspace, robot_type: RobotType) -> None:
     toml.check_box("workspace", box.lower_m, box.upper_m)
     toml.check_known("workspace", "frame", box.frames, robot_type.frames)
     if not robot_type.model:
-        raise ProtocolError("workspace needs a model: without one nobody knows where a frame is")
+        raise ProtocolError("workspace needs a model, which determines the position of frames")
 
 
 def _check_gaze(gaze: Gaze, robot_type: RobotType) -> None:
-    toml.check_known("gaze", "frame", (gaze.frame, *gaze.also), robot_type.frames)
+    toml.check_known("gaze", "frame", (gaze.frame, *gaze.additional_frames), robot_type.frames)
     toml.check_known("gaze", "joint", gaze.joints, [joint.name for joint in robot_type.joints])
     if not 0 < math.hypot(*gaze.axis) < math.inf:
-        raise ProtocolError("gaze: axis must be a direction, with finite numbers that are not all 0")
+        raise ProtocolError("gaze: axis must have finite numbers that are not all 0")
 
 
 def _check_positive(holder: Struct, fields: Sequence[str], where: str) -> None:

@@ -1,4 +1,4 @@
-"""A room's manifest, ``robots/rooms/<room>/room.toml``: the robots that stand in it and the devices that it has."""
+"""Manifest of a room, ``robots/rooms/<room>/room.toml``: its robots and devices."""
 
 import math
 from collections.abc import Iterable, Sequence
@@ -7,25 +7,24 @@ from typing import Annotated, Any
 
 from msgspec import Meta, Struct
 
-from device_agent.protocol import Id, Label, Stream, Text, Vector3
-from device_agent.protocol import description as reports
+from device_agent.protocol import Id, Label, Stream, Text, Vector3, description
 from device_agent.protocol.errors import ProtocolError
 from device_agent.protocol.manifests import toml
 from device_agent.protocol.manifests.robot_type import Diagnostic, RobotType, check_diagnostics
 
 MANIFEST = "room.toml"
 MAX_RATE_HZ = 50.0
-"""Of a stream, as for telemetry."""
+"""Maximum rate of a stream [Hz]; the limit of telemetry."""
 _PERIOD_MS = 50
-"""Of a room device: how often it looks whether it is stopped or held."""
+"""Period in which a room device checks Stop and holds [ms]."""
 _NO_BRAKING_RAD_S2 = 1.0
-"""A type must name one; nothing turns here."""
+"""Placeholder: a robot type requires a value, but a room device has no joints."""
 
 Vector2 = tuple[float, float]
 
 
 class Plan(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """The floor's extent in the room's frame, x and y, and the ceiling's height above it [m]."""
+    """Extent of the floor, x and y in the room's frame, and height of the ceiling [m]."""
 
     lower_m: Vector2
     upper_m: Vector2
@@ -33,14 +32,14 @@ class Plan(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
 
 
 class RoomRobot(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """One robot of the room: where its base stands, z up.
+    """A robot of the room and the pose of its base, z up.
 
     Attributes:
-        name: Of the device at the agent; unique in the room.
-        type: Its robot type.
-        label: For people; the type's without it.
-        position_m: Of its model's origin in the room [m].
-        yaw_rad: About the vertical [rad].
+        name: Device name at the agent, unique in the room.
+        type: Robot type.
+        label: Display name; empty for the label of the type.
+        position_m: Position of the model's origin in the room [m].
+        yaw_rad: Rotation about the vertical [rad].
     """
 
     name: Id
@@ -50,18 +49,18 @@ class RoomRobot(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     yaw_rad: float = 0.0
 
 
-class Control(reports.Control, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """One thing that can be set at a room device, within ``lower`` and ``upper`` [``unit``]."""
+class Control(description.Control, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """Control of a manifest; see ``description.Control``."""
 
 
 class Watch(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """When a stream or camera of a room device is not well though its driver says nothing of it.
+    """Supervision of a stream or camera: when it is faulty although its driver reports no fault.
 
     Attributes:
-        source: The stream or camera.
-        silent_s: It has given nothing for so long [s]; ``None``: it may be silent.
-        stuck_s: What it gave has been exactly the same for so long [s]; ``None``: it may stay the same. Only for what
-            has noise: a door that is shut stays so, a thermometer that shows the same hundredths for minutes is broken.
+        source: Stream or camera.
+        silent_s: Fault after this time without data [s]; ``None``: silence is allowed.
+        stuck_s: Fault after this time with exactly equal values [s]; ``None``: equal values are allowed. Only for
+            sources with noise: a closed door may report the same value forever, a working thermometer never does.
     """
 
     source: Id
@@ -70,21 +69,21 @@ class Watch(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
 
 
 class RoomDeviceManifest(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """One sensor or switch of the room.
+    """A sensor or switch of the room.
 
     Attributes:
-        name: Of the device at the agent; unique in the room.
-        kind: What it is: ``camera``, ``thermometer`` …; its robot type's name.
-        label: For people.
+        name: Device name at the agent, unique in the room.
+        kind: ``camera``, ``thermometer`` …; also the name of its robot type.
+        label: Display name.
         driver: One of ``device_agent.sensors.names()``.
-        streams: What it measures, and how often when nobody asks for another rate.
-        cameras: What it films, and how many pictures a second.
-        captures: What raw data can be had of it: ``image``, ``scan`` …
-        controls: What can be set.
-        diagnostics: How what it measures is to be judged; the first that fits a field counts.
-        watch: When its streams and cameras are silent or stuck.
-        position_m: Where it is in the room [m].
-        options: For its driver.
+        streams: Measurement streams with their default rates.
+        cameras: Camera streams with their frame rates.
+        captures: Raw data that can be captured: ``image``, ``scan`` …
+        controls: Values that can be set.
+        diagnostics: How the cloud evaluates measurements; the first match of a field applies.
+        watch: Supervision of streams and cameras.
+        position_m: Position in the room [m].
+        options: Options of the driver.
     """
 
     name: Id
@@ -101,8 +100,8 @@ class RoomDeviceManifest(Struct, frozen=True, kw_only=True, forbid_unknown_field
     options: dict[str, Any] = {}
 
     def robot_type(self) -> RobotType:
-        """It as the type of a device without joints, so that leases, Stop, actions and interlocks hold for it too."""
-        does = ("streams", "cameras", "captures", "controls")
+        """The device as a robot type without joints, so that leases, Stop, actions and interlocks apply to it."""
+        abilities = ("streams", "cameras", "captures", "controls")
         return RobotType(
             type=self.kind,
             label=self.label,
@@ -117,14 +116,14 @@ class RoomDeviceManifest(Struct, frozen=True, kw_only=True, forbid_unknown_field
             frames=(),
             home_rad={},
             braking_rad_s2=_NO_BRAKING_RAD_S2,
-            capabilities=tuple(name for name in does if getattr(self, name)),
+            capabilities=tuple(name for name in abilities if getattr(self, name)),
             streams=self.streams,
             diagnostics=self.diagnostics,
         )
 
 
 class Zone(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """A named box of the room, for presence. ``lower_m``: its lowest corner; ``upper_m``: its highest [m]."""
+    """A named box of the room, for presence. ``lower_m``: lowest corner; ``upper_m``: highest corner [m]."""
 
     name: Id
     label: Label
@@ -133,13 +132,13 @@ class Zone(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
 
 
 class Person(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """Somebody who walks about in the simulated room. Real rooms name none.
+    """A simulated pedestrian. Manifests of real rooms have none.
 
     Attributes:
-        name: Of the body in the room's model.
-        path_m: The corners of the way, which is walked round and round [m].
-        speed_m_s: How fast.
-        pause_s: How long each corner is worth standing still.
+        name: Body in the room's model.
+        path_m: Corners of a closed path [m].
+        speed_m_s: Walking speed [m/s].
+        pause_s: Pause at each corner [s].
     """
 
     name: Id
@@ -149,21 +148,25 @@ class Person(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
 
 
 class Climate(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """What the air of the simulated room depends on. Real rooms name none.
+    """Parameters of the simulated air and light. Manifests of real rooms have none.
 
     Attributes:
-        ventilation_per_h: Changes of the room's air by fresh air, door shut [1/h].
-        door_m3_h: Exchange with the corridor through the wide open door [m³/h].
-        loss_w_k: Heat through walls and window, for each kelvin between inside and outside [W/K].
-        capacity_j_k: Heat that the room takes for each kelvin: its air, and what furniture and walls take soon [J/K].
-        heater_w: Most that the radiator gives [W].
-        outside_c: Temperature outside [°C]; ``corridor_c``: behind the door.
-        outside_humidity_percent: Relative humidity outside [%].
-        outside_co2_ppm: Of the air outside; ``corridor_co2_ppm``: of the corridor's.
-        daylight_lux: Inside, in the middle of the room, with the blinds open [lx].
-        lamp_lux: Of the lamp at its brightest, in the same place [lx].
+        ventilation_per_h: Air changes with a closed door [1/h].
+        door_m3_h: Air exchange with the corridor through the open door [m³/h].
+        loss_w_k: Heat loss through walls and window [W/K].
+        capacity_j_k: Heat capacity of the air, and of furniture and walls in the short term [J/K].
+        heater_w: Maximum power of the radiator [W].
+        outside_c: Outside temperature [°C].
+        corridor_c: Temperature of the corridor [°C].
+        outside_humidity_percent: Outside relative humidity [%].
+        outside_co2_ppm: CO₂ of the outside air [ppm].
+        corridor_co2_ppm: CO₂ of the corridor [ppm].
+        daylight_lux: Daylight in the middle of the room with open blinds [lx].
+        lamp_lux: Light of the lamp at full brightness in the same place [lx].
         quiet_db: Sound level of the empty room, A-weighted [dB].
-        start_c: Temperature when the simulation begins [°C]; ``start_humidity_percent``, ``start_co2_ppm``: the same.
+        start_c: Initial temperature [°C].
+        start_humidity_percent: Initial relative humidity [%].
+        start_co2_ppm: Initial CO₂ [ppm].
     """
 
     ventilation_per_h: float = 1.0
@@ -185,20 +188,20 @@ class Climate(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
 
 
 class Room(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """One room. Its frame has its origin on the floor and z up.
+    """A room. The origin of its frame is on the floor, z is up.
 
     Attributes:
-        room: Its id, the folder's name.
-        version: Rises with each change that robots or people could notice.
-        model: MJCF file of the room without its robots, relative to the folder; empty for a real room.
-        plan: Its extent.
-        robots: Who stands where.
-        devices: Its sensors and switches.
+        room: Id, equal to the folder's name.
+        version: Rises with each change that affects robots or people.
+        model: MJCF file of the room without robots, relative to the folder; empty for a real room.
+        plan: Extent of the room.
+        robots: Robots and their poses.
+        devices: Sensors and switches.
         zones: Named boxes.
-        people: Who walks about in its simulation.
-        climate: Its air and light in simulation.
-        start: What its simulation is set to in the beginning: the position of an actuator of its model, in its joint's
-            own unit, or one of ``lamp`` (0…1) and ``thermostat`` [°C].
+        people: Simulated pedestrians.
+        climate: Simulated air and light.
+        start: Initial settings of the simulation: position of an actuator of the model in its joint's unit, ``lamp``
+            (0…1) or ``thermostat`` [°C].
     """
 
     room: Id
@@ -215,16 +218,16 @@ class Room(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     start: dict[Id, float] = {}
 
     def robot(self, name: str) -> RoomRobot | None:
-        """The robot of that name, if there is one."""
+        """The robot of this name, or ``None``."""
         return next((robot for robot in self.robots if robot.name == name), None)
 
     def device(self, name: str) -> RoomDeviceManifest | None:
-        """The device of that name, if there is one."""
+        """The device of this name, or ``None``."""
         return next((device for device in self.devices if device.name == name), None)
 
     @property
     def names(self) -> tuple[str, ...]:
-        """Of all robots and devices."""
+        """Names of all robots and devices."""
         return (*(robot.name for robot in self.robots), *(device.name for device in self.devices))
 
 
@@ -232,16 +235,16 @@ def load(folder: Path) -> Room:
     """Read and check the manifest of a room's folder.
 
     Raises:
-        ProtocolError: Missing, not TOML, or a field is wrong; the text names file and field.
+        ProtocolError: The manifest is missing or wrong. The message names file and field.
     """
     return toml.load(folder / MANIFEST, parse, named="room")
 
 
 def parse(text: str) -> Room:
-    """Read a manifest from TOML text.
+    """Parse a manifest from TOML text.
 
     Raises:
-        ProtocolError: Not TOML, a field is wrong, or fields contradict each other.
+        ProtocolError: The text is not TOML, a field is wrong, or fields contradict each other.
     """
     room = toml.convert(text, Room)
     toml.check_box("plan", room.plan.lower_m, room.plan.upper_m)
@@ -272,29 +275,29 @@ def _check_device(device: RoomDeviceManifest) -> None:
     for stream in (*device.streams, *device.cameras):
         if not 0 < stream.rate_hz <= MAX_RATE_HZ:
             raise ProtocolError(
-                f"rate_hz of stream '{stream.name}' of {where} must be above 0, {MAX_RATE_HZ:g} at most"
+                f"rate_hz of stream '{stream.name}' of {where} must be above 0 and at most {MAX_RATE_HZ:g}"
             )
     for control in device.controls:
         if not -math.inf < control.lower < control.upper < math.inf:
             raise ProtocolError(
-                f"control '{control.name}' of {where}: lower must be below upper, and both of them finite"
+                f"control '{control.name}' of {where}: lower must be below upper, and both must be finite"
             )
-    _check_judgements(device, where)
+    _check_supervision(device, where)
 
 
-def _check_judgements(device: RoomDeviceManifest, where: str) -> None:
-    """Refuse diagnostics and watches of what the device has not, or that contradict themselves."""
+def _check_supervision(device: RoomDeviceManifest, where: str) -> None:
+    """Reject diagnostics and supervision of unknown streams."""
     try:
         check_diagnostics(device.diagnostics)
     except ProtocolError as error:
         raise ProtocolError(f"{where}: {error}") from error
     streams = [stream.name for stream in device.streams]
     sources = [*streams, *(camera.name for camera in device.cameras)]
-    asked = [("diagnostics", each.stream, streams) for each in device.diagnostics]
-    asked += [("watch", each.source, sources) for each in device.watch]
-    for what, name, known in asked:
+    references = [("diagnostics", each.stream, streams) for each in device.diagnostics]
+    references += [("watch", each.source, sources) for each in device.watch]
+    for what, name, known in references:
         if name not in known:
-            raise ProtocolError(f"{what} of {where}: it has no '{name}'; it has: {', '.join(known) or 'none'}")
+            raise ProtocolError(f"{what} of {where}: there is no '{name}'; known: {', '.join(known) or 'none'}")
 
 
 def _check_person(person: Person, plan: Plan) -> None:
@@ -305,8 +308,8 @@ def _check_person(person: Person, plan: Plan) -> None:
     for corner in person.path_m:
         _check_finite(where, corner)
         _check_inside(where, corner, plan)
-    ends = zip(person.path_m, (*person.path_m[1:], person.path_m[0]), strict=True)
-    if any(math.dist(here, there) == 0 for here, there in ends):
+    sides = zip(person.path_m, (*person.path_m[1:], person.path_m[0]), strict=True)
+    if any(math.dist(start, end) == 0 for start, end in sides):
         raise ProtocolError(f"path_m of {where} has the same corner twice in a row")
 
 
@@ -321,13 +324,13 @@ def _check_climate(climate: Climate) -> None:
 def _check_inside(where: str, position_m: Sequence[float], plan: Plan) -> None:
     for value, lower, upper in zip(position_m, plan.lower_m, plan.upper_m, strict=False):
         if not lower <= value <= upper:
-            raise ProtocolError(f"{where} stands outside of the plan: {tuple(position_m[:2])}")
+            raise ProtocolError(f"{where} is outside of the plan: {tuple(position_m[:2])}")
 
 
 def _check_names(what: str, names: Sequence[str]) -> None:
-    twice = sorted({name for name in names if list(names).count(name) > 1})
-    if twice:
-        raise ProtocolError(f"{what}: the name '{twice[0]}' is there twice")
+    duplicates = sorted({name for name in names if list(names).count(name) > 1})
+    if duplicates:
+        raise ProtocolError(f"{what}: the name '{duplicates[0]}' is used twice")
 
 
 def _check_finite(where: str, values: Iterable[float]) -> None:

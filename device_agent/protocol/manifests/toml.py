@@ -1,4 +1,4 @@
-"""How the manifest of a folder is read: TOML of one type; what is wrong is one error that names file and field."""
+"""Reads TOML manifests; each error names the file and the field."""
 
 import math
 from collections.abc import Callable, Collection, Sequence
@@ -17,11 +17,11 @@ def load(path: Path, parse: Callable[[str], Manifest], *, named: str) -> Manifes
 
     Args:
         path: The file.
-        parse: Reads and checks its text.
-        named: The field that equals the folder's name.
+        parse: Reads and checks the text.
+        named: The field that must equal the folder's name.
 
     Raises:
-        ProtocolError: Missing, not TOML, or a field is wrong; the text names file and field.
+        ProtocolError: The file is missing, not TOML, or a field is wrong. The message names file and field.
     """
     try:
         manifest = parse(path.read_text(encoding="utf-8"))
@@ -34,12 +34,12 @@ def load(path: Path, parse: Callable[[str], Manifest], *, named: str) -> Manifes
 
 
 def convert(text: str, kind: type[Manifest]) -> Manifest:
-    """The fields of a manifest from TOML text.
+    """Convert TOML text to a manifest.
 
     Raises:
-        ProtocolError: Not TOML, or a field is wrong.
+        ProtocolError: The text is not TOML, or a field is wrong.
     """
-    import tomllib  # noqa: PLC0415 (15 ms of regular expressions, for who reads a manifest only)
+    import tomllib  # noqa: PLC0415 (loading takes 15 ms, and only readers of manifests need it)
 
     try:
         return msgspec.convert(tomllib.loads(text), kind, strict=False)
@@ -48,20 +48,20 @@ def convert(text: str, kind: type[Manifest]) -> Manifest:
 
 
 def check_positive(what: str, value: float) -> None:
-    """Refuse what is not above 0 and finite.
+    """Require a finite number above 0.
 
     Raises:
-        ProtocolError: It is not.
+        ProtocolError: The number is not.
     """
     if not 0 < value < math.inf:
         raise ProtocolError(f"{what} is {value}; it must be above 0 and finite")
 
 
 def check_box(where: str, lower_m: Sequence[float], upper_m: Sequence[float]) -> None:
-    """Refuse a box without an inside.
+    """Require finite corners with ``lower_m`` below ``upper_m`` on each axis.
 
     Raises:
-        ProtocolError: A corner is not finite, or the lower one is not below the upper one.
+        ProtocolError: The box is not valid.
     """
     for lower, upper in zip(lower_m, upper_m, strict=True):
         if not -math.inf < lower < upper < math.inf:
@@ -69,10 +69,10 @@ def check_box(where: str, lower_m: Sequence[float], upper_m: Sequence[float]) ->
 
 
 def check_known(where: str, what: str, named: Sequence[str], known: Collection[str]) -> None:
-    """Refuse a name that nothing has.
+    """Require known names.
 
     Raises:
-        ProtocolError: There is one; the text lists those there are.
+        ProtocolError: A name is unknown. The message lists the known names.
     """
     for name in named:
         if name not in known:

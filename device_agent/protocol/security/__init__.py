@@ -1,1 +1,1 @@
-"""Security."""
+"""Signatures, broker permissions, key rotation and revocation."""

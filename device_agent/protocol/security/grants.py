@@ -1,8 +1,8 @@
-"""What one broker connection may do: a short-lived EdDSA token with exact topics, default deny.
+"""Permissions of one broker connection: a short-lived EdDSA token with exact topics, default deny.
 
-The functions issue it, the client gives it as its MQTT password (user name = principal, client id = ``client_id``),
-and the embedded broker checks it with the public key alone. Brokers that cannot read it (mosquitto's dynamic security)
-get the same topics written into them by the ``BrokerAccess`` adapter.
+The functions issue the token. The client sends it as its MQTT password (user name: principal, client id:
+``client_id``), and the embedded broker verifies it with the public key alone. For brokers that cannot read it
+(mosquitto's dynamic security) the ``BrokerAccess`` adapter configures the same topics.
 """
 
 import time
@@ -31,7 +31,7 @@ SERVICE_PUBLISH = (
     f"{_EVERY_DEVICE}/{topics.LATE}/+",
     revocation.TOPIC,
 )
-"""What the functions say: orders; and for agents that speak HTTP, what those have told them."""
+"""Topics to which the functions publish: commands, and messages of agents that use HTTP."""
 SERVICE_SUBSCRIBE = (
     topics.conn(topics.ANY, topics.ANY),
     *(f"{_EVERY_DEVICE}/{kind}" for kind in (topics.DESC, topics.STATE, topics.EVENT, topics.ACK)),
@@ -39,19 +39,19 @@ SERVICE_SUBSCRIBE = (
     f"{_EVERY_DEVICE}/{topics.TELE}/+",
     f"{_EVERY_DEVICE}/{topics.LATE}/+",
 )
-"""What the functions hear."""
+"""Topics to which the functions subscribe."""
 
 
 class Grant(Struct, frozen=True, kw_only=True):
-    """Topics of one connection.
+    """Permissions of one connection.
 
     Attributes:
-        principal: Who it is: ``account:…``, ``agent:…`` or ``service:…``.
-        client_id: The MQTT client id it is bound to.
-        publish: Topic filters that cover what it may publish, and the topic of its will.
-        subscribe: Topic filters; a subscription is allowed when one of them covers it whole.
+        principal: ``account:…``, ``agent:…`` or ``service:…``.
+        client_id: MQTT client id to which the token is bound.
+        publish: Topic filters for publishing, including the will.
+        subscribe: Topic filters; a subscription is allowed if one of them covers all of it.
         token_id: Unique id, for revocation.
-        expires_at: End of the connection's right [s since 1970].
+        expires_at: End of validity [s since 1970].
     """
 
     principal: str
@@ -62,20 +62,20 @@ class Grant(Struct, frozen=True, kw_only=True):
     expires_at: int
 
     def may_publish(self, topic: str) -> bool:
-        """Whether ``topic`` (no wildcards) may be published."""
+        """Whether the client may publish to ``topic``, which has no wildcards."""
         if "+" in topic or "#" in topic:
             return False
         return any(topics.matches(pattern, topic) for pattern in self.publish)
 
     def may_subscribe(self, pattern: str) -> bool:
-        """Whether the whole of ``pattern`` lies inside what may be read."""
+        """Whether the grant covers all of ``pattern``."""
         return any(topics.matches(granted, pattern) for granted in self.subscribe)
 
 
 def covering(principal: str) -> tuple[str, ...]:
-    """How a revocation may name a principal: itself, what it is part of, and either with ``+`` for any one part.
+    """Names by which a revocation matches a principal: its prefixes, also with ``+`` for any one part.
 
-    ``account:a:s:watch`` is part of ``account:a:s``, and one of ``account:a:+:watch``.
+    ``account:a:s:watch`` is matched by ``account:a:s`` and by ``account:a:+:watch``.
     """
     parts = principal.split(":")
     whole = [parts[:length] for length in range(1, len(parts) + 1)]
@@ -100,10 +100,10 @@ def issue(grant: Grant, key: Ed25519PrivateKey) -> str:
 
 
 def read(token: str, keys: Mapping[str, Ed25519PublicKey], *, leeway_s: float = 0) -> Grant:
-    """The grant in a token.
+    """Verify a token and return its grant.
 
     Raises:
-        SignatureError: Expired, of another purpose, or not signed by one of ``keys``.
+        SignatureError: The token has expired, has another purpose, or is not signed by one of ``keys``.
     """
     try:
         kid = jwt.get_unverified_header(token).get("kid", "")
@@ -130,8 +130,8 @@ def read(token: str, keys: Mapping[str, Ed25519PublicKey], *, leeway_s: float = 
         raise SignatureError(f"broker token refused: {error}") from error
 
 
-def key_of(token: str) -> str:
-    """Id of the key that a token says it was signed with; empty where it does not say."""
+def signing_key_id(token: str) -> str:
+    """Id of the key that the unverified token names; empty if it names none."""
     try:
         return str(jwt.get_unverified_header(token).get("kid", ""))
     except jwt.PyJWTError:
@@ -139,35 +139,35 @@ def key_of(token: str) -> str:
 
 
 def issued_at(token: str) -> float:
-    """When a token that ``read`` has accepted was made [s since 1970]; 0 where it does not say."""
+    """Issue time of a token that ``read`` has accepted [s since 1970]; 0 if it has none."""
     claims: dict[str, Any] = jwt.decode(token, options={"verify_signature": False})
     moment = claims.get("iat", 0)
     return float(moment) if isinstance(moment, int | float) else 0.0
 
 
-def agent_orders(space: str, agent: str) -> tuple[str, ...]:
-    """Where an agent hears what is addressed to its devices."""
+def agent_command_topics(space: str, agent: str) -> tuple[str, ...]:
+    """Topics on which an agent receives commands, setpoints and Stop."""
     own = f"{topics.ROOT}/{space}/{agent}/+"
     return (f"{own}/{topics.CMD}", f"{own}/{topics.CTL}/+", f"{own}/{topics.STOP}")
 
 
 def agent_grant(space: str, agent: str, *, token_id: str, lifetime_s: float) -> Grant:
-    """What an agent may do: speak for its own devices, hear what is addressed to them, and what its space measures."""
+    """Grant of an agent: publish for its devices, receive their commands, and read the measurements of its space."""
     own = f"{topics.ROOT}/{space}/{agent}"
-    spoken = (topics.DESC, topics.STATE, topics.EVENT, topics.ACK)
+    published = (topics.DESC, topics.STATE, topics.EVENT, topics.ACK)
     return Grant(
         principal=f"agent:{agent}",
         client_id=agent,
         publish=(
             topics.conn(space, agent),
-            *(f"{own}/+/{kind}" for kind in spoken),
+            *(f"{own}/+/{kind}" for kind in published),
             f"{own}/+/{topics.DESC}/+",
             f"{own}/+/{topics.TELE}/+",
             f"{own}/+/{topics.LATE}/+",
             f"{own}/+/{topics.CAM}/+",
         ),
         subscribe=(
-            *agent_orders(space, agent),
+            *agent_command_topics(space, agent),
             topics.device(space, topics.ANY, topics.ANY, topics.TELE, topics.ANY),
         ),
         token_id=token_id,
@@ -175,8 +175,8 @@ def agent_grant(space: str, agent: str, *, token_id: str, lifetime_s: float) -> 
     )
 
 
-def heard(space: str, agent: str, device: str) -> tuple[str, ...]:
-    """What whoever watches a device hears; ``+`` stands for all of a space. Never ``cmd``, ``ctl`` or ``stop``."""
+def device_subscriptions(space: str, agent: str, device: str) -> tuple[str, ...]:
+    """Topics of a viewer of a device, never ``cmd``, ``ctl`` or ``stop``; ``+`` stands for all of a space."""
     plain = (topics.DESC, topics.STATE, topics.EVENT, topics.ACK)
     named = ((topics.DESC, topics.TWIN), (topics.TELE, topics.ANY), (topics.CAM, topics.ANY))
     return (
@@ -187,9 +187,9 @@ def heard(space: str, agent: str, device: str) -> tuple[str, ...]:
 
 
 def service_grant(*, client_id: str, token_id: str, lifetime_s: float) -> Grant:
-    """What a connection of the functions may do: tell every device and the broker, hear and pass on what agents say.
+    """Grant of a functions connection: command all devices, read and relay agents' messages.
 
-    Never setpoints and pictures.
+    It excludes setpoints and camera frames.
     """
     return Grant(
         principal="service:functions",
@@ -201,14 +201,14 @@ def service_grant(*, client_id: str, token_id: str, lifetime_s: float) -> Grant:
     )
 
 
-def speaker_grant(*, client_id: str, token_id: str, lifetime_s: float) -> Grant:
-    """What a program may do that speaks another protocol for agents: hear what they might, setpoints too.
+def gateway_grant(*, client_id: str, token_id: str, lifetime_s: float) -> Grant:
+    """Grant of a gateway to agents with another protocol: receive what the agents would, including setpoints.
 
-    What they answer it says as the functions do.
+    The gateway's responses are published by the functions.
     """
     kinds = (topics.CMD, topics.STOP, f"{topics.CTL}/+", f"{topics.TELE}/+")
     return Grant(
-        principal="service:speaker",
+        principal="service:gateway",
         client_id=client_id,
         publish=(),
         subscribe=(topics.conn(topics.ANY, topics.ANY), *(f"{_EVERY_DEVICE}/{kind}" for kind in kinds)),
@@ -218,10 +218,10 @@ def speaker_grant(*, client_id: str, token_id: str, lifetime_s: float) -> Grant:
 
 
 def check(grant: Grant) -> None:
-    """Refuse a grant that could not be written into every broker.
+    """Reject a grant that some supported broker could not represent.
 
     Raises:
-        ProtocolError: A client id or topic filter outside the contract.
+        ProtocolError: The client id or a topic filter violates the contract.
     """
     if not topics.is_id(grant.client_id):
         raise ProtocolError(f"client id '{grant.client_id[:80]}' is not {topics.ID_PATTERN}")

@@ -1,7 +1,7 @@
-"""How a device learns the cloud's next key: by a statement that a key signed which the device has pinned already.
+"""Statements by which a device learns the cloud's next key: signed with a key that the device has already pinned.
 
-A statement is a ``signing.Signed`` envelope under a context of its own, whose body is a ``NewKey``. It travels in an
-order and in the answers to an agent's requests; whoever carries it can change nothing in it.
+A statement is a ``signing.Signed`` envelope with its own context and a ``NewKey`` as body. It travels in commands and
+in responses to the agent's requests; the carrier cannot change it.
 """
 
 from typing import Annotated
@@ -12,18 +12,18 @@ from device_agent.protocol.fields import Milliseconds
 
 KEYS_CONTEXT = b"telescope/v1/keys\n"
 MAX_STATEMENTS = 16
-"""Most that are told at once: keys change once in weeks."""
+"""Maximum number of statements in one message. Keys change every few weeks."""
 
 PublicKeyText = Annotated[str, Meta(pattern="^[A-Za-z0-9_-]{43}$")]
 Statement = Annotated[str, Meta(min_length=1, max_length=1024)]
-"""A signed statement as it travels: the envelope's JSON as text."""
+"""A signed statement in transit: the JSON of its envelope as text."""
 Serial = Annotated[int, Meta(ge=1, le=2**53)]
 
 
 class NewKey(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """From now on ``key`` counts too; those of a lower ``serial`` until ``former_until_ms`` on the cloud's clock.
+    """``key`` becomes valid now; keys with a lower ``serial`` remain valid until ``former_until_ms`` (cloud clock).
 
-    ``serial`` only rises, so that no statement, however well signed, leads back to an older key.
+    ``serial`` only rises, so no statement can restore an older key.
     """
 
     serial: Serial

@@ -1,6 +1,6 @@
-"""What the functions tell the embedded broker itself, on a topic that no subscriber ever sees.
+"""Revocations that the functions publish to the embedded broker, on a topic that no client can subscribe to.
 
-Brokers with a control interface of their own (mosquitto's dynamic security) are told through that instead.
+Brokers with their own control interface (mosquitto's dynamic security) are controlled through that interface.
 """
 
 from msgspec import Struct
@@ -9,15 +9,13 @@ TOPIC = "$CONTROL/telescope/v1"
 
 
 class Revoke(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True, omit_defaults=True):
-    """Cut live sessions and refuse the tokens behind them. Exactly one of the first three is given.
+    """Close live sessions and reject the tokens behind them. Exactly one of the first three fields is set.
 
     Attributes:
-        client_id: Every token of this client id made up to ``before_s``.
-        principal: Every token of this principal, and of what is part of it, made up to ``before_s``; see
-            ``grants.covering``.
-        token_id: This one token.
-        before_s: The teller's clock, the same that stamps the tokens [s since 1970]; the broker's own where it is not
-            given.
+        client_id: All tokens of this client id issued up to ``before_s``.
+        principal: All tokens of this principal and its parts issued up to ``before_s``; see ``grants.covering``.
+        token_id: This token.
+        before_s: Time on the clock that stamps the tokens [s since 1970]; the broker's own clock if not given.
     """
 
     client_id: str | None = None

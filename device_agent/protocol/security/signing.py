@@ -1,7 +1,7 @@
-"""Signatures on what the cloud tells a robot: Ed25519 over the exact bytes that travel.
+"""Ed25519 signatures of messages from the cloud to devices, over the exact bytes in transit.
 
-The signed text is carried as raw JSON inside an envelope, so nothing depends on two programs writing the same JSON
-for the same value. A context string keeps a signature made for one purpose from serving another.
+The envelope carries the signed text as raw JSON, so two programs need not produce equal JSON for equal values. A
+context string prevents a signature made for one purpose from being used for another.
 """
 
 import base64
@@ -30,21 +30,21 @@ class Signed(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
 
 
 def generate() -> Ed25519PrivateKey:
-    """A new private key."""
+    """Generate a private key."""
     return Ed25519PrivateKey.generate()
 
 
 def public_text(key: Ed25519PublicKey) -> str:
-    """The public key as base64url text: the form in which it is stored, sent and pinned."""
+    """The public key as base64url text, the form in which it is stored, sent and pinned."""
     raw = key.public_bytes(serialization.Encoding.Raw, serialization.PublicFormat.Raw)
     return base64.urlsafe_b64encode(raw).rstrip(b"=").decode()
 
 
 def public_key(text: str) -> Ed25519PublicKey:
-    """Read what ``public_text`` wrote.
+    """Parse the output of ``public_text``.
 
     Raises:
-        ProtocolError: Not 32 bytes of base64url.
+        ProtocolError: The text is not 32 bytes of base64url.
     """
     try:
         return Ed25519PublicKey.from_public_bytes(_unbase64(text))
@@ -53,22 +53,27 @@ def public_key(text: str) -> Ed25519PublicKey:
 
 
 def key_id(key: Ed25519PublicKey) -> str:
-    """A short stable name of a public key."""
+    """Short, stable id of a public key."""
     return hashlib.sha256(public_text(key).encode()).hexdigest()[:16]
 
 
 def sign(body: bytes, key: Ed25519PrivateKey, *, context: bytes = COMMAND_CONTEXT) -> bytes:
-    """The envelope around ``body`` (JSON), ready to publish."""
+    """The signed envelope around ``body`` (JSON), ready to publish."""
     signature = base64.urlsafe_b64encode(key.sign(context + body)).rstrip(b"=").decode()
     return codec.encode(Signed(key=key_id(key.public_key()), signature=signature, body=Raw(body)))
 
 
 def verify(payload: bytes, keys: Mapping[str, Ed25519PublicKey], *, context: bytes = COMMAND_CONTEXT) -> bytes:
-    """The body of an envelope, once one of the pinned ``keys`` (by ``key_id``) is seen to have signed it.
+    """The body of an envelope that one of ``keys`` has signed.
+
+    Args:
+        payload: The envelope.
+        keys: Pinned keys by ``key_id``.
+        context: Purpose of the signature.
 
     Raises:
-        SignatureError: Unknown key, or not signed by it.
-        ProtocolError: Not an envelope.
+        SignatureError: The key is unknown, or the signature does not match.
+        ProtocolError: The payload is not an envelope.
     """
     envelope = codec.decode(payload, Signed)
     key = keys.get(envelope.key)
@@ -83,17 +88,17 @@ def verify(payload: bytes, keys: Mapping[str, Ed25519PublicKey], *, context: byt
 
 
 def movement_text(robot_type: str, name: str, version: int, sha256: str) -> str:
-    """What the signature of a movement's version says: four lines, none of which can hold a line's end."""
+    """The text that the signature of a movement version covers: four lines; no field can contain a line break."""
     return f"{robot_type}\n{name}\n{version}\n{sha256}"
 
 
 def sign_text(text: str, key: Ed25519PrivateKey, *, context: bytes) -> str:
-    """A signature that is kept beside ``text``, as base64url."""
+    """A detached signature of ``text``, as base64url."""
     return base64.urlsafe_b64encode(key.sign(context + text.encode())).rstrip(b"=").decode()
 
 
 def verify_text(text: str, signature: str, key: Ed25519PublicKey, *, context: bytes) -> None:
-    """Check what ``sign_text`` made.
+    """Verify a signature of ``sign_text``.
 
     Raises:
         SignatureError: ``key`` did not sign this text for this purpose.
@@ -105,8 +110,8 @@ def verify_text(text: str, signature: str, key: Ed25519PublicKey, *, context: by
 
 
 def _unbase64(text: str) -> bytes:
-    """Bytes of base64url; each has one text alone, so that no character of it may differ."""
+    """Decode base64url strictly: each byte string has exactly one valid text, so signatures are not malleable."""
     content = base64.b64decode(text + "=" * (-len(text) % 4), altchars=b"-_", validate=True)
     if base64.urlsafe_b64encode(content).rstrip(b"=").decode() != text:
-        raise binascii.Error("bits are set that belong to no byte")
+        raise binascii.Error("the text has unused bits set")
     return content

@@ -1,1 +1,1 @@
-"""Xmpp."""
+"""The wire contract over XMPP."""

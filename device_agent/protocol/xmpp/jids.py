@@ -1,4 +1,4 @@
-"""Names on an XMPP server that both sides know: apart from stanzas, so that who only names somebody loads no XML."""
+"""Well-known JIDs, in a module that loads no XML parser."""
 
 CLOUD = "cloud"
-"""The user that speaks for the cloud, with a resource for each process that does."""
+"""User name of the cloud; each of its processes has a resource of its own."""

@@ -1,13 +1,13 @@
-"""The wire contract over XMPP: one message of ours is one ``<message>`` with one element of ours in it.
+"""The wire contract over XMPP: each message is one ``<message>`` with one element.
 
 ```
 <message to='cloud@…/…' id='7'><m xmlns='urn:telescope:v1' topic='ts/v1/…'>{"…": …}</m>
   <request xmlns='urn:xmpp:receipts'/></message>
 ```
 
-Topic and payload are those of MQTT, byte for byte. What wants to be confirmed (QoS 1) asks for a receipt (XEP-0184),
-which is sent once the message is stored; an error in its place says why it was refused. Agents speak with the cloud and
-with nobody else.
+Topic and payload equal those of MQTT, byte for byte. A message with QoS 1 requests a receipt (XEP-0184), which is sent
+once the message is stored; an error instead of the receipt contains the reason. Agents exchange messages with the cloud
+only.
 """
 
 import base64
@@ -22,52 +22,52 @@ from device_agent.protocol.errors import ProtocolError
 
 NAMESPACE = "urn:telescope:v1"
 RECEIPTS = "urn:xmpp:receipts"
-PING_S = 2.5
-"""Both ends say something at least this often."""
-DEAD_S = 7.0
-"""From whom nothing came for so long is gone."""
+PING_INTERVAL_S = 2.5
+"""Maximum interval between stanzas of either end [s]."""
+TIMEOUT_S = 7.0
+"""A peer without traffic for this long counts as disconnected [s]."""
 PRIORITY = -1
-"""Of everybody's presence: a message to somebody's other, wrong place is never better than none."""
+"""Priority of all presences: a negative value keeps the server from rerouting messages to another resource."""
 MAX_STANZA_BYTES = 192 * 1024
-"""The longest payload in base64, and room for what is around it."""
+"""The largest payload in base64, and its envelope [bytes]."""
 MAX_TOPIC = 400
-MAX_WHY = 400
+MAX_REASON = 400
 MAX_LISTEN = 64
 
 _ELEMENT = f"{{{NAMESPACE}}}m"
 _UNFIT = re.compile("[^\\t\\n -\ud7ff\ue000-\ufffd\U00010000-\U0010ffff]")
-"""What XML cannot carry, or (a carriage return) changes on the way."""
+"""Characters that XML cannot represent, or normalizes (carriage return)."""
 _ID = re.compile(r"\A[A-Za-z0-9_.-]{1,64}\Z")
 
 
-class Told(NamedTuple):
-    """One message, as it came. ``id`` is empty where no receipt is wanted."""
+class Delivery(NamedTuple):
+    """One received message. ``id`` is empty if no receipt is requested."""
 
     topic: str
     payload: bytes
     id: str = ""
 
 
-class Refused(NamedTuple):
-    """A message that came back. ``final``: whoever is there does not take it, now or later; else nobody was there."""
+class Rejection(NamedTuple):
+    """A returned message. ``final``: the recipient rejects it for good; otherwise there was no recipient."""
 
     id: str
-    why: str
+    reason: str
     final: bool
 
 
 def message(
     to: str, topic: str, payload: bytes, *, receipt: str = "", body: str = "", listen: Iterable[str] = ()
 ) -> str:
-    """One message as the text of its stanza.
+    """One message as stanza text.
 
     Args:
-        to: The JID of whom it is for.
-        topic: Of ``protocol.topics``.
-        payload: Any bytes; those that XML cannot carry travel as base64.
-        receipt: An id, where a receipt is wanted.
-        body: What an ordinary client shows.
-        listen: With an agent's greeting: topics of the space's other agents that it wants to hear.
+        to: JID of the recipient.
+        topic: Topic of ``protocol.topics``.
+        payload: Any bytes; bytes that XML cannot represent are encoded as base64.
+        receipt: Message id if a receipt is requested.
+        body: Text that an ordinary XMPP client shows.
+        listen: Topics of other agents of the space that the agent subscribes to; sent with its presence.
     """
     stanza = Element("message", {"to": to})
     if receipt:
@@ -75,8 +75,8 @@ def message(
         SubElement(stanza, "request", {"xmlns": RECEIPTS})
     if body:
         SubElement(stanza, "body").text = "".join(letter for letter in body if not _UNFIT.match(letter))
-    for wanted in listen:
-        SubElement(stanza, "listen", {"xmlns": NAMESPACE, "topic": wanted})
+    for pattern in listen:
+        SubElement(stanza, "listen", {"xmlns": NAMESPACE, "topic": pattern})
     element = SubElement(stanza, "m", {"xmlns": NAMESPACE, "topic": topic})
     element.text = _plain(payload)
     if element.text is None:
@@ -86,57 +86,59 @@ def message(
 
 
 def receipt(to: str, message_id: str) -> str:
-    """The confirmation of a message."""
+    """The receipt of a message."""
     stanza = Element("message", {"to": to})
     SubElement(stanza, "received", {"xmlns": RECEIPTS, "id": message_id})
     return tostring(stanza, encoding="unicode")
 
 
-def refusal(to: str, message_id: str, why: str) -> str:
-    """The answer to a message that is not taken, and would not be at another time."""
+def rejection(to: str, message_id: str, reason: str) -> str:
+    """The final rejection of a message."""
     stanza = Element("message", {"to": to, "type": "error", "id": message_id})
     error = SubElement(stanza, "error", {"type": "modify"})
     SubElement(error, "not-acceptable", {"xmlns": "urn:ietf:params:xml:ns:xmpp-stanzas"})
     text = SubElement(error, "text", {"xmlns": "urn:ietf:params:xml:ns:xmpp-stanzas"})
-    text.text = "".join(letter for letter in why[:MAX_WHY] if not _UNFIT.match(letter))
+    text.text = "".join(letter for letter in reason[:MAX_REASON] if not _UNFIT.match(letter))
     return tostring(stanza, encoding="unicode")
 
 
 def presence(*, to: str = "", available: bool = True) -> str:
-    """Presence, to all who know us or to one."""
+    """Presence, to all contacts or to one JID."""
     stanza = Element("presence", ({"to": to} if to else {}) | ({} if available else {"type": "unavailable"}))
     if available:
         SubElement(stanza, "priority").text = str(PRIORITY)
     return tostring(stanza, encoding="unicode")
 
 
-def forget(domain: str, user: str) -> str:
-    """The cloud's word to the server that a user has no rights any more (``infra/prosody``)."""
+def revoke_user(domain: str, user: str) -> str:
+    """Tells the server that a user has lost all rights (``infra/prosody``)."""
     stanza = Element("message", {"to": domain})
     SubElement(stanza, "forget", {"xmlns": NAMESPACE, "user": user})
     return tostring(stanza, encoding="unicode")
 
 
 def ping(domain: str) -> str:
-    """A question to the server that it answers at once (XEP-0199)."""
+    """A ping to the server (XEP-0199)."""
     stanza = Element("iq", {"to": domain, "type": "get", "id": "ping"})
     SubElement(stanza, "ping", {"xmlns": "urn:xmpp:ping"})
     return tostring(stanza, encoding="unicode")
 
 
-def read(stanza: Element) -> Told | None:
-    """Our message in a ``<message>`` that arrived; ``None`` where there is none.
+def parse(stanza: Element) -> Delivery | None:
+    """The message in a ``<message>`` stanza, or ``None`` if it contains none.
 
     Raises:
-        ProtocolError: It is not as ``message`` makes it.
+        ProtocolError: The stanza violates the format of ``message``.
     """
-    found = stanza.findall(_ELEMENT)
-    if not found or stanza.get("type") == "error":
+    elements = stanza.findall(_ELEMENT)
+    if not elements or stanza.get("type") == "error":
         return None
-    (element, *others) = found
+    (element, *others) = elements
     topic, text = element.get("topic", ""), element.text or ""
     if others or len(element) or not 1 <= len(topic) <= MAX_TOPIC:
-        raise ProtocolError(f"a message holds one element <m xmlns='{NAMESPACE}' topic='…'> with text alone in it")
+        raise ProtocolError(
+            f"a message must contain exactly one element <m xmlns='{NAMESPACE}' topic='…'> with text only"
+        )
     match element.get("as", "text"):
         case "text":
             payload = text.encode()
@@ -146,47 +148,47 @@ def read(stanza: Element) -> Told | None:
             except (ValueError, binascii.Error) as error:
                 raise ProtocolError("the payload is not base64") from error
         case other:
-            raise ProtocolError(f"a payload is text or base64, not '{other[:20]}'")
+            raise ProtocolError(f"the encoding must be text or base64, not '{other[:20]}'")
     if len(payload) > codec.MAX_BYTES:
-        raise ProtocolError(f"message of {len(payload)} bytes, {codec.MAX_BYTES} is the most")
-    wanted = stanza.find(f"{{{RECEIPTS}}}request") is not None
-    message_id = stanza.get("id", "") if wanted else ""
+        raise ProtocolError(f"the payload has {len(payload)} bytes; the limit is {codec.MAX_BYTES}")
+    wants_receipt = stanza.find(f"{{{RECEIPTS}}}request") is not None
+    message_id = stanza.get("id", "") if wants_receipt else ""
     if message_id and not _ID.match(message_id):
-        raise ProtocolError("the id of a message that wants a receipt is letters, digits, _, . and -, 64 at most")
-    return Told(topic, payload, message_id)
+        raise ProtocolError("a message id has 1 to 64 letters, digits, _, . and -")
+    return Delivery(topic, payload, message_id)
 
 
-def listened(stanza: Element) -> tuple[str, ...]:
-    """What somebody who greets wants to hear; what is more than ``MAX_LISTEN`` is left out."""
-    wanted = (element.get("topic", "") for element in stanza.findall(f"{{{NAMESPACE}}}listen"))
-    return tuple(topic for topic in wanted if len(topic) <= MAX_TOPIC)[:MAX_LISTEN]
+def requested_topics(stanza: Element) -> tuple[str, ...]:
+    """Topics that the sender subscribes to; more than ``MAX_LISTEN`` are ignored."""
+    requested = (element.get("topic", "") for element in stanza.findall(f"{{{NAMESPACE}}}listen"))
+    return tuple(topic for topic in requested if len(topic) <= MAX_TOPIC)[:MAX_LISTEN]
 
 
-def received(stanza: Element) -> str | None:
-    """The id of the message that this one confirms."""
+def receipt_id(stanza: Element) -> str | None:
+    """Id of the message that this receipt confirms, or ``None``."""
     found = stanza.find(f"{{{RECEIPTS}}}received")
     return None if found is None or stanza.get("type") == "error" else found.get("id", "")
 
 
-def refused(stanza: Element) -> Refused | None:
-    """What an error says about a message of ours; ``None`` where this is no error."""
+def parse_rejection(stanza: Element) -> Rejection | None:
+    """The rejection in an error stanza, or ``None`` if the stanza is not an error."""
     if stanza.get("type") != "error":
         return None
     tags = [element.tag for element in stanza.iter()]
-    why = next((text.text for text in stanza.iter() if text.tag.endswith("}text") and text.text), None)
+    reason = next((text.text for text in stanza.iter() if text.tag.endswith("}text") and text.text), None)
     final = any(tag.endswith("}not-acceptable") for tag in tags)
-    return Refused(stanza.get("id", ""), (why or "nobody takes it there")[:MAX_WHY], final)
+    return Rejection(stanza.get("id", ""), (reason or "no recipient is available")[:MAX_REASON], final)
 
 
 def user_at(jid: str, domain: str) -> tuple[str, str] | None:
-    """User and resource of a JID of this domain; ``None`` for any other."""
+    """User and resource of a JID of this domain; ``None`` for other domains."""
     bare, _, resource = jid.partition("/")
-    user, at, found = bare.partition("@")
-    return (user, resource) if at and user and found == domain else None
+    user, _, host = bare.partition("@")
+    return (user, resource) if user and host == domain else None
 
 
 def _plain(payload: bytes) -> str | None:
-    """The payload as text, where XML carries it unchanged and no longer than base64 would be."""
+    """The payload as text, or ``None`` if XML would change it or base64 would be shorter."""
     try:
         text = payload.decode()
     except UnicodeDecodeError:

@@ -1,7 +1,7 @@
-"""One XMPP connection, as both ends of the wire contract need it: slixmpp, bare, in the event loop that runs.
+"""One XMPP connection for either end of the wire contract, on slixmpp and the running event loop.
 
-Of slixmpp come the stream, its security and the login. What it does for chat clients is left out: each of our stanzas
-goes to one callback, and what is sent is written at once (asyncio sets TCP_NODELAY).
+slixmpp provides the stream, TLS and the login. Its chat features are not used: each stanza goes to one callback, and
+sent stanzas are written at once (asyncio sets TCP_NODELAY).
 """
 
 import asyncio
@@ -20,23 +20,23 @@ from slixmpp.xmlstream.matcher import MatchXPath
 from device_agent.protocol.xmpp import stanzas
 
 _LOGIN_S = 5.0
-_GOODBYE_S = 0.2
-_GOODBYE_LOOKS = 20
+_FLUSH_S = 0.2
+_FLUSH_POLLS = 20
 _CLIENT = "jabber:client"
 _HANDLERS_FOR_CHAT = ("IM", "IMError", "Presence", "Roster Update")
 
 _log = logging.getLogger(__name__)
-# It writes down whole stanzas, passwords among them, and reports as errors what is raised here anyway.
+# slixmpp logs whole stanzas including passwords, and logs errors that are raised here anyway.
 logging.getLogger("slixmpp").setLevel(logging.CRITICAL)
 
 
 class StreamError(OSError):
-    """No connection, or it was lost. The text says why."""
+    """The connection failed or was lost. The message names the cause."""
 
 
 @dataclass(frozen=True, slots=True)
 class Login:
-    """Where and as whom to connect. ``jid`` has a resource, or the server chooses one."""
+    """Server and credentials. If ``jid`` has no resource, the server assigns one."""
 
     host: str
     port: int
@@ -45,12 +45,12 @@ class Login:
 
     @property
     def domain(self) -> str:
-        """The part of the JID that names the server."""
+        """The server part of the JID."""
         return self.jid.partition("/")[0].partition("@")[2]
 
     @property
     def local(self) -> bool:
-        """Whether the server is on this machine: only then may the stream be in the clear."""
+        """Whether the server is on this machine; only then is a stream without TLS allowed."""
         try:
             return ipaddress.ip_address(self.host).is_loopback
         except ValueError:
@@ -58,12 +58,12 @@ class Login:
 
 
 class Stream:
-    """One connection; ``open`` once, then ``stay`` until it is lost.
+    """One connection. Call ``open`` once, then ``stay`` until the connection is lost.
 
     Args:
-        login: Where and as whom.
-        message: Given each ``<message>``.
-        presence: Given each ``<presence>``.
+        login: Server and credentials.
+        message: Receives each ``<message>``.
+        presence: Receives each ``<presence>``.
     """
 
     def __init__(
@@ -74,24 +74,24 @@ class Stream:
         self._presence = presence
         self._client: _Client | None = None
         self._lost = asyncio.Event()
-        self._why = "the connection was closed"
+        self._reason = "the connection was closed"
 
     @property
     def jid(self) -> str:
-        """The whole JID, with the resource that the server gave."""
+        """The full JID with the assigned resource."""
         return "" if self._client is None else str(self._client.boundjid.full)
 
     @property
     def unsent_bytes(self) -> int:
-        """What the kernel has not taken yet [bytes]."""
+        """Size of the send buffer [bytes]."""
         transport: Any = None if self._client is None else self._client.transport
         return 0 if transport is None else int(transport.get_write_buffer_size())
 
     async def open(self) -> None:
-        """Connect, log in, and say that we are there.
+        """Connect, log in and send presence.
 
         Raises:
-            StreamError: Not reached, not secure, or refused.
+            StreamError: The server cannot be reached, is not secure, or rejects the login.
         """
         login = self._login
         ready = asyncio.get_running_loop().create_future()
@@ -99,53 +99,53 @@ class Stream:
         client.register_handler(Callback("message", MatchXPath(f"{{{_CLIENT}}}message"), self._on(self._message)))
         client.register_handler(Callback("presence", MatchXPath(f"{{{_CLIENT}}}presence"), self._on(self._presence)))
 
-        def settled(_: object) -> None:
+        def established(_: object) -> None:
             if not ready.done():
                 ready.set_result(None)
 
-        def failed(why: str) -> Callable[[object], None]:
+        def failed(reason: str) -> Callable[[object], None]:
             def fail(detail: object) -> None:
-                self._why = f"{why}: {detail}" if isinstance(detail, OSError | str) else why
+                self._reason = f"{reason}: {detail}" if isinstance(detail, OSError | str) else reason
                 self._lost.set()
                 if not ready.done():
-                    ready.set_exception(StreamError(f"{login.host}:{login.port}: {self._why}"))
+                    ready.set_exception(StreamError(f"{login.host}:{login.port}: {self._reason}"))
 
             return fail
 
-        client.add_event_handler("session_start", settled)
+        client.add_event_handler("session_start", established)
         client.add_event_handler("connection_failed", failed("cannot be reached"))
-        client.add_event_handler("failed_all_auth", failed("the XMPP server refuses the password, or has no TLS"))
-        client.add_event_handler("ssl_invalid_chain", failed("the certificate is not one that this machine trusts"))
+        client.add_event_handler("failed_all_auth", failed("the XMPP server rejects the password, or has no TLS"))
+        client.add_event_handler("ssl_invalid_chain", failed("this machine does not trust the server's certificate"))
         client.add_event_handler("disconnected", failed("the connection was lost"))
         try:
             async with asyncio.timeout(_LOGIN_S):
                 client.connect(login.host, login.port)
                 await ready
         except TimeoutError as error:
-            raise StreamError(f"{login.host}:{login.port} does not answer as an XMPP server") from error
+            raise StreamError(f"{login.host}:{login.port} does not respond as an XMPP server") from error
         self.send(stanzas.presence())
 
     async def stay(self) -> None:
-        """Keep the connection until it is lost.
+        """Keep the connection alive until it is lost.
 
         Raises:
-            StreamError: It is.
+            StreamError: The connection was lost.
         """
         loop = asyncio.get_running_loop()
         client = self._client
         assert client is not None  # noqa: S101 (after `open`)
-        question = stanzas.ping(self._login.domain)
+        ping = stanzas.ping(self._login.domain)
         while not self._lost.is_set():
-            if loop.time() - client.heard_s > stanzas.DEAD_S:
-                raise StreamError(f"the XMPP server has said nothing for {stanzas.DEAD_S:.0f} s")
-            self.send(question)
+            if loop.time() - client.last_traffic_s > stanzas.TIMEOUT_S:
+                raise StreamError(f"the XMPP server sent nothing for {stanzas.TIMEOUT_S:.0f} s")
+            self.send(ping)
             with contextlib.suppress(TimeoutError):
-                async with asyncio.timeout(stanzas.PING_S):
+                async with asyncio.timeout(stanzas.PING_INTERVAL_S):
                     await self._lost.wait()
-        raise StreamError(self._why)
+        raise StreamError(self._reason)
 
     def send(self, stanza: str) -> bool:
-        """Write a stanza; ``False`` where the connection is gone."""
+        """Write a stanza. Returns ``False`` if there is no connection."""
         client = self._client
         if client is None or client.transport is None or self._lost.is_set():
             return False
@@ -153,7 +153,7 @@ class Stream:
         return True
 
     async def close(self) -> None:
-        """Say goodbye, briefly, and let go. May be called twice."""
+        """Disconnect. May be called repeatedly."""
         client, self._client = self._client, None
         if client is None:
             return
@@ -161,15 +161,15 @@ class Stream:
         client.cancel_connection_attempt()
         transport: Any = client.transport
         if transport is not None:
-            # The server tells everybody who knows us; whether it closes its side is of no interest.
+            # The server informs all contacts; there is no need to wait until it closes its side.
             client.send_raw(stanzas.presence(available=False) + client.stream_footer)
-            for _ in range(_GOODBYE_LOOKS):
+            for _ in range(_FLUSH_POLLS):
                 if not transport.get_write_buffer_size():
                     break
-                await asyncio.sleep(_GOODBYE_S / _GOODBYE_LOOKS)
-            transport.abort()  # under TLS, `close` would wait for the other side
+                await asyncio.sleep(_FLUSH_S / _FLUSH_POLLS)
+            transport.abort()  # under TLS, `close` would wait for the peer
         await client.quit()
-        await asyncio.sleep(0)  # the socket is closed by the loop's next turn
+        await asyncio.sleep(0)  # the loop closes the socket in its next iteration
 
     def _on(self, handle: Callable[[Element], None]) -> Callable[[Any], None]:
         def run(stanza: Any) -> None:
@@ -181,12 +181,12 @@ class Stream:
         return run
 
 
-class _Client(ClientXMPP):  # type: ignore[misc]  # slixmpp is not looked into
+class _Client(ClientXMPP):  # type: ignore[misc]  # slixmpp has no type information
     """slixmpp's client without what it does for chat."""
 
     def __init__(self, login: Login) -> None:
-        self.heard_s = 0.0
-        # Before the base class: it looks for a loop by itself, in ways that are no longer wanted.
+        self.last_traffic_s = 0.0
+        # Before the base class, whose own lookup of a loop is deprecated.
         loop = asyncio.get_running_loop()
         super().__init__(
             login.jid,
@@ -201,15 +201,15 @@ class _Client(ClientXMPP):  # type: ignore[misc]  # slixmpp is not looked into
         self.enable_starttls = not login.local
         self.enable_plaintext = login.local
         self.whitespace_keepalive = False
-        self.heard_s = loop.time()
+        self.last_traffic_s = loop.time()
 
     def data_received(self, data: bytes) -> None:
-        """Take note that the server lives."""
-        self.heard_s = self.loop.time()
+        """Record the time of the last traffic."""
+        self.last_traffic_s = self.loop.time()
         super().data_received(data)
 
     async def quit(self) -> None:
-        """End the tasks that slixmpp leaves behind."""
+        """Cancel tasks that slixmpp leaves running."""
         task = self._run_out_filters
         if task is not None:
             task.cancel()

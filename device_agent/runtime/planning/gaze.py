@@ -48,7 +48,7 @@ def aim(
         position = np.array(start_rad, dtype=float)
         position[turning] = joints
         poses = geometry.poses(position.tolist())
-        return np.concatenate([_beside(poses[frame], axis, point_m) for frame in (gaze.frame, *gaze.also)])
+        return np.concatenate([_beside(poses[frame], axis, point_m) for frame in (gaze.frame, *gaze.additional_frames)])
 
     joints = np.clip(np.array(start_rad, dtype=float)[turning], lower, upper)
     for _ in range(_ROUNDS):

@@ -35,7 +35,7 @@ _MOST_UNSENT_BYTES = 128 * 1024
 _UNSENT_LOOK_S = 0.02
 _MOST_QUEUED_BYTES = 4 * 1024 * 1024
 """More than this, and nothing is taken any more."""
-NOTICED_WITHIN_S = stanzas.DEAD_S + stanzas.PING_S
+NOTICED_WITHIN_S = stanzas.TIMEOUT_S + stanzas.PING_INTERVAL_S
 _log = logging.getLogger(__name__)
 
 
@@ -305,17 +305,17 @@ class _Link:
 
     def _on_message(self, stanza: Element) -> None:
         sender = stanza.get("from", "")
-        if (refused := stanzas.refused(stanza)) is not None:
+        if (refused := stanzas.parse_rejection(stanza)) is not None:
             self._came_back(refused)
             return
         if sender.partition("/")[0] != self._access.cloud:
             _log.warning("a message of %s was dropped: only the cloud may speak to an agent", sender[:200])
             return
-        if (number := stanzas.received(stanza)) is not None:
+        if (number := stanzas.receipt_id(stanza)) is not None:
             self._settle(number)
             return
         try:
-            told = stanzas.read(stanza)
+            told = stanzas.parse(stanza)
         except ProtocolError as error:
             _log.warning("a message was dropped: %s", error)
             return
@@ -331,12 +331,12 @@ class _Link:
         if delivered is not None:
             delivered()
 
-    def _came_back(self, refused: stanzas.Refused) -> None:
+    def _came_back(self, refused: stanzas.Rejection) -> None:
         if refused.id not in self._answers:
-            _log.warning("a message came back: %s", refused.why)
+            _log.warning("a message came back: %s", refused.reason)
         if not refused.final:
             self._delivered.pop(refused.id, None)
-        self._settle(refused.id, refused.why)
+        self._settle(refused.id, refused.reason)
 
     def _on_presence(self, stanza: Element) -> None:
         sender = stanza.get("from", "")

@@ -82,11 +82,11 @@ def _device_stop(at: Mapping[str, str]) -> _Said:
 
 
 def _space_heard(at: Mapping[str, str]) -> _Said:
-    return (), grants.heard(at["space"], topics.ANY, topics.ANY)
+    return (), grants.device_subscriptions(at["space"], topics.ANY, topics.ANY)
 
 
 def _device_heard(at: Mapping[str, str]) -> _Said:
-    return (), grants.heard(at["space"], at["agent"], at["device"])
+    return (), grants.device_subscriptions(at["space"], at["agent"], at["device"])
 
 
 _DEVICE = ("space", "agent", "device")

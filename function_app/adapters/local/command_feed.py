@@ -74,7 +74,7 @@ def _patterns(space: str, agent: str) -> tuple[str, ...]:
 
 def _credentials(access: BrokerAccess) -> Callable[[], Awaitable[ServiceCredentials]]:
     async def issued() -> ServiceCredentials:
-        grant = grants.speaker_grant(
+        grant = grants.gateway_grant(
             client_id=f"speaker-{secrets.token_hex(8)}", token_id=secrets.token_hex(16), lifetime_s=LIFETIME_S
         )
         given = await access.issue(grant)

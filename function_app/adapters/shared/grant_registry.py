@@ -108,7 +108,7 @@ class GrantRegistry:
             StoreError: It is not known whether it was taken back: nobody is to be let in.
         """
         try:
-            known = await self._keys.public(grants.key_of(password))
+            known = await self._keys.public(grants.signing_key_id(password))
             grant = grants.read(password, known)
             issued_s = grants.issued_at(password)
         except SignatureError:

@@ -8,7 +8,7 @@ from collections.abc import Callable, Sequence
 from device_agent.protocol import Presence, codec, topics
 from device_agent.protocol.errors import ProtocolError
 from device_agent.protocol.xmpp import stanzas
-from device_agent.protocol.xmpp.stanzas import Told
+from device_agent.protocol.xmpp.stanzas import Delivery
 from function_app.bootstrap import Functions
 from function_app.domain.common.problems import Problem
 from function_app.domain.devices.devices import Agent, Link
@@ -60,11 +60,11 @@ class AgentSession:
         agent: Agent,
         jid: str,
         greeting: Presence,
-        greeted: Told,
+        greeted: Delivery,
         listen: Sequence[str],
         broker_up: Callable[[], bool],
         measured: Callable[[InboundMessage], None],
-        told: Callable[[Agent, Told], None],
+        told: Callable[[Agent, Delivery], None],
     ) -> None:
         self.agent = agent
         self.jid = jid
@@ -76,8 +76,8 @@ class AgentSession:
         self._broker_up = broker_up
         self._measured = measured
         self._told = told
-        self._waiting: asyncio.Queue[Told | None] = asyncio.Queue()
-        self._streams: asyncio.Queue[Told] = asyncio.Queue()
+        self._waiting: asyncio.Queue[Delivery | None] = asyncio.Queue()
+        self._streams: asyncio.Queue[Delivery] = asyncio.Queue()
         self._doubt = asyncio.Event()
         self._left = False
         self._replaced = False
@@ -85,7 +85,7 @@ class AgentSession:
 
     # ------------------------------------------------------------ what happens to it
 
-    def say(self, told: Told) -> None:
+    def say(self, told: Delivery) -> None:
         """It has told something."""
         if told.id == "" and f"/{topics.TELE}/" in told.topic:
             if self._streams.qsize() >= MOST_MEASURED:
@@ -153,10 +153,10 @@ class AgentSession:
                     at_ms=self._functions.clock.now_ms(),
                     software=self.greeting.software,
                 )
-                await self._store([Told(topics.conn(self.agent.space or "", self.agent.id), codec.encode(gone))])
+                await self._store([Delivery(topics.conn(self.agent.space or "", self.agent.id), codec.encode(gone))])
                 return
 
-    async def _store(self, batch: list[Told]) -> None:
+    async def _store(self, batch: list[Delivery]) -> None:
         pause_s = FIRST_PAUSE_S
         for _ in range(TRIES):
             try:
@@ -175,7 +175,7 @@ class AgentSession:
                     self._told(self.agent, told)
                 if told.id:
                     self._line.send(
-                        stanzas.receipt(self.jid, told.id) if why is None else stanzas.refusal(self.jid, told.id, why)
+                        stanzas.receipt(self.jid, told.id) if why is None else stanzas.rejection(self.jid, told.id, why)
                     )
             return
         # Not confirmed, and by this it will know: it greets somebody anew, and tells again what it must.

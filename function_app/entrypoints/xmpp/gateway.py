@@ -12,7 +12,7 @@ from xml.etree.ElementTree import Element
 from device_agent.protocol import Presence, State, codec, topics
 from device_agent.protocol.errors import ProtocolError
 from device_agent.protocol.xmpp import jids, stanzas
-from device_agent.protocol.xmpp.stanzas import Told
+from device_agent.protocol.xmpp.stanzas import Delivery
 from function_app.bootstrap import Functions
 from function_app.domain.common.ids import AGENT_LENGTH
 from function_app.domain.common.problems import Problem
@@ -77,18 +77,18 @@ class XmppGateway:
         if user is None:
             return
         try:
-            told = stanzas.read(stanza)
+            told = stanzas.parse(stanza)
         except ProtocolError as error:
             _log.warning("a message of %s was refused: %s", user, error)
             if stanza.get("id") and stanza.get("type") != "error":
-                self._line.send(stanzas.refusal(jid, stanza.get("id", ""), str(error)))
+                self._line.send(stanzas.rejection(jid, stanza.get("id", ""), str(error)))
             return
         if told is None:
             return
         served = self._served.get(user)
         greeting = _greeting(told, user)
         if greeting is not None and (served is None or served.greeting.session != greeting.session):
-            self._start(self._greeted(user, jid, told, greeting, stanzas.listened(stanza)))
+            self._start(self._greeted(user, jid, told, greeting, stanzas.requested_topics(stanza)))
         elif served is not None and served.jid == jid:
             served.say(told)
         elif told.id:
@@ -153,7 +153,7 @@ class XmppGateway:
         found = stanzas.user_at(jid, self._line.domain)
         return found[0] if found is not None and found[1] and len(found[0]) == AGENT_LENGTH else None
 
-    async def _greeted(self, user: str, jid: str, told: Told, greeting: Presence, wanted: tuple[str, ...]) -> None:
+    async def _greeted(self, user: str, jid: str, told: Delivery, greeting: Presence, wanted: tuple[str, ...]) -> None:
         try:
             agent = await self._known(user)
         except (StoreError, Problem) as error:
@@ -166,7 +166,7 @@ class XmppGateway:
             why = why or "A newer connection of this agent is there."
         if agent is None or why is not None:
             if told.id:
-                self._line.send(stanzas.refusal(jid, told.id, why or ""))
+                self._line.send(stanzas.rejection(jid, told.id, why or ""))
             return
         if before is not None:
             before.leave(replaced=True)
@@ -212,7 +212,7 @@ class XmppGateway:
             del self._served[agent.id]
             self._orders.drop(agent.space or "", agent.id)
         if not welcome:
-            self._line.send(stanzas.forget(self._line.domain, agent.id))
+            self._line.send(stanzas.revoke_user(self._line.domain, agent.id))
         _log.info("%s is gone, session %d", agent.id, served.greeting.session)
 
     def _start(self, work: Coroutine[None, None, None]) -> None:
@@ -222,7 +222,7 @@ class XmppGateway:
 
     # ------------------------------------------------------------ people, and what is measured
 
-    def _show(self, agent: Agent, told: Told) -> None:
+    def _show(self, agent: Agent, told: Delivery) -> None:
         """A person who is there with an XMPP client of their own hears how their devices are."""
         places = self._people.get(agent.account or "")
         if not places or not told.topic.endswith(f"/{topics.STATE}"):
@@ -254,7 +254,7 @@ class XmppGateway:
                 _log.warning("%d measurements were not stored: %s", len(batch), error)
 
 
-def _greeting(told: Told, user: str) -> Presence | None:
+def _greeting(told: Delivery, user: str) -> Presence | None:
     if not told.topic.endswith(f"/{user}/{topics.CONN}"):
         return None
     try:
@@ -273,7 +273,7 @@ def _may_hear(agent: Agent, topic: str) -> bool:
     return parsed.space == agent.space and parsed.kind == topics.TELE
 
 
-def _unfit(agent: Agent | None, told: Told) -> str | None:
+def _unfit(agent: Agent | None, told: Delivery) -> str | None:
     """Why an agent cannot be served."""
     if agent is None or not agent.claimed:
         return "Nobody has claimed this agent."

@@ -93,7 +93,7 @@ class MqttCredentials:
         )
         subscribe = [topics.conn(space, agent) for space, agent in sorted({(one.space, one.agent) for one in seen})]
         for device in seen:
-            subscribe += grants.heard(device.space, device.agent, device.name)
+            subscribe += grants.device_subscriptions(device.space, device.agent, device.name)
         lifetime_s = max(1, (ends_ms - now_ms) // 1000)
         return await self._issue(grant, lifetime_s, tuple(watched.stops), tuple(dict.fromkeys(subscribe)))
 
@@ -147,7 +147,7 @@ class MqttCredentials:
         """
         space = require_claimed(agent)
         grant = grants.agent_grant(space, agent.id, token_id=new_id(), lifetime_s=AGENT_S)
-        return await self._issue(grant, AGENT_S, grant.publish, grants.agent_orders(space, agent.id))
+        return await self._issue(grant, AGENT_S, grant.publish, grants.agent_command_topics(space, agent.id))
 
     async def _issue(
         self, grant: Grant, lifetime_s: int, publish: tuple[str, ...], subscribe: tuple[str, ...]
@@ -196,7 +196,7 @@ def _watching(devices: list[Device], access: BrokerAccess) -> _Watched:
     whole: set[str] = set()
     for space, role in sorted({(device.space, device.space_role) for device in devices if device.space_role}):
         says = [topics.device(space, topics.ANY, topics.ANY, topics.STOP)] if role.may_operate else []
-        if not result.add(says, grants.heard(space, topics.ANY, topics.ANY), access):
+        if not result.add(says, grants.device_subscriptions(space, topics.ANY, topics.ANY), access):
             break
         inside = [device for device in devices if device.space == space and device.space_role]
         result.devices += inside
@@ -205,7 +205,7 @@ def _watching(devices: list[Device], access: BrokerAccess) -> _Watched:
     stoppable = set(result.stops)
     for device in devices:
         says = [_stop(device)] if device.role.may_operate and _stop(device) not in stoppable else []
-        hears = () if device.id in whole else grants.heard(device.space, device.agent, device.name)
+        hears = () if device.id in whole else grants.device_subscriptions(device.space, device.agent, device.name)
         if not says and not hears:
             continue
         if not result.add(says, hears, access):

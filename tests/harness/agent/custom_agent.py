@@ -90,7 +90,7 @@ class OwnAgent:
             "client_id": AGENT,
             "username": login.username,
             "password": login.password,
-            "subscribe": grants.agent_orders(SPACE, AGENT),
+            "subscribe": grants.agent_command_topics(SPACE, AGENT),
             "lifetime_s": 300,
         }
         (self.store.folder / _ACCESS).write_text(json.dumps(access))

@@ -50,7 +50,7 @@ def grant(account: str, client: str = "w", *, session: str = "s1", lifetime_s: f
         principal=f"account:{account}:{session}:watch",
         client_id=f"{client}-{account}",
         publish=(f"ts/v1/{account}/+/+/stop",),
-        subscribe=grants.heard(account, "+", "+"),
+        subscribe=grants.device_subscriptions(account, "+", "+"),
         token_id=new_id(),
         expires_at=int(time.time() + lifetime_s),
     )
@@ -224,7 +224,7 @@ def test_a_namespace_that_is_away_is_one_clear_error_and_nobody_is_let_in(there:
 
 def test_what_nobody_is_given_here_is_not_signed(there: There) -> None:
     with pytest.raises(BrokerAccessError, match="topic spaces"):
-        there.broker.issue(grants.speaker_grant(client_id="s", token_id="t", lifetime_s=60))
+        there.broker.issue(grants.gateway_grant(client_id="s", token_id="t", lifetime_s=60))
     with pytest.raises(BrokerAccessError, match="no connection"):
         there.cloud.functions.access.service_credentials()
 

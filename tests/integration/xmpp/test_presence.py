@@ -72,7 +72,7 @@ def test_a_person_sees_their_agents_and_how_they_are_and_no_others(site: XmppSit
         wait_until(lambda: hers.there(robot.id), "the agent to be seen")
         robot.say_state(State(device="arm", at_ms=1, tick_ms=1, mode=Mode.STREAMING, epoch=3))
         wait_until(lambda: hers.messages, "the state")
-        told = stanzas.read(hers.messages[0])
+        told = stanzas.parse(hers.messages[0])
         assert told is not None
         assert codec.decode(told.payload, State).epoch == 3
         assert hers.messages[0].findtext("{jabber:client}body") == "arm: streaming"

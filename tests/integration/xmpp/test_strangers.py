@@ -151,7 +151,7 @@ class TestTenants:
             item = "<item jid='zzzzzzzzzz@telescope.localhost' subscription='both'/>"
             client.say(f"<iq type='set' id='3'><query xmlns='jabber:iq:roster'>{item}</query></iq>")
             client.say("<presence to='zzzzzzzzzz@telescope.localhost'/>")
-            client.say(stanzas.forget(DOMAIN, unheard.id))
+            client.say(stanzas.revoke_user(DOMAIN, unheard.id))
             time.sleep(QUIET_S)
             assert not client.ended
 
@@ -164,7 +164,7 @@ class TestTenants:
             client.say(stanzas.message(to, topics.conn(other.space, other.id), greeting, receipt="1"))
             client.say(stanzas.message(to, topics.conn(other.space, unheard.id), greeting, receipt="2"))
             client.say(stanzas.message(to, topics.conn(unheard.space, unheard.id), greeting, receipt="3"))
-            wait_until(lambda: any(stanzas.received(each) == "3" for each in client.messages), "the receipt")
+            wait_until(lambda: any(stanzas.receipt_id(each) == "3" for each in client.messages), "the receipt")
             foreign = other.ack("0" * 31, "done")  # type: ignore[arg-type]
             client.say(stanzas.message(to, other.topic(topics.ACK), codec.encode(foreign), receipt="4"))
             client.say(stanzas.message(to, unheard.topic(topics.CMD), b"{}", receipt="5"))
@@ -175,8 +175,8 @@ class TestTenants:
             assert anna.get(f"/devices/{unheard.device}").json()["online"]
 
 
-def refusals(client: XmppClient) -> list[stanzas.Refused]:
-    return [found for each in client.messages if (found := stanzas.refused(each)) is not None]
+def refusals(client: XmppClient) -> list[stanzas.Rejection]:
+    return [found for each in client.messages if (found := stanzas.parse_rejection(each)) is not None]
 
 
 HOSTILE = [

@@ -186,15 +186,15 @@ def _stanza(data: bytes) -> None:
         stanza = fromstring(data)  # noqa: S314 (what slixmpp does with what arrives)
     except (ParseError, ValueError, LookupError):
         return
-    stanzas.received(stanza)
-    stanzas.refused(stanza)
+    stanzas.receipt_id(stanza)
+    stanzas.parse_rejection(stanza)
     stanzas.user_at(stanza.get("from", ""), "site")
     try:
-        told = stanzas.read(stanza)
+        told = stanzas.parse(stanza)
     except ProtocolError:
         return
     if told is not None:
-        again = stanzas.read(fromstring(stanzas.message("a@site", told.topic, told.payload, receipt=told.id)))  # noqa: S314
+        again = stanzas.parse(fromstring(stanzas.message("a@site", told.topic, told.payload, receipt=told.id)))  # noqa: S314
         if again != told:
             raise Found(f"{told} is another one when it is written and read again: {again}")
 

@@ -52,7 +52,7 @@ def test_limits_that_are_none_are_refused(was: str, now: str, says: str) -> None
 @pytest.mark.parametrize(
     ("cameras", "says"),
     [
-        ('[{ name = "eyes", rate_hz = 30.0 }]', "camera 'eyes': 30 pictures a second; 10 is the most"),
+        ('[{ name = "eyes", rate_hz = 30.0 }]', "camera 'eyes': rate_hz is 30; the limit is 10"),
         ('[{ name = "eyes", rate_hz = 0.0 }]', "rate_hz of camera 'eyes' is 0"),
         ('[{ name = "eyes", rate_hz = 1.0 }, { name = "eyes", rate_hz = 1.0 }]', "two cameras"),
     ],

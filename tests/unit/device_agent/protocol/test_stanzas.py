@@ -9,25 +9,25 @@ from hypothesis import strategies as st
 from device_agent.protocol import codec
 from device_agent.protocol.errors import ProtocolError
 from device_agent.protocol.xmpp import stanzas
-from device_agent.protocol.xmpp.stanzas import Told
+from device_agent.protocol.xmpp.stanzas import Delivery
 
 TOPIC = "ts/v1/lab/abc/arm/ack"
 PAYLOADS = st.binary(max_size=300) | st.text(max_size=300).map(str.encode)
 
 
-def across(stanza: str) -> stanzas.Told | None:
+def across(stanza: str) -> stanzas.Delivery | None:
     """As a server passes it on: read, and written anew."""
-    return stanzas.read(XML(tostring(XML(stanza.encode()))))
+    return stanzas.parse(XML(tostring(XML(stanza.encode()))))
 
 
 @given(PAYLOADS)
 def test_a_payload_arrives_byte_for_byte(payload: bytes) -> None:
-    assert across(stanzas.message("a@b/c", TOPIC, payload, receipt="7")) == Told(TOPIC, payload, "7")
+    assert across(stanzas.message("a@b/c", TOPIC, payload, receipt="7")) == Delivery(TOPIC, payload, "7")
 
 
 @given(PAYLOADS, st.text(max_size=50))
 def test_no_carriage_return_and_nothing_that_xml_forbids_is_ever_written(payload: bytes, body: str) -> None:
-    text = stanzas.message("a@b/c", TOPIC, payload, body=body) + stanzas.refusal("a@b/c", "7", body)
+    text = stanzas.message("a@b/c", TOPIC, payload, body=body) + stanzas.rejection("a@b/c", "7", body)
     assert not stanzas._UNFIT.search(text)
 
 
@@ -57,27 +57,27 @@ def test_the_longest_message_fits_into_the_longest_stanza(fill: bytes) -> None:
 )
 def test_what_is_not_as_we_write_it_is_refused(inside: str) -> None:
     with pytest.raises(ProtocolError):
-        stanzas.read(XML(f"<message>{inside}</message>"))
+        stanzas.parse(XML(f"<message>{inside}</message>"))
 
 
 def test_an_id_that_could_be_an_attack_is_refused() -> None:
     inside = "<m xmlns='urn:telescope:v1' topic='t'/><request xmlns='urn:xmpp:receipts'/>"
     with pytest.raises(ProtocolError, match="id"):
-        stanzas.read(XML(f'<message id="\'/&gt;">{inside}</message>'))
+        stanzas.parse(XML(f'<message id="\'/&gt;">{inside}</message>'))
 
 
 def test_an_ordinary_message_and_one_that_came_back_are_none_of_ours() -> None:
-    assert stanzas.read(XML("<message><body>hello</body></message>")) is None
-    assert stanzas.read(XML("<message type='error'><m xmlns='urn:telescope:v1' topic='t'/></message>")) is None
+    assert stanzas.parse(XML("<message><body>hello</body></message>")) is None
+    assert stanzas.parse(XML("<message type='error'><m xmlns='urn:telescope:v1' topic='t'/></message>")) is None
 
 
 def test_a_receipt_and_a_refusal_name_their_message() -> None:
-    assert stanzas.received(XML(stanzas.receipt("a@b/c", "7"))) == "7"
-    assert stanzas.refused(XML(stanzas.refusal("a@b/c", "8", "not a topic"))) == ("8", "not a topic", True)
+    assert stanzas.receipt_id(XML(stanzas.receipt("a@b/c", "7"))) == "7"
+    assert stanzas.parse_rejection(XML(stanzas.rejection("a@b/c", "8", "not a topic"))) == ("8", "not a topic", True)
     bounced = "<message type='error' id='9'><error type='cancel'><service-unavailable/></error></message>"
-    assert stanzas.refused(XML(bounced)) == ("9", "nobody takes it there", False)
-    assert stanzas.refused(XML(stanzas.receipt("a@b/c", "7"))) is None
-    assert stanzas.received(XML(stanzas.refusal("a@b/c", "8", ""))) is None
+    assert stanzas.parse_rejection(XML(bounced)) == ("9", "no recipient is available", False)
+    assert stanzas.parse_rejection(XML(stanzas.receipt("a@b/c", "7"))) is None
+    assert stanzas.receipt_id(XML(stanzas.rejection("a@b/c", "8", ""))) is None
 
 
 @pytest.mark.parametrize("jid", ["x@other/r", "lab", "@lab", "x@lab.org/r", "lab/x@lab", ""])
@@ -92,5 +92,5 @@ def test_an_address_of_this_server_is_taken_apart() -> None:
 def test_a_greeting_says_what_it_wants_to_hear_and_no_more_than_is_heard_to() -> None:
     wanted = [f"ts/v1/lab/a/b/tele/{number}" for number in range(stanzas.MAX_LISTEN + 1)]
     stanza = XML(stanzas.message("a@b/c", TOPIC, b"{}", receipt="1", listen=["x" * 401, *wanted]))
-    assert stanzas.listened(stanza) == tuple(wanted[: stanzas.MAX_LISTEN])
-    assert stanzas.read(stanza) == Told(TOPIC, b"{}", "1")
+    assert stanzas.requested_topics(stanza) == tuple(wanted[: stanzas.MAX_LISTEN])
+    assert stanzas.parse(stanza) == Delivery(TOPIC, b"{}", "1")

@@ -26,8 +26,8 @@ def person(publish: tuple[str, ...] = (), subscribe: tuple[str, ...] = ()) -> Gr
 
 
 def watching(*devices: str, spaces: tuple[str, ...] = (), stops: tuple[str, ...] = ()) -> Grant:
-    heard = [topic for space in spaces for topic in grants.heard(space, "+", "+")]
-    heard += [topic for name in devices for topic in grants.heard("room", "agentaaaaa", name)]
+    heard = [topic for space in spaces for topic in grants.device_subscriptions(space, "+", "+")]
+    heard += [topic for name in devices for topic in grants.device_subscriptions("room", "agentaaaaa", name)]
     said = [f"ts/v1/{space}/+/+/stop" for space in spaces]
     said += [f"ts/v1/room/agentaaaaa/{name}/stop" for name in stops]
     return person(tuple(said), tuple(dict.fromkeys(heard)))
@@ -95,7 +95,7 @@ def test_every_topic_of_a_grant_is_allowed(grant: Grant) -> None:
         person(("ts/v1/space/${client.attributes.kind}/arm/stop",)),
         Grant(**{**{name: getattr(AGENT, name) for name in AGENT.__struct_fields__}, "principal": "account:x:y"}),
         Grant(**{**{name: getattr(AGENT, name) for name in AGENT.__struct_fields__}, "publish": AGENT.publish[1:]}),
-        grants.speaker_grant(client_id="s", token_id="t", lifetime_s=1),
+        grants.gateway_grant(client_id="s", token_id="t", lifetime_s=1),
         grants.service_grant(client_id="s", token_id="t", lifetime_s=1),
     ],
 )

@@ -1,0 +1,112 @@
+"""Retained condition of agents and devices. Readers ignore unknown fields."""
+
+from enum import StrEnum
+
+from msgspec import Struct
+
+from device_agent.protocol.fields import Count, Id, Label, Milliseconds, Text
+
+
+class Presence(Struct, frozen=True, kw_only=True):
+    """``conn``: whether the agent is connected to the broker. Retained, and the MQTT will.
+
+    ``session`` rises with each connection. Readers ignore ``online=False`` with a lower session than the newest one.
+    """
+
+    online: bool
+    session: Count
+    at_ms: Milliseconds
+    software: Label = ""
+
+
+class Mode(StrEnum):
+    """What the device is doing now."""
+
+    IDLE = "idle"
+    STREAMING = "streaming"
+    ACTION = "action"
+    HOLDING = "holding"
+    STOPPED = "stopped"
+    FAULT = "fault"
+
+
+class StopLatch(Struct, frozen=True, kw_only=True):
+    """Who stopped the device, and when. It stays until an authorized caller resets it."""
+
+    caller: Label
+    reason: Text
+    at_ms: Milliseconds
+
+
+class OpenRequest(Struct, frozen=True, kw_only=True):
+    """A pending request for control. It expires without a response after ``expires_in_ms``."""
+
+    id: Id
+    requester: Label
+    expires_in_ms: Milliseconds
+
+
+class LeaseState(Struct, frozen=True, kw_only=True):
+    """The lease in force at the device.
+
+    Attributes:
+        holder: Name of the operator in control.
+        epoch: Fencing token of the lease.
+        expires_in_ms: Remaining time [ms].
+        reason: Why control was taken from another operator; empty otherwise.
+        request: Pending request for control. For display only: motion does not depend on it.
+    """
+
+    holder: Label
+    epoch: Count
+    expires_in_ms: Milliseconds
+    reason: Text = ""
+    request: OpenRequest | None = None
+
+
+class ActionState(Struct, frozen=True, kw_only=True):
+    """The action that the device runs now."""
+
+    id: Id
+    kind: Label
+    name: Label = ""
+    progress: float = 0.0
+
+
+class Fault(Struct, frozen=True, kw_only=True):
+    """A fault that persists."""
+
+    code: Label
+    message: Text
+    since_ms: Milliseconds
+
+
+class Restriction(Struct, frozen=True, kw_only=True):
+    """A speed restriction of the room, set by the interlock ``source``. ``speed`` is the remaining share; 0: hold."""
+
+    source: Text
+    speed: float
+    reason: Text
+
+
+class State(Struct, frozen=True, kw_only=True):
+    """``state``: the current condition. Retained; published on change and every 30 s, at most once per second.
+
+    Attributes:
+        ended_epoch: Highest epoch that the device no longer accepts. It only rises, so even an outdated message
+            correctly marks the leases that have ended.
+        stiffness: Joints that hold with reduced strength: joint name → share of the full strength.
+    """
+
+    device: Id
+    at_ms: Milliseconds
+    tick_ms: Milliseconds
+    mode: Mode
+    epoch: Count
+    ended_epoch: Count = 0
+    stop: StopLatch | None = None
+    lease: LeaseState | None = None
+    action: ActionState | None = None
+    faults: tuple[Fault, ...] = ()
+    restrictions: tuple[Restriction, ...] = ()
+    stiffness: dict[str, float] = {}
