@@ -2,9 +2,9 @@
 // Only types: what arrives is checked in messages.ts before anything else sees it. SI units and radians.
 
 /**
- * `conn`: the agent's link to the broker. Retained, and the will.
+ * `conn`: whether the agent is connected to the broker. Retained, and the MQTT will.
  *
- * `session` rises at each connection; an `online=False` with a lower session than one already seen is old news.
+ * `session` rises with each connection. Readers ignore `online=False` with a lower session than the newest one.
  */
 export interface Presence {
   online: boolean;
@@ -16,20 +16,22 @@ export interface Presence {
 /**
  * `desc`: what the device is and can do. Retained.
  *
- * `limits` names what the agent itself holds, whoever moves the device: `clearance` and `workspace` are missing
- * where nobody knows the robot's shape.
- *
- * `actions` names the kinds of action that it takes; `postures`, `expressions` and `behaviours` what those of
- * these kinds may name. An agent that names no actions is an older one.
- * `mirrors` and `narrowing`: how its joints hang together.
- * `cameras`: what `cam/{name}` shows; `captures`: what raw data can be had; `controls`: what can be set.
- *
- * `diagnostics`: how what it measures is to be judged, where that is said by no robot type, but by its room.
- * `position_m`: where a room device is, in its room's frame; of a robot its room tells (`positions`).
- * `base`: the limits of one that drives or walks; missing where it stays in its place.
- *
- * `scripts`: movement scripts run in the jail, run with less (`trusted`, as the agent's owner wants it), or are
- * refused; `scripts_note` says why, and what to do.
+ * Attributes:
+ * mimic_joints: Joints that follow other joints.
+ * position_dependent_limits: Joint ranges that depend on other joints.
+ * actions: Kinds of actions that the device accepts. `postures`, `expressions` and `behaviours` list the
+ * names that such actions may use. Empty: the agent is an older one.
+ * cameras: Camera streams at `cam/{name}`.
+ * captures: Raw data that can be captured.
+ * controls: Values that can be set.
+ * limits: Limits that the agent enforces for every command source. `clearance` and `workspace` are absent if
+ * the shape of the robot is unknown.
+ * diagnostics: How the cloud evaluates the measurements of a room device; for robots, see the robot type.
+ * position_m: Position of a room device in the room; the stream `positions` of the room reports robots.
+ * base: Limits of a mobile base; `None` for a fixed robot.
+ * scripts: `sandboxed`: movement scripts run confined. `unconfined`: they run with fewer layers, as the
+ * agent's owner allows. `unavailable`: they are rejected.
+ * scripts_note: Why scripts are not sandboxed, and the remedy.
  */
 export interface Description {
   /** letters, digits, _ and -, 1 to 64 of them */
@@ -76,11 +78,12 @@ export interface Joint {
 }
 
 /**
- * One motor moves two joints.
+ * A joint that follows another joint, because one motor moves both. A command for either joint moves both.
  *
  * Attributes:
- * joint: The one that only follows: at `factor` times the position of
- * of: the joint that counts. Whoever names either moves both.
+ * joint: The joint that follows.
+ * mimics: The joint that it follows.
+ * multiplier: Position of `joint` divided by the position of `mimics`.
  */
 export interface MimicJoint {
   joint: string;
@@ -89,12 +92,13 @@ export interface MimicJoint {
 }
 
 /**
- * The range of one joint depends on where another one is.
+ * The range of one joint depends on the position of another joint.
  *
  * Attributes:
- * joint: Whose range; `by`: the other.
- * table: Rows of `by`'s position and the range there, lower and upper [rad]; linear in between. It reaches over
- * all of `by`'s range.
+ * joint: The joint with the variable range.
+ * depends_on: The joint that determines the range.
+ * table: Rows of the position of `depends_on` and the lower and upper limit there [rad], interpolated linearly.
+ * The rows cover the whole range of `depends_on`.
  */
 export interface PositionDependentLimit {
   joint: string;
@@ -102,14 +106,14 @@ export interface PositionDependentLimit {
   table: [number, number, number][];
 }
 
-/** One stream at `tele/{name}`: `joints` carries `JointTelemetry`, all others `Measurements`. */
+/** A stream at `tele/{name}`: `joints` carries `JointTelemetry`, all others `Measurements`. */
 export interface Stream {
   /** letters, digits, _ and -, 1 to 64 of them */
   name: string;
   rate_hz: number;
 }
 
-/** One thing that can be set, within `lower` and `upper` [`unit`]. */
+/** A value that can be set, between `lower` and `upper` [`unit`]. */
 export interface Control {
   /** letters, digits, _ and -, 1 to 64 of them */
   name: string;
@@ -120,9 +124,11 @@ export interface Control {
 }
 
 /**
- * When the room slows or holds the device: on its condition, and when its sensor was silent for `stale_ms`.
+ * An interlock: the room slows or holds the device on a condition, or if its sensor is silent for `stale_ms`.
  *
- * `name` says device, stream and condition; `speed` is the share that is left, 0 for `hold`.
+ * Attributes:
+ * name: Device, stream and condition.
+ * speed: Remaining share of the speed limits; 0 for `hold`.
  */
 export interface InterlockDescription {
   name: string;
@@ -132,18 +138,21 @@ export interface InterlockDescription {
 }
 
 /**
- * How some measurements of a device are to be judged. Values in the measurement's own unit.
+ * How the cloud evaluates measurements of a device. Limits are in the measurement's own unit.
  *
  * Attributes:
- * stream: The stream that carries them.
- * fields: Their names; `*` stands for any text: `temperature_c.*`.
- * label: What is measured, for people; `unit`: of the values.
- * advice: What to do when something is wrong.
- * low: Below this something breaks; `high`: above.
- * warning_low: Below this somebody should look; `warning_high`: above.
- * change: A lasting shift that is worth a word; without it half of the room to the limits.
- * horizon_s: How long before a limit a trend towards it is told [s].
- * questions: What to look for: `level`, `trend`, `change`, `outlier`; none: nothing there is unusual.
+ * stream: Stream of the measurements.
+ * fields: Names of the measurements; `*` matches any text: `temperature_c.*`.
+ * label: Display name of the quantity.
+ * unit: Unit of the values.
+ * advice: What to do when a check fails.
+ * low: Values below are an error.
+ * high: Values above are an error.
+ * warning_low: Values below are a warning.
+ * warning_high: Values above are a warning.
+ * change: Lasting shift that is reported; `None`: half of the distance to the limits.
+ * horizon_s: A trend is reported this long before it reaches a limit [s].
+ * checks: Checks to run: `level`, `trend`, `change`, `outlier`; empty: no value is unusual.
  */
 export interface Diagnostic {
   /** letters, digits, _ and -, 1 to 64 of them */
@@ -161,21 +170,21 @@ export interface Diagnostic {
   checks?: string[];
 }
 
-/** How fast a base may be driven: forward or back, to a side (0: it cannot), turning. */
+/** Speed limits of a mobile base: forwards and backwards, sideways (0: not possible) and turning. */
 export interface BaseLimits {
   forward_m_s: number;
   left_m_s: number;
   turn_rad_s: number;
 }
 
-/** `desc/twin`: the drawing from which a page builds its live view. Retained. */
+/** `desc/twin`: the model from which the console draws the live view. Retained. */
 export interface Twin {
   /** letters, digits, _ and -, 1 to 64 of them */
   device: string;
   bodies: Body[];
 }
 
-/** One body of the tree; `parent` is its index in `Twin.bodies`, -1 for a root. */
+/** One body of the tree. `parent` is its index in `Twin.bodies`, -1 for a root. */
 export interface Body {
   name: string;
   parent: number;
@@ -186,9 +195,9 @@ export interface Body {
 }
 
 /**
- * The joint by which a body turns or slides: axis and anchor in the body's own frame.
+ * The joint that moves a body relative to its parent. Axis and anchor are in the body's own frame.
  *
- * One that `follows` others has no motor of its own: its position is the sum of factor times position of those.
+ * A joint that `follows` others has no motor: its position is the sum of multiplier times position of those joints.
  */
 export interface TwinJoint {
   name: string;
@@ -202,8 +211,8 @@ export interface TwinJoint {
 /**
  * One primitive shape of a body.
  *
- * `size_m` is as MuJoCo gives it: box half extents; sphere radius; capsule and
- * cylinder radius, half length along z; ellipsoid radii; plane half extents.
+ * `size_m` follows MuJoCo: half extents of a box; radius of a sphere; radius and half length along z of a capsule
+ * or cylinder; radii of an ellipsoid; half extents of a plane.
  */
 export interface Geometry {
   shape: "box" | "capsule" | "cylinder" | "ellipsoid" | "plane" | "sphere";
@@ -214,11 +223,12 @@ export interface Geometry {
 }
 
 /**
- * `state`: the current condition. Retained; on change and every 30 s, at most once a second.
+ * `state`: the current condition. Retained; published on change and every 30 s, at most once per second.
  *
- * `ended_epoch` is the highest epoch that the device will never obey again. It only rises, so even an old message
- * tells the truth: a lease of such an epoch is nobody's any more. `stiffness` names the joints that hold with less
- * than all their strength, and with which share of it.
+ * Attributes:
+ * ended_epoch: Highest epoch that the device no longer accepts. It only rises, so even an outdated message
+ * correctly marks the leases that have ended.
+ * stiffness: Joints that hold with reduced strength: joint name → share of the full strength.
  */
 export interface State {
   /** letters, digits, _ and -, 1 to 64 of them */
@@ -236,10 +246,10 @@ export interface State {
   stiffness?: Record<string, number>;
 }
 
-/** What the device is doing at this moment. */
+/** What the device is doing now. */
 export type Mode = "action" | "fault" | "holding" | "idle" | "stopped" | "streaming";
 
-/** Who stopped the device, and when. There until somebody who may resets it. */
+/** Who stopped the device, and when. It stays until an authorized caller resets it. */
 export interface StopLatch {
   caller: string;
   reason: string;
@@ -247,10 +257,14 @@ export interface StopLatch {
 }
 
 /**
- * The lease that the device obeys now.
+ * The lease in force at the device.
  *
- * `reason` says why it was taken from somebody else, and is empty where it was not. `request` is for people:
- * nothing about motion depends on it.
+ * Attributes:
+ * holder: Name of the operator in control.
+ * epoch: Fencing token of the lease.
+ * expires_in_ms: Remaining time [ms].
+ * reason: Why control was taken from another operator; empty otherwise.
+ * request: Pending request for control. For display only: motion does not depend on it.
  */
 export interface LeaseState {
   holder: string;
@@ -260,7 +274,7 @@ export interface LeaseState {
   request?: OpenRequest | null;
 }
 
-/** Somebody asks the holder for control, and gets an answer in the time that is left or none. */
+/** A pending request for control. It expires without a response after `expires_in_ms`. */
 export interface OpenRequest {
   /** letters, digits, _ and -, 1 to 64 of them */
   id: string;
@@ -277,14 +291,14 @@ export interface ActionState {
   progress?: number;
 }
 
-/** Something wrong that lasts. */
+/** A fault that persists. */
 export interface Fault {
   code: string;
   message: string;
   since_ms: number;
 }
 
-/** What the room allows at this moment: `speed` is the share that is left, 0: hold. `source` is an interlock. */
+/** A speed restriction of the room, set by the interlock `source`. `speed` is the remaining share; 0: hold. */
 export interface Restriction {
   source: string;
   speed: number;
@@ -294,10 +308,11 @@ export interface Restriction {
 /**
  * `tele/joints`: all joints of one device at one tick, in the order of `Description.joints`.
  *
- * `epoch` is that of the lease in force at the device, 0 when none is: whoever thinks to have control and reads 0
- * has it no longer. `setpoint_sequence` is the newest setpoint the control loop has taken (0: none in this lease),
- * and `setpoint_sent_ms` the operator's own clock in it, so that the page measures its round trip on one clock.
- * `limited` names what changed a setpoint on its way to the motors.
+ * Attributes:
+ * epoch: Epoch of the lease in force at the device, 0 for none. A holder that reads 0 has lost control.
+ * setpoint_sequence: Newest setpoint that the control loop has accepted; 0 for none in this lease.
+ * setpoint_sent_ms: `sent_ms` of that setpoint, so that the operator measures its round trip on one clock.
+ * limited: Limits that changed a setpoint before it reached the motors.
  */
 export interface JointTelemetry {
   tick_ms: number;
@@ -317,10 +332,10 @@ export interface JointTelemetry {
 }
 
 /**
- * `tele/{stream}`, every stream but `joints`: named values, all measured at one moment.
+ * `tele/{stream}` except `joints`: named values, all measured at one moment.
  *
- * A name is a quantity with its unit, then a dot and the part of the device where there are several:
- * `temperature_c.elbow`. `sequence` counts up from one start of the agent to the next.
+ * A name consists of a quantity with its unit and, if the device has several, a dot and the part:
+ * `temperature_c.elbow`. `sequence` starts anew with each start of the agent.
  */
 export interface Measurements {
   tick_ms: number;
@@ -329,7 +344,7 @@ export interface Measurements {
   values: Record<string, number | boolean>;
 }
 
-/** `event`: a fact that happened, in the past tense. Stored. */
+/** `event`: a fact that happened, in the past tense. The cloud stores it. */
 export interface Event {
   /** letters, digits, _ and -, 1 to 64 of them */
   id: string;
@@ -342,7 +357,7 @@ export interface Event {
   data?: Record<string, unknown>;
 }
 
-/** `ack`: the device's answer to one command. `sequence` orders the acks of one command. */
+/** `ack`: the device's response to one command. `sequence` orders the acknowledgements of one command. */
 export interface Ack {
   /** letters, digits, _ and -, 1 to 64 of them */
   id: string;
@@ -356,20 +371,20 @@ export interface Ack {
   result?: Record<string, unknown>;
 }
 
-/** How far a command has come. The last four are terminal. */
+/** Progress of a command. The last four values are terminal. */
 export type AckStatus = "accepted" | "cancelled" | "done" | "expired" | "failed" | "received" | "started";
 
-/** Why a command ended as it did: a code for programs, a sentence for people that says what to do. */
+/** Why a command ended: a code for programs, and a message for people that names the remedy. */
 export interface Reason {
   code: string;
   message: string;
 }
 
 /**
- * `cmd`: a request to a device; travels inside `signing.Signed`.
+ * `cmd`: a request to a device; the body of `signing.Signed`.
  *
- * `space`, `agent` and `device` bind it to one device, `epoch` to one lease; it runs at most once per
- * `id` and never later than `issued_at_ms + ttl_ms` on the cloud's clock, which the agent reads as an offset to
+ * `space`, `agent` and `device` bind it to one device, `epoch` binds it to one lease. It runs at most once per
+ * `id` and never after `issued_at_ms + ttl_ms` on the cloud's clock; the agent tracks the offset of that clock to
  * its own monotonic clock.
  */
 export interface Command {
@@ -389,9 +404,9 @@ export interface Command {
 }
 
 /**
- * Control of the device now belongs to `holder`, for `lease_ms` from the moment of arrival. Also renews.
+ * `holder` has control for `lease_ms` from the time of arrival. Also renews a lease.
  *
- * `reason`: why it was taken from somebody else, for that person to read.
+ * `reason`: why control was taken from another operator; shown to that operator.
  */
 export interface GrantLease {
   kind: "grant_lease";
@@ -400,12 +415,12 @@ export interface GrantLease {
   reason?: string;
 }
 
-/** Nobody controls the device any more; what moves is brought to a hold. */
+/** Ends the lease; motion is brought to a hold. */
 export interface ReleaseLease {
   kind: "release_lease";
 }
 
-/** Show the holder, and everybody, that somebody asks for control. Changes nothing else; lapses by itself. */
+/** Shows all viewers that `requester` asks for control. Changes nothing else and expires by itself. */
 export interface RequestControl {
   kind: "ask_lease";
   /** letters, digits, _ and -, 1 to 64 of them */
@@ -414,7 +429,7 @@ export interface RequestControl {
   answer_within_ms: number;
 }
 
-/** Nobody asks any more: refused, or withdrawn. */
+/** Removes a request for control that was refused or withdrawn. */
 export interface WithdrawRequest {
   kind: "drop_request";
   /** letters, digits, _ and -, 1 to 64 of them */
@@ -422,11 +437,14 @@ export interface WithdrawRequest {
 }
 
 /**
- * Run one movement script. The source must hash to `sha256` (hex).
+ * Runs one movement script. The source must hash to `sha256` (hex).
  *
- * `signature` is the one that was made, with the cloud's key `key`, when the movement was saved: over robot type,
- * name, version and hash. `author` is the account that saved it, or `SHIPPED`: each author counts versions by
- * itself, and a device never runs an older one than it has. It is ended after `timeout_ms`.
+ * Attributes:
+ * author: Account that saved the movement, or `SHIPPED`. Versions are counted per author, and a device never
+ * runs an older version than before.
+ * key: Id of the cloud's key that signed the movement when it was saved.
+ * signature: Signature over robot type, name, version and hash.
+ * timeout_ms: The script is terminated after this time [ms].
  */
 export interface RunMovement {
   kind: "run_movement";
@@ -444,10 +462,10 @@ export interface RunMovement {
   timeout_ms?: number;
 }
 
-/** Move to joint positions and end there; `plan`: around what is in between. */
+/** Move to joint positions. `plan`: avoid obstacles. */
 export interface MoveJoints {
   kind: "move_joints";
-  /** joint name → position [rad]; joints not named keep their target */
+  /** joint name → position [rad]; other joints keep their target */
   position_rad: Record<string, number>;
   /** share of each joint's velocity limit */
   speed?: number;
@@ -455,10 +473,14 @@ export interface MoveJoints {
 }
 
 /**
- * Bring a frame to a pose in the robot's base frame and end there; no frame: the last of the device's.
+ * Move a frame to a pose in the robot's base frame.
  *
- * The orientation is a quaternion (w, x, y, z), or roll, pitch and yaw about the base's axes; with neither the frame
- * keeps its own. `straight`: on a straight line. `plan`: around what is in between.
+ * Attributes:
+ * quaternion: Target orientation (w, x, y, z).
+ * rpy_rad: Target roll, pitch and yaw about the axes of the base; without either orientation, it is kept.
+ * frame: Frame to move; empty for the device's last frame.
+ * straight: Move on a straight line.
+ * plan: Avoid obstacles.
  */
 export interface MovePose {
   kind: "move_pose";
@@ -472,14 +494,14 @@ export interface MovePose {
   plan?: boolean;
 }
 
-/** Speak `text`, and end when it is said; `language` as `en` or `sk`, or empty for the robot's own. */
+/** Speak `text`; ends when speech ends. `language`: `en`, `sk` …; empty for the robot's default. */
 export interface Say {
   kind: "say";
   text: string;
   language?: string;
 }
 
-/** Show one of the device's expressions; `strength` 0 is home. */
+/** Show an expression of the device; `strength` 0 is the home position. */
 export interface Express {
   kind: "express";
   /** letters, digits, _ and -, 1 to 64 of them */
@@ -487,7 +509,7 @@ export interface Express {
   strength?: number;
 }
 
-/** Move to one of the device's postures. */
+/** Move to a posture of the device. */
 export interface TakePosture {
   kind: "take_posture";
   /** letters, digits, _ and -, 1 to 64 of them */
@@ -496,14 +518,14 @@ export interface TakePosture {
   speed?: number;
 }
 
-/** Run one of the device's behaviours to its end. */
+/** Run a behaviour of the device to its end. */
 export interface RunBehaviour {
   kind: "run_behaviour";
   /** letters, digits, _ and -, 1 to 64 of them */
   name: string;
 }
 
-/** Let joints hold with `value` of their strength, 0: limp; no joints: all. It lasts beyond the action. */
+/** Set the holding strength of joints to the share `value`; 0: limp. No joints: all. Outlasts the action. */
 export interface SetStiffness {
   kind: "set_stiffness";
   value: number;
@@ -518,7 +540,7 @@ export interface LookAt {
   speed?: number;
 }
 
-/** Move the base at a velocity for a time, then stand; `turn_rad_s` is counter-clockwise. */
+/** Drive the base at a velocity for a time, then stop; `turn_rad_s` is counter-clockwise. */
 export interface Drive {
   kind: "drive";
   forward_m_s?: number;
@@ -527,7 +549,7 @@ export interface Drive {
   duration_s?: number;
 }
 
-/** Go to a place in the room, around what stands there now; `yaw_rad`: how to stand, counter-clockwise from x. */
+/** Navigate to a position in the room around obstacles; `yaw_rad`: final heading, counter-clockwise from x. */
 export interface GoTo {
   kind: "go_to";
   x_m: number;
@@ -535,7 +557,7 @@ export interface GoTo {
   yaw_rad?: number | null;
 }
 
-/** Measure these streams of a room device at this rate for a time, then again as before; no streams: all. */
+/** Measure streams of a room device at another rate for a time; no streams: all. */
 export interface CollectData {
   kind: "gather";
   streams?: string[];
@@ -543,20 +565,20 @@ export interface CollectData {
   duration_s: number;
 }
 
-/** Measure these streams of a room device once, now; no streams: all. The result has the `values`. */
+/** Measure streams of a room device once, now; no streams: all. The result contains the `values`. */
 export interface TakePicture {
   kind: "shoot";
   streams?: string[];
 }
 
-/** Take a raw picture or scan and store it; the result names the `upload`. */
+/** Capture raw data and upload it; the result names the `upload`. */
 export interface CaptureRaw {
   kind: "capture";
   /** letters, digits, _ and -, 1 to 64 of them */
   name: string;
 }
 
-/** Set a control of a room device, within its limits and in its unit; the result says what was `applied`. */
+/** Set a control of a room device, within its limits and in its unit. The result contains the `applied` value. */
 export interface SetControl {
   kind: "set_control";
   /** letters, digits, _ and -, 1 to 64 of them */
@@ -564,7 +586,7 @@ export interface SetControl {
   value: number;
 }
 
-/** End the named action; the device holds where it is. */
+/** Cancel the named action; the device holds its position. */
 export interface CancelAction {
   kind: "cancel_action";
   /** letters, digits, _ and -, 1 to 64 of them */
@@ -578,19 +600,19 @@ export interface StopDevice {
 }
 
 /**
- * Release the Stop latch. Nothing resumes.
+ * Reset the Stop latch. Motion does not resume.
  *
- * It brings an epoch of its own, which ends with it: what was ordered before the reset is never obeyed after it, and a
- * reset that comes late, or again, is older than the latch that it finds.
+ * The command carries an epoch of its own, which ends with it. The device therefore rejects commands issued before the
+ * reset, and a delayed or repeated reset is older than a newer latch.
  */
 export interface ResetStop {
   kind: "reset_stop";
 }
 
 /**
- * The cloud has new keys: statements that lead to the newest, oldest first (`device_agent.protocol.security.key_rotation`).
+ * Statements that lead to the cloud's newest keys, oldest first (`security.key_rotation`).
  *
- * Changes nothing else, and takes the device from nobody.
+ * Changes nothing else and does not affect the lease.
  */
 export interface RotateKey {
   kind: "follow_key";
@@ -598,10 +620,12 @@ export interface RotateKey {
 }
 
 /**
- * `ctl/{epoch}`: one streamed setpoint. The newest wins; `sequence` starts at 1 in each lease.
+ * `ctl/{epoch}`: one streamed setpoint. The newest is used; `sequence` starts at 1 in each lease.
  *
- * `echo_tick_ms` is `tick_ms` of the last telemetry the operator saw: its age on the robot's own clock is the
- * loop age. `sent_ms` is any clock of the operator's [ms]; telemetry echoes it.
+ * Attributes:
+ * echo_tick_ms: `tick_ms` of the newest telemetry that the operator has received. Its age on the robot's own
+ * clock is the loop age.
+ * sent_ms: Time of sending on any clock of the operator [ms]; telemetry echoes it.
  */
 export interface Setpoint {
   epoch: number;
@@ -611,17 +635,17 @@ export interface Setpoint {
   target: JointTarget | JogTarget | DriveTarget;
 }
 
-/** Go to these joint positions, as fast as limits allow. */
+/** Move to joint positions as fast as the limits allow. */
 export interface JointTarget {
   kind: "joints";
-  /** joint name → position [rad]; joints not named keep their target */
+  /** joint name → position [rad]; other joints keep their target */
   position_rad: Record<string, number>;
 }
 
 /**
- * Move a frame at this velocity while setpoints are fresh; no frame: the last of the device's.
+ * Move a frame at a velocity while setpoints are fresh; no frame: the device's last frame.
  *
- * Along and about the axes of the robot's base, or with `tool` those of the frame itself.
+ * Velocities are along and about the axes of the robot's base, or with `tool` those of the frame itself.
  */
 export interface JogTarget {
   kind: "jog";
@@ -631,7 +655,7 @@ export interface JogTarget {
   tool?: boolean;
 }
 
-/** Move the base at this velocity while setpoints are fresh; `turn_rad_s` is counter-clockwise. */
+/** Drive the base at a velocity while setpoints are fresh; `turn_rad_s` is counter-clockwise. */
 export interface DriveTarget {
   kind: "drive";
   forward_m_s?: number;
@@ -639,7 +663,7 @@ export interface DriveTarget {
   turn_rad_s?: number;
 }
 
-/** `stop`: latch Stop now. Needs no lease and no signature: the broker lets only those publish it who may. */
+/** `stop`: latch Stop now. Needs no lease and no signature; the broker restricts the publishers. */
 export interface Stop {
   /** letters, digits, _ and -, 1 to 64 of them */
   id: string;
