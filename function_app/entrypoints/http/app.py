@@ -8,6 +8,8 @@ from urllib.parse import urlsplit
 
 from fastapi import FastAPI, Request, Response
 from fastapi.exceptions import RequestValidationError
+from fastapi.openapi.utils import get_openapi
+from fastapi.routing import APIRoute
 from starlette.exceptions import HTTPException
 from starlette.requests import ClientDisconnect
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
@@ -23,6 +25,7 @@ from function_app.entrypoints.http.framework.api_reference import reference
 from function_app.entrypoints.http.framework.authentication import COOKIE, Caller, is_stop
 from function_app.entrypoints.http.framework.client_address import client_address
 from function_app.entrypoints.http.framework.responses import JSON, problem
+from function_app.entrypoints.http.framework.route_index import RouteIndex
 from function_app.entrypoints.http.framework.routing import (
     ACCOUNT_SCHEMES,
     AGENT_SCHEME,
@@ -99,10 +102,11 @@ def create_app(functions: Functions) -> FastAPI:
         uploads.router(functions, caller),
         health_check.router(functions),
     )
-    app.state.routes = [route for routes in resources for route in routes.router.routes]
-    # Side by side and not as routers within the router, each of which would be looked through twice.
-    app.router.routes += [*app.state.routes, *blob_transfers.router(functions.transfers).routes]
-    _document(app, [kind for routes in resources for kind in routes.kinds])
+    routers = [*(routes.router for routes in resources), blob_transfers.router(functions.transfers)]
+    index = RouteIndex(route for router in routers for route in router.routes if isinstance(route, APIRoute))
+    app.router.routes.insert(0, index)
+    app.state.route_index = index
+    _document(app, index, [kind for routes in resources for kind in routes.kinds])
     app.add_exception_handler(Problem, _on_problem)
     app.add_exception_handler(StoreError, _on_store)
     app.add_exception_handler(RequestValidationError, _on_validation)
@@ -125,12 +129,12 @@ def _by_name(url: str) -> bool:
     return parts.scheme == "https" and parts.hostname != "localhost"
 
 
-def _document(app: FastAPI, kinds: Sequence[Any]) -> None:
-    made = app.openapi
-
+def _document(app: FastAPI, index: RouteIndex, kinds: Sequence[Any]) -> None:
     def openapi() -> dict[str, Any]:
         if app.openapi_schema is None:
-            document = made()
+            document = get_openapi(
+                title=app.title, version=app.version, description=app.description, routes=index.routes
+            )
             components = document.setdefault("components", {})
             # What the framework's own validation would say never leaves: refusals are problem details.
             components["schemas"] = schemas(kinds)
@@ -189,11 +193,10 @@ async def _on_http(request: Request, error: Exception) -> Response:
 
 
 def _methods(request: Request) -> list[str]:
-    """What may be asked at this address: the framework names the methods of the first route alone."""
-    known: list[Any] = request.app.state.routes
-    # The first one that fits decides: ``agents/enroll`` is no agent.
-    place = next((route.path for route in known if route.path_regex.match(request.url.path)), None)
-    return sorted({method for route in known if route.path == place for method in route.methods})
+    """Methods of the path. The framework names those of one route only."""
+    index: RouteIndex = request.app.state.route_index
+    routes = index.on_path(request.scope)
+    return sorted({method for route in routes if route.path == routes[0].path for method in route.methods or ()})
 
 
 class _Addresses:

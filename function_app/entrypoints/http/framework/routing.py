@@ -5,9 +5,6 @@ from typing import Annotated, Any, Literal
 
 import msgspec
 from fastapi import APIRouter, Query, Response
-from fastapi.routing import APIRoute
-from starlette.routing import Match
-from starlette.types import Scope
 
 from function_app.entrypoints.http.framework import schemas as contract
 from function_app.entrypoints.http.framework.api_key_scopes import FOR_KEYS
@@ -43,33 +40,11 @@ _MEANINGS = {
 }
 
 
-class Route(APIRoute):
-    """A route that is told apart by how its address begins, and how deep it is, before its pattern is asked.
-
-    There are more than a hundred, looked through one after the other for each request: the patterns alone would take
-    longer than a read of the tables.
-    """
-
-    def __init__(self, path: str, endpoint: Callable[..., Any], **described: Any) -> None:
-        super().__init__(path, endpoint, **described)
-        self._beginning = path.partition("{")[0]
-        self._depth = None if ":path}" in path else path.count("/")
-
-    def matches(self, scope: Scope) -> tuple[Match, Scope]:
-        """As Starlette asks."""
-        path: str = scope["path"]
-        if not scope.get("root_path") and (
-            not path.startswith(self._beginning) or self._depth not in {None, path.count("/")}
-        ):
-            return Match.NONE, {}
-        return super().matches(scope)
-
-
 class Routes:
     """A router for one resource. Handlers take ``request`` and path or query parameters and return a response."""
 
     def __init__(self, tag: str) -> None:
-        self.router = APIRouter(prefix=PREFIX, tags=[tag], route_class=Route)
+        self.router = APIRouter(prefix=PREFIX, tags=[tag])
         self.kinds: list[Any] = [contract.Problem]
         """Every struct that its routes have named."""
 

@@ -7,7 +7,7 @@ from fastapi import APIRouter, Request, Response
 from fastapi.responses import StreamingResponse
 
 from function_app.domain.common.problems import Problem, not_found
-from function_app.entrypoints.http.framework.routing import PREFIX, Route
+from function_app.entrypoints.http.framework.routing import PREFIX
 from function_app.ports.blobs import TransferRefused, Transfers
 
 PATH = "/blobs"
@@ -17,7 +17,7 @@ _SHOWN = frozenset({"image/jpeg", "image/png", "image/webp"})
 
 def router(transfers: Transfers | None) -> APIRouter:
     """The routes; without ``transfers`` nothing is behind them."""
-    routes = APIRouter(prefix=PREFIX, include_in_schema=False, route_class=Route)
+    routes = APIRouter(prefix=PREFIX, include_in_schema=False)
 
     @routes.put(PATH + "/{token}")
     async def receive(request: Request, token: str) -> Response:

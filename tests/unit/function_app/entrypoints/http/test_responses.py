@@ -7,10 +7,12 @@ from typing import Any
 
 import httpx
 import pytest
+from fastapi.routing import APIRoute
 from hypothesis import HealthCheck, given
 from hypothesis import settings as quickly
 from hypothesis import strategies as st
 from starlette.routing import Match
+from starlette.types import Scope
 
 from function_app.domain.common.problems import Problem
 from function_app.entrypoints.http.framework.responses import MAX_BODY
@@ -300,17 +302,49 @@ class TestConsole:
         assert [message["type"] for message in sent] == ["websocket.close"]
 
 
-class TestRoutes:
-    def test_one_that_is_passed_over_at_once_would_not_have_fitted(self, cloud: Cloud) -> None:
-        routes = cloud.app.state.routes
-        paths = {route.path_format.replace("{", "x").replace("}", "") for route in routes}
-        paths |= {f"{path}/more" for path in paths} | {f"{API}/robot-types/ur5/files/meshes/a/b.obj", f"{API}/devicesx"}
+class TestRouteIndex:
+    def test_it_finds_the_same_routes_as_a_linear_search(self, cloud: Cloud) -> None:
+        index = cloud.app.state.route_index
+        paths = {route.path_format.replace("{", "x").replace("}", "") for route in index.routes}
+        paths |= {f"{path}/more" for path in paths} | {f"{path}/" for path in paths}
+        paths |= {
+            f"{API}/robot-types/ur5/files/meshes/a/b.obj",
+            f"{API}/devicesx",
+            "",
+            "/",
+            "//",
+            f"{API}/devices//lease",
+        }
         for path in paths:
-            scope = {"type": "http", "method": "GET", "path": path}
-            quickly_found = [route.path for route in routes if route.matches(dict(scope))[0] != Match.NONE]
-            assert quickly_found == [route.path for route in routes if route.path_regex.match(path)], path
+            expected = [route.path for route in index.routes if route.path_regex.match(path)]
+            assert [route.path for route in index.on_path({"path": path})] == expected, path
 
-    def test_behind_a_prefix_of_the_host_they_are_found_too(self, cloud: Cloud) -> None:
+    def test_it_finds_routes_behind_a_path_prefix_of_the_host(self, cloud: Cloud) -> None:
         scope = {"type": "http", "method": "GET", "path": f"/stage{API}/devices/{DEVICE}", "root_path": "/stage"}
-        found = [route.path for route in cloud.app.state.routes if route.matches(dict(scope))[0] == Match.FULL]
-        assert found == [f"{API}/devices/{{device}}"]
+        match, found = cloud.app.state.route_index.matches(scope)
+        assert (match, found["route"].path) == (Match.FULL, f"{API}/devices/{{device}}")
+
+    @pytest.mark.parametrize(
+        ("request_line", "operation", "expected"),
+        [
+            ("DELETE /agents/enroll", "unpair_agent", Match.FULL),
+            ("GET /agents/enroll", "enroll_agent", Match.PARTIAL),
+            ("GET /devices/d/actions", "list_actions", Match.FULL),
+            ("GET /nothing", None, Match.NONE),
+        ],
+    )
+    def test_a_request_tries_at_most_one_route(
+        self, cloud: Cloud, monkeypatch: pytest.MonkeyPatch, request_line: str, operation: str | None, expected: Match
+    ) -> None:
+        method, path = request_line.split()
+        tried: list[APIRoute] = []
+        original = APIRoute.matches
+
+        def counted(route: APIRoute, scope: Scope) -> tuple[Match, Scope]:
+            tried.append(route)
+            return original(route, scope)
+
+        monkeypatch.setattr(APIRoute, "matches", counted)
+        match, found = cloud.app.state.route_index.matches({"type": "http", "method": method, "path": f"{API}{path}"})
+        assert (match, getattr(found.get("route"), "operation_id", None)) == (expected, operation)
+        assert len(tried) <= 1
