@@ -1,7 +1,7 @@
-"""``python -m benchmarks [SUITE …] [--quick]``: measures, writes ``results/*.json`` and ``docs/results/benchmarks.md``.
+"""Runs benchmark suites, writes ``results/*.json`` and ``docs/results/benchmarks.md``.
 
-Prints what is claimed and what was seen; the exit code is 1 where a claim does not hold. A quick run is for the
-terminal: it leaves the page and the results of whole runs alone.
+Usage: ``python -m benchmarks [SUITE …] [--quick]``. Prints each target with the measured value. The exit code is 1 if a
+target is missed. A quick run writes to ``results/quick`` only; the page shows full runs.
 """
 
 import argparse
@@ -16,14 +16,14 @@ from benchmarks.reporting.report import QUICK, RESULTS, Report, save
 
 
 def main() -> int:
-    """Run the suites that are asked for, one after the other."""
+    """Runs the requested suites in order and returns the exit code."""
     parser = argparse.ArgumentParser(prog="python -m benchmarks", description=__doc__.splitlines()[0])
-    parser.add_argument("suites", nargs="*", metavar="SUITE", help=f"of {', '.join(suites.NAMES)}; all by default")
-    parser.add_argument("--quick", action="store_true", help="fewer samples: all suites in under ten minutes")
+    parser.add_argument("suites", nargs="*", metavar="SUITE", help=f"one of {', '.join(suites.NAMES)} (default: all)")
+    parser.add_argument("--quick", action="store_true", help="take fewer samples: all suites in about ten minutes")
     chosen = parser.parse_args()
     unknown = sorted(set(chosen.suites) - set(suites.NAMES))
     if unknown:
-        parser.error(f"no suite {', '.join(unknown)}; there are {', '.join(suites.NAMES)}")
+        parser.error(f"unknown suite {', '.join(unknown)}; choose from {', '.join(suites.NAMES)}")
     reports = [run(name, quick=chosen.quick) for name in chosen.suites or suites.NAMES]
     if not chosen.quick:
         page.write()
@@ -35,12 +35,12 @@ def main() -> int:
 
 
 def run(name: str, *, quick: bool) -> Report:
-    """One suite; its report is saved."""
-    began_s = time.monotonic()
+    """Runs one suite and saves its report."""
+    started_s = time.monotonic()
     suite: Any = importlib.import_module(f"benchmarks.suites.{name}")
 
     def say(line: str) -> None:
-        print(f"{name:10} {time.monotonic() - began_s:6.0f} s  {line}", flush=True)
+        print(f"{name:10} {time.monotonic() - started_s:6.0f} s  {line}", flush=True)
 
     report: Report = suite.run(quick=quick, say=say)
     save(report, QUICK if quick else RESULTS)

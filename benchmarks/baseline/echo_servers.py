@@ -1,7 +1,8 @@
-"""The least that an exchange must contain, each in a process of its own: it answers what comes with what came.
+"""Echo servers, each in its own process: the minimum that an exchange must contain.
 
-``python -m benchmarks.baseline.echo_servers tcp|http PORT`` or ``… mqtt PORT CLIENT USER PASSWORD TOPIC ANSWER QOS BYTES``; it prints
-``ready`` once it is. Over MQTT the answer is made as long as ``BYTES`` if it is shorter.
+Usage: ``python -m benchmarks.baseline.echo_servers tcp|http PORT`` or
+``… mqtt PORT CLIENT USER PASSWORD TOPIC REPLY_TOPIC QOS BYTES``. The program prints ``ready`` when it accepts requests.
+Over MQTT the reply is padded to ``BYTES``.
 """
 
 import asyncio
@@ -17,7 +18,7 @@ HOST = "127.0.0.1"
 
 
 def send_at_once(_client: Any, _userdata: Any, opened: Any) -> None:
-    """Paho's ``on_socket_open``: a small message does not wait for the acknowledgement of the one before."""
+    """Disables Nagle's algorithm; paho calls it as ``on_socket_open``."""
     opened.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
 
 
@@ -32,13 +33,13 @@ async def _tcp(port: int) -> None:
 
 
 async def serve(app: Any, port: int) -> None:
-    """An application under uvicorn, as the functions are served; prints ``ready``."""
+    """Serves an application with uvicorn, as the product does; prints ``ready``."""
     import uvicorn
 
     config = uvicorn.Config(app, host=HOST, port=port, log_level="error", access_log=False, timeout_keep_alive=600)
     server = uvicorn.Server(config)
     serving = asyncio.create_task(server.serve())
-    while not server.started:  # noqa: ASYNC110 (it offers nothing to wait for)
+    while not server.started:  # noqa: ASYNC110 (uvicorn offers no event to wait for)
         await asyncio.sleep(0.01)
     print("ready", flush=True)
     await serving
@@ -54,7 +55,7 @@ async def _http(port: int) -> None:
         return Response(await request.body(), media_type="application/json")
 
     @app.get("/echo")
-    async def again() -> dict[str, str]:
+    async def status() -> dict[str, str]:
         return {"status": "ok"}
 
     @app.get("/sized/{length}")
@@ -65,19 +66,19 @@ async def _http(port: int) -> None:
 
 
 def _mqtt(port: int, *words: str) -> None:
-    client_id, user, password, topic, answer, level, least = words
-    qos, size = int(level), int(least)
+    client_id, user, password, topic, reply_topic, qos_text, size_text = words
+    qos, size = int(qos_text), int(size_text)
     client = paho.Client(CallbackAPIVersion.VERSION2, client_id, protocol=paho.MQTTv311)
     client.username_pw_set(user, password)
     client.on_socket_open = send_at_once
 
-    def back(_client: paho.Client, _userdata: Any, message: paho.MQTTMessage) -> None:
-        client.publish(answer, message.payload.ljust(size), qos)
+    def reply(_client: paho.Client, _userdata: Any, message: paho.MQTTMessage) -> None:
+        client.publish(reply_topic, message.payload.ljust(size), qos)
 
     def subscribe(*_: Any) -> None:
         client.subscribe(topic, qos)
 
-    client.on_message = back
+    client.on_message = reply
     client.on_connect = subscribe
     client.on_subscribe = lambda *_: print("ready", flush=True)
     client.connect(HOST, port, keepalive=60)
@@ -85,7 +86,7 @@ def _mqtt(port: int, *words: str) -> None:
 
 
 def main(kind: str, port: str, *more: str) -> None:
-    """Until it is ended."""
+    """Serves until the process is terminated."""
     if kind == "tcp":
         asyncio.run(_tcp(int(port)))
     elif kind == "http":

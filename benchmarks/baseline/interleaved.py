@@ -1,4 +1,4 @@
-"""Fair timing on a machine that is never quite at rest: what is to be compared takes turns."""
+"""Timing that stays comparable on a busy machine: the compared paths run interleaved."""
 
 import contextlib
 import gc
@@ -10,43 +10,44 @@ from typing import Final
 from benchmarks.reporting.report import Table, percentile
 
 Exchange = Callable[[], float | None]
-"""One round trip; where more than that has to be done, it gives its own time [ms]. Whatever it raises ends the run."""
+"""One round trip. It may return its own duration [ms] if it contains other work. An exception ends the run."""
 SHARES: Final = {"p50": 0.5, "p95": 0.95, "p99": 0.99, "most": 1.0}
 
 
 def measure_interleaved(
     paths: Mapping[str, Exchange], *, rounds: int, each: int, warm_up: int = 20, pause_s: float = 0.0
 ) -> dict[str, list[float]]:
-    """Time several paths so that what else the machine does falls on all of them alike.
+    """Times several paths so that other load on the machine affects all of them equally.
 
     Args:
         paths: Name → one round trip.
-        rounds: How often all paths have their turn, in a new order each time.
-        each: Round trips in a turn.
-        warm_up: Round trips of each path that are not counted.
-        pause_s: Before each round trip, outside of its time. What comes after a pause finds sleeping processors and
-            cold caches, so what is paced by nature is to be compared with what is paced alike.
+        rounds: Number of rounds; each round runs all paths in a new random order.
+        each: Round trips per path and round.
+        warm_up: Uncounted round trips per path.
+        pause_s: Untimed pause before each round trip [s]. After a pause, processors sleep and caches are cold.
+            Compare a paced path only with paths that have the same pause.
 
     Returns:
-        Name → how long each round trip took [ms], ``rounds`` × ``each`` of them.
+        Name → durations [ms], shape (``rounds`` × ``each``,).
     """
-    found: dict[str, list[float]] = {name: [] for name in paths}
+    durations_ms: dict[str, list[float]] = {name: [] for name in paths}
     for exchange in paths.values():
         for _ in range(warm_up):
             exchange()
-    chance, order = random.Random(1), list(paths)
+    generator, order = random.Random(1), list(paths)
     with _no_collector():
         for _ in range(rounds):
-            chance.shuffle(order)
+            generator.shuffle(order)
             for name in order:
-                exchange, taken = paths[name], found[name]
+                exchange = paths[name]
                 for _ in range(each):
                     time.sleep(pause_s)
-                    began = time.perf_counter()
-                    own = exchange()
-                    taken.append((time.perf_counter() - began) * 1000 if own is None else own)
+                    started_s = time.perf_counter()
+                    own_ms = exchange()
+                    elapsed_ms = (time.perf_counter() - started_s) * 1000
+                    durations_ms[name].append(elapsed_ms if own_ms is None else own_ms)
             gc.collect()
-    return found
+    return durations_ms
 
 
 @contextlib.contextmanager
@@ -58,19 +59,19 @@ def _no_collector() -> Iterator[None]:
         gc.enable()
 
 
-def table(title: str, found: Mapping[str, list[float]], *, against: str = "", note: str = "") -> Table:
-    """Percentiles of each path [ms]; with ``against``, medians as ratios to that path's."""
+def table(title: str, durations_ms: Mapping[str, list[float]], *, against: str = "", note: str = "") -> Table:
+    """Returns a table of percentiles per path; with ``against``, also the ratio of medians to that path."""
     columns = ["path", "n", *(f"{name} ms" for name in SHARES)] + ([f"× {against}"] if against else [])
     rows: list[list[str | float | int | None]] = []
-    for name, taken in found.items():
-        row: list[str | float | int | None] = [name, len(taken)]
-        row += [percentile(taken, share) for share in SHARES.values()]
+    for name, samples in durations_ms.items():
+        row: list[str | float | int | None] = [name, len(samples)]
+        row += [percentile(samples, share) for share in SHARES.values()]
         if against:
-            row.append(percentile(taken, 0.5) / percentile(found[against], 0.5))
+            row.append(percentile(samples, 0.5) / percentile(durations_ms[against], 0.5))
         rows.append(row)
     return Table(title=title, columns=columns, rows=rows, note=note)
 
 
-def median(taken: list[float]) -> float:
-    """The sample in the middle."""
-    return percentile(taken, 0.5)
+def median(samples: list[float]) -> float:
+    """Returns the middle sample."""
+    return percentile(samples, 0.5)

@@ -1,4 +1,4 @@
-"""What suites measure at: the product as ``make up`` starts it, bare peers beside it, and clients with any rights."""
+"""Starts the product as ``make up`` does, with reference programs beside it and clients with any permissions."""
 
 import contextlib
 import http.client
@@ -27,21 +27,21 @@ from tests.harness.cloud.cloud import Cloud
 from tests.harness.network.brokers import BrokerKind
 from tests.harness.paths import ROOT
 
-PATIENCE_S: Final = 10.0
+TIMEOUT_S: Final = 10.0
 LEASE_MS: Final = 60_000
 PERIOD_S: Final = 0.025
-"""Between two setpoints, as the console sends them."""
+"""Time between two setpoints of the console [s]."""
 PAYLOAD: Final = json.dumps({"text": "x" * 139}).encode()
-"""150 bytes of JSON, as in the facts that these figures are to be compared with."""
+"""150 bytes of JSON, the payload of the published reference measurements."""
 
 
 class MeasuredProduct:
-    """One started product. ``start`` gives one.
+    """A running product; ``start`` creates it.
 
     Attributes:
-        machine: It.
-        api: Its API, asked with ``token``, an API key of who owns all.
-        kind: Its broker.
+        machine: The processes.
+        api: HTTP client with ``token``, an API key of the owner of all devices.
+        kind: The broker in use.
     """
 
     def __init__(self, machine: Machine, kind: BrokerKind, cloud: Cloud) -> None:
@@ -56,16 +56,16 @@ class MeasuredProduct:
 
     @property
     def mqtt_port(self) -> int:
-        """Where its broker takes TCP."""
+        """TCP port of the broker."""
         return self.machine.port + 1
 
     def rights(self, *, publish: tuple[str, ...] = (), subscribe: tuple[str, ...] = ()) -> tuple[str, str, str]:
-        """Client id, user name and password of a new client with exactly these rights."""
+        """Returns client id, user name and password of a new client with exactly these permissions."""
         self._number += 1
         return broker_credentials(self._cloud, f"bench-{self._number}", publish, subscribe)
 
-    def line(self, *, publish: tuple[str, ...] = (), subscribe: tuple[str, ...] = (), qos: int = 0) -> "MqttClient":
-        """A connected client that has subscribed."""
+    def connect(self, *, publish: tuple[str, ...] = (), subscribe: tuple[str, ...] = (), qos: int = 0) -> "MqttClient":
+        """Returns a connected and subscribed client."""
         return MqttClient(
             self.mqtt_port, *self.rights(publish=publish, subscribe=subscribe), subscribe=subscribe, qos=qos
         )
@@ -74,7 +74,7 @@ class MeasuredProduct:
 def broker_credentials(
     cloud: Cloud, name: str, publish: tuple[str, ...], subscribe: tuple[str, ...]
 ) -> tuple[str, str, str]:
-    """Client id, user name and password of a client with exactly these rights, for two hours."""
+    """Returns client id, user name and password of a client with exactly these permissions for two hours."""
     grant = Grant(
         principal=f"account:{name}",
         client_id=name,
@@ -88,33 +88,34 @@ def broker_credentials(
 
 
 class MqttClient:
-    """A warm paho client, as an app would have one. ``with`` closes it.
+    """A connected paho client, as an application has one. Leaving the context closes it.
 
     Attributes:
-        heard: Payloads in the order in which they came.
+        received: Payloads in order of arrival.
+        on_payload: Called with each payload; by default it appends to ``received``.
     """
 
     def __init__(
         self, port: int, client_id: str, user: str, password: str, *, subscribe: tuple[str, ...], qos: int
     ) -> None:
-        self.forget()
+        self.reset()
         self._filters = [(each, qos) for each in subscribe]
         self._ready = threading.Event()
         self.client = paho.Client(CallbackAPIVersion.VERSION2, client_id, protocol=paho.MQTTv311)
         self.client.username_pw_set(user, password)
         self.client.on_socket_open = send_at_once
-        self.client.on_message = lambda _c, _u, message: self.hear(bytes(message.payload))
+        self.client.on_message = lambda _c, _u, message: self.on_payload(bytes(message.payload))
         self.client.on_connect = self._connected
         self.client.on_subscribe = lambda *_: self._ready.set()
         self.client.connect(HOST, port, keepalive=60)
         self.client.loop_start()
-        if not self._ready.wait(PATIENCE_S):
-            raise TimeoutError("the broker does not let the bench's client in")
+        if not self._ready.wait(TIMEOUT_S):
+            raise TimeoutError("the broker did not accept the benchmark's client")
 
-    def forget(self) -> None:
-        """Let go of what has been heard: a client is in a cycle with its callbacks, and may stay for long."""
-        self.heard: queue.SimpleQueue[bytes] = queue.SimpleQueue()
-        self.hear: Callable[[bytes], None] = self.heard.put_nowait
+    def reset(self) -> None:
+        """Discards received payloads. The client and its callbacks form a cycle, so they may stay in memory."""
+        self.received: queue.SimpleQueue[bytes] = queue.SimpleQueue()
+        self.on_payload: Callable[[bytes], None] = self.received.put_nowait
 
     def _connected(self, *_: Any) -> None:
         if self._filters:
@@ -127,12 +128,12 @@ class MqttClient:
 
     def __exit__(self, *_: object) -> None:
         self.client.disconnect()
-        with contextlib.suppress(AttributeError):  # paho's thread may end by itself, and be gone, just then
+        with contextlib.suppress(AttributeError):  # paho's thread may end by itself at the same moment
             self.client.loop_stop()
 
 
 class _TelemetryFields(msgspec.Struct):
-    """What a hand needs to know of telemetry."""
+    """The telemetry fields that the operator needs."""
 
     tick_ms: int
     commanded_rad: tuple[float, ...]
@@ -141,49 +142,49 @@ class _TelemetryFields(msgspec.Struct):
 
 
 class StreamingOperator:
-    """An operator who holds one robot's joints where they are, setpoint by setpoint. ``with`` gives control up.
+    """An operator who streams setpoints that keep one robot in place. Leaving the context releases control.
 
     Args:
-        stand: The product.
-        name: The device's name at its agent.
+        product: The running product.
+        name: Name of the device at its agent.
 
     Attributes:
-        sent: The newest setpoint, as it went out.
-        heard: The newest telemetry, as it came.
+        sent: Payload of the newest setpoint.
+        received: Payload of the newest telemetry.
     """
 
-    def __init__(self, stand: MeasuredProduct, name: str = "ur5") -> None:
-        self._stand = stand
-        self.sent = self.heard = b""
-        self.device = stand.api.device(name)
+    def __init__(self, product: MeasuredProduct, name: str = "ur5") -> None:
+        self._product = product
+        self.sent = self.received = b""
+        self.device = product.api.device(name)
         self._path = f"/devices/{self.device['id']}/lease"
-        self._seen = threading.Condition()
+        self._telemetry_changed = threading.Condition()
         self._newest: _TelemetryFields | None = None
         self._sequence = 0
         self._next_s = 0.0
         self._ending = threading.Event()
         topic = self.device["topic"]
-        self.line = stand.line(publish=(f"{topic}/ctl/+",), subscribe=(f"{topic}/tele/joints",))
-        self.line.hear = self._hear
-        granted = stand.api.post(self._path, {"lease_ms": LEASE_MS, "wait_ms": 5000})
+        self.mqtt = product.connect(publish=(f"{topic}/ctl/+",), subscribe=(f"{topic}/tele/joints",))
+        self.mqtt.on_payload = self._on_telemetry
+        granted = product.api.post(self._path, {"lease_ms": LEASE_MS, "wait_ms": 5000})
         self.epoch: int = granted["epoch"]
         self._topic = f"{topic}/ctl/{self.epoch}"
-        self._renewing = threading.Thread(target=self._renew, daemon=True)
-        self._renewing.start()
-        with self._seen:
-            self._seen.wait_for(lambda: self._newest is not None, PATIENCE_S)
+        self._renewal = threading.Thread(target=self._renew, daemon=True)
+        self._renewal.start()
+        with self._telemetry_changed:
+            self._telemetry_changed.wait_for(lambda: self._newest is not None, TIMEOUT_S)
         joints = [each.name for each in robot_type.load(ROOT / "robots" / self.device["robot_type"]).joints]
         self.target_rad: dict[str, float] = dict(zip(joints, self._latest().commanded_rad, strict=True))
 
     def exchange(self) -> float:
-        """A setpoint, until telemetry says that the driver has applied it [ms]; as many a second as a page sends.
+        """Sends a setpoint at the console's rate and returns the time until telemetry reports it as applied [ms].
 
         Raises:
-            TimeoutError: It does not.
+            TimeoutError: Telemetry does not report the setpoint.
         """
         time.sleep(max(0.0, self._next_s - time.monotonic()))
         self._next_s = time.monotonic() + PERIOD_S
-        with self._seen:
+        with self._telemetry_changed:
             self._sequence += 1
             setpoint = Setpoint(
                 epoch=self.epoch,
@@ -193,97 +194,106 @@ class StreamingOperator:
                 target=JointTarget(position_rad=self.target_rad),
             )
             self.sent = codec.encode(setpoint)
-            began = time.perf_counter()
-            self.line.client.publish(self._topic, self.sent)
-            if not self._seen.wait_for(self._applied, PATIENCE_S):
-                raise TimeoutError(f"setpoint {self._sequence} is not seen again in telemetry")
-        return (time.perf_counter() - began) * 1000
+            started_s = time.perf_counter()
+            self.mqtt.client.publish(self._topic, self.sent)
+            if not self._telemetry_changed.wait_for(self._applied, TIMEOUT_S):
+                raise TimeoutError(f"telemetry did not report setpoint {self._sequence}")
+        return (time.perf_counter() - started_s) * 1000
 
-    def act(self, caller: "HttpConnection") -> float:
-        """An action to where the arm is, until it has started [ms]; it ends by itself, which is waited for after that.
+    def run_action(self, connection: "HttpConnection") -> float:
+        """Starts an action to the present pose, waits for its end, and returns the time until it started [ms].
 
         Raises:
-            RuntimeError: It did not start.
+            RuntimeError: The action did not start.
         """
         request = {"kind": "move_joints", "position_rad": self.target_rad}
-        asked = {"request": request, "epoch": self.epoch, "wait_for": "started", "wait_ms": 10_000}
-        body = json.dumps(asked).encode()
-        began = time.perf_counter()
-        started = caller.ask("POST", f"/api/v1/devices/{self.device['id']}/actions", body)
-        took_ms = (time.perf_counter() - began) * 1000
-        if started["status"] not in ("started", "done"):
-            raise RuntimeError(f"not started: {started}")
-        caller.ask("GET", f"/api/v1/actions/{started['id']}?wait_ms=10000")
-        return took_ms
+        body = {"request": request, "epoch": self.epoch, "wait_for": "started", "wait_ms": 10_000}
+        payload = json.dumps(body).encode()
+        started_s = time.perf_counter()
+        action = connection.request("POST", f"/api/v1/devices/{self.device['id']}/actions", payload)
+        duration_ms = (time.perf_counter() - started_s) * 1000
+        if action["status"] not in ("started", "done"):
+            raise RuntimeError(f"the action did not start: {action}")
+        connection.request("GET", f"/api/v1/actions/{action['id']}?wait_ms=10000")
+        return duration_ms
 
     def _latest(self) -> _TelemetryFields:
         if self._newest is None:
-            raise TimeoutError("the robot tells nothing")
+            raise TimeoutError("the robot publishes no telemetry")
         return self._newest
 
     def _applied(self) -> bool:
         newest = self._newest
         return newest is not None and newest.epoch == self.epoch and newest.setpoint_sequence >= self._sequence
 
-    def _hear(self, payload: bytes) -> None:
+    def _on_telemetry(self, payload: bytes) -> None:
         newest = codec.decode(payload, _TelemetryFields)
-        with self._seen:
-            self._newest, self.heard = newest, payload
-            self._seen.notify()
+        with self._telemetry_changed:
+            self._newest, self.received = newest, payload
+            self._telemetry_changed.notify()
 
     def _renew(self) -> None:
         while not self._ending.wait(LEASE_MS / 4000):
-            self._stand.api.post(self._path, {"lease_ms": LEASE_MS, "epoch": self.epoch})
+            self._product.api.post(self._path, {"lease_ms": LEASE_MS, "epoch": self.epoch})
 
     def __enter__(self) -> Self:
         return self
 
     def __exit__(self, *_: object) -> None:
         self._ending.set()
-        self._renewing.join(PATIENCE_S)
-        self._stand.api.http.delete(self._path, params={"epoch": self.epoch})
-        self.line.__exit__()
+        self._renewal.join(TIMEOUT_S)
+        self._product.api.http.delete(self._path, params={"epoch": self.epoch})
+        self.mqtt.__exit__()
 
 
 class HttpConnection:
-    """One warm HTTP connection of the standard library: the client that costs least. ``with`` closes it."""
+    """One open HTTP connection of the standard library, the cheapest client. Leaving the context closes it."""
 
     def __init__(self, port: int, headers: dict[str, str] | None = None) -> None:
-        self._line = http.client.HTTPConnection(HOST, port, timeout=PATIENCE_S)
+        self._connection = http.client.HTTPConnection(HOST, port, timeout=TIMEOUT_S)
         self._headers = {"Content-Type": "application/json", **(headers or {})}
-        self._line.connect()
-        self._line.sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+        self._connection.connect()
+        self._connection.sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
 
-    def ask(self, method: str, path: str, body: bytes | None = None) -> Any:
-        """The answer's JSON. Raises: RuntimeError: It is a refusal."""
-        self._line.request(method, path, body, self._headers)
-        answer = self._line.getresponse()
-        read = answer.read()
-        if answer.status >= http.client.BAD_REQUEST:
-            raise RuntimeError(f"{method} {path}: {answer.status} {read[:300]!r}")
-        return json.loads(read) if read else None
+    def request(self, method: str, path: str, body: bytes | None = None) -> Any:
+        """Sends a request and returns the JSON of the response.
+
+        Raises:
+            RuntimeError: The response is an error.
+        """
+        self._connection.request(method, path, body, self._headers)
+        response = self._connection.getresponse()
+        content = response.read()
+        if response.status >= http.client.BAD_REQUEST:
+            raise RuntimeError(f"{method} {path}: {response.status} {content[:300]!r}")
+        return json.loads(content) if content else None
 
     def __enter__(self) -> Self:
         return self
 
     def __exit__(self, *_: object) -> None:
-        self._line.close()
+        self._connection.close()
 
 
 @contextlib.contextmanager
 def start(home: Path, kind: BrokerKind, **more: str) -> Iterator[MeasuredProduct]:
-    """The product with one simulated UR5, and this broker; ``more`` are settings."""
+    """Runs the product with one simulated UR5 and this broker; ``more`` are further settings."""
     with start_machine(home, port=0, TELESCOPE_BROKER=kind, **more) as machine:
         if machine.process.poll() is not None:
             raise RuntimeError("".join(machine.lines))
-        given = {"TELESCOPE_HOME": str(home), "TELESCOPE_PORT": str(machine.port), "TELESCOPE_BROKER": kind, **more}
-        with Cloud(settings.read(given)) as cloud:
+        environment = {
+            "TELESCOPE_HOME": str(home),
+            "TELESCOPE_PORT": str(machine.port),
+            "TELESCOPE_BROKER": kind,
+            **more,
+        }
+        with Cloud(settings.read(environment)) as cloud:
             yield MeasuredProduct(machine, kind, cloud)
 
 
 @contextlib.contextmanager
 def start_peer(module: str, *arguments: str) -> Iterator["subprocess.Popen[str]"]:
-    """A program beside the product that says ``ready`` when it is, to the end of the ``with``."""
+    """Runs a reference program that prints ``ready`` when it accepts requests."""
     with subprocess.Popen(
         [sys.executable, "-m", module, *arguments], cwd=ROOT, stdout=subprocess.PIPE, text=True
     ) as process:
@@ -297,8 +307,8 @@ def start_peer(module: str, *arguments: str) -> Iterator["subprocess.Popen[str]"
 
 
 def free_port() -> int:
-    """A port that nobody listens on."""
-    with socket.socket() as found:
-        found.bind((HOST, 0))
-        port: int = found.getsockname()[1]
+    """Returns a free TCP port."""
+    with socket.socket() as listener:
+        listener.bind((HOST, 0))
+        port: int = listener.getsockname()[1]
         return port

@@ -177,10 +177,10 @@ class FaultRuns(Bench):
             FaultOperator(self.ground, FULL, shuffled=True) as hand,
         ):
             heard: list[bytes] = []
-            line.hear = heard.append
+            line.on_payload = heard.append
             hand.await_motion()
             time.sleep(self.chance.uniform(0.8, 1.2))
-            line.hear = lambda _payload: None
+            line.on_payload = lambda _payload: None
             for first in range(0, len(heard), 2):
                 for payload in reversed(heard[first : first + 2]):
                     line.client.publish(topic, payload, 1)

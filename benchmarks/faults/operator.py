@@ -5,7 +5,7 @@ import threading
 import time
 from typing import Final, Self
 
-from benchmarks.baseline.product import LEASE_MS, PATIENCE_S
+from benchmarks.baseline.product import LEASE_MS, TIMEOUT_S
 from benchmarks.faults.processes import STREAMED, ProductProcesses
 from device_agent.protocol import JointTarget, JointTelemetry, Setpoint, codec
 from tests.harness.network.brokers import wait_until
@@ -43,10 +43,10 @@ class FaultOperator:
         granted = ground.post(f"{ground.device(STREAMED)}/lease", lease_ms=LEASE_MS, wait_ms=5000)
         self.epoch = granted["epoch"]
         ear = self._stack.enter_context(ground.issued({"purpose": "view"}, f"{ground.topic(STREAMED)}/tele/joints"))
-        ear.hear = self._hear
+        ear.on_payload = self._hear
         control = {"purpose": "control", "device": ground.device(STREAMED).rpartition("/")[2], "epoch": self.epoch}
         self._line = self._stack.enter_context(ground.issued(control))
-        wait_until(lambda: self._newest is not None and self._newest.epoch == self.epoch, "the lease", PATIENCE_S)
+        wait_until(lambda: self._newest is not None and self._newest.epoch == self.epoch, "the lease", TIMEOUT_S)
         self._thread.start()
         return self
 
@@ -97,7 +97,7 @@ class FaultOperator:
     def await_motion(self) -> None:
         """Until the arm is commanded to move as it is asked to."""
         if self._speed_rad_s:
-            wait_until(self._moves, "motion", PATIENCE_S)
+            wait_until(self._moves, "motion", TIMEOUT_S)
 
     def _moves(self) -> bool:
         newest = self._ground.noted.since(STREAMED, time.monotonic() * 1000 - 50)

@@ -15,7 +15,7 @@ from typing import Any, Final, Self
 from websockets.sync.client import connect
 
 from benchmarks.baseline.interleaved import Exchange
-from benchmarks.baseline.product import PATIENCE_S
+from benchmarks.baseline.product import TIMEOUT_S
 from device_agent.protocol import JointTarget, Setpoint, codec
 from device_agent.protocol.xmpp import stanzas
 from device_agent.protocol.xmpp.stream import Login, Stream
@@ -57,7 +57,7 @@ def mqtt(stack: contextlib.ExitStack, ports: Ports, broker: RunningBroker, trans
     def exchange() -> None:
         _require_none(heard)
         sender.publish(topic, SETPOINT, qos=0)
-        heard.get(timeout=PATIENCE_S)
+        heard.get(timeout=TIMEOUT_S)
 
     return exchange
 
@@ -70,7 +70,7 @@ def web_socket(stack: contextlib.ExitStack, ports: Ports, port: int) -> Exchange
 
     def exchange() -> None:
         sender.send(text)
-        receiver.recv(timeout=PATIENCE_S)
+        receiver.recv(timeout=TIMEOUT_S)
 
     return exchange
 
@@ -85,7 +85,7 @@ def xmpp(stack: contextlib.ExitStack, ports: Ports, port: int) -> Exchange:
     def exchange() -> None:
         _require_none(heard)
         sender.say(stanza)
-        heard.get(timeout=PATIENCE_S)
+        heard.get(timeout=TIMEOUT_S)
 
     return exchange
 
@@ -130,4 +130,4 @@ class _XmppUser:
         self._loop.close()
 
     def _run(self, work: Any) -> None:
-        asyncio.run_coroutine_threadsafe(work, self._loop).result(PATIENCE_S)
+        asyncio.run_coroutine_threadsafe(work, self._loop).result(TIMEOUT_S)

@@ -192,12 +192,12 @@ class _Operator:
     def _act(self, request: Mapping[str, Any]) -> End:
         asked = {"request": request, "epoch": self._hand.epoch, "wait_for": "started", "wait_ms": 5_000}
         path = f"/api/v1/devices/{self._hand.device['id']}/actions"
-        started = self._caller.ask("POST", path, json.dumps(asked).encode())
+        started = self._caller.request("POST", path, json.dumps(asked).encode())
         if started["status"] not in ("started", "done"):
             raise RuntimeError(f"the robot does not do it: {started}")
 
         def end() -> None:
-            ended = self._caller.ask("GET", f"/api/v1/actions/{started['id']}?wait_ms=10000")
+            ended = self._caller.request("GET", f"/api/v1/actions/{started['id']}?wait_ms=10000")
             if ended["status"] != "done":
                 raise RuntimeError(f"the robot did not do it: {ended}")
 

@@ -11,8 +11,8 @@ from typing import Final
 
 from benchmarks.baseline.interleaved import Exchange, measure_interleaved
 from benchmarks.baseline.product import (
-    PATIENCE_S,
     PAYLOAD,
+    TIMEOUT_S,
     HttpConnection,
     MeasuredProduct,
     MqttClient,
@@ -69,16 +69,16 @@ def paths(stand: MeasuredProduct) -> Iterator[dict[str, Exchange]]:
         hand = stack.enter_context(StreamingOperator(stand))
 
         def read() -> None:
-            caller.ask("GET", f"/api/v1/devices/{hand.device['id']}")
+            caller.request("GET", f"/api/v1/devices/{hand.device['id']}")
 
         def tell() -> None:
-            line.client.publish(_TOPIC, PAYLOAD, 1).wait_for_publish(PATIENCE_S)
+            line.client.publish(_TOPIC, PAYLOAD, 1).wait_for_publish(TIMEOUT_S)
 
         yield {
             ANNOUNCED: _announce(stand, f"http://{HOST}:{web}"),
             _READ: read,
             _TOLD: tell,
-            _STARTED: partial(hand.act, caller),
+            _STARTED: partial(hand.run_action, caller),
         }
 
 

@@ -18,7 +18,7 @@ from collections.abc import Mapping
 from typing import Any, Final
 
 from benchmarks.baseline.interleaved import Exchange
-from benchmarks.baseline.product import PATIENCE_S, HttpConnection
+from benchmarks.baseline.product import TIMEOUT_S, HttpConnection
 from benchmarks.papers.exchanges import SETPOINT
 from device_agent.protocol import AckStatus
 from tests.harness.cloud.cloud_processes import Ground
@@ -74,7 +74,7 @@ def pairs(port: int, count: int, *, in_step: bool, seed: int) -> list[float]:
 
 
 def _ask(port: int, method: str, name: str, body: bytes | None = None) -> Any:
-    with contextlib.closing(http.client.HTTPConnection(HOST, port, timeout=PATIENCE_S)) as line:
+    with contextlib.closing(http.client.HTTPConnection(HOST, port, timeout=TIMEOUT_S)) as line:
         line.connect()
         line.sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
         line.request(method, f"/messages/{name}", body, {"Content-Type": "application/json"})
@@ -110,9 +110,9 @@ def long_poll(stack: contextlib.ExitStack, ports: Mapping[int, int], ground: Gro
 
     def exchange() -> float:
         began = time.perf_counter()
-        started = caller.ask("POST", f"/api/v1/devices/{device}/actions", body)
-        took_ms = (robot.arrived.get(timeout=PATIENCE_S) - began) * 1000
-        caller.ask("GET", f"/api/v1/actions/{started['id']}?wait_ms=10000")
+        started = caller.request("POST", f"/api/v1/devices/{device}/actions", body)
+        took_ms = (robot.arrived.get(timeout=TIMEOUT_S) - began) * 1000
+        caller.request("GET", f"/api/v1/actions/{started['id']}?wait_ms=10000")
         return took_ms
 
     return exchange

@@ -11,7 +11,7 @@ from typing import Any, Final
 
 from benchmarks.baseline.echo_servers import HOST
 from benchmarks.baseline.interleaved import Exchange
-from benchmarks.baseline.product import PATIENCE_S, PERIOD_S, free_port, start_peer
+from benchmarks.baseline.product import PERIOD_S, TIMEOUT_S, free_port, start_peer
 from benchmarks.peers.arm import HOME_RAD, NAMES, setpoint
 from benchmarks.peers.robots import CONTROL, JOINTS, METHOD, ROS_TYPE, zenoh_peer
 from device_agent.protocol import JointTelemetry, codec
@@ -51,13 +51,13 @@ class PeerOperator:
         with self._seen:
             self._sequence += 1
             self._send(self._sequence)
-            if not self._seen.wait_for(lambda: self._applied >= self._sequence, PATIENCE_S):
+            if not self._seen.wait_for(lambda: self._applied >= self._sequence, TIMEOUT_S):
                 raise TimeoutError(f"setpoint {self._sequence} is not seen again")
         return (time.perf_counter() - began) * 1000
 
     def settle(self) -> Exchange:
         """The exchange, once it works: a channel may be open before the other end knows of it."""
-        ends_s = time.monotonic() + PATIENCE_S
+        ends_s = time.monotonic() + TIMEOUT_S
         while time.monotonic() < ends_s:
             with self._seen:
                 self._sequence += 1
@@ -132,7 +132,7 @@ def grpc() -> Iterator[Exchange]:
         yield operator.settle()
         asked.put(None)
         told.cancel()
-        listening.join(PATIENCE_S)
+        listening.join(TIMEOUT_S)
 
 
 @contextlib.contextmanager
@@ -165,13 +165,13 @@ def foxglove() -> Iterator[Exchange]:
         listening.start()
         yield operator.settle()
         line.close()
-        listening.join(PATIENCE_S)
+        listening.join(TIMEOUT_S)
 
 
 def _channel(line: Any) -> int:
     """The number of the joints' channel, which the server advertises of its own accord."""
     while True:
-        said = json.loads(line.recv(PATIENCE_S))
+        said = json.loads(line.recv(TIMEOUT_S))
         for each in said.get("channels", ()) if said["op"] == "advertise" else ():
             if each["topic"] == f"/{JOINTS}":
                 return int(each["id"])

@@ -1,4 +1,4 @@
-"""What a suite has found: tables, charts and claims, kept as JSON. The page and the terminal show nothing else."""
+"""Result of one suite: tables, charts and targets, stored as JSON. The page and the terminal show only these."""
 
 import json
 import os
@@ -12,12 +12,12 @@ import msgspec
 
 RESULTS: Final = Path(__file__).resolve().parents[1] / "results"
 QUICK: Final = RESULTS / "quick"
-"""Where short runs leave what they found; not kept with the sources."""
+"""Results of quick runs; not under version control."""
 Cell = str | float | int | None
 
 
 class Table(msgspec.Struct, frozen=True, kw_only=True):
-    """Rows below a head. Numbers are shown with three digits."""
+    """One table. Numbers are shown with three digits."""
 
     title: str
     columns: list[str]
@@ -26,14 +26,14 @@ class Table(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class Chart(msgspec.Struct, frozen=True, kw_only=True):
-    """Lines, or bars beside each other, over the same places.
+    """One chart: lines or grouped bars over common x values.
 
     Attributes:
-        kind: ``line``, ``bar``, ``cdf``: shares of the samples of each series, which are not paired with ``x``, or
-            ``waterfall``: parts that follow each other, each beginning where the one above it ends.
-        x: Places, numbers or names.
+        kind: ``line``, ``bar``, ``cdf`` (cumulative share of each series; ``x`` is unused) or ``waterfall``
+            (consecutive parts; each bar starts where the previous one ends).
+        x: Numbers or names.
         series: Name → values.
-        marks: Name → a value to compare with, drawn as a dashed line.
+        marks: Name → reference value, drawn as a dashed line.
     """
 
     title: str
@@ -47,13 +47,13 @@ class Chart(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class Claim(msgspec.Struct, frozen=True, kw_only=True):
-    """What Telescope wants to hold, and what was seen.
+    """A target and its measured value.
 
     Attributes:
-        text: The claim.
-        seen: The figure.
-        bound: ``seen`` may be as large as this, or with ``at_least`` as small.
-        unit: Of both; a ratio's is ``×``.
+        text: What is measured.
+        seen: Measured value.
+        bound: Largest allowed value; the smallest one if ``at_least`` is set.
+        unit: Unit of both values; ``×`` for a ratio.
     """
 
     text: str
@@ -64,23 +64,23 @@ class Claim(msgspec.Struct, frozen=True, kw_only=True):
 
     @property
     def holds(self) -> bool:
-        """Whether the figure is on the right side of its bound."""
+        """True if the measured value meets the bound."""
         return self.seen >= self.bound if self.at_least else self.seen <= self.bound
 
     def line(self) -> str:
-        """For a terminal and a page."""
+        """Returns the target and the measured value as one line of text."""
         sign = "≥" if self.at_least else "≤"
-        return f"{self.text}: {self.seen:.3g} {self.unit} (wanted {sign} {self.bound:g})"
+        return f"{self.text}: {self.seen:.3g} {self.unit} (target {sign} {self.bound:g})"
 
 
 class Report(msgspec.Struct, kw_only=True):
-    """One suite's run.
+    """Result of one run of a suite.
 
     Attributes:
-        suite: Its name, which is its file's too.
-        about: Paragraphs: what was done, and how it is to be read.
-        quick: Whether it was the short run.
-        load: Of the machine over the minute before, from its other programs: 0 on a quiet one.
+        suite: Name of the suite and of its file.
+        about: Paragraphs that describe the method and how to read the results.
+        quick: True for a run with few samples.
+        load: Load average of the machine over the minute before the run; 0 on an idle machine.
     """
 
     suite: str
@@ -100,7 +100,7 @@ class Report(msgspec.Struct, kw_only=True):
 
 
 def save(report: Report, folder: Path = RESULTS) -> Path:
-    """Write it down, in place of what was found before."""
+    """Writes the report and replaces the previous one."""
     folder.mkdir(parents=True, exist_ok=True)
     path = folder / f"{report.suite}.json"
     text = json.dumps(msgspec.to_builtins(report), indent=1, ensure_ascii=False)
@@ -109,13 +109,17 @@ def save(report: Report, folder: Path = RESULTS) -> Path:
 
 
 def load(suite: str, folder: Path = RESULTS) -> Report | None:
-    """What a suite has found last, if it has run."""
+    """Returns the latest report of a suite, or None."""
     path = folder / f"{suite}.json"
     return msgspec.json.decode(path.read_bytes(), type=Report) if path.exists() else None
 
 
 def percentile(samples: Sequence[float], share: float) -> float:
-    """The sample below which this share of them lies. Raises: ValueError: There is none."""
+    """Returns the sample at a share (0 to 1) of the sorted samples.
+
+    Raises:
+        ValueError: There are no samples.
+    """
     if not samples:
         raise ValueError("no sample")
     ordered = sorted(samples)
@@ -123,7 +127,7 @@ def percentile(samples: Sequence[float], share: float) -> float:
 
 
 def format_cell(value: Cell) -> str:
-    """A cell as text: three digits, no more."""
+    """Returns a cell as text with at most three digits."""
     if value is None:
         return "–"
     if isinstance(value, float):

@@ -17,7 +17,7 @@ from typing import Any, Final
 import msgspec
 
 from benchmarks.baseline.echo_servers import HOST
-from benchmarks.baseline.product import PATIENCE_S, MeasuredProduct, free_port, start, start_peer
+from benchmarks.baseline.product import TIMEOUT_S, MeasuredProduct, free_port, start, start_peer
 from benchmarks.reporting.report import Cell, Chart, Claim, Table
 from benchmarks.scale.brokers import answer, program
 from benchmarks.scale.http_load import HttpLoad, HttpLoadResult, Request
@@ -121,7 +121,7 @@ def _functions(stand: MeasuredProduct, port: int) -> Iterator["subprocess.Popen[
     )
     with subprocess.Popen([sys.executable, "-m", "function_app", "serve"], cwd=ROOT, env=environment) as process:
         try:
-            ends_s = time.monotonic() + PATIENCE_S
+            ends_s = time.monotonic() + TIMEOUT_S
             while not _healthy(port):
                 if process.poll() is not None or time.monotonic() > ends_s:
                     raise RuntimeError("another process of the functions does not start")

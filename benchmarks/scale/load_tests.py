@@ -13,7 +13,7 @@ from typing import Any, Final
 
 import msgspec
 
-from benchmarks.baseline.product import PATIENCE_S, MeasuredProduct
+from benchmarks.baseline.product import TIMEOUT_S, MeasuredProduct
 from benchmarks.reporting.report import Cell, Table
 from benchmarks.scale.brokers import answer, program
 from benchmarks.scale.functions import FunctionsUnderTest, Load
@@ -134,7 +134,7 @@ class LoadTest:
             progress.wait()
             before_s, all_s = processor_s(broker), time.monotonic()
             megabytes = resident_mb(broker), resident_mb(self._stand.machine.pid("function_app serve"))
-            process.wait(PATIENCE_S + count * gap_s + seconds)
+            process.wait(TIMEOUT_S + count * gap_s + seconds)
             percent = 100 * (processor_s(broker) - before_s) / (time.monotonic() - all_s)
             heard = msgspec.json.decode(answer(listener, "now"), type=SubscriberResult)
         return LoadTestResult(
@@ -182,7 +182,7 @@ def actions(
 ) -> list[Load]:
     """As many as are taken, by so many processes, for the arms of a swarm, which are where they are asked to be."""
     found = []
-    longest_s = len(processes) * (seconds + 1) + PATIENCE_S
+    longest_s = len(processes) * (seconds + 1) + TIMEOUT_S
     with contextlib.ExitStack() as stack, LoadTest(stand, home).living(ARMS, ARMS_HZ, longest_s, 0.02) as process:
         _Progress(process, ARMS).wait()
         devices = _there(stand)

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Final
 
 from benchmarks.baseline.echo_servers import HOST
-from benchmarks.baseline.product import PATIENCE_S
+from benchmarks.baseline.product import TIMEOUT_S
 from benchmarks.reporting.report import Cell, Table
 from benchmarks.scale import mqtt_packets
 from benchmarks.scale.functions import FunctionsUnderTest
@@ -62,7 +62,7 @@ def functions(site: FunctionsUnderTest, steps: tuple[int, ...]) -> list[list[Cel
 
         def grow(count: int) -> None:
             while len(lines) < count:
-                line = stack.enter_context(socket.create_connection((HOST, site.ports[0]), PATIENCE_S))
+                line = stack.enter_context(socket.create_connection((HOST, site.ports[0]), TIMEOUT_S))
                 line.sendall(asked)
                 line.recv(_ANSWER)
                 lines.append(line)

@@ -9,7 +9,7 @@ from collections.abc import Iterator
 from typing import Final
 
 from benchmarks.baseline.echo_servers import HOST
-from benchmarks.baseline.product import PATIENCE_S
+from benchmarks.baseline.product import TIMEOUT_S
 
 _CONNECT, _CONNACK, PUBLISH, _SUBSCRIBE, _SUBACK = 0x10, 0x20, 0x30, 0x82, 0x90
 _CLEAN_WITH_LOGIN: Final = 0xC2
@@ -60,7 +60,7 @@ def payload(body: bytes) -> bytes:
 
 def connect(port: int, client: str, user: str, password: str) -> socket.socket:
     """A connection that the broker has taken. Raises: ConnectionError: It has not."""
-    line = socket.create_connection((HOST, port), PATIENCE_S)
+    line = socket.create_connection((HOST, port), TIMEOUT_S)
     line.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
     head = text("MQTT") + struct.pack("!BBH", 4, _CLEAN_WITH_LOGIN, _KEEP_ALIVE_S)
     line.sendall(packet(_CONNECT, head + text(client) + text(user) + text(password)))

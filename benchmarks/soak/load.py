@@ -10,7 +10,7 @@ from typing import Any, Final, Self
 
 import httpx
 
-from benchmarks.baseline.product import LEASE_MS, PATIENCE_S, MeasuredProduct, MqttClient
+from benchmarks.baseline.product import LEASE_MS, TIMEOUT_S, MeasuredProduct, MqttClient
 from device_agent.protocol import JointTarget, JointTelemetry, Setpoint, codec
 from device_agent.protocol.manifests import robot_type
 from tests.harness.browser.product import Api
@@ -72,7 +72,7 @@ class Load:
     def __exit__(self, *_: object) -> None:
         self._ending.set()
         for each in self._threads:
-            each.join(4 * PATIENCE_S)
+            each.join(4 * TIMEOUT_S)
 
     def _again(self, name: str, work: Callable[[httpx.Client, int], None]) -> None:
         """One round after the other; one that goes wrong is counted, and the next one begins a second later."""
@@ -204,8 +204,8 @@ class Load:
         """All that robots measure, for a while."""
         with self._connected(http, {"purpose": "view"}) as line:
             self._ending.wait(self._hold_s)
-            heard = line.heard.qsize()
-            line.forget()
+            heard = line.received.qsize()
+            line.reset()
             self.count("messages heard", heard)
             if not heard:
                 raise RuntimeError("nothing is heard")
@@ -236,12 +236,12 @@ class StreamingResult:
         self._names = [each.name for each in joints]
         self._topic = f"{device['topic']}/ctl/{epoch}"
         self._line = line
-        self._newest = codec.decode(heard.heard.get(timeout=PATIENCE_S), JointTelemetry)
+        self._newest = codec.decode(heard.received.get(timeout=TIMEOUT_S), JointTelemetry)
         self._began_s = time.monotonic()
         self._home_rad = list(self._newest.commanded_rad)
         self.epoch = epoch
         self.sequence = 0
-        heard.hear = self._hear
+        heard.on_payload = self._hear
 
     def _hear(self, payload: bytes) -> None:
         self._newest = codec.decode(payload, JointTelemetry)

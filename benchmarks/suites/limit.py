@@ -11,9 +11,9 @@ from typing import Final
 from benchmarks.baseline.echo_servers import HOST
 from benchmarks.baseline.interleaved import Exchange, measure_interleaved, median, table
 from benchmarks.baseline.product import (
-    PATIENCE_S,
     PAYLOAD,
     PERIOD_S,
+    TIMEOUT_S,
     HttpConnection,
     MeasuredProduct,
     StreamingOperator,
@@ -110,16 +110,16 @@ def paths(stand: MeasuredProduct) -> Iterator[dict[str, Exchange]]:
         found: dict[str, Exchange] = {"TCP": _tcp(stack, tcp), "HTTP": _http(stack, web)}
         hand = stack.enter_context(StreamingOperator(stand))
         hand.exchange()
-        found["MQTT, QoS 0"] = mqtt(stack, stand, 0, hand.sent, len(hand.heard))
+        found["MQTT, QoS 0"] = mqtt(stack, stand, 0, hand.sent, len(hand.received))
         found["MQTT, QoS 1"] = mqtt(stack, stand, 1)
         found["setpoint"] = hand.exchange
         caller = stack.enter_context(HttpConnection(stand.machine.port, {"Authorization": f"Bearer {stand.token}"}))
-        found["action"] = partial(hand.act, caller)
+        found["action"] = partial(hand.run_action, caller)
         yield found
 
 
 def _tcp(stack: contextlib.ExitStack, port: int) -> Exchange:
-    line = stack.enter_context(socket.create_connection((HOST, port), PATIENCE_S))
+    line = stack.enter_context(socket.create_connection((HOST, port), TIMEOUT_S))
     line.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
 
     def exchange() -> None:
@@ -135,7 +135,7 @@ def _http(stack: contextlib.ExitStack, port: int) -> Exchange:
     caller = stack.enter_context(HttpConnection(port))
 
     def exchange() -> None:
-        caller.ask("POST", "/echo", PAYLOAD)
+        caller.request("POST", "/echo", PAYLOAD)
 
     return exchange
 
@@ -158,10 +158,10 @@ def mqtt(
             str(answer_bytes),
         )
     )
-    line = stack.enter_context(stand.line(publish=(there,), subscribe=(back,), qos=qos))
+    line = stack.enter_context(stand.connect(publish=(there,), subscribe=(back,), qos=qos))
 
     def exchange() -> None:
         line.client.publish(there, payload, qos)
-        line.heard.get(timeout=PATIENCE_S)
+        line.received.get(timeout=TIMEOUT_S)
 
     return exchange

@@ -109,10 +109,10 @@ def _act(stand: TracedProduct, caller: HttpConnection, hand: StreamingOperator, 
     time.sleep(random.uniform(0.0, 0.01))  # at any phase of the control loop
     began_ns = time.monotonic_ns()
     yield Timestamp(ASKED, began_ns)
-    started = caller.ask("POST", f"/api/v1/devices/{hand.device['id']}/actions", body)
+    started = caller.request("POST", f"/api/v1/devices/{hand.device['id']}/actions", body)
     yield Timestamp(ANSWERED, time.monotonic_ns())
     yield from stand.marks.until(f"moves:{ROBOT}", since_ns=began_ns, within_s=_WITHIN_S)
-    caller.ask("GET", f"/api/v1/actions/{started['id']}?wait_ms=10000")
+    caller.request("GET", f"/api/v1/actions/{started['id']}?wait_ms=10000")
 
 
 def _set(stand: TracedProduct, hand: StreamingOperator) -> list[Timestamp]:
