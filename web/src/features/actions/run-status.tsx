@@ -6,6 +6,7 @@ import type { DeviceStore } from "../devices/model/device-store";
 import { format } from "../../shared/i18n/format";
 import { describeRequest, texts } from "./texts";
 import { whyNotAct } from "../devices/availability";
+import "./run-status.css";
 
 interface RunStatusProps {
   device: DeviceStore;

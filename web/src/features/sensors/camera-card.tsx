@@ -10,6 +10,7 @@ import { texts } from "./texts";
 import { contentOf } from "./use-capture-content";
 import { Age, Card } from "../../shared/ui/parts";
 import { whyNot } from "../devices/availability";
+import "./sensors.css";
 
 /** Without a picture for this long, what is shown is not live [ms]; a slow camera has three of its periods. */
 const STALLED_MS = 2_000;

@@ -10,6 +10,7 @@ import { format } from "../../shared/i18n/format";
 import { texts } from "./texts";
 import { History, useRecording } from "./history-card";
 import { Age, Card, Choice } from "../../shared/ui/parts";
+import "./sensors.css";
 
 /** More values than this are a table. */
 const MOST_CARDS = 4;

@@ -16,6 +16,7 @@ import { Plan } from "../spaces/floor-plan";
 import { Readings } from "./readings-card";
 import { ScanCard } from "./lidar-card";
 import { Settings } from "./settings-card";
+import "./sensors.css";
 
 /** What has a card of its own. */
 const IMAGE = "image";

@@ -16,6 +16,7 @@ import { useNames } from "./floor-plan-labels";
 import { shown } from "../sensors/readings-card";
 import { deviceAddress } from "../../app/routes";
 import { colour, onColourChange } from "../../shared/ui/canvas-theme";
+import "./floor-plan.css";
 
 const POSITIONS = "positions";
 const OCCUPANCY = "occupancy";
